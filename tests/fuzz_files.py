@@ -27,7 +27,8 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant import io
 from flexplant.errors import FlexplantError
-from flexplant.io import ansys, foreign_parsers, mat_variables
+from flexplant.io import ansys, foreign_parsers
+from flexplant.io import mat_matrices as mat_variables
 from flexplant.io.nastran import read_nodes
 
 sys.path.insert(0, str(Path(__file__).parent))

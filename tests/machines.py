@@ -5,8 +5,7 @@ import time
 import numpy as np
 
 from flexplant.lti import StateSpace
-from flexplant.lti.discretisation import discretized
-from flexplant.lti.noise import noise_factor
+from flexplant.lti.discretisation import discretized, noise_factor
 from flexplant.plant import Foreign, StandardPlant
 
 RATE = 2000.0

@@ -18,17 +18,18 @@ from flexplant.lti import (
     balanced,
     balancing,
     controllability_gramian,
-    doubling,
-    h2_norms,
     lyapunov,
     norms,
     responses,
     solve_lyapunov,
     solve_stein,
 )
+from flexplant.lti import norms as h2_norms
+from flexplant.lti import riccati as doubling
 from flexplant.lti.riccati import control_care
 from flexplant.parallel import CHUNK, PROBE, mapped
-from flexplant.synthesis import attempts, servo
+from flexplant.synthesis import hinf as attempts
+from flexplant.synthesis import servo
 
 
 def square(item):

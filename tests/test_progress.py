@@ -14,9 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from flexplant import progress
-from flexplant.parallel import Progress, interruptible, mapped
-from flexplant.progress import tick
+from flexplant import parallel as progress
+from flexplant.parallel import Progress, interruptible, mapped, tick
 
 HERE = Path(__file__).parent
 

@@ -6,7 +6,7 @@ import numpy as np
 
 import flexplant as fx
 from flexplant.certificates import in_words
-from flexplant.notebook import as_html
+from flexplant.store import as_html
 from flexplant.versions import versions
 from stages import RATE, ports, reduced
 

@@ -11,12 +11,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from .dof_columns import columns_of, component_columns, direction_names, listed, node_numbers
-from .dof_index import DofIndex, in_box, rotation_hint, unknown_dof
+from .dof_columns import DIRECTIONS as DIRECTIONS
+from .dof_columns import (
+    DofIndex,
+    columns_of,
+    component_columns,
+    direction_names,
+    in_box,
+    listed,
+    node_numbers,
+    rotation_hint,
+    unknown_dof,
+)
+from .dof_columns import Interpolation as Interpolation
+from .dof_columns import Place as Place
 from .errors import LabelError, ShapeError, counted, require_known, unknown_label
-from .places import DIRECTIONS as DIRECTIONS
-from .places import Interpolation as Interpolation
-from .places import Place as Place
 from .values import FloatArray, IntArray, Value, frozen, instance, real_array
 
 

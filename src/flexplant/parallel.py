@@ -6,19 +6,30 @@ and linear algebra runs on one thread while items are computed (its rounding dep
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
-from time import perf_counter
-from typing import Any, TypeVar
+from math import inf
+from os import cpu_count
+from time import monotonic, perf_counter
+from types import TracebackType
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 
 from .errors import ModelError, SolverError
-from .progress import Progress as Progress
-from .surviving import Lost, survived
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -174,3 +185,271 @@ def _seeds(
     else:
         source = rng if isinstance(rng, np.random.SeedSequence) else np.random.SeedSequence(rng)
     return list(source.spawn(count))  # type: ignore[attr-defined]
+
+
+#: calls that are sent out at once
+_SENT = 64
+#: what is said of a call whose process ended twice
+DIED: Final = "its worker died, twice (out of memory, or a crash of compiled code?)"
+
+
+@dataclass(frozen=True)
+class Lost:
+    """What comes out of a call whose process ended twice, or took too long, and why."""
+
+    reason: str
+
+
+def survived(
+    function: Callable[..., Any],
+    calls: Mapping[int, tuple[Any, ...]],
+    executor: Executor,
+    timeout: float | None = None,
+) -> Iterator[tuple[int, Any]]:
+    """Yield numbers and results of ``function(*call)`` as they come.
+
+    When a process of a pool dies, the rest goes on in as many processes as the pool had, started
+    as its own were, one call at a time in each: the calls that were out are done once more, and
+    one whose process dies again yields `Lost`. With a timeout [s] this is so from the beginning,
+    and a process that takes longer is ended. What the function raises is raised.
+    """
+    left, tried = dict(calls), set[int]()
+    if timeout is None:
+        for number, result in _pooled(function, left, executor, tried):
+            del left[number]
+            yield number, result
+    if left:
+        yield from _single(function, left, executor, tried, inf if timeout is None else timeout)
+
+
+def _pooled(
+    function: Callable[..., Any],
+    calls: Mapping[int, tuple[Any, ...]],
+    executor: Executor,
+    lost: set[int],
+) -> Iterator[tuple[int, Any]]:
+    """Yield what an executor finds; when it breaks, the calls that were out go to lost."""
+    waiting = iter(list(calls.items()))
+    out: dict[Future[Any], int] = {}
+    broken = False
+    try:
+        while True:
+            while not broken and len(out) < _SENT and (item := next(waiting, None)) is not None:
+                try:
+                    out[executor.submit(function, *item[1])] = item[0]
+                except BrokenExecutor:
+                    broken = True
+            if not out:
+                return
+            done = wait(out, return_when=FIRST_COMPLETED).done
+            for future in sorted(done, key=lambda one: out[one]):
+                number = out.pop(future)
+                error = future.exception()
+                if error is None:
+                    yield number, future.result()
+                elif isinstance(error, BrokenExecutor):
+                    broken = True
+                    lost.add(number)
+                elif type(error).__name__ == "KilledWorker":  # of dask, which tried it again
+                    yield number, Lost(DIED)
+                else:
+                    raise error
+    finally:
+        for future in out:
+            future.cancel()
+
+
+def _single(
+    function: Callable[..., Any],
+    calls: Mapping[int, tuple[Any, ...]],
+    executor: Executor,
+    tried: set[int],
+    timeout: float,
+) -> Iterator[tuple[int, Any]]:
+    """Yield what processes like those of a pool find, each of which has one call at a time.
+
+    The process that dies is that of the call to blame, and it can be ended without another.
+    """
+    waiting = list(calls)[::-1]
+    first = next(iter(calls.values()))[0]  # a function that the calls have in common
+    #: the process of each call that is out, its number (None while it starts), and its end [s]
+    out: dict[Future[Any], tuple[ProcessPoolExecutor, int | None, float]] = {}
+
+    def start() -> None:
+        process = _one_like(executor)
+        out[process.submit(_started, function, first)] = process, None, inf
+
+    def send(process: ProcessPoolExecutor, number: int) -> None:
+        try:
+            sent = process.submit(function, *calls[number])
+        except BrokenExecutor:  # it died while it had nothing to do
+            waiting.append(number)
+            start()
+        else:
+            out[sent] = process, number, monotonic() + timeout
+
+    try:
+        for _ in range(
+            min(getattr(executor, "_max_workers", None) or cpu_count() or 1, len(calls))
+        ):
+            start()
+        while out:
+            soonest = min(end for _, _, end in out.values())
+            pause = None if soonest == inf else max(0.0, soonest - monotonic())
+            wait(out, timeout=pause, return_when=FIRST_COMPLETED)
+            now = monotonic()
+            over = [one for one, (_, _, end) in out.items() if one.done() or end <= now]
+            for future in over:
+                process, number, _ = out.pop(future)
+                late = not future.done()
+                error = None if late else future.exception()
+                if late or isinstance(error, BrokenExecutor):
+                    _end(process)
+                    if number is None:
+                        raise SolverError(
+                            "a process like those of the executor ends while it starts. Check the "
+                            "executor's initializer, or compute without an executor."
+                        ) from error
+                    if late:
+                        yield number, Lost(f"took longer than {timeout:g} s, and was ended")
+                    elif number in tried:
+                        yield number, Lost(DIED)
+                    else:
+                        tried.add(number)
+                        waiting.append(number)
+                    if waiting:
+                        start()
+                    continue
+                if error is not None:
+                    _end(process)
+                    raise error
+                if waiting:
+                    send(process, waiting.pop())
+                else:
+                    process.shutdown()
+                if number is not None:
+                    yield number, future.result()
+    finally:  # interrupted too: no process stays
+        for process, _, _ in out.values():
+            _end(process)
+
+
+def _one_like(executor: Executor) -> ProcessPoolExecutor:
+    """Return a pool of one process, which starts as those of an executor do.
+
+    The settings of a pool are not public; those that another kind of executor lacks are defaults.
+    """
+    if isinstance(executor, ThreadPoolExecutor):  # its threads could not start
+        raise SolverError(
+            "the executor is broken: its initializer failed. Mend that, or leave it out."
+        )
+    return ProcessPoolExecutor(
+        1,
+        mp_context=getattr(executor, "_mp_context", None),
+        initializer=getattr(executor, "_initializer", None),
+        initargs=getattr(executor, "_initargs", ()),
+        max_tasks_per_child=getattr(executor, "_max_tasks_per_child", None),
+    )
+
+
+def _end(process: ProcessPoolExecutor) -> None:
+    """End a pool of one process, whatever it is doing."""
+    for one in list((getattr(process, "_processes", None) or {}).values()):
+        one.kill()
+    process.shutdown(cancel_futures=True)
+
+
+def _started(*_functions: Any) -> None:
+    """Return at once: the process has started, and imported what some functions need."""
+
+
+#: shorter work than this shows no bar [s]
+PATIENCE = 2.0
+#: a bar that nothing advances is drawn anew after this long, for the time it shows [s]
+_AGAIN = 1.0
+#: the bars that a thread is inside of
+_open = threading.local()
+
+
+class Progress:
+    """A bar for long work: after two seconds, on a terminal or in a notebook, unless forced.
+
+    Work inside of other work shows none of its own, neither here nor in the process of a pool.
+    """
+
+    def __init__(
+        self, total: int | None, description: str, *, progress: bool | None = None
+    ) -> None:
+        self.bar: Any = None
+        #: items counted
+        self.done = 0
+        self.description = description
+        self._over = threading.Event()
+        self._forced = bool(progress)
+        stream = watched() if progress is None and not _open_bars() else None
+        if progress or stream is not None:
+            from tqdm import tqdm
+
+            self.bar = tqdm(
+                total=total,
+                desc=description,
+                bar_format=None if total != 0 else "{desc}: {elapsed}",
+                delay=0.0 if progress else PATIENCE,
+                leave=bool(progress),
+                file=stream or sys.stderr,
+            )
+
+    def __enter__(self) -> Self:
+        _open_bars().append(self)
+        if self.bar is not None and not self._forced:
+            threading.Thread(target=self._shown, daemon=True).start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._over.set()
+        _open_bars().remove(self)
+        if self.bar is not None:
+            self.bar.close()
+
+    def advance(self, items: int = 1) -> None:
+        """Count some items as done."""
+        self.done += items
+        if self.bar is not None:
+            self.bar.update(items)
+
+    def _shown(self) -> None:
+        """Draw the bar while the first item, or any later one, takes its time."""
+        wait = PATIENCE
+        while not self._over.wait(wait):
+            self.bar.refresh()
+            wait = _AGAIN
+
+
+def tick(description: str) -> None:
+    """Count an item of the innermost work, where that is its description.
+
+    For loops far below the function that shows the bar; without such a bar it does nothing.
+    """
+    bars = _open_bars()
+    if bars and bars[-1].description == description:
+        bars[-1].advance()
+
+
+def watched() -> Any:
+    """Return the stream of a terminal or notebook that somebody sees; None in pipes and files."""
+    if sys.stderr is not None and sys.stderr.isatty():
+        return sys.stderr
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return sys.stdout if type(shell).__name__ == "ZMQInteractiveShell" else None
+
+
+def _open_bars() -> list[Progress]:
+    if not hasattr(_open, "bars"):
+        _open.bars = []
+    bars: list[Progress] = _open.bars
+    return bars

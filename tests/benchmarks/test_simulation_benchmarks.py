@@ -9,7 +9,7 @@ import scipy.signal
 from timing import best
 
 import flexplant as fx
-from flexplant.loop.noise_sources import white_noise
+from flexplant.loop.budget import white_noise
 from flexplant.parallel import one_thread
 from flexplant.simulation.runs import SampleBySample
 from flexplant.simulation.stepping import Drawn, machine

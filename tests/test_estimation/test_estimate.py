@@ -200,7 +200,7 @@ def test_blocks_and_the_time_varying_filter_agree_around_gaps(method, monkeypatc
     mixed = kalman.estimate(records(model, y, u), method)
     for module in ("passage", "smoothing"):
         monkeypatch.setattr(f"flexplant.estimation.{module}.SETTLED", -1.0)
-    monkeypatch.setattr("flexplant.estimation.fading.excess", lambda *_: None)
+    monkeypatch.setattr("flexplant.estimation.passage.excess", lambda *_: None)
     slow = kalman.estimate(records(model, y, u), method)
     for channel in ("die:hat", "y1:innovation", "y2:innovation"):
         deviation, known = slow.deviation(channel), np.isfinite(slow[channel])
@@ -225,7 +225,7 @@ def test_a_start_that_lasts_for_long_goes_in_blocks_and_is_that_of_single_sample
     monkeypatch.setattr(_Walk, "_step", lambda *given: count.append(1) or singly(*given))
     fast = kalman.estimate(records(model, y, u), method)
     assert len(count) < 100
-    monkeypatch.setattr("flexplant.estimation.fading.excess", lambda *_: None)
+    monkeypatch.setattr("flexplant.estimation.passage.excess", lambda *_: None)
     slow = kalman.estimate(records(model, y, u), method)
     assert len(count) > 2500
     for channel in ("die:hat", "y1:innovation", "y2:innovation"):

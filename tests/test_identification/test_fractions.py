@@ -5,8 +5,8 @@ import pytest
 
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
-from flexplant.identification.basis import pole_terms, residual_terms
-from flexplant.identification.plscf import Moments
+from flexplant.identification.diagram import Moments
+from flexplant.identification.refine import pole_terms, residual_terms
 from flexplant.lti import Frf
 from flexplant.store import load
 from oracles_identification import held_mode, modal_frf, pole

@@ -19,9 +19,8 @@ from flexplant.identification import (
     identify_modes,
     stabilisation_diagram,
 )
-from flexplant.identification.pole_split import separated
+from flexplant.identification.pole_test import completed, separated, unexplained
 from flexplant.identification.refine import LEAST, Lines, _Projected, refined
-from flexplant.identification.residual_peaks import completed, unexplained
 from flexplant.lti import Frf
 from flexplant.store import load
 from oracles_identification import held_mode, mac, modal_frf, noisy, pole

@@ -15,7 +15,7 @@ from flexplant.identification import (
     identify_modes,
     multisine,
 )
-from flexplant.identification.basis import hann_ratio
+from flexplant.identification.refine import hann_ratio
 from flexplant.io import read_frf_csv, write_frf_csv
 from flexplant.lti import Frf
 from flexplant.store import load

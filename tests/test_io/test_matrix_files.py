@@ -12,7 +12,7 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant.errors import FlexplantError, FlexplantWarning, ModelError, ShapeError
 from flexplant.io import models
-from flexplant.io.formats import Format
+from flexplant.io.paths import Format
 
 FE = Path("/work/shared/data/fe")
 needs_data = pytest.mark.skipif(not FE.exists(), reason="no data folder")

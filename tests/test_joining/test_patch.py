@@ -7,7 +7,7 @@ import scipy.linalg as la
 import flexplant as fx
 from flexplant.errors import LabelError, ModelError
 from flexplant.joining.component import components_of
-from flexplant.joining.patch_error import compliances
+from flexplant.joining.join import compliances
 
 SOLID = {"density": 2700, "youngs_modulus": 70e9, "poisson_ratio": 0.3}
 

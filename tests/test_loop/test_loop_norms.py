@@ -9,7 +9,8 @@ import scipy.linalg as la
 from flexplant.errors import CertificateError, SolverError
 from flexplant.estimation import design_kalman, design_static
 from flexplant.loop import close_loop
-from flexplant.lti import StateSpace, h2_norm, h2_norms, lyapunov, solve_stein
+from flexplant.lti import StateSpace, h2_norm, lyapunov, solve_stein
+from flexplant.lti import norms as h2_norms
 from flexplant.plant import Sensor, assemble_plant
 from flexplant.synthesis import design_servo
 from machines import observer, servo, stage

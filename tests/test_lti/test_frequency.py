@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.lti import Frf, StateSpace, append, frequency_response, series
-from flexplant.lti.dense_responses import diagonal_form
 from flexplant.lti.discretisation import discretized
 from flexplant.lti.frequency import default_freq
+from flexplant.lti.responses import diagonal_form
 from oracles_lti import sweep
 from systems_lti import machine
 

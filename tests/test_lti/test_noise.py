@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad_vec
 
 from flexplant.lti import StateSpace
-from flexplant.lti.noise import noise_factor
+from flexplant.lti.discretisation import noise_factor
 from oracles_plant import noise_by_doubling
 
 

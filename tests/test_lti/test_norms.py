@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexplant.errors import ModelError
-from flexplant.lti import StateSpace, h2_norm, hinf_norm, level_set, lft, norms, peak_gain
+from flexplant.lti import StateSpace, h2_norm, hinf_norm, lft, norms, peak_gain
+from flexplant.lti import norms as level_set
 from flexplant.lti.discretisation import discretized
-from flexplant.lti.peaks import Peaks, climbed, exceeding, proved_peak
-from flexplant.lti.residues import residues
-from flexplant.progress import Progress
+from flexplant.lti.peaks import Peaks, climbed, exceeding, proved_peak, residues
+from flexplant.parallel import Progress
 from oracles_lti import largest_gain, lyapunov, peak_by_search, stein, sweep
 from systems_lti import machine
 

@@ -9,7 +9,7 @@ from flexplant.errors import LabelError, ModelError, ShapeError, SolverError
 from flexplant.labels import DofSet
 from flexplant.modes import solve, solve_modes
 from flexplant.modes import sparse_modes as counted
-from flexplant.modes.mode_errors import rigid_residual
+from flexplant.modes.solve import rigid_residual
 from flexplant.structure import FEModel, ModalDamping, Rayleigh, Spring
 from plates import make_plate
 

@@ -19,8 +19,8 @@ from flexplant.placement import (
     place_actuators,
     place_sensors,
 )
-from flexplant.placement.branch import Branch
 from flexplant.placement.layouts import layouts_of
+from flexplant.placement.rows import Branch
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
 from flexplant.structure import FEModel, ModalDamping
 from oracles_placement import best_subset, stationary_riccati

@@ -13,10 +13,9 @@ from flexplant.placement import (
     ModeInformation,
     place_sensors,
 )
-from flexplant.placement.layouts import Layouts
-from flexplant.placement.mode_information import ModeRows
+from flexplant.placement.by_rows import ModeRows
+from flexplant.placement.layouts import Layouts, RigidPart
 from flexplant.placement.problem import Problem
-from flexplant.placement.rigid_part import RigidPart
 from flexplant.placement.rows import LinearRows
 from flexplant.reduction import EffectiveIndependence, PivotedQr
 from flexplant.work import Work

@@ -23,8 +23,7 @@ from flexplant.plant import (
     stage_weights,
     suspend,
 )
-from flexplant.plant.propagation import Flow
-from flexplant.plant.sampling import sampled_physical
+from flexplant.plant.sampling import Flow, sampled_physical
 from flexplant.store import load
 from flexplant.structure import FEModel
 from oracles_ports import (

@@ -16,7 +16,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import FlexplantWarning, ModelError
-from flexplant.plot.html.shapes import neighbours
+from flexplant.plot.html.sections import neighbours
 from flexplant.values import with_unit
 from stages import RATE, full, ports, reduced, some_modes
 

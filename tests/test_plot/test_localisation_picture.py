@@ -8,7 +8,7 @@ from flexplant import plot
 from flexplant.errors import ModelError
 from flexplant.labels import DofSet
 from flexplant.updating import AddedMass
-from flexplant.updating.judgement.localisation import Localisation
+from flexplant.updating.judgement.localise import Localisation
 
 
 @pytest.fixture

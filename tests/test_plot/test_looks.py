@@ -7,7 +7,7 @@ import pytest
 import flexplant as fx
 from flexplant.errors import ModelError
 from flexplant.lti import inverse_sensitivity, tf
-from flexplant.plot._style import CYCLE, STYLES
+from flexplant.plot._axes import CYCLE, STYLES
 from flexplant.values import in_unit
 from stages import reduced, sampled
 

@@ -8,10 +8,10 @@ import oracles_loop as oracle
 from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import design_kalman
 from flexplant.loop import close_loop
-from flexplant.loop.noise_sources import white_noise
+from flexplant.loop.budget import white_noise
 from flexplant.plant import assemble_plant
 from flexplant.simulation import Quantiser, Saturation, simulate
-from flexplant.simulation.conditions import Conditions, finer_loop
+from flexplant.simulation.nonlinear_elements import Conditions, finer_loop
 from flexplant.simulation.runs import InBlocks, SampleBySample, make_runner
 from flexplant.synthesis import design_servo
 from machines import block, matrices, observer, servo, stage

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexplant.loop import ClosedLoop, close_loop
-from flexplant.loop.noise_sources import white_noise
+from flexplant.loop.budget import white_noise
 from flexplant.lti import StateSpace
 from flexplant.lti.recursion import Recursion
 from flexplant.plant import StandardPlant

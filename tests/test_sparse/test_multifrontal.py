@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 import meshes
 from flexplant.errors import SolverError
 from flexplant.sparse import ordering
-from flexplant.sparse.complex_symmetric import ComplexSymmetricFactor
 from flexplant.sparse.factor import is_positive_definite, lowest_eigenvalue_bound
 from flexplant.sparse.inertia import SignedFactor, multifrontal_inertia
-from flexplant.sparse.multifrontal import MultifrontalCholesky
+from flexplant.sparse.multifrontal import ComplexSymmetricFactor, MultifrontalCholesky
 from flexplant.sparse.ordering import dissect
 
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from flexplant.errors import CertificateError
 from flexplant.lti import StateSpace, lft
-from flexplant.synthesis import certificate
-from flexplant.synthesis.certificate import certified_norm, swept_norm
+from flexplant.synthesis import controller as certificate
+from flexplant.synthesis.controller import certified_norm, swept_norm
 from oracles_synthesis import brute_norm
 
 

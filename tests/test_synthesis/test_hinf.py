@@ -26,7 +26,7 @@ from flexplant.plant import (
 )
 from flexplant.store import load
 from flexplant.synthesis import Riccati, design_hinf
-from flexplant.synthesis.certificate import certified_norm
+from flexplant.synthesis.controller import certified_norm
 from flexplant.testbeds import wafer_stage
 from oracles_synthesis import brute_norm, closed_loop, gains, split, stability
 from stages import CORNERS, NOISE, RATE, fitted, ports, reduced, sampled

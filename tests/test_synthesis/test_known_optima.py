@@ -12,7 +12,7 @@ import oracles_synthesis as oracle
 from flexplant.errors import CertificateError
 from flexplant.lti import StateSpace, lft
 from flexplant.synthesis import Lmi, Riccati, StructuredLmi, design_hinf
-from flexplant.synthesis.certificate import certified_norm
+from flexplant.synthesis.controller import certified_norm
 
 #: structures with the smallest gamma of Glover and McFarlane's problem
 STRUCTURES = {

@@ -15,7 +15,7 @@ from flexplant.lti import StateSpace, lft
 from flexplant.lti.preparation import prepared
 from flexplant.store import load
 from flexplant.synthesis import lmi_programs
-from flexplant.synthesis.certificate import certified_norm
+from flexplant.synthesis.controller import certified_norm
 from flexplant.synthesis.hinf import design_hinf
 from flexplant.synthesis.hinf_riccati import Riccati
 from flexplant.synthesis.lmi import Lmi

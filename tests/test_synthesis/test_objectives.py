@@ -12,7 +12,7 @@ from flexplant.errors import AssumptionError, InfeasibleError, LabelError, Model
 from flexplant.lti import StateSpace, lft
 from flexplant.lti.discretisation import held_exactly
 from flexplant.synthesis import H2, Hinf, PeakGain, PoleRegion, design_lmi
-from flexplant.synthesis.objectives.sampled_poles import damped, within
+from flexplant.synthesis.objectives.lmis import damped, within
 
 pytestmark = pytest.mark.slow
 

@@ -21,7 +21,7 @@ from flexplant.errors import (
 from flexplant.lti import StateSpace, hinf_norm, lft, tustin
 from flexplant.lti.preparation import prepared
 from flexplant.synthesis import Lmi, Riccati, StructuredLmi, design_hinf
-from flexplant.synthesis.certificate import certified_norm
+from flexplant.synthesis.controller import certified_norm
 from oracles_synthesis import (
     brute_norm,
     closed_loop,

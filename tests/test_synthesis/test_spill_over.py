@@ -27,7 +27,7 @@ from flexplant.reduction import DesiredDofs, reduce
 from flexplant.store import load
 from flexplant.structure import FEModel, ModalDamping
 from flexplant.synthesis import Lmi, Riccati, design_hinf, design_servo
-from flexplant.synthesis.spill_over_check import spill_over
+from flexplant.synthesis.controller import spill_over
 from oracles_ports import chain
 from oracles_synthesis import closed_loop, split, stability
 from plates import make_plate

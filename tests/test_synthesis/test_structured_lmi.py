@@ -12,10 +12,9 @@ from flexplant.lti import StateSpace
 from flexplant.lti.preparation import prepared
 from flexplant.synthesis import StructuredLmi, design_hinf
 from flexplant.synthesis.interior_point import iterates
-from flexplant.synthesis.lmi_plant import Plant, half
+from flexplant.synthesis.lmi_solution import Plant, half
 from flexplant.synthesis.lower_bound import pointwise_bound
-from flexplant.synthesis.projected_lmis import ProjectedLmis
-from flexplant.synthesis.structured_lmi import _eliminated
+from flexplant.synthesis.structured_lmi import ProjectedLmis, _eliminated
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "compleib-open.npz"
 

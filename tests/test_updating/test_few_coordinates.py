@@ -14,9 +14,9 @@ from flexplant.updating import (
     ModeShapes,
     localise,
 )
-from flexplant.updating.confined import coordinates, lifted, load_vectors
 from flexplant.updating.family import Family
 from flexplant.updating.judgement import subsets
+from flexplant.updating.judgement.subsets import coordinates, lifted, load_vectors
 from flexplant.updating.point_model import first_point
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flexplant.updating.pairing import mac, pair
+from flexplant.updating.point_model import mac, pair
 
 
 def turned(degrees):

@@ -14,14 +14,11 @@ from ..lti.lyapunov import scale_of
 from ..parallel import one_thread
 from ..values import BoolArray, FloatArray, Value, instance, known_units, real_array, sizes_of
 from .estimator_channels import estimates
-from .filter_model import FilterModel
-from .lags import Filter, FixedLag, Lag, Predictor, Smoother
-from .passage import Passage, passed
+from .filter_model import FilterModel, Sight, Steady
+from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother
+from .passage import Passage, Start, passed, stationary_start
 from .recorded import recorded
-from .sight import Sight
 from .smoothing import lagged, smoothed
-from .start import Start, stationary_start
-from .steady import Steady
 
 #: part of a sensor's samples above which those beyond a gate are no outliers
 _MOST = 0.1

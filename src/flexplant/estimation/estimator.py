@@ -4,28 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError, ShapeError, counted
+from ..errors import LabelError, ModelError, ShapeError, counted, require_known
 from ..loop import ClosedLoop
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, positive, real_array, sizes_of
-from .error import error_variances
+from ..values import FloatArray, Value, positive, real_array, short, sizes_of
+from .error import NODES, NOTED, error_variances, loop_variances
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels, row_of, same_pois, sensors
-from .filter_model import FilterModel, filter_model
+from .filter_model import FilterModel, Sight, filter_model
 from .kalman_certificate import KalmanCertificate
-from .lag_report import LAGS, LagReport, lag_report
-from .lags import Filter, Lag
-from .left_out import LeftOut
-from .loop_error import loop_variances
-from .mesh import NODES, NOTED
-from .moving_pois import moving_sight
+from .lag_report import LAGS, Filter, Lag, LagReport, lag_report
+from .left_out import LeftOut, left_out
 
 #: relative difference between two ways to a variance from which it is stated beside the rms: six
 #: digits are more than any model holds
@@ -341,6 +337,162 @@ class KalmanEstimator(Value):
         `rts_smoother` takes no u: it is right for u = 0;
         `estimate(records, Smoother())` is right for any.
         """
-        from .filterpy_twin import twin
-
         return twin(self.model, self.predicted_covariance)
+
+
+#: points of a path that are assembled together
+_TOGETHER = 128
+
+
+def moving_sight(
+    plant: StandardPlant, found: LeftOut | None, model: FilterModel, path: Any, count: int
+) -> Sight:
+    """Return the rows of all POIs at each sample, those on a path at its points.
+
+    Each distinct point is a POI of its own of the same plant: its rows of C and D are exact, and so
+    are the covariances of the modes left out there.
+    """
+    pois = {poi.name: poi for poi in plant.assembled.ports.z}
+    if not isinstance(path, Mapping):
+        if len(pois) != 1:
+            raise LabelError(
+                f"the plant has the POIs {', '.join(pois)}: name those that move, "
+                f"path={{name: points}}, got {short(path)}."
+            )
+        path = {next(iter(pois)): path}
+    nz = model.C1.shape[0]
+    c = np.repeat(np.hstack([model.C1, model.N])[None], count, axis=0)
+    D1 = np.repeat(model.D1[None], count, axis=0)
+    V = np.repeat(np.diagonal(model.V)[None], count, axis=0)
+    for name, points in path.items():
+        require_known("POI", [name], pois)
+        points = real_array(points, f"the path of {name!r}", (None, 3))
+        if len(points) != count:
+            raise ShapeError(
+                f"the path of {name!r} has {counted(len(points), 'point')}, the record {count} "
+                "samples. Pass the point at each sample."
+            )
+        distinct, which = np.unique(points, axis=0, return_inverse=True)
+        which = which.reshape(-1)
+        rows = [model.channels.index(pois[name].channel(axis)) for axis in pois[name].axes]
+        for first in range(0, len(distinct), _TOGETHER):
+            some = distinct[first : first + _TOGETHER]
+            there = _model_at(plant, found, pois[name], some)
+            at = np.flatnonzero((which >= first) & (which < first + len(some)))
+            place = which[at] - first
+            for i, row in enumerate(rows):
+                own = nz + place * len(rows) + i
+                c[at, row] = np.hstack([there.C1, there.N])[own]
+                D1[at, row], V[at, row] = there.D1[own], there.V.diagonal()[own]
+    return Sight(c, D1, V)
+
+
+def _model_at(
+    plant: StandardPlant, found: LeftOut | None, poi: Any, points: FloatArray
+) -> FilterModel:
+    """Return the model with a further POI at each point, after the plant's own."""
+    ports = plant.assembled.ports
+    more = [poi.replace(name=f"{poi.name}@{i}", at=p.tolist()) for i, p in enumerate(points)]
+    wider = ports.replace(z=[*ports.z, *more])
+    moved = plant.with_ports(wider)
+    if found is None:
+        return filter_model(moved)
+    assert found.larger is not None  # noqa: S101 - left_out sets it
+    whole = found.larger.with_ports(wider)
+    return filter_model(moved, left_out(moved, whole))
+
+
+def twin(model: FilterModel, covariance: FloatArray) -> Any:
+    """Return filterpy's filter of a model; P is the covariance of x[k|k-1], x is at rest."""
+    if np.any(model.D2):
+        raise ModelError(
+            "filterpy's filter has no feedthrough from u to y, this plant has one. Sample it "
+            "with a delay: plant.continuous.discretized(rate, delay=1)."
+        )
+    if np.any(model.S):
+        raise ModelError(
+            "filterpy's filter takes the noises of process and sensors as independent, those of "
+            "this plant are correlated. Use observer.estimate, which includes the correlation."
+        )
+    n, m = model.B.shape
+    found = twin_class()(dim_x=n, dim_z=model.C2.shape[0], dim_u=m)
+    found.F, found.B, found.H = model.A.copy(), model.B.copy(), model.C2.copy()
+    found.Q, found.R = model.Q.copy(), model.R.copy()
+    found.P = covariance.copy()
+    found.x = np.zeros((n, 1))
+    return found
+
+
+@cache
+def twin_class() -> Any:
+    """Return a subclass of `filterpy.kalman.KalmanFilter` whose y and u are 1-D or columns.
+
+    filterpy adds ``B u`` to the column x as it comes: a 1-D u would make x an (n, n) array. Its
+    smoother, which takes no u, inverts covariances: here in states of unit variance, and without
+    the states of delay lines, which are known exactly.
+    """
+    from filterpy.kalman import KalmanFilter
+
+    class Twin(KalmanFilter):  # type: ignore[misc]
+        def update(self, z: Any, R: Any = None, H: Any = None) -> None:
+            super().update(None if z is None else _column(z, self.dim_z, "y"), R, H)
+
+        def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
+            super().predict(_command(u, self.dim_u), B, F, Q)
+
+        def predict_steadystate(self, u: Any = None, B: Any = None) -> None:
+            super().predict_steadystate(_command(u, self.dim_u), B)
+
+        def get_prediction(
+            self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None
+        ) -> tuple[FloatArray, FloatArray]:
+            # 1.4 takes u alone, so that what is not given is not passed on
+            given = {"B": B, "F": F, "Q": Q}
+            others = {name: value for name, value in given.items() if value is not None}
+            x, P = super().get_prediction(_command(u, self.dim_u), **others)
+            return x, P
+
+        def rts_smoother(
+            self, Xs: Any, Ps: Any, Fs: Any = None, Qs: Any = None, inv: Any = None
+        ) -> tuple[Any, ...]:
+            found: tuple[Any, ...] = super().rts_smoother(
+                Xs, Ps, Fs, Qs, _scaled_inverse if inv is None else inv
+            )
+            return found
+
+        def __reduce__(self) -> tuple[Any, ...]:
+            return _restored, (self.__dict__,)
+
+    return Twin
+
+
+def _scaled_inverse(P: FloatArray) -> FloatArray:
+    """Return the inverse of a covariance in states of unit variance; delay lines have none."""
+    inverse, size = np.zeros_like(P), np.sqrt(P.diagonal())
+    some = np.flatnonzero(size)
+    unit = P[np.ix_(some, some)] / size[some] / size[some][:, None]
+    inverse[np.ix_(some, some)] = np.linalg.inv(unit) / size[some] / size[some][:, None]
+    return inverse
+
+
+def _command(u: Any, count: int) -> FloatArray:
+    # None and 0 are filterpy's own defaults for no command
+    return np.zeros((count, 1)) if u is None or np.array_equal(u, 0) else _column(u, count, "u")
+
+
+def _column(value: Any, count: int, name: str) -> FloatArray:
+    found = real_array(value, name)
+    if found.shape not in ((count,), (count, 1)) and not (count == 1 and found.size == 1):
+        raise ShapeError(
+            f"{name} must have {count} entries, as a 1-D array or a column, got shape "
+            f"{found.shape}. Pass all of them, in the order of the plant."
+        )
+    return found.reshape(count, 1)
+
+
+def _restored(fields: dict[str, Any]) -> Any:
+    """Return an unpickled filter: pickle finds no class that is made inside a function."""
+    kind = twin_class()
+    twin = kind.__new__(kind)
+    twin.__dict__.update(fields)
+    return twin

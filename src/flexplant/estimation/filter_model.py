@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import AssumptionError, ShapeError, SolverError, counted
+from ..lti.lyapunov import solve_stein
+from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import FloatArray, Value
-from .estimator_channels import poi_channels, sensors
+from ..values import FloatArray, IntArray, Value
+from .estimator_channels import estimates, poi_channels, sensors
 from .left_out import LeftOut
 
 #: noise of a sensor beside its motion in one sample that rounding may hide: its square is 1e-12
@@ -179,3 +182,144 @@ def check_precision(model: FilterModel, error: Exception) -> None:
         f"{_LOST * motion[i] * np.sqrt(2.0 * model.dt):.1g}) or more, what the data sheet says, "
         "and check the unit of asd."
     ) from error
+
+
+class Sight(NamedTuple):
+    """How the POIs see the state and the noise: ``z = C1 x + n + D1 u``, rows c = [C1 N].
+
+    The first axis has one entry, or one for each sample where POIs move.
+    """
+
+    c: FloatArray  # (1 or N, nz, n + ny)
+    D1: FloatArray  # (1 or N, nz, nu)
+    V: FloatArray  # (1 or N, nz) variances of n
+
+    def part(self, at: slice | IntArray) -> Sight:
+        """Return the rows at some samples."""
+        return self if self.c.shape[0] == 1 else Sight(*(part[at] for part in self))
+
+    def applied(self, watched: FloatArray) -> FloatArray:
+        """Return ``c watched`` (k, nz) for watched [x; b] (k, n + ny)."""
+        if self.c.shape[0] == 1:
+            return np.asarray(watched @ self.c[0].T)
+        return np.asarray(np.einsum("kzi,ki->kz", self.c, watched))
+
+    def commanded(self, u: FloatArray) -> FloatArray:
+        """Return ``D1 u`` (k, nz)."""
+        if self.c.shape[0] == 1:
+            return np.asarray(u @ self.D1[0].T)
+        return np.asarray(np.einsum("kzi,ki->kz", self.D1, u))
+
+
+def filter_system(
+    plant: StandardPlant, model: FilterModel, K: FloatArray, L_z: FloatArray, name: str
+) -> StateSpace:
+    """Return the filter, from sensors and u to the estimates.
+
+    ``x+ = A x + B u + K e``, ``hat = C1 x + D1 u + L_z e`` with the innovation
+    ``e = y - C2 x - D2 u``.
+    """
+    m = model
+    return StateSpace(
+        m.A - K @ m.C2,
+        np.hstack([K, m.B - K @ m.D2]),
+        m.C1 - L_z @ m.C2,
+        np.hstack([L_z, m.D1 - L_z @ m.D2]),
+        plant.dt,
+        inputs=[*m.sensors, *m.commands],
+        outputs=estimates(m.channels),
+        states=plant.system.states,
+        name=name,
+        units=plant.units,
+    )
+
+
+def noise_root(model: FilterModel) -> tuple[FloatArray, FloatArray]:
+    """Return G (n, r) and H (ny, r): process and sensor noise are G xi and H xi, xi of unit size.
+
+    A factor of ``[Q S; S' R]`` by its eigenvectors, each row scaled to unit size before.
+    """
+    n, joint = model.A.shape[0], np.block([[model.Q, model.S], [model.S.T, model.R]])
+    size = np.sqrt(np.maximum(joint.diagonal(), 0.0))
+    size = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(joint / size / size[:, None])
+    root = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return root[:n], root[n:]
+
+
+def error_system(model: FilterModel, K: FloatArray, L_z: FloatArray) -> StateSpace:
+    """Return the error of a filter on its own model, driven by noise of unit variance."""
+    m, (G, H) = model, noise_root(model)
+    return StateSpace(m.A - K @ m.C2, G - K @ H, m.C1 - L_z @ m.C2, -L_z @ H, m.dt)
+
+
+def own_variances(model: FilterModel, K: FloatArray, L_z: FloatArray) -> FloatArray:
+    """Return the variances (nz,) of the error of a filter on its own model."""
+    m, left = model, model.C1 - L_z @ model.C2
+    X = solve_stein(m.A - K @ m.C2, m.driven(K))
+    return np.asarray(np.sum((left @ X) * left, axis=1) + np.sum((L_z @ m.R) * L_z, axis=1))
+
+
+class FilterGains(NamedTuple):
+    """L, K and the whitening W of the innovations, zeros at sensors that are missing."""
+
+    L: FloatArray
+    K: FloatArray
+    W: FloatArray
+
+
+def gains(model: FilterModel, P: FloatArray, seen: FloatArray) -> FilterGains:
+    """Return the gains of a covariance P before the measurement, for the sensors that are there."""
+    M = P @ model.C2.T
+    S = model.C2 @ M + model.R
+    W = np.zeros_like(S)
+    there = np.flatnonzero(seen)
+    if there.size:
+        at = np.ix_(there, there)
+        W[at] = np.linalg.inv(np.linalg.cholesky(0.5 * (S + S.T)[at]))
+    weight = W.T @ W
+    L = M @ weight
+    return FilterGains(L, model.A @ L + model.S @ weight, W)
+
+
+class Steady:
+    """The stationary filter of a model in states and sensors of unit variance."""
+
+    def __init__(self, model: FilterModel, P: FloatArray) -> None:
+        self.model, self.P = model, P
+        self.gains = gains(model, P, np.ones(model.C2.shape[0], dtype=bool))
+        self.F = model.A - self.gains.K @ model.C2
+
+    def variances(
+        self, sight: Sight, P: FloatArray, g: FilterGains, *, predict: bool
+    ) -> FloatArray:
+        """Return the variances (1 or k, nz) of the estimates of a covariance P and its gains.
+
+        ``(C1 - L_z C2) P (C1 - L_z C2)' + V - L_z N' - N L_z' + L_z R L_z'``: Joseph's form.
+        """
+        m, n = self.model, P.shape[0]
+        C1, N = sight.c[:, :, :n], sight.c[:, :, n:]
+        L_z = sight.c @ self.entering(g, predict=predict)
+        left = C1 - L_z @ m.C2
+        own = np.sum((left @ P) * left, axis=2)
+        return np.asarray(own + sight.V + np.sum((L_z @ m.R - 2.0 * N) * L_z, axis=2))
+
+    def entering(self, g: FilterGains, *, predict: bool) -> FloatArray:
+        """Return how an innovation enters [x; b] (n + ny, ny)."""
+        both = np.vstack([g.L, g.W.T @ g.W])
+        return np.zeros_like(both) if predict else both
+
+    def onward(self, P: FloatArray, g: FilterGains) -> FloatArray:
+        """Return the rows (n + ny, n) by which a later adjoint enters [x; b]."""
+        closed = self.model.A - g.K @ self.model.C2
+        return np.vstack([P @ closed.T, -g.K.T])
+
+    def weight(self, sight: Sight) -> FloatArray:
+        """Return Y: ``trace(Y dP)`` is what dP adds to all later variances, relative to them."""
+        n = self.model.A.shape[0]
+        some = np.unique(np.linspace(0, sight.c.shape[0] - 1, 50).astype(np.int64))
+        chosen = Sight(*(part[some] for part in sight))
+        size = np.sqrt(self.variances(chosen, self.P, self.gains, predict=False))
+        rows = (chosen.c[:, :, :n] / size[:, :, None] / np.sqrt(some.size)).reshape(-1, n)
+        H = np.vstack([self.gains.W @ self.model.C2, rows])
+        return solve_stein(self.F.T, H.T @ H)

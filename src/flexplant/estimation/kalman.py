@@ -13,14 +13,19 @@ from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
 from ..values import FloatArray
-from .error import error_variances
+from .error import error_variances, unresolved_share
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike
-from .filter_model import FilterModel, check_noises, check_precision, filter_model, weighed
-from .filter_system import filter_system
+from .filter_model import (
+    FilterModel,
+    check_noises,
+    check_precision,
+    filter_model,
+    filter_system,
+    weighed,
+)
 from .kalman_certificate import KalmanCertificate, error_of
 from .left_out import left_out
-from .mesh import unresolved_share
 
 
 @one_thread()

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arguments import positive_array
 from ..errors import FlexplantError, require_known
 from ..lti.lyapunov import solve_stein
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, positive_array, whole
 from .estimator_channels import row_of
-from .sight import Sight
+from .filter_model import Sight, Steady
 from .static import design_static
-from .steady import Steady
 
 #: lags of the table [s]
 LAGS = (1e-4, 1e-3, 1e-2)
@@ -168,3 +167,92 @@ def _static(plant: StandardPlant, channels: Sequence[str]) -> tuple[FloatArray, 
         return np.array([static.rms(name) for name in channels]), ""
     except FlexplantError as error:
         return np.full(len(channels), np.nan), str(error)
+
+
+@dataclass(frozen=True, eq=False)
+class Predictor(Value):
+    """From the measurements before a sample: x[k|k-1].
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> observer = fx.design_kalman(fx.testbeds.three_masses())
+    >>> records = {name: np.zeros(20) for name in ("y1", "y2", "u1")}
+    >>> found = [observer.estimate(records, lag) for lag in (fx.estimation.Predictor(), None)]
+    >>> bool(found[0].deviation("die:hat")[-1] > found[1].deviation("die:hat")[-1])
+    True
+    """
+
+
+@dataclass(frozen=True, eq=False)
+class Filter(Value):
+    """From the measurements up to a sample, its own among them: x[k|k].
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> observer = fx.design_kalman(fx.testbeds.three_masses())
+    >>> records = {name: np.zeros(20) for name in ("y1", "y2", "u1")}
+    >>> observer.estimate(records, fx.estimation.Filter())["die:hat"].shape
+    (20,)
+    """
+
+
+@dataclass(frozen=True, eq=False)
+class FixedLag(Value):
+    """From the measurements up to some samples after: x[k|k+lag], known that much later.
+
+    Parameters
+    ----------
+    samples : int
+        The lag, at least 1. At the end of a record what there is.
+
+    Raises
+    ------
+    ModelError
+        When it is no whole number from 1.
+
+    References
+    ----------
+    [AndersonMoore1979]_, chapter 7.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> observer = fx.design_kalman(fx.testbeds.three_masses())
+    >>> records = {"y1": np.zeros(50), "y2": np.zeros(50), "u1": np.zeros(50)}
+    >>> observer.estimate(records, fx.FixedLag(5)).lag
+    FixedLag(samples=5)
+    """
+
+    samples: int
+
+    def __post_init__(self) -> None:
+        self._set(samples=whole(self.samples, "samples"))
+
+
+@dataclass(frozen=True, eq=False)
+class Smoother(Value):
+    """From all measurements of the record: the fixed-interval smoother x[k|N-1].
+
+    References
+    ----------
+    [AndersonMoore1979]_, chapter 7.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> observer = fx.design_kalman(fx.testbeds.three_masses())
+    >>> records = {"y1": np.zeros(50), "y2": np.zeros(50), "u1": np.zeros(50)}
+    >>> filtered, smoothed = (observer.estimate(records, lag) for lag in (None, fx.Smoother()))
+    >>> bool(smoothed.deviation("die:hat")[25] < filtered.deviation("die:hat")[25])
+    True
+    """
+
+
+#: when an estimate is wanted
+Lag: TypeAlias = Predictor | Filter | FixedLag | Smoother

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ..arguments import members
 from ..errors import AssumptionError, FlexplantWarning, ModelError, counted, require_known
 from ..loop import close_loop
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, in_unit, short
+from ..values import FloatArray, Value, in_unit, members, short
+from .error import loop_variances
 from .estimator_channels import poi_channels, row_of
-from .loop_error import loop_variances
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -17,8 +17,7 @@ from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, instance, real_array, short, sizes_of, whole
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, sensors
-from .filter_model import FilterModel, check_noises, filter_model, weighed
-from .filter_system import filter_system
+from .filter_model import FilterModel, check_noises, filter_model, filter_system, weighed
 from .kalman_certificate import AGREEMENT
 from .recorded import recorded
 

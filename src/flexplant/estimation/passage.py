@@ -6,15 +6,14 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg as la
+from scipy.sparse import csgraph
 
+from ..lti.lyapunov import solve_stein
 from ..lti.recursion import Recursion
-from ..values import BoolArray, FloatArray
-from . import fading
+from ..values import BoolArray, FloatArray, IntArray
+from .filter_model import FilterGains, FilterModel, Sight, Steady, gains
 from .recorded import Recorded
-from .sight import Sight
-from .start import Start
-from .steady import FilterGains, Steady, gains
-from .unknowns import KnownParameters, Unknowns
 
 #: the gain counts as stationary when all that its last changes would still do to the estimates and
 #: innovations, summed over time, is this part of their variances
@@ -173,7 +172,7 @@ class _Walk:
 
         Later samples count with their innovations after it is dropped: they are filtered again.
         """
-        length = until - k if not np.isfinite(self.gate) else fading.LONGEST
+        length = until - k if not np.isfinite(self.gate) else LONGEST
         while k < until:
             end = min(k + length, until)
             after = self._steadily(k, end, x)
@@ -277,7 +276,7 @@ class _Walk:
 
     def _excess(self, P: FloatArray, Z: FloatArray) -> FloatArray | None:
         found = self.found if Z.shape[1] else None
-        return fading.excess(self.steady, self._weight[0], P, Z, found)
+        return excess(self.steady, self._weight[0], P, Z, found)
 
     def _fading(
         self, k: int, until: int, x: FloatArray, Y: FloatArray
@@ -287,16 +286,16 @@ class _Walk:
         Returns the sample after it, state and covariance there, and whether it is stationary.
         """
         m, g = self.model, self.steady.gains
-        length = fading.FIRST
+        length = FIRST
         while k < until and Y.shape[1]:
             at = slice(k, min(k + length, until))
             count, first = at.stop - k, x
             x = self._steadily(at.start, at.stop, x)
-            moved = fading.faded(self.steady.F, Y, count)
+            moved = faded(self.steady.F, Y, count)
             C = m.C2 @ moved[:-1]
-            found = fading.shown(g.W @ C, self.whitened[at])
+            found = shown(g.W @ C, self.whitened[at])
             before, after = found.value[:-1], found.value[1:]
-            enter = fading.seen(self.steady, self.sight.part(at), moved[:-1], predict=self.predict)
+            enter = seen(self.steady, self.sight.part(at), moved[:-1], predict=self.predict)
             value, covariance = (before, found.covariance[:-1])
             if not self.predict:
                 value, covariance = after, found.covariance[1:]
@@ -313,8 +312,8 @@ class _Walk:
                 continue
             x = x + moved[-1] @ found.value[-1]
             Y = moved[-1] @ np.linalg.cholesky(found.covariance[-1])
-            Y = fading.kept(self._weight[0], Y)
-            k, length = at.stop, min(2 * length, fading.LONGEST)
+            Y = kept(self._weight[0], Y)
+            k, length = at.stop, min(2 * length, LONGEST)
         return k, x, self.steady.P + Y @ Y.T, not Y.shape[1]
 
     def _steadily(self, first: int, last: int, x: FloatArray) -> FloatArray:
@@ -352,3 +351,181 @@ class _Walk:
         self.variance[at] = self.steady.variances(here, self.steady.P, g, predict=self.predict)
         self.deviation[at] = self.s * np.sqrt(m.innovation(self.steady.P).diagonal())
         return x
+
+
+#: what is left out of a start changes all later estimates, summed over time, by the root of this
+#: part of their deviations
+FADED = 1e-12
+#: largest part of the stationary variance of a state that may still be unknown of it
+_LARGEST = 1e4
+#: samples of the first stretch, and of the longest: twice as many each time
+FIRST, LONGEST = 64, 1024
+
+
+class ShownSoFar(NamedTuple):
+    """What the measurements of a stretch say of eta, before the first and after each of them."""
+
+    value: FloatArray  # (k + 1, r)
+    covariance: FloatArray  # (k + 1, r, r)
+
+
+def excess(
+    steady: Steady, weight: FloatArray, P: FloatArray, Z: FloatArray, found: KnownParameters | None
+) -> FloatArray | None:
+    """Return Y (n, r) with ``P_k = P + Y Y'``, P_k the covariance now and P the stationary one.
+
+    The filter of any first covariance P_k above the stationary P is the stationary filter of a
+    first state ``x + Y eta``, eta of zero mean and unit covariance, whose innovations
+    ``e = C F^k Y eta + white noise`` show eta by least squares: the partitioned filter. None where
+    P_k is not above P, or has so much to show still that digits would be lost.
+
+    References
+    ----------
+    [Lainiotis1975]_.
+    """
+    more = P - steady.P
+    if Z.shape[1]:
+        if found is None or found.open.size:
+            return None
+        X = Z @ found.X
+        if np.any(np.sum(X**2, axis=1) > _LARGEST * steady.P.diagonal().max()):
+            return None
+        more = more + X @ X.T
+    sizes, vectors = np.linalg.eigh(0.5 * (more + more.T))
+    below = vectors[:, sizes < 0] * np.sqrt(-sizes[sizes < 0])
+    if np.sum((weight @ below) * below) > FADED + 1e-13 * np.sum(np.abs(weight * steady.P)):
+        return None
+    return kept(weight, vectors[:, sizes > 0] * np.sqrt(sizes[sizes > 0]))
+
+
+def kept(weight: FloatArray, Y: FloatArray) -> FloatArray:
+    """Return the combinations of columns of Y that still matter to later estimates."""
+    sizes, mix = np.linalg.eigh(Y.T @ weight @ Y)
+    gone = np.cumsum(np.maximum(sizes, 0.0)) < FADED
+    return np.asarray(Y @ mix[:, ~gone])
+
+
+def faded(F: FloatArray, Y: FloatArray, samples: int) -> FloatArray:
+    """Return ``F^k Y`` for k = 0 .. samples (samples + 1, n, r)."""
+    moved = np.empty((samples + 1, *Y.shape))
+    moved[0] = Y
+    for k in range(samples):
+        np.matmul(F, moved[k], out=moved[k + 1])
+    return moved
+
+
+def shown(rows: FloatArray, white: FloatArray) -> ShownSoFar:
+    """Return what whitened innovations ``white = rows eta + noise`` (k, ny) show of eta."""
+    count, _, r = rows.shape
+    information, values = np.zeros((count + 1, r, r)), np.zeros((count + 1, r))
+    information[0] = np.eye(r)
+    np.matmul(rows.transpose(0, 2, 1), rows, out=information[1:])
+    values[1:] = np.einsum("kyr,ky->kr", rows, white)
+    covariance = np.linalg.inv(np.cumsum(information, axis=0))
+    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+    return ShownSoFar(np.einsum("krs,ks->kr", covariance, np.cumsum(values, axis=0)), covariance)
+
+
+def seen(steady: Steady, here: Sight, moved: FloatArray, *, predict: bool) -> FloatArray:
+    """Return how eta enters the estimates (k, nz, r)."""
+    n = moved.shape[1]
+    enter = steady.entering(steady.gains, predict=predict)
+    rows = here.c[:, :, :n] - here.c @ enter @ steady.model.C2
+    return np.asarray(rows @ moved)
+
+
+#: a direction counts as found from this part of the best known one's information (root)
+_FOUND = 1e-10
+
+
+class KnownParameters(NamedTuple):
+    """What is known of the parameters delta: their value, ``X X'`` their covariance.
+
+    The columns of `open` are directions that no measurement has shown yet.
+    """
+
+    value: FloatArray
+    X: FloatArray
+    open: FloatArray
+
+    def added(self, rows: FloatArray) -> FloatArray:
+        """Return the variance (p,) that delta adds where it enters by rows (p, r)."""
+        variance = np.sum((rows @ self.X) ** 2, axis=1)
+        missed = np.linalg.norm(rows @ self.open, axis=1)
+        return np.where(missed > 1e-8 * np.linalg.norm(rows, axis=1), np.inf, variance)
+
+
+class Unknowns:
+    """The least-squares problem of delta, in triangular form (square root of its information)."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self.root = np.zeros((0, count + 1))
+
+    def add(self, rows: FloatArray, values: FloatArray) -> None:
+        """Add measurements ``values = rows delta + noise`` of unit variance."""
+        both = np.vstack([self.root, np.column_stack([rows, values])])
+        self.root = np.asarray(np.linalg.qr(both, mode="r"))
+
+    def found(self) -> KnownParameters:
+        """Return what is known by now."""
+        R = self.root[: self.count, : self.count]
+        U, sizes, V = np.linalg.svd(R, full_matrices=True)
+        rank = int(np.count_nonzero(sizes > _FOUND * np.max(sizes, initial=0.0)))
+        X = V[:rank].T / sizes[:rank]
+        value = X @ (U[:, :rank].T @ self.root[: self.count, self.count])
+        return KnownParameters(value, X, V[rank:].T)
+
+
+#: modulus of a sampled pole from which a mode has no stationary motion
+_ON_CIRCLE = 1.0 - 1e-12
+
+
+class Start(NamedTuple):
+    """A first state ``x = Z delta + x'``: delta (r,) quite unknown, x' of covariance P."""
+
+    P: FloatArray
+    Z: FloatArray
+
+
+def stationary_start(model: FilterModel) -> Start:
+    """Return the state before a record of a machine that has run for long, with u at rest.
+
+    Modes that are damped have the covariance of their stationary motion, ``P = A P A' + Q``. Modes
+    on or outside the unit circle (rigid bodies, undamped ones) have none: their states x_r are
+    unknown parameters delta, without any prior. Others that follow them (such as late outputs) do
+    so with the states V x_r, ``A_e V - V A_r = -A_er``, so that the rest ``x' = x - V x_r`` is
+    stationary.
+    """
+    n = model.A.shape[0]
+    kept = kept_states(model.A)
+    rest = np.setdiff1d(np.arange(n), kept)
+    P, Z = np.zeros((n, n)), np.zeros((n, kept.size))
+    Z[kept, np.arange(kept.size)] = 1.0
+    A, Q = model.A[np.ix_(rest, rest)], model.Q[np.ix_(rest, rest)]
+    entering = model.A[np.ix_(rest, kept)]
+    if np.any(entering):
+        V = la.solve_sylvester(A, -model.A[np.ix_(kept, kept)], -entering)
+        Z[rest] = V
+        A = A - V @ model.A[np.ix_(kept, rest)]
+        left = np.zeros((rest.size, n))
+        left[:, rest], left[:, kept] = np.eye(rest.size), -V
+        Q = left @ model.Q @ left.T
+    P[np.ix_(rest, rest)] = solve_stein(A, 0.5 * (Q + Q.T))
+    return Start(P, Z)
+
+
+def kept_states(A: FloatArray) -> IntArray:
+    """Return the states of modes on or outside the unit circle.
+
+    Judged on the parts of A that are coupled both ways, so that the two eigenvalues 1 of a
+    rigid-body mode are exact.
+    """
+    count, owner = csgraph.connected_components(A != 0, directed=True, connection="strong")
+    kept = []
+    for part in range(count):
+        states = np.flatnonzero(owner == part)
+        radius = np.max(np.abs(np.linalg.eigvals(A[np.ix_(states, states)])))
+        if radius >= _ON_CIRCLE:
+            kept.append(states)
+    return np.sort(np.concatenate(kept)) if kept else np.zeros(0, dtype=np.int64)

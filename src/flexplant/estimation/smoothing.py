@@ -7,10 +7,8 @@ import numpy as np
 from ..lti.lyapunov import solve_stein
 from ..lti.recursion import Recursion
 from ..values import FloatArray, IntArray
-from .passage import SETTLED, Moment, Passage
-from .sight import Sight
-from .steady import Steady
-from .unknowns import KnownParameters
+from .filter_model import Sight, Steady
+from .passage import SETTLED, KnownParameters, Moment, Passage
 
 #: samples whose later measurements are followed side by side
 _TOGETHER = 2048

@@ -9,13 +9,12 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError, SolverError
-from ..progress import Progress, tick
+from ..parallel import Progress, tick
 from ..values import ComplexArray, FloatArray, positive, real_array, whole
-from .diagram import built_diagram
+from .diagram import OrderPoles, built_diagram
 from .identify import checked_orders
 from .measured import MeasuredModes
-from .plscf import OrderPoles
-from .records import signals
+from .spectra import signals
 
 #: periods of the lowest frequency over which covariances are used where no lags are given
 PERIODS = 2.0

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
 import numpy as np
 import scipy.linalg as la
 
-from ..values import ComplexArray
-from .refine import Lines, projected_model, projected_normal
+from ..errors import SolverError, warn
+from ..values import ComplexArray, FloatArray
+from .refine import Fit, Lines, projected_cost, projected_model, projected_normal, refined
 
 #: probability that noise anywhere in the band passes for a pole
 CHANCE = 1e-3
@@ -102,3 +106,357 @@ def freedom(lines: Lines, m: int) -> float:
     n_out, n_in, _ = lines.data.shape
     used = n_out * n_in * (lines.lower + lines.upper) + 2 * m * (n_out + n_in)
     return float(max(1.0, 2 * lines.data.size - lines.inflation * used))
+
+
+#: half the distance at which a pole is taken apart, in parts of its damping
+APART = 0.5
+#: numbers of residual terms tried where 9 leave more than noise
+MORE = (25, 17, 13)
+#: what a weak pole must lower the cost by elsewhere
+GAIN = 0.1
+#: a pole is weak whose cost is less than so many times the least that is required of one
+WEAK = 4.0
+
+
+def separated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
+    r"""Return the fit with those poles taken apart that are two.
+
+    A pole of two modes, repeated or so close that one pole passes for both, requires residues
+    of rank two (several inputs), or for a pole of its own at each output (one input):
+
+    .. math:: \frac{\psi l^T}{s-\lambda} \to \frac{\psi l^T + \psi' l_\perp^T}{s-\lambda}
+        \quad\text{or}\quad \frac{\psi l^T}{s-\lambda-\delta} + \frac{\psi' l^T}{s-\lambda+\delta}
+
+    Both are tried at every pole; the fit that follows must lower chi-square by more than noise
+    does at any of them once in a thousand times.
+    """
+    for _ in range(fit.poles.size):
+        better = _apart(lines, fit, steps)
+        if better is None:
+            break
+        fit = better
+    return fit
+
+
+def least_of(lines: Lines, places: int) -> float:
+    """Return by how much a second pole must lower the cost at one of some places."""
+    from scipy.special import chdtri
+
+    n_out, n_in, _ = lines.data.shape
+    return float(chdtri(2 * (n_out + n_in), CHANCE / places))
+
+
+def _apart(lines: Lines, fit: Fit, steps: int) -> Fit | None:
+    unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
+    least = least_of(lines, fit.poles.size) * unit
+    trials = []
+    for k in range(fit.poles.size):
+        for poles, part in _pairs(fit, k):
+            trials.append((fit.cost - projected_cost(lines, poles, part), poles, part))
+    trials.sort(key=lambda trial: -trial[0])
+    for gain, poles, part in trials[:3]:
+        if gain < least / 3:
+            break
+        try:
+            more = refined(lines, poles, part, steps=steps, below=fit.cost - least)
+        except SolverError:
+            continue
+        enough = fit.cost - more.cost > least and _narrow(more, fit)
+        if enough and corroborated(lines, fit.model, more.model):
+            return more
+    return None
+
+
+def _pairs(fit: Fit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
+    """Return poles and participation with pole k twice: other directions, other places."""
+    pole, own = fit.poles[k], fit.participation[:, [k]]
+    delta = 1j * APART * abs(pole.real)
+    moved = fit.poles.copy()
+    moved[k] += delta
+    pairs = [(np.append(moved, pole - delta), np.hstack([fit.participation, own]))]
+    others = np.asarray(la.null_space(own.conj().T), dtype=np.complex128)
+    for other in others.T:
+        # a little of its own, so that the fit is free to turn both
+        mixed = other[:, None] * la.norm(own) + 1e-3 * own
+        pairs.append((np.append(fit.poles, pole), np.hstack([fit.participation, mixed])))
+    return pairs
+
+
+def _narrow(more: Fit, fit: Fit) -> bool:
+    """Whether no pole became broader than any was: then it replaced something else."""
+    zeta = [-f.poles.real / np.abs(f.poles) for f in (more, fit)]
+    return bool(zeta[0].max() <= 1.5 * zeta[1].max())
+
+
+def relocated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
+    """Return the fit with weak poles moved to where they lower the cost most.
+
+    Noise gives the likelihood of a mode that is hardly seen several peaks; the fit climbs the one
+    that it is started at. Its neighbourhood of seven half-widths is searched.
+    """
+    for k in range(fit.poles.size):
+        pole = fit.poles[k]
+        rest = np.delete(fit.poles, k)
+        if not rest.size or -pole.real > 0.05 * abs(pole):
+            continue
+        without = projected_cost(lines, rest, np.delete(fit.participation, k, axis=1))
+        if without - fit.cost > WEAK * price(lines):
+            continue
+        trials = []
+        for shift in np.arange(-7.0, 7.1, 0.7):
+            poles = fit.poles.copy()
+            poles[k] = pole + 1j * shift * abs(pole.real)
+            trials.append((projected_cost(lines, poles, fit.participation), poles))
+        for _, poles in sorted(trials, key=lambda trial: trial[0])[:3]:
+            if abs(poles[k] - pole) < 1.0 * abs(pole.real):
+                continue
+            try:
+                more = refined(lines, poles, fit.participation, steps=steps, below=fit.cost - GAIN)
+            except SolverError:
+                continue
+            if more.cost < fit.cost - GAIN and _narrow(more, fit):
+                fit = more
+    return fit
+
+
+def backed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Lines, Fit]:
+    """Return the fit with more residual terms where the data require them.
+
+    Sampling folds modes of more than half the rate into the band: each is weak and as broad as
+    its frequency and damping were, many together are no noise. What a first few of these terms
+    leave is too little to be seen and enough to bias, and in a wide band they cost next to
+    nothing: so as many as the lines afford.
+    """
+    from scipy.special import chdtri
+
+    channels = lines.data.shape[0] * lines.data.shape[1]
+    unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
+    for upper in MORE:
+        if lines.freq.size < 8 * (upper + lines.lower) or upper <= lines.upper:
+            continue
+        more = replace(lines, upper=upper)
+        gain = fit.cost - projected_cost(more, fit.poles, fit.participation)
+        if gain > unit * chdtri(channels * (upper - lines.upper), CHANCE):
+            return more, refined(more, fit.poles, fit.participation, steps=steps, strict=False)
+    return lines, fit
+
+
+#: lengths [lines] of the stretches that are examined
+STRETCHES = (3, 9, 27, 81)
+#: standard deviations of a stretch's chi-square above which it is not explained
+LIMIT = 6.0
+#: damping ratios tried for a missed pole, beside the widths that its stretch suggests
+DAMPING = (0.0005, 0.002, 0.008, 0.03)
+#: data without noise leave rounding, which is no noise either
+ROUNDING = 1e-9
+#: and without noise, what is left is seldom a mode where it is less than this share of the response
+SHARE = 0.01
+#: poles that may be added, and the damping ratio above which one is no mode
+MOST, BROADEST = 6, 0.2
+
+
+#: lines around a peak, and standard deviations of their sum without the two highest, of a mode
+AROUND, NEARBY = 6, 2.5
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A stretch of lines that is not explained: its middle [Hz], width [Hz] and height [sigma]."""
+
+    freq: float
+    width: float
+    height: float
+    isolated: bool = False  # one or two lines, and noise alone around them
+
+
+def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
+    r"""Return the stretches whose residual is more than noise, the highest first.
+
+    Over L lines of c channels the sum of :math:`2 |e|^2/\sigma^2` is chi-square with 2 c L degrees
+    of freedom. Its middle and spread are also taken from all stretches (median, median absolute
+    deviation): an estimated variance is off everywhere, a missed pole is off in one place.
+    """
+    error = np.abs(lines.data - model) ** 2 * lines.weight**2
+    channels = lines.data.shape[0] * lines.data.shape[1]
+    power = error.sum(axis=(0, 1))
+    found: list[Peak] = []
+    if exact(lines, model):
+        return found
+    noiseless = not lines.known and _smooth(lines, model)
+    measured = np.sum(np.abs(lines.data * lines.weight) ** 2, axis=(0, 1))
+    for length in STRETCHES:
+        if 4 * length > power.size:
+            break
+        total = np.convolve(power, np.ones(length), mode="valid")
+        middle = float(np.median(total))
+        spread = 1.4826 * float(np.median(np.abs(total - middle)))
+        freedom = 2.0 * channels * length * (1.0 - used)
+        spread = max(spread, middle / freedom * np.sqrt(2.0 * freedom * lines.inflation))
+        # chi-square leans to the right, its cube root does not (Wilson and Hilferty, 1931)
+        height = 3.0 * middle / spread * (np.cbrt(total / middle) - 1.0)
+        if noiseless:
+            share = total / np.convolve(measured, np.ones(length), mode="valid")
+            height = np.where(share > SHARE**2, height, 0.0)
+        best = int(np.argmax(height))
+        if height[best] > LIMIT:
+            seen = lines.freq[best : best + length]
+            weight = power[best : best + length]
+            step = float(lines.freq[1] - lines.freq[0])
+            middle_freq = float(seen @ weight / weight.sum())
+            alone = _isolated(power, best, length, middle, spread)
+            if alone:
+                if not _surpassing(lines, model, slice(best, best + length)):
+                    continue
+                middle_freq = float(seen[np.argmax(weight)])
+            found.append(Peak(middle_freq, step * length, float(height[best]), alone))
+    return sorted(found, key=lambda peak: -peak.height)
+
+
+def _isolated(power: FloatArray, first: int, length: int, middle: float, spread: float) -> bool:
+    """Return whether a peak is one or two lines and nothing around them.
+
+    A disturbance of one frequency, a variance that came out too small there, or a mode narrower
+    than the lines are apart; one that they resolve is seen at the neighbours too.
+    """
+    aside = max(0, (AROUND - length + 1) // 2)
+    near = np.sort(power[max(0, first - aside) : first + length + aside])[:-2]
+    share = near.size / length
+    rest, wide = middle * share, spread * np.sqrt(share)
+    return bool(3.0 * rest / wide * (np.cbrt(np.sum(near) / rest) - 1.0) < NEARBY)
+
+
+def _surpassing(lines: Lines, model: ComplexArray, where: slice) -> bool:
+    r"""Whether a response at single lines is off by more than its estimated variance explains.
+
+    With nu complex degrees of freedom :math:`|e|^2/\sigma^2` exceeds x by chance with probability
+    :math:`(1 + x/\nu)^{-\nu}` (F distribution of 2 and 2 nu degrees), which chi-square, nu without
+    limit, understates: one variance in hundreds comes out several times too small.
+    """
+    nu = lines.variance_freedom
+    if nu is None:
+        return True
+    error = (lines.data[..., where] - model[..., where]) * lines.weight[..., where]
+    x = float(np.max(np.abs(error))) ** 2 / 2.0
+    return bool(-nu * np.log1p(x / nu) < np.log(CHANCE / lines.data.size))
+
+
+def exact(lines: Lines, model: ComplexArray) -> bool:
+    """Whether a fit leaves rounding only."""
+    return bool(la.norm(lines.data - model) < ROUNDING * la.norm(lines.data))
+
+
+def _smooth(lines: Lines, model: ComplexArray) -> bool:
+    """Whether neighbouring lines are off alike nearly everywhere: noise does not do that."""
+    error = (lines.data - model) * lines.weight
+    alike = np.sum(error[..., 1:] * error[..., :-1].conj(), axis=(0, 1)).real
+    power = np.sum(np.abs(error) ** 2, axis=(0, 1))
+    window = np.ones(9)
+    near = np.convolve(alike, window, mode="valid")
+    return bool(np.median(near / np.convolve(power[1:], window, mode="valid")) > 0.5)
+
+
+def candidate(
+    lines: Lines, model: ComplexArray, poles: ComplexArray, part: ComplexArray, peak: Peak
+) -> tuple[ComplexArray, ComplexArray, float]:
+    """Return poles and participation with the one added that explains a peak best, and the cost.
+
+    Frequencies across the peak and some damping ratios are tried; the participation is the
+    leading right singular vector of what the trial pole has in common with the residual.
+    """
+    error = (lines.data - model) * lines.weight**2
+    best: tuple[float, ComplexArray, ComplexArray] | None = None
+    own = np.clip(peak.width / (2 * peak.freq) * np.array([0.3, 1.0]), 1e-5, 0.15)
+    for zeta in np.unique([*DAMPING, *own.tolist()]):
+        for shift in (-0.5, -0.2, 0.0, 0.2, 0.5):
+            omega = 2 * np.pi * (peak.freq + shift * peak.width)
+            pole = omega * (-zeta + 1j * np.sqrt(1 - zeta**2))
+            term = 1.0 / (2j * np.pi * lines.freq - pole)
+            common = error @ term.conj()
+            gain = np.sum(lines.weight**2 * np.abs(term) ** 2, axis=2)
+            sizes, right = la.svd(common / np.sqrt(gain))[1:]
+            score = float(sizes[0])
+            if best is None or score > best[0]:
+                best = score, np.array([pole]), right[0][:, None]
+    assert best is not None  # noqa: S101 - trials were made
+    more = np.concatenate([poles, best[1]])
+    parts = np.concatenate([part, best[2].astype(np.complex128)], axis=1)
+    return more, parts, projected_cost(lines, more, parts)
+
+
+def fewest_terms(lines: Lines, fit: Fit, fewer: Sequence[int], *, steps: int) -> tuple[Lines, Fit]:
+    """Return the fit with the fewest residual terms of modes above that the data let pass."""
+    from scipy.special import chdtri
+
+    unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
+    channels = lines.data.shape[0] * lines.data.shape[1]
+    for upper in fewer:
+        less = replace(lines, upper=upper)
+        lost = projected_cost(less, fit.poles, fit.participation) - fit.cost
+        # a term too many costs next to nothing; one too few a bias: so noise may pass 1 in 10
+        if lost < unit * lines.inflation * chdtri(channels * (lines.upper - upper), 0.1):
+            return less, refined(less, fit.poles, fit.participation, steps=steps, strict=False)
+    return lines, fit
+
+
+def completed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Fit, list[Peak]]:
+    """Return the fit with the poles added that its residual requires, and the peaks still left."""
+    left = unexplained(lines, fit)
+    for _ in range(MOST):
+        resolved = [peak for peak in left if not peak.isolated][:2]
+        better = next(filter(None, (_added(lines, fit, peak, steps) for peak in resolved)), None)
+        if better is None:
+            break
+        fit = better
+        left = unexplained(lines, fit)
+    return fit, left
+
+
+def _added(lines: Lines, fit: Fit, peak: Peak, steps: int) -> Fit | None:
+    unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
+    least = price(lines) * unit
+    poles, part, cost = candidate(lines, fit.model, fit.poles, fit.participation, peak)
+    if fit.cost - cost < least / 4:
+        return None
+    try:
+        more = refined(lines, poles, part, steps=steps, below=fit.cost - least)
+    except SolverError:
+        return None
+    zeta, before = (-each.poles.real / np.abs(each.poles) for each in (more, fit))
+    # where a broad pole stands behind the others already, none shall become broader
+    broadest = max(BROADEST, 1.1 * before.max())
+    enough = fit.cost - more.cost > least and corroborated(lines, fit.model, more.model)
+    return more if enough and zeta.max() < broadest else None
+
+
+def unexplained(lines: Lines, fit: Fit) -> list[Peak]:
+    """Return the peaks of what a fit leaves, each once, the highest first."""
+    used = 1.0 - freedom(lines, fit.poles.size) / (2 * fit.model.size)
+    kept: list[Peak] = []
+    for peak in peaks(lines, fit.model, used):
+        if all(abs(peak.freq - other.freq) > max(peak.width, other.width) for other in kept):
+            kept.append(peak)
+    return kept
+
+
+def warned(left: list[Peak]) -> None:
+    """Warn of stretches that no pole explains, and of single lines."""
+    stretches = [peak for peak in left if not peak.isolated]
+    if stretches:
+        warn(
+            f"more than noise is left near {_listed(stretches)}: a mode may be missed or merged "
+            "there, and its neighbours be off by more than their stated deviation. Look at "
+            "plot.identified and plot.stabilisation, choose poles by hand (start=), or narrow the "
+            "band."
+        )
+    single = [peak for peak in left if peak.isolated]
+    if single:
+        warn(
+            f"single lines hold more than noise, with noise alone around them: {_listed(single)}. "
+            "No pole was fitted to them: a disturbance of one frequency (mains, a pump) or a "
+            "variance from few segments looks so, and so does a mode narrower than the lines are "
+            "apart. Measure with longer segments to distinguish them, or average more."
+        )
+
+
+def _listed(left: list[Peak]) -> str:
+    return ", ".join(f"{peak.freq:.4g} Hz ({peak.height:.0f} sigma)" for peak in left[:4])

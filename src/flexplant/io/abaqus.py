@@ -16,9 +16,9 @@ from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
 from .assembled import from_triplets
-from .formats import Format
 from .numbers import decimal, printed_digits, rows_of_numbers, wrong_line
 from .paths import (
+    Format,
     check_size,
     check_whole,
     defined_twice,

@@ -16,8 +16,7 @@ from ..values import FloatArray, IntArray
 from .assembled import assembled, missing_extra
 from .child import in_child
 from .file_shapes import FileShapes, ModesFormat
-from .formats import Elsewhere, Format, is_text
-from .paths import file_path, no_motion, unread
+from .paths import Elsewhere, Format, file_path, is_text, no_motion, unread
 from .tables import read_nodes_table
 
 #: a local coordinate system turned less than this [deg] is none

@@ -16,8 +16,7 @@ from ..structure.matrices import completed
 from ..structure.precision import digits_of
 from ..values import FloatArray, IntArray
 from .foreign_parsers import sound
-from .formats import USUAL
-from .paths import damaged, file_path, parsing
+from .paths import USUAL, damaged, file_path, parsing
 from .tables import read_dofs
 
 #: the names under which K, M and D are looked for, in any case

@@ -13,11 +13,9 @@ from ..errors import FlexplantError, LabelError, ModelError, counted, require_kn
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
-from .formats import USUAL, Format
-from .nastran import Nodes, nastran_float, read_nodes
-from .nastran_names import named_matrices
+from .nastran import Nodes, named_matrices, nastran_float, read_nodes
 from .numbers import fixed_numbers, printed_digits
-from .paths import check_whole, damaged, file_path, unread, wrong_line_of
+from .paths import USUAL, Format, check_whole, damaged, file_path, unread, wrong_line_of
 
 _ENDINGS = ("AAX", "AA", "GG", "2GG", "2PP", "")
 

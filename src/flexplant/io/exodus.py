@@ -18,8 +18,7 @@ from ..modes import Modes
 from ..values import FloatArray, Matrix, one_of, real_array
 from .assembled import missing_extra
 from .file_shapes import FileShapes, ModesFormat, check_mass, frequencies
-from .formats import Elsewhere
-from .paths import damaged, file_path, parsing
+from .paths import Elsewhere, damaged, file_path, parsing
 
 _NAME = re.compile(r"(?:disp\w*?|displ\w*?|d|u|(rot\w*?|r))_?([xyz])", re.IGNORECASE)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import FlexplantError, ModelError, ShapeError, require_known, unknown_label
 from ..lti.frequency import Frf
-from .mat_variables import mat_variables
+from .mat_matrices import mat_variables
 from .paths import file_path, parsing
 
 _OPTIONAL = ("inputs", "outputs", "quantity", "coherence", "variance")

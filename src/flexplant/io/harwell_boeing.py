@@ -14,9 +14,8 @@ from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import one_matrix_each
 from .foreign_parsers import sound
-from .formats import Format
 from .numbers import fixed_numbers, printed_digits, spaced_numbers
-from .paths import check_size, check_whole, parsing, refused, unread
+from .paths import Format, check_size, check_whole, parsing, refused, unread
 
 #: lines whose digits are counted
 _SAMPLE = 4000

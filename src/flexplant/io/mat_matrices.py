@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,8 @@ from ..errors import FlexplantError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, chosen, missing_extra
-from .formats import USUAL, Format
-from .mat_variables import mat_variables
-from .paths import check_size, file_path, parsing
+from .child import in_child
+from .paths import USUAL, Format, check_size, file_path, parsing
 
 #: a byte of a compressed file holds no more bytes than this
 _DEFLATED = 1100
@@ -217,3 +217,28 @@ def _hdf5(item: Any, path: Path, size: int) -> Any:
 
 MATLAB = Format((".mat",), read_matlab, lambda head: head.startswith(b"matlab "))
 NUMPY = Format((".npz", ".npy"), read_npz)
+
+
+def mat_variables(path: str | Path) -> dict[str, Any]:
+    """Return {name: value}, structures as dicts, cells as arrays of objects."""
+    wrong = _cut(file_path(path).read_bytes())
+    kind, found = ("cut off", {}) if wrong else in_child("matlab", path, keep="matlab")
+    if kind != "value":
+        raise FlexplantError(
+            f"{str(path)!r} cannot be read as a MATLAB file ({wrong or found!s:.80}). It is "
+            "damaged or of version 7.3, which is another format: save it with '-v7'."
+        )
+    content: dict[str, Any] = found
+    return content
+
+
+def _cut(content: bytes) -> str:
+    """Return what is wrong with the lengths of the variables of a file of version 5, in words."""
+    order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
+    at = 128
+    while order and at < len(content):
+        size = struct.unpack_from(f"{order}I", content[at : at + 8].ljust(8, b"\0"), 4)[0]
+        if at + 8 + size > len(content):
+            return f"a variable at byte {at} of {size} bytes in a file of {len(content)}"
+        at += 8 + size
+    return ""

@@ -18,9 +18,8 @@ from ..labels import DofSet
 from ..structure import FEMatrices
 from ..values import FloatArray
 from .assembled import one_matrix_each
-from .formats import Format
 from .numbers import printed_digits, rows_of_numbers, wrong_line
-from .paths import check_size, check_whole, damaged, unread, wrong_line_of
+from .paths import Format, check_size, check_whole, damaged, unread, wrong_line_of
 
 #: lines whose digits are counted
 _SAMPLE = 4000

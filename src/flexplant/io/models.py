@@ -24,8 +24,7 @@ from . import (
     sierra,
     uff,
 )
-from .formats import HEAD, USUAL, Elsewhere, Format, ends
-from .paths import file_path, three_units
+from .paths import HEAD, USUAL, Elsewhere, Format, ends, file_path, three_units
 from .tables import read_dofs, read_nodes_table
 
 FORMATS: tuple[Format, ...] = (

@@ -10,10 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantError, LabelError, ModelError
+from ..dof_columns import at_nodes
+from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
+from ..labels import DIRECTIONS, DofSet
 from ..values import FloatArray
+from .file_shapes import FileShapes
 from .numbers import decimal
-from .paths import defined_twice, file_path
+from .paths import USUAL, defined_twice, file_path
+from .tables import read_nodes_table
 
 _KINDS = ("GRID", "GRDSET", "CORD2R", "CORD2C", "CORD2S")
 _INCLUDE = re.compile(r"\s*INCLUDE\s+(?:'([^']*)'|\"([^\"]*)\"|([^\s$]+))", re.IGNORECASE)
@@ -229,3 +233,85 @@ class _Systems:
         outward = np.sin(down) * radial + np.cos(down) * np.array([0, 0, 1.0])
         south = np.cos(down) * radial - np.sin(down) * np.array([0, 0, 1.0])
         return np.asarray(axes @ np.column_stack([outward, south, tangent]))
+
+
+_LETTERS = {"stiffness": "K", "mass": "M", "damping": "B"}
+
+
+def named_matrices(
+    found: Mapping[str, Any],
+    given: Mapping[str, str | None],
+    endings: Sequence[str],
+    path: str,
+) -> list[str | None]:
+    """Return the names of stiffness, mass and damping; of the latter two None where not there."""
+    names: list[str | None] = []
+    for what, said in given.items():
+        if what == "damping" and said is None:
+            names.append(None)
+            continue
+        name = None if said == USUAL else said
+        require_known("matrix", () if name is None else (name,), found, repr(path))
+        usual = [_LETTERS[what] + ending for ending in endings]
+        there = [one for one in usual if one in found] if name is None else [name]
+        if len(there) > 1:
+            raise ModelError(
+                f"{path!r} holds {there}, any of which may be the {what}. Say which: "
+                f"{what}={there[0]!r}."
+            )
+        if not there and what == "stiffness":
+            raise ModelError(
+                f"{path!r} holds {sorted(found)}, none of which has a usual name of a stiffness "
+                f"matrix ({', '.join(usual)}). Say which it is: stiffness='...'."
+            )
+        names.append(there[0] if there else None)
+    return names
+
+
+_BULK = (".bdf", ".dat", ".nas", ".blk")
+
+
+def shapes_at(
+    table: tuple[Any, Any, Any],
+    omega: FloatArray,
+    *,
+    nodes: Nodes | Path | None,
+    turned: bool,
+    masses: FloatArray | None,
+    path: str,
+) -> FileShapes:
+    """Return the FileShapes of eigenvectors."""
+    ids, kinds, values = table
+    grid = kinds == 1
+    notes: tuple[str, ...] = ()
+    if not grid.all():
+        scalar = counted(int(np.count_nonzero(~grid)), "scalar point")
+        notes = (f"without a place, left out: {scalar}",)
+    ids, values = ids[grid], np.array(values[grid])
+    xyz, axes = _places(ids, nodes, path)
+    local_rows = [] if turned else [i for i, node in enumerate(ids.tolist()) if node in axes]
+    for row in local_rows:
+        local = axes[int(ids[row])]
+        for first in (0, 3):
+            values[row, first : first + 3] = local @ values[row, first : first + 3]
+    if local_rows:
+        moved = counted(len(local_rows), "node")
+        notes = (*notes, f"{moved} moved in local directions: turned into the basic ones")
+    dofs = DofSet(np.repeat(ids, 6), DIRECTIONS * ids.size, np.repeat(xyz, 6, axis=0))
+    phi = values.reshape(6 * ids.size, omega.size)
+    return FileShapes(omega, phi, dofs, masses=masses, notes=notes)
+
+
+def _places(ids: Any, nodes: Nodes | Path | None, path: str) -> tuple[FloatArray, Any]:
+    if isinstance(nodes, Path):
+        if not nodes.name.lower().endswith(_BULK):
+            known, xyz = read_nodes_table(nodes)
+            return at_nodes(ids, known, xyz, str(nodes)), {}
+        nodes = read_nodes(nodes)
+    missing = [node for node in ids.tolist() if nodes is None or node not in nodes.xyz]
+    if nodes is None or missing:
+        raise LabelError(
+            f"{path!r} does not say where {len(missing)} of its nodes are, the first "
+            f"{missing[:6]}, nor in which directions they move. Give the bulk data: nodes=."
+        )
+    return np.array([nodes.xyz[node] for node in ids.tolist()]).reshape(-1, 3), nodes.axes

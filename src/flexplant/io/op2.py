@@ -12,8 +12,7 @@ import numpy as np
 from ..errors import FlexplantError, ModelError
 from ..values import FloatArray, IntArray
 from .file_shapes import FileShapes, ModesFormat
-from .nastran import Nodes, nodes_of
-from .nastran_shapes import shapes_at
+from .nastran import Nodes, nodes_of, shapes_at
 from .paths import damaged, defined_twice
 
 

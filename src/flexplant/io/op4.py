@@ -11,14 +11,11 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantError, ModelError, require_known
 from ..labels import DofSet
-from ..structure.completion import completed
-from ..structure.matrices import FEMatrices
+from ..structure.matrices import FEMatrices, completed
 from ..values import name_list
-from .formats import USUAL, Format
-from .nastran_names import named_matrices
-from .op4_binary import binary_matrices
-from .op4_text import text_matrices
-from .paths import file_path
+from .nastran import named_matrices
+from .op4_binary import binary_matrices, text_matrices
+from .paths import USUAL, Format, file_path
 
 #: a matrix of the file: dense where the file holds it dense, real or complex
 Op4Matrix: TypeAlias = Any

@@ -14,9 +14,8 @@ from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
 from .assembled import from_triplets
 from .exodus import opened
-from .formats import Format
 from .numbers import printed_digits, rows_of_numbers, wrong_line
-from .paths import check_size, check_whole, damaged, file_path, no_motion, wrong_line_of
+from .paths import Format, check_size, check_whole, damaged, file_path, no_motion, wrong_line_of
 
 _WORD = re.compile(rb"[^\s,;]+")
 #: a map has so many entries a node: x, y, z, rx, ry, rz and two or three that are no motion

@@ -15,8 +15,7 @@ from ..lti.frequency import ORDERS, Frf
 from ..structure.units import Units
 from ..values import FloatArray, IntArray, positive
 from .file_shapes import FileShapes, ModesFormat
-from .formats import Elsewhere
-from .paths import GLOBAL, ONCE, at_zero, damaged, file_path, refused, unread
+from .paths import GLOBAL, ONCE, Elsewhere, at_zero, damaged, file_path, refused, unread
 from .tables import read_nodes_table
 from .uff_analysis import NORMAL_MODE, AnalysisData, mode_records, responses_of_model
 from .uff_records import (

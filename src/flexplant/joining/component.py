@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..dof_columns import component_columns
-from ..errors import ModelError, require_known
-from ..labels import DofSet
+from ..errors import LabelError, ModelError, require_known
+from ..labels import DIRECTIONS, DofSet, Interpolation
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..values import FloatArray, instance
-from .joined_shapes import PlacedShape
-from .pose import Pose, turned
+from ..values import FloatArray, IntArray, Value, instance, real_array
 
 #: either kind of model that can be joined
 Model = FEModel | ReducedModel
@@ -148,4 +149,307 @@ def _placed_reduced(model: ReducedModel, full: DofSet, C: Any, pose: Pose) -> Re
         dofs=own,
         coordinates=names,
         **(changes | {"T": T @ wide.T}),
+    )
+
+
+#: rows of one place on two components that differ by less are one motion
+_SAME = 1e-9
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PlacedShape(Interpolation):
+    """The shapes of a component that was turned and shifted.
+
+    Parameters
+    ----------
+    own : Interpolation
+        Of the component where it was made.
+    pose : Pose
+        Where it stands.
+    C : (n, n) sparse array
+        Its DOFs in the directions of the machine by those of its own, ``q = C q_own``.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> bar = {"length": 0.2, "elements": 2, "area": 1e-4, "inertia": 1e-9}
+    >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
+    >>> joint, shift = fx.Joint("left/3:z", "right/1:z"), fx.Pose(shift=(0.2, 0.0, 0.0))
+    >>> machine = fx.joined({"left": beam, "right": beam}, joint, placed={"right": shift})
+    >>> machine.dofs.interpolation.parts[1].interpolation
+    <PlacedShape of <BeamShape 0.2 m, 2 elements>>
+    """
+
+    own: Interpolation
+    pose: Pose
+    C: sp.csc_array
+
+    def __repr__(self) -> str:
+        return f"<PlacedShape of {self.own!r}>"
+
+    def row(self, xyz: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (n,) of all DOFs in the motion `direction` at a point.
+
+        Raises
+        ------
+        LabelError
+            When the point is off the component, or its shapes do not give the motion.
+        """
+        return np.asarray(self.rows(np.asarray(xyz, dtype=np.float64)[None], direction)[0])
+
+    def rows(self, points: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (p, n) at many points (p, 3), as `row` does one by one."""
+        places = self.pose.own_points(points)
+        found = sum(share * self.own.rows(places, own) for own, share in self._shares(direction))
+        return np.asarray((self.C @ np.asarray(found).T).T)
+
+    def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
+        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
+
+        Turned, it is a mixture of the directions of its node, which must all be known.
+        """
+        node, _, direction = label.rpartition(":")
+        if direction not in DIRECTIONS:
+            return None
+        row, place = np.zeros(self.C.shape[1]), np.zeros(3)
+        for own, share in self._shares(direction):
+            found = self.own.dependent(f"{node}:{own}")
+            if found is None:
+                return None
+            row, place = row + share * found[0], found[1]
+        return np.asarray(self.C @ row), self.pose.points(place[None])[0]
+
+    def _shares(self, direction: str) -> list[tuple[str, float]]:
+        """Return the own directions in one of the machine, and their shares."""
+        first, axis = divmod(DIRECTIONS.index(direction), 3)
+        shares = np.asarray(self.pose.rotation)[axis].tolist()
+        own = DIRECTIONS[3 * first : 3 * first + 3]
+        return [(name, share) for name, share in zip(own, shares, strict=True) if share]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class JoinedShape(Interpolation):
+    """The shapes of all components of a joined machine.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of the components.
+    parts : sequence of DofSet
+        Their DOFs with their shapes, where they are placed.
+    expansion : (n_all, n) sparse array, optional
+        All DOFs of all components, one after the other, by those that are left. None: all are.
+    motions : (n_all, k) array, optional
+        All motions of a reduced machine: by these, places of two components move alike or not.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> bar = {"length": 0.2, "elements": 2, "area": 1e-4, "inertia": 1e-9}
+    >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
+    >>> joint, shift = fx.Joint("left/3:z", "right/1:z"), fx.Pose(shift=(0.2, 0.0, 0.0))
+    >>> machine = fx.joined({"left": beam, "right": beam}, joint, placed={"right": shift})
+    >>> machine.dofs.interpolation, machine.dofs.nearest((0.4, 0.0, 0.0), "z")
+    (<JoinedShape of left, right>, 'right/3:z')
+    """
+
+    names: tuple[str, ...]
+    parts: tuple[DofSet, ...]
+    expansion: sp.csc_array | None = None
+    motions: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        self._set(names=tuple(self.names), parts=tuple(self.parts))
+        self._set(expansion=self.expansion, motions=self.motions)
+
+    def __repr__(self) -> str:
+        return f"<JoinedShape of {', '.join(self.names)}>"
+
+    def row(self, xyz: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (n,) of the DOFs in the motion `direction` at a point.
+
+        Raises
+        ------
+        LabelError
+            When the point is on no component that has this motion, or on several that move
+            independently.
+        """
+        found: dict[str, FloatArray] = {}
+        failed: list[str] = []
+        for index, (name, part) in enumerate(zip(self.names, self.parts, strict=True)):
+            try:
+                found[name] = self._expanded(index, part.row(xyz, direction))
+            except LabelError as error:
+                failed.append(f"{name}: {error}")
+        if not found:
+            raise LabelError(
+                f"the point {tuple(np.asarray(xyz).tolist())} is on no component with the motion "
+                f"{direction!r}. {' '.join(failed)}"
+            )
+        rows = list(found.values())
+        seen = rows if self.motions is None else [row @ self.motions for row in rows]
+        if any(np.abs(one - seen[0]).max() > _SAME * np.abs(seen[0]).max() for one in seen[1:]):
+            one, other = list(found)[:2]
+            raise LabelError(
+                f"the point {tuple(np.asarray(xyz).tolist())} is on {one!r} and on {other!r}, "
+                "which have a motion of their own there. Name a DOF: "
+                f"dofs.nearest(point, {direction!r}, component={one!r})."
+            )
+        return rows[0]
+
+    def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
+        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None."""
+        for index, (name, part) in enumerate(zip(self.names, self.parts, strict=True)):
+            rest = label.removeprefix(f"{name}/")
+            if rest != label and rest in part:
+                return self._expanded(index, part.row(rest)), part.xyz[part.index(rest)]
+            if rest != label and part.interpolation is not None:
+                inner = part.interpolation.dependent(rest)
+                if inner is not None:
+                    return self._expanded(index, inner[0]), inner[1]
+        return None
+
+    def _expanded(self, index: int, row: FloatArray) -> FloatArray:
+        sizes = [len(part) for part in self.parts]
+        start = sum(sizes[:index])
+        if self.expansion is None:
+            found = np.zeros(sum(sizes))
+            found[start : start + sizes[index]] = row
+            return found
+        rows = np.flatnonzero(row)
+        return np.asarray(row[rows] @ self._by_rows[start + rows])
+
+    @cached_property
+    def _by_rows(self) -> Any:
+        expansion: Any = self.expansion
+        return sp.csr_array(expansion)
+
+
+#: entries of a rotation below this are zero: cos(pi/2) is 6e-17
+_ZERO = 1e-14
+#: how far a rotation matrix may be from orthogonal
+_ORTHOGONAL = 1e-9
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Pose(Value):
+    """Where a component stands: its point p comes to ``R p + shift``.
+
+    Parameters
+    ----------
+    shift : (3,) array [m]
+        Where its origin comes to.
+    rotation : (3,) array [rad] or (3, 3) array
+        A turn about this axis by its length, about the origin of the component; or R itself.
+
+    Raises
+    ------
+    ShapeError, ModelError
+        When R is no rotation: not orthogonal, or a mirror image; or a turn is beyond 2 pi.
+
+    Examples
+    --------
+    >>> pose = Pose(shift=(1.0, 0.0, 0.0), rotation=(0.0, 0.0, np.pi / 2))
+    >>> pose.points([[0.5, 0.0, 0.0]])
+    array([[1. , 0.5, 0. ]])
+    """
+
+    shift: Sequence[float] | FloatArray = (0.0, 0.0, 0.0)
+    rotation: Any = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        turn = real_array(self.rotation, "rotation")
+        if turn.ndim == 1:
+            x, y, z = real_array(turn, "rotation", (3,))
+            if la.norm(turn) > 2 * np.pi:
+                raise ModelError(
+                    f"rotation {turn.tolist()} is more than a whole turn: it is in radians. For "
+                    "degrees, pass numpy.radians([0, 0, 90])."
+                )
+            turn = la.expm(np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
+            turn[np.abs(turn) < _ZERO] = 0.0
+        turn = real_array(turn, "rotation", (3, 3))
+        if np.abs(turn @ turn.T - np.eye(3)).max() > _ORTHOGONAL or la.det(turn) < 0:
+            raise ModelError(
+                f"rotation must be a rotation vector [rad] or an orthogonal matrix without a "
+                f"mirror image, got {turn.tolist()}: lengths would change. A quarter turn about z "
+                "is (0, 0, pi / 2)."
+            )
+        self._set(shift=real_array(self.shift, "shift", (3,)), rotation=turn)
+
+    def __repr__(self) -> str:
+        angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(self.rotation) - 1), -1.0, 1.0)))
+        place = ", ".join(f"{float(x):g}" for x in self.shift)
+        return f"<Pose at ({place}) m, turned by {angle:.4g} degrees>"
+
+    def points(self, xyz: Any) -> FloatArray:
+        """Return where points (n, 3) [m] of the component are in the machine."""
+        return np.asarray(real_array(xyz, "xyz", (None, 3)) @ self.rotation.T + self.shift)
+
+    def own_points(self, xyz: FloatArray) -> FloatArray:
+        """Return where points (n, 3) [m] of the machine are in the component."""
+        return np.asarray((xyz - self.shift) @ self.rotation)
+
+    def own_ground(self) -> FloatArray:
+        """Return the (6, 6) map of ground motion about the machine's origin to the component's.
+
+        Translation and rotation in the component: ``R^T (v + w x shift)`` and ``R^T w``.
+        """
+        x, y, z = self.shift
+        back = self.rotation.T
+        cross = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # w x shift = cross w
+        return np.block([[back, back @ cross], [np.zeros((3, 3)), back]])
+
+
+def turned(dofs: DofSet, pose: Pose) -> tuple[DofSet, sp.csc_array]:
+    """Return DOFs in the directions and places of the machine, and C with ``q = C q_own``.
+
+    The interpolation is left out. C is orthogonal: it turns each node's displacements, and its
+    rotations.
+    """
+    kinds, n = np.array(dofs.kinds), len(dofs)
+    rows, columns, values = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
+    for first in (0, 3):
+        there = np.flatnonzero((dofs.kinds >= first) & (dofs.kinds < first + 3))
+        # by node, then by direction
+        there = there[np.lexsort((dofs.kinds[there], dofs.node_index[there]))]
+        for own, group in _groups(dofs, there, first):
+            R = pose.rotation[:, own]
+            made = np.flatnonzero(np.any(np.abs(R) > _ORTHOGONAL, axis=1))
+            if made.size != own.size:
+                raise _oblique(dofs, group[0], own + first)
+            kinds[group] = first + made
+            rows.append(np.repeat(group, own.size, axis=1).ravel())
+            columns.append(np.tile(group, (1, own.size)).ravel())
+            values.append(np.tile(R[made].ravel(), group.shape[0]))
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    names = np.array(DIRECTIONS, dtype=object)
+    placed = dofs.replace(
+        directions=tuple(names[kinds]), xyz=pose.points(dofs.xyz), interpolation=None
+    )
+    return placed, sp.csc_array(entries, shape=(n, n))
+
+
+def _groups(dofs: DofSet, rows: IntArray, first: int) -> list[tuple[IntArray, IntArray]]:
+    """Return, for nodes with the same directions, these (k,) and their rows (m, k)."""
+    if not rows.size:
+        return []
+    node = dofs.node_index[rows]
+    starts = np.flatnonzero(np.diff(node, prepend=-1))
+    bits = np.add.reduceat(1 << (dofs.kinds[rows] - first), starts)
+    found = []
+    for mask in np.unique(bits):
+        own = np.flatnonzero([mask >> k & 1 for k in range(3)])
+        begin = starts[bits == mask]
+        found.append((own, rows[begin[:, None] + np.arange(own.size)]))
+    return found
+
+
+def _oblique(dofs: DofSet, rows: IntArray, own: IntArray) -> ModelError:
+    has = ", ".join(DIRECTIONS[k] for k in own)
+    return ModelError(
+        f"node {dofs.nodes[rows[0]]} has only the directions {has}, which this rotation turns out "
+        "of x, y and z: its motion would be oblique. Turn by quarter turns, or about the axis that "
+        "keeps them, or use a component with all directions (place those of a machine before "
+        "they are joined)."
     )

@@ -11,8 +11,7 @@ import numpy as np
 from ..errors import LabelError, require_known
 from ..labels import DIRECTIONS, DofSet
 from ..values import FloatArray
-from .joint import Joint
-from .patch import Patch, mean_motions
+from .joint import Joint, Patch, mean_motions
 
 #: lever arms below this part of the machine's size are none
 _NO_ARM = 1e-9

@@ -7,22 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from ..arguments import mapping
 from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
-from ..values import ComplexArray, FloatArray, IntArray, instance
+from ..values import ComplexArray, FloatArray, IntArray, instance, mapping
 from .frf_errors import MeasuredParts, side_by_side, variance_of, warn_of_errors
 from .frf_joints import (
     FrfLink,
     channel_rows,
+    channels_of,
     frf_links,
     independent,
+    known_places,
+    parts_of,
     softness,
     warn_of_bending,
 )
 from .joint import Joint
-from .measured_channels import channels_of, known_places, parts_of
 
 #: condition of the interface beyond which errors of a measurement hide the answer
 _CONDITION = 1e8

@@ -8,25 +8,33 @@ from typing import Any, overload
 import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
+import scipy.sparse.csgraph as csgraph
 
 from ..errors import ModelError, warn
 from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
+from ..modes.attachment_vectors import static_response
+from ..modes.shifted import stiffness_factor
 from ..reduction import ReducedModel
-from ..sparse.factor import dense
+from ..sparse.factor import DENSE_LIMIT, dense
 from ..structure import FEModel
-from ..structure.rigid import rigid_body_basis
-from ..values import FloatArray, frozen
-from .component import Component, Model, components_of
-from .elimination import Elimination, eliminated
+from ..structure.placed import SPANNED
+from ..structure.rigid import orthonormalised, rigid_body_basis
+from ..values import FloatArray, IntArray, frozen
+from .component import Component, JoinedShape, Model, Pose, components_of
+from .ends import split_end
 from .frf_coupling import joined_frfs
-from .joined_shapes import JoinedShape
 from .joining_certificate import certified
-from .joint import Joint
-from .links import Link, links_of, machine_size, rows_of, warn_of_missing_statics
-from .motions import groups_of, left_motions
-from .patch_error import patch_errors
-from .pose import Pose
+from .joint import Joint, Patch
+from .links import (
+    Elimination,
+    Link,
+    eliminated,
+    links_of,
+    machine_size,
+    rows_of,
+    warn_of_missing_statics,
+)
 
 #: more coordinates of a machine with reduced components would not fit the memory comfortably
 _LARGEST = 5000
@@ -320,3 +328,138 @@ def _reduced(
         joint_motions=fields["joint_motions"][order],
         joining=fields["joining"],
     )
+
+
+#: a stretch below this part of the largest is none
+_NONE = 1e-9
+
+
+def groups_of(links: Sequence[Link], count: int) -> list[IntArray]:
+    """Return the components (from 0) of each part of the machine that joints hold together."""
+    pairs = [link.owners for link in links if link.holds and len(link.owners) == 2]
+    graph = sp.coo_array(
+        (np.ones(len(pairs)), ([p[0] for p in pairs], [p[1] for p in pairs])), shape=(count, count)
+    )
+    label = csgraph.connected_components(graph, directed=False)[1]
+    return [np.flatnonzero(label == number) for number in range(int(label.max()) + 1)]
+
+
+def left_motions(
+    parts: Sequence[Component],
+    groups: Sequence[IntArray],
+    rows: Any,
+    M: Any,
+    kept: IntArray,
+    *,
+    free: bool,
+) -> FloatArray:
+    """Return the M-orthonormal motions (k, m) of components as rigid bodies that stretch no joint.
+
+    For each part of the machine first those of the whole, then those of one component against
+    others (a slide, a hinge): all are combinations of the components' own motions.
+    """
+    starts = np.concatenate([[0], np.cumsum([part.n for part in parts])])
+    found = []
+    for group in groups:
+        several = [parts[i] for i in group]
+        own = [_own_motions(part, free=free) for part in several]
+        motions = np.zeros((int(starts[-1]), sum(part.shape[1] for part in own)))
+        mixes, column, missed = [], 0, np.zeros(6)
+        for i, part, body in zip(group, several, own, strict=True):
+            motions[starts[i] : starts[i + 1], column : column + body.shape[1]] = body
+            column += body.shape[1]
+            mixes.append(body.T @ part.model.inertia(part.model.rigid_motions()))
+            missed = np.maximum(missed, part.model.missed_motions())
+        scale = np.abs(motions).max(axis=0, initial=0.0)
+        motions = motions / np.where(scale > 0, scale, 1.0)
+        whole = np.vstack(mixes) * scale[:, None]
+        stretch = np.asarray(rows @ motions)
+        most = np.asarray(abs(rows) @ np.abs(motions)).max(axis=1, initial=0.0)
+        stretch[np.abs(stretch) <= _NONE * most[:, None]] = 0.0  # rounding of what cancels
+        allowed = null_space(stretch)
+        beside = np.linalg.norm(whole - allowed @ (allowed.T @ whole), axis=0)
+        size = np.linalg.norm(whole, axis=0)
+        clean = (missed < SPANNED) & (size > 0) & (beside <= _NONE * size)
+        candidates = motions[kept] @ np.hstack([whole[:, clean], allowed])
+        found.append(orthonormalised(M, candidates, dependent="drop"))
+    return np.hstack(found)
+
+
+def _own_motions(part: Component, *, free: bool) -> FloatArray:
+    """Return the rigid-body motions (n, r) of a component: without energy, or held as well."""
+    rigid: FloatArray = part.model.rigid_body
+    if free:
+        return rigid
+    every: FloatArray = part.model.body_motions
+    # those of a reduced model are known better than from its shapes
+    return rigid if rigid.shape[1] == every.shape[1] else every
+
+
+def null_space(stretch: FloatArray) -> FloatArray:
+    """Return an orthonormal basis (r, q) of the motions (r,) that stretch (m, r) nothing."""
+    if not stretch.size:
+        return np.eye(stretch.shape[1])
+    size = np.linalg.norm(stretch, axis=1)
+    _, values, right = la.svd(stretch / np.where(size > 0, size, 1.0)[:, None])
+    full = np.zeros(stretch.shape[1])
+    full[: values.size] = values
+    return np.asarray(right[full <= _NONE * max(float(full.max(initial=0.0)), 1e-300)].T)
+
+
+#: patches of more displacements are not examined: each is a load of the component
+_MOST = 1000
+#: singular values of the compliance of a patch below this part of the largest are none
+_RANK = 1e-11
+
+
+def patch_errors(links: Sequence[Link], parts: Sequence[Component]) -> dict[str, float]:
+    """Return, for each patch of a joint, how far apart its bounds of the compliance are.
+
+    With u the displacements of the nodes, C their elastic compliance on the component alone, A the
+    rigid motions of the patch and W the mean, ``W A = I``: a load on the mean motion meets
+    ``W C W^T``, on a patch that stays rigid ``(A^T C^-1 A)^-1``, which is less (Gauss and Markov).
+    What is returned is the largest of 1 - rigid / mean over the axes joined; NaN for a patch of
+    more than 1000 displacements, or of an unstable component.
+    """
+    found: dict[str, float] = {}
+    joints = list({id(link.joint): link.joint for link in links}.values())
+    for number, joint in enumerate(joints, 1):
+        axes = [DIRECTIONS.index(link.axis) for link in links if link.joint is joint]
+        for end in (joint.first, joint.second):
+            if isinstance(end, Patch):
+                name = split_end(f"{end.component}/", [part.name for part in parts])[0]
+                part = next(part for part in parts if part.name == name)
+                mean, rigid = compliances(part, end, axes)
+                found[f"joint {number}, {end!r}"] = float(np.max(1.0 - rigid / mean))
+    return found
+
+
+def compliances(
+    part: Component, patch: Patch, axes: Sequence[int]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the elastic compliance (k,) along axes: of the mean motion, and of a rigid patch."""
+    rows, point = patch.rows(part.dofs), patch.point(part.dofs)
+    W, A, _ = patch.mean(part.dofs, point)
+    if rows.size > _MOST or part.model.n_unstable:
+        return np.full(len(axes), np.nan), np.full(len(axes), np.nan)
+    C = _compliance(part, rows)
+    W, A = W[list(axes)], A[:, list(axes)]
+    mean = np.diag(W @ C @ W.T)
+    # motions of A cost no energy here, so that C is invertible where the patch can move at all
+    beside = float(np.trace(C)) / max(float(np.sum(A**2)), 1e-300)
+    stiffness = la.pinvh(C + beside * A @ A.T, rtol=_RANK)
+    rigid = np.diag(la.inv(A.T @ stiffness @ A)) - beside
+    return np.asarray(mean), np.asarray(rigid)
+
+
+def _compliance(part: Component, rows: Any) -> FloatArray:
+    """Return the elastic compliance (m, m) of some DOFs of a component, free or held."""
+    model: Any = part.model
+    loads = np.asarray(part.T[rows].T.todense() if not part.is_reduced else part.T[rows].T)
+    large = sp.issparse(model.K) and model.n_dof > DENSE_LIMIT
+    if large:
+        moved = stiffness_factor(model).static(loads)
+    else:
+        moved = static_response(model.M, model.K, model.rigid_body, loads)
+    found = loads.T @ moved
+    return np.asarray(0.5 * (found + found.T))

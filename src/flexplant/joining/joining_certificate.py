@@ -11,8 +11,7 @@ import numpy as np
 from ..errors import CertificateError, counted
 from ..values import FloatArray, IntArray, Value
 from .component import Component
-from .elimination import Elimination
-from .links import Link, machine_size, rows_of
+from .links import Elimination, Link, machine_size, rows_of
 
 #: largest gap, imbalance and error of the inertia, relative
 _LIMIT = 1e-7

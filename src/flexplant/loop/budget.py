@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import CertificateError, ModelError, require_known, unknown_label
+from ..errors import (
+    AssumptionError,
+    CertificateError,
+    LabelError,
+    ModelError,
+    require_known,
+    unknown_label,
+)
+from ..lti.grid import resonance_grid
 from ..lti.lyapunov import solve_lyapunov, solve_stein
+from ..lti.responses import continuous_poles, responder
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, Value, in_unit, real_array, short
-from .noise_sources import Source
-from .spectrum import densities, integrated, periodogram
+from ..plant import StandardPlant
+from ..values import FloatArray, IntArray, Value, in_unit, instance, real_array, short
 
 #: relative: the variance by the two Lyapunov equations, and by the integral of the spectrum
 AGREEMENT = 1e-6
@@ -212,3 +220,300 @@ def _residue(residue: Any, channel: str, start: float, dt: float) -> FloatArray:
             f"{samples.size * dt:g} s. Choose an earlier start, or a longer run."
         )
     return late
+
+
+#: densities (n_source, n_freq) at frequencies [Hz]
+Densities = Callable[[FloatArray], FloatArray]
+#: intervals are halved until the error of each source's integral is below this part of it
+TOLERANCE = 1e-8
+ROUNDS = 40
+#: edges over all frequencies, beside those at resonances: what a picture of the stairs needs
+_STAIRS = 150
+#: frequencies at a time
+STEP = 2048
+
+
+class Spectrum(NamedTuple):
+    """A one-sided power spectral density.
+
+    Parameters
+    ----------
+    freq : (n_freq,) array [Hz]
+        Frequencies.
+    psd : (n_freq,) array [unit^2/Hz]
+        Its integral over all frequencies is the mean square.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> flat = fx.loop.Spectrum(freq=np.array([0.0, 1.0]), psd=np.array([2.0, 2.0]))
+    >>> float(np.trapezoid(flat.psd, flat.freq))  # the variance
+    2.0
+    """
+
+    freq: FloatArray
+    psd: FloatArray
+
+
+class Integral(NamedTuple):
+    """Integrals (n_source, n_edge) of densities from 0 to the edges [Hz]."""
+
+    edges: FloatArray
+    values: FloatArray
+
+
+def densities(monitored: StateSpace, row: int, noises: Sequence[Source]) -> Densities:
+    """Return the function of frequency that gives each source's one-sided density in an output.
+
+    Sampled: ``2 h |C (z I - A)^-1 G + D|^2`` with ``z = exp(2 pi i f h)``; G is the exact
+    covariance of a sample, so the density holds all that folds back from above half the rate.
+    Continuous: ``2 |C (s I - A)^-1 G + D|^2``.
+    """
+    n = monitored.n_states
+    none = np.zeros((n, 1))
+    # from the output back to the states: one column for any number of noises
+    dual = StateSpace(monitored.A.T, monitored.C[[row]].T, np.eye(n), none, monitored.dt)
+    reach = responder(dual)
+    factor = 2.0 * (monitored.dt or 1.0)
+
+    def found(freq: FloatArray) -> FloatArray:
+        out = np.empty((len(noises), freq.size))
+        for start in range(0, freq.size, STEP):
+            part = slice(start, start + STEP)
+            # transposed, not conjugated: C (z I - A)^-1 of the same z
+            back = reach(freq[part])[:, 0].T
+            for i, one in enumerate(noises):
+                out[i, part] = np.sum(np.abs(back @ one.G + one.D[row]) ** 2, axis=1)
+        return factor * out
+
+    return found
+
+
+def integrated(find: Densities, monitored: StateSpace, variances: FloatArray) -> Integral:
+    """Return the running integrals of densities, by adaptive Gauss-Kronrod quadrature.
+
+    Intervals begin between the resonances and are halved where the rules of 7 and of 15 points
+    differ. A continuous loop is integrated to infinity, over ``t = f / (f + f_c)``.
+    """
+    top = 0.5 / monitored.dt if monitored.dt else np.inf
+    grid = _starts(monitored, top)
+    centre = float(np.sqrt(grid[1] * grid[-2]))
+    edges = grid if monitored.dt else np.append(grid[:-1] / (grid[:-1] + centre), 1.0)
+    nodes, gauss, kronrod = _rule()
+
+    def values(left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+        middle, half = 0.5 * (left + right), 0.5 * (right - left)
+        t = middle[:, None] + half[:, None] * nodes
+        freq, speed = (t, np.ones_like(t))
+        if not monitored.dt:
+            freq, speed = centre * t / (1.0 - t), centre / (1.0 - t) ** 2
+        density = find(freq.ravel()).reshape(-1, *t.shape) * speed * half[:, None]
+        fine = density @ kronrod
+        return fine, np.abs(fine - density @ gauss)
+
+    left, right = edges[:-1], edges[1:]
+    fine, error = values(left, right)
+    size = np.where(variances > 0, variances, 1.0)[:, None]
+    for _ in range(ROUNDS):
+        share = np.max(error / size, axis=0, initial=0.0)
+        if share.sum() <= TOLERANCE:
+            break
+        bad = np.flatnonzero(share > TOLERANCE / share.size)
+        middle = 0.5 * (left[bad] + right[bad])
+        fresh = np.concatenate([left[bad], middle]), np.concatenate([middle, right[bad]])
+        keep = np.setdiff1d(np.arange(left.size), bad)
+        more, missed = values(*fresh)
+        left, right = np.append(left[keep], fresh[0]), np.append(right[keep], fresh[1])
+        fine = np.concatenate([fine[:, keep], more], axis=1)
+        error = np.concatenate([error[:, keep], missed], axis=1)
+    order = np.argsort(left)
+    ends = np.append(left[order], right[order[-1]])
+    if not monitored.dt:
+        ends = centre * ends[:-1] / (1.0 - ends[:-1])
+        ends = np.append(ends, np.inf)
+    total = np.cumsum(fine[:, order], axis=1)
+    return Integral(ends, np.concatenate([np.zeros((total.shape[0], 1)), total], axis=1))
+
+
+def _starts(monitored: StateSpace, top: float) -> FloatArray:
+    """Return edges from 0 to the top: some over all frequencies, five at each resonance."""
+    base = resonance_grid(monitored.poles(), monitored.dt, points=25)
+    s = continuous_poles(monitored)
+    s = s[(s.imag > 0) & (np.abs(s.real) < 0.1 * s.imag)]
+    near = (s.imag[:, None] - s.real[:, None] * np.array([-20, -3, 0, 3, 20])) / (2.0 * np.pi)
+    edges = np.concatenate([np.geomspace(base[0], base[-1], _STAIRS), near.ravel()])
+    return np.concatenate([[0.0], np.unique(edges[(edges > 0) & (edges < top)]), [top]])
+
+
+def _rule() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return nodes on (-1, 1) and the weights of Gauss (7 points) and Kronrod (15 points).
+
+    Kronrod's weights integrate polynomials exactly to degree 14 at least: they follow from the
+    nodes, which are those of QUADPACK [Piessens1983]_.
+    """
+    half = [
+        0.991455371120812639206854697526329,
+        0.949107912342758524526189684047851,
+        0.864864423359769072789712788640926,
+        0.741531185599394439863864773280788,
+        0.586087235467691130294144838258730,
+        0.405845151377397166906606412076961,
+        0.207784955007898467600689403773245,
+    ]
+    nodes: FloatArray = np.array([*(-x for x in half), 0.0, *half[::-1]])
+    inner, weights = np.polynomial.legendre.leggauss(7)
+    gauss: FloatArray = np.zeros(15)
+    gauss[1::2] = weights[np.argsort(inner)]
+    legendre = np.polynomial.legendre.legvander(nodes, 14).T
+    moments = np.zeros(15)
+    moments[0] = 2.0
+    return nodes, gauss, np.asarray(np.linalg.solve(legendre, moments), dtype=np.float64)
+
+
+def periodogram(signal: FloatArray, dt: float) -> Spectrum:
+    """Return the spectrum of a record whose sum times its spacing is the mean square exactly."""
+    n = signal.size
+    size: FloatArray = np.asarray(np.abs(np.fft.rfft(signal)) ** 2, dtype=np.float64) * (
+        2.0 * dt / n
+    )
+    size[0] *= 0.5
+    if n % 2 == 0:
+        size[-1] *= 0.5
+    return Spectrum(np.asarray(np.fft.rfftfreq(n, dt), dtype=np.float64), size)
+
+
+#: relative: the noise factors of single disturbances add up to the one that the plant has
+_ADDS_UP = 1e-6
+
+
+class WhiteNoise(NamedTuple):
+    """How white samples enter: `factor` (n, r) into x, `deviation` at the `columns` of w."""
+
+    factor: FloatArray
+    columns: IntArray
+    deviation: FloatArray
+
+
+class Source(NamedTuple):
+    """One white noise of unit intensity (continuous) or unit variance (sampled) in a closed loop.
+
+    ``x+ = A x + G n``, ``output = C x + D n`` with G (n, r) and D (n_output, r).
+    """
+
+    name: str
+    G: FloatArray
+    D: FloatArray
+
+
+def white_names(plant: StandardPlant) -> tuple[list[str], list[str]]:
+    """Return the channels of w that are white noise: disturbances, then noises per sample.
+
+    The latter are those of sensors, and disturbances that are held over each sample.
+    """
+    loud = [name for name, level in plant.asd.items() if level > 0]
+    held = plant.held if plant.dt else ()
+    sensors = [name for name in loud if name.removesuffix(":noise") in plant.y or name in held]
+    white = [name for name in loud if name not in sensors]
+    direct = plant.system.select(inputs=white).D
+    if np.any(direct):
+        i, j = np.argwhere(direct)[0]
+        raise AssumptionError(
+            f"white noise {white[j]!r} reaches {plant.system.outputs[i]!r} directly: a sample of "
+            "it would have infinite variance. Give the disturbance a coloured spectrum, let it "
+            "be held over each sample (held=True), or sense a displacement or velocity."
+        )
+    return white, sensors
+
+
+def white_noise(plant: StandardPlant) -> WhiteNoise:
+    """Return the noises of a sampled plant, all disturbances together.
+
+    The disturbances' covariance over a sample is exact, so what they excite above half the rate
+    is in the samples; a sensor's noise has the variance ``asd^2 rate / 2`` of a sample.
+    """
+    white, sensors = white_names(plant)
+    factor = continuous_factor(plant) if white else np.zeros((plant.system.n_states, 0))
+    columns = np.array([plant.w.index(name) for name in sensors], dtype=np.int64)
+    asd = np.array([plant.asd[name] for name in sensors])
+    return WhiteNoise(factor, columns, asd * np.sqrt(0.5 / plant.dt))
+
+
+def continuous_factor(plant: StandardPlant) -> FloatArray:
+    """Return the noise factor of the disturbances that are not held over each sample."""
+    total = plant.noise_factor
+    return total[:, : total.shape[1] - len(plant.held)]
+
+
+def sources(plant: StandardPlant, monitored: StateSpace) -> list[Source]:
+    """Return the white noises of a plant as they enter its closed loop, each by itself."""
+    white, sensors = white_names(plant)
+    found = []
+    for name, factor in _factors(plant, white).items() if plant.dt else ():
+        G = np.zeros((monitored.n_states, factor.shape[1]))
+        G[: factor.shape[0]] = factor
+        found.append(Source(name, G, np.zeros((len(monitored.outputs), G.shape[1]))))
+    root = np.sqrt(0.5 / (plant.dt or 1.0))
+    for name in sensors if plant.dt else (*white, *sensors):
+        column = [monitored.inputs.index(name)]
+        size = plant.asd[name] * root
+        found.append(Source(name, monitored.B[:, column] * size, monitored.D[:, column] * size))
+    return found
+
+
+def _factors(plant: StandardPlant, white: list[str]) -> dict[str, FloatArray]:
+    """Return G of each white disturbance; of all together where they cannot be separated."""
+    if not white:
+        return {}
+    total = continuous_factor(plant)
+    if len(white) == 1:
+        return {white[0]: total}
+    if plant.is_assembled:
+        found = {}
+        for name in white:  # the plant sampled with one of them
+            asd = {n: level for n, level in plant.asd.items() if n == name or n in plant.held}
+            alone = plant.unweighted.continuous.replace(asd=asd)
+            found[name] = continuous_factor(alone.discretized(1.0 / plant.dt, delay=plant.delay))
+        # a plant whose noise was changed since it was assembled keeps its own
+        if all(factor.shape[0] == total.shape[0] for factor in found.values()):
+            own = np.sum(total**2, axis=1)
+            added = np.sum([np.sum(factor**2, axis=1) for factor in found.values()], axis=0)
+            if np.allclose(added, own, rtol=_ADDS_UP, atol=0.0):
+                return found
+    return {" + ".join(white): total}
+
+
+def stationary_row(
+    plant: StandardPlant, monitored: StateSpace, problem: object, channel: str
+) -> int:
+    """Return the row of an output of a closed loop that has a stationary state."""
+    if plant.is_weighted:
+        raise AssumptionError(
+            "the plant is weighted, so its z and w are not physical signals: close the loop "
+            "around plant.unweighted with the same blocks."
+        )
+    given: object = channel
+    instance(given, str, "a channel", "Pass its name: 'die:error'.", LabelError)
+    row = int(monitored.output_index([channel])[0])
+    check_stationary(problem, f"the rms of {channel!r}")
+    return row
+
+
+def check_stationary(problem: object, what: str) -> None:
+    """Raise AssumptionError when a closed loop has no stationary state."""
+    if problem is not None:
+        raise AssumptionError(
+            f"{what} needs a stable closed loop, this one is {getattr(problem, 'reason', problem)}:"
+            " its noise grows without bound. Stabilise it first: see loop.is_stable."
+        )
+
+
+def check_direct(noises: Sequence[Source], row: int, channel: str) -> None:
+    """Raise ModelError where continuous white noise passes to an output without rolling off."""
+    for one in noises:
+        if np.any(one.D[row]):
+            raise ModelError(
+                f"white noise {one.name!r} passes straight through to {channel!r}, so its variance "
+                "in continuous time is infinite. Close the loop around plant.discretized(rate), or "
+                "let the controller roll off."
+            )

@@ -11,7 +11,7 @@ from ..errors import LabelError, ModelError, require_known
 from ..lti.grid import climbed
 from ..values import FloatArray, Value, short
 from .closed import ClosedLoop
-from .margins import first_above
+from .sensitivity import first_above
 
 #: share of the bandwidth at which low-frequency suppression is compared
 LOW = 0.1

@@ -2,17 +2,16 @@
 
 from ..rooms import public_names as _public_names
 from .balancing import BalancedReduction as BalancedReduction
+from .balancing import NormReport as NormReport
 from .balancing import balanced as balanced
+from .balancing import hankel_norm as hankel_norm
+from .balancing import hankel_values as hankel_values
+from .balancing import norm_report as norm_report
 from .discretisation import discretized as discretized
 from .discretisation import tustin as tustin
 from .frequency import Frf as Frf
 from .frequency import default_freq as default_freq
 from .frequency import frequency_response as frequency_response
-from .h2_norms import h2_norm as h2_norm
-from .hankel import NormReport as NormReport
-from .hankel import hankel_norm as hankel_norm
-from .hankel import hankel_values as hankel_values
-from .hankel import norm_report as norm_report
 from .interconnection import append as append
 from .interconnection import connect as connect
 from .interconnection import feedback as feedback
@@ -23,10 +22,12 @@ from .lyapunov import controllability_gramian as controllability_gramian
 from .lyapunov import observability_gramian as observability_gramian
 from .lyapunov import solve_lyapunov as solve_lyapunov
 from .lyapunov import solve_stein as solve_stein
-from .matching import matched as matched
 from .minimal import minimal as minimal
 from .modal import ModalForm as ModalForm
+from .modal import Split as Split
 from .modal import modal_form as modal_form
+from .modal import split_stable as split_stable
+from .norms import h2_norm as h2_norm
 from .norms import hinf_norm as hinf_norm
 from .norms import linf_norm as linf_norm
 from .norms import peak_gain as peak_gain
@@ -35,10 +36,9 @@ from .riccati import control_care as control_care
 from .riccati import control_dare as control_dare
 from .riccati import solve_care as solve_care
 from .riccati import solve_dare as solve_dare
-from .splitting import Split as Split
-from .splitting import split_stable as split_stable
 from .statespace import StateSpace as StateSpace
 from .statespace import as_statespace as as_statespace
+from .transfer import matched as matched
 from .transfer import tf as tf
 from .transfer import zpk as zpk
 from .weights import highpass as highpass

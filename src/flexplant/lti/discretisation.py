@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..arguments import between
-from ..errors import ModelError
-from ..values import FloatArray, IntArray, positive
+from ..errors import ModelError, warn
+from ..values import ComplexArray, FloatArray, IntArray, between, positive
 from .joining import Matrices
-from .rate_check import check_rate, light_modes
+from .lyapunov import compressed
 from .statespace import StateSpace, System, as_statespace
 
 #: distance of a pole from where a map is singular, relative to it, that counts as none
@@ -327,3 +326,117 @@ def bilinear(sys: System, rate: float) -> StateSpace:
         dt=0.0,
         blocks=None,
     )
+
+
+#: times half the rate: where even the lowest mode lies above this, the rate is in another unit
+_HOPELESS = 10.0
+#: samples: a delay between 0 and this changes nothing that can be measured
+_NO_DELAY = 0.01
+#: samples: a delay beyond this is in another unit, of a loop, an actuator or a sensor
+_LONGEST = 1000.0
+#: damping ratio up to which a pole is a mode, not a filter
+_LIGHT = 0.3
+
+
+def check_rate(modes: FloatArray, rate: float, delay: float) -> None:
+    """Judge a sampling rate [Hz] by the elastic modes [Hz] of a system, and a delay by the rate."""
+    rate, delay = positive(rate, "rate"), positive(delay, "delay", zero=True)
+    if 0 < delay < _NO_DELAY:
+        raise ModelError(
+            f"delay={delay:g} is in samples, which here means {delay / rate:.3g} s and changes "
+            f"nothing. If {delay:g} s is meant, it is delay={delay * rate:.4g} at {rate:g} Hz."
+        )
+    if delay > _LONGEST:
+        raise ModelError(
+            f"delay={delay:g} is in samples, which here means {delay / rate:.3g} s: no loop runs "
+            f"that late. If {delay:g} us are meant, it is delay={1e-6 * delay * rate:.4g} at "
+            f"{rate:g} Hz."
+        )
+    if not modes.size or modes.min() <= 0.5 * rate:
+        return
+    said = (
+        f"all {modes.size} elastic modes, {modes.min():.4g} Hz and above, lie above "
+        f"half the sampling rate ({0.5 * rate:g} Hz): in its samples they look like slow ones. The "
+        "rate is in Hz"
+    )
+    if modes.min() > 0.5 * _HOPELESS * rate:
+        raise ModelError(f"{said}{_meant(rate, float(modes.min()))}.")
+    said = f"{said}, the model in SI units: are both?"
+    warn(said)
+
+
+def _meant(rate: float, lowest: float) -> str:
+    """Return which other unit would bring the lowest mode below half the rate."""
+    if rate < 1 and 2 * lowest <= 1 / rate:
+        return f"; {rate:g} s as a sampling period is rate={1 / rate:g}"
+    if 2 * lowest <= 1e3 * rate:
+        return f"; {rate:g} kHz is rate={1e3 * rate:g}"
+    return ""
+
+
+def check_latency(name: str, latency: float, rate: float) -> None:
+    """Raise ModelError when the latency [s] of a port is more than 1000 samples."""
+    if latency * rate > _LONGEST:
+        raise ModelError(
+            f"the latency of {name!r} is {latency:g} s, {latency * rate:.4g} samples at {rate:g} "
+            f"Hz: latencies are in seconds. If {latency:g} samples are meant, it is "
+            f"latency={latency / rate:.4g}."
+        )
+
+
+def light_modes(poles: ComplexArray) -> FloatArray:
+    """Return the frequencies [Hz] of the lightly damped pairs among continuous poles [rad/s]."""
+    size = np.abs(poles)
+    return np.asarray(size[(poles.imag > 0) & (-poles.real < _LIGHT * size)] / (2.0 * np.pi))
+
+
+#: nodes that integrate ``e^(A s) B B' e^(A' s)`` to rounding over a piece of |A| s <= 1
+_NODES = 10
+
+
+def accumulated_noise(
+    at: Callable[[float], FloatArray], force: FloatArray, time: float, rate: float
+) -> FloatArray:
+    """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``.
+
+    Gauss-Legendre quadrature. Over the whole interval where as many nodes as make it exact to
+    rounding give less than n columns, as for a large structure with few forces. Else over a piece
+    so short that ten nodes are exact, then ``G(2 t) = [G(t), e^(A t) G(t)]``: log2(time rate)
+    steps, however fast the modes are. Sums of squares, so that G G' is positive semidefinite in
+    any units; the block exponential of [VanLoan1978]_ was seen to lose that on large models.
+    """
+    n, m = force.shape
+    # the error is a Bessel function of order 2 count and argument |A| time: nothing beyond there
+    size = min(rate * time, 2.0 * n)
+    count, doublings = _NODES + int(np.ceil(0.5 * size + 4.0 * np.cbrt(size))), 0
+    if count * m >= n:
+        count, doublings = _NODES, max(0, int(np.ceil(np.log2(max(rate * time, 1e-300)))))
+    piece = time / 2**doublings
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    parts = [
+        np.sqrt(0.5 * piece * weight) * (at(0.5 * piece * (node + 1.0)) @ force)
+        for node, weight in zip(nodes, weights, strict=True)
+    ]
+    G = compressed(np.hstack(parts))
+    for k in range(doublings):
+        G = compressed(np.hstack([G, at(piece * 2**k) @ G]))
+    return G
+
+
+def noise_factor(g: StateSpace, asd: FloatArray, h: float) -> FloatArray:
+    """Return G with ``G G' = Q_d``, the covariance that white noise adds to x in one sample.
+
+    ``Q_d = int_0^h e^(A s) B S B' e^(A' s) ds`` with S = diag(asd^2 / 2), the intensity of noise
+    with the one-sided amplitude spectral density asd (`accumulated_noise`).
+    """
+    n = g.n_states
+    active = np.flatnonzero(asd)
+    if not n or not active.size:
+        return np.zeros((n, 0))
+    B = g.B[:, active] * (np.asarray(asd)[active] / np.sqrt(2.0))
+    pairs = diagonal_pairs(g)
+    if pairs is None:
+        rate = float(np.linalg.norm(g.A, 1))
+        return accumulated_noise(lambda time: np.asarray(la.expm(g.A * time)), B, h, rate)
+    rate = float(np.max(np.abs(g.poles()), initial=0.0))
+    return accumulated_noise(lambda time: block_diagonal(pair_expm(pairs, time)), B, h, rate)

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..arguments import between
 from ..errors import ModelError, ShapeError
-from ..values import ComplexArray, FloatArray
+from ..values import ComplexArray, FloatArray, between
 
 #: samples of a window that stand for all lengths
 SAMPLES = 256

@@ -9,15 +9,13 @@ import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
-from ..arguments import between
-from ..values import ComplexArray, FloatArray
-from .factors import controllability_factor, observability_factor
+from ..values import ComplexArray, FloatArray, between
 from .joining import is_block_diagonal, joined_blocks, stacked
-from .modal import modal_form
+from .lyapunov import controllability_factor, observability_factor
+from .modal import modal_form, part_of, split_stable
+from .norms import DOUBLE, eigenvalues_with_error
 from .responses import responses
 from .scaling import reciprocal, state_scale
-from .splitting import part_of, split_stable
-from .stability import DOUBLE, eigenvalues_with_error
 from .statespace import StateSpace, System, as_statespace
 
 #: shares and Hankel singular values below this of what they are computed from are rounding

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
-from .level_set import LEVELS, level_set_peak
-from .peaks import proved_peak
-from .residues import Residues, residues
-from .responses import points, responder
-from .scaling import state_scale
-from .stability import obstacle
+from ..values import ComplexArray, FloatArray
+from .lyapunov import controllability_gramian, observability_gramian
+from .peaks import Residues, proved_peak, residues
+from .responses import Responder, continuous_poles, points, responder
+from .scaling import balanced_matrix, even_scale, state_scale
 from .statespace import StateSpace, System, as_statespace
 
 #: the norm lies between the gain found and (1 + TOLERANCE) times it
@@ -172,3 +176,314 @@ def _gain(g: StateSpace, freq: float) -> float:
     s, d = points(g, np.array([freq]))[0], state_scale(g.A, g.B, g.C)
     shifted = s * np.eye(d.size) - g.A * d / d[:, None]
     return float(np.linalg.norm((g.C * d) @ np.linalg.solve(shifted, g.B / d[:, None]) + g.D, 2))
+
+
+#: the squares of the H2 norm by both Gramians agree to this, or to rounding of their terms
+_SAME_NORM, ROUNDING = 2e-8, 1e-13
+
+
+@one_thread()
+def h2_norm(sys: System) -> float:
+    """Return the H2 norm: the rms of all outputs together for white inputs of unit intensity.
+
+    ``trace(C P C')^(1/2)``, P the controllability Gramian (``trace(C P C' + D D')^(1/2)`` when
+    sampled). Exact in modal blocks. The observability Gramian Q gives it a second time,
+    ``trace(B' Q B) = trace(C P C')``: both agree to 1e-8, or to the rounding of their terms.
+
+    Parameters
+    ----------
+    sys : StateSpace or control.StateSpace
+        Continuous or sampled.
+
+    Returns
+    -------
+    float
+        Infinite when the system is not strictly stable (rigid-body modes are not), or continuous
+        with feedthrough; `norm_report` says which.
+
+    Raises
+    ------
+    ModelError
+        When `sys` is no system.
+    SolverError
+        When a Gramian is too badly conditioned for its residual.
+    CertificateError
+        When the two Gramians give different norms.
+
+    References
+    ----------
+    [ZhouDoyleGlover1996]_, section 4.6.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> print(f"{fx.h2_norm(fx.StateSpace([[-2.0]], [[1.0]], [[1.0]], [[0.0]])):.3f}")
+    0.500
+    """
+    g = as_statespace(sys)
+    if obstacle(g) is not None or (not g.dt and g.n_states and np.any(g.D)):
+        return float("inf")
+    if not g.n_states:
+        return float(np.linalg.norm(g.D)) if g.dt else (float("inf") if np.any(g.D) else 0.0)
+    square, terms = _trace(g.C, controllability_gramian(g))
+    other, their = _trace(g.B.T, observability_gramian(g))
+    direct = float(np.sum(g.D**2)) if g.dt else 0.0
+    allowed = _SAME_NORM * (max(square, other) + direct) + ROUNDING * max(terms, their)
+    if not abs(square - other) <= allowed:
+        raise CertificateError(
+            f"the H2 norm of {g!r} is {np.sqrt(max(square, 0.0)):.9g} by the controllability "
+            f"Gramian and {np.sqrt(max(other, 0.0)):.9g} by the observability Gramian: a pole is "
+            "too close to the edge of stability for double precision. Check the least damped poles."
+        )
+    return float(np.sqrt(max(square + direct, 0.0)))
+
+
+def _trace(C: FloatArray, P: FloatArray) -> tuple[float, float]:
+    """Return ``trace(C P C')`` and the size of its terms before they cancel."""
+    deviation = np.abs(C) @ np.sqrt(np.maximum(P.diagonal(), 0.0))
+    return float(np.sum(C @ P * C)), float(np.sum(deviation**2))
+
+
+#: poles this close to the axis, relative to the size of A, are examined with their condition
+NEAR = 1e-6
+#: roundings of A that a pole is allowed to have suffered
+ROUNDINGS = 4.0
+#: largest condition of a pole: two in one are moved by the root of rounding
+DOUBLE = 1.0 / float(np.sqrt(np.finfo(float).eps))
+
+
+class Obstacle(NamedTuple):
+    """A pole that makes a norm infinite."""
+
+    reason: str
+    freq: float  # [Hz]
+
+
+def obstacle(
+    g: StateSpace, *, axis_only: bool = False, known: ComplexArray | None = None
+) -> Obstacle | None:
+    """Return the worst pole on or beyond the edge of stability (or on it alone), or None.
+
+    Computed poles are moved by rounding: those of a rigid body in dense A come out at some 1e-4
+    rad/s, on either side. A pole nearer to the edge than its own uncertainty (rounding of A times
+    the condition of the eigenvalue) counts as lying on it. Eigenvalues that are known are not
+    computed again.
+    """
+    if not g.n_states:
+        return None
+    poles, error = uncertain_poles(g, known)
+    growth = np.abs(poles) - 1.0 if g.dt else poles.real
+    on_axis = np.abs(growth) <= error
+    beyond = (growth > 0) & ~on_axis & (not axis_only)
+    if not (beyond | on_axis).any():
+        return None
+    worst = int(np.argmax(np.where(beyond if beyond.any() else on_axis, growth, -np.inf)))
+    pole, unsure = poles[worst], float(error[worst])
+    edge = "the unit circle" if g.dt else "the imaginary axis"
+    freq = float(abs(np.angle(pole) / g.dt if g.dt else pole.imag)) / (2 * np.pi)
+    if beyond[worst]:
+        return Obstacle(
+            f"unstable: a pole at {freq:.6g} Hz lies {growth[worst]:.3g}"
+            f"{'' if g.dt else ' rad/s'} beyond {edge}",
+            freq,
+        )
+    integrates = abs(pole - 1.0 if g.dt else pole) <= unsure
+    kind = "a rigid-body mode or integrator" if integrates else f"an undamped pole at {freq:.6g} Hz"
+    rounding = f" (to within its rounding, {unsure:.1g})" if unsure else ""
+    return Obstacle(f"marginal: {kind} lies on {edge}{rounding}", 0.0 if integrates else freq)
+
+
+def uncertain_poles(
+    g: StateSpace, known: ComplexArray | None = None
+) -> tuple[ComplexArray, FloatArray]:
+    """Return the poles and how far rounding may have moved each."""
+    poles = g.poles() if known is None else known
+    if g.blocks is not None and max(g.blocks) <= 2:
+        return poles, np.zeros(poles.size)  # closed form: as exact as A
+    d = state_scale(g.A, g.B, g.C)
+    A = g.A * d / d[:, None]
+    gap = np.abs(np.abs(poles) - 1.0 if g.dt else poles.real)
+    size = float(np.linalg.norm(A))  # at least the norm, which costs more
+    if np.any(gap <= NEAR * size):
+        size = float(np.linalg.norm(A, 2))
+    error = np.finfo(float).eps * size * np.ones(poles.size)
+    if not np.any(gap <= NEAR * size):
+        return poles, error
+    poles, _, error = eigenvalues_with_error(A)
+    return poles, error
+
+
+def eigenvalues_with_error(
+    A: FloatArray, largest: float = DOUBLE
+) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """Return eigenvalues, eigenvectors and how far rounding may have moved each eigenvalue.
+
+    In the units that LAPACK takes for A itself, in which the blocks of unlike speed that do not act
+    on each other do not spoil each other. Conditions count up to `largest`.
+    """
+    found: Any = la.eig(A, left=True, right=True)
+    values, left, right = found
+    d = even_scale(A)[:, None]
+    size = np.linalg.norm(left * d, axis=0) * np.linalg.norm(right / d, axis=0)
+    condition = size / np.maximum(np.abs(np.sum(left.conj() * right, axis=0)), size / largest)
+    rounding = ROUNDINGS * np.finfo(float).eps * float(np.linalg.norm(A * d.T / d, 2))
+    return (
+        np.asarray(values, dtype=np.complex128),
+        right.astype(np.complex128),
+        rounding * condition,
+    )
+
+
+LEVELS = 30
+#: how far above the largest gain of the feedthrough a level set is not lost in rounding
+CLEAR = 1e-7
+#: points across each resonance at first; parabolas from there on, each on an interval so much
+#: narrower: the last one is 1e-3 of a resonance wide, its error in the gain below 1e-10
+ACROSS, PARABOLAS, NARROWER = 9, 3, 8.0
+
+
+def level_set_peak(g: StateSpace, tolerance: float, bar: Progress) -> tuple[float, float]:
+    """Return the largest gain and its frequency [Hz] of a system without poles on the axis.
+
+    What a search finds is improved from the middles of the crossings of its level, until none is
+    left at (1 + tolerance) times it.
+    """
+    top = 0.5 / g.dt if g.dt else np.inf
+    find = _largest(responder(g))
+    gain, freq = _searched(g, find, top)
+    if not gain:
+        return 0.0, 0.0
+    level = _Level(g)
+    for _ in range(LEVELS):
+        bar.advance()
+        # just above the feedthrough the Hamiltonian matrix is nearly singular: a level more
+        close = gain <= (1 + CLEAR) * level.through
+        levels = (tolerance, CLEAR) if close else (tolerance,)
+        found = [level.crossings(gain * (1 + one)) for one in levels]
+        middles = np.concatenate([one for c in found for one in (c, 0.5 * (c[1:] + c[:-1]))])
+        middles = middles[middles < top]
+        gains = find(middles)
+        if not gains.size or gains.max() <= gain * (1 + tolerance):
+            return gain, freq
+        best = int(np.argmax(gains))
+        gain, freq = float(gains[best]), float(middles[best])
+    raise SolverError(
+        f"the level set of the H-infinity norm of {g!r} did not settle in {LEVELS} levels (last "
+        f"gain {gain:.9g} at {freq:.6g} Hz). Report this system."
+    )
+
+
+def _searched(
+    g: StateSpace, find: Callable[[FloatArray], FloatArray], top: float
+) -> tuple[float, float]:
+    """Return the largest gain that a zoom around every resonance finds, and its frequency [Hz]."""
+    poles = continuous_poles(g)
+    size, swing = np.abs(poles) / (2 * np.pi), np.abs(poles.imag) / (2 * np.pi)
+    width = np.minimum(np.abs(poles.real) / (2 * np.pi), size)
+    upper = poles.imag >= 0
+    centre = np.concatenate([[0.0], swing[upper], size[upper]])
+    half = np.concatenate([[0.0], 3 * width[upper], 0.7 * size[upper]])
+    # the peak of |H| lies at |s| (1 - 2 zeta^2)^(1/2), close to the pole; a few of them matter
+    first = find(np.minimum(centre, 0.999999 * top))
+    keep = np.argsort(first)[::-1][:12]
+    keep = keep[first[keep] >= 0.1 * first[keep[0]]]
+    centre, half = centre[keep], half[keep]
+    best_gain, best_freq = float(np.linalg.norm(g.D, 2)), np.inf
+    if g.dt:
+        best_gain, best_freq = float(np.linalg.norm(g.evaluated(-1.0), 2)), top
+    pattern, spacing = np.linspace(-1.0, 1.0, ACROSS), 2.0 * half / (ACROSS - 1)
+    end = min(top, 1e300)
+    reach = half
+    for _ in range(1 + PARABOLAS):
+        grid = np.clip(centre[:, None] + reach[:, None] * pattern, 0.0, end)
+        gains = find(grid.reshape(-1)).reshape(grid.shape)
+        peak, each = np.argmax(gains, axis=1), np.arange(grid.shape[0])
+        largest = gains[each, peak]
+        if largest.max() > best_gain:
+            where = int(np.argmax(largest))
+            best_gain, best_freq = float(largest[where]), float(grid[where, peak[where]])
+        # a resolved peak lies a few percent above its best point; the level set is the judge
+        close = largest >= 0.8 * largest.max()
+        inner = np.clip(peak, 1, grid.shape[1] - 2)
+        centre = np.array([_vertex(grid[i], gains[i], inner[i]) for i in each[close]])
+        spacing = spacing[close] / NARROWER
+        pattern, reach = np.array([-1.0, 0.0, 1.0]), spacing
+    centre = np.clip(centre, 0.0, end)
+    gains = find(centre)
+    where = int(np.argmax(gains))
+    if gains[where] > best_gain:
+        best_gain, best_freq = float(gains[where]), float(centre[where])
+    return best_gain, best_freq
+
+
+def _vertex(freq: FloatArray, gains: FloatArray, i: int) -> float:
+    """Return where 1 / gain^2, a parabola beside a resonance, is least; near point i.
+
+    The best of the three points where they are not on a parabola with a minimum.
+    """
+    best = float(freq[int(np.argmax(gains[i - 1 : i + 2])) + i - 1])
+    left, right = freq[i] - freq[i - 1], freq[i + 1] - freq[i]
+    if not (left > 0.0 and right > 0.0 and gains[i - 1 : i + 2].min() > 0.0):
+        return best
+    a, b, c = (gains[i] / gains[i - 1 : i + 2]) ** 2
+    down, up = (b - a) / left, (c - b) / right
+    if not up > down:
+        return best
+    # the slope of the parabola is (down + up) / 2 or so at point i, and grows to both sides
+    slope = (down * right + up * left) / (left + right)
+    step = -0.5 * slope * (left + right) / (up - down)
+    return float(freq[i] + min(max(step, -left), right))
+
+
+def _largest(respond: Responder) -> Callable[[FloatArray], FloatArray]:
+    """Return the function of frequency [Hz] that gives the largest singular values (n_freq,)."""
+
+    def find(freq: FloatArray) -> FloatArray:
+        if not freq.size:
+            return np.zeros(0)
+        H = np.moveaxis(respond(freq), 2, 0)
+        if 1 in H.shape[1:]:
+            return np.asarray(np.sqrt(np.sum(np.abs(H) ** 2, axis=(1, 2))))
+        return np.asarray(np.linalg.svd(H, compute_uv=False)[:, 0])
+
+    return find
+
+
+class _Level:
+    """The frequencies at which a singular value of a stable system equals a level."""
+
+    def __init__(self, g: StateSpace) -> None:
+        self.dt = g.dt
+        A, B, C, D = g.A, g.B, g.C, g.D
+        if g.dt:  # z = (1 + s) / (1 - s)
+            eye = np.eye(A.shape[0])
+            factor = la.lu_factor(A + eye)
+            inverse_B = la.lu_solve(factor, B)
+            A = la.lu_solve(factor, A - eye)
+            D = D - C @ inverse_B
+            C = np.sqrt(2.0) * la.lu_solve(factor, C.T, trans=1).T
+            B = np.sqrt(2.0) * inverse_B
+        self.A, self.B, self.C, self.D = A, B, C, D
+        self.through = float(np.linalg.norm(D, 2))
+
+    def crossings(self, gamma: float) -> FloatArray:
+        """Return the sorted frequencies [Hz] of eigenvalues on, or nearly on, the axis."""
+        root = np.sqrt(gamma)
+        A, B, C, D = self.A, self.B / root, self.C / root, self.D / gamma
+        # (gamma = 1) R = I - D'D, S = I - D D', through the singular values of D
+        U, d, Vh = np.linalg.svd(D, full_matrices=True)
+        gap_in, gap_out = np.ones(D.shape[1]), np.ones(D.shape[0])
+        gap_in[: d.size] = gap_out[: d.size] = (1 - d) * (1 + d)
+        BV, CU = B @ Vh.T, U.T @ C
+        mixed = np.zeros(D.T.shape)
+        mixed[np.arange(d.size), np.arange(d.size)] = d / gap_in[: d.size]
+        F = A + BV @ mixed @ CU
+        H = np.block([[F, (BV / gap_in) @ BV.T], [-(CU.T / gap_out) @ CU, -F.T]])
+        balanced = balanced_matrix(H)
+        values: ComplexArray = np.asarray(la.eigvals(balanced), dtype=np.complex128)
+        # eigenvalues that only seem to lie on the axis do no harm: the gain is computed there
+        near = np.abs(values.real) <= 1e-9 * np.linalg.norm(balanced)
+        swing = np.unique(np.abs(values.imag[near]))
+        if self.dt:
+            return np.asarray(np.arctan(swing) / (np.pi * self.dt))
+        return np.asarray(swing / (2 * np.pi))

@@ -13,14 +13,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.linalg as la
 
-from ..errors import ModelError, counted
+from ..errors import ModelError, SolverError, counted
+from ..parallel import one_thread
 from ..values import ComplexArray, FloatArray, Value, real_array
-from .doubling import Continuous, Discrete, RiccatiProblem, solved
-from .lyapunov import symmetric
+from .lyapunov import accumulated, doubled, scale_of, solve_continuous, symmetric
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -291,3 +292,301 @@ def _problem(
     C, cross = whitening @ C, cross @ whitening.T
     shift = cross * J
     return RiccatiProblem(A - shift @ C, C, Q - shift @ cross.T, J, shift, whitening)
+
+
+#: largest accepted relative residual, and last Newton correction, in states of unit variance
+RESIDUAL, CORRECTION = 1e-9, 1e-7
+#: doublings: a closed loop with 1 - radius above 2^-40 has converged by then
+DOUBLINGS = 50
+NEWTON_STEPS = 10
+
+
+class RiccatiProblem(NamedTuple):
+    """A problem with whitened outputs (R is J, a diagonal of signs) and no cross term."""
+
+    A: FloatArray
+    C: FloatArray
+    Q: FloatArray
+    J: FloatArray  # (p,) of +1 and -1
+    gain: FloatArray  # (n, p), what the cross term adds to the gain
+    whitening: FloatArray  # (p, p), whitened y = whitening y
+
+    @property
+    def G(self) -> FloatArray:
+        """Return ``C' J C``, the information that one measurement brings."""
+        return np.asarray((self.C.T * self.J) @ self.C)
+
+    def scaled(self, d: FloatArray) -> RiccatiProblem:
+        """Return the problem in states x / d."""
+        return self._replace(
+            A=self.A * d / d[:, None],
+            C=self.C * d,
+            Q=self.Q / d / d[:, None],
+            gain=self.gain / d[:, None],
+        )
+
+
+class Discrete:
+    """The steps of the solution for the discrete equation."""
+
+    equation = "discrete Riccati equation"
+
+    def start(self, p: RiccatiProblem) -> FloatArray:
+        """Return the first scale of the states, from accumulated noise and information."""
+        return _scale(accumulated(p.A, p.Q), accumulated(p.A.T, p.G))
+
+    def doubling(self, p: RiccatiProblem) -> tuple[FloatArray, int]:
+        """Return P and the number of doublings."""
+        return _doubling(p.A.T, p.G, p.Q)
+
+    def gain(self, p: RiccatiProblem, P: FloatArray) -> FloatArray:
+        """Return the gain K (n, p) that belongs to P."""
+        inner = (p.C @ P) @ p.C.T + np.diag(p.J)
+        return np.asarray(la.solve(inner, p.C @ P @ p.A.T, assume_a="sym").T)
+
+    def residual(self, p: RiccatiProblem, P: FloatArray, K: FloatArray) -> FloatArray:
+        """Return the residual of the equation, given the gain of P."""
+        # Joseph form: a sum of squares in P and J, so rounding stays relative to P
+        closed = p.A - K @ p.C
+        return np.asarray(closed @ P @ closed.T + (K * p.J) @ K.T + p.Q - P)
+
+    def correction(self, closed: FloatArray, residual: FloatArray) -> FloatArray:
+        """Return the Newton correction for a residual."""
+        return doubled(closed, residual)
+
+    def stable(self, poles: ComplexArray) -> bool:
+        """Return whether the closed loop is strictly stable."""
+        return bool(np.max(np.abs(poles), initial=0.0) < 1.0)
+
+    def slow(self, poles: ComplexArray) -> bool:
+        """Return whether the closed loop is so slow that its stability may be rounding."""
+        return bool(np.max(np.abs(poles)) > 0.99)
+
+    def relative(self, p: RiccatiProblem, residual: FloatArray, P: FloatArray) -> float:
+        """Return the size of a residual relative to the terms of the equation."""
+        return float(np.linalg.norm(residual) / (np.linalg.norm(P) or 1.0))
+
+    def defect(self, p: RiccatiProblem) -> str:
+        """Return which mode makes a stabilising solution impossible, or ""."""
+        return _defect(p, lambda s: np.abs(s) - 1.0, 1.0)
+
+
+class Continuous:
+    """The steps of the solution for the continuous equation."""
+
+    equation = "continuous Riccati equation"
+
+    def start(self, p: RiccatiProblem) -> FloatArray:
+        """Return the first scale of the states, from accumulated noise and information."""
+        A, Q, G, _ = self._cayley(p)
+        return _scale(accumulated(A.T, Q), accumulated(A, G))
+
+    def doubling(self, p: RiccatiProblem) -> tuple[FloatArray, int]:
+        """Return P and the number of doublings."""
+        A, Q, G, _ = self._cayley(p)
+        return _doubling(A, G, Q)
+
+    def _cayley(self, p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """Return the discrete (control form) problem of the same solution, and the shift."""
+        n = p.A.shape[0]
+        moduli = np.abs(la.eigvals(np.block([[p.A.T, -p.G], [-p.Q, -p.A]])))
+        typical = np.exp(np.mean(np.log(np.maximum(moduli, 1e-6 * np.max(moduli, initial=1e-300)))))
+        best: tuple[float, tuple[FloatArray, FloatArray, FloatArray, float]] | None = None
+        for factor in (1.0, 1.7, 0.6, 3.1, 0.33):
+            shift = float(typical * factor)
+            moved = p.A.T - shift * np.eye(n)
+            try:
+                inner = moved + p.G @ np.linalg.solve(moved.T, p.Q)
+                condition = float(np.linalg.cond(moved) * np.linalg.cond(inner))
+            except np.linalg.LinAlgError:
+                continue  # a pole lies at the shift: the next one misses it
+            if not np.isfinite(condition):
+                continue
+            if best is None or condition < best[0]:
+                inverse = np.linalg.inv(inner)
+                A = np.eye(n) + 2 * shift * inverse
+                G = 2 * shift * np.linalg.solve(moved, p.G) @ inverse.T
+                Q = 2 * shift * inverse.T @ p.Q @ np.linalg.inv(moved)
+                best = condition, (A, 0.5 * (Q + Q.T), 0.5 * (G + G.T), shift)
+            if best[0] < 1e8:
+                break
+        if best is None:
+            raise SolverError(
+                "continuous Riccati equation: no shift makes its Cayley transform regular, so it "
+                "has no stabilising solution. Is an unstable mode without input or output?"
+            )
+        return best[1]
+
+    def gain(self, p: RiccatiProblem, P: FloatArray) -> FloatArray:
+        """Return the gain K (n, p) that belongs to P."""
+        return np.asarray(P @ p.C.T * p.J)
+
+    def residual(self, p: RiccatiProblem, P: FloatArray, K: FloatArray) -> FloatArray:
+        """Return the residual of the equation, given the gain of P."""
+        closed = p.A - K @ p.C
+        return np.asarray(closed @ P + P @ closed.T + (K * p.J) @ K.T + p.Q)
+
+    def correction(self, closed: FloatArray, residual: FloatArray) -> FloatArray:
+        """Return the Newton correction for a residual."""
+        return solve_continuous(closed, residual)
+
+    def stable(self, poles: ComplexArray) -> bool:
+        """Return whether the closed loop is strictly stable."""
+        return bool(np.max(poles.real, initial=-np.inf) < 0.0)
+
+    def slow(self, poles: ComplexArray) -> bool:
+        """Return whether the closed loop is so slow that its stability may be rounding."""
+        return bool(np.max(poles.real) > -0.01 * np.max(np.abs(poles)))
+
+    def relative(self, p: RiccatiProblem, residual: FloatArray, P: FloatArray) -> float:
+        """Return the size of a residual relative to the terms of the equation."""
+        size = np.linalg.norm(p.A) * np.linalg.norm(P) + np.linalg.norm(p.Q)
+        return float(np.linalg.norm(residual) / (size or 1.0))
+
+    def defect(self, p: RiccatiProblem) -> str:
+        """Return which mode makes a stabilising solution impossible, or ""."""
+        return _defect(p, np.real, 0.0)
+
+
+class DoublingResult(NamedTuple):
+    """P, the gain on the caller's outputs, closed-loop poles, relative residual, iterations."""
+
+    P: FloatArray
+    gain: FloatArray
+    poles: ComplexArray
+    residual: float
+    iterations: int
+
+
+@one_thread()
+@np.errstate(over="ignore", invalid="ignore")
+def solved(problem: RiccatiProblem, kind: Discrete | Continuous) -> DoublingResult:
+    """Return the stabilising solution, scaled back."""
+    n = problem.A.shape[0]
+    if not n:
+        empty = np.zeros((0, problem.C.shape[0]))
+        return DoublingResult(np.zeros((0, 0)), empty, np.zeros(0, dtype=np.complex128), 0.0, 0)
+    d = kind.start(problem)
+    first = problem.scaled(d)
+    try:
+        P, doublings = kind.doubling(first)
+        # to unit variances: there residual and correction are relative
+        unit = scale_of(np.abs(P.diagonal()))
+        d, P = d * unit, P / unit / unit[:, None]
+        scaled = problem.scaled(d)
+        P, K, residual, steps = _newton(scaled, kind, P)
+    except (SolverError, np.linalg.LinAlgError) as error:
+        reason = kind.defect(first) or str(error)
+        raise SolverError(f"{kind.equation}: {reason}") from error
+    poles = np.asarray(la.eigvals(scaled.A - K @ scaled.C), dtype=np.complex128)
+    if not kind.stable(poles) or residual > RESIDUAL:
+        reason = kind.defect(first) or (
+            f"the residual is {residual:.1e} of P (allowed {RESIDUAL:.0e}), the closed loop is "
+            f"{'' if kind.stable(poles) else 'not '}strictly stable. The problem is too badly "
+            "conditioned for double precision."
+        )
+        raise SolverError(f"{kind.equation}: {reason}")
+    # noise that misses a rigid-body mode but for rounding gives a slow, meaningless loop
+    if kind.slow(poles) and (reason := kind.defect(first)):
+        raise SolverError(f"{kind.equation}: {reason}")
+    gain = ((K + scaled.gain) * d[:, None]) @ problem.whitening
+    return DoublingResult(P * d * d[:, None], gain, poles, residual, doublings + steps)
+
+
+def _doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, int]:
+    """Return X of ``X = A' X (I + G X)^-1 A + H`` by doubling; quadratic convergence."""
+    eye = np.eye(A.shape[0])
+    for k in range(1, DOUBLINGS + 1):
+        solved = np.linalg.solve(eye + G @ H, np.hstack([A, G]))
+        left, right = np.split(solved, 2, axis=1)
+        step = A.T @ H @ left
+        G = G + A @ right @ A.T
+        G, step = 0.5 * (G + G.T), 0.5 * (step + step.T)
+        H, A = H + step, A @ left
+        size = np.linalg.norm(H)
+        if not np.isfinite(size) or not np.isfinite(G).all():
+            raise SolverError("the doubling overflows: no stabilising solution was found.")
+        if np.linalg.norm(step) <= 1e-15 * size:
+            return H, k
+    raise SolverError(f"no convergence in {DOUBLINGS} doublings: no stabilising solution.")
+
+
+def _newton(
+    p: RiccatiProblem, kind: Discrete | Continuous, P: FloatArray
+) -> tuple[FloatArray, FloatArray, float, int]:
+    """Correct P by Newton (Kleinman) steps until the correction is rounding."""
+    last = np.inf
+    for taken in range(1, NEWTON_STEPS + 1):  # noqa: B007 - its last value is returned
+        K = kind.gain(p, P)
+        change = kind.correction(p.A - K @ p.C, kind.residual(p, P, K))
+        size = float(np.linalg.norm(change) / np.linalg.norm(P)) if np.any(P) else 0.0
+        # far from the solution the second step may be the larger one: the first one is arbitrary
+        if size < last or last > CORRECTION:
+            P = 0.5 * (P + change + (P + change).T)
+        if size < 1e-11 or (size >= 0.5 * last and last < CORRECTION):
+            break
+        last = min(size, last)
+    else:
+        raise SolverError(
+            f"the solution is determined to {last:.1e} only (Newton steps stall there): a mode is "
+            "hardly excited by Q, or hardly seen in the outputs."
+        )
+    K = kind.gain(p, P)
+    return P, K, kind.relative(p, kind.residual(p, P, K), P), taken
+
+
+def _scale(states: FloatArray, information: FloatArray) -> FloatArray:
+    """Return d for which noise and information have equal size in x / d."""
+    variance = np.where(
+        (states > 0) & (information > 0),
+        np.sqrt(states) / np.sqrt(np.where(information > 0, information, 1.0)),
+        np.where(states > 0, states, 1.0 / np.where(information > 0, information, 1.0)),
+    )
+    return scale_of(variance)
+
+
+def _defect(
+    p: RiccatiProblem, growth: Callable[[ComplexArray], FloatArray], marginal: float
+) -> str:
+    """Return why no strictly stabilising solution exists, or "" (Popov-Belevitch-Hautus)."""
+    lam = la.eigvals(p.A).astype(np.complex128)
+    size = max(1.0 if marginal else 0.0, float(np.max(np.abs(lam), initial=0.0)))
+    critical = lam[growth(lam) >= -1e-9 * size]
+    # a Jordan block of a rigid-body mode comes out of eigvals at the root of the rounding
+    near = np.abs(critical - marginal) < 1e-6 * size
+    distinct = [complex(marginal)] if near.any() else []
+    for value in critical[~near]:
+        if all(abs(value - seen) > 1e-6 * size for seen in distinct):
+            distinct.append(complex(value))
+    for value in distinct:
+        shifted = p.A - value * np.eye(p.A.shape[0])
+        missed = _unseen(shifted, p.G)
+        if missed:
+            return (
+                f"{missed} mode(s) of A at {value:.6g} (rigid-body or unstable) cannot be seen in "
+                "the outputs (reached by the inputs, in the control form), so their error is "
+                "unbounded. Add or move sensors (actuators)."
+            )
+        missed = _unseen(shifted.conj().T, p.Q) if growth(np.array(value)) < 1e-6 * size else 0
+        if missed:
+            return (
+                f"{missed} mode(s) of A at {value:.6g} (rigid-body) are not excited by the noise Q "
+                "(of the cost, in the control form), so the stationary closed loop is not strictly "
+                "stable. Add a disturbance that moves them."
+            )
+    return ""
+
+
+def _unseen(shifted: ComplexArray, weight: FloatArray) -> int:
+    """Return how many directions of the null space of `shifted` the quadratic form misses."""
+    _, sizes, right = la.svd(shifted)
+    null = right[sizes < 1e-9 * max(1.0, float(sizes[0]))].conj().T
+    if not null.size:
+        return 0
+    form = null.conj().T @ weight @ null
+    spread = np.sqrt(np.abs(form.diagonal().real))
+    if np.any(spread == 0):
+        return int(np.count_nonzero(spread == 0))
+    values = la.eigvalsh(form / spread / spread[:, None])
+    # as a covariance: 3e-7 of an amplitude; below that it is rounding
+    return int(np.count_nonzero(np.abs(values) < 1e-13))

@@ -2,35 +2,139 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..errors import ModelError, counted
+from ..errors import ModelError, ShapeError, counted
 from ..values import (
     ComplexArray,
     FloatArray,
     IntArray,
+    Value,
     known_units,
     positive,
     real_array,
+    short,
     signal_names,
 )
-from .channels import Channels, chosen_pair, rows_of
-from .direct import direct_gain
-from .foreign import foreign_fields
-from .joining import block_eigenvalues, checked_blocks, short_list
-from .system_arithmetic import SystemArithmetic
+from .joining import (
+    Channels,
+    block_eigenvalues,
+    checked_blocks,
+    chosen_pair,
+    in_parallel,
+    in_series,
+    rows_of,
+    short_list,
+)
+from .sections import matrix_fields, tf_fields, zpk_fields
 from .zeros import invariant_zeros
 
 if TYPE_CHECKING:
     import control
     from scipy import signal
+
+
+class SystemArithmetic(Value):
+    """What `StateSpace` calculates with: systems of any kind and numbers."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+    #: arrays leave `2.0 * g` with a numpy number to this class
+    __array_ufunc__ = None
+
+    @abstractmethod
+    def _like(self, other: Any) -> Self:
+        """Return another system, of python-control say, as one of this class."""
+
+    def _direct(self, value: Any) -> FloatArray:
+        """Return a number or a matrix that is added to D; of several channels it is a matrix."""
+        found = real_array(value, "what is added to a system")
+        if found.shape != self.D.shape and (found.ndim or self.D.shape != (1, 1)):
+            raise ModelError(
+                f"what is added to a system of shape {self.D.shape} is a system or a matrix of "
+                f"that shape, got {short(value)}. For I + L add np.eye({self.D.shape[0]})."
+            )
+        return found
+
+    def __neg__(self) -> Self:
+        """Return the system with its outputs negated."""
+        return self.replace(C=-self.C, D=-self.D)
+
+    def __add__(self, other: Any) -> Self:
+        """Return `parallel(self, other)`: same channels, outputs added; a number adds to D."""
+        if isinstance(other, Mapping):  # an Frf, which is computed line by line
+            return NotImplemented
+        if isinstance(other, int | float | np.number | np.ndarray):
+            return self.replace(D=self.D + self._direct(other))
+        return type(self)(**in_parallel(self, self._like(other)))
+
+    def __radd__(self, other: Any) -> Self:
+        """Return `self + other`: ``1 + L``."""
+        found: Self = self + other
+        return found
+
+    def __rsub__(self, other: Any) -> Self:
+        """Return `-self + other`: ``1 - S``."""
+        found: Self = -self + other
+        return found
+
+    def __sub__(self, other: Any) -> Self:
+        """Return self + (-other): same channels, outputs subtracted."""
+        if isinstance(other, Mapping):
+            return NotImplemented
+        numeric = isinstance(other, int | float | np.number | np.ndarray)
+        return self + (-other if numeric else -self._like(other))
+
+    def __mul__(self, other: Any) -> Self:
+        """Return `series(other, self)`, as transfer functions multiply; a number scales outputs."""
+        if isinstance(other, int | float | np.number):
+            factor = float(real_array(other, "the factor", ()))
+            return self.replace(C=factor * self.C, D=factor * self.D)
+        if isinstance(other, Mapping):
+            return NotImplemented
+        return type(self)(**in_series(self._like(other), self))
+
+    def __rmul__(self, other: float) -> Self:
+        """Return the system with its outputs times a number."""
+        return self * other if isinstance(other, int | float | np.number) else NotImplemented
+
+    def __rtruediv__(self, other: float) -> Self:
+        """Return a number times the inverse of the system: ``1 / (1 + L)``.
+
+        From ``y = C x + D u``: ``u = D^-1 (y - C x)``.
+        """
+        D = self.D
+        if D.shape[0] != D.shape[1] or np.linalg.matrix_rank(D) < D.shape[0]:
+            raise ModelError(
+                "the inverse of this system differentiates: its D is not invertible, as of all "
+                "plants. For 1 / (1 + L) write the brackets; for S and T see lti.feedback."
+            )
+        inverse = np.linalg.inv(D)
+        B, C = self.B @ inverse, -inverse @ self.C
+        found = self.replace(
+            A=self.A - B @ self.C, B=B, C=C, D=inverse, inputs=self.outputs, outputs=self.inputs
+        )
+        return found * other
+
+    def __truediv__(self, other: float) -> Self:
+        """Return the system with its outputs divided by a number."""
+        divisor = float(real_array(other, "the divisor", ()))
+        if not divisor:
+            raise ModelError("a system is divided by a number other than 0: pass one.")
+        return self * (1.0 / divisor)
+
 
 #: what functions of systems accept: ours, or one of python-control or SciPy
 System: TypeAlias = "StateSpace | control.StateSpace | control.TransferFunction | signal.lti"
@@ -353,3 +457,59 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
             )
         return inner
     return StateSpace.from_control(sys)
+
+
+def direct_gain(D: Any, B: Any, C: Any) -> FloatArray:
+    """Return D (p, m) of a system with inputs B and outputs C; the number 0 stands for zeros."""
+    if np.ndim(D):
+        return real_array(D, "D", (None, None))
+    (m,) = real_array(B, "B", (None, None)).shape[1:]
+    p = len(real_array(C, "C", (None, None)))
+    if real_array(D, "D", ()) != 0:
+        raise ShapeError(
+            f"D is the gain from {m} inputs to {p} outputs, an array of shape ({p}, {m}); got the "
+            f"number {D:g}. Pass that array, or 0 where no input acts on an output directly."
+        )
+    return np.zeros((p, m))
+
+
+def foreign_fields(sys: Any) -> dict[str, Any]:
+    """Return the fields of a `StateSpace` that a system of python-control or SciPy has.
+
+    A transfer function becomes sections in series (`tf_fields`), each channel of a matrix with
+    states of its own: `minimal` removes what they share.
+    """
+    dt = _sampling_time(sys)
+    if all(hasattr(sys, part) for part in ("A", "B", "C", "D")):
+        fields = {part: getattr(sys, part) for part in ("A", "B", "C", "D")}
+    elif all(hasattr(sys, part) for part in ("zeros", "poles", "gain")):
+        fields = zpk_fields(sys.zeros, sys.poles, sys.gain, dt)
+    elif hasattr(sys, "input_labels"):
+        fields = matrix_fields(
+            [
+                [tf_fields(*pair, dt) for pair in zip(*row, strict=True)]
+                for row in zip(sys.num, sys.den, strict=True)
+            ]
+        )
+    else:
+        fields = tf_fields(sys.num, sys.den, dt)
+    named = {"inputs": "input_labels", "outputs": "output_labels", "states": "state_labels"}
+    labels = {ours: getattr(sys, theirs) for ours, theirs in named.items() if hasattr(sys, theirs)}
+    return {**fields, **labels, "dt": dt, "name": getattr(sys, "name", None)}
+
+
+def _sampling_time(sys: Any) -> float:
+    matrices, ratio = (hasattr(sys, "A") and hasattr(sys, "B")), hasattr(sys, "den")
+    if not (hasattr(sys, "dt") and (matrices or ratio or hasattr(sys, "gain"))):
+        raise ModelError(
+            f"need a system of flexplant, python-control or SciPy, got {type(sys).__name__}. "
+            "Make one: StateSpace(A, B, C, D), fx.lti.tf(num, den), control.ss(...)."
+        )
+    if sys.dt is None and type(sys).__module__.startswith("scipy"):
+        return 0.0  # SciPy's sign of continuous time
+    if sys.dt is None or sys.dt is True:
+        raise ModelError(
+            f"the sampling time of {getattr(sys, 'name', sys)!r} is {sys.dt}: state it in seconds "
+            "(0 for continuous time), frequencies depend on it."
+        )
+    return float(sys.dt)

@@ -10,14 +10,14 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..errors import ModelError, SolverError, counted
-from ..sparse.complex_symmetric import ComplexSymmetricFactor
 from ..sparse.factor import DENSE_LIMIT, dense
-from ..sparse.orthonormal import beyond
+from ..sparse.multifrontal import ComplexSymmetricFactor
+from ..sparse.rayleigh_ritz import beyond
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping, Rayleigh
-from ..structure.negative_stiffness import signed_root, unstable_stiffness
+from ..structure.definite import signed_root, unstable_stiffness
 from ..values import ComplexArray, FloatArray
 from .attachment_vectors import static_response
-from .damper_forces import damper_forces
+from .damped_modes import damper_forces
 from .modes import Modes
 from .shifted import StiffnessFactor, dissection_of, held_factor
 

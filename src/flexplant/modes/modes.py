@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet, Place
-from ..structure.negative_stiffness import signed_square
+from ..structure.definite import signed_square
 from ..structure.placed import Placed, missed
 from ..values import ComplexArray, FloatArray, IntArray, Value, real_array
 

@@ -15,8 +15,8 @@ from ..sparse.multifrontal import MultifrontalCholesky
 from ..sparse.ordering import Dissection, dissect
 from ..sparse.pardiso import Pardiso, PardisoCholesky
 from ..sparse.rayleigh_ritz import rounding_of
+from ..structure.definite import unstable_stiffness
 from ..structure.model import FEModel
-from ..structure.negative_stiffness import unstable_stiffness
 from ..values import FloatArray
 
 #: the shift, in roundings of the energies of rigid-body motions: far below the first elastic mode

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
+import scipy.linalg as la
 
-from ..errors import ModelError, SolverError
-from ..parallel import one_thread
+from ..errors import ModelError, SolverError, counted
+from ..parallel import one_thread, tick
 from ..sparse.factor import by_rows
-from ..sparse.lanczos import BLOCK, REACHED, SAME, BlockLanczos, iterated
+from ..sparse.lanczos import BLOCK, REACHED, SAME, STEPS, BlockLanczos, along_basis, iterated
 from ..sparse.pardiso import Pardiso
-from ..sparse.rayleigh_ritz import Absolute, column_groups, rayleigh_ritz, rounding_of
+from ..sparse.rayleigh_ritz import SPREAD, Absolute, column_groups, rayleigh_ritz, rounding_of
+from ..structure.definite import are_rigid
 from ..structure.eigen import check_stiffness
 from ..structure.model import FEModel
-from ..structure.negative_stiffness import are_rigid
-from ..values import FloatArray, Rng
-from .davidson import BlockDavidson
+from ..values import FloatArray, IntArray, Matrix, Rng
 from .shifted import (
     CountingFactor,
     StiffnessFactor,
@@ -278,3 +279,119 @@ def _gap_below(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[i
     before = max(float(squares[first - 1]), 0.0) if first else 0.0
     apart = squares[first] - before > closest and first < count
     return first, 0.5 * (before + float(squares[first])) if apart else 0.0
+
+
+#: steps with M times the last block in place of residuals
+_FIRST = 10
+#: residual, relative to ||K phi||, at which a value is known: its error is of the second order
+_VALUE = 1e-5
+#: residual below which the limit of a shape is computed
+_NEAR = 1e-8
+#: shapes that are improved at a time: a pass over the factor costs little more for more of them
+_IMPROVED = 24
+#: steps before giving up, beyond one for each mode
+_STEPS = 40
+#: after so many steps modes must not be lower than this part of -sigma (where it is below zero),
+#: to converge fast
+_EARLY, _FAR = 12, 0.1
+
+
+class BlockDavidson(BlockLanczos):
+    """The lowest modes by corrections ``P (K phi - omega^2 M phi)``, P near ``(K - sigma M)^-1``.
+
+    The basis of Lanczos, but extended by corrections of its Ritz vectors: P may be in error, since
+    the residuals are those of K and M [MorganScott1986]_.
+    """
+
+    def __init__(
+        self,
+        solve: Callable[[FloatArray], FloatArray],
+        K: Matrix,
+        M: Matrix,
+        sigma: float,
+        locked: FloatArray,
+        *,
+        want: int,
+        rng: Rng = 0,
+        start: FloatArray | None = None,
+    ) -> None:
+        super().__init__(solve, M, locked, want=want, rng=rng, start=start)
+        self._K, self._sigma = by_rows(K), sigma
+        # until errors of P show, the steps of Lanczos do as well and cost less
+        for _ in range(_FIRST):
+            if self._loaded.shape[1]:
+                self._extend(self._loaded)
+
+    def modes(
+        self, count: int, extra: int, needed: Callable[[FloatArray], FloatArray]
+    ) -> FloatArray:
+        """Return the lowest shapes (n, count), the last `extra` of them for their values only.
+
+        `needed` says of shapes (n, m) which residuals (m,), relative to ``||K phi||``, they may
+        leave.
+        """
+        found = np.zeros(count, dtype=bool)
+        self._limit, self._left = np.zeros(count), np.full(count, np.inf)
+        for _ in range(_STEPS + count):
+            squares, mix = la.eigh(self._T)
+            if self.steps > _EARLY and squares[:count][-1] < -_FAR * self._sigma:
+                break
+            at = np.flatnonzero(~found[: self._m])[:_IMPROVED]
+            residual, found[at] = self._residuals(squares, mix, at, needed)
+            # a shape is as good as those of the same value: they may be mixed
+            last = squares[:count][-extra - 1] * (1 + SPREAD)
+            shapes = int(np.searchsorted(squares[:count], last, side="right"))
+            if np.all(found[:shapes]) and np.all(self._left <= _VALUE):
+                # all of them once more: a mode found late moves those above it
+                at = np.arange(count)
+                self._limit[:], self._left[:] = 0.0, np.inf
+                residual, found = self._residuals(squares, mix, at, needed)
+                if np.all(found[:shapes]) and np.all(self._left <= _VALUE):
+                    return self._shapes(mix[:, :count])
+            unfinished = residual[:, ~found[at]][:, :_IMPROVED]
+            if not unfinished.shape[1]:
+                continue
+            if self._r + self._m + _IMPROVED > self._capacity:
+                self._restart(squares, mix, max(count + self._block, 2 * self._m // 3))
+            self._extend(unfinished)
+        raise SolverError(
+            f"{counted(count, 'mode')} did not converge in {self.steps} steps of a Davidson "
+            "iteration: its preconditioner is too far from the inverse of K - sigma M."
+        )
+
+    def _extend(self, forces: FloatArray) -> None:
+        """Add ``P forces`` to the basis."""
+        moved = self._solve(forces)
+        block, self._loaded, _ = self._orthonormal(moved / np.linalg.norm(moved, axis=0))
+        width = block.shape[1]
+        if not width:
+            raise SolverError("the corrections of a Davidson iteration bring nothing new.")
+        self._append(block)
+        along = along_basis(self._V[self._r : self._r + self._m], np.asarray(self._K @ block))
+        grown = np.zeros((self._m, self._m))
+        grown[:-width, :-width] = self._T
+        grown[:, -width:] = along
+        grown[-width:, :] = along.T
+        self._T = grown
+        self.steps += 1
+        tick(STEPS)
+
+    def _residuals(
+        self,
+        squares: FloatArray,
+        mix: FloatArray,
+        at: IntArray,
+        needed: Callable[[FloatArray], FloatArray],
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return ``K phi - omega^2 M phi`` of some shapes, and which of them are found."""
+        phi = self._shapes(mix[:, at])
+        force = np.asarray(self._K @ phi)
+        size = np.linalg.norm(force, axis=0)
+        force -= np.asarray(self._M @ phi) * squares[at]
+        left = np.linalg.norm(force, axis=0) / size
+        near = left < _NEAR
+        new = np.flatnonzero(near & (self._limit[at] == 0))
+        if new.size:
+            self._limit[at[new]] = needed(phi[:, new])
+        self._left[at] = left
+        return force, near & (left <= self._limit[at])

@@ -13,9 +13,9 @@ from ..errors import ModelError, warn
 from ..parallel import Progress
 from ..values import FloatArray, positive, whole
 from ..work import Work
-from .branch import Branch, Groups
 from .exchange import best_start
 from .problem import Found, Problem, Search
+from .rows import Branch, Groups
 from .tangent import Convex
 
 #: branches that are opened in one round, on an executor or not: results do not depend on it

@@ -2,16 +2,49 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from ..errors import LabelError, ModelError
-from ..values import FloatArray, name_list, one_of, positive, real_array, short
-from .candidate_places import Places
-from .constraint import Constraint, limits
+from ..values import FloatArray, Value, name_list, one_of, positive, real_array, short, whole
+from .candidates import Places, Zone
 from .rows import LinearRows
+
+
+class Constraint(Value):
+    """The base of all constraints: a new one defines `rows`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> isinstance(fx.placement.MinimumDistance(0.1), fx.placement.Constraint)
+    True
+    """
+
+    @abstractmethod
+    def rows(self, places: Places) -> LinearRows:
+        """Return linear rows in x, which is 1 for chosen candidates and 0 for others."""
+
+    def drawn(self, places: Places) -> tuple[Zone, ...]:
+        """Return zones without candidates, seen from above, for pictures."""
+        return ()
+
+
+def limits(at_least: Any, at_most: Any) -> tuple[int | None, int | None]:
+    """Return two counts, checked; None where there is no limit."""
+    low, high = (
+        None if n is None else whole(n, name, minimum=0)
+        for n, name in ((at_least, "at_least"), (at_most, "at_most"))
+    )
+    if low is not None and high is not None and low > high:
+        raise ModelError(
+            f"at_least {low} is above at_most {high}: no choice is both. Exchange them."
+        )
+    return low, high
 
 
 @dataclass(frozen=True, eq=False)

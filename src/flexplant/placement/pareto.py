@@ -13,9 +13,8 @@ from ..errors import InfeasibleError, ModelError
 from ..plant import Actuator, StandardPlant
 from ..values import FloatArray, Rng, Value, positive, real_array, short
 from .candidates import checked_plant
-from .constraint import Constraint
 from .criterion import Criterion, in_words
-from .groups import Budget
+from .groups import Budget, Constraint
 from .placement import Placement
 from .problem import Search
 from .search import place_actuators, place_sensors

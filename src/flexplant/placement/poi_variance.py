@@ -12,7 +12,7 @@ from ..errors import AssumptionError, ModelError
 from ..estimation import Filter, FixedLag, KalmanEstimator, Predictor, design_kalman
 from ..modes import Modes
 from ..plant import StandardPlant, larger_plant
-from ..plant.ground import followed
+from ..plant.dynamics import followed
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..values import FloatArray, flag, one_of, short

@@ -13,10 +13,8 @@ import numpy as np
 
 from ..values import FloatArray, Value
 from ..work import Work
-from .branch import Branch
-from .layouts import Layouts
-from .rigid_part import WEAK
-from .rows import LinearRows
+from .layouts import WEAK, Layouts
+from .rows import Branch, LinearRows
 from .tangent import Convex
 
 #: draws of an admissible choice until one sees every rigid-body mode

@@ -13,7 +13,7 @@ from ..plant import StandardPlant
 from ..values import FloatArray, one_of, short
 from .candidates import SIDES, Port, checked_plant, side_of, sides_of, with_side
 from .criterion import Scorer, Wrapping
-from .rigid_part import RigidPart
+from .layouts import RigidPart
 
 _MEASURES = ("worst", "mean")
 

@@ -4,24 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import InfeasibleError, ModelError
+from ..errors import InfeasibleError, LabelError, ModelError, counted, require_known
 from ..fingerprint import fingerprint
 from ..plant import StandardPlant
-from ..values import Rng, instance, short
+from ..values import Rng, instance, name_list, short, whole
 from ..work import Work
-from .candidates import checked_plant
-from .constraint import Constraint
+from .candidates import Port, checked_plant, known_candidates, places_of, side_of
+from .closed_loop_h2 import Separation
 from .criterion import Criterion
 from .exchange import Exchange
-from .exhaustive import Exhaustive
+from .groups import Constraint
+from .layouts import layouts_of
 from .placement import Placement
-from .problem import Search
-from .task import problem_of
+from .problem import Found, Problem, Search
+from .rows import LinearRows
+from .zones import rows_of
 
 #: up to here every subset is scored when no method is given: it takes seconds, and proves it
 _FEW = 1500
@@ -286,3 +289,135 @@ def _placed(
         found.stopped,
         layouts.criterion.unit(plant),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Exhaustive(Search):
+    """Every subset: the optimum, proven.
+
+    Parameters
+    ----------
+    limit : int
+        More subsets than this are refused.
+
+    Raises
+    ------
+    ModelError
+        When limit is no whole number of at least 1.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> fx.place_sensors(plant, candidates, 1, method=fx.placement.Exhaustive()).proven
+    True
+    """
+
+    limit: int = 200_000
+
+    def __post_init__(self) -> None:
+        self._set(limit=whole(self.limit, "limit"))
+
+    def search(self, problem: Problem, work: Work) -> Found:
+        """Return the best of all subsets; see `Search.search`. Nothing is random.
+
+        Raises
+        ------
+        ModelError
+            When there are more subsets than `limit`.
+        """
+        if problem.subsets > self.limit:
+            raise ModelError(
+                f"there are {counted(problem.subsets, 'subset')}, more than "
+                f"Exhaustive(limit={self.limit}) allows. Use Exchange(), whose bound shows how far "
+                "from the optimum it can be, or a higher limit."
+            )
+        sets = list(problem.choices())
+        values = problem.layouts.scores(sets, work, "every subset")
+        best = int(np.argmin(values))
+        value = float(values[best])
+        return Found(sets[best], value, value, len(sets), ((value,),))
+
+
+def problem_of(
+    plant: StandardPlant,
+    wanted: Mapping[str, tuple[Sequence[Any], int]],
+    criterion: Any,
+    required: Sequence[str],
+    constraints: Sequence[Constraint],
+) -> Problem:
+    """Return the problem of choosing so many candidates of each side, with everything checked."""
+    listed = {side: _listed(plant, side, given) for side, (given, _) in wanted.items()}
+    ports = tuple(port for part in listed.values() for port in part)
+    names = [port.name for port in ports]
+    if len(set(names)) < len(names):
+        raise LabelError("a sensor and an actuator have the same name: rename one.")
+    kept = _required(names, required)
+    counts = {
+        side: whole(count, "count", maximum=max(len(listed[side]), 1))
+        for side, (_, count) in wanted.items()
+    }
+    _check_counts(counts, [ports[i] for i in kept])
+    side: Any = "".join(wanted)
+    layouts = layouts_of(plant, side, ports, criterion)
+    layouts.require_any()
+    rows = rows_of(constraints, places_of(plant, ports), side)
+    if len(wanted) > 1:
+        rows = rows.and_(_shares(ports, counts))
+        if isinstance(layouts.scorer, Separation):
+            numbers = (counts["y"], counts["u"])
+            layouts = replace(layouts, scorer=replace(layouts.scorer, counts=numbers))
+    problem = Problem(layouts, sum(counts.values()), rows.with_partners(kept), rows)
+    _require_start(problem, constraints, [names[i] for i in kept])
+    return problem
+
+
+def _listed(plant: StandardPlant, side: str, given: Sequence[Any]) -> tuple[Port, ...]:
+    ports = tuple(known_candidates(plant, side, given).values())
+    if not ports:
+        raise ModelError("there are no candidates: pass a list of at least one to choose from.")
+    if len(ports) != len(tuple(given)):
+        raise LabelError("a candidate is listed twice: each may be chosen once.")
+    return ports
+
+
+def _check_counts(counts: Mapping[str, int], kept: Sequence[Port]) -> None:
+    for side, count in counts.items():
+        needed = sum(side_of(port) == side for port in kept)
+        if needed > count:
+            raise ModelError(f"count is {count}, and {needed} candidates are required.")
+
+
+def _shares(ports: Sequence[Port], counts: Mapping[str, int]) -> LinearRows:
+    """Return the rows by which so many of each side are chosen."""
+    A = np.array([[side_of(port) == side for port in ports] for side in counts], dtype=np.float64)
+    exact = np.array(list(counts.values()), dtype=np.float64)
+    return LinearRows(A, exact, exact)
+
+
+def _require_start(
+    problem: Problem, constraints: Sequence[Constraint], required: Sequence[str]
+) -> None:
+    """Raise InfeasibleError when there is no choice to begin with."""
+    layouts = problem.layouts
+    first = problem.start(None) if len(problem.required) <= problem.count else ()
+    what = f"no choice of {problem.count} of the {problem.total} candidates"
+    if not first and problem.rows.A.size:
+        given = ", ".join(map(repr, constraints)) or "OffPoi()"
+        together = f" together with the required {', '.join(required)}" if required else ""
+        raise InfeasibleError(
+            f"{what} satisfies the constraints {given:.300}{together:.200}. Relax a constraint, "
+            "require others, or give more candidates."
+        )
+    if layouts.missing(first):
+        raise InfeasibleError(
+            f"{what} will do; of the nearest one: {layouts.reason(first)} Choose more, or require "
+            "others."
+        )
+
+
+def _required(names: Sequence[str], required: Sequence[str]) -> tuple[int, ...]:
+    listed = name_list(required, "required candidates")
+    require_known("required candidate", listed, names)
+    return tuple(sorted({names.index(name) for name in listed}))

@@ -15,10 +15,9 @@ from ..plant.ports import Quantity
 from ..structure import Disc, Rectangle
 from ..values import FloatArray, Value, positive, real_array
 from ..work import Work
-from .candidate_places import places_of
-from .candidates import checked_plant
-from .constraint import Constraint
+from .candidates import checked_plant, places_of
 from .criterion import Criterion, in_words
+from .groups import Constraint
 from .layouts import layouts_of
 from .zones import all_of, rows_of
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..values import FloatArray
-from .branch import Branch, ascended
 from .criterion import Scorer
+from .rows import Branch, ascended
 from .tangent import Below, Convex
 
 MEASURES = ("trace", "log det", "least")

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..errors import SolverError
 from ..values import FloatArray
-from .branch import Branch, ascended
 from .criterion import Scorer
+from .rows import Branch, ascended
 
 #: steps in the weights on one tangent, and the relative gap at which they stop
 _STEPS, _GAP = 40, 1e-3

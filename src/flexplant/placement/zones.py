@@ -11,8 +11,8 @@ import numpy as np
 from ..errors import ModelError
 from ..structure import Disc
 from ..values import positive, real_array, short
-from .candidate_places import Places, Zone
-from .constraint import Constraint, limits
+from .candidates import Places, Zone
+from .groups import Constraint, limits
 from .rows import LinearRows
 
 

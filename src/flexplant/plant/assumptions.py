@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+import scipy.linalg as la
+
 from ..errors import AssumptionError, unknown_label
-from ..values import Value
-from .aliased_modes import aliased_modes
-from .assumption import Assumption
+from ..lti.discretisation import block_diagonal
+from ..values import ComplexArray, FloatArray, Value
 from .partition import Partition
-from .rank_conditions import full_ranks, no_zeros
-from .reach_and_sight import reach_and_sight
-from .visibility import WEAK, ModeVisibility, mode_visibility
+from .reach_and_sight import Assumption, full_ranks, no_zeros, reach_and_sight, response_at
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -121,3 +122,186 @@ def _lines(items: tuple[Assumption, ...]) -> list[str]:
         + (f" {item.remedy}" if item.remedy else "")
         for item in items
     ]
+
+
+#: modes that are named
+_SHOWN = 3
+
+
+def aliased_modes(plant: Partition) -> str:
+    """Return, in words, which elastic modes of a sampled plant are not below half its rate.
+
+    A mode at f looks like one at ``|f - m rate|``, m whole, in its samples: a controller of that
+    rate cannot distinguish them. Empty when there are none.
+    """
+    if not plant.dt or not plant.is_assembled:
+        return ""
+    rate = 1.0 / plant.dt
+    count = plant.assembled.realisation.n_modes
+    freq = np.sqrt(np.maximum(np.linalg.det(plant.modal_blocks[:count]), 0.0)) / (2 * np.pi)
+    above = np.flatnonzero(freq >= 0.5 * rate * (1 - 1e-9))
+    if not above.size:
+        return ""
+    seen = np.round(np.abs(freq - rate * np.round(freq / rate)) / rate, 9) * rate
+    named = [f"mode {i + 1} ({freq[i]:.4g} Hz) looks like {seen[i]:.4g} Hz" for i in above[:_SHOWN]]
+    more = above.size - len(named)
+    return (
+        f"not below half the sampling rate of {rate:g} Hz: {', '.join(named)}"
+        + (f", and {more} more" if more else "")
+        + " in its samples"
+    )
+
+
+#: a mode reached or seen less than this, beside the channel's strongest mode, is called weak
+WEAK = 0.01
+_VERBS = {"w": "excites", "u": "reaches", "y": "sees", "z": "sees"}
+
+
+@dataclass(frozen=True, eq=False)
+class ModeVisibility(Value):
+    """How well w excites, u reaches, y and z see an elastic mode.
+
+    Where damping couples the modes (`plant.form` is dense) it is an undamped mode, with its own
+    part of the damping.
+
+    Parameters
+    ----------
+    mode : int
+        Number, from 1, rigid-body modes included.
+    freq : float [Hz]
+        Frequency.
+    zeta : float
+        Damping ratio.
+    shares : mapping {"w", "u", "y", "z": float}
+        The best channel's modal force per unit force (or modal displacement per unit motion)
+        beside that of the elastic mode where this channel is strongest: 1 at best, 0 at a node.
+    channels : mapping {"w", "u", "y", "z": str}
+        That channel.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.testbeds.three_masses().check().modes
+    >>> [round(mode.freq, 1) for mode in modes]
+    [100.7, 174.3]
+    """
+
+    mode: int
+    freq: float
+    zeta: float
+    shares: dict[str, float]
+    channels: dict[str, str]
+
+    @property
+    def weak(self) -> tuple[str, ...]:
+        """What is below one percent, in words."""
+        return tuple(
+            f"{side} {_VERBS[side]} mode {self.mode} ({self.freq:.4g} Hz, damping "
+            f"{100 * self.zeta:.2g} %) "
+            + (
+                f"at {100 * share:.2g} % of its strongest mode (best: {self.channels[side]})."
+                if share > 1e-8
+                else "nowhere: it has a node at every channel."
+            )
+            for side, share in self.shares.items()
+            if share < WEAK
+        )
+
+
+def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
+    """Return the visibility of every elastic mode; none for a plant without a structure."""
+    given, plant = plant, plant.unweighted.continuous
+    if not plant.is_assembled:
+        return ()
+    # rigid-body modes and unstable ones come first
+    g, count = plant.system, plant.assembled.realisation.n_modes
+    n_rigid = plant.n_rigid + len(plant.unstable_modes)
+    pairs = plant.modal_blocks[n_rigid:count]
+    omega = np.sqrt(np.abs(np.linalg.det(pairs)))
+    zeta = -0.5 * np.trace(pairs, axis1=1, axis2=2) / omega
+    swinging = _swinging(pairs)
+    # filters of ports act at the pole; one that does not swing stands for its frequency
+    wanted = omega * (-zeta + 1j * np.sqrt(np.maximum(1.0 - zeta**2, 0.0)))
+    wanted = np.where(zeta < 1.0, wanted, 1j * omega)
+    # the structure's states first: filters of sensors stand before them
+    own_first = [*plant.modal_states, *np.setdiff1d(np.arange(g.n_states), plant.modal_states)]
+    inner = g.A[np.ix_(own_first, own_first)]
+    elastic = slice(2 * n_rigid, 2 * count)
+    inner[elastic, elastic] = block_diagonal(swinging)
+    g = g.replace(A=inner, B=g.B[own_first], C=g.C[:, own_first], states=(), blocks=None)
+    left, right = _vectors(g.A, wanted, 2 * n_rigid)
+    sides: dict[str, tuple[Sequence[str], FloatArray]] = {}
+    for side in "wu":
+        kept = [n for n in getattr(plant, side) if n in getattr(given, side)]
+        names = [n for n in kept if np.any(g.B[:, g.input_index([n])])]
+        sides[side] = names, np.abs(left.conj().T @ g.B[:, g.input_index(names)])
+    orders = {s.name: s.order for s in plant.assembled.ports.y}
+    for side in "yz":
+        block = given.origin.reading if side == "y" else None
+        kept = [n for n in getattr(plant, side) if n in getattr(given, side)]
+        names = [n for n in kept if np.any(g.C[g.output_index([n])])]
+        names = names if block is None else list(block.inputs)
+        power = np.array([1 - orders.get(name, 0) for name in names])
+        motions = (g.C[g.output_index(names)] @ right).T * omega[:, None] ** power
+        if block is not None:
+            names = list(block.outputs)
+            points = np.exp(wanted * given.dt) if given.dt else wanted
+            seen = [response_at(block, z) @ m for z, m in zip(points, motions, strict=True)]
+            motions = np.array(seen).reshape(omega.size, len(names))
+        sides[side] = names, np.abs(motions)
+    return tuple(
+        _entry(n_rigid + 1 + k, float(omega[k]), float(zeta[k]), k, sides)
+        for k in range(omega.size)
+    )
+
+
+def _swinging(pairs: FloatArray) -> FloatArray:
+    """Return the pairs, those of real modes without their damping: it is no part of the shape."""
+    real = pairs[:, 0, 0] == 0.0
+    swinging = pairs.copy()
+    swinging[real, 1, 1] = 0.0
+    return swinging
+
+
+def _entry(
+    number: int,
+    omega: float,
+    zeta: float,
+    k: int,
+    sides: dict[str, tuple[Sequence[str], FloatArray]],
+) -> ModeVisibility:
+    shares, channels = {}, {}
+    for side, (names, gains) in sides.items():
+        if not names:
+            continue
+        share = gains[k] / np.maximum(gains.max(axis=0), 1e-300)
+        best = int(np.argmax(share))
+        shares[side], channels[side] = float(share[best]), names[best]
+    return ModeVisibility(number, omega / (2 * np.pi), zeta, shares, channels)
+
+
+def _vectors(A: FloatArray, poles: ComplexArray, first: int) -> tuple[ComplexArray, ComplexArray]:
+    """Return left and right eigenvectors (n, k) of modes; right ones of unit size in their states.
+
+    Mode k has the states first + 2 k and the next; other states (of actuators, say) follow.
+    """
+    n, count = A.shape[0], poles.size
+    left = np.zeros((n, count), dtype=np.complex128)
+    right = np.zeros((n, count), dtype=np.complex128)
+    for k, pole in enumerate(poles.tolist()):
+        own = slice(first + 2 * k, first + 2 * k + 2)
+        values, rights = np.linalg.eig(A[own, own])
+        lefts = la.inv(rights).conj().T
+        i = int(np.argmin(np.abs(values - pole)))
+        left[own, k], right[own, k] = lefts[:, i], rights[:, i]
+    rest = np.arange(first + 2 * count, n)
+    if rest.size and np.any(A[: rest[0], rest]):
+        for k, pole in enumerate(poles.tolist()):
+            shifted = pole * np.eye(rest.size) - A[np.ix_(rest, rest)]
+            into = left[: rest[0], k].conj() @ A[: rest[0], rest]
+            left[rest, k] = np.linalg.solve(shifted.T, into).conj()
+    if rest.size and np.any(A[rest, : rest[0]]):
+        for k, pole in enumerate(poles.tolist()):
+            shifted = pole * np.eye(rest.size) - A[np.ix_(rest, rest)]
+            right[rest, k] = np.linalg.solve(shifted, A[rest, : rest[0]] @ right[: rest[0], k])
+    return left, right

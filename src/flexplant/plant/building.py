@@ -7,9 +7,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..errors import ModelError
-from ..lti.discretisation import diagonal_pairs, held_exactly
-from ..lti.noise import noise_factor
-from ..lti.rate_check import check_latency, check_rate, light_modes
+from ..lti.discretisation import (
+    check_latency,
+    check_rate,
+    diagonal_pairs,
+    held_exactly,
+    light_modes,
+    noise_factor,
+)
 from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..reduction import ReducedModel

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import NamedTuple
+
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, as_statespace
-from .ground import Carried, Parts, followed, with_ground
+from ..structure.placed import SPANNED
+from ..values import FloatArray
+from .port import QUANTITIES, Seen
 from .ports import Ports
 from .realisation import ModalRealisation
 
@@ -93,3 +98,130 @@ def _carried(realisation: ModalRealisation, ports: Ports) -> dict[str, Carried]:
 
 def _named(part: StateSpace | None, name: str) -> StateSpace:
     return (part or as_statespace(1.0)).replace(inputs=[name], outputs=[name])
+
+
+#: relative: a gain at 0 Hz smaller than this is a zero there
+_ZERO = 1e-9
+
+
+class Carried(NamedTuple):
+    """What moves with the ground."""
+
+    order: int
+    gains: Mapping[str, float]
+
+
+class Parts(NamedTuple):
+    """A structure, and the filters {channel: filter} before and after it."""
+
+    structure: StateSpace
+    before: dict[str, StateSpace]
+    after: dict[str, StateSpace]
+
+
+def followed(one: Seen, order: int, push: FloatArray, ground: FloatArray) -> FloatArray:
+    """Return what a channel shows at once (m,) of loads `push` (m, n) and of `ground` (m, 6).
+
+    An accelerometer on a free body shows none of the ground's acceleration: the load -M r takes
+    back what the ground adds. So it does on springs, up to what the shapes miss of its motion.
+    """
+    direct = push @ one.direct
+    if order < 2:
+        return direct
+    along = ground @ one.carried
+    total: FloatArray = direct + along
+    total[np.abs(total) <= SPANNED * np.abs(along)] = 0.0
+    return total
+
+
+def with_ground(parts: Parts, carried: Mapping[str, Carried]) -> Parts:
+    """Return the parts with absolute displacements and velocities added.
+
+    The ground moves by ``a / s^p``, p = 2 for displacements and 1 for velocities. A filter of a
+    sensor with m zeros at 0 Hz integrates m times without a state more, ``F / s^m`` being
+    ``(A, A^-m B, C, 0)``, and so does a shape, ``(A, B, C A^-m, 0)``.
+    """
+    structure, before, after = parts.structure, dict(parts.before), dict(parts.after)
+    needed: dict[str, set[int]] = {}
+    entries: dict[tuple[str, str], float] = {}
+    for output, one in carried.items():
+        times = _integrals(after[output], 2 - one.order)
+        own = output
+        if times:
+            after[output] = _with_ground_input(after[output], output, times)
+            own = after[output].inputs[1]
+        for name, gain in one.gains.items():
+            left = 2 - one.order - times
+            found = _integrals(before[name], left)
+            if found < left:
+                raise ModelError(_unbounded(output, one.order, name, left, found))
+            if left:
+                needed.setdefault(name, set()).add(left)
+            entries[own, _channel(name, left)] = gain
+    for name, lefts in needed.items():
+        before[name] = _with_integrals(before[name], name, sorted(lefts))
+    inputs = [name for part in before.values() for name in part.outputs]
+    outputs = [name for part in after.values() for name in part.inputs]
+    n = structure.n_states
+    column = [inputs.index(name) for name in structure.inputs]
+    row = [outputs.index(name) for name in structure.outputs]
+    B, C = np.zeros((n, len(inputs))), np.zeros((len(outputs), n))
+    D = np.zeros((len(outputs), len(inputs)))
+    B[:, column], C[row], D[np.ix_(row, column)] = structure.B, structure.C, structure.D
+    for (output, name), gain in entries.items():
+        D[outputs.index(output), inputs.index(name)] += gain
+    wider = structure.replace(B=B, C=C, D=D, inputs=inputs, outputs=outputs)
+    return Parts(wider, before, after)
+
+
+def _channel(name: str, times: int) -> str:
+    """Return the name of the ground's acceleration, integrated some times."""
+    return name if not times else f"{name}:{QUANTITIES[2 - times]}"
+
+
+def _integrals(part: StateSpace, most: int) -> int:
+    """Return how many zeros at 0 Hz a filter has, up to `most`."""
+    if not part.n_states:
+        return 0
+    B, direct = part.B, float(part.D[0, 0])
+    for times in range(most):
+        B = np.asarray(np.linalg.solve(part.A, B), dtype=np.float64)
+        size = abs(direct) + float((np.abs(part.C) @ np.abs(B))[0, 0])
+        if abs(direct - float((part.C @ B)[0, 0])) > _ZERO * size:
+            return times
+        direct = 0.0
+    return most
+
+
+def _with_ground_input(part: StateSpace, name: str, times: int) -> StateSpace:
+    """Return a filter with a second input that it integrates some times besides."""
+    B = np.linalg.matrix_power(np.linalg.inv(part.A), times) @ part.B
+    return part.replace(
+        B=np.hstack([part.B, B]),
+        D=np.hstack([part.D, np.zeros((1, 1))]),
+        inputs=[name, f"{name}:ground"],
+        units={},
+    )
+
+
+def _with_integrals(part: StateSpace, name: str, times: list[int]) -> StateSpace:
+    """Return a filter that shows integrals of its output too."""
+    inverse = np.linalg.inv(part.A)
+    rows = [part.C @ np.linalg.matrix_power(inverse, count) for count in times]
+    return part.replace(
+        C=np.vstack([part.C, *rows]),
+        D=np.vstack([part.D, np.zeros((len(times), 1))]),
+        outputs=[name, *(_channel(name, count) for count in times)],
+        units={},
+    )
+
+
+def _unbounded(output: str, order: int, name: str, left: int, found: int) -> str:
+    has = f"the shape of {name!r} has {found or 'none'}"
+    return (
+        f"{output!r} is an absolute {QUANTITIES[order]}, which grows without bound with the "
+        f"acceleration of {name!r}: its integrals need {counted(left, 'zero')} at 0 Hz more "
+        f"than the sensor has, and {has}. Give it one that has, shape=highpass(0.1, "
+        f"order={left}) say, or dynamics to the sensor (a geophone's), or measure relative to the "
+        "ground: absolute=False."
+    )

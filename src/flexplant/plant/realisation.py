@@ -17,7 +17,7 @@ from ..modes.modes import pole_pairs
 from ..modes.normal_form import PROPORTIONAL, RealForm, modal, real_form
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..structure.negative_stiffness import signed_square
+from ..structure.definite import signed_square
 from ..structure.placed import Structure as Structure
 from ..values import ComplexArray, FloatArray, Value
 

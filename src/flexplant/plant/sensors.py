@@ -11,8 +11,16 @@ from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace
 from ..structure.rigid import place_motion
 from ..values import FloatArray, Value, check_names, short
-from .port import Quantity, Seen, SensorPort, motion_unit, seen
-from .port_checks import checked_choice, checked_name, checked_place
+from .port import (
+    Quantity,
+    Seen,
+    SensorPort,
+    checked_choice,
+    checked_name,
+    checked_place,
+    motion_unit,
+    seen,
+)
 from .realisation import ModalRealisation
 
 

@@ -13,10 +13,12 @@ from ..labels import Place
 from ..lti.statespace import System
 from ..values import FloatArray
 from .assumptions import AssumptionReport
-from .building import rebuilt, sampled
+from .building import continuous_plant, rebuilt, sampled
 from .moving import Along, along, moved
 from .partition import Partition
 from .ports import Ports
+from .realisation import ModalRealisation, Structure
+from .residual_form import ResidualForm, modes_of
 from .rigid.rigid_motion import RigidModes, rigid_modes_of
 from .uncertainty.opening import uncertain
 from .uncertainty.uncertain_plant import UncertainPlant
@@ -244,7 +246,7 @@ class StandardPlant(Partition):
             bounded by additive weights (see `NeglectedModes`).
         shapes : (m, n, r) array, optional
             Of measured modes: directions over the n DOFs of the plant's modes, each a standard
-            deviation of the shape, independent (`flexplant.identification.shape_deviations`). Each
+            deviation of the shape, independent (`flexplant.identification.structural`). Each
             becomes a Delta `mode6:shape1` on what drives the mode and what is seen of it.
 
         Returns
@@ -322,3 +324,68 @@ def standard_plant(given: StandardPlant | System) -> StandardPlant:
     True
     """
     return StandardPlant.of(given)
+
+
+def assemble_plant(
+    model: Structure | ModalRealisation, ports: Ports, *, residual: ResidualForm | None = None
+) -> StandardPlant:
+    """Return the standard plant of a structure with its channels.
+
+    ``M q'' + D q' + K q = f`` (the paper's (1), or (8) when reduced) in modal states, with forces
+    at the disturbances and actuators and motions at the POIs and sensors. The filters of the ports
+    (shapes, dynamics) add their states.
+
+    Parameters
+    ----------
+    model : FEModel, Modes or ReducedModel
+        The structure. A plant's `realisation` serves too: the modes are then not solved again.
+    ports : Ports
+        The channels.
+    residual : FastStates or Feedthrough, optional
+        What residual attachment vectors of Modes become: fast modes (when not given), or a
+        compliance that answers at once.
+
+    Returns
+    -------
+    StandardPlant
+        Continuous. w: disturbances, sensor noises `y1:noise`, references; u: actuators;
+        z: POI axes `die:z`, errors `die:error`, efforts `u1:effort`; y: sensors, references.
+        Delays of ports act once it is sampled. `plant.form` says whether A is in modal blocks.
+
+    Raises
+    ------
+    LabelError
+        When a place is not on the structure.
+    ModelError
+        When the model or the ports have another type, or a side is empty.
+
+    Warns
+    -----
+    FlexplantWarning
+        When damping couples the modes so that blocks cannot hold it: an overdamped pair, two poles
+        that (nearly) coalesce, or a damper to ground that drags rigid-body motion at more than
+        1e-4 of the first elastic frequency (what drags less is left out: rigid-body modes are
+        undamped by convention). The undamped modes are then kept with all of D between them, the
+        dense form.
+
+    References
+    ----------
+    [paper]_, equations (1)-(8) and Fig. 2.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0], stiffnesses=[100.0]), count=2)
+    >>> ports = fx.Ports(
+    ...     u=[fx.Actuator("u1", at="1:x")],
+    ...     z=[fx.Poi("die", at="2:x", axes=("x",))],
+    ...     y=[fx.Sensor("y1", at="1:x", asd=1e-10)],
+    ... )
+    >>> fx.assemble_plant(modes, ports)
+    <StandardPlant: 4 states, continuous>
+      w (1) y1:noise
+      u (1) u1
+      z (2) die:x  u1:effort
+      y (1) y1
+    """
+    return continuous_plant(StandardPlant, modes_of(model, residual), ports)

@@ -21,7 +21,7 @@ from ..modes.direct_check import checked_response
 from ..modes.dynamic_basis import DynamicBasis
 from ..modes.shifted import held_factor
 from ..modes.solve import modes_reaching
-from ..progress import Progress
+from ..parallel import Progress
 from ..reduction import ReducedModel
 from ..structure import Damping, FEModel
 from ..values import ComplexArray, FloatArray, instance, positive, real_array, whole

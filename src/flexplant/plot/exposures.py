@@ -12,8 +12,20 @@ from ..errors import LabelError, ModelError
 from ..simulation import ErrorMap, Response, exposure_errors
 from ..simulation.exposure import error_channels
 from ..values import in_unit, instance, short, with_unit
-from ._axes import axes, finish, legend, legend_below, named, plan, shown_in
-from ._style import BLACK, BLUE, GREY, ORANGE, RED
+from ._axes import (
+    BLACK,
+    BLUE,
+    GREY,
+    ORANGE,
+    RED,
+    axes,
+    finish,
+    legend,
+    legend_below,
+    named,
+    plan,
+    shown_in,
+)
 from .response import shade, time_axis
 
 
@@ -119,7 +131,7 @@ def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> A
     Parameters
     ----------
     found : ErrorMap
-        From `flexplant.simulation.error_map`; points that span an area.
+        From `flexplant.simulation.exposure`; points that span an area.
     what : str
         "ma" or "msd".
     ax : Axes, optional

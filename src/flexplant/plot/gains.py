@@ -12,7 +12,7 @@ from ..errors import FlexplantError, ModelError
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import as_statespace
 from ..values import ComplexArray, FloatArray, short
-from ._style import POINTS, Style, role_of, styles
+from ._axes import POINTS, Style, role_of, styles
 
 #: of a magnitude below the largest one that is drawn, nothing can be read: zeros at half the rate
 _DEPTH = 160.0

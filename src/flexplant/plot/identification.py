@@ -8,8 +8,20 @@ from matplotlib.axes import Axes
 from ..identification import IdentifiedModes, StabilisationDiagram
 from ..lti.frequency import Frf
 from ..values import ComplexArray, FloatArray, instance
-from ._axes import axes, finish, legend, named, shown_in
-from ._style import BLUE, GREY, LIGHT, ORANGE, RED, STYLES, Style
+from ._axes import (
+    BLUE,
+    GREY,
+    LIGHT,
+    ORANGE,
+    RED,
+    STYLES,
+    Style,
+    axes,
+    finish,
+    legend,
+    named,
+    shown_in,
+)
 from .gains import shared_unit
 
 #: marker, colour and legend of the flags 0 to 3

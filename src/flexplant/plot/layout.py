@@ -13,9 +13,8 @@ from ..errors import counted
 from ..labels import DofSet
 from ..plant import Ports
 from ..values import FloatArray, in_unit
-from ._axes import axes, legend_below, plan, solid_axes
-from ._style import BLACK, GREY, LIGHT, PORTS, PURPLE, Style
-from ._surface import Surface, surface_of
+from ._axes import BLACK, GREY, LIGHT, PORTS, PURPLE, Style, axes, legend_below, plan, solid_axes
+from .mode_shapes import Surface, surface_of
 
 
 def layout(

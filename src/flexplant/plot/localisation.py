@@ -12,8 +12,7 @@ from ..labels import DofSet
 from ..updating import Localisation
 from ..updating.parameters.added import Parameter, PointParameter
 from ..values import FloatArray, instance, with_unit
-from ._axes import axes, finish, legend_below, plan
-from ._style import BLUE, GREY, LIGHT, RED
+from ._axes import BLUE, GREY, LIGHT, RED, axes, finish, legend_below, plan
 
 #: colours of what was chosen, cannot be distinguished from it, hardly can, and of all others
 COLOURS = {"chosen": RED, "alike": BLUE, "rival": GREY, "other": LIGHT}

@@ -12,13 +12,12 @@ from matplotlib.patches import Rectangle as Box
 
 from ..errors import ModelError
 from ..placement import ParetoCurve, SensorMap
-from ..placement.candidate_places import Zone, places_of
 from ..placement.candidate_shapes import shapes_of
+from ..placement.candidates import Zone, places_of
 from ..plant import Ports, StandardPlant
 from ..structure import Disc
 from ..values import FloatArray, in_unit, instance, whole
-from ._axes import axes, finish, legend, legend_below, named, plan
-from ._style import BLUE, LIGHT, PORTS, RED, STYLES
+from ._axes import BLUE, LIGHT, PORTS, RED, STYLES, axes, finish, legend, legend_below, named, plan
 
 
 def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None = None) -> Axes:

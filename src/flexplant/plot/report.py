@@ -10,10 +10,8 @@ from ..simulation import Response
 from ..store import written
 from ..values import short
 from ..versions import versions
-from .html.design import Design
-from .html.page import Chapter, page, table
-from .html.picture import Gallery
-from .html.result import loops_section, result
+from .html.page import Chapter, Gallery, page, table
+from .html.result import Design, loops_section, result
 from .html.sections import certificates, sections
 
 

@@ -5,15 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
 from ..errors import ModelError, require_known
+from ..loop import ClosedLoop
+from ..loop.blocks import references
+from ..lti.discretisation import held_exactly
+from ..lti.recursion import Recursion
+from ..lti.responses import continuous_poles
+from ..lti.statespace import StateSpace, as_statespace
 from ..simulation import Response
-from ..values import instance, name_list, real_array
-from ._axes import finish, legend, named, panel_axes, quantity_of, shown_in
-from ._style import GREY, styles
+from ..values import FloatArray, instance, name_list, positive, real_array
+from ._axes import GREY, finish, legend, named, panel_axes, quantity_of, shown_in, styles
+from .gains import labelled
 
 
 def response(
@@ -152,3 +159,149 @@ def _panel(
     errors = all(name.endswith(":error") for name in group)
     quantity = "error" if errors else quantity_of(unit)
     finish(ax, x=named("time", time), y=named(quantity, shown))
+
+
+#: channels for which a grid of panels can still be read
+_MOST = 36
+#: a pole is shown until it has decayed to 1 %, or for so many periods
+_DECAY, _PERIODS = 4.6, 20.0
+#: samples of a picture at least and at most, and in a period of the fastest pole
+_FEWEST, _MANY, _FINE = 500, 20_000, 12.0
+
+
+def step(
+    systems: Any,
+    *,
+    outputs: Sequence[str] | str | None = None,
+    inputs: Sequence[str] | str | None = None,
+    duration: float | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the responses to a step of one unit at each input, a panel for each channel.
+
+    Exact at the instants drawn: continuous systems are sampled with a zero-order hold.
+
+    Parameters
+    ----------
+    systems : StateSpace, ClosedLoop, or mapping {label: one of these} or list of them
+        What to draw; several share their axes. Systems of python-control and SciPy too.
+    outputs, inputs : str or sequence of str, optional
+        Channels of the first one; all when not given, of a loop with references these and the
+        motions of their POIs. Others are drawn by the same names.
+    duration : float [s], optional
+        When not given, until the slowest pole has decayed to 1 % or for 20 of its periods.
+    ax : Axes, optional
+        Where one channel is drawn.
+
+    Returns
+    -------
+    Axes
+        Of the first channel; `.figure.axes` are all, row by row.
+
+    Raises
+    ------
+    ModelError
+        When one is no system, there is nothing to draw, or more channels than can be read.
+    LabelError
+        When a channel is unknown.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.plot.step(fx.lowpass(10.0)).get_xlabel()
+    'time [ms]'
+    """
+    given = labelled(systems)
+    found = {label: as_statespace(g) for label, g in given.items()}
+    first = next(iter(found.values()))
+    moved, moves = _set_points(next(iter(given.values()))) or (first.outputs, first.inputs)
+    rows = list(moved if outputs is None else name_list(outputs, "outputs"))
+    columns = list(moves if inputs is None else name_list(inputs, "inputs"))
+    for label, g in found.items():
+        for name, known in [(r, g.outputs) for r in rows] + [(c, g.inputs) for c in columns]:
+            require_known("channel", [name], known, f"the system {label}".strip())
+    end = (
+        max(map(_duration, found.values())) if duration is None else positive(duration, "duration")
+    )
+    panels = _panels(ax, len(rows), len(columns))
+    for (label, g), look in zip(found.items(), styles(found), strict=True):
+        time, data = _responses(g.select(rows, columns), end)
+        for i, output in enumerate(rows):
+            for j, name in enumerate(columns):
+                _draw(panels[i, j], time, data[i, j], g, (output, name), label or None, look)
+    for panel in panels[:-1].ravel():
+        panel.set_xlabel("")
+    for panel, name in zip(panels[0], columns, strict=True):
+        panel.set_title(f"step of {f'1 {first.units.get(name, str())}'.rstrip()} at {name}")
+    if any(found):
+        legend(panels[0, -1], given=ax is not None)
+    shown: Axes = panels[0, 0]
+    return shown
+
+
+def _set_points(found: Any) -> tuple[list[str], list[str]] | None:
+    """Return what references move, and these, of a loop that has some."""
+    if not isinstance(found, ClosedLoop) or not (refs := references(found.plant)):
+        return None
+    owners = {name.rpartition(":")[0] for name in refs}
+    return [name for name in found.plant.z if name.rpartition(":")[0] in owners], refs
+
+
+def _panels(ax: Axes | None, rows: int, columns: int) -> Any:
+    if rows * columns > _MOST or (ax is not None and rows * columns > 1):
+        raise ModelError(
+            f"{rows} outputs and {columns} inputs are {rows * columns} channels: "
+            f"{'one axes holds one' if ax is not None else f'{_MOST} can be read'}. Choose some: "
+            "outputs=, inputs=."
+        )
+    if ax is not None:
+        return np.array([[ax]], dtype=object)
+    size = (max(7.0, 4.0 * columns), max(3.6, 2.4 * rows))
+    return plt.subplots(
+        rows, columns, sharex=True, squeeze=False, layout="constrained", figsize=size
+    )[1]
+
+
+def _draw(
+    ax: Axes,
+    time: FloatArray,
+    signal: FloatArray,
+    g: StateSpace,
+    channel: tuple[str, str],
+    text: str | None,
+    look: dict[str, Any],
+) -> None:
+    second, clock = shown_in(ax.xaxis, float(time[-1]), "s")
+    size = float(np.max(np.abs(signal), initial=0.0))
+    factor, unit = shown_in(ax.yaxis, size, g.units.get(channel[0]))
+    form: dict[str, Any] = {"drawstyle": "steps-post"} if g.dt else {}
+    ax.plot(time / second, signal / factor, label=text, **look, **form)
+    finish(ax, x=named("time", clock), y=named(channel[0], unit))
+
+
+def _duration(g: StateSpace) -> float:
+    """Return the time [s] in which the slowest pole decays or has turned often."""
+    poles = continuous_poles(g)
+    size = np.abs(poles)
+    moving = poles[size > 1e-6 * size.max(initial=0.0)]
+    if not moving.size:
+        return 100.0 * g.dt if g.dt else 1.0
+    decay = _DECAY / np.maximum(np.abs(moving.real), 1e-12 * np.abs(moving))
+    return float(np.max(np.minimum(decay, 2.0 * np.pi * _PERIODS / np.abs(moving))))
+
+
+def _responses(g: StateSpace, end: float) -> tuple[FloatArray, FloatArray]:
+    """Return times and the responses (p, m, n) to a step at each input."""
+    h = g.dt
+    if not h:
+        fastest = float(np.max(np.abs(g.poles()), initial=0.0))
+        fine = 2.0 * np.pi / (_FINE * fastest) if fastest else end
+        h = float(np.clip(fine, end / _MANY, end / _FEWEST))
+        g = held_exactly(g, 1.0 / h)
+    count = int(np.ceil(end / h)) + 1
+    run = Recursion(g.A, g.B, g.C, g.D)
+    start = np.zeros(g.n_states)
+    data = np.empty((len(g.outputs), len(g.inputs), count))
+    for j in range(len(g.inputs)):
+        data[:, j] = run.run(np.eye(len(g.inputs))[[j] * count], start)[0].T
+    return np.asarray(h * np.arange(count), dtype=np.float64), data

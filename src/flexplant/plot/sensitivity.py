@@ -16,8 +16,7 @@ from ..loop.comparison import error_sensitivity
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import as_statespace
 from ..values import FloatArray, real_array, short
-from ._axes import axes, finish, legend
-from ._style import GREY, STYLES, Style, styles
+from ._axes import GREY, STYLES, Style, axes, finish, legend, styles
 from .gains import by_label, decibel, readable, shared_reference
 
 #: what weights limit

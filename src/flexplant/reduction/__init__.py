@@ -8,20 +8,20 @@ from .component_modes import Rubin as Rubin
 from .condensation import Guyan as Guyan
 from .condensation import Irs as Irs
 from .condensation import Serep as Serep
+from .criteria import DofSelection as DofSelection
 from .criteria import EffectiveIndependence as EffectiveIndependence
 from .criteria import Greedy as Greedy
 from .criteria import PivotedQr as PivotedQr
 from .criteria import SelectionCriterion as SelectionCriterion
+from .criteria import select_dofs as select_dofs
+from .judging import ReductionQuality as ReductionQuality
 from .krylov import Krylov as Krylov
 from .methods import DesiredDofs as DesiredDofs
 from .methods import ReductionMethod as ReductionMethod
 from .methods import reduce as reduce
-from .quality import ReductionQuality as ReductionQuality
 from .ranking import ModeRanking as ModeRanking
 from .ranking import rank_modes as rank_modes
 from .reduced import ReducedModel as ReducedModel
-from .selection import DofSelection as DofSelection
-from .selection import select_dofs as select_dofs
 from .truncation import ModalBalanced as ModalBalanced
 from .truncation import ModalTruncation as ModalTruncation
 

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, Self, TypeAlias
 
 import numpy as np
 
-from ..errors import ModelError
-from ..labels import Place
+from ..errors import ModelError, counted
+from ..labels import DofSet, Place
 from ..lti.grid import climbed
-from ..modes.attachment_vectors import labels_of, places
+from ..modes.attachment_vectors import labels_of, places, static_response
+from ..modes.direct_check import DirectCheck, antiresonances, checked_response
+from ..modes.dynamic_basis import DynamicBasis
 from ..modes.modes import Modes
 from ..modes.shifted import held_factor
 from ..modes.solve import modes_reaching
-from ..structure import FEModel
-from ..values import ComplexArray, FloatArray, positive, real_array, whole
-from .check_responses import (
-    FullResponses,
-    Reduced,
-    check_frequencies,
-    reduced_response,
-    static_error,
-)
+from ..structure import FEModel, Hysteretic
+from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array, whole
+from .bounds import ErrorBound
 from .mode_pairs import paired
-from .quality import ReductionQuality
 
 #: refinements of the frequencies at which the error is largest
 _ROUNDS = 3
@@ -197,3 +194,312 @@ def _undamped_modes(reduced: Reduced) -> Modes:
     if not reduced.is_physical:
         return found
     return found.replace(phi=reduced.T @ found.phi, dofs=reduced.full_dofs)
+
+
+#: points over the band, beside resonances and antiresonances
+_GRID = 200
+#: direct solutions that check the responses of a small and of a large structure
+_CHECKS, _SMALL = (6, 3), 2000
+#: their difference, of the peak, from which on they join the basis
+_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True, eq=False, repr=False, match_args=False)
+class Reduced(Protocol):
+    """What a comparison reads of a `ReducedModel`, which offers it as its `quality`."""
+
+    M: FloatArray
+    D: FloatArray
+    K: FloatArray
+    T: FloatArray
+    full_dofs: DofSet
+    rigid_body: FloatArray
+    condition: float
+    bound: ErrorBound | None
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether all coordinates are DOFs of the structure."""
+
+    def modes(self) -> Modes:
+        """Return all modes."""
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed."""
+
+
+#: gives the responses (f, p, q) at frequencies [Hz]
+Find: TypeAlias = Callable[[FloatArray], ComplexArray]
+
+
+class FullResponses:
+    """The responses of a full structure, wherever they are wanted."""
+
+    def __init__(
+        self,
+        full: FEModel | Modes,
+        modes: Modes,
+        B: FloatArray,
+        C: FloatArray,
+        loss: float | None,
+    ) -> None:
+        self.full, self.B, self.C, self.loss = full, B, C, loss
+        self.basis: DynamicBasis | None = None
+        if isinstance(full, FEModel):
+            law = None if loss is None else Hysteretic(loss)
+            self.basis = DynamicBasis(full, modes, np.hstack([B, C.T]), law)
+        self.check: DirectCheck | None = None
+
+    def at(self, freq: FloatArray) -> ComplexArray:
+        """Return the responses (f, p, q)."""
+        if not self.B.shape[1]:
+            return np.zeros((freq.size, self.C.shape[0], 0), dtype=np.complex128)
+        if self.basis is not None:
+            return self.basis.response(freq, self.C, self.B)
+        assert isinstance(self.full, Modes)  # noqa: S101 - it is no FEModel
+        return _modal_response(self.full, freq, self.B, self.C, self.loss or 0.0)
+
+    def checked(self, freq: FloatArray) -> None:
+        """Compare the responses in a band with direct solutions, which mend the basis."""
+        if self.basis is not None and self.B.shape[1]:
+            self.basis, _, self.check = checked_response(
+                self.basis,
+                freq,
+                self.C,
+                self.B,
+                checks=_CHECKS[self.full.dofs.xyz.shape[0] > _SMALL],
+                tolerance=_TOLERANCE,
+            )
+
+    def static(self) -> FloatArray:
+        """Return the elastic compliance (p + q, p + q) of [inputs, outputs]; NaN if not known."""
+        loads = np.hstack([self.B, self.C.T])
+        if self.basis is not None:
+            return self.basis.compliance(loads.T, loads)
+        assert isinstance(self.full, Modes)  # noqa: S101 - it is no FEModel
+        if np.iscomplexobj(self.full.phi):
+            return np.full((loads.shape[1],) * 2, np.nan)
+        r = self.full.n_rigid
+        motion = (loads.T @ np.real(self.full.basis))[:, r:] / self.full.basis_omega[r:]
+        return np.asarray(motion @ motion.T)
+
+    def __str__(self) -> str:
+        how = "its D" if self.loss is None else f"loss factor {self.loss:.3g} in both"
+        if self.basis is None:
+            return "the sum over the given modes" + (f", {how}" if self.loss is not None else "")
+        check = f"; {self.check}" if self.check is not None else ""
+        return f"{self.basis.n_modes} modes and {self.basis.n_shapes} static shapes, {how}{check}"
+
+
+def check_frequencies(
+    low: float, high: float, both: Sequence[tuple[Find, FloatArray]]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return frequencies [Hz] over a band, and of these the resonances and antiresonances."""
+    start = low if low > 0 else high / 1000
+    resonances = np.concatenate([own for _, own in both])
+    resonances = resonances[(resonances >= low) & (resonances <= high)]
+    deep = np.concatenate([antiresonances(find, own, low, high) for find, own in both])
+    return np.concatenate([np.geomspace(start, high, _GRID), resonances, deep]), resonances, deep
+
+
+def _modal_response(
+    modes: Modes, freq: FloatArray, B: FloatArray, C: FloatArray, loss: float
+) -> ComplexArray:
+    s = 2j * np.pi * freq[:, None]
+    if np.iscomplexobj(modes.phi):
+        r = modes.n_rigid
+        poles = np.asarray(modes.poles)
+        phi = np.asarray(modes.phi)
+        swing = np.where(poles.imag > 0, poles.imag, 1.0)
+        one = np.where(np.arange(poles.size) < r, 1 / s**2, 1 / (2j * swing * (s - poles)))
+        two = np.where(np.arange(poles.size) < r, 0.0, 1 / (-2j * swing * (s - poles.conj())))
+        total = np.einsum("pk,fk,kq->fpq", C @ phi, one, phi.T @ B)
+        total = total + np.einsum("pk,fk,kq->fpq", C @ phi.conj(), two, phi.conj().T @ B)
+        return np.asarray(total, dtype=np.complex128)
+    gain = 1.0 / (modes.basis_squares * (1 + 1j * loss) + modes.basis_rates * s + s**2)
+    basis = np.real(modes.basis)
+    return np.asarray(np.einsum("pk,fk,kq->fpq", C @ basis, gain, basis.T @ B))
+
+
+def reduced_response(
+    reduced: Reduced, freq: FloatArray, B: FloatArray, C: FloatArray, loss: float | None
+) -> ComplexArray:
+    """Return responses (f, p, q) of the reduced model: with a loss factor, or its own D."""
+    omega = 2 * np.pi * freq[:, None, None]
+    if not B.shape[1]:
+        return np.zeros((freq.size, C.shape[0], 0), dtype=np.complex128)
+    stiffness: Any = reduced.K * (1 + 1j * loss) if loss is not None else reduced.K
+    damping = 0.0 if loss is not None else 1j * omega * reduced.D
+    size = 1.0 / np.sqrt(np.abs(np.diag(reduced.K)) + np.abs(np.diag(reduced.M)))
+    matrix = (stiffness + damping - omega**2 * reduced.M) * size[:, None] * size
+    return np.asarray((C * size) @ np.linalg.solve(matrix, (B * size[:, None])[None]))
+
+
+def static_error(whole: FloatArray, reduced: Reduced, Br: FloatArray, Cr: FloatArray) -> FloatArray:
+    """Return errors (p, q) of the elastic compliance `whole`, of the size of its channels."""
+    q = Br.shape[1]
+    watched = np.hstack([Br, Cr.T])
+    found = watched.T @ static_response(reduced.M, reduced.K, reduced.rigid_body, watched)
+    size = np.sqrt(np.abs(np.diag(whole)))
+    return np.asarray(np.abs(found - whole)[q:, :q] / np.outer(size[q:], size[:q]))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ReductionQuality(Value):
+    """The error of a reduced model beside the full one.
+
+    Parameters
+    ----------
+    modes : (m,) array of int
+        Numbers of the full model's modes that are compared.
+    full_freq, freq : (m,) arrays [Hz]
+        Their frequencies, and those of the reduced modes paired with them, one to one, by shape and
+        frequency; NaN where none has a MAC of 0.5.
+    freq_error : (m,) array
+        Relative; 0 for rigid-body modes, NaN without a partner.
+    mac : (m,) array
+        Of each full mode with the reduced one: mass-weighted for an FEModel. Of repeated modes,
+        whose shapes are any basis of a subspace, the squared cosines of the angles between the two
+        subspaces.
+    group : (m,) array of int
+        Number of the first mode whose shape cannot be distinguished from that of each: of
+        repeated modes that lack a partner it is not known which one is missing.
+    check_freq : (f,) array [Hz]
+        Where responses were compared.
+    frf_error : (p, q) array
+        Largest error over the band, of the largest response, output by input.
+    resonance_error : (p, q) array
+        Largest error at a resonance of either model, of the largest response of any pair and
+        either model there; NaN without a resonance in the band.
+    antiresonance_error : (p, q) array
+        Largest error at an antiresonance of either model, of the larger response of both there: 1
+        where one has an antiresonance that the other does not have. NaN without one.
+    static_error : (p, q) array
+        Of the elastic static compliance, relative to its size sqrt(G_ii G_jj).
+    true_error : float [m/N]
+        Largest singular value of the error at the check frequencies.
+    orthogonality : float
+        Departure of the expanded reduced modes from M-orthonormality; NaN against Modes.
+    condition : float
+        Of what the method inverted.
+    inputs, outputs : sequence of str
+        The channels.
+    route : str
+        How the full responses were found.
+    full_error : float
+        Difference between these and direct solutions with all of the matrices, of the peak; NaN
+        against Modes.
+    bound : ErrorBound, optional
+        The a-priori bound of the method, when it is of these channels.
+    bounded : bool
+        Whether the bound covers all modes that were compared with: that of a reduction of some
+        modes says nothing of the others of a model.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5, 4e5])
+    >>> small = fx.reduce(model, fx.ModalTruncation(3))
+    >>> quality = small.quality(model, band=(10.0, 200.0), inputs=["1:x"], outputs=["1:x"])
+    >>> quality.freq_error.round(9), quality.mac.round(6)
+    (array([ 0.,  0.,  0., nan]), array([1., 1., 1., 0.]))
+    """
+
+    modes: IntArray
+    full_freq: FloatArray
+    freq: FloatArray
+    freq_error: FloatArray
+    mac: FloatArray
+    group: IntArray
+    check_freq: FloatArray
+    frf_error: FloatArray
+    resonance_error: FloatArray
+    antiresonance_error: FloatArray
+    static_error: FloatArray
+    true_error: float
+    orthogonality: float
+    condition: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    route: str
+    full_error: float = np.nan
+    bound: ErrorBound | None = None
+    bounded: bool = True
+
+    @property
+    def alike(self) -> tuple[tuple[int, ...], ...]:
+        """Numbers of the elastic modes whose shapes cannot be distinguished, group by group."""
+        elastic = self.full_freq > 0
+        firsts = np.unique(self.group[elastic])
+        groups = [self.modes[elastic & (self.group == first)].tolist() for first in firsts]
+        return tuple(tuple(members) for members in groups if len(members) > 1)
+
+    @property
+    def band_bound(self) -> float | None:
+        """The a-priori bound [m/N] for frequencies up to the last one checked, if there is one."""
+        if self.bound is None or not self.check_freq[-1]:
+            return None if self.bound is None else self.bound.value
+        return self.bound.below(float(self.check_freq[-1]))
+
+    @property
+    def holds(self) -> bool:
+        """Whether the true error at the check frequencies is within the bound, if there is one.
+
+        A bound that does not cover all modes that were compared with is none (`bounded`).
+        """
+        limit = self.band_bound if self.bounded else None
+        return limit is None or self.true_error <= limit * (1 + 1e-9)
+
+    def __repr__(self) -> str:
+        lost = int(np.count_nonzero(np.isnan(self.freq)))
+        errors = self.freq_error[~np.isnan(self.freq_error)]
+        lines = [
+            f"<ReductionQuality: {counted(self.modes.size, 'mode')}, worst frequency "
+            f"{100 * np.abs(errors).max(initial=0.0):.3g} %, lowest MAC "
+            f"{self.mac[~np.isnan(self.freq)].min(initial=1.0):.4f}"
+            + (f", {lost} without a partner" if lost else "")
+        ]
+        if self.alike:
+            listed = "; ".join(", ".join(map(str, members)) for members in self.alike[:4])
+            more = ", ..." if len(self.alike) > 4 else ""
+            lines.append(f"shapes that cannot be distinguished: modes {listed}{more}")
+        if self.frf_error.size:
+            i, j = np.unravel_index(int(np.argmax(self.frf_error)), self.frf_error.shape)
+            lines.append(
+                f"FRF over {self.check_freq[0]:.4g} to {self.check_freq[-1]:.4g} Hz: worst "
+                f"{100 * self.frf_error[i, j]:.3g} % of the peak ({self.inputs[j]} -> "
+                f"{self.outputs[i]}), static {100 * self.static_error.max():.3g} %"
+            )
+            if not np.all(np.isnan(self.resonance_error)):
+                lines[-1] += f", at resonance {100 * np.nanmax(self.resonance_error):.3g} %"
+            if not np.all(np.isnan(self.antiresonance_error)):
+                worst = 100 * np.nanmax(self.antiresonance_error)
+                lines[-1] += f", at antiresonance {worst:.3g} %"
+            if self.bound is not None:
+                lines.append(
+                    f"error {self.true_error:.3g} m/N, bound {self.band_bound:.3g} m/N up to "
+                    f"{self.check_freq[-1]:.4g} Hz ({self.bound.value:.3g} at all)"
+                    + ("" if self.holds else ": BROKEN")
+                )
+                if not self.bounded:
+                    lines[-1] += (
+                        f", of the {self.bound.covers} modes solved: others add to the error"
+                    )
+            lines.append(f"by {self.route}")
+        return "\n  ".join(lines) + ">"
+
+    def table(self) -> str:
+        """Return mode by mode: both frequencies, error, MAC and of which shape it may also be."""
+        other = {
+            n: f"  alike: {', '.join(str(k) for k in members if k != n)}"
+            for members in self.alike
+            for n in members
+        }
+        lines = [f"mode{'full [Hz]':>12s}{'reduced [Hz]':>14s}{'error [%]':>12s}{'MAC':>9s}"]
+        lines += [
+            f"{n:4d}{f:12.4f}{g:14.4f}{100 * e:12.3g}{m:9.5f}{other.get(n, '')}"
+            for n, f, g, e, m in zip(
+                self.modes, self.full_freq, self.freq, self.freq_error, self.mac, strict=True
+            )
+        ]
+        return "\n".join(lines)

@@ -15,9 +15,9 @@ from ..labels import DofSet, Place
 from ..modes.attachment_vectors import places
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
-from ..progress import Progress
+from ..parallel import Progress
 from ..structure import Damping, FEModel
-from ..structure.negative_stiffness import refuse_unstable
+from ..structure.definite import refuse_unstable
 from ..values import FloatArray, Value
 from .criteria import PivotedQr
 from .projection import checked_damping, labels_given, shown

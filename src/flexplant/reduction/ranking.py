@@ -9,12 +9,12 @@ import numpy as np
 
 from ..errors import ModelError, counted
 from ..labels import Place
+from ..lti.balancing import hankel_values
 from ..lti.discretisation import block_diagonal
-from ..lti.hankel import hankel_values
 from ..lti.statespace import StateSpace
 from ..modes.attachment_vectors import labels_of, places
 from ..modes.modes import Modes
-from ..structure.negative_stiffness import refuse_unstable
+from ..structure.definite import refuse_unstable
 from ..values import FloatArray, IntArray, Value
 
 

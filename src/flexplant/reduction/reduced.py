@@ -14,24 +14,104 @@ from ..labels import DofSet, Place
 from ..modes.damped_modes import leaving_overdamped
 from ..modes.modes import Modes
 from ..modes.normal_form import normal_form
-from ..progress import Progress
+from ..parallel import Progress
 from ..structure import FEModel
-from ..structure.negative_stiffness import refuse_unstable, unstable_stiffness
-from ..structure.placed import SPANNED
-from ..structure.rigid import orthonormalised
-from ..values import (
-    FloatArray,
-    IntArray,
-    Value,
-    name_list,
-    positive,
-    real_array,
-)
+from ..structure.definite import refuse_unstable, unstable_stiffness
+from ..structure.placed import SPANNED, missed
+from ..structure.rigid import orthonormalised, rigid_motions
+from ..values import ComplexArray, FloatArray, IntArray, Value, name_list, positive, real_array
 from .bounds import ErrorBound
-from .judging import quality_of
-from .quality import ReductionQuality
-from .spanned import Spanned
-from .static_followers import static_followers
+from .judging import ReductionQuality, quality_of
+
+
+class Spanned:
+    """A model whose k coordinates are amounts of shapes of n DOFs: ``q_n = T q_k``.
+
+    The counterpart of `Placed`, whose coordinates are the displacements themselves.
+    """
+
+    M: FloatArray
+    T: FloatArray
+    dofs: DofSet
+    full_dofs: DofSet
+
+    @property
+    def n_dof(self) -> int:
+        """Number of coordinates k."""
+        return int(self.M.shape[0])
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether all coordinates are DOFs of the structure."""
+        return len(self.dofs) == self.n_dof
+
+    def expand(self, q: FloatArray | ComplexArray) -> FloatArray | ComplexArray:
+        """Return the motion ``T q`` of all n DOFs, of motions (k,) or (k, m) of the coordinates.
+
+        Shapes may be complex.
+
+        Raises
+        ------
+        ShapeError
+            When there are not k rows.
+        """
+        if np.iscomplexobj(q):
+            parts = np.asarray(q)
+            return np.asarray(self.expand(parts.real) + 1j * self.expand(parts.imag))
+        shape = (self.n_dof,) if np.ndim(q) == 1 else (self.n_dof, None)
+        return np.asarray(self.T @ real_array(q, "q", shape))
+
+    def row(self, at: Place, direction: str = "z") -> FloatArray:
+        """Return the row (k,) that gives the motion at a place of the full structure.
+
+        Its transpose is the reduced load f* of a unit force there.
+
+        Parameters
+        ----------
+        at : str, (3,) array [m] or mapping
+            A DOF label, a point, or {label: weight}: any of the full structure, not only of the
+            desired DOFs.
+        direction : str
+            The motion at a point.
+
+        Raises
+        ------
+        LabelError
+            When the place is unknown.
+        """
+        return np.asarray(self.full_dofs.row(at, direction) @ self.T)
+
+    def rows(self, points: FloatArray, direction: str = "z") -> FloatArray:
+        """Return the rows (p, k) of the motion at many points (p, 3) [m]; see `row`."""
+        return np.asarray(self.full_dofs.rows(points, direction) @ self.T)
+
+    def inertia(self, motions: FloatArray) -> FloatArray:
+        """Return the loads (k, r) ``M* motions`` of motions (k, r)."""
+        return np.asarray(self.M @ motions)
+
+    def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+        """Return the relative parts (6,) of the rigid-body motions that T cannot make."""
+        wanted = rigid_motions(self.full_dofs, list(about))
+        return missed(self.T @ self.rigid_motions(about), wanted)
+
+    def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+        """Return the coordinates (k, 6) nearest to the six rigid-body motions of the geometry.
+
+        Parameters
+        ----------
+        about : (3,) array [m]
+            The point that rotations turn about.
+
+        Raises
+        ------
+        ShapeError
+            When `about` is no point.
+        """
+        centre = real_array(list(about), "about", (3,))
+        if self.is_physical:
+            return rigid_motions(self.dofs, centre)
+        return np.asarray(la.lstsq(self.T, rigid_motions(self.full_dofs, centre))[0])
+
 
 #: part of the largest eigenvalue of K* by which the lowest one is negative where K* is indefinite
 _DEFINITE = 1e-14
@@ -344,3 +424,28 @@ class ReducedModel(Spanned, Value):
         refuse_unstable(self, "a comparison of responses")
         with Progress(0, "quality"):
             return quality_of(self, full, band, inputs, outputs, count, freq, loss)
+
+
+def static_followers(
+    D: FloatArray, K: FloatArray, light: IntArray
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return the coordinates with mass (c,), how all k follow them (k, c), flexibility and K.
+
+    ``q_light = -K_ll^-1 K_lh q_heavy + K_ll^-1 f_light``, exactly; the flexibility (k, k) is that
+    of the second term, K (c, c) what is left of the stiffness.
+    """
+    k = K.shape[0]
+    heavy = np.setdiff1d(np.arange(k), light)
+    if np.any(D[light]):
+        raise ModelError("a massless coordinate is damped: give it a mass, or no damper.")
+    try:
+        inverse = la.inv(K[np.ix_(light, light)])
+    except la.LinAlgError as error:
+        raise ModelError("a massless coordinate has no stiffness: nothing holds it.") from error
+    flexibility = np.zeros((k, k))
+    flexibility[np.ix_(light, light)] = 0.5 * (inverse + inverse.T)
+    follow = np.zeros((k, heavy.size))
+    follow[heavy] = np.eye(heavy.size)
+    follow[light] = -inverse @ K[np.ix_(light, heavy)]
+    left = follow.T @ K @ follow
+    return heavy, follow, flexibility, np.asarray(0.5 * (left + left.T), dtype=np.float64)

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import LabelError, ModelError, counted
+from ..errors import AssumptionError, LabelError, ModelError, counted, warn
 from ..loop import ClosedLoop, close_loop
-from ..loop.known import DERIVATIVES, force_name
+from ..loop.blocks import DERIVATIVES, force_name
+from ..lti.responses import responder
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, decouple, standard_plant
-from ..values import ComplexArray, FloatArray, Value, instance, name_list, real_array, short, whole
-from .inverse_series import Inverse, coefficients
+from ..values import (
+    ComplexArray,
+    FloatArray,
+    Value,
+    instance,
+    name_list,
+    positive,
+    real_array,
+    short,
+    whole,
+)
 from .motion import SetPoint
+from .simulate import simulate
 
 #: what a set-point gives, by the order of the derivative
 TERMS = ("position", *DERIVATIVES)
@@ -331,3 +343,192 @@ def _check_order(move: Any, gains: FloatArray) -> None:
             f"so that its {TERMS[highest]} is impulses. Give the set-point a bound on "
             f"{TERMS[highest]}, or use feedforward.up_to({TERMS[move.order]!r})."
         )
+
+
+#: points on a circle of Cauchy's integrals; its largest radius [rad/s], and how often it is halved
+_SAMPLES, _LARGEST, _RADII = 16, 6e3, 24
+#: relative: two circles give the same coefficients
+_SAME = 1e-8
+#: condition above which a response counts as singular
+_SINGULAR = 1e9
+#: the response of a POI to forces, and what is to follow, at s
+Inverse: TypeAlias = Callable[[complex], tuple[ComplexArray, ComplexArray]]
+
+
+def coefficients(find: Inverse, dt: float, axes: Sequence[str]) -> FloatArray:
+    """Return k_0, ..., k_4 (p, r, 5) of F(s), G F = rhs, on the largest circle that allows it."""
+    radius = min(_LARGEST, 0.5 / dt) if dt else _LARGEST
+    powers = np.arange(5)
+    outer = _on_circle(find, radius, axes)
+    for _ in range(_RADII):
+        inner = _on_circle(find, 0.5 * radius, axes)
+        size = np.abs(outer) * radius**powers
+        scale = size.max(axis=(1, 2), keepdims=True)
+        if np.all(np.abs(outer - inner) * (0.5 * radius) ** powers <= _SAME * scale):
+            inner[np.abs(inner) * (0.5 * radius) ** powers <= _SAME * scale] = 0.0
+            return inner
+        outer, radius = inner, 0.5 * radius
+    raise AssumptionError(
+        f"the response from forces along {', '.join(axes)} to the POI has no inverse that is "
+        "regular at low frequency: there is a zero at rest. Check which axes the actuators move."
+    )
+
+
+def _on_circle(find: Inverse, radius: float, axes: Sequence[str]) -> FloatArray:
+    """Return k_m = sum F(s_i) s_i^-m / N over N points of a circle (the lower half conjugate)."""
+    turns = np.exp(2j * np.pi * (np.arange(_SAMPLES // 2) + 0.5) / _SAMPLES)
+    values = []
+    for turn in turns:
+        G, wanted = find(radius * complex(turn))
+        rows = np.max(np.abs(G), axis=2, keepdims=True)
+        columns = np.max(np.abs(G), axis=1, keepdims=True)
+        flat = rows.min(initial=1.0) <= 0 or columns.min(initial=1.0) <= 0
+        if flat or np.max(np.linalg.cond(G / np.sqrt(rows * columns))) > _SINGULAR:
+            raise AssumptionError(
+                f"the forces along {', '.join(axes)} do not move these axes of the POI apart from "
+                "each other, so that there is no inverse. Choose other axes of the POI."
+            )
+        values.append(
+            np.linalg.solve(G, np.broadcast_to(wanted, (len(G), *wanted.shape[-2:])))[..., 0]
+        )
+    F = np.array(values)[..., None] * (turns[:, None] ** -np.arange(5))[:, None, None, :]
+    return np.asarray(2.0 / _SAMPLES * F.sum(axis=0).real / radius ** np.arange(5))
+
+
+#: part of the largest force that may fall outside the run
+_OUTSIDE = 1e-3
+
+
+def inverse_forces(
+    loop: ClosedLoop,
+    move: SetPoint,
+    *,
+    duration: float,
+    bandwidth: float,
+    reference: str | None = None,
+) -> dict[str, FloatArray]:
+    """Return the forces that make the POI follow a set-point, by the plant's regularised inverse.
+
+    Minimises ``|r - P u|^2 + rho |u|^2`` over all forces, those before a change of the set-point
+    included: at each frequency ``U = P* (P P* + rho)^-1 R``. A plant with zeros outside the
+    stability region (sampled or with sensors away from actuators) has no stable causal inverse;
+    this one is stable, and acts ahead of the set-point (preview). In units of acceleration rho is
+    ``(2 pi bandwidth)^-4``: far below the bandwidth the plant is inverted, far above nothing is
+    done. All axes of the POI are followed, those without a reference at rest. What the feedback of
+    the loop would add on the model, because its sensors do not move like the POI, is subtracted.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        The controller on a model: a sampled plant, assembled from a free structure.
+    move : SetPoint
+        With a rest before it that is long enough for the preview; a warning says when it is not.
+    duration : float [s]
+        Of the run.
+    bandwidth : float [Hz]
+        Up to which the plant is inverted.
+    reference : str, optional
+        The reference's channel; the plant's only one when not given.
+
+    Returns
+    -------
+    dict {channel: (n_time,) array}
+        `u1:feedforward`, ...: references of a loop with the block `known_forces(plant)`.
+
+    Raises
+    ------
+    LabelError, AssumptionError
+        As for `design_feedforward`.
+    ModelError
+        When the plant is continuous or held, `move` is no SetPoint, or a number is not positive.
+
+    Warns
+    -----
+    FlexplantWarning
+        When forces of more than 0.1 % of the largest fall before the run, or after it.
+
+    References
+    ----------
+    [VanZundertOomen2018]_.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop = fx.close_loop(plant, observer, servo, fx.simulation.known_forces(plant))
+    >>> move = fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.05)
+    >>> sorted(fx.simulation.inverse_forces(loop, move, duration=0.2, bandwidth=60.0))
+    ['u1:feedforward']
+    """
+    instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
+    plant, poi, name = tracked(loop.plant, reference)
+    given: object = move
+    instance(given, SetPoint, "move", "Use setpoint(...) or scan(...).")
+    if not plant.dt:
+        raise ModelError("the inverse is of a sampled loop: use plant.discretized(rate, delay=).")
+    steps = round(positive(duration, "duration") / plant.dt)
+    reach = 2.0 * np.pi * positive(bandwidth, "bandwidth") * plant.dt
+    T, axes = force_axes(plant, poi)
+    low = design_feedforward(plant, reference=name, order=2)
+    if np.any(low.gains[:, :, :2]):
+        raise ModelError(
+            "the plant is held, so that it takes a force to stay away from rest: this inverse is "
+            "of free machines. Use design_feedforward(plant)."
+        )
+    channels = [poi.channel(axis) for axis in poi.axes]
+    size = 1 << int(np.ceil(np.log2(4 * steps)))  # what wraps around has three lengths to decay
+    freq: FloatArray = np.asarray(np.fft.rfftfreq(size, plant.dt), dtype=np.float64)
+    P = np.moveaxis(responder(plant.system.select(channels, plant.u))(freq[1:]), 2, 0) @ T
+    z = np.exp(2j * np.pi * freq[1:] * plant.dt)
+    second = z - 2.0 + 1.0 / z  # the second difference of a motion: finite at rest, as P s^2
+    H = P * second[:, None, None]
+    # in units in which a unit force accelerates its own axis by one unit per sample^2
+    masses = decouple(plant, axes=poi.axes).mass.diagonal()
+    scale = np.diag(masses / plant.dt**2)
+    H = H @ scale
+    damping = (np.abs(second) / reach**2) ** 2
+    back = H.conj().swapaxes(1, 2)
+    gram = H @ back + damping[:, None, None] * np.eye(len(axes))
+    position = np.asarray(move.at((np.arange(-1, steps + 1)) * plant.dt).position)
+    spectrum = np.fft.rfft(np.diff(position, 2), size)
+    target = np.zeros((freq.size - 1, len(axes), 1), dtype=np.complex128)
+    target[:, 0, 0] = spectrum[1:]
+    U = np.zeros((freq.size, len(axes)), dtype=np.complex128)
+    U[1:] = (back @ np.linalg.solve(gram, target))[:, :, 0]
+    U[0] = low.gains[0, :, 2] / masses * spectrum[0].real
+    force = np.fft.irfft(U, size, axis=0) @ (T @ scale).T
+    outside = float(np.max(np.abs(force[steps:])))
+    if outside > _OUTSIDE * float(np.max(np.abs(force))):
+        late = np.flatnonzero(np.max(np.abs(force), axis=1) > _OUTSIDE * np.abs(force).max())
+        ahead = (size - late[late > size // 2].min(initial=size)) * plant.dt
+        warn(
+            f"forces up to {outside:.3g} N fall outside the run and are cut off: the inverse acts "
+            f"{ahead:.3g} s before the run begins, or after it ends. Give the set-point a longer "
+            "rest and the run more time, or lower the bandwidth."
+        )
+    own = force[:steps] - _feedback(loop, force[:steps], move, name)
+    return {force_name(actuator): own[:, i] for i, actuator in enumerate(plant.u)}
+
+
+def _feedback(loop: ClosedLoop, force: FloatArray, move: SetPoint, name: str) -> FloatArray:
+    """Return what the controller adds (n_time, nu) while these forces move its own plant."""
+    plant = loop.plant
+    names = [force_name(u) for u in plant.u]
+    alone = close_loop(plant, known_forces(plant))
+    given = {one: force[:, i] for i, one in enumerate(names)}
+    run = simulate(alone, reference={**given, name: move}, duration=len(force) * plant.dt,
+                   noise=False)  # fmt: skip
+    both = close_loop(plant, *loop.blocks, known_forces(plant))
+    law, x = both.controller, np.zeros(both.controller.n_states)
+    y_at, f_at = law.input_index(plant.y), law.input_index(names)
+    rows = law.output_index(plant.u)
+    read = np.array([run[one] for one in plant.y]).T
+    direct = np.linalg.inv(law.D[np.ix_(rows, f_at)])
+    known = np.zeros_like(force)
+    for k, y in enumerate(read):
+        # the force beside the controller's own that makes the sum what is wanted
+        known[k] = direct @ (force[k] - law.C[rows] @ x - law.D[np.ix_(rows, y_at)] @ y)
+        x = law.A @ x + law.B[:, y_at] @ y + law.B[:, f_at] @ known[k]
+    return force - known

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import ModelError, counted
 from ..loop import ClosedLoop, close_loop
-from ..loop.known import force_name
+from ..loop.blocks import force_name
 from ..values import FloatArray, Value, instance, positive, short, whole, with_unit
 from .feedforward import Feedforward, known_forces, term_numbers, tracked
 from .motion import SetPoint

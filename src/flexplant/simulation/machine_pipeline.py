@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import AssumptionError, ModelError, counted
-from ..estimation import design_kalman
+from ..estimation import KalmanEstimator, design_kalman
 from ..identification import MeasuredModes, identify_modes, numbered
 from ..loop import ClosedLoop, SpillOver, bandwidth, close_loop
 from ..lti.frequency import Frf
@@ -26,13 +26,14 @@ from ..plant import (
     stage_weights,
 )
 from ..reduction import ModalTruncation, ReducedModel, reduce
+from ..store import written
 from ..structure import Damping, FEModel
 from ..synthesis import design_hinf
 from ..updating import Eigenvalues, Localisation, UpdateResult, localise, update
 from ..values import Value, generator, instance, positive, short, whole
-from .machine_report import MachineReport
+from .response import Response
 from .simulate import simulate
-from .specification import Specification
+from .specification import Specification, Verdict
 
 #: times that measured modes are paired with those of a model, at most
 _PAIRINGS = 5
@@ -346,3 +347,85 @@ class MachinePipeline(Value):
             row |= {n: found.verdict[n] for n in found.verdict.names if n not in row}
             row["passed"] = found.verdict.passed
         return row
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MachineReport(Value):
+    """All stages of a `MachinePipeline` for one machine; prints as a text of some forty lines.
+
+    Parameters
+    ----------
+    row : mapping {column: number, truth or text}
+        Its line in the table of a study.
+    measured : MeasuredModes
+        Identified, or as they were given.
+    fit : UpdateResult
+        The update of the model.
+    observer : KalmanEstimator
+        Of the POI, with the modes left out as noise.
+    blocks : tuple of StateSpace or Controller
+        The controller.
+    left_out : SpillOver or None
+        The certificate on the larger model: how the loop on the updated one stands with the modes
+        left out.
+    loop : ClosedLoop
+        On the machine; on the larger model for a machine that was measured only.
+    run : Response
+        Of that loop.
+    verdict : Verdict, optional
+        Beside the specification.
+    places : Localisation, optional
+        Which candidates joined the update.
+    warned : tuple of str
+        What was warned of on the way.
+    """
+
+    row: Mapping[str, Any]
+    measured: MeasuredModes
+    fit: UpdateResult
+    observer: KalmanEstimator
+    blocks: tuple[Any, ...]
+    left_out: SpillOver | None
+    loop: ClosedLoop
+    run: Response
+    verdict: Verdict | None = None
+    places: Localisation | None = None
+    warned: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        self._set(row=dict(self.row), blocks=tuple(self.blocks), warned=tuple(self.warned))
+
+    def __repr__(self) -> str:
+        sections: dict[str, Sequence[Any]] = {
+            "Measured": [self.measured],
+            "Localised": [self.places],
+            "Updated": [self.fit],
+            "Observer": [self.observer],
+            "Controller": self.blocks,
+            "Loop on the larger model": [self.left_out and self.left_out.summary],
+            "Loop that was run": [self.loop],
+            "Specification": [self.verdict],
+            "In numbers": [f"{name}: {_shown(value)}" for name, value in self.row.items()],
+            "Warnings": self.warned,
+        }
+        lines = []
+        for heading, parts in sections.items():
+            shown = "\n".join(str(part) for part in parts if part is not None)
+            if shown:
+                lines += [heading, *(f"  {line}" for line in shown.splitlines()), ""]
+        return "\n".join(lines[:-1])
+
+    def write(self, path: str | Path) -> None:
+        """Write the text to a file, at once or not at all; `save` keeps the values themselves.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file, replaced when it is there.
+        """
+        with written(path) as file:
+            file.write(f"{self!r}\n".encode())
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

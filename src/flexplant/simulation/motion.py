@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,6 @@ import numpy.typing as npt
 
 from ..errors import ModelError, counted
 from ..values import FloatArray, Value, instance, real_array
-from .profile import moved
 
 #: [samples] a time this close to the grid is on it
 ON_GRID = 1e-6
@@ -192,3 +192,176 @@ class SetPoint(Value):
     def _before(self) -> FloatArray:
         """Return the states just before the ends of the phases."""
         return moved(self.states.T, np.where(self.from_end, 0.0, self.lengths))
+
+
+#: relative: bounds may be exceeded by rounding alone
+_ROUNDING = 1e-13
+
+
+class Phase(NamedTuple):
+    """A stretch of time in which the highest derivative is constant.
+
+    `state` is position, velocity, acceleration, jerk and snap at its beginning or, with
+    `from_end`, at its end: expanded from there, what begins or ends at rest does so exactly.
+    """
+
+    length: float
+    from_end: bool
+    state: FloatArray
+
+
+def spans(t: tuple[float, ...]) -> tuple[list[float], list[float]]:
+    """Return the lengths b_k of the pulse of each level, and their effective widths w_k.
+
+    Level 1 holds the highest derivative for t_1. Level k puts two pulses of level k - 1, the
+    second with the opposite sign, a time t_k apart: ``b_k = 2 b_(k-1) + t_k``. Its integral is
+    ``w_k = b_(k-1) + t_k`` times the peak of level k - 1, so that the last one covers the distance
+    ``w_1 w_2 ... w_n`` times the highest derivative.
+    """
+    b, w = [0.0], []
+    for length in t:
+        w.append(b[-1] + length)
+        b.append(2.0 * b[-1] + length)
+    return b, w
+
+
+def shortest(distance: float, bounds: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the durations t_1, ..., t_n of each level, bounds those of velocity and upwards.
+
+    Each duration is the longest that the bounds and the distance allow, from the highest
+    derivative downwards.
+    """
+    if len(bounds) == 1:
+        return (distance / bounds[0],)
+    if len(bounds) == 2:
+        velocity, acceleration = bounds
+        steady = min(velocity / acceleration, float(np.sqrt(distance / acceleration)))
+        return steady, max(0.0, distance / (acceleration * steady) - steady)
+    found = _durations(distance, *bounds)
+    return found if len(bounds) == 4 else found[1:]
+
+
+def on_grid(distance: float, bounds: tuple[float, ...], rate: float) -> tuple[float, ...]:
+    """Return the durations in whole samples: the shortest motion near the optimum off the grid.
+
+    Any durations give the distance exactly with one level of the highest derivative. For those of
+    the levels 1 to n - 1 the last one, a constant velocity, is as short as all bounds allow:
+    ``w_n >= distance / (bound_m w_(n-1) ... w_(n-m+1))``. So every bound holds for every choice.
+    """
+    off = shortest(distance, bounds)
+    choices = []
+    for level, length in enumerate(off[:-1]):
+        below = int(np.floor(length * rate))
+        least = 1 if level == 0 else 0
+        choices.append(sorted({max(below + step, least) for step in (-1, 0, 1, 2)}))
+    best: tuple[float, float] | None = None
+    chosen: tuple[float, ...] = ()
+    for first in product(*choices):
+        b, w = spans(tuple(float(n) for n in first))
+        widths = np.cumprod([1.0, *w[::-1]])
+        ticks = [bound / rate**m for m, bound in enumerate(bounds, start=1)]
+        needed = max(distance / (bound * v) for bound, v in zip(ticks, widths, strict=True))
+        last = max(np.ceil(needed * (1.0 - _ROUNDING) - b[-1]), 0.0 if first else 1.0)
+        total, volume = 2.0 * b[-1] + last, float(widths[-1]) * (b[-1] + last)
+        if best is None or (total, -volume) < best:
+            best, chosen = (total, -volume), (*(float(n) for n in first), float(last))
+    return chosen
+
+
+def flank(t: tuple[float, ...], change: float) -> list[Phase]:
+    """Return the phases in which the velocity rises from 0 by a change, durations t in seconds.
+
+    The first half is expanded from rest, the second from its end by the symmetry of the flank,
+    ``v(T - t) = change - v(t)`` and ``p(T - t) = change (T / 2 - t) + p(t)``.
+    """
+    b, w = spans(t)
+    level = change / float(np.prod(w))
+    pulse = [(t[0], level)]
+    for length in t[1:-1]:
+        pulse = [*pulse, (length, 0.0), *((s, -one) for s, one in pulse)]
+    half = [] if len(t) == 1 else pulse
+    rows, x, now, starts = [], np.zeros(5), 0.0, []
+    for length, value in half:
+        x[len(t) + 1] = value
+        rows.append(Phase(length, False, x.copy()))
+        starts.append(now)
+        x, now = moved(x, length), now + length
+    middle = np.zeros(5)
+    middle[0], middle[1], middle[2] = x[0], 0.5 * change * b[-2] / w[-1], change / w[-1]
+    rows.append(Phase(t[-1], False, middle))
+    for start, row in zip(starts[::-1], rows[-2::-1], strict=True):
+        p, v, a, j, s = row.state
+        end = np.array([change * (0.5 * b[-1] - start) + p, change - v, a, -j, s])
+        rows.append(Phase(row.length, True, end))
+    return rows
+
+
+def mirrored(rows: list[Phase], total: float) -> list[Phase]:
+    """Return phases in reversed time: what rises from rest comes to rest, at the position total."""
+    back = []
+    for length, from_end, (p, v, a, j, s) in reversed(rows):
+        back.append(Phase(length, not from_end, np.array([total - p, v, -a, j, -s])))
+    return back
+
+
+def moved(state: FloatArray, t: float | FloatArray) -> FloatArray:
+    """Return position, velocity, acceleration, jerk and snap (5, ...) after constant snap."""
+    p, v, a, j, s = state
+    return np.array(
+        [
+            p + t * (v + t / 2.0 * (a + t / 3.0 * (j + t / 4.0 * s))),
+            v + t * (a + t / 2.0 * (j + t / 3.0 * s)),
+            a + t * (j + t / 2.0 * s),
+            j + t * s,
+            s + 0.0 * t,
+        ]
+    )
+
+
+def _durations(
+    distance: float, velocity: float, acceleration: float, jerk: float, snap: float | None = None
+) -> tuple[float, float, float, float]:
+    """Return for how long snap, jerk, acceleration and velocity are held in one flank.
+
+    A jerk pulse lasts J = 2 ramp + hold and adds the acceleration a; the acceleration lasts
+    2 J + steady and adds the velocity a (J + steady).
+    """
+    if snap is None:
+        ramp, peak = 0.0, jerk
+        hold = min(acceleration / jerk, np.sqrt(velocity / jerk), np.cbrt(distance / (2.0 * jerk)))
+    else:
+        ramp = min(
+            jerk / snap,
+            np.sqrt(acceleration / snap),
+            np.cbrt(velocity / (2.0 * snap)),
+            (distance / (8.0 * snap)) ** 0.25,
+        )
+        peak = snap * ramp
+        hold = max(
+            0.0,
+            min(
+                acceleration / peak - ramp,
+                # peak (ramp + hold) (2 ramp + hold) = velocity
+                0.5 * (np.sqrt(ramp**2 + 4.0 * velocity / peak) - 3.0 * ramp),
+                _longest_pulse(ramp, distance / (2.0 * peak)) - 2.0 * ramp,
+            ),
+        )
+    pulse, reached = 2.0 * ramp + hold, peak * (ramp + hold)
+    steady = max(
+        0.0,
+        min(
+            velocity / reached - pulse,
+            # reached (pulse + steady) (2 pulse + steady) = distance
+            0.5 * (np.sqrt(pulse**2 + 4.0 * distance / reached) - 3.0 * pulse),
+        ),
+    )
+    both = 2.0 * pulse + steady
+    cruise = max(0.0, distance / (reached * (pulse + steady)) - both)
+    return float(ramp), float(hold), float(steady), float(cruise)
+
+
+def _longest_pulse(ramp: float, volume: float) -> float:
+    """Return the root p > ramp of p^2 (p - ramp) = volume, by the hyperbolic form of Cardano's."""
+    third = ramp / 3.0
+    angle = np.arccosh(1.0 + 0.5 * volume / third**3) / 3.0
+    return float(third + 2.0 * third * np.cosh(angle))

@@ -8,8 +8,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..values import positive, real_array
-from .motion import ON_GRID, SetPoint
-from .profile import Phase, flank, mirrored, on_grid, shortest, spans
+from .motion import ON_GRID, Phase, SetPoint, flank, mirrored, on_grid, shortest, spans
 
 
 def setpoint(

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from ..errors import AssumptionError, LabelError, ModelError, require_known, warn
 from ..loop import ClosedLoop
-from ..loop.known import DERIVATIVES, references
-from ..loop.noise_sources import white_noise
+from ..loop.blocks import DERIVATIVES, references
+from ..loop.budget import white_noise
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant
 from ..values import (
@@ -25,9 +25,8 @@ from ..values import (
     short,
     whole,
 )
-from .conditions import conditions, finer_loop
 from .motion import SetPoint
-from .nonlinear_elements import Element
+from .nonlinear_elements import Element, conditions, finer_loop
 from .response import Response
 from .runs import make_runner
 

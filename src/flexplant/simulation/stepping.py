@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..loop import ClosedLoop
-from ..loop.noise_sources import WhiteNoise
+from ..loop.budget import WhiteNoise
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import FloatArray, IntArray

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import SolverError, counted
-from ..progress import tick
+from ..parallel import tick
 from ..values import FloatArray, Matrix, Rng
 from .factor import by_rows, without_zeros
 from .rayleigh_ritz import column_groups, mixed

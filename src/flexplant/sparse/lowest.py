@@ -18,8 +18,7 @@ from .inertia import multifrontal_inertia
 from .lanczos import VALUE, BlockLanczos, iterated
 from .multifrontal import MultifrontalCholesky
 from .ordering import Dissection, dissect
-from .orthonormal import beyond
-from .rayleigh_ritz import rayleigh_ritz
+from .rayleigh_ritz import beyond, rayleigh_ritz
 
 #: up to this many DOFs dense LAPACK finds every eigenvalue
 _DENSE = 300

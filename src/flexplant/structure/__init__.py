@@ -9,11 +9,11 @@ from .damping import Damping as Damping
 from .damping import ModalDamping as ModalDamping
 from .damping import Rayleigh as Rayleigh
 from .hysteretic import Hysteretic as Hysteretic
+from .hysteretic import LossRegion as LossRegion
 from .inspection.check import ModelCheck as ModelCheck
 from .inspection.check import check as check
 from .interpolation import ScatteredShape as ScatteredShape
 from .interpolation import interpolated as interpolated
-from .loss_region import LossRegion as LossRegion
 from .matrices import FEMatrices as FEMatrices
 from .mesh.beam import beam as beam
 from .mesh.block import solid_block as solid_block

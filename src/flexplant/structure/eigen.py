@@ -13,7 +13,7 @@ from ..labels import DofSet
 from ..sparse.factor import DENSE_LIMIT, dense, unit_diagonal
 from ..sparse.rayleigh_ritz import rayleigh_ritz, rounding_of, soft_group
 from ..values import FloatArray
-from .negative_stiffness import are_rigid, signed_root
+from .definite import are_rigid, signed_root
 from .zero_energy import beyond, most_moved
 
 #: eigenvalues above this part of the largest one are right to 1e-9 when M is made the identity

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -14,15 +14,21 @@ from ..dof_columns import at_nodes, node_numbers
 from ..errors import LabelError, ModelError, ShapeError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
-from ..values import IntArray, Value, flag, instance, name_list, one_of, real_array, whole
-from .completion import completed as completed
-from .completion import square
-from .condense import empty_rows, held_rows
+from ..values import (
+    FloatArray,
+    IntArray,
+    Value,
+    flag,
+    instance,
+    name_list,
+    one_of,
+    real_array,
+    whole,
+)
 from .definite import SEMIDEFINITE, are_swapped
-from .local_axes import cosines
 from .model import FEModel
 from .precision import digits_of, endangered, held_by_rounding, shown_digits
-from .singular_mass import inertial
+from .singular_mass import empty_rows, held_rows, inertial
 from .units import units
 from .zero_energy import freed
 
@@ -403,3 +409,76 @@ class FEMatrices(Value):
             return None
         known = None if model is None else model.rigid_body
         return held_by_rounding(self.K, self.M, self.dofs, self.digits, known)
+
+
+def cosines(dofs: DofSet, rotations: Any) -> Any:
+    """Return C (n, n), sparse, ``q_local = C q_global``, from {node: (3, 3) direction cosines}."""
+    rows, columns, values = [np.arange(len(dofs))], [np.arange(len(dofs))], [np.ones(len(dofs))]
+    instance(rotations, Mapping, "rotations", "Pass {node: (3, 3) cosines}.", LabelError)
+    for node, given in rotations.items():
+        matrix = real_array(given, f"rotations[{node}]", (3, 3))
+        if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-6:
+            raise ModelError(
+                f"the direction cosines of node {node} are not orthogonal, got "
+                f"{matrix.round(6).tolist()}: row i holds the global components of local axis i."
+            )
+        found = np.flatnonzero(dofs.nodes == node)
+        if not found.size:
+            raise LabelError(f"rotations name node {node}, which has no DOF: {dofs!r}.")
+        for first in (0, 3):
+            kinds = dofs.kinds[found]
+            three = found[(kinds >= first) & (kinds < first + 3)]
+            if three.size not in (0, 3):
+                raise ModelError(
+                    f"node {node} has a local coordinate system, but only {three.size} of three "
+                    "directions: the held one would be oblique in global directions. Leave its "
+                    "DOFs local, place ports elsewhere, or export it unconstrained."
+                )
+            three = three[np.argsort(dofs.kinds[three])]
+            if three.size:
+                rows.append(np.repeat(three, 3))
+                columns.append(np.tile(three, 3))
+                values.append((matrix - np.eye(3)).ravel())
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return sp.csc_array(entries, shape=(len(dofs), len(dofs)))
+
+
+def square(given: Any, name: str) -> sp.csc_array:
+    """Return a square sparse matrix with finite real entries, without stored zeros."""
+    stored: Any = given
+    if not sp.issparse(given):
+        array = real_array(given, name)
+        if array.ndim != 2 or array.shape[0] != array.shape[1]:
+            raise ShapeError(
+                f"{name} must be square, got shape {array.shape}. Pass an (n, n) array."
+            )
+        return sp.csc_array(array)
+    listed: Any = stored.tocoo()
+    if listed.ndim != 2 or listed.shape[0] != listed.shape[1]:
+        raise ShapeError(f"{name} must be square, got shape {listed.shape}. Pass an (n, n) array.")
+    data: FloatArray = real_array(listed.data, f"stored entries of {name}")
+    matrix: Any = sp.csc_array((data, (listed.row, listed.col)), shape=listed.shape)
+    matrix.sum_duplicates()
+    matrix.eliminate_zeros()
+    return cast("sp.csc_array", matrix)
+
+
+def completed(given: Any, name: str) -> tuple[sp.csc_array, str | None]:
+    """Return a symmetric matrix of which a file holds one triangle, and a note of what was done.
+
+    A matrix that stores every pair (i, j), (j, i) at most once, in either triangle, is completed;
+    one that stores both is left as it is, for `check` to compare them.
+    """
+    matrix = square(given, name)
+    lower: Any = sp.tril(matrix, -1, format="csc")
+    upper: Any = sp.triu(matrix, 1, format="csc")
+    if not lower.nnz and not upper.nnz:
+        return matrix, None
+    pattern = [abs(part).astype(bool).astype(np.int8) for part in (lower, upper.T)]
+    if pattern[0].multiply(pattern[1]).nnz:
+        return matrix, None
+    half: Any = lower + upper
+    which = "each pair once" if lower.nnz and upper.nnz else None
+    which = which or ("upper triangle only" if upper.nnz else "lower triangle only")
+    full: Any = sp.csc_array(half + half.T + sp.diags_array(matrix.diagonal()))
+    return full, f"{name}: {which}, completed"

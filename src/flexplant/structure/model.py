@@ -17,9 +17,15 @@ from ..sparse.factor import is_positive_definite, with_pattern_of
 from ..values import FloatArray, Matrix, Value, frozen, instance, real_array
 from .attachments import HeldShape, Part, added_matrices, summed
 from .damping import Damping, Rayleigh, damping_matrix
-from .definite import MatrixLike, check_semidefinite, slow, symmetric, without_inertia
+from .definite import (
+    MatrixLike,
+    check_semidefinite,
+    slow,
+    symmetric,
+    unstable_stiffness,
+    without_inertia,
+)
 from .eigen import has_negative_springs
-from .negative_stiffness import unstable_stiffness
 from .placed import Placed
 from .precision import digits_of, endangered, held_by_rounding
 from .rigid import body_motions, force_parts, orthonormalised, rigid_body_basis

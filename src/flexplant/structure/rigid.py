@@ -17,8 +17,7 @@ from ..sparse.factor import by_rows
 from ..sparse.lowest import ROUNDING, definite_solver
 from ..sparse.rayleigh_ritz import Absolute
 from ..values import FloatArray, IntArray, Matrix
-from .components import bodies
-from .soft_springs import unheld
+from .soft_springs import bodies, unheld
 
 #: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
 _ENERGY_TOLERANCE = 1e-10

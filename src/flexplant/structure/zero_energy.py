@@ -13,9 +13,8 @@ from ..labels import DIRECTIONS, DofSet
 from ..sparse.factor import by_rows, dense
 from ..sparse.lowest import PRECISION, ROUNDING
 from ..values import FloatArray, IntArray
-from .components import bodies
 from .rigid import orthonormalised, rigid_motions
-from .soft_springs import unheld
+from .soft_springs import bodies, unheld
 
 #: times the energy that rounding of the entries allows: free
 _MARGIN = 3.0

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple, Protocol
 
-from ..certificates import in_words
-from ..errors import counted
-from ..loop import SpillOver
+import numpy as np
+
+from ..certificates import in_words, stability, stability_name
+from ..errors import CertificateError, FlexplantWarning, counted, warn
+from ..loop import SpillOver, close_loop
+from ..lti.norms import peak_gain
+from ..lti.preparation import Prepared
+from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
-from ..values import Value
+from ..plant import StandardPlant, larger_plant
+from ..structure import FEModel
+from ..values import ComplexArray, FloatArray, Value
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -87,3 +96,175 @@ class Controller(Value):
             lines.append(f"  with the modes left out: {self.left_out.summary}")
         lines += [f"  {note}" for note in self.notes]
         return "\n".join(lines)
+
+
+class SolvedController(NamedTuple):
+    """A controller of the prepared problem, with what its method claims."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    gamma: float
+    lower: float
+    #: numbers for the certificate, and sentences, on how it was found
+    certificate: Mapping[str, float] = MappingProxyType({})
+    notes: tuple[str, ...] = ()
+
+
+class SynthesisMethod(Protocol):
+    """A way to solve the prepared problem: `Riccati()` or `Lmi()`."""
+
+    def solve(self, problem: Prepared) -> SolvedController:
+        """Return a controller of the prepared problem."""
+
+
+#: the two norms agree to this part, and the claim holds to it
+AGREEMENT = 1e-3
+
+
+def certified_norm(
+    loop: StateSpace, claim: float, respond: Responder | None = None
+) -> dict[str, float]:
+    """Return what was verified of a closed loop: its norm by two routes, and its stability."""
+    least = stability(loop.poles(), loop.dt)
+    if not least < (1.0 if loop.dt else 0.0):
+        raise CertificateError(
+            f"the closed loop is not stable ({stability_name(loop.dt)} {least:.6g}): the "
+            "controller is refused. "
+            "Is the sign of the feedback u = K y right, and is it the plant that it was made for?"
+        )
+    norm, _ = peak_gain(loop)
+    swept = swept_norm(loop, respond)
+    if not abs(norm - swept) <= AGREEMENT * norm:
+        raise CertificateError(
+            f"two routes to the norm disagree: {norm:.6g} with proof, {swept:.6g} by a sweep. "
+            "The loop is too badly conditioned to trust; loosen the weights."
+        )
+    if norm > claim * (1.0 + AGREEMENT):
+        raise CertificateError(
+            f"the closed loop has the norm {norm:.6g}, but {claim:.6g} was claimed: "
+            "the controller is refused."
+        )
+    return {"norm": norm, "swept norm": swept, stability_name(loop.dt): least, "claim": claim}
+
+
+def reached_norms(P: StandardPlant, loop: StateSpace, respond: Responder) -> dict[str, float]:
+    """Return the largest gain of a loop from each group of w to each group of z, by a sweep.
+
+    The groups follow from the names that `assemble_plant` gives: of w `references` (die:ref),
+    `noises` (y1:noise) and `disturbances`, of z `efforts` (u1:effort) and `motions`. Empty for a
+    plant that was not assembled from a structure.
+    """
+    if not P.is_assembled:
+        return {}
+    gain = respond(_sweep(loop))
+    w = {"references": ":ref", "noises": ":noise"}
+    sides = [_grouped(P.z, {"efforts": ":effort"}, "motions"), _grouped(P.w, w, "disturbances")]
+    return {
+        f"{to} from {source}": _peak(gain[rows][:, columns])[0]
+        for to, rows in sides[0].items()
+        for source, columns in sides[1].items()
+    }
+
+
+def _grouped(names: Sequence[str], endings: Mapping[str, str], rest: str) -> dict[str, list[int]]:
+    """Return the places of names by group, from their endings; empty groups left out."""
+    groups: dict[str, list[int]] = {rest: [], **{group: [] for group in endings}}
+    for i, name in enumerate(names):
+        own = next((group for group, end in endings.items() if name.endswith(end)), rest)
+        groups[own].append(i)
+    return {group: places for group, places in groups.items() if places}
+
+
+def swept_norm(loop: StateSpace, respond: Responder | None = None) -> float:
+    """Return the largest gain over a grid that is refined at resonances and at its own peak."""
+    if not loop.D.size:
+        return 0.0
+    if not loop.n_states:
+        return float(np.linalg.norm(loop.D, 2))
+    find, freq = respond or responder(loop), _sweep(loop)
+    best = float(np.linalg.norm(loop.D, 2)) if not loop.dt else 0.0
+    for _ in range(3):
+        largest, peak = _peak(find(freq))
+        best = max(best, largest)
+        bracket = freq[max(peak - 1, 0)], freq[min(peak + 1, freq.size - 1)]
+        freq = np.linspace(*bracket, 40)
+    return best
+
+
+def _sweep(loop: StateSpace) -> FloatArray:
+    """Return frequencies [Hz] from 0 up, dense around the resonances of a loop with states."""
+    poles = loop.poles()
+    if loop.dt:
+        poles = np.asarray(np.log(np.where(np.abs(poles) > 0, poles, 1e-300)) / loop.dt)
+    nyquist = 0.5 / loop.dt if loop.dt else np.inf
+    speeds = np.abs(poles.imag[np.abs(poles.imag) > 0]) / (2 * np.pi)
+    sizes = np.abs(poles) / (2 * np.pi)
+    low, high = (
+        (0.01 * float(sizes[sizes > 0].min()), min(100.0 * float(sizes.max()), nyquist))
+        if np.any(sizes > 0)
+        else (1e-3, min(1e3, nyquist))
+    )
+    width = np.abs(poles.real[np.abs(poles.imag) > 0]) / (2 * np.pi)
+    offsets = np.concatenate([[0.0], np.geomspace(0.05, 20.0, 24)])
+    near = (speeds[:, None] + width[:, None] * np.concatenate([-offsets, offsets])).ravel()
+    freq = np.concatenate([[0.0], np.geomspace(min(low, 0.5 * high), high, 600), near])
+    return np.asarray(np.unique(freq[(freq >= 0) & (freq <= nyquist)]))
+
+
+def _peak(H: ComplexArray) -> tuple[float, int]:
+    """Return the largest singular value of responses (p, m, n_freq), and at which frequency.
+
+    It lies between the Frobenius norm over the root of the rank and the Frobenius norm: where the
+    latter is too small there is nothing to compute.
+    """
+    size = np.sqrt(np.sum(H.real**2 + H.imag**2, axis=(0, 1)))
+    near = np.flatnonzero(size >= size.max() * (1.0 - 1e-12) / np.sqrt(min(H.shape[:2])))
+    gains = np.linalg.norm(np.moveaxis(H[:, :, near], 2, 0), 2, axis=(1, 2))
+    largest = int(np.argmax(gains))
+    return float(gains[largest]), int(near[largest])
+
+
+#: what a high peak means
+CLOSE = ", and one that differs a little from the model may be unstable"
+
+
+def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> SpillOver | None:
+    """Return the check of a design's loop with the modes left out; None: they are not known."""
+    whole = larger_plant(plant, larger)
+    if whole is None:
+        return None
+    plain, reading = plant.unweighted, plant.origin.reading
+    before = [] if reading is None else [reading]
+    with warnings.catch_warnings():  # one warning is enough, where the user called from
+        warnings.simplefilter("ignore", FlexplantWarning)
+        found = close_loop(plain, *before, *blocks, larger=whole).left_out
+    if found is not None and not found.is_fine:
+        warn(
+            f"with the modes that the plant left out the loop is {found.summary}. The machine has "
+            f"these modes{CLOSE if found.is_high else ''}: choose less bandwidth, keep them in "
+            "the plant, or weight the efforts (or roll the controller off) before them."
+        )
+    return found
+
+
+def with_left_out(
+    answer: Controller, plant: StandardPlant, larger: Any, block: StateSpace | None = None
+) -> Controller:
+    """Return an answer with its check on the modes left out, or the note that none are known.
+
+    The block is its part from the plant's y to u, unless all of its system is.
+    """
+    found = spill_over(plant, [answer.system if block is None else block], larger)
+    if found is None:
+        return answer.replace(notes=(*answer.notes, *unchecked(plant)))
+    certificate = dict(answer.certificate or {}) | found.certificate
+    return answer.replace(certificate=certificate, left_out=found)
+
+
+def unchecked(plant: StandardPlant) -> tuple[str, ...]:
+    """Return a note that no modes left out are known, for a plant that may have left out some."""
+    if not plant.is_assembled or isinstance(plant.model, FEModel):
+        return ()
+    return ("modes left out of the plant: none known, none checked; larger= gives them",)

@@ -9,18 +9,16 @@ import numpy as np
 
 from ..certificates import stability, stability_name
 from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
-from ..lti.h2_norms import h2_norm
 from ..lti.interconnection import lft
+from ..lti.norms import h2_norm
 from ..lti.preparation import Prepared, prepared
 from ..lti.riccati import control_care, control_dare, solve_care, solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from .controller import Controller
-from .method import SolvedController
+from .controller import Controller, SolvedController, with_left_out
 from .reach import posed, require_reach
 from .singular import made_regular, missing_ranks
-from .spill_over_check import with_left_out
 
 #: the H2 norm by the closed loop's Gramians and by the formula of the least cost agree to this
 AGREEMENT = 1e-5

@@ -17,8 +17,8 @@ from ..lti.statespace import StateSpace
 from ..parallel import Progress
 from ..values import Value, positive
 from .central import OnAxisError, central, indefinite, quadratic, riccati_solutions
+from .controller import SolvedController
 from .lower_bound import parrott
-from .method import SolvedController
 from .reach import beyond_rounding
 from .singular import made_regular, missing_ranks, require_ranks
 

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..values import FloatArray
-from .lmi_plant import half
+from .lmi_solution import half
 
 #: the most steps
 STEPS = 100

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..loop.hidden_modes import hidden_modes
-from ..loop.nyquist import nyquist_count
+from ..loop.report import nyquist_count
 from ..lti.frequency import Frf
 from ..lti.grid import SOUGHT, highest, resonance_grid
 from ..lti.interconnection import loop_poles

@@ -10,10 +10,19 @@ from ..errors import FlexplantError, InfeasibleError, SolverError
 from ..lti.preparation import Prepared
 from ..parallel import Progress
 from ..values import Value
-from .lmi_method import LOOSER, Candidate, check_cost, check_size, checked_settings, first_verified
-from .lmi_plant import Plant, lqg_states, same_states
+from .controller import SolvedController
 from .lmi_programs import Optimum, moderate_controller, smallest_gamma
-from .method import SolvedController
+from .lmi_solution import (
+    LOOSER,
+    Candidate,
+    Plant,
+    check_cost,
+    check_size,
+    checked_settings,
+    first_verified,
+    lqg_states,
+    same_states,
+)
 
 #: gap between value and lower bound at which no other coordinates are tried
 _GAP = 5e-4

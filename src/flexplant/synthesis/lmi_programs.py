@@ -12,8 +12,7 @@ import scipy.linalg as la
 
 from ..errors import InfeasibleError, SolverError, counted
 from ..parallel import interruptible
-from .lmi_plant import Plant, half, null_space
-from .lmi_solution import Matrices, dual_bound, reconstructed
+from .lmi_solution import Matrices, Plant, dual_bound, half, null_space, reconstructed
 
 #: part of the back-off that goes into X Y >= (1 + ...)^2, away from the singular I - X Y
 APART = 0.6

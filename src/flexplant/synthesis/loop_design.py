@@ -18,8 +18,8 @@ from ..lti.statespace import StateSpace, System, as_statespace
 from ..parallel import one_thread
 from ..plant import StandardPlant, decouple
 from ..values import FloatArray, Value, name_list, short
+from .controller import spill_over, unchecked
 from .law import Element, Law
-from .spill_over_check import spill_over, unchecked
 
 
 @dataclass(frozen=True, eq=False, repr=False)

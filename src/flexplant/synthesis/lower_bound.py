@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg as la
 
 from ..errors import FlexplantError
 from ..lti.grid import highest, resonance_grid
 from ..lti.preparation import Prepared
 from ..lti.responses import responses
 from ..values import ComplexArray, FloatArray
-from .relaxed import relaxed_bound
+from .central import OnAxisError, indefinite, stabilising
 from .structured_lmi import StructuredLmi
 
 #: points of the sweep, and times that it is refined
@@ -84,3 +86,133 @@ def _beyond(M: ComplexArray | FloatArray, Pzw: ComplexArray | FloatArray) -> Flo
 
 def _adjoint(M: ComplexArray | FloatArray) -> ComplexArray:
     return np.asarray(M.conj().swapaxes(1, 2), dtype=np.complex128)
+
+
+#: relative: a direction of D12 that is smaller is rounding
+_RANK = 1e-9
+#: relative: how much rho(X Y) exceeds gamma^2 where gamma is refuted
+_BEYOND = 1e-5
+#: gamma is tried at these parts of what is reached, until one is refuted; then halving intervals
+_PARTS = (0.999 / 1.05, 0.8, 0.5, 0.2, 0.05, 1e-2, 1e-3)
+#: relative width at which the halving stops
+_WIDTH = 1e-3
+
+
+class FullInformation(NamedTuple):
+    """``x1' = A x1 + B1 w + B2 v``, ``z = C x1 + D11 w + D12 v``, D12 of full rank; x1 = T' x.
+
+    Of a problem in which u moves some states at no cost: these are chosen freely, among the inputs
+    v. Whatever a controller does to the plant can be done here, so that no norm is larger.
+    """
+
+    A: FloatArray
+    B1: FloatArray
+    B2: FloatArray
+    C: FloatArray
+    D11: FloatArray
+    D12: FloatArray
+    T: FloatArray
+
+    @property
+    def direct(self) -> float:
+        """The least norm that D11 and D12 alone allow."""
+        beyond = self.D11 - self.D12 @ np.linalg.lstsq(self.D12, self.D11, rcond=None)[0]
+        return float(np.linalg.norm(beyond, 2)) if beyond.size else 0.0
+
+    def value(self, gamma: float) -> FloatArray | None:
+        """Return X (n, n) of the game's value ``x' X x``, None where gamma is refuted.
+
+        The sup over w of the inf over v of ``|z|^2 - gamma^2 |w|^2``, by a Riccati equation.
+        """
+        if gamma <= self.direct:
+            return None
+        D = np.hstack([self.D11, self.D12])
+        m1 = self.D11.shape[1]
+        R = D.T @ D - la.block_diag(gamma**2 * np.eye(m1), np.zeros((len(D.T) - m1,) * 2))
+        X, _ = stabilising(
+            self.A, np.hstack([self.B1, self.B2]), self.C.T @ self.C, R, self.C.T @ D
+        )
+        speed = float(np.linalg.norm(self.A)) or 1.0
+        if indefinite(X, float(np.linalg.norm(self.C)) ** 2 / speed):
+            return None
+        return np.asarray(self.T @ X @ self.T.T)
+
+
+def full_information(
+    A: FloatArray,
+    B1: FloatArray,
+    B2: FloatArray,
+    C: FloatArray,
+    D11: FloatArray,
+    D12: FloatArray,
+) -> FullInformation:
+    """Return the problem of a plant with all states known, in which D12 has full rank.
+
+    Directions of u that z does not contain move some states at any speed at no cost: these states
+    become inputs, with their columns of A and C; and again, until no direction is free.
+    """
+    T = np.eye(A.shape[0])
+    while B2.shape[1]:
+        sizes = np.linalg.norm(np.vstack([B2, D12]), axis=0)
+        B2, D12 = B2 / np.where(sizes > 0, sizes, 1.0), D12 / np.where(sizes > 0, sizes, 1.0)
+        _, values, turn = la.svd(D12, full_matrices=True)
+        rank = int(np.count_nonzero(values > _RANK))
+        if rank == D12.shape[1]:
+            break
+        free = B2 @ turn[rank:].T
+        basis, moved, _ = la.svd(free, full_matrices=True)
+        count = int(np.count_nonzero(moved > _RANK * max(np.max(moved, initial=0.0), 1.0)))
+        left, fast = basis[:, count:], basis[:, :count]
+        B2 = left.T @ np.hstack([A @ fast, B2 @ turn[:rank].T])
+        D12 = np.hstack([C @ fast, D12 @ turn[:rank].T])
+        A, B1, C, T = left.T @ A @ left, left.T @ B1, C @ left, T @ left
+    return FullInformation(A, B1, B2, C, D11, D12, T)
+
+
+def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
+    """Return the largest gamma, up to the one reached, that is refuted for every controller.
+
+    Where ||w -> z|| < gamma is reached, it is reached with a little noise and effort added too.
+    Their Riccati equations have solutions X and Y with rho(X Y) < gamma^2, which are at least the
+    values of the same problem with all states known and free states as inputs, and of its dual.
+
+    References
+    ----------
+    [Stoorvogel1992]_ (the two quadratic matrix inequalities of singular problems).
+    """
+    sides = (
+        full_information(p.A, p.B1, p.B2, p.C1, p.D11, p.D12),
+        full_information(p.A.T, p.C1.T, p.C2.T, p.B1.T, p.D11.T, p.D21.T),
+    )
+    low = max(known, *(one.direct for one in sides))
+    high = gamma
+    for part in _PARTS:
+        if part * gamma <= low:
+            break
+        if _refuted(sides, part * gamma):
+            low = part * gamma
+            break
+        high = part * gamma
+    while 0.0 < low < high / (1.0 + _WIDTH):
+        middle = float(np.sqrt(low * high))
+        if _refuted(sides, middle):
+            low = middle
+        else:
+            high = middle
+    return min(low, gamma)
+
+
+def _refuted(sides: tuple[FullInformation, FullInformation], gamma: float) -> bool:
+    values = []
+    for one in sides:
+        try:
+            X = one.value(gamma)
+        except (OnAxisError, la.LinAlgError):
+            continue
+        if X is None:
+            return True
+        values.append(X)
+    if len(values) < 2:
+        return False
+    coupling = float(np.max(la.eigvals(values[0] @ values[1]).real, initial=0.0))
+    return coupling > gamma**2 * (1.0 + _BEYOND)

@@ -10,9 +10,9 @@ import scipy.linalg as la
 from ..certificates import stability, stability_name
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..loop import modulus_margin
+from ..lti.balancing import hankel_norm
 from ..lti.discretisation import bilinear, tustin
 from ..lti.frequency import Frf, frequency_response
-from ..lti.hankel import hankel_norm
 from ..lti.interconnection import lft, series
 from ..lti.minimal import minimal
 from ..lti.norms import peak_gain
@@ -21,8 +21,7 @@ from ..lti.statespace import StateSpace, System, as_statespace
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..values import FloatArray, positive
-from .controller import Controller
-from .spill_over_check import with_left_out
+from .controller import Controller, with_left_out
 
 #: corner of the integral action of the recipe, beside the bandwidth
 _INTEGRAL = 0.1

@@ -15,7 +15,7 @@ from ..lti.norms import hinf_norm
 from ..lti.preparation import Prepared, normalised
 from ..lti.statespace import StateSpace
 from ..values import FloatArray
-from .method import SolvedController
+from .controller import SolvedController
 
 #: a direction of D12 or D21 that is smaller is missing (in a prepared problem the others are 1)
 _RANK = 0.5

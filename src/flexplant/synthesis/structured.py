@@ -15,11 +15,9 @@ from ..lti.statespace import System
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant, standard_plant
 from ..values import FloatArray, Rng, generator, short, whole
-from .certificate import certified_norm, reached_norms
-from .controller import Controller
+from .controller import Controller, certified_norm, reached_norms, with_left_out
 from .nonsmooth import Pieces, bfgs, decrease_left, joined, minimax
 from .reach import require_stabilisable
-from .spill_over_check import with_left_out
 from .structured_loop import DECAY, ScaledLoop
 from .structures import ControllerFamily, ControllerStructure, as_system
 

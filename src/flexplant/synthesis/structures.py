@@ -9,7 +9,6 @@ from typing import Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..arguments import function
 from ..errors import FlexplantError, ModelError, ShapeError, counted
 from ..lti.balancing import balanced
 from ..lti.discretisation import bilinear, tustin
@@ -17,7 +16,7 @@ from ..lti.preparation import Prepared
 from ..lti.riccati import control_care, solve_care
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, instance, real_array, whole
+from ..values import FloatArray, Value, function, instance, real_array, whole
 from .hinf import design_hinf
 from .structured_loop import Matrices
 

@@ -8,23 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from ..arguments import between
 from ..errors import SolverError, warn
 from ..loop import in_axes
 from ..lti.frequency import Frf
 from ..lti.grid import resonance_grid
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..parallel import one_thread
+from ..parallel import Progress, one_thread
 from ..plant import StandardPlant, larger_plant
-from ..progress import Progress
-from ..values import FloatArray, whole
-from .axis_law import AxisLaw
+from ..values import FloatArray, between, whole
+from .axis_law import AxisLaw, MeasuredAxis
 from .joint_plant import JointPlant, Worst
 from .joint_search import JointLaws, JointSearch
 from .law_search import FoundLaw, LawSearch
 from .loop_design import Axes, LoopDesign, axes_of, made
-from .measured_axis import MeasuredAxis
 from .servo_loop import TARGET
 
 #: distance of a pole from zero frequency, beside the farthest, that counts as none

@@ -8,7 +8,7 @@ from .judgement.correlation import frac as frac
 from .judgement.correlation import mac as mac
 from .judgement.identifiability import Identifiability as Identifiability
 from .judgement.identifiability import identifiability as identifiability
-from .judgement.localisation import Localisation as Localisation
+from .judgement.localise import Localisation as Localisation
 from .judgement.localise import localise as localise
 from .judgement.posterior import Posterior as Posterior
 from .judgement.posterior import sample_posterior as sample_posterior
@@ -25,10 +25,10 @@ from .parameters.polynomial import PolynomialParameter as PolynomialParameter
 from .residuals.eigenvalues import Eigenvalues as Eigenvalues
 from .residuals.frf_residual import FrfResidual as FrfResidual
 from .residuals.mode_shapes import ModeShapes as ModeShapes
+from .residuals.mode_shapes import ShapeCorrelation as ShapeCorrelation
 from .residuals.point_residuals import Antiresonances as Antiresonances
 from .residuals.point_residuals import StaticCompliance as StaticCompliance
 from .residuals.residual import Residual as Residual
-from .residuals.shape_correlation import ShapeCorrelation as ShapeCorrelation
 from .search import GaussNewton as GaussNewton
 from .search import Lasso as Lasso
 from .search import Tikhonov as Tikhonov

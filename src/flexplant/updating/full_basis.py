@@ -14,13 +14,12 @@ from ..modes import solve_modes
 from ..modes.dynamic_basis import static_shapes
 from ..modes.sparse_modes import counted_modes
 from ..reduction import ReducedModel
-from ..sparse.orthonormal import beyond
+from ..sparse.rayleigh_ritz import beyond
 from ..structure.attachments import summed
 from ..structure.model import FEModel
 from ..values import FloatArray
-from .pairing import pair
 from .parameters.added import Parameter, PointParameter
-from .point_model import Point
+from .point_model import Point, pair
 from .residuals.residual import Residual
 from .search import Objective
 from .search.objective import numbers

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, SolverError, counted, warn
-from ..progress import Progress
+from ..parallel import Progress
 from ..structure.model import FEModel
 from ..values import FloatArray, Rng, flag, generator, instance, positive, whole
 from .full_basis import MOST_ROUNDS, FullBasis, is_large
@@ -16,14 +16,12 @@ from .judgement.goodness import chi_square, covariance, is_bad, worst
 from .parameters.added import Parameter
 from .residuals.eigenvalues import Eigenvalues
 from .residuals.residual import Residual
-from .rounds import corrected, moved
 from .search import GaussNewton, Objective, SearchEnd, TrustRegion, UpdateMethod, checked_residuals
+from .search.objective import Defect
 from .search.update_method import ITERATIONS
-from .searching import from_one_start, from_starts
+from .searching import all_starts, check_units, from_one_start, from_starts, summary
 from .sensitivities import checked_parameters, checked_values
-from .starts import all_starts, check_units, summary
-from .update_result import History, UpdateResult
-from .updated_model import changed_model
+from .update_result import History, UpdateResult, changed_model
 
 #: a parameter this close to its bound, relative to their distance, is at it
 AT_BOUND = 1e-6
@@ -59,7 +57,7 @@ def update(
     where the noise of every residual is known (the answer is then the maximum a posteriori).
 
     Modes are found by their number in the model at `start` and followed by shape (see
-    `flexplant.updating.pairing`), so they may swap order on the way; those with measured shapes
+    `flexplant.updating.point_model`), so they may swap order on the way; those with measured shapes
     are assigned by MAC at each step. Modes that are exactly
     repeated there are first turned to the vectors in which the step splits them, the lower mode
     number going to the lower frequency. Steps are shortened while M or K would become indefinite,
@@ -281,3 +279,68 @@ def _at_bound(objective: Objective, p: FloatArray) -> tuple[str, ...]:
     near = AT_BOUND * np.where(np.isfinite(width), width, np.maximum(np.abs(p), 1e-12))
     at = (p - low <= near) | (high - p <= near)
     return tuple(q.name for q, there in zip(objective.parameters, at, strict=True) if there)
+
+
+#: standard deviations by which a round moves the estimate that need no further round
+STILL = 1e-2
+
+
+def corrected(
+    objective: Objective,
+    basis: FullBasis,
+    method: UpdateMethod,
+    end: SearchEnd,
+    *,
+    rounds: int,
+    most: int | None,
+    tolerance: float,
+) -> tuple[SearchEnd, list[FloatArray]]:
+    """Return the end of the last round, the objective being there, and the estimates on the way.
+
+    In each round the full model is solved at the estimate, and the difference of its residuals
+    from those of the reduced model, with its derivative, is added to the reduced model's::
+
+        r(p) = r_reduced(p) + d + d' (p - p_0),   d = r_full(p_0) - r_reduced(p_0)
+
+    Where a round moves the estimate no more, r and dr/dp are those of the full model.
+
+    References
+    ----------
+    [Stetter1978]_; [AlexandrovLewis2001]_ (the derivative).
+    """
+    first = end.trail.p[0]
+    estimates = [end.p]
+    for _ in range(rounds):
+        point = objective.at(end.p)
+        full = basis.objective(point)
+        there = full.at(end.p)
+        objective.defect = None
+        objective.defect = Defect(
+            end.p,
+            full.values(there, prior=False) - objective.values(point, prior=False),
+            full.slopes(there, prior=False) - objective.slopes(point, prior=False),
+        )
+        before = end.trail
+        # what is drawn to the start is so anew; modes keep the numbers they have there
+        objective.path = [] if method.penalised else before.p[:-1]
+        begin = first if method.penalised else end.p
+        end = method.search(objective, begin, most=most, tolerance=tolerance)
+        end.trail = end.trail if method.penalised else before.joined(end.trail)
+        estimates.append(end.p)
+        if moved(objective, end.p, estimates[-2]) < STILL:
+            break
+    return end, estimates
+
+
+def moved(objective: Objective, p: FloatArray, before: FloatArray) -> float:
+    """Return how far an estimate moved, in standard deviations: ``|J dp| / sqrt(q)``.
+
+    Of residuals of unit variance where the noise is known; else relative to what is left of them.
+    """
+    point = objective.at(p)
+    change = objective.slopes(point) @ (p - before)
+    size = 1.0
+    if not objective.noise_known:
+        left = objective.values(point)
+        size = float(left @ left) / max(left.size - p.size, 1)
+    return float((change @ change / max(size, 1e-300) / p.size) ** 0.5)

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...errors import AssumptionError, FlexplantError, require_known
-from ...structure.negative_stiffness import signed_root
+from ...structure.definite import signed_root
 from ...values import FloatArray, IntArray
 from ..partition import Partition
 from ..realisation import ModalRealisation

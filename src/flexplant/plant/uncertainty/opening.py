@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
+import scipy.sparse as sp
 
 from ...errors import LabelError, ModelError, unknown_label
 from ...identification import MeasuredModes
+from ...labels import Place
 from ...lti.statespace import StateSpace
 from ...updating import UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters.added import Parameter
-from ...values import ComplexArray, FloatArray, positive
-from ..building import P
+from ...values import ComplexArray, FloatArray, positive, real_array
+from ..building import P, continuous_plant, rebuilt
 from ..partition import Partition
+from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
 from ..realisation import ModalRealisation
-from .inserted import require_exact, system_matrix, with_channels
+from .delta_channels import require_exact, system_matrix, with_channels
 from .neglected import NeglectedModes, neglected_modes, opened
-from .parametric import by_parameters
-from .shape_channels import shape_deltas, with_shape_channels
-from .uncertain_plant import Delta, UncertainPlant, modal_realisation, with_changes
+from .uncertain_plant import (
+    Delta,
+    UncertainPlant,
+    elastic_part,
+    modal_realisation,
+    reshaped,
+    with_changes,
+)
 
 #: relative standard deviations below this open no channel
 _KNOWN = 1e-12
@@ -314,3 +323,202 @@ def _check_range(deltas: Sequence[Delta], deviations: float) -> None:
                 f"{deviations:g} standard deviations, so it may be negative: no controller is "
                 "robust to that. Measure it better, leave the mode out, or lower deviations."
             )
+
+
+#: relative: eigenvalues of a parameter's matrix below this are rounding
+_RANK = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class _Load(ForcePort):
+    """A force along a vector over the model's DOFs."""
+
+    name: str
+    along: FloatArray
+
+    def push(self, realisation: ModalRealisation) -> FloatArray:
+        """Return the vector."""
+        return self.along
+
+
+@dataclass(frozen=True, eq=False)
+class _Felt(SensorPort):
+    """A motion along a vector over the model's DOFs; accelerations are absolute, as inertia is."""
+
+    name: str
+    along: FloatArray
+    at: Place = ""
+    quantity: Quantity = "displacement"
+
+    def row(self, realisation: ModalRealisation) -> FloatArray:
+        """Return the vector."""
+        return self.along
+
+
+def by_parameters(
+    plant: Partition, fit: UpdateResult, parameters: Sequence[Parameter], deviations: float
+) -> tuple[StateSpace, tuple[Delta, ...]]:
+    """Return the continuous plant with channels for Deltas on the parameters, and these.
+
+    ``(M + sum d_i dM_i) q'' + (D + sum d_i dD_i) q' + (K + sum d_i dK_i) q = f``: with
+    ``dM_i = U s U'`` the change is the force ``-U s d_i U' q''``, a feedback around the (absolute)
+    acceleration, and so for velocities and displacements. Each Delta has as many channels as its
+    matrices have rank. Exact for any port and any damping.
+    """
+    realisation, ports = plant.assembled.realisation, plant.assembled.ports
+    model = realisation.model
+    for name in "MDK":
+        own, others = getattr(model, name, None), getattr(fit.model, name)
+        if own is None or own.shape != others.shape or not np.allclose(
+            _dense(own), _dense(others), rtol=1e-9, atol=0.0
+        ):  # fmt: skip
+            raise ModelError(
+                f"the plant has another {name} than the fit's model. Assemble it from fit.model."
+            )
+    std = np.sqrt(np.diag(fit.covariance)) * deviations  # type: ignore[arg-type]
+    deltas: list[Delta] = []
+    loads: list[_Load] = []
+    felt: list[_Felt] = []
+    for parameter, scale in zip(parameters, std.tolist(), strict=True):
+        deltas.append(Delta(parameter.name, 0, "parameter", scale))
+        for order, part in zip((2, 1, 0), parameter.matrices(model), strict=True):
+            if part is None:
+                continue
+            whole = _dense(part)
+            if order == 1:
+                whole = elastic_part(model, realisation, whole)
+            values, vectors = np.linalg.eigh(0.5 * (whole + whole.T))
+            for i in np.flatnonzero(np.abs(values) > _RANK * np.abs(values).max()).tolist():
+                name = f"{parameter.name}:{len(loads) + 1}"
+                size = np.sqrt(scale * abs(values[i]))
+                loads.append(_Load(f"{name}:w", -np.sign(values[i]) * size * vectors[:, i]))
+                felt.append(_Felt(f"{name}:z", size * vectors[:, i], quantity=QUANTITIES[order]))
+    wider = ports.replace(w=[*loads, *ports.w], y=[*ports.y, *felt])
+    system = continuous_plant(type(plant), realisation, wider).system
+    return (
+        system.select(
+            [*(port.name for port in felt), *plant.z, *plant.y],
+            [*(port.name for port in loads), *plant.w, *plant.u],
+        ),
+        tuple(deltas),
+    )
+
+
+def _dense(matrix: object) -> FloatArray:
+    return np.asarray(matrix.toarray() if sp.issparse(matrix) else matrix)  # type: ignore[attr-defined]
+
+
+#: relative: a dependence below this is rounding
+_ROUNDING = 1e-9
+
+
+class _Channel(NamedTuple):
+    """One channel of a Delta: what it moves, what it reads, of which mode's velocity."""
+
+    left: FloatArray
+    right: FloatArray
+    state: int
+    #: whether it reads the rate of that state
+    of_rate: bool = False
+    name: str = ""
+    #: factor of `right` that makes both sides of one size
+    even: float = 1.0
+
+
+def shape_deltas(
+    plant: Partition,
+    shapes: FloatArray,
+    measured: Sequence[int],
+    chosen: Sequence[int],
+    deviations: float,
+) -> list[Delta]:
+    """Return a Delta for each direction (n,) of `shapes` (m, n, r) of the chosen modes."""
+    realisation = modal_realisation(plant)
+    n = realisation.outputs.shape[0]
+    given = real_array(shapes, "shapes", (len(measured), n, None))
+    found = []
+    for number in chosen:
+        phi = realisation.inputs[:, 2 * number - 1]
+        for j, direction in enumerate(given[list(measured).index(number)].T, 1):
+            size = float(np.linalg.norm(direction) / np.linalg.norm(phi))
+            if size > 0:
+                along = direction / size
+                found.append(
+                    Delta(f"mode{number}:shape{j}", number, "shape", deviations * size, along)
+                )
+    return found
+
+
+def with_shape_channels(
+    plant: Partition, system: StateSpace, others: Sequence[Delta], deltas: Sequence[Delta]
+) -> StateSpace:
+    r"""Return a plant's system with channels for Deltas on shapes beside those it has.
+
+    ``phi + d v`` drives the mode by ``d v^T f`` more and shows ``d v q``, ``d v q'`` or
+    ``d v q''`` of its motion more: four channels at most, of which q'' feels what the first one
+    drives. Their columns are read off the plant assembled with forces or motions changed alone, so
+    that they hold for any port and filter.
+    """
+    base, g = system_matrix(plant.system), plant.system
+    n, m = g.n_states, len(g.inputs)
+    before = len(system.inputs) - m
+    first: list[_Channel] = []
+    further: list[_Channel] = []
+    for delta in deltas:
+        states = [int(plant.modal_states[2 * delta.mode - i]) for i in (2, 1)]
+        own = _factors(plant, delta, base, *states)
+        if not own:
+            raise ModelError(f"{delta.name} moves no port of the plant: leave that mode out.")
+        for i, one in enumerate(own):
+            row = np.concatenate([one.right[:n], np.zeros(before), one.right[n:]])
+            if one.of_rate:  # with what the other Deltas make of it
+                row = np.concatenate([system.A[one.state], system.B[one.state]])
+            even = np.sqrt(delta.scale * np.linalg.norm(one.left) / np.linalg.norm(one.right))
+            part = one._replace(
+                name=f"{delta.name}:{i + 1}" if i else delta.name,
+                left=one.left * (delta.scale / even),
+                right=row * even,
+                even=float(even),
+            )
+            (further if i else first).append(part)
+    parts = [*first, *further]
+    names = [one.name for one in parts]
+    left = np.array([one.left for one in parts]).T
+    right = np.array([one.right for one in parts])
+    feed = np.array([one.of_rate * one.even * left[one.state] for one in parts])
+    found = with_channels(system, before, names, left, right, feed)
+    require_exact(plant, found, [*others, *deltas], "the shapes of modes", "Leave shapes= out.")
+    return found
+
+
+def _factors(plant: Partition, delta: Delta, base: FloatArray, q: int, v: int) -> list[_Channel]:
+    """Return columns and rows of what a unit change of a shape does, of states q and v."""
+    realisation = modal_realisation(plant)
+    driven, seen = (
+        system_matrix(rebuilt(plant, realisation=one).system) - base
+        for one in (
+            reshaped(realisation, delta, 1.0, outputs=False),
+            reshaped(realisation, delta, 1.0, inputs=False),
+        )
+    )
+    found = []
+    row = driven[v]
+    if np.any(row):
+        found.append(_Channel(driven @ row / (row @ row), row, v))
+    # displacements and velocities read the states, accelerations what else their rate holds
+    size, rest, beyond = np.linalg.norm(seen, axis=1), seen.copy(), base[v].copy()
+    rest[:, [q, v]], beyond[[q, v]] = 0.0, 0.0
+    amount = rest @ beyond / max(float(beyond @ beyond), 1e-300)
+    amount[np.linalg.norm(rest, axis=1) <= _ROUNDING * size] = 0.0
+    plain = seen - np.outer(amount, base[v])
+    motion, speed = (np.eye(base.shape[1])[i] for i in (q, v))
+    for column, right, of_rate in (
+        (plain[:, q], motion, False),
+        (plain[:, v], speed, False),
+        (amount, base[v], True),
+    ):
+        small = np.abs(column) * np.linalg.norm(right) <= _ROUNDING * size
+        left = np.where(small, 0.0, column)
+        if np.any(left):
+            found.append(_Channel(left, right, v, of_rate))
+    return found

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import base64
+import io
+import json
+import re
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from importlib.resources import files
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedFormatter, FuncFormatter
 
 
 class Chapter(NamedTuple):
@@ -102,3 +112,117 @@ def tiles(found: Iterable[tuple[str, str, str, str]]) -> str:
         )
         + "</div>"
     )
+
+
+#: characters of an SVG above which a picture of many points goes in as pixels, [dots per inch]
+_LARGEST, _DPI = 1_200_000, 170
+
+
+class Gallery:
+    """Draws pictures into figures of HTML; their elements have names that are unique in a page."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def picture(self, draw: Callable[[], Any], caption: str) -> str:
+        """Return what `draw` draws on new axes as a figure with a caption."""
+        self._count += 1
+        prefix = f"p{self._count}-"
+        open_before = set(plt.get_fignums())
+        settings: Any = {
+            "svg.fonttype": "path",
+            "svg.hashsalt": prefix,
+            "figure.max_open_warning": 0,
+        }
+        with plt.ioff(), mpl.rc_context(settings):
+            try:
+                draw()
+                new = [n for n in plt.get_fignums() if n not in open_before]
+                parts = [_drawn(plt.figure(n), prefix, caption) for n in new]
+            finally:
+                for n in set(plt.get_fignums()) - open_before:
+                    plt.close(n)
+        return "".join(parts)
+
+
+def _drawn(figure: Figure, prefix: str, caption: str) -> str:
+    file = io.StringIO()
+    figure.savefig(file, format="svg", metadata=dict.fromkeys(_METADATA))
+    image = _inline(file.getvalue(), prefix, caption)
+    width, height = 72.0 * figure.get_size_inches()
+    if len(image) > _LARGEST:
+        pixels = io.BytesIO()
+        figure.savefig(pixels, format="png", dpi=_DPI, metadata={"Software": None})
+        data = base64.b64encode(pixels.getvalue()).decode()
+        image = (
+            f'<svg viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{escape(caption)}">'
+            f'<image width="{width:g}" height="{height:g}" href="data:image/png;base64,{data}"/>'
+            "</svg>"
+        )
+    panels = [panel for ax in figure.axes if (panel := _panel(ax, width, height))]
+    buttons = "".join(
+        f'<button type="button" data-do="{what}" title="{said}" aria-label="{said}">{sign}</button>'
+        for what, said, sign in _BUTTONS
+    )
+    return (
+        f'<figure class="picture" data-panels="{escape(json.dumps(panels))}">'
+        f'<div class="canvas">{image}</div><figcaption>{escape(caption)}'
+        f'<div class="tools"><output></output>{buttons}</div></figcaption></figure>\n'
+    )
+
+
+_METADATA = ("Creator", "Date", "Format", "Type")
+_BUTTONS = (
+    ("in", "zoom in", "+"),
+    ("out", "zoom out", "\N{MINUS SIGN}"),
+    ("reset", "whole picture", "\N{ANTICLOCKWISE OPEN CIRCLE ARROW}"),
+    ("large", "large, and back", "\N{NORTH EAST ARROW}"),
+)
+
+
+def _inline(svg: str, prefix: str, caption: str) -> str:
+    """Return an SVG for a page: without prolog, with its own names, coordinates in 1/100 pt."""
+    svg = svg[svg.index("<svg") :].replace("xlink:href", "href")
+    svg = re.sub(r"<metadata>.*?</metadata>\s*", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'\s(?:xmlns(?::\w+)?|version)="[^"]*"', "", svg)
+    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
+    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg, count=1)
+    svg = svg.replace("<svg", f'<svg role="img" aria-label="{escape(caption)}"', 1)
+    used = set(re.findall(r'(?:url\(|href=")#([^)"]+)', svg))
+
+    def named(match: re.Match[str]) -> str:
+        return f' id="{prefix}{match[1]}"' if match[1] in used else ""
+
+    svg = re.sub(r'\sid="([^"]*)"', named, svg)
+    svg = re.sub(r'(url\(|href=")#', rf"\1#{prefix}", svg)
+    return re.sub(r'\sd="([^"]*)"', _rounded, svg)
+
+
+def _rounded(match: re.Match[str]) -> str:
+    short = re.sub(r"-?\d+\.\d{3,}", lambda n: f"{float(n[0]):.2f}", match[1])
+    return f' d="{" ".join(short.split())}"'
+
+
+def _panel(ax: Axes, width: float, height: float) -> dict[str, Any] | None:
+    """Return where axes lie in the picture, and what their two scales show there."""
+    if ax.name != "rectilinear" or ax.get_label() == "<colorbar>" or not ax.axison:
+        return None
+    box = ax.get_position()
+    scales = [
+        _scale(axis, limits)
+        for axis, limits in ((ax.xaxis, ax.get_xlim()), (ax.yaxis, ax.get_ylim()))
+    ]
+    if not any(scales):
+        return None
+    corners = box.x0 * width, (1 - box.y1) * height, box.x1 * width, (1 - box.y0) * height
+    return {"box": [round(c, 2) for c in corners], "x": scales[0], "y": scales[1]}
+
+
+def _scale(axis: Any, limits: tuple[float, float]) -> list[Any] | None:
+    """Return (low, high, whether logarithmic, label) of an axis of numbers."""
+    kind, formatter = axis.get_scale(), axis.get_major_formatter()
+    if kind not in ("linear", "log") or isinstance(formatter, FixedFormatter | FuncFormatter):
+        return None
+    low, high = (float(f"{limit:.6g}") for limit in limits)
+    label = axis.get_label_text().replace("$^2$", "\N{SUPERSCRIPT TWO}")
+    return [low, high, kind == "log", label]

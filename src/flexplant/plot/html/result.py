@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from html import escape
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ...certificates import in_words, stability_name
-from ...errors import FlexplantError, counted
+from ...errors import FlexplantError, ModelError, counted
 from ...loop import ClosedLoop, ErrorBudget, LoopFigures, compare_loops, report_loops
+from ...plant import StandardPlant
 from ...simulation import ExposureErrors, Verdict
-from ...values import with_unit
+from ...values import Value, short, with_unit
 from ..budget import budget
 from ..nyquist import nyquist
 from ..sensitivity import sensitivity
-from .design import Design
-from .page import Chapter, note, table, tiles
-from .picture import Gallery
+from .page import Chapter, Gallery, note, table, tiles
 
 Tile = tuple[str, str, str, str]
 
@@ -155,3 +154,49 @@ def _margin_table(loop: ClosedLoop) -> str:
         *("modulus margin", "at [Hz]"),
     ]
     return table(head, rows, "Each loop broken at its actuator while the others stay closed")
+
+
+Kind = TypeVar("Kind")
+
+
+class Design:
+    """Named values in the order in which they were given."""
+
+    def __init__(self, parts: Sequence[Any]) -> None:
+        self.named: dict[str, Any] = {}
+        for name, value in _listed(parts):
+            own = name or _free(type(value).__name__, self.named)
+            if own in self.named:
+                raise ModelError(f"two parts of the report are named {own!r}: rename one.")
+            self.named[own] = value
+        if not self.named:
+            raise ModelError(
+                "there is nothing to report: pass values, such as a closed loop and its run."
+            )
+
+    def of(self, kind: type[Kind]) -> dict[str, Kind]:
+        """Return the values of a kind by name."""
+        return {name: one for name, one in self.named.items() if isinstance(one, kind)}
+
+    @property
+    def plant(self) -> StandardPlant | None:
+        """The plant that was given, else that of the first loop."""
+        own: list[StandardPlant] = list(self.of(StandardPlant).values())
+        return next(iter([*own, *(loop.plant for loop in self.of(ClosedLoop).values())]), None)
+
+
+def _listed(parts: Sequence[Any]) -> Iterator[tuple[str, Any]]:
+    for part in parts:
+        named = isinstance(part, Mapping) and not isinstance(part, Value)
+        for name, value in part.items() if named else [("", part)]:
+            if not isinstance(value, Value):
+                raise ModelError(
+                    f"a report holds values of flexplant, got {short(value)}. Pass plants, loops, "
+                    "controllers, runs and so on, or mappings of names to such."
+                )
+            yield str(name), value
+
+
+def _free(name: str, taken: Mapping[str, Any]) -> str:
+    numbers = (f" {i}" if i > 1 else "" for i in range(1, len(taken) + 2))
+    return next(f"{name}{number}" for number in numbers if f"{name}{number}" not in taken)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import ModelError, counted
-from ...progress import Progress
+from ...parallel import Progress
 from ...values import FloatArray, Value
 from ..matrices import FEMatrices
 from ..model import FEModel

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...arguments import positive_array
 from ...errors import ModelError, ShapeError
 from ...labels import DofSet
-from ...values import FloatArray, frozen, positive
+from ...values import FloatArray, frozen, positive, positive_array
 from ..model import FEModel
 
 

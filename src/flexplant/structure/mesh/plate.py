@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arguments import members
-from ...values import FloatArray
+from ...values import FloatArray, members
 from ..model import FEModel
 from .element_matrices import plate_mass, plate_stiffness
 from .grid_fields import (

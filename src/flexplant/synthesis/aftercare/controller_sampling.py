@@ -9,9 +9,8 @@ from ...lti.discretisation import tustin
 from ...lti.statespace import as_statespace
 from ...plant import StandardPlant
 from ...values import instance, positive
-from ..controller import Controller
-from ..spill_over_check import with_left_out
-from .loop_check import loop_facts, required, stable_before
+from ..controller import Controller, with_left_out
+from .order import loop_facts, required, stable_before
 
 
 def discretise_controller(

@@ -7,8 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError, SolverError
+from ...errors import (
+    AssumptionError,
+    CertificateError,
+    FlexplantError,
+    InfeasibleError,
+    ModelError,
+    SolverError,
+)
 from ...lti.interconnection import lft
+from ...lti.norms import peak_gain
 from ...lti.preparation import prepared
 from ...lti.riccati import control_care, control_dare, solve_care, solve_dare
 from ...lti.scaling import mean_speed, state_scale
@@ -16,12 +24,13 @@ from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
 from ...values import positive, short, whole
-from ..controller import Controller
-from ..lmi_plant import Plant
+from ..controller import Controller, with_left_out
+from ..h2 import design_h2
+from ..hinf import design_hinf
+from ..hinf_riccati import Riccati
+from ..lmi_solution import Plant
 from ..reach import require_stabilisable
-from ..spill_over_check import with_left_out
-from .least import require_reachable
-from .programs import ObjectivePrograms
+from .lmis import ObjectivePrograms
 from .specifications import H2, Hinf, PeakGain, PoleRegion
 
 #: what a verified norm may exceed its bound by
@@ -249,3 +258,41 @@ def _verified(
             raise CertificateError(f"{spec!r} is {value:.6g} in the closed loop.")
         reached[repr(spec)] = value
     return reached
+
+
+#: relative: bounds so close to the least value are left to the search
+_NEAR = 1e-3
+#: part of an H2 norm, found with noise or effort added, that no controller reaches either
+_CERTAIN = 0.5
+
+
+def require_reachable(plant: StandardPlant, subject_to: Sequence[Any]) -> None:
+    """Raise InfeasibleError when a bound is below what any controller reaches for it alone.
+
+    H2 by two Riccati equations, H-infinity by its lower bound; bounds on peaks and regions of
+    poles are not judged, nor what has no optimum.
+    """
+    for spec in subject_to:
+        if not isinstance(spec, H2 | Hinf) or spec.below is None:
+            continue
+        w, z = spec.chosen(plant)
+        alone = StandardPlant.from_statespace(
+            plant.system.select([*z, *plant.y], [*w, *plant.u]), u=plant.u, y=plant.y
+        )
+        try:
+            best = design_h2(alone) if isinstance(spec, H2) else design_hinf(alone, Riccati())
+        except FlexplantError:
+            continue
+        gamma = float(best.gamma or 0.0)
+        # a singular H2 problem has an infimum, which noise and effort added miss by a few per cent
+        proved = best.lower is not None
+        least = best.lower if best.lower is not None else _CERTAIN * gamma
+        if least <= spec.below * (1.0 + _NEAR):
+            continue
+        freq = peak_gain(lft(alone.system, best.system))[1]
+        raise InfeasibleError(
+            f"{spec!r} is beyond every controller: from {', '.join(w)} to {', '.join(z)} none "
+            f"reaches less than {f'{least:.4g}' if proved else f'about {gamma:.4g}'}, even "
+            f"without the other objectives (the best loop peaks at {freq:.4g} Hz). Raise below, "
+            "take lighter weights there, or name fewer w and z."
+        )

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import ModelError, require_known
-from ...lti.h2_norms import h2_norm
-from ...lti.norms import peak_gain
+from ...lti.norms import h2_norm, peak_gain
 from ...lti.responses import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant

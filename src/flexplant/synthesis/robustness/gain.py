@@ -12,17 +12,14 @@ from ...errors import AssumptionError, CertificateError, ModelError
 from ...lti.frequency import frequency_response
 from ...lti.norms import peak_gain
 from ...lti.statespace import StateSpace
-from ...parallel import one_thread
+from ...parallel import Progress, one_thread
 from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ...progress import Progress
 from ...values import ComplexArray, FloatArray, Value, generator
 from .lower import power_iteration
-from .machine import machine, neglected_delta, values_of
-from .perturbation import Perturbation, matrix_of
 from .sweep import INTERVALS, Covered, covered
-from .uncertain_loop import UncertainLoop, uncertain_loop
-from .uncertainty_blocks import places
+from .uncertain_loop import UncertainLoop, machine, neglected_delta, uncertain_loop, values_of
+from .uncertainty_blocks import Perturbation, matrix_of, places
 
 #: frequencies that start a search, starts at each, rounds over all real Deltas
 _SOUGHT, _STARTS, _ROUNDS = 5, 3, 3

@@ -10,8 +10,16 @@ import scipy.linalg as la
 
 from ...lti.statespace import StateSpace
 from ...values import ComplexArray, FloatArray
-from .perturbation import Perturbation, matrix_of, realised
-from .uncertainty_blocks import Block, FullBlock, Place, RepeatedScalar, places
+from .uncertainty_blocks import (
+    Block,
+    FullBlock,
+    Perturbation,
+    Place,
+    RepeatedScalar,
+    matrix_of,
+    places,
+    realised,
+)
 
 #: steps of a power iteration; change at which it has settled
 _STEPS, _SETTLED = 60, 1e-6

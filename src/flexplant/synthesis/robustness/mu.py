@@ -10,14 +10,21 @@ import numpy as np
 
 from ...errors import AssumptionError, ModelError
 from ...lti.discretisation import bilinear, image_freq
-from ...lti.stability import obstacle
+from ...lti.norms import obstacle
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...values import ComplexArray, FloatArray, Value, generator
 from .lower import crossing_multiple, destabilising, power_iteration
-from .perturbation import Perturbation, matrix_of
 from .sweep import covered
-from .uncertainty_blocks import Block, RepeatedScalar, Scalings, checked_blocks, places
+from .uncertainty_blocks import (
+    Block,
+    Perturbation,
+    RepeatedScalar,
+    Scalings,
+    checked_blocks,
+    matrix_of,
+    places,
+)
 from .upper import upper_level
 
 #: frequencies at which a perturbation is sought, starts at each

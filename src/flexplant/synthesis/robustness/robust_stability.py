@@ -11,10 +11,9 @@ import numpy as np
 from ...certificates import stability
 from ...errors import CertificateError, FlexplantError, counted
 from ...loop import ClosedLoop, SpillOver
-from ...parallel import one_thread
+from ...parallel import Progress, one_thread
 from ...plant import StandardPlant, larger_plant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ...progress import Progress
 from ...values import FloatArray, Value, generator, whole
 from .lower import (
     Destabilising,
@@ -22,10 +21,9 @@ from .lower import (
     power_iteration,
     smallest_with_block,
 )
-from .machine import machine, neglected_delta, values_of
 from .mu import sought
 from .sweep import INTERVALS, covered
-from .uncertain_loop import UncertainLoop, uncertain_loop
+from .uncertain_loop import UncertainLoop, machine, neglected_delta, uncertain_loop, values_of
 from .uncertainty_blocks import FullBlock, places
 
 #: mu below this is not resolved

@@ -18,7 +18,7 @@ from ...errors import SolverError
 from ...lti.responses import responder
 from ...lti.scaling import state_scale
 from ...lti.statespace import StateSpace
-from ...progress import tick
+from ...parallel import tick
 from ...values import ComplexArray, FloatArray
 from .uncertainty_blocks import Block, Scalings, places
 from .upper import centred, reached_level, simple_bound, upper_level

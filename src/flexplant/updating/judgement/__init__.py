@@ -7,7 +7,7 @@ from .correlation import frac as frac
 from .correlation import mac as mac
 from .identifiability import Identifiability as Identifiability
 from .identifiability import identifiability as identifiability
-from .localisation import Localisation as Localisation
+from .localise import Localisation as Localisation
 from .localise import localise as localise
 from .posterior import Posterior as Posterior
 from .posterior import sample_posterior as sample_posterior

@@ -12,8 +12,8 @@ from ...errors import ModelError, ShapeError
 from ...identification import MeasuredModes
 from ...reduction.mode_pairs import groups_alike, likeness
 from ...values import ComplexArray, FloatArray, Value, short
-from ..pairing import mac as _mac
 from ..point_model import Point
+from ..point_model import mac as _mac
 from ..residuals.frf_residual import FrfResidual
 from ..residuals.mode_shapes import ModeShapes
 from ..search import Objective, checked_residuals

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ...arguments import between
 from ...errors import ModelError
 from ...parallel import Progress
-from ...values import FloatArray, Rng, Value, generator
+from ...values import FloatArray, Rng, Value, between, generator
 from ..parameters.added import Parameter
 from ..search import Objective, checked_residuals
 from ..sensitivities import checked_parameters

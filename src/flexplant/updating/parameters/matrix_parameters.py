@@ -9,13 +9,22 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...arguments import element_mask, function, mapping
 from ...errors import LabelError, ModelError, ShapeError
 from ...modes import solve_modes
 from ...sparse.factor import DENSE_LIMIT, dense
 from ...structure import ModalDamping
 from ...structure.eigen import elastic_modes
-from ...values import FloatArray, Matrix, positive, real_array, short, whole
+from ...values import (
+    FloatArray,
+    Matrix,
+    element_mask,
+    function,
+    mapping,
+    positive,
+    real_array,
+    short,
+    whole,
+)
 from .added import MAKES, Derivatives, Parameter, checked_bounds, checked_prior, checked_text
 
 #: entries of a symmetric matrix differ by less than this, relatively, from their mirror images

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ...arguments import function
 from ...errors import LabelError, ModelError, ShapeError
-from ...values import FloatArray, Matrix, positive, real_array, whole
+from ...values import FloatArray, Matrix, function, positive, real_array, whole
 from .added import MAKES, Derivatives, Parameter, checked_bounds, checked_prior, checked_text
 from .matrix_parameters import checked_matrix, projected
 

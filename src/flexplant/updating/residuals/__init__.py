@@ -3,7 +3,7 @@
 from .eigenvalues import Eigenvalues as Eigenvalues
 from .frf_residual import FrfResidual as FrfResidual
 from .mode_shapes import ModeShapes as ModeShapes
+from .mode_shapes import ShapeCorrelation as ShapeCorrelation
 from .point_residuals import Antiresonances as Antiresonances
 from .point_residuals import StaticCompliance as StaticCompliance
 from .residual import Residual as Residual
-from .shape_correlation import ShapeCorrelation as ShapeCorrelation

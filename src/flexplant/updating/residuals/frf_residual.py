@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...arguments import positive_array
 from ...errors import ModelError, ShapeError, counted, require_known, warn
 from ...labels import DIRECTIONS, Place
 from ...lti import Frf
 from ...lti.frequency import ORDERS
-from ...values import ComplexArray, FloatArray, flag, instance, positive, short
+from ...values import ComplexArray, FloatArray, flag, instance, positive, positive_array, short
 from ..family import Family
 from ..point_model import Point
+from .point_residuals import Held
 from .residual import Bound, Residual, channel_places, place_rows, split_parts
-from .zero_order_hold import Held
 
 #: lines whose response is below so many standard deviations of the noise are left out
 SIGNAL = 3.0

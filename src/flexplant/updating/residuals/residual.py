@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ...arguments import mapping
 from ...errors import LabelError
 from ...labels import Place
-from ...values import ComplexArray, FloatArray, Matrix, Value
+from ...values import ComplexArray, FloatArray, Matrix, Value, mapping
 from ..family import Family
 from ..point_model import Point
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...arguments import between
 from ...errors import ModelError, SolverError, counted
-from ...values import FloatArray
+from ...values import FloatArray, between
 from ..point_model import Point
 from .objective import Objective
 from .update_method import SearchEnd, Trail, UpdateMethod

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...progress import tick
+from ...parallel import tick
 from ...values import FloatArray, Value, positive
 from .objective import Objective
 
