@@ -14,9 +14,8 @@ ROOT = Path(flexplant.__file__).parent
 #: in import order; the first entry is the foundation, whose modules may use each other
 ROOMS = (
     (
-        *("errors", "rooms", "values", "arguments", "notebook", "store", "certificates"),
-        *("versions", "surviving", "progress", "parallel", "fingerprint", "checkpoint", "work"),
-        *("places", "dof_columns", "dof_index", "labels", "bibliography", "foreign_names"),
+        *("errors", "rooms", "checks", "store", "certificates", "versions", "parallel"),
+        *("fingerprint", "work", "dof_columns", "labels", "bibliography", "foreign_names"),
     ),
     "lti",
     "sparse",

@@ -28,8 +28,8 @@ from flexplant.lti import norms as h2_norms
 from flexplant.lti import riccati as doubling
 from flexplant.lti.riccati import control_care
 from flexplant.parallel import CHUNK, PROBE, mapped
-from flexplant.synthesis import hinf as attempts
-from flexplant.synthesis import servo
+from flexplant.synthesis.hinf import hinf_design as attempts
+from flexplant.synthesis.servo import servo_design as servo
 
 
 def square(item):

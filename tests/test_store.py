@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from flexplant.checks import Value
 from flexplant.errors import FlexplantError
 from flexplant.labels import DofSet
 from flexplant.lti import StateSpace
 from flexplant.store import load
-from flexplant.values import Value
 
 
 @dataclass(frozen=True, eq=False, repr=False)

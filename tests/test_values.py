@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.values import (
+from flexplant.checks import (
     Value,
     check_names,
     frozen,
@@ -23,6 +22,7 @@ from flexplant.values import (
     signal_names,
     whole,
 )
+from flexplant.errors import LabelError, ModelError, ShapeError
 
 
 @dataclass(frozen=True, eq=False, repr=False)

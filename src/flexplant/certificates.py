@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from .checks import ComplexArray
 from .store import Value
-from .values import ComplexArray
 
 
 class Certificate(Value):

@@ -11,8 +11,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from .checks import FloatArray, IntArray, Value, check_names, name_list, short
 from .errors import LabelError, ShapeError, unknown_label
-from .values import FloatArray, IntArray, Value, check_names, name_list, short
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 #: a place: a DOF label, a point (x, y, z) [m], or a mapping {label or point: weight}

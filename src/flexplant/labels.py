@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from .checks import FloatArray, IntArray, Value, frozen, instance, real_array
 from .dof_columns import DIRECTIONS as DIRECTIONS
 from .dof_columns import (
     DofIndex,
@@ -26,7 +27,6 @@ from .dof_columns import (
 from .dof_columns import Interpolation as Interpolation
 from .dof_columns import Place as Place
 from .errors import LabelError, ShapeError, counted, require_known, unknown_label
-from .values import FloatArray, IntArray, Value, frozen, instance, real_array
 
 
 @dataclass(frozen=True, eq=False, repr=False)

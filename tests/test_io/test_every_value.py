@@ -16,6 +16,7 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant import estimation, lti, placement, structure, synthesis
 from flexplant import plant as plants
+from flexplant.checks import Value
 from flexplant.errors import FlexplantError
 from flexplant.estimation.left_out import LeftOut
 from flexplant.loop import close_loop
@@ -24,7 +25,6 @@ from flexplant.reduction import select_dofs
 from flexplant.simulation import LearnedFeedforward, error_map, exposure_errors
 from flexplant.store import load
 from flexplant.updating import eigenvalue_sensitivities
-from flexplant.values import Value
 from stages import CORNERS, RATE, Z8, full, ports, reduced, some_modes
 
 

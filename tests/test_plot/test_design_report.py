@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import flexplant as fx
+from flexplant.checks import with_unit
 from flexplant.errors import FlexplantWarning, ModelError
 from flexplant.plot.html.sections import neighbours
-from flexplant.values import with_unit
 from stages import RATE, full, ports, reduced, some_modes
 
 CHROMIUM = next(

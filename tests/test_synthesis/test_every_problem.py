@@ -11,7 +11,7 @@ import oracles_synthesis as oracle
 from flexplant.errors import AssumptionError, FlexplantWarning, InfeasibleError, SolverError
 from flexplant.lti import StateSpace, hinf_norm
 from flexplant.synthesis import Riccati, StructuredLmi, design_hinf
-from flexplant.synthesis import hinf as attempts
+from flexplant.synthesis.hinf import hinf_design as attempts
 
 
 def structure(seed, w=1, u=1, z=1, y=1, noise=0.0, effort=0.0, modes=3):

@@ -7,7 +7,7 @@ import scipy.linalg as la
 from flexplant.lti import StateSpace
 from flexplant.lti.preparation import prepared
 from flexplant.synthesis import design_hinf
-from flexplant.synthesis.lower_bound import full_information, pointwise_bound, relaxed_bound
+from flexplant.synthesis.hinf.lower_bound import full_information, pointwise_bound, relaxed_bound
 from oracles_lmi import output_feedback_gamma, state_feedback_gamma
 
 

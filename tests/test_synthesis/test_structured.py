@@ -25,8 +25,8 @@ from flexplant.synthesis import (
     design_loops,
     design_structured,
 )
-from flexplant.synthesis.nonsmooth import Pieces, bfgs, decrease_left, downhill, minimax
-from flexplant.synthesis.structured import _StructureSearch
+from flexplant.synthesis.structured.nonsmooth import Pieces, bfgs, decrease_left, downhill, minimax
+from flexplant.synthesis.structured.structured_design import _StructureSearch
 from stages import ports, sampled
 
 

@@ -11,10 +11,10 @@ from flexplant.errors import ModelError, SolverError
 from flexplant.lti import StateSpace
 from flexplant.lti.preparation import prepared
 from flexplant.synthesis import StructuredLmi, design_hinf
-from flexplant.synthesis.interior_point import iterates
-from flexplant.synthesis.lmi_solution import Plant, half
-from flexplant.synthesis.lower_bound import pointwise_bound
-from flexplant.synthesis.structured_lmi import ProjectedLmis, _eliminated
+from flexplant.synthesis.hinf.lower_bound import pointwise_bound
+from flexplant.synthesis.lmi.interior_point import iterates
+from flexplant.synthesis.lmi.lmi_solution import Plant, half
+from flexplant.synthesis.lmi.structured_lmi import ProjectedLmis, _eliminated
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "compleib-open.npz"
 

@@ -6,10 +6,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, IntArray, with_unit
 from ..errors import counted
 from ..plant import StandardPlant
 from ..plant.uncertainty.uncertain_plant import Delta, with_changes
-from ..values import ComplexArray, FloatArray, IntArray, with_unit
 from .estimator import KalmanEstimator
 from .innovation_spectrum import InnovationLines, InnovationParts, impulse, parts_of, steady_gain
 from .whiteness import ExcessPeak

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..checks import FloatArray, Value, between, instance, real_array, short
 from ..errors import ModelError, ShapeError, counted
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
-from ..values import FloatArray, Value, between, instance, real_array, short
 from .causes import (
     Cause,
     LikelyCause,

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import AssumptionError, CertificateError, ModelError, warn
 from ..labels import DofSet
 from ..loop import ClosedLoop, close_loop
@@ -18,7 +19,6 @@ from ..modes import Modes
 from ..plant import StandardPlant
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..values import ComplexArray, FloatArray, IntArray
 from .estimator_channels import estimates, poi_channels, read_alike, same_pois
 
 #: two ways to a variance agree to this, half a per cent of an rms: no machine is known so well;

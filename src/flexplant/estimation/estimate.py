@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import BoolArray, FloatArray, Value, instance, known_units, real_array, sizes_of
 from ..errors import LabelError, counted, unknown_label, warn
 from ..lti.lyapunov import scale_of
 from ..parallel import one_thread
-from ..values import BoolArray, FloatArray, Value, instance, known_units, real_array, sizes_of
 from .estimator_channels import estimates
 from .filter_model import FilterModel, Sight, Steady
 from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother

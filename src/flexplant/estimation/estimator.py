@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import FloatArray, Value, positive, real_array, short, sizes_of
 from ..errors import LabelError, ModelError, ShapeError, counted, require_known
 from ..loop import ClosedLoop
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, positive, real_array, short, sizes_of
 from .error import NODES, NOTED, error_variances, loop_variances
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels, row_of, same_pois, sensors

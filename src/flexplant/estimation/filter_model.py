@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray, Value
 from ..errors import AssumptionError, ShapeError, SolverError, counted
 from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import FloatArray, IntArray, Value
 from .estimator_channels import estimates, poi_channels, sensors
 from .left_out import LeftOut
 

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray
 from ..lti.frequency import frequency_response
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import ComplexArray, FloatArray
 from .estimator import KalmanEstimator
 from .whiteness import PooledSpectrum
 

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, Value, check_names, name_list
 from ..errors import AssumptionError, require_known
 from ..lti.scaling import state_scale
 from ..lti.statespace import System
 from ..plant import StandardPlant
-from ..values import ComplexArray, FloatArray, Value, check_names, name_list
 from .estimator_channels import checked_plant
 from .filter_model import FilterModel, filter_model
 

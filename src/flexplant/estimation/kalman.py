@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..checks import FloatArray
 from ..errors import AssumptionError, CertificateError, SolverError
 from ..lti.riccati import solve_dare
 from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
-from ..values import FloatArray
 from .error import error_variances, unresolved_share
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike

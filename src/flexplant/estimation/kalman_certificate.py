@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..certificates import Certificate
+from ..checks import FloatArray, real_array
 from ..errors import CertificateError, SolverError
 from ..lti.lyapunov import solve_stein
 from ..plant import StandardPlant
-from ..values import FloatArray, real_array
 from .estimator_channels import sensors
 from .filter_model import FilterModel, filter_model
 

@@ -9,11 +9,11 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import FloatArray, Value, positive_array, whole
 from ..errors import FlexplantError, require_known
 from ..lti.lyapunov import solve_stein
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, positive_array, whole
 from .estimator_channels import row_of
 from .filter_model import Sight, Steady
 from .static import design_static

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, IntArray, Value
 from ..errors import ModelError, counted
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
@@ -16,7 +17,6 @@ from ..plant.ports import Ports
 from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
-from ..values import ComplexArray, FloatArray, IntArray, Value
 from .estimator_channels import read_alike, sensors
 
 #: a mode of the plant is one of the larger plant's within this part of its frequency

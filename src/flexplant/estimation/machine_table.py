@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, Value, in_unit, members, short
 from ..errors import AssumptionError, FlexplantWarning, ModelError, counted, require_known
 from ..loop import close_loop
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, in_unit, members, short
 from .error import loop_variances
 from .estimator_channels import poi_channels, row_of
 

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import FloatArray, members, whole
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..lti.lyapunov import DOUBLINGS, scale_of, solve_stein
 from ..lti.statespace import StateSpace, System
 from ..parallel import Progress, one_thread, tick
 from ..plant import StandardPlant, UncertainPlant
-from ..values import FloatArray, members, whole
 from .error import error_variances, moving_parts
 from .estimator_channels import same_pois
 from .filter_model import FilterModel, filter_model, filter_system, own_variances

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from ..certificates import Certificate
+from ..checks import FloatArray, Value, instance, real_array, short, sizes_of, whole
 from ..errors import CertificateError, LabelError, ModelError, ShapeError, counted, require_known
 from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, instance, real_array, short, sizes_of, whole
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, sensors
 from .filter_model import FilterModel, check_noises, filter_model, filter_system, weighed
 from .kalman_certificate import AGREEMENT

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, Value
 from ..errors import AssumptionError, ModelError, SolverError, counted, warn
 from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
-from ..values import ComplexArray, FloatArray, Value
 from .causes import settling
 from .consistency import consistency
 from .estimate import Estimate

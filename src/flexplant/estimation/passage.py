@@ -9,9 +9,9 @@ import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
+from ..checks import BoolArray, FloatArray, IntArray
 from ..lti.lyapunov import solve_stein
 from ..lti.recursion import Recursion
-from ..values import BoolArray, FloatArray, IntArray
 from .filter_model import FilterGains, FilterModel, Sight, Steady, gains
 from .recorded import Recorded
 

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..checks import FloatArray, floats, real_array, short
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
-from ..values import FloatArray, floats, real_array, short
 from .filter_model import FilterModel
 
 #: samples that are copied together

@@ -9,13 +9,13 @@ import numpy as np
 import scipy.linalg as la
 
 from ..certificates import Certificate
+from ..checks import FloatArray, Value, between, sizes_of
 from ..errors import CertificateError, SolverError, counted
 from ..lti.norms import hinf_norm
 from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, between, sizes_of
 from .error import error_variances
 from .estimator_channels import poi_channels, row_of, same_pois, sensors
 from .filter_model import FilterModel, error_system, filter_system, own_variances, weighed

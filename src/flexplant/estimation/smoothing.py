@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray
 from ..lti.lyapunov import solve_stein
 from ..lti.recursion import Recursion
-from ..values import FloatArray, IntArray
 from .filter_model import Sight, Steady
 from .passage import SETTLED, KnownParameters, Moment, Passage
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, Value
 from ..errors import AssumptionError, ModelError
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
 from ..plant.rigid.rigid_motion import seen
-from ..values import FloatArray, Value
 from .error import error_variances
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 

@@ -10,13 +10,13 @@ import numpy as np
 import scipy.linalg as la
 
 from ..certificates import Certificate
+from ..checks import FloatArray, Value, instance, positive, sizes_of
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError, counted
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, instance, positive, sizes_of
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of
 from .filter_model import FilterModel, check_noises, filter_model, weighed
 from .invertibility import InputEntry, Invertibility, entry, judged, unknown_names

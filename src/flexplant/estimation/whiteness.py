@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..values import FloatArray
+from ..checks import FloatArray
 
 #: bands of lines over which the spectrum is averaged to find an excess, beside the narrowest one
 _WIDTHS = (1, 8, 64)

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, IntArray, Value, between, real_array
 from ..errors import ModelError, ShapeError, SolverError, counted
-from ..values import ComplexArray, FloatArray, IntArray, Value, between, real_array
 
 #: flags of a pole, each including the ones before
 NEW, FREQUENCY, DAMPING, STABLE = 0, 1, 2, 3

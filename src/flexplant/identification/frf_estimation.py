@@ -8,9 +8,9 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import ComplexArray, FloatArray, members, positive
 from ..errors import ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf
-from ..values import ComplexArray, FloatArray, members, positive
 from .periodic import Periodic, periodic_frf
 from .spectra import H1Estimator, SpectralMethod, dropouts_warned, records, spectral_frf
 

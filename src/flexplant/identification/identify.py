@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, between, instance, positive, real_array, short, whole
 from ..errors import LabelError, ModelError, ShapeError, SolverError, counted, require_known
 from ..lti.frequency import Frf
 from ..parallel import Progress, one_thread
-from ..values import ComplexArray, FloatArray, between, instance, positive, real_array, short, whole
 from .diagram import Moments, OrderPoles, PoleSelection, StabilisationDiagram, built_diagram
 from .line_weights import PreparedLines, prepared
 from .pole_test import (

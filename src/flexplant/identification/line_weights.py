@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import ComplexArray, FloatArray, instance, real_array
 from ..errors import ModelError
 from ..lti.frequency import Frf
-from ..values import ComplexArray, FloatArray, instance, real_array
 
 #: lines over which what a fit leaves is averaged to a variance
 WINDOW = 41

@@ -10,10 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..errors import LabelError, ModelError, ShapeError, counted
-from ..labels import Place
-from ..modes import Modes
-from ..values import (
+from ..checks import (
     ComplexArray,
     FloatArray,
     Value,
@@ -25,6 +22,9 @@ from ..values import (
     short,
     whole,
 )
+from ..errors import LabelError, ModelError, ShapeError, counted
+from ..labels import Place
+from ..modes import Modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, positive, real_array, whole
 from ..errors import ModelError, SolverError
 from ..parallel import Progress, tick
-from ..values import ComplexArray, FloatArray, positive, real_array, whole
 from .diagram import OrderPoles, built_diagram
 from .identify import checked_orders
 from .measured import MeasuredModes

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, Value, generator, positive, real_array, whole
 from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf
-from ..values import ComplexArray, FloatArray, Value, generator, positive, real_array, whole
 from .spectra import Records, error_statistics
 
 #: a line counts as excited when the weakest direction of the inputs is not this much below the rest

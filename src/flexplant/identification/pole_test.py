@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray
 from ..errors import SolverError, warn
-from ..values import ComplexArray, FloatArray
 from .refine import Fit, Lines, projected_cost, projected_model, projected_normal, refined
 
 #: probability that noise anywhere in the band passes for a pole

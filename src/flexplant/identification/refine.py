@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, counted
-from ..values import ComplexArray, FloatArray, IntArray
 
 #: largest entry of a participation vector beside the one held at 1
 RUNAWAY = 5.0

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray
 from ..errors import ModelError, SolverError, warn
 from ..lti.frequency import Frf, checked_freq
-from ..values import ComplexArray, FloatArray
 from .diagram import StabilisationDiagram
 from .line_weights import PreparedLines
 from .measured import MeasuredModes

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, Value, positive, real_array, signal_names
 from ..errors import ModelError, ShapeError, warn
 from ..lti.frequency import Frf
 from ..lti.line_correlation import checked_overlap, checked_window
-from ..values import ComplexArray, FloatArray, Value, positive, real_array, signal_names
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

@@ -10,11 +10,11 @@ from typing import Any, cast
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import FloatArray, IntArray
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
-from ..values import FloatArray, IntArray
 from .assembled import from_triplets
 from .numbers import decimal, printed_digits, rows_of_numbers, wrong_line
 from .paths import (

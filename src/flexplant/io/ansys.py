@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, counted
 from ..labels import DIRECTIONS, DofSet
 from ..structure import FEMatrices
-from ..values import FloatArray, IntArray
 from .assembled import assembled, missing_extra
 from .child import in_child
 from .file_shapes import FileShapes, ModesFormat

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import FloatArray, IntArray
 from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from ..structure.matrices import completed
 from ..structure.precision import digits_of
-from ..values import FloatArray, IntArray
 from .foreign_parsers import sound
 from .paths import USUAL, damaged, file_path, parsing
 from .tables import read_dofs

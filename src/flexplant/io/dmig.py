@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import FloatArray, IntArray
 from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
-from ..values import FloatArray, IntArray
 from .nastran import Nodes, named_matrices, nastran_float, read_nodes
 from .numbers import fixed_numbers, printed_digits
 from .paths import USUAL, Format, check_whole, damaged, file_path, unread, wrong_line_of

@@ -12,10 +12,10 @@ from typing import Any, cast
 import numpy as np
 import scipy.io
 
+from ..checks import FloatArray, Matrix, one_of, real_array
 from ..errors import FlexplantError, LabelError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..modes import Modes
-from ..values import FloatArray, Matrix, one_of, real_array
 from .assembled import missing_extra
 from .file_shapes import FileShapes, ModesFormat, check_mass, frequencies
 from .paths import Elsewhere, damaged, file_path, parsing

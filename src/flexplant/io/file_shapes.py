@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, positive, real_array
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..modes import Modes
 from ..structure.units import Units
-from ..values import FloatArray, positive, real_array
 from .paths import damaged, unread
 
 #: generalised masses nearer to 1 than this are those of mass-normalised shapes in few digits

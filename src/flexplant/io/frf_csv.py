@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..checks import FloatArray, instance
 from ..errors import FlexplantError, LabelError
 from ..lti.frequency import Frf
 from ..store import written
-from ..values import FloatArray, instance
 from .numbers import decimal
 from .paths import file_path, refused, text_of
 

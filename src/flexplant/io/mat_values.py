@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.io
 
+from ..checks import short
 from ..errors import LabelError, ModelError, require_known
 from ..labels import DofSet
 from ..loop import ClosedLoop
@@ -17,7 +18,6 @@ from ..lti.statespace import StateSpace, System, as_statespace
 from ..plant import StandardPlant
 from ..reduction import ReducedModel
 from ..store import written
-from ..values import short
 from .mat_matrices import mat_variables
 from .paths import parsing
 

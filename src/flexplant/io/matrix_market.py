@@ -13,10 +13,10 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.io import mmread
 
+from ..checks import FloatArray
 from ..errors import FlexplantError, ShapeError
 from ..labels import DofSet
 from ..structure import FEMatrices
-from ..values import FloatArray
 from .assembled import one_matrix_each
 from .numbers import printed_digits, rows_of_numbers, wrong_line
 from .paths import Format, check_size, check_whole, damaged, unread, wrong_line_of

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
 from ..labels import DIRECTIONS, DofSet
-from ..values import FloatArray
 from .file_shapes import FileShapes
 from .numbers import decimal
 from .paths import USUAL, defined_twice, file_path

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..values import FloatArray
+from ..checks import FloatArray
 
 #: characters of a number that a program printed, at least; shorter ones may be typed by hand
 _PRINTED = 12

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray
 from ..errors import FlexplantError, ModelError
-from ..values import FloatArray, IntArray
 from .file_shapes import FileShapes, ModesFormat
 from .nastran import Nodes, nodes_of, shapes_at
 from .paths import damaged, defined_twice

@@ -9,10 +9,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import name_list
 from ..errors import FlexplantError, ModelError, require_known
 from ..labels import DofSet
 from ..structure.matrices import FEMatrices, completed
-from ..values import name_list
 from .nastran import named_matrices
 from .op4_binary import binary_matrices, text_matrices
 from .paths import USUAL, Format, file_path

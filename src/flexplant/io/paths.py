@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..checks import short
 from ..errors import FlexplantError, ModelError
 from ..structure import FEMatrices
-from ..values import short
 from .numbers import cut_short
 
 #: what to do with a file that says a thing twice, and one in axes of its own

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ..checks import FloatArray, instance
 from ..errors import FlexplantError, LabelError, ModelError
 from ..modes import Modes
 from ..structure import FEMatrices, FEModel
 from ..structure.units import units as unit_system
-from ..values import FloatArray, instance
 from . import ansys, exodus, op2, uff
 from .file_shapes import FileShapes, ModesFormat, check_mass, modes_of
 from .nastran import shapes_at

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import FloatArray, IntArray
 from ..errors import FlexplantError, ModelError, ShapeError, counted
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
-from ..values import FloatArray, IntArray
 from .assembled import from_triplets
 from .exodus import opened
 from .numbers import printed_digits, rows_of_numbers, wrong_line

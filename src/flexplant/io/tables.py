@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.units import units
-from ..values import FloatArray, IntArray
 from .numbers import decimal
 from .paths import file_path, refused, text_of
 

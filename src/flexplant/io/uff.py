@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray, positive
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError, ModelError, require_known
 from ..identification import MeasuredModes
 from ..labels import DIRECTIONS, DofSet
 from ..lti.frequency import ORDERS, Frf
 from ..structure.units import Units
-from ..values import FloatArray, IntArray, positive
 from .file_shapes import FileShapes, ModesFormat
 from .paths import GLOBAL, ONCE, Elsewhere, at_zero, damaged, file_path, refused, unread
 from .tables import read_nodes_table

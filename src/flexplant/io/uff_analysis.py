@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import FlexplantError
 from ..labels import DIRECTIONS
 from ..lti.frequency import ORDERS, Frf
-from ..values import ComplexArray, FloatArray, IntArray
 from .numbers import spaced_numbers
 from .paths import ONCE, at_zero, damaged, refused, unread
 from .uff_records import KINDS, datasets, whole_entry

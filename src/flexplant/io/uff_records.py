@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, short
 from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS
-from ..values import FloatArray, short
 from .paths import GLOBAL, file_path, refused, unread
 
 

@@ -11,12 +11,12 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ..checks import FloatArray, IntArray, Value, instance, real_array
 from ..dof_columns import component_columns
 from ..errors import LabelError, ModelError, require_known
 from ..labels import DIRECTIONS, DofSet, Interpolation
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..values import FloatArray, IntArray, Value, instance, real_array
 
 #: either kind of model that can be joined
 Model = FEModel | ReducedModel

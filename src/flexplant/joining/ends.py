@@ -8,9 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ..checks import FloatArray
 from ..errors import LabelError, require_known
 from ..labels import DIRECTIONS, DofSet
-from ..values import FloatArray
 from .joint import Joint, Patch, mean_motions
 
 #: lever arms below this part of the machine's size are none

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, IntArray, instance, mapping
 from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
-from ..values import ComplexArray, FloatArray, IntArray, instance, mapping
 from .frf_errors import MeasuredParts, side_by_side, variance_of, warn_of_errors
 from .frf_joints import (
     FrfLink,

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray
 from ..errors import warn
 from ..lti import Frf
-from ..values import ComplexArray, FloatArray
 
 #: part of each response that is taken for its error where none is known: of a good measurement
 _USUAL = 0.01

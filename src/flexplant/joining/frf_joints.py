@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, instance
 from ..dof_columns import at_nodes
 from ..errors import LabelError, ModelError, unknown_label, warn
 from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
 from ..lti.frequency import ORDERS
 from ..structure.rigid import rigid_motions
-from ..values import ComplexArray, FloatArray, instance
 from .ends import JointEnd, joint_axes
 from .joint import Joint, Patch
 

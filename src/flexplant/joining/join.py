@@ -10,6 +10,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
+from ..checks import FloatArray, IntArray, frozen
 from ..errors import ModelError, warn
 from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
@@ -20,7 +21,6 @@ from ..sparse.factor import DENSE_LIMIT, dense
 from ..structure import FEModel
 from ..structure.placed import SPANNED
 from ..structure.rigid import orthonormalised, rigid_body_basis
-from ..values import FloatArray, IntArray, frozen
 from .component import Component, JoinedShape, Model, Pose, components_of
 from .ends import split_end
 from .frf_coupling import joined_frfs

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray, Value
 from ..errors import CertificateError, counted
-from ..values import FloatArray, IntArray, Value
 from .component import Component
 from .links import Elimination, Link, machine_size, rows_of
 

@@ -8,11 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..dof_columns import node_numbers
-from ..errors import LabelError, ModelError, require_known
-from ..labels import DIRECTIONS, DofSet
-from ..structure.rigid import rigid_motions
-from ..values import (
+from ..checks import (
     FloatArray,
     IntArray,
     Value,
@@ -22,6 +18,10 @@ from ..values import (
     real_array,
     short,
 )
+from ..dof_columns import node_numbers
+from ..errors import LabelError, ModelError, require_known
+from ..labels import DIRECTIONS, DofSet
+from ..structure.rigid import rigid_motions
 
 #: an end: "stage/41:z", "stage/41" (a node), ("stage", (x, y, z)) or a Patch
 End: TypeAlias = "str | tuple[str, Sequence[float]] | Patch"

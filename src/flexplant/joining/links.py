@@ -11,11 +11,11 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
+from ..checks import FloatArray, IntArray, instance, positive
 from ..dof_columns import in_box
 from ..errors import ModelError, warn
 from ..labels import DIRECTIONS, DofSet
 from ..structure.rigid import rigid_motions
-from ..values import FloatArray, IntArray, instance, positive
 from .component import Component, Model, Pose, components_of
 from .ends import JointEnd, joint_axes
 from .joint import Joint

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, flag, instance, positive
 from ..errors import ModelError, ShapeError, counted
 from ..lti.between_lines import followed
 from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..values import ComplexArray, FloatArray, flag, instance, positive
 
 #: degrees of freedom above which a variance is taken as it is
 _FREEDOM = 20.0

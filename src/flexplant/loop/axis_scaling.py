@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..values import ComplexArray, FloatArray
+from ..checks import ComplexArray, FloatArray
 
 #: sweeps that balance rows against columns; a sweep gains the coupling squared, units at once
 _SWEEPS = 30

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, inner_names
 from ..errors import LabelError, ModelError, unknown_label
 from ..lti.interconnection import connect
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import ComplexArray, FloatArray, inner_names
 
 
 def joined(

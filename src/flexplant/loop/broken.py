@@ -9,12 +9,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, short
 from ..errors import LabelError
 from ..lti.grid import SOUGHT, highest, resonance_grid
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import ComplexArray, FloatArray, short
 from .axis_scaling import scaled_size
 from .hidden_modes import FEWEST, HiddenModes, hidden_modes
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray, Value, in_unit, instance, real_array, short
 from ..errors import (
     AssumptionError,
     CertificateError,
@@ -22,7 +23,6 @@ from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..lti.responses import continuous_poles, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import FloatArray, IntArray, Value, in_unit, instance, real_array, short
 
 #: relative: the variance by the two Lyapunov equations, and by the integral of the spectrum
 AGREEMENT = 1e-6

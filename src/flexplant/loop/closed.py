@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import ComplexArray, FloatArray, Value, inner_names, name_list
 from ..errors import ModelError, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
 from ..lti.interconnection import lft, loop_poles
@@ -17,7 +18,6 @@ from ..lti.norms import Obstacle, obstacle
 from ..lti.responses import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant, standard_plant
-from ..values import ComplexArray, FloatArray, Value, inner_names, name_list
 from .blocks import as_block, check_inputs, commands, drives, joined, with_known
 from .broken import BrokenLoop, Path, plant_path
 from .budget import (

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..checks import FloatArray, Value, short
 from ..errors import LabelError, ModelError, require_known
 from ..lti.grid import climbed
-from ..values import FloatArray, Value, short
 from .closed import ClosedLoop
 from .sensitivity import first_above
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import ComplexArray, FloatArray
 from ..lti.between_lines import AROUND, LINES, pole_between
-from ..values import ComplexArray, FloatArray
 
 #: damping ratio below which a mode is not considered: no structure has less
 _LEAST = 1e-5

@@ -8,9 +8,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, Value, whole
 from ..errors import counted, unknown_label
 from ..lti.responses import Responder
-from ..values import ComplexArray, FloatArray, Value, whole
 from .broken import BrokenLoop, inverted
 from .hidden_modes import FEWEST, HiddenModes, low_slope
 from .sensitivity import Loop, taken_apart

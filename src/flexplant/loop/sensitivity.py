@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import ComplexArray, FloatArray, short
 from ..errors import AssumptionError, LabelError, ModelError, ShapeError, unknown_label
 from ..lti.between_lines import followed
 from ..lti.frequency import Frf, frequency_response, sampled_freq
@@ -15,7 +16,6 @@ from ..lti.interconnection import loop_poles
 from ..lti.responses import remembered, responder
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
-from ..values import ComplexArray, FloatArray, short
 from .broken import BrokenLoop, inverted, largest, moved
 from .closed import ClosedLoop
 

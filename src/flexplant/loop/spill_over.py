@@ -10,9 +10,9 @@ import numpy as np
 import scipy.linalg as la
 
 from ..certificates import in_words, stability_name
+from ..checks import FloatArray, IntArray, Value
 from ..errors import ModelError
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, IntArray, Value
 
 #: a mode with less than this part of the one that takes part most is not named
 _TAKES_PART = 0.3

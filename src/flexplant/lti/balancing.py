@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..checks import FloatArray, Value, positive
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
-from ..values import FloatArray, Value, positive
 from .interconnection import parallel, series
 from .lyapunov import compressed, controllability_factor, observability_factor
 from .modal import Split, split_stable

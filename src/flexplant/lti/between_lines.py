@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..values import ComplexArray, FloatArray, IntArray
+from ..checks import ComplexArray, FloatArray, IntArray
 
 #: change of a response between two lines, beside its size, below which it is a straight line
 _STRAIGHT = 1e-9

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, IntArray, between, positive
 from ..errors import ModelError, warn
-from ..values import ComplexArray, FloatArray, IntArray, between, positive
 from .joining import Matrices
 from .lyapunov import compressed
 from .statespace import StateSpace, System, as_statespace

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
-from ..values import (
+from ..checks import (
     ComplexArray,
     FloatArray,
     Value,
@@ -24,6 +23,7 @@ from ..values import (
     short,
     signal_names,
 )
+from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
 from .grid import checked_freq as checked_freq
 from .grid import default_freq as default_freq
 from .grid import sampled_freq as sampled_freq

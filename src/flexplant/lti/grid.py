@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import ComplexArray, FloatArray, IntArray, positive, positive_array
 from ..errors import ModelError
-from ..values import ComplexArray, FloatArray, IntArray, positive, positive_array
 from .responses import continuous_poles, responder
 from .statespace import StateSpace, System, as_statespace
 

@@ -12,8 +12,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, IntArray, short
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
-from ..values import ComplexArray, FloatArray, IntArray, short
 
 #: A, B, C, D
 Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]

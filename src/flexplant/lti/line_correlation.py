@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import ComplexArray, FloatArray, between
 from ..errors import ModelError, ShapeError
-from ..values import ComplexArray, FloatArray, between
 
 #: samples of a window that stand for all lengths
 SAMPLES = 256

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, real_array
 from ..errors import ModelError, SolverError
 from ..parallel import one_thread
-from ..values import ComplexArray, FloatArray, real_array
 from .joining import is_block_diagonal
 from .scaling import even_scale, state_scale
 from .statespace import StateSpace, System, as_statespace

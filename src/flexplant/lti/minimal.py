@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
-from ..values import ComplexArray, FloatArray, between
+from ..checks import ComplexArray, FloatArray, between
 from .joining import is_block_diagonal, joined_blocks, stacked
 from .lyapunov import controllability_factor, observability_factor
 from .modal import modal_form, part_of, split_stable

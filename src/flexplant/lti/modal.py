@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, Value, positive
 from ..errors import SolverError, counted
-from ..values import ComplexArray, FloatArray, Value, positive
 from .joining import block_eigenvalues, is_block_diagonal
 from .norms import eigenvalues_with_error, uncertain_poles
 from .scaling import state_scale

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray
 from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
-from ..values import ComplexArray, FloatArray
 from .lyapunov import controllability_gramian, observability_gramian
 from .peaks import Residues, proved_peak, residues
 from .responses import Responder, continuous_poles, points, responder

@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..values import ComplexArray, FloatArray
+from ..checks import ComplexArray, FloatArray
 from .responses import ModalPairs, diagonal_form, modal_pairs
 from .statespace import StateSpace
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import FloatArray, Value, inner_names
 from ..errors import ModelError, counted
-from ..values import FloatArray, Value, inner_names
 from .discretisation import bilinear, image_freq, tustin
 from .modal import modal_form
 from .scaling import bordered_scale, mean_speed, state_scale

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..values import FloatArray
+from ..checks import FloatArray
 
 #: samples in a piece, whose arrays stay in the cache; a whole number of blocks of any size
 PIECE = 4096

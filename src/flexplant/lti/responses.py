@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csgraph
 
+from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..parallel import one_thread
-from ..values import ComplexArray, FloatArray, IntArray
 from .scaling import scaled_schur, state_scale
 from .statespace import StateSpace
 

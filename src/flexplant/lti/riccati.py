@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, Value, real_array
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
-from ..values import ComplexArray, FloatArray, Value, real_array
 from .lyapunov import accumulated, doubled, scale_of, solve_continuous, symmetric
 
 

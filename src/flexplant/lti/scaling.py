@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg as la
 
-from ..values import ComplexArray, FloatArray
+from ..checks import ComplexArray, FloatArray
 
 #: size of B and C beside A: enough to hold the states of a chain together
 BORDER = 1.0

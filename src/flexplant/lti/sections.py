@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import ComplexArray, FloatArray, real_array
 from ..errors import ModelError
-from ..values import ComplexArray, FloatArray, real_array
 from .joining import cascaded, stacked
 
 

@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..errors import ModelError, ShapeError, counted
-from ..values import (
+from ..checks import (
     ComplexArray,
     FloatArray,
     IntArray,
@@ -24,6 +23,7 @@ from ..values import (
     short,
     signal_names,
 )
+from ..errors import ModelError, ShapeError, counted
 from .joining import (
     Channels,
     block_eigenvalues,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import between, positive
 from ..errors import ModelError
-from ..values import between, positive
 from .sections import tf_fields, zpk_fields
 from .statespace import StateSpace, System, as_statespace
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..checks import positive, real_array
 from ..errors import ModelError
-from ..values import positive, real_array
 from .interconnection import series
 from .statespace import StateSpace
 

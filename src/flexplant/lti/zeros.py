@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..values import ComplexArray, FloatArray
+from ..checks import ComplexArray, FloatArray
 from .scaling import mean_speed, reciprocal, state_scale
 
 #: a zero closer to the limit than this, relative to its size, is tested as if it were on it

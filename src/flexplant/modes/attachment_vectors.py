@@ -9,13 +9,13 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ..checks import FloatArray, Matrix, short
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..sparse.factor import DENSE_LIMIT, dense, diagonal
 from ..sparse.multifrontal import MultifrontalCholesky
 from ..structure import FEModel
 from ..structure.eigen import signed
-from ..values import FloatArray, Matrix, short
 from .shifted import stiffness_factor
 
 #: of a place's whole elastic compliance: what is less than this beyond the modes is rounding

@@ -8,13 +8,13 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ..checks import ComplexArray, FloatArray
 from ..errors import SolverError, counted, warn
 from ..sparse.factor import by_rows, diagonal
 from ..sparse.pardiso import Pardiso
 from ..sparse.rayleigh_ritz import Absolute, beyond
 from ..structure import FEModel
 from ..structure.definite import signed_square
-from ..values import ComplexArray, FloatArray
 from .modes import Modes
 from .normal_form import NormalForm, normal_form
 from .shifted import stiffness_factor

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..values import ComplexArray, FloatArray
+from ..checks import ComplexArray, FloatArray
 from .dynamic_basis import DynamicBasis
 from .shifted import held_factor
 

@@ -9,13 +9,13 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ..checks import ComplexArray, FloatArray
 from ..errors import ModelError, SolverError, counted
 from ..sparse.factor import DENSE_LIMIT, dense
 from ..sparse.multifrontal import ComplexSymmetricFactor
 from ..sparse.rayleigh_ritz import beyond
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping, Rayleigh
 from ..structure.definite import signed_root, unstable_stiffness
-from ..values import ComplexArray, FloatArray
 from .attachment_vectors import static_response
 from .damped_modes import damper_forces
 from .modes import Modes

@@ -8,11 +8,11 @@ from typing import Any, cast
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, IntArray, Value, real_array
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet, Place
 from ..structure.definite import signed_square
 from ..structure.placed import Placed, missed
-from ..values import ComplexArray, FloatArray, IntArray, Value, real_array
 
 #: relative: a frequency that rounding of K may change by more is one to know of
 _SOFT = 1e-4

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, IntArray, Matrix, Value, real_array
 from ..errors import ModelError, SolverError, counted
 from ..sparse.factor import dense
 from ..structure.definite import signed_square
 from ..structure.eigen import elastic_modes
 from ..structure.rigid import orthonormalised
-from ..values import ComplexArray, FloatArray, IntArray, Matrix, Value, real_array
 
 #: coupling of modes by D, relative to the largest modal damping, that still counts as rounding
 PROPORTIONAL = 1e-9

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import FloatArray
 from ..errors import ModelError, SolverError, counted
 from ..sparse.factor import DENSE_LIMIT, same_pattern
 from ..sparse.inertia import SignedFactor, multifrontal_inertia, signed_factor
@@ -17,7 +18,6 @@ from ..sparse.pardiso import Pardiso, PardisoCholesky
 from ..sparse.rayleigh_ritz import rounding_of
 from ..structure.definite import unstable_stiffness
 from ..structure.model import FEModel
-from ..values import FloatArray
 
 #: the shift, in roundings of the energies of rigid-body motions: far below the first elastic mode
 #: of nearly all models, yet K - sigma M is well away from singular

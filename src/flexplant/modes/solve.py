@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import FloatArray, instance, positive, short
 from ..errors import ModelError, SolverError, warn
 from ..labels import Place
 from ..parallel import Progress
@@ -19,7 +20,6 @@ from ..sparse.rayleigh_ritz import Absolute, column_groups, rounding_of
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping
 from ..structure.definite import signed_root, signed_square
 from ..structure.eigen import elastic_modes, signed
-from ..values import FloatArray, instance, positive, short
 from .attachment_vectors import attachment_vectors, labels_of, places, projected_zeta
 from .damped_modes import damped_modes, is_rayleigh, leaving_overdamped, wider
 from .modes import Modes

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import FloatArray, IntArray, Matrix, Rng
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread, tick
 from ..sparse.factor import by_rows
@@ -18,7 +19,6 @@ from ..sparse.rayleigh_ritz import SPREAD, Absolute, column_groups, rayleigh_rit
 from ..structure.definite import are_rigid
 from ..structure.eigen import check_stiffness
 from ..structure.model import FEModel
-from ..values import FloatArray, IntArray, Matrix, Rng
 from .shifted import (
     CountingFactor,
     StiffnessFactor,

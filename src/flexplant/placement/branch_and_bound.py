@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..checks import FloatArray, positive, whole
 from ..errors import ModelError, warn
 from ..parallel import Progress
-from ..values import FloatArray, positive, whole
 from ..work import Work
 from .exchange import best_start
 from .problem import Found, Problem, Search

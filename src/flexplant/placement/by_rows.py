@@ -7,11 +7,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from ..checks import FloatArray, flag, instance
 from ..errors import InfeasibleError, ModelError
 from ..plant import StandardPlant
 from ..reduction import EffectiveIndependence
 from ..reduction.criteria import SelectionCriterion
-from ..values import FloatArray, flag, instance
 from ..work import Work
 from .candidate_shapes import ByShapes, Shapes
 from .problem import Found, Problem, Search

@@ -9,11 +9,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ..checks import FloatArray, short
 from ..errors import AssumptionError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..values import FloatArray, short
 from .criterion import Criterion, Scorer
 from .summed import SummedWorth, by_size
 

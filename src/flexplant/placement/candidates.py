@@ -8,10 +8,10 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from ..checks import FloatArray, Value, short
 from ..errors import LabelError, ModelError, require_known, unknown_label
 from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
 from ..structure import Disc, Rectangle
-from ..values import FloatArray, Value, short
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import FloatArray, positive, short
 from ..errors import ModelError
 from ..estimation import design_kalman
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import control_dare
 from ..plant import StandardPlant
 from ..synthesis import design_hinf
-from ..values import FloatArray, positive, short
 from .candidates import PlantChannel, Port, side_of
 from .criterion import Criterion, Scorer
 from .poi_axes import measured_rows, plain, poi_rows, pushed_columns, sensor_rows, structure_part

@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ..checks import FloatArray, Value, function, short, with_unit
 from ..errors import FlexplantError, ModelError
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, function, short, with_unit
 from .candidates import Port, Side, sides_of, with_side
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..values import FloatArray, function, whole
+from ..checks import FloatArray, function, whole
 from ..work import Work
 from .layouts import layouts_of
 from .problem import Found, Problem, Search

@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ..checks import FloatArray, one_of
 from ..errors import ModelError
 from ..plant import StandardPlant
 from ..plant.realisation import ModalRealisation
-from ..values import FloatArray, one_of
 from .candidate_shapes import ByShapes, Shapes, noise_sizes, shapes_of
 from .criterion import Criterion, Scorer
 from .summed import MEASURES, SummedWorth, summed

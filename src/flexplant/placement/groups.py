@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, Value, name_list, one_of, positive, real_array, short, whole
 from ..errors import LabelError, ModelError
-from ..values import FloatArray, Value, name_list, one_of, positive, real_array, short, whole
 from .candidates import Places, Zone
 from .rows import LinearRows
 

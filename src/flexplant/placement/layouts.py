@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import FloatArray
 from ..errors import AssumptionError, CertificateError, counted
 from ..plant import Actuator, Assumption, SensorPort, StandardPlant, assemble_plant
-from ..values import FloatArray
 from ..work import Work
 from .candidates import Port, Side, checked_plant, side_of, with_side
 from .closed_loop_h2 import ClosedLoopH2

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, Rng, Value, positive, real_array, short
 from ..errors import InfeasibleError, ModelError
 from ..plant import Actuator, StandardPlant
-from ..values import FloatArray, Rng, Value, positive, real_array, short
 from .candidates import checked_plant
 from .criterion import Criterion, in_words
 from .groups import Budget, Constraint

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import FloatArray, function, one_of, positive
 from ..errors import AssumptionError
 from ..plant import StandardPlant, larger_plant
-from ..values import FloatArray, function, one_of, positive
 from .candidate_shapes import Shapes, shapes_of
 from .candidates import SIDES, side_of, sides_of
 from .criterion import Criterion, Scorer, Wrapping, as_criterion

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..checks import Value
 from ..errors import counted
 from ..plant import StandardPlant
-from ..values import Value
 from .candidates import Port, Side, side_of, with_side
 from .criterion import in_words
 

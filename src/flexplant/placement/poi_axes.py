@@ -7,12 +7,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from ..checks import FloatArray, positive, short
 from ..errors import LabelError, ModelError, counted, require_known
 from ..estimation.estimator_channels import sensors
 from ..lti.discretisation import held_exactly
 from ..lti.statespace import StateSpace
 from ..plant import Actuator, StandardPlant
-from ..values import FloatArray, positive, short
 from .candidates import with_side
 
 #: POIs, or axes of a POI, that count, each once or by a factor

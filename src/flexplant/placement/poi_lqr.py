@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray, positive
 from ..errors import CertificateError, SolverError
 from ..lti.discretisation import held_exactly
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import control_dare
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import FloatArray, IntArray, positive
 from .criterion import Criterion, Scorer
 from .poi_axes import (
     Named,

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, flag, one_of, short
 from ..errors import AssumptionError, ModelError
 from ..estimation import Filter, FixedLag, KalmanEstimator, Predictor, design_kalman
 from ..modes import Modes
@@ -15,7 +16,6 @@ from ..plant import StandardPlant, larger_plant
 from ..plant.dynamics import followed
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..values import FloatArray, flag, one_of, short
 from .criterion import Criterion, OnBoth, OnPlant, Scorer
 from .poi_axes import (
     Named,

@@ -11,7 +11,7 @@ from math import comb, prod
 
 import numpy as np
 
-from ..values import FloatArray, Value
+from ..checks import FloatArray, Value
 from ..work import Work
 from .layouts import WEAK, Layouts
 from .rows import Branch, LinearRows

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
+from ..checks import FloatArray, IntArray, Value
 from ..errors import SolverError
 from ..lti.lyapunov import doubled
 from ..lti.riccati import control_dare
-from ..values import FloatArray, IntArray, Value
 from .criterion import Scorer
 from .tangent import Convex, Tangent
 

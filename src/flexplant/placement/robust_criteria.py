@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, one_of, short
 from ..errors import FlexplantError, ModelError
 from ..plant import StandardPlant
-from ..values import FloatArray, one_of, short
 from .candidates import SIDES, Port, checked_plant, side_of, sides_of, with_side
 from .criterion import Scorer, Wrapping
 from .layouts import RigidPart

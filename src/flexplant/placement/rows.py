@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_array
 
-from ..values import FloatArray, IntArray
+from ..checks import FloatArray, IntArray
 
 #: what rounding may have added to a sum
 _SLACK = 1e-9

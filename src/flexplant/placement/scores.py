@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray, Value, instance, short, whole
 from ..errors import LabelError, ModelError, counted
 from ..parallel import mapped
 from ..plant import StandardPlant
-from ..values import FloatArray, IntArray, Value, instance, short, whole
 from ..work import Work
 from .candidates import Port, Side, checked_plant, known_candidates, places_of, with_side
 from .criterion import Criterion, in_words

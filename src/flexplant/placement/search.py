@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import Rng, instance, name_list, short, whole
 from ..errors import InfeasibleError, LabelError, ModelError, counted, require_known
 from ..fingerprint import fingerprint
 from ..plant import StandardPlant
-from ..values import Rng, instance, name_list, short, whole
 from ..work import Work
 from .candidates import Port, checked_plant, known_candidates, places_of, side_of
 from .closed_loop_h2 import Separation

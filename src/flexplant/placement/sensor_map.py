@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import FloatArray, Value, positive, real_array
 from ..errors import ModelError, counted
 from ..plant import Sensor, StandardPlant
 from ..plant.ports import Quantity
 from ..structure import Disc, Rectangle
-from ..values import FloatArray, Value, positive, real_array
 from ..work import Work
 from .candidates import checked_plant, places_of
 from .criterion import Criterion, in_words

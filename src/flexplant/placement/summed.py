@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..values import FloatArray
+from ..checks import FloatArray
 from .criterion import Scorer
 from .rows import Branch, ascended
 from .tangent import Below, Convex

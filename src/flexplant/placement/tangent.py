@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..checks import FloatArray
 from ..errors import SolverError
-from ..values import FloatArray
 from .criterion import Scorer
 from .rows import Branch, ascended
 

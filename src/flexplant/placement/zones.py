@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import positive, real_array, short
 from ..errors import ModelError
 from ..structure import Disc
-from ..values import positive, real_array, short
 from .candidates import Places, Zone
 from .groups import Constraint, limits
 from .rows import LinearRows

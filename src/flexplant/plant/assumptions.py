@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, Value
 from ..errors import AssumptionError, unknown_label
 from ..lti.discretisation import block_diagonal
-from ..values import ComplexArray, FloatArray, Value
 from .partition import Partition
 from .reach_and_sight import Assumption, full_ranks, no_zeros, reach_and_sight, response_at
 

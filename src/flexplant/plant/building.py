@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ..checks import FloatArray, instance, positive
 from ..errors import ModelError
 from ..lti.discretisation import (
     check_latency,
@@ -19,7 +20,6 @@ from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..values import FloatArray, instance, positive
 from .dynamics import structure_system, with_filters
 from .origin import Assembled, Foreign
 from .partition import Partition

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..checks import FloatArray
 from ..errors import ModelError, counted
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, as_statespace
 from ..structure.placed import SPANNED
-from ..values import FloatArray
 from .port import QUANTITIES, Seen
 from .ports import Ports
 from .realisation import ModalRealisation

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..checks import FloatArray, Value, between, positive
 from ..errors import unknown_label
 from ..labels import Place
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, Value, between, positive
 from .forces import BaseAcceleration, Disturbance
 from .port import ForcePort, force_unit
 from .realisation import ModalRealisation

@@ -7,10 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from ..checks import FloatArray, real_array
 from ..labels import Place
 from ..lti.statespace import StateSpace
 from ..structure.rigid import turned_about
-from ..values import FloatArray, real_array
 from .port import ForcePort, force_unit, motion_unit
 from .realisation import ModalRealisation
 from .rigid.rigid_body import inertia_load

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import FloatArray, Value, real_array
 from ..errors import LabelError, ModelError, counted, unknown_label
-from ..values import FloatArray, Value, real_array
 from .building import rebuilt
 from .forces import Actuator, Disturbance
 from .partition import Partition

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from ..checks import FloatArray, Value
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, Value
 from .ports import Ports
 from .realisation import ModalRealisation
 

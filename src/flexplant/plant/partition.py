@@ -8,10 +8,10 @@ from typing import Any, NamedTuple, Self, TypeGuard
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray, Value, name_list, positive, short
 from ..errors import LabelError, ModelError, counted, require_known, unknown_label
 from ..labels import DIRECTIONS
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..values import FloatArray, IntArray, Value, name_list, positive, short
 from .origin import ELSEWHERE, Assembled, Foreign, Origin
 
 

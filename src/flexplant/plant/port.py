@@ -8,10 +8,10 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from ..checks import FloatArray, Value, check_names, flag, positive, real_array, short
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace, as_statespace
-from ..values import FloatArray, Value, check_names, flag, positive, real_array, short
 from .realisation import ModalRealisation
 
 Quantity: TypeAlias = Literal["displacement", "velocity", "acceleration"]

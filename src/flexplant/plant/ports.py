@@ -6,10 +6,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from ..checks import Value, check_names, instance, short
 from ..errors import LabelError, ModelError, unknown_label
 from ..lti.interconnection import series
 from ..lti.weights import pade
-from ..values import Value, check_names, instance, short
 from .forces import Actuator as Actuator
 from .forces import Disturbance as Disturbance
 from .port import QUANTITIES as QUANTITIES

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, Value
 from ..errors import counted
 from ..labels import DIRECTIONS
 from ..lti.scaling import state_scale
 from ..lti.statespace import StateSpace
 from ..lti.zeros import axis_zeros
-from ..values import ComplexArray, FloatArray, Value
 from .partition import Partition
 from .rigid.rigid_motion import body_of, rigid_modes
 

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, Value
 from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..lti.discretisation import block_diagonal
@@ -19,7 +20,6 @@ from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..structure.definite import signed_square
 from ..structure.placed import Structure as Structure
-from ..values import ComplexArray, FloatArray, Value
 
 T = TypeVar("T")
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..checks import Value, instance, positive
 from ..errors import ModelError, warn
-from ..values import Value, instance, positive
 from .realisation import MODAL, ModalRealisation, Structure, realised
 
 

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import FloatArray, IntArray
 from ..errors import AssumptionError
 from ..lti.discretisation import accumulated_noise, acting, block_diagonal, pair_expm
 from ..lti.lyapunov import compressed
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, IntArray
 
 
 class Late(NamedTuple):

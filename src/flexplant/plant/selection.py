@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import Value
 from ..lti.discretisation import acting
 from ..lti.statespace import StateSpace
-from ..values import Value
 from .origin import Assembled
 from .ports import Ports
 from .sensors import Poi

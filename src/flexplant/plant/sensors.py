@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+from ..checks import FloatArray, Value, check_names, short
 from ..errors import LabelError, require_known
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace
 from ..structure.rigid import place_motion
-from ..values import FloatArray, Value, check_names, short
 from .port import (
     Quantity,
     Seen,

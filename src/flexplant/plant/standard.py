@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy.typing as npt
 
+from ..checks import FloatArray
 from ..labels import Place
 from ..lti.statespace import System
-from ..values import FloatArray
 from .assumptions import AssumptionReport
 from .building import continuous_plant, rebuilt, sampled
 from .moving import Along, along, moved

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from ..checks import ComplexArray, FloatArray, instance, positive, real_array, whole
 from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf
 from ..lti.frequency import frequency_response as system_response
@@ -24,7 +25,6 @@ from ..modes.solve import modes_reaching
 from ..parallel import Progress
 from ..reduction import ReducedModel
 from ..structure import Damping, FEModel
-from ..values import ComplexArray, FloatArray, instance, positive, real_array, whole
 from .ports import Ports
 from .realisation import Structure
 from .residual_form import modes_of

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import instance
 from ..errors import ModelError, require_known
 from ..lti.discretisation import tustin
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..values import instance
 from .building import P
 from .origin import Weighted
 from .partition import Partition

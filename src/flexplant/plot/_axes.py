@@ -17,8 +17,8 @@ from matplotlib.axis import Axis
 from matplotlib.collections import PolyCollection
 from matplotlib.ticker import MaxNLocator
 
+from ..checks import FloatArray, in_unit
 from ..errors import ModelError
-from ..values import FloatArray, in_unit
 
 #: points along a line, of which none shall lie under a legend
 _DENSE = 500

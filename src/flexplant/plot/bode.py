@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
 
+from ..checks import FloatArray, name_list, real_array, short
 from ..errors import ModelError, unknown_label
 from ..lti.frequency import Frf
-from ..values import FloatArray, name_list, real_array, short
 from ._axes import STYLES, axes, finish, legend, role_of
 from .gains import Curve, curves, decibel, gain_label, readable, shared_reference
 

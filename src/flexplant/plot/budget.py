@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from ..checks import in_unit, instance, short, with_unit
 from ..errors import ModelError, counted
 from ..loop import ClosedLoop, ErrorBudget, Spectrum
 from ..simulation import Response
-from ..values import in_unit, instance, short, with_unit
 from ._axes import CYCLE, axes, finish, legend, named, shown_in, styles
 from .gains import by_label
 

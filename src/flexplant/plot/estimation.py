@@ -10,13 +10,13 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from ..checks import FloatArray, between, instance, name_list, positive, real_array, short
 from ..errors import ModelError, ShapeError
 from ..estimation import Consistency, Estimate, LagReport
 from ..estimation.estimator_channels import row_of
 from ..estimation.lag_report import PREDICTOR, SMOOTHER, STATIC
 from ..estimation.whiteness import spectrum_of
 from ..simulation import EstimatorComparison
-from ..values import FloatArray, between, instance, name_list, positive, real_array, short
 from ._axes import (
     BLACK,
     BLUE,

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
+from ..checks import in_unit, instance, short, with_unit
 from ..errors import LabelError, ModelError
 from ..simulation import ErrorMap, Response, exposure_errors
 from ..simulation.exposure import error_channels
-from ..values import in_unit, instance, short, with_unit
 from ._axes import (
     BLACK,
     BLUE,

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
+from ..checks import ComplexArray, FloatArray, short
 from ..errors import FlexplantError, ModelError
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import as_statespace
-from ..values import ComplexArray, FloatArray, short
 from ._axes import POINTS, Style, role_of, styles
 
 #: of a magnitude below the largest one that is drawn, nothing can be read: zeros at half the rate

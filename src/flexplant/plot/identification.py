@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
+from ..checks import ComplexArray, FloatArray, instance
 from ..identification import IdentifiedModes, StabilisationDiagram
 from ..lti.frequency import Frf
-from ..values import ComplexArray, FloatArray, instance
 from ._axes import (
     BLUE,
     GREY,

@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
+from ..checks import FloatArray, in_unit
 from ..errors import counted
 from ..labels import DofSet
 from ..plant import Ports
-from ..values import FloatArray, in_unit
 from ._axes import BLACK, GREY, LIGHT, PORTS, PURPLE, Style, axes, legend_below, plan, solid_axes
 from .mode_shapes import Surface, surface_of
 

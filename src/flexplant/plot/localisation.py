@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
+from ..checks import FloatArray, instance, with_unit
 from ..errors import ModelError
 from ..labels import DofSet
 from ..updating import Localisation
 from ..updating.parameters.added import Parameter, PointParameter
-from ..values import FloatArray, instance, with_unit
 from ._axes import BLUE, GREY, LIGHT, RED, axes, finish, legend_below, plan
 
 #: colours of what was chosen, cannot be distinguished from it, hardly can, and of all others

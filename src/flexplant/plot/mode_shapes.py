@@ -10,10 +10,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
+from ..checks import ComplexArray, FloatArray, IntArray, in_unit, instance, positive, whole
 from ..errors import ModelError
 from ..labels import DofSet
 from ..modes import Modes
-from ..values import ComplexArray, FloatArray, IntArray, in_unit, instance, positive, whole
 from ._axes import BLACK, GREY, solid_axes
 
 _COLOURS = "viridis"

@@ -8,13 +8,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
+from ..checks import ComplexArray, FloatArray, positive
 from ..errors import ModelError, unknown_label
 from ..loop import ClosedLoop, sensitivity
 from ..lti.between_lines import LINES, followed, steps_between
 from ..lti.frequency import Frf
 from ..lti.responses import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
-from ..values import ComplexArray, FloatArray, positive
 from ._axes import GREY, RED, axes, finish, legend, styles
 from .gains import curves, labelled
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..checks import short
 from ..simulation import Response
 from ..store import written
-from ..values import short
 from ..versions import versions
 from .html.page import Chapter, Gallery, page, table
 from .html.result import Design, loops_section, result

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
+from ..checks import FloatArray, instance, name_list, positive, real_array
 from ..errors import ModelError, require_known
 from ..loop import ClosedLoop
 from ..loop.blocks import references
@@ -18,7 +19,6 @@ from ..lti.recursion import Recursion
 from ..lti.responses import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
 from ..simulation import Response
-from ..values import FloatArray, instance, name_list, positive, real_array
 from ._axes import GREY, finish, legend, named, panel_axes, quantity_of, shown_in, styles
 from .gains import labelled
 

@@ -9,13 +9,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
+from ..checks import FloatArray, real_array, short
 from ..errors import LabelError, ModelError, ShapeError
 from ..loop import ClosedLoop, complementary_sensitivity, control_sensitivity
 from ..loop import sensitivity as sensitivity_of
 from ..loop.comparison import error_sensitivity
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import as_statespace
-from ..values import FloatArray, real_array, short
 from ._axes import GREY, STYLES, Style, axes, finish, legend, styles
 from .gains import by_label, decibel, readable, shared_reference
 

@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from ..checks import ComplexArray, FloatArray, in_unit, instance
 from ..errors import counted
 from ..lti.frequency import Frf
 from ..updating import Correlation, FrfResidual, Residual, UpdateResult, correlate
 from ..updating.search import Objective
-from ..values import ComplexArray, FloatArray, in_unit, instance
 from ._axes import BLUE, CYCLE, GREY, LIGHT, POINTS, STYLES, axes, finish, legend, named, shown_in
 
 #: parameters that are drawn by themselves; the rest are left to the repr

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..checks import FloatArray, Value, name_list, positive, real_array, whole
 from ..errors import counted
-from ..values import FloatArray, Value, name_list, positive, real_array, whole
 from .ranking import peak_gains
 
 

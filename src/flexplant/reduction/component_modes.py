@@ -9,12 +9,12 @@ from typing import ClassVar
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import FloatArray, positive, whole
 from ..errors import ModelError, counted
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..sparse.factor import dense, unit_diagonal
 from ..structure import Damping, FEModel, ModalDamping
-from ..values import FloatArray, positive, whole
 from .condensation import DofPartition
 from .methods import ReductionMethod
 from .projection import (

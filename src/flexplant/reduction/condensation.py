@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import FloatArray, IntArray, positive, whole
 from ..errors import ModelError, ShapeError, SolverError, counted
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..sparse.factor import unit_diagonal
 from ..structure import Damping, FEModel, ModalDamping
-from ..values import FloatArray, IntArray, positive, whole
 from .methods import ReductionMethod, refused_partition
 from .projection import (
     Solver,

@@ -10,9 +10,9 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, Value, instance, name_list, positive, whole
 from ..errors import LabelError, ModelError, ShapeError, counted
 from ..modes.modes import Modes
-from ..values import ComplexArray, FloatArray, Value, instance, name_list, positive, whole
 
 #: shapes at DOFs, real or complex
 Rows: TypeAlias = FloatArray | ComplexArray

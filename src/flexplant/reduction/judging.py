@@ -8,6 +8,7 @@ from typing import Any, Protocol, Self, TypeAlias
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, real_array, whole
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..lti.grid import climbed
@@ -18,7 +19,6 @@ from ..modes.modes import Modes
 from ..modes.shifted import held_factor
 from ..modes.solve import modes_reaching
 from ..structure import FEModel, Hysteretic
-from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array, whole
 from .bounds import ErrorBound
 from .mode_pairs import paired
 

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ..checks import FloatArray, real_array, whole
 from ..errors import ModelError, SolverError, counted
 from ..labels import Place
 from ..modes.attachment_vectors import labels_of, places, static_response
@@ -18,7 +19,6 @@ from ..modes.modes import Modes
 from ..modes.shifted import stiffness_factor
 from ..sparse.factor import DENSE_LIMIT, dense, dynamic_lu
 from ..structure import Damping, FEModel
-from ..values import FloatArray, real_array, whole
 from .methods import ReductionMethod
 from .projection import checked_damping, fe_model, projected
 from .reduced import ReducedModel

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import FloatArray, Value
 from ..errors import FlexplantError, ModelError, ShapeError, counted
 from ..labels import DofSet, Place
 from ..modes.attachment_vectors import places
@@ -18,7 +19,6 @@ from ..modes.solve import solve_modes
 from ..parallel import Progress
 from ..structure import Damping, FEModel
 from ..structure.definite import refuse_unstable
-from ..values import FloatArray, Value
 from .criteria import PivotedQr
 from .projection import checked_damping, labels_given, shown
 from .reduced import ReducedModel

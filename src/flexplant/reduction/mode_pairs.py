@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..values import ComplexArray, FloatArray, IntArray
+from ..checks import ComplexArray, FloatArray, IntArray
 
 #: modes closer than this, relatively, are compared as one subspace: any change mixes their shapes
 CLUSTER = 1e-3

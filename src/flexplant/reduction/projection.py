@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ..checks import FloatArray, Matrix, name_list
 from ..errors import LabelError, ModelError, SolverError
 from ..labels import DofSet
 from ..modes.modes import Modes
@@ -16,7 +17,6 @@ from ..sparse.factor import DENSE_LIMIT, dense, unit_diagonal
 from ..sparse.multifrontal import MultifrontalCholesky
 from ..structure import Damping, FEModel
 from ..structure.eigen import elastic_modes
-from ..values import FloatArray, Matrix, name_list
 from .bounds import ErrorBound
 from .reduced import ReducedModel
 

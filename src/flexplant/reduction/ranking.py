@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray, Value
 from ..errors import ModelError, counted
 from ..labels import Place
 from ..lti.balancing import hankel_values
@@ -15,7 +16,6 @@ from ..lti.statespace import StateSpace
 from ..modes.attachment_vectors import labels_of, places
 from ..modes.modes import Modes
 from ..structure.definite import refuse_unstable
-from ..values import FloatArray, IntArray, Value
 
 
 def peak_gains(omega: FloatArray, zeta: FloatArray) -> FloatArray:

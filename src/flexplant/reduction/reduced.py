@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, IntArray, Value, name_list, positive, real_array
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..modes.damped_modes import leaving_overdamped
@@ -19,7 +20,6 @@ from ..structure import FEModel
 from ..structure.definite import refuse_unstable, unstable_stiffness
 from ..structure.placed import SPANNED, missed
 from ..structure.rigid import orthonormalised, rigid_motions
-from ..values import ComplexArray, FloatArray, IntArray, Value, name_list, positive, real_array
 from .bounds import ErrorBound
 from .judging import ReductionQuality, quality_of
 

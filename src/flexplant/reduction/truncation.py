@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import FloatArray, IntArray, whole
 from ..errors import ModelError, counted
 from ..labels import Place
 from ..modes.attachment_vectors import attachment_vectors, labels_of, places, static_response
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..structure import Damping, FEModel, ModalDamping
-from ..values import FloatArray, IntArray, whole
 from .bounds import ErrorBound
 from .condensation import kept_columns, mode_numbers
 from .methods import ReductionMethod

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..checks import FloatArray, Value, instance, short
 from ..errors import LabelError, ModelError, require_known, unknown_label
 from ..estimation import KalmanEstimator, StaticEstimator
 from ..estimation.estimator_channels import estimates, poi_channels, row_of
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, Value, instance, short
 from .response import Response
 
 Estimator = KalmanEstimator | StaticEstimator

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import FloatArray, Value, instance, name_list, positive, real_array
 from ..errors import LabelError, ModelError, ShapeError, counted, require_known
 from ..loop import ClosedLoop, close_loop
 from ..plant import Poi
-from ..values import FloatArray, Value, instance, name_list, positive, real_array
 from .response import Numbers, Response, moving_moments, unit_of
 from .simulate import Signal, simulate
 

@@ -9,13 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import AssumptionError, LabelError, ModelError, counted, warn
-from ..loop import ClosedLoop, close_loop
-from ..loop.blocks import DERIVATIVES, force_name
-from ..lti.responses import responder
-from ..lti.statespace import StateSpace
-from ..plant import Poi, StandardPlant, decouple, standard_plant
-from ..values import (
+from ..checks import (
     ComplexArray,
     FloatArray,
     Value,
@@ -26,6 +20,12 @@ from ..values import (
     short,
     whole,
 )
+from ..errors import AssumptionError, LabelError, ModelError, counted, warn
+from ..loop import ClosedLoop, close_loop
+from ..loop.blocks import DERIVATIVES, force_name
+from ..lti.responses import responder
+from ..lti.statespace import StateSpace
+from ..plant import Poi, StandardPlant, decouple, standard_plant
 from .motion import SetPoint
 from .simulate import simulate
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..checks import FloatArray, Value, instance, positive, short, whole, with_unit
 from ..errors import ModelError, counted
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import force_name
-from ..values import FloatArray, Value, instance, positive, short, whole, with_unit
 from .feedforward import Feedforward, known_forces, term_numbers, tracked
 from .motion import SetPoint
 from .response import Response

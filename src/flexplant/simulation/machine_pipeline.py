@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import Value, generator, instance, positive, short, whole
 from ..errors import AssumptionError, ModelError, counted
 from ..estimation import KalmanEstimator, design_kalman
 from ..identification import MeasuredModes, identify_modes, numbered
@@ -30,7 +31,6 @@ from ..store import written
 from ..structure import Damping, FEModel
 from ..synthesis import design_hinf
 from ..updating import Eigenvalues, Localisation, UpdateResult, localise, update
-from ..values import Value, generator, instance, positive, short, whole
 from .response import Response
 from .simulate import simulate
 from .specification import Specification, Verdict

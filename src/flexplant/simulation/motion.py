@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import FloatArray, Value, instance, real_array
 from ..errors import ModelError, counted
-from ..values import FloatArray, Value, instance, real_array
 
 #: [samples] a time this close to the grid is on it
 ON_GRID = 1e-6

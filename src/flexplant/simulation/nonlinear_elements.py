@@ -8,11 +8,11 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from ..checks import FloatArray, Value, instance, positive, real_array, short, whole
 from ..errors import ModelError, require_known, unknown_label
 from ..loop import ClosedLoop
 from ..loop.blocks import with_known
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, instance, positive, real_array, short, whole
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -9,9 +9,9 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import FloatArray, IntArray, Value, check_names, known_units, positive, real_array
 from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
 from ..loop import Spectrum
-from ..values import FloatArray, IntArray, Value, check_names, known_units, positive, real_array
 
 #: one number, or one per run
 Numbers: TypeAlias = "float | FloatArray"

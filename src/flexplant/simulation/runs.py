@@ -8,12 +8,12 @@ from typing import Protocol
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import FloatArray, IntArray
 from ..errors import AssumptionError, ModelError
 from ..loop import ClosedLoop
 from ..loop.blocks import joined
 from ..loop.budget import WhiteNoise
 from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, Recursion, cheapest
-from ..values import FloatArray, IntArray
 from .nonlinear_elements import Acting, Conditions, Moving
 from .stepping import Buffers, Drawn, Machine, machine, step_through
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import positive, real_array
 from ..errors import ModelError
-from ..values import positive, real_array
 from .motion import ON_GRID, Phase, SetPoint, flank, mirrored, on_grid, shortest, spans
 
 

@@ -8,13 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import AssumptionError, LabelError, ModelError, require_known, warn
-from ..loop import ClosedLoop
-from ..loop.blocks import DERIVATIVES, references
-from ..loop.budget import white_noise
-from ..parallel import Progress, one_thread
-from ..plant import StandardPlant
-from ..values import (
+from ..checks import (
     FloatArray,
     flag,
     instance,
@@ -25,6 +19,12 @@ from ..values import (
     short,
     whole,
 )
+from ..errors import AssumptionError, LabelError, ModelError, require_known, warn
+from ..loop import ClosedLoop
+from ..loop.blocks import DERIVATIVES, references
+from ..loop.budget import white_noise
+from ..parallel import Progress, one_thread
+from ..plant import StandardPlant
 from .motion import SetPoint
 from .nonlinear_elements import Element, conditions, finer_loop
 from .response import Response

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, Value, in_unit, instance, positive, short
 from ..errors import AssumptionError, ModelError, require_known
 from ..loop import ClosedLoop, bandwidth
-from ..values import FloatArray, Value, in_unit, instance, positive, short
 from .exposure import exposure_errors, settling_time
 from .response import Response
 

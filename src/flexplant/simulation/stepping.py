@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray
 from ..loop import ClosedLoop
 from ..loop.budget import WhiteNoise
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import FloatArray, IntArray
 from .nonlinear_elements import Acting
 
 

@@ -12,10 +12,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import Value, instance, positive, seed_sequence, short
 from ..errors import ModelError, counted, require_known, warn
 from ..fingerprint import fingerprint
 from ..parallel import Lost, Progress, one_thread, survived
-from ..values import Value, instance, positive, seed_sequence, short
 from ..work import Checkpoint
 
 #: a row of the table, or the reason why there is none

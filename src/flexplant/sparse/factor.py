@@ -9,8 +9,8 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
+from ..checks import FloatArray, IntArray, Matrix
 from ..errors import SolverError
-from ..values import FloatArray, IntArray, Matrix
 from .multifrontal import MultifrontalCholesky
 from .ordering import dissect
 

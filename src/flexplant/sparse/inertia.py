@@ -9,9 +9,9 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import blas, lapack
 
+from ..checks import FloatArray, IntArray
 from ..errors import SolverError
 from ..parallel import one_thread
-from ..values import FloatArray, IntArray
 from .factor import by_rows
 from .multifrontal import assembled, in_single
 from .ordering import Dissection, Front, dissect

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import FloatArray, Matrix, Rng
 from ..errors import SolverError, counted
 from ..parallel import tick
-from ..values import FloatArray, Matrix, Rng
 from .factor import by_rows, without_zeros
 from .rayleigh_ritz import column_groups, mixed
 

@@ -11,8 +11,8 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
+from ..checks import FloatArray, IntArray
 from ..errors import SolverError
-from ..values import FloatArray, IntArray
 from .factor import DENSE_LIMIT, dense, diagonal, negative_pivots, symmetric_lu
 from .inertia import multifrontal_inertia
 from .lanczos import VALUE, BlockLanczos, iterated

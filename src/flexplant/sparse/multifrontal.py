@@ -9,9 +9,9 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import blas, lapack
 
+from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError
 from ..parallel import one_thread
-from ..values import ComplexArray, FloatArray, IntArray
 from .ordering import Dissection, Front, dissect
 
 #: blocks smaller than this (entries, on average) are added by index lists, larger ones as slices

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..values import FloatArray, IntArray
+from ..checks import FloatArray, IntArray
 
 #: a part of fewer DOFs is eliminated as one dense block
 LEAF = 96

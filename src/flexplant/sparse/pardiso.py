@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import FloatArray, Value
 from ..errors import SolverError
-from ..values import FloatArray, Value
 
 #: matrix type: real, symmetric, positive definite
 _POSITIVE_DEFINITE = 2

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..values import FloatArray
+from ..checks import FloatArray
 from .factor import by_rows
 
 #: eigenvalues closer together than this are found to 1e-9 of themselves in one go

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import FloatArray, IntArray, Matrix, Value, instance, positive, real_array
 from ..errors import LabelError, ModelError, counted, require_known
 from ..labels import DIRECTIONS, DofSet, Interpolation, Place
-from ..values import FloatArray, IntArray, Matrix, Value, instance, positive, real_array
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, Matrix, Value, flag, positive, real_array, short, whole
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..sparse.factor import dense
-from ..values import FloatArray, Matrix, Value, flag, positive, real_array, short, whole
 from .eigen import elastic_modes
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from ..checks import FloatArray, Matrix, real_array
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..sparse.factor import (
@@ -20,7 +21,6 @@ from ..sparse.factor import (
     unit_diagonal,
 )
 from ..sparse.rayleigh_ritz import rounding_of
-from ..values import FloatArray, Matrix, real_array
 
 #: what becomes a matrix of a structure
 MatrixLike: TypeAlias = "npt.ArrayLike | sp.sparray | sp.spmatrix"

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import FloatArray
 from ..errors import ModelError
 from ..labels import DofSet
 from ..sparse.factor import DENSE_LIMIT, dense, unit_diagonal
 from ..sparse.rayleigh_ritz import rayleigh_ritz, rounding_of, soft_group
-from ..values import FloatArray
 from .definite import are_rigid, signed_root
 from .zero_energy import beyond, most_moved
 

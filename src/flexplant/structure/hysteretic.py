@@ -10,9 +10,9 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ..checks import FloatArray, Matrix, Value, between, element_mask, instance, real_array, short
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
-from ..values import FloatArray, Matrix, Value, between, element_mask, instance, real_array, short
 from .attachments import Spring, added_matrices
 from .damping import Damping
 

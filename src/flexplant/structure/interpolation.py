@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ..checks import FloatArray, IntArray, instance, positive, real_array
 from ..errors import LabelError, ModelError, counted
 from ..labels import DIRECTIONS, DofSet, Interpolation
-from ..values import FloatArray, IntArray, instance, positive, real_array
 from .model import FEModel
 
 #: up to this many nodes one smooth interpolant serves everywhere; beyond, the nearest nodes do

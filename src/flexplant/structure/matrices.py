@@ -10,11 +10,7 @@ from typing import Any, cast
 import numpy as np
 import scipy.sparse as sp
 
-from ..dof_columns import at_nodes, node_numbers
-from ..errors import LabelError, ModelError, ShapeError, counted, warn
-from ..labels import DofSet
-from ..sparse.factor import is_positive_definite
-from ..values import (
+from ..checks import (
     FloatArray,
     IntArray,
     Value,
@@ -25,6 +21,10 @@ from ..values import (
     real_array,
     whole,
 )
+from ..dof_columns import at_nodes, node_numbers
+from ..errors import LabelError, ModelError, ShapeError, counted, warn
+from ..labels import DofSet
+from ..sparse.factor import is_positive_definite
 from .definite import SEMIDEFINITE, are_swapped
 from .model import FEModel
 from .precision import digits_of, endangered, held_by_rounding, shown_digits

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from ..checks import FloatArray, Matrix, Value, frozen, instance, real_array
 from ..errors import ModelError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite, with_pattern_of
-from ..values import FloatArray, Matrix, Value, frozen, instance, real_array
 from .attachments import HeldShape, Part, added_matrices, summed
 from .damping import Damping, Rayleigh, damping_matrix
 from .definite import (

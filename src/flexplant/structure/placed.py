@@ -7,8 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
+from ..checks import FloatArray, real_array
 from ..labels import DofSet, Place
-from ..values import FloatArray, real_array
 from .rigid import rigid_motions
 
 #: relative: a rigid-body motion that the shapes of a model make up to this is one of theirs. Those

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import FloatArray
 from ..errors import SolverError
 from ..labels import DofSet
 from ..sparse.lowest import Lowest, lowest_modes
-from ..values import FloatArray
 from .rigid import force_free
 from .zero_energy import nearly_free
 

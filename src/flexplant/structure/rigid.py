@@ -11,12 +11,12 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
+from ..checks import FloatArray, IntArray, Matrix
 from ..errors import ModelError, SolverError
 from ..labels import DIRECTIONS, DofSet, Place
 from ..sparse.factor import by_rows
 from ..sparse.lowest import ROUNDING, definite_solver
 from ..sparse.rayleigh_ritz import Absolute
-from ..values import FloatArray, IntArray, Matrix
 from .soft_springs import bodies, unheld
 
 #: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy

@@ -10,9 +10,9 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
+from ..checks import FloatArray, IntArray
 from ..errors import ModelError, SolverError, counted
 from ..sparse.factor import dense, diagonal, is_positive_definite, symmetric_lu, unit_diagonal
-from ..values import FloatArray, IntArray
 
 #: relative to a unit diagonal: an eigenvalue of M below this is none
 _SINGULAR = 1e-11

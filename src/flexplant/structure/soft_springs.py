@@ -9,11 +9,11 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
+from ..checks import FloatArray, IntArray, Matrix
 from ..labels import DofSet
 from ..sparse.factor import by_rows, diagonal
 from ..sparse.lowest import PRECISION
 from ..sparse.rayleigh_ritz import Absolute
-from ..values import FloatArray, IntArray, Matrix
 
 #: times the usual rounding of a row: a force larger than this is of a spring
 _OUTLIER = 30.0

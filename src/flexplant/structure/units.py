@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy.sparse as sp
 
+from ..checks import FloatArray, positive, short
 from ..errors import ModelError
 from ..labels import DofSet
-from ..values import FloatArray, positive, short
 
 #: one unit of it in metres, kilograms, seconds
 LENGTHS: Mapping[str, float] = {

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import FloatArray, IntArray
 from ..errors import ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..sparse.factor import by_rows, dense
 from ..sparse.lowest import PRECISION, ROUNDING
-from ..values import FloatArray, IntArray
 from .rigid import orthonormalised, rigid_motions
 from .soft_springs import bodies, unheld
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..certificates import in_words, stability, stability_name
+from ..checks import ComplexArray, FloatArray, Value
 from ..errors import CertificateError, FlexplantWarning, counted, warn
 from ..loop import SpillOver, close_loop
 from ..lti.norms import peak_gain
@@ -19,7 +20,6 @@ from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant, larger_plant
 from ..structure import FEModel
-from ..values import ComplexArray, FloatArray, Value
 
 
 @dataclass(frozen=True, eq=False, repr=False)

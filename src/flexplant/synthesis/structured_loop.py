@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray
 from ..lti.grid import climbed, resonance_grid
 from ..lti.norms import peak_gain
 from ..lti.preparation import Prepared
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace
-from ..values import ComplexArray, FloatArray
-from .nonsmooth import Pieces
+from .structured.nonsmooth import Pieces
 
 #: a loop counts as stable with this decay, in the scaled unit of time
 DECAY = 1e-7

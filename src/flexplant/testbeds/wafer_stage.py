@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, Value, generator, positive, short, whole
 from ..errors import ModelError, counted, unknown_label
 from ..estimation import design_static
 from ..identification import MeasuredModes
@@ -20,7 +21,6 @@ from ..plant.realisation import ModalRealisation, realised
 from ..simulation import Response, simulate
 from ..structure import FEModel, ModalDamping, kirchhoff_plate
 from ..synthesis import design_servo
-from ..values import ComplexArray, FloatArray, Value, generator, positive, short, whole
 
 SIZE = (0.6, 0.6)
 #: the plate of the paper's Table 1, as its drawing says

@@ -12,12 +12,12 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ..checks import ComplexArray, FloatArray
 from ..errors import ModelError
 from ..sparse.factor import dense
 from ..structure.definite import refuse_unstable
 from ..structure.eigen import elastic_modes
 from ..structure.rigid import orthonormalised
-from ..values import ComplexArray, FloatArray
 from .parameters.added import Parameter
 
 #: modes whose eigenvalues differ by less than this, relatively, count as exactly repeated

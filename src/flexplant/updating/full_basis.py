@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ..checks import FloatArray
 from ..errors import ModelError, ShapeError
 from ..modes import solve_modes
 from ..modes.dynamic_basis import static_shapes
@@ -17,7 +18,6 @@ from ..reduction import ReducedModel
 from ..sparse.rayleigh_ritz import beyond
 from ..structure.attachments import summed
 from ..structure.model import FEModel
-from ..values import FloatArray
 from .parameters.added import Parameter, PointParameter
 from .point_model import Point, pair
 from .residuals.residual import Residual

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
-from ..values import ComplexArray, FloatArray, IntArray
 from .family import Eigen, Family, groups
 
 #: entries of bordered systems that are solved together

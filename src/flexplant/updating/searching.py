@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, Rng, generator, real_array, whole
 from ..errors import FlexplantError, ModelError, ShapeError, SolverError
-from ..values import FloatArray, Rng, generator, real_array, whole
 from .judgement.goodness import chance, chi_square, is_bad
 from .parameters.added import PointParameter
 from .residuals.eigenvalues import Eigenvalues

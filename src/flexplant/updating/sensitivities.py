@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..checks import ComplexArray, FloatArray, Value, instance, real_array, short
 from ..errors import LabelError, ModelError, ShapeError, counted
-from ..values import ComplexArray, FloatArray, Value, instance, real_array, short
 from .family import Eigen, Family, repeated_groups
 from .parameters.added import Parameter
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import FloatArray, Rng, flag, generator, instance, positive, whole
 from ..errors import ModelError, SolverError, counted, warn
 from ..parallel import Progress
 from ..structure.model import FEModel
-from ..values import FloatArray, Rng, flag, generator, instance, positive, whole
 from .full_basis import MOST_ROUNDS, FullBasis, is_large
 from .judgement.goodness import chi_square, covariance, is_bad, worst
 from .parameters.added import Parameter

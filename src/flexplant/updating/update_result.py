@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import ComplexArray, FloatArray, Matrix, Rng, Value, between, generator, short, whole
 from ..errors import ModelError, counted, require_known, warn
 from ..modes import Modes, solve_modes
 from ..modes.normal_form import RIGID_DRAG
 from ..structure.attachments import summed
 from ..structure.model import FEModel
 from ..structure.rigid import orthonormalised
-from ..values import ComplexArray, FloatArray, Matrix, Rng, Value, between, generator, short, whole
 from .family import Family
 from .judgement.goodness import chance
 from .parameters.added import AddedMass, Parameter

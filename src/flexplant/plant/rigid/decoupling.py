@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...checks import FloatArray, Value, name_list
 from ...errors import AssumptionError, counted, require_known
 from ...lti.statespace import StateSpace
-from ...values import FloatArray, Value, name_list
 from ..standard import StandardPlant, standard_plant
 from .rigid_body import RigidBody, refuse_lost, rigid_body_of
 from .rigid_motion import projected

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import FloatArray, IntArray
 from ...errors import AssumptionError, FlexplantError, require_known
 from ...structure.definite import signed_root
-from ...values import FloatArray, IntArray
 from ..partition import Partition
 from ..realisation import ModalRealisation
 from .rigid_body import RigidBody, refuse_lost, rigid_body_of

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import Value, positive
 from ...errors import AssumptionError, LabelError, ModelError, require_known
 from ...lti.discretisation import tustin
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
 from ...lti.weights import inverse_sensitivity, leadlag
-from ...values import Value, positive
 from ..forces import BaseAcceleration
 from ..ports import Ports
 from ..standard import StandardPlant, standard_plant

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import ComplexArray, FloatArray, Value, positive, real_array
 from ...errors import ModelError, counted
 from ...labels import Place
 from ...modes import Modes, normal_form
@@ -16,7 +17,6 @@ from ...reduction import ReducedModel
 from ...structure import Damper, FEModel, Spring
 from ...structure.placed import SPANNED
 from ...structure.rigid import orthonormalised
-from ...values import ComplexArray, FloatArray, Value, positive, real_array
 from ..port import checked_direction, checked_place
 from ..realisation import realised
 

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import FloatArray
 from ...errors import CertificateError, ModelError
 from ...lti.discretisation import bilinear, discretized, tustin
 from ...lti.interconnection import lft
 from ...lti.scaling import state_scale
 from ...lti.statespace import StateSpace
-from ...values import FloatArray
 from ..partition import Partition
 from .neglected import NeglectedModes, opened
 from .uncertain_plant import Delta, UncertainPlant, with_changes

@@ -9,13 +9,13 @@ from typing import TypeAlias
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import ComplexArray, FloatArray, Value, whole
 from ...errors import CertificateError, ModelError, counted
 from ...lti.discretisation import image_freq
 from ...lti.frequency import frequency_response
 from ...lti.interconnection import side_by_side
 from ...lti.modal import part_of
 from ...lti.statespace import StateSpace, System
-from ...values import ComplexArray, FloatArray, Value, whole
 from ..building import sampled_like, with_modes_of
 from ..partition import Partition, is_plant
 from ..realisation import Structure

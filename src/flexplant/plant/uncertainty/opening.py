@@ -10,13 +10,13 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ...checks import ComplexArray, FloatArray, positive, real_array
 from ...errors import LabelError, ModelError, unknown_label
 from ...identification import MeasuredModes
 from ...labels import Place
 from ...lti.statespace import StateSpace
 from ...updating import UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters.added import Parameter
-from ...values import ComplexArray, FloatArray, positive, real_array
 from ..building import P, continuous_plant, rebuilt
 from ..partition import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort

@@ -10,13 +10,13 @@ from typing import Any, Generic, Literal
 import numpy as np
 import scipy.sparse as sp
 
+from ...checks import FloatArray, Value, generator, real_array, whole
 from ...errors import FlexplantWarning, ModelError, counted, require_known
 from ...lti.statespace import StateSpace
 from ...sparse.factor import dense
 from ...structure.rigid import orthonormalised
 from ...updating import UpdateResult
 from ...updating.parameters.added import Parameter
-from ...values import FloatArray, Value, generator, real_array, whole
 from ..building import P, rebuilt
 from ..partition import Partition
 from ..realisation import MODAL, ModalRealisation

@@ -9,11 +9,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ...certificates import in_words, stability_name
+from ...checks import Value, short, with_unit
 from ...errors import FlexplantError, ModelError, counted
 from ...loop import ClosedLoop, ErrorBudget, LoopFigures, compare_loops, report_loops
 from ...plant import StandardPlant
 from ...simulation import ExposureErrors, Verdict
-from ...values import Value, short, with_unit
 from ..budget import budget
 from ..nyquist import nyquist
 from ..sensitivity import sensitivity

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...certificates import Certificate, figure
+from ...checks import FloatArray, IntArray, with_unit
 from ...estimation import LagReport
 from ...identification import StabilisationDiagram
 from ...loop import ClosedLoop, ErrorBudget
@@ -23,7 +24,6 @@ from ...reduction import ReducedModel
 from ...simulation import ErrorMap, ExposureErrors, Response, Verdict
 from ...synthesis import Controller
 from ...updating import Localisation, UpdateResult
-from ...values import FloatArray, IntArray, with_unit
 from ..bode import bode, singular_values
 from ..budget import budget
 from ..estimation import lag_report

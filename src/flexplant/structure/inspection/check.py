@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import FloatArray, Value
 from ...errors import ModelError, counted
 from ...parallel import Progress
-from ...values import FloatArray, Value
 from ..matrices import FEMatrices
 from ..model import FEModel
 from ..precision import held_motions, verdict

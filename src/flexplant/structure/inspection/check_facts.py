@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ...checks import FloatArray, IntArray
 from ...errors import ModelError, SolverError
 from ...sparse.factor import by_rows, diagonal, is_positive_definite, unit_diagonal
 from ...sparse.lowest import ROUNDING, Lowest, lowest_modes
-from ...values import FloatArray, IntArray
 from ..definite import are_rigid, are_swapped, unstable_stiffness
 from ..matrices import FEMatrices
 from ..model import FEModel

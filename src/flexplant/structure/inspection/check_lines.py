@@ -8,10 +8,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import FloatArray
 from ...errors import counted
 from ...labels import DIRECTIONS, DofSet
 from ...sparse.factor import diagonal
-from ...values import FloatArray
 from ..rigid import rigid_motions
 from ..zero_energy import ZeroEnergy, most_moved
 from .check_facts import Facts

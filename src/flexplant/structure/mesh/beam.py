@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import one_of, positive, short
 from ...errors import ModelError
-from ...values import one_of, positive, short
 from ..model import FEModel
 from .element_matrices import beam_mass, beam_stiffness
 from .grid_fields import Field, counts_of, dofs_of, field_of

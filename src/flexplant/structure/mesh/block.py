@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ...values import FloatArray, real_array
+from ...checks import FloatArray, real_array
 from ..model import FEModel
 from .element_matrices import brick_mass, brick_stiffness
 from .grid_fields import Field, counts_of, dofs_of, field_of, lengths_of, poisson_of, present_of

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ...checks import FloatArray, frozen, positive, positive_array
 from ...errors import ModelError, ShapeError
 from ...labels import DofSet
-from ...values import FloatArray, frozen, positive, positive_array
 from ..model import FEModel
 
 

@@ -10,9 +10,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from ...checks import FloatArray, Value, positive, real_array, short, whole
 from ...errors import ModelError, ShapeError
 from ...labels import DofSet, Interpolation
-from ...values import FloatArray, Value, positive, real_array, short, whole
 from .grid_matrices import Grid
 
 #: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...values import FloatArray, IntArray
+from ...checks import FloatArray, IntArray
 
 #: so many numbers at once: more of them no longer fit the cache
 _CHUNK = 100_000

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...values import FloatArray, members
+from ...checks import FloatArray, members
 from ..model import FEModel
 from .element_matrices import plate_mass, plate_stiffness
 from .grid_fields import (

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
+from ...checks import FloatArray, IntArray, Value, positive, real_array
 from ...errors import ModelError
-from ...values import FloatArray, IntArray, Value, positive, real_array
 from .element_matrices import beam_mass, beam_rotary, beam_stiffness
 from .grid_matrices import Grid
 

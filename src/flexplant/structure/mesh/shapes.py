@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import FloatArray, real_array
 from ...errors import LabelError, counted
 from ...labels import Interpolation
-from ...values import FloatArray, real_array
 from .element_matrices import brick_shape, brick_slopes, hermite, plate_coefficients, plate_terms
 from .grid_matrices import Grid
 

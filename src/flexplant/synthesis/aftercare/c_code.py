@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import FloatArray, short
 from ...errors import CertificateError, LabelError, ModelError
 from ...lti.frequency import frequency_response
 from ...lti.grid import resonance_grid
 from ...lti.minimal import minimal
 from ...lti.statespace import StateSpace, as_statespace
-from ...values import FloatArray, short
 
 _HEADER = """\
 /* {title}

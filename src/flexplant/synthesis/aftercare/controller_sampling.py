@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from ...checks import instance, positive
 from ...errors import ModelError
 from ...lti.discretisation import tustin
 from ...lti.statespace import as_statespace
 from ...plant import StandardPlant
-from ...values import instance, positive
 from ..controller import Controller, with_left_out
 from .order import loop_facts, required, stable_before
 

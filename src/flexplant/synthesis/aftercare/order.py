@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...certificates import stability, stability_name
+from ...checks import FloatArray, positive, whole
 from ...errors import CertificateError, FlexplantError, FlexplantWarning, ModelError
 from ...loop import close_loop
 from ...lti.balancing import balanced
@@ -20,7 +21,6 @@ from ...lti.riccati import control_care, control_dare
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
-from ...values import FloatArray, positive, whole
 from ..controller import Controller, with_left_out
 
 

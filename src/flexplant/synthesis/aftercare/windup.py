@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import FloatArray, positive
 from ...errors import AssumptionError, ModelError
 from ...lti.riccati import solve_care, solve_dare
 from ...lti.statespace import StateSpace, as_statespace
-from ...values import FloatArray, positive
 
 #: D of a conditioned controller is inverted up to this condition
 _LARGEST = 1e8

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import positive, short, whole
 from ...errors import (
     AssumptionError,
     CertificateError,
@@ -23,12 +24,11 @@ from ...lti.scaling import mean_speed, state_scale
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
-from ...values import positive, short, whole
 from ..controller import Controller, with_left_out
 from ..h2 import design_h2
-from ..hinf import design_hinf
-from ..hinf_riccati import Riccati
-from ..lmi_solution import Plant
+from ..hinf.hinf_design import design_hinf
+from ..hinf.hinf_riccati import Riccati
+from ..lmi.lmi_solution import Plant
 from ..reach import require_stabilisable
 from .lmis import ObjectivePrograms
 from .specifications import H2, Hinf, PeakGain, PoleRegion

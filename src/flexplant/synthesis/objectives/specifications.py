@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import FloatArray, Value, name_list, positive
 from ...errors import ModelError, require_known
 from ...lti.norms import h2_norm, peak_gain
 from ...lti.responses import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
-from ...values import FloatArray, Value, name_list, positive
 
 #: samples of an impulse response that are computed together, and at most
 _TOGETHER, _LONGEST = 256, 4e6

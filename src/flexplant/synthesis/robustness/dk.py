@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...checks import FloatArray, whole
 from ...errors import AssumptionError, FlexplantError, ModelError, SolverError, counted
 from ...lti.discretisation import tustin
 from ...lti.grid import resonance_grid
@@ -14,9 +15,8 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ...values import FloatArray, whole
 from ..controller import Controller, SynthesisMethod, with_left_out
-from ..hinf import design_hinf
+from ..hinf.hinf_design import design_hinf
 from .sweep import covered
 from .uncertain_loop import OpenPlant, UncertainLoop, open_plant, uncertain_loop
 from .uncertainty_blocks import FullBlock, Scalings, osborne, places

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import ComplexArray, FloatArray, Value, generator
 from ...errors import AssumptionError, CertificateError, ModelError
 from ...lti.frequency import frequency_response
 from ...lti.norms import peak_gain
@@ -15,7 +16,6 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ...values import ComplexArray, FloatArray, Value, generator
 from .lower import power_iteration
 from .sweep import INTERVALS, Covered, covered
 from .uncertain_loop import UncertainLoop, machine, neglected_delta, uncertain_loop, values_of

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import ComplexArray, FloatArray
 from ...lti.statespace import StateSpace
-from ...values import ComplexArray, FloatArray
 from .uncertainty_blocks import (
     Block,
     FullBlock,

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import ComplexArray, FloatArray, Value, generator
 from ...errors import AssumptionError, ModelError
 from ...lti.discretisation import bilinear, image_freq
 from ...lti.norms import obstacle
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
-from ...values import ComplexArray, FloatArray, Value, generator
 from .lower import crossing_multiple, destabilising, power_iteration
 from .sweep import covered
 from .uncertainty_blocks import (

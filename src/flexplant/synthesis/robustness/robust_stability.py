@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from ...certificates import stability
+from ...checks import FloatArray, Value, generator, whole
 from ...errors import CertificateError, FlexplantError, counted
 from ...loop import ClosedLoop, SpillOver
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant, larger_plant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ...values import FloatArray, Value, generator, whole
 from .lower import (
     Destabilising,
     destabilising,

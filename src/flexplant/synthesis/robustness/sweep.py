@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import ComplexArray, FloatArray
 from ...errors import SolverError
 from ...lti.responses import responder
 from ...lti.scaling import state_scale
 from ...lti.statespace import StateSpace
 from ...parallel import tick
-from ...values import ComplexArray, FloatArray
 from .uncertainty_blocks import Block, Scalings, places
 from .upper import centred, reached_level, simple_bound, upper_level
 

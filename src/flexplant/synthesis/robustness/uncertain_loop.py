@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import FloatArray, name_list, short
 from ...errors import AssumptionError, ModelError
 from ...loop import ClosedLoop, close_loop
 from ...lti.discretisation import bilinear, image_freq, tustin
@@ -19,7 +20,6 @@ from ...plant import StandardPlant
 from ...plant.uncertainty.delta_channels import DeltaChannels, delta_channels
 from ...plant.uncertainty.neglected import opened
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ...values import FloatArray, name_list, short
 from .uncertainty_blocks import Block, FullBlock, Perturbation, RepeatedScalar, realised
 
 #: heights are taken this much above the weights at the frequencies that sample an interval

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import ComplexArray, FloatArray, IntArray, Value, flag, short, whole
 from ...errors import ModelError, ShapeError
 from ...lti.statespace import StateSpace, as_statespace
-from ...values import ComplexArray, FloatArray, IntArray, Value, flag, short, whole
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...values import ComplexArray, FloatArray, IntArray
+from ...checks import ComplexArray, FloatArray, IntArray
 from .uncertainty_blocks import Place, Scalings, osborne
 
 #: Newton decrement at which a centre is left; steps for one

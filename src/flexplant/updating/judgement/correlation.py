@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import ComplexArray, FloatArray, Value, short
 from ...errors import ModelError, ShapeError
 from ...identification import MeasuredModes
 from ...reduction.mode_pairs import groups_alike, likeness
-from ...values import ComplexArray, FloatArray, Value, short
 from ..point_model import Point
 from ..point_model import mac as _mac
 from ..residuals.frf_residual import FrfResidual

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ...values import FloatArray
+from ...checks import FloatArray
 from ..point_model import Point
 from ..search import Objective
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import FloatArray, Value
 from ...errors import counted
-from ...values import FloatArray, Value
 from ..family import repeated_groups
 from ..parameters.added import Parameter
 from ..search import Objective, checked_residuals

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import FloatArray, Value
+from ...checks import whole as counted
 from ...errors import ModelError, require_known, warn
 from ...parallel import Progress
 from ...structure.model import FEModel
-from ...values import FloatArray, Value
-from ...values import whole as counted
 from ..full_basis import FullBasis
 from ..parameters.added import Parameter
 from ..search import Objective, checked_residuals

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import FloatArray, Rng, Value, between, generator
 from ...errors import ModelError
 from ...parallel import Progress
-from ...values import FloatArray, Rng, Value, between, generator
 from ..parameters.added import Parameter
 from ..search import Objective, checked_residuals
 from ..sensitivities import checked_parameters

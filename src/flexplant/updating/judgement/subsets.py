@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import FloatArray
 from ...errors import ModelError, SolverError
-from ...values import FloatArray
 from ..family import ROUNDING, Eigen, Family, factors
 from ..point_model import Point
 from ..search import Objective, TrustRegion

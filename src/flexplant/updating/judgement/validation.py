@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import FloatArray, Rng, Value, between, generator
 from ...errors import ModelError
 from ...sparse.factor import dense
-from ...values import FloatArray, Rng, Value, between, generator
 from ..parameters.added import Parameter
 from ..residuals.residual import Residual
 from ..search import Objective, checked_residuals

@@ -10,9 +10,9 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
+from ...checks import FloatArray, Matrix, Value, real_array, short
 from ...errors import LabelError, ModelError, require_known
 from ...labels import DIRECTIONS, Place
-from ...values import FloatArray, Matrix, Value, real_array, short
 
 #: how the function that builds a model is written
 MAKES = "It returns an FEModel: lambda t: kirchhoff_plate(thickness=t, ...), say."

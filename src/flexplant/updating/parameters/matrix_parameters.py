@@ -9,12 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...errors import LabelError, ModelError, ShapeError
-from ...modes import solve_modes
-from ...sparse.factor import DENSE_LIMIT, dense
-from ...structure import ModalDamping
-from ...structure.eigen import elastic_modes
-from ...values import (
+from ...checks import (
     FloatArray,
     Matrix,
     element_mask,
@@ -25,6 +20,11 @@ from ...values import (
     short,
     whole,
 )
+from ...errors import LabelError, ModelError, ShapeError
+from ...modes import solve_modes
+from ...sparse.factor import DENSE_LIMIT, dense
+from ...structure import ModalDamping
+from ...structure.eigen import elastic_modes
 from .added import MAKES, Derivatives, Parameter, checked_bounds, checked_prior, checked_text
 
 #: entries of a symmetric matrix differ by less than this, relatively, from their mirror images

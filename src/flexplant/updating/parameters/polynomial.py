@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import FloatArray, Matrix, function, positive, real_array, whole
 from ...errors import LabelError, ModelError, ShapeError
-from ...values import FloatArray, Matrix, function, positive, real_array, whole
 from .added import MAKES, Derivatives, Parameter, checked_bounds, checked_prior, checked_text
 from .matrix_parameters import checked_matrix, projected
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import ComplexArray, FloatArray, instance, positive, positive_array
 from ...errors import LabelError
 from ...identification import MeasuredModes
-from ...values import ComplexArray, FloatArray, instance, positive, positive_array
 from ..family import Family, groups
 from ..point_model import Point
 from .mode_shapes import chosen_modes

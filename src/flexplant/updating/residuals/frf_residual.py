@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ...checks import ComplexArray, FloatArray, flag, instance, positive, positive_array, short
 from ...errors import ModelError, ShapeError, counted, require_known, warn
 from ...labels import DIRECTIONS, Place
 from ...lti import Frf
 from ...lti.frequency import ORDERS
-from ...values import ComplexArray, FloatArray, flag, instance, positive, positive_array, short
 from ..family import Family
 from ..point_model import Point
 from .point_residuals import Held

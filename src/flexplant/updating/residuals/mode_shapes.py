@@ -9,10 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ...errors import LabelError, ModelError, ShapeError, counted, require_known
-from ...identification import MeasuredModes
-from ...labels import DIRECTIONS, Place
-from ...values import (
+from ...checks import (
     ComplexArray,
     FloatArray,
     flag,
@@ -22,6 +19,9 @@ from ...values import (
     short,
     whole,
 )
+from ...errors import LabelError, ModelError, ShapeError, counted, require_known
+from ...identification import MeasuredModes
+from ...labels import DIRECTIONS, Place
 from ..family import Family, groups
 from ..parameters.added import checked_place
 from ..point_model import CLUSTER, Point, measured_pairs

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import ComplexArray, FloatArray, positive, positive_array, real_array
 from ...errors import ModelError, ShapeError, counted, require_known
 from ...labels import DIRECTIONS, Place
-from ...values import ComplexArray, FloatArray, positive, positive_array, real_array
 from ..family import Family
 from ..parameters.added import checked_place
 from ..point_model import Point

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import ComplexArray, FloatArray, Matrix, Value, mapping
 from ...errors import LabelError
 from ...labels import Place
-from ...values import ComplexArray, FloatArray, Matrix, Value, mapping
 from ..family import Family
 from ..point_model import Point
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ...checks import FloatArray, between
 from ...errors import ModelError, SolverError, counted
-from ...values import FloatArray, between
 from ..point_model import Point
 from .objective import Objective
 from .update_method import SearchEnd, Trail, UpdateMethod

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ...checks import FloatArray
 from ...errors import ModelError, SolverError
-from ...values import FloatArray
 from .objective import Objective
 from .trust_region import TrustRegion
 from .update_method import PenalisedMethod, SearchEnd, Trail, units

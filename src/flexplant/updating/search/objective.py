@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...checks import ComplexArray, FloatArray, instance
 from ...errors import ModelError
-from ...values import ComplexArray, FloatArray, instance
 from ..family import Eigen, Family, repeated_groups
 from ..parameters.added import Parameter
 from ..point_model import Point, first_point

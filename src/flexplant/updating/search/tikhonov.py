@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...values import FloatArray
+from ...checks import FloatArray
 from .objective import Objective
 from .trust_region import TrustRegion, minimised
 from .update_method import PenalisedMethod, SearchEnd, units

@@ -9,8 +9,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
+from ...checks import FloatArray, one_of, positive
 from ...errors import ModelError
-from ...values import FloatArray, one_of, positive
 from .objective import Objective
 from .update_method import SearchEnd, Trail, UpdateMethod, units
 

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ...checks import FloatArray, Value, positive
 from ...parallel import tick
-from ...values import FloatArray, Value, positive
 from .objective import Objective
 
 #: what a bar calls the steps of all searches

@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import AssumptionError, SolverError
-from ..lti.lyapunov import solve_continuous
-from ..lti.preparation import Prepared
-from ..lti.scaling import state_scale
-from ..lti.statespace import StateSpace
-from ..values import FloatArray
+from ...checks import FloatArray
+from ...errors import AssumptionError, SolverError
+from ...lti.lyapunov import solve_continuous
+from ...lti.preparation import Prepared
+from ...lti.scaling import state_scale
+from ...lti.statespace import StateSpace
 
 #: relative: what counts as on the imaginary axis; the largest residual of a Riccati equation
 _AXIS, _RESIDUAL = 1e-10, 1e-6

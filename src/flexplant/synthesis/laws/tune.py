@@ -8,21 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import SolverError, warn
-from ..loop import in_axes
-from ..lti.frequency import Frf
-from ..lti.grid import resonance_grid
-from ..lti.interconnection import series
-from ..lti.statespace import StateSpace, System, as_statespace
-from ..parallel import Progress, one_thread
-from ..plant import StandardPlant, larger_plant
-from ..values import FloatArray, between, whole
+from ...checks import FloatArray, between, whole
+from ...errors import SolverError, warn
+from ...loop import in_axes
+from ...lti.frequency import Frf
+from ...lti.grid import resonance_grid
+from ...lti.interconnection import series
+from ...lti.statespace import StateSpace, System, as_statespace
+from ...parallel import Progress, one_thread
+from ...plant import StandardPlant, larger_plant
+from ..servo.servo_loop import TARGET
 from .axis_law import AxisLaw, MeasuredAxis
 from .joint_plant import JointPlant, Worst
 from .joint_search import JointLaws, JointSearch
 from .law_search import FoundLaw, LawSearch
 from .loop_design import Axes, LoopDesign, axes_of, made
-from .servo_loop import TARGET
 
 #: distance of a pole from zero frequency, beside the farthest, that counts as none
 _ZERO = 1e-6

@@ -7,21 +7,21 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..certificates import stability, stability_name
-from ..errors import AssumptionError, CertificateError, ModelError, SolverError
-from ..loop import modulus_margin
-from ..lti.balancing import hankel_norm
-from ..lti.discretisation import bilinear, tustin
-from ..lti.frequency import Frf, frequency_response
-from ..lti.interconnection import lft, series
-from ..lti.minimal import minimal
-from ..lti.norms import peak_gain
-from ..lti.riccati import control_care, control_dare, solve_care, solve_dare
-from ..lti.statespace import StateSpace, System, as_statespace
-from ..parallel import one_thread
-from ..plant import StandardPlant
-from ..values import FloatArray, positive
-from .controller import Controller, with_left_out
+from ...certificates import stability, stability_name
+from ...checks import FloatArray, positive
+from ...errors import AssumptionError, CertificateError, ModelError, SolverError
+from ...loop import modulus_margin
+from ...lti.balancing import hankel_norm
+from ...lti.discretisation import bilinear, tustin
+from ...lti.frequency import Frf, frequency_response
+from ...lti.interconnection import lft, series
+from ...lti.minimal import minimal
+from ...lti.norms import peak_gain
+from ...lti.riccati import control_care, control_dare, solve_care, solve_dare
+from ...lti.statespace import StateSpace, System, as_statespace
+from ...parallel import one_thread
+from ...plant import StandardPlant
+from ..controller import Controller, with_left_out
 
 #: corner of the integral action of the recipe, beside the bandwidth
 _INTEGRAL = 0.1

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, FlexplantError, LabelError, counted
-from ..loop.broken import BrokenLoop, inverted
-from ..lti.discretisation import held_exactly
-from ..lti.grid import highest, resonance_grid
-from ..lti.responses import responder, responses
-from ..lti.statespace import StateSpace
-from ..plant import Foreign, Poi, StandardPlant
-from ..plant.rigid.rigid_motion import rigid_gain
-from ..values import ComplexArray, FloatArray, frozen
-from .controller_elements import LowPass, Notch, Pid
-from .law import Law
+from ...checks import ComplexArray, FloatArray, frozen
+from ...errors import AssumptionError, FlexplantError, LabelError, counted
+from ...loop.broken import BrokenLoop, inverted
+from ...lti.discretisation import held_exactly
+from ...lti.grid import highest, resonance_grid
+from ...lti.responses import responder, responses
+from ...lti.statespace import StateSpace
+from ...plant import Foreign, Poi, StandardPlant
+from ...plant.rigid.rigid_motion import rigid_gain
+from ..laws.controller_elements import LowPass, Notch, Pid
+from ..laws.law import Law
 
 #: |S| at u that a notch is to bring the loop below: 6 dB
 TARGET = 2.0

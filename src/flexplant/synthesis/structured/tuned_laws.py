@@ -10,14 +10,14 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import ModelError, require_known
-from ..lti.preparation import Prepared
-from ..lti.statespace import System
-from ..plant import StandardPlant
-from ..values import FloatArray, Value, name_list, rebuild
-from .law import Element, Law, SingleElement, chained
-from .loop_design import axes_of, checked_laws
-from .structured_loop import Matrices
+from ...checks import FloatArray, Value, name_list, rebuild
+from ...errors import ModelError, require_known
+from ...lti.preparation import Prepared
+from ...lti.statespace import System
+from ...plant import StandardPlant
+from ..laws.law import Element, Law, SingleElement, chained
+from ..laws.loop_design import axes_of, checked_laws
+from ..structured_loop import Matrices
 from .structures import ControllerFamily, differenced
 
 #: what an element may have free; the depth of a notch is not, unless it is named

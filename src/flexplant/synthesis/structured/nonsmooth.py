@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..values import FloatArray
+from ...checks import FloatArray
 
 #: value (infinite where not defined) and gradient
 Function: TypeAlias = Callable[[FloatArray], tuple[float, FloatArray]]

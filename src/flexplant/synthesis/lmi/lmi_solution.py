@@ -8,14 +8,14 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import FlexplantError, InfeasibleError, ModelError, SolverError
-from ..lti.interconnection import lft
-from ..lti.norms import peak_gain
-from ..lti.preparation import Prepared
-from ..lti.riccati import control_care, solve_care
-from ..lti.statespace import StateSpace
-from ..values import FloatArray, positive, whole
-from .controller import SolvedController
+from ...checks import FloatArray, positive, whole
+from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError
+from ...lti.interconnection import lft
+from ...lti.norms import peak_gain
+from ...lti.preparation import Prepared
+from ...lti.riccati import control_care, solve_care
+from ...lti.statespace import StateSpace
+from ..controller import SolvedController
 
 #: what a closed loop may exceed its target by
 _EXCESS = 1e-3

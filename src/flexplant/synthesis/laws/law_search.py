@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import SolverError
-from ..values import ComplexArray, FloatArray, IntArray
+from ...checks import ComplexArray, FloatArray, IntArray
+from ...errors import SolverError
 from .axis_law import AxisLaw
 from .law import Law, product, tustin_s
 

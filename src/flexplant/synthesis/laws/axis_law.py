@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ..loop.hidden_modes import FEWEST, hidden_modes
-from ..loop.report import nyquist_count
-from ..lti.between_lines import between_lines, steps_between
-from ..values import ComplexArray, FloatArray, IntArray
+from ...checks import ComplexArray, FloatArray, IntArray
+from ...loop.hidden_modes import FEWEST, hidden_modes
+from ...loop.report import nyquist_count
+from ...lti.between_lines import between_lines, steps_between
 from .controller_elements import LowPass, Notch, Pid
 from .law import Law, Section, product, tustin_s
 

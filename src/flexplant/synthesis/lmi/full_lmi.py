@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
-from ..errors import FlexplantError, InfeasibleError, SolverError
-from ..lti.preparation import Prepared
-from ..parallel import Progress
-from ..values import Value
-from .controller import SolvedController
+from ...checks import Value
+from ...errors import FlexplantError, InfeasibleError, SolverError
+from ...lti.preparation import Prepared
+from ...parallel import Progress
+from ..controller import SolvedController
 from .lmi_programs import Optimum, moderate_controller, smallest_gamma
 from .lmi_solution import (
     LOOSER,

@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..certificates import stability_name
-from ..errors import CertificateError, ModelError, SolverError, warn
-from ..loop import LoopReport, report_loops
-from ..lti.discretisation import tustin
-from ..lti.interconnection import series, side_by_side
-from ..lti.minimal import minimal
-from ..lti.responses import responses
-from ..lti.statespace import StateSpace, System, as_statespace
-from ..lti.weights import lowpass
-from ..parallel import one_thread
-from ..plant import StandardPlant
-from ..values import FloatArray, Value, positive
-from .controller import Controller, with_left_out
-from .hinf import design_hinf
-from .loop_design import Axes, axes_of, connected
+from ...certificates import stability_name
+from ...checks import FloatArray, Value, positive
+from ...errors import CertificateError, ModelError, SolverError, warn
+from ...loop import LoopReport, report_loops
+from ...lti.discretisation import tustin
+from ...lti.interconnection import series, side_by_side
+from ...lti.minimal import minimal
+from ...lti.responses import responses
+from ...lti.statespace import StateSpace, System, as_statespace
+from ...lti.weights import lowpass
+from ...parallel import one_thread
+from ...plant import StandardPlant
+from ..controller import Controller, with_left_out
+from ..laws.loop_design import Axes, axes_of, connected
+from .hinf_design import design_hinf
 from .ncf import (
     below_half_rate,
     continuous,

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import InfeasibleError, SolverError, counted
-from ..parallel import interruptible
+from ...errors import InfeasibleError, SolverError, counted
+from ...parallel import interruptible
 from .lmi_solution import Matrices, Plant, dual_bound, half, null_space, reconstructed
 
 #: part of the back-off that goes into X Y >= (1 + ...)^2, away from the singular I - X Y

@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, counted, require_known, warn
-from ..loop import LoopReport, SpillOver, in_axes, report_loops
-from ..loop.axes import static_map
-from ..loop.sensitivity import taken_apart
-from ..lti.frequency import Frf
-from ..lti.interconnection import series, side_by_side
-from ..lti.statespace import StateSpace, System, as_statespace
-from ..parallel import one_thread
-from ..plant import StandardPlant, decouple
-from ..values import FloatArray, Value, name_list, short
-from .controller import spill_over, unchecked
+from ...checks import FloatArray, Value, name_list, short
+from ...errors import LabelError, ModelError, counted, require_known, warn
+from ...loop import LoopReport, SpillOver, in_axes, report_loops
+from ...loop.axes import static_map
+from ...loop.sensitivity import taken_apart
+from ...lti.frequency import Frf
+from ...lti.interconnection import series, side_by_side
+from ...lti.statespace import StateSpace, System, as_statespace
+from ...parallel import one_thread
+from ...plant import StandardPlant, decouple
+from ..controller import spill_over, unchecked
 from .law import Element, Law
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import scipy.linalg as la
 
-from ..values import FloatArray
+from ...checks import FloatArray
 from .lmi_solution import half
 
 #: the most steps

@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, LabelError, ModelError, SolverError, counted, warn
-from ..loop import ClosedLoop
-from ..loop.blocks import drives, joined
-from ..loop.spill_over import growing_modes, named
-from ..lti.interconnection import loop_poles
-from ..lti.joining import stacked
-from ..lti.statespace import StateSpace
-from ..parallel import one_thread
-from ..plant import Poi, StandardPlant, larger_plant, standard_plant
-from ..plant.rigid.rigid_motion import RigidModes, require_weak
-from ..values import FloatArray, between, positive, real_array
-from .controller import CLOSE, Controller, unchecked
+from ...checks import FloatArray, between, positive, real_array
+from ...errors import AssumptionError, LabelError, ModelError, SolverError, counted, warn
+from ...loop import ClosedLoop
+from ...loop.blocks import drives, joined
+from ...loop.spill_over import growing_modes, named
+from ...lti.interconnection import loop_poles
+from ...lti.joining import stacked
+from ...lti.statespace import StateSpace
+from ...parallel import one_thread
+from ...plant import Poi, StandardPlant, larger_plant, standard_plant
+from ...plant.rigid.rigid_motion import RigidModes, require_weak
+from ..controller import CLOSE, Controller, unchecked
 from .servo_loop import (
     TARGET,
     Axis,

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError
-from ..lti.discretisation import trapezoidal
-from ..lti.frequency import sampled_freq
-from ..lti.joining import Matrices, cascaded
-from ..lti.statespace import StateSpace
-from ..values import ComplexArray, FloatArray, Value, flag, instance, positive, real_array, short
+from ...checks import ComplexArray, FloatArray, Value, flag, instance, positive, real_array, short
+from ...errors import ModelError
+from ...lti.discretisation import trapezoidal
+from ...lti.frequency import sampled_freq
+from ...lti.joining import Matrices, cascaded
+from ...lti.statespace import StateSpace
 
 
 class Section(NamedTuple):

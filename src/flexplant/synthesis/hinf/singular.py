@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
-from ..lti.interconnection import lft
-from ..lti.norms import hinf_norm
-from ..lti.preparation import Prepared, normalised
-from ..lti.statespace import StateSpace
-from ..values import FloatArray
-from .controller import SolvedController
+from ...checks import FloatArray
+from ...errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
+from ...lti.interconnection import lft
+from ...lti.norms import hinf_norm
+from ...lti.preparation import Prepared, normalised
+from ...lti.statespace import StateSpace
+from ..controller import SolvedController
 
 #: a direction of D12 or D21 that is smaller is missing (in a prepared problem the others are 1)
 _RANK = 0.5

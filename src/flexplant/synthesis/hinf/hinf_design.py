@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import (
+from ...checks import short
+from ...errors import (
     AssumptionError,
     CertificateError,
     FlexplantError,
@@ -17,16 +18,14 @@ from ..errors import (
     SolverError,
     warn,
 )
-from ..lti.interconnection import lft
-from ..lti.norms import hinf_norm
-from ..lti.preparation import Prepared, departure_from_normal, prepared
-from ..lti.responses import Responder, remembered, responder
-from ..lti.statespace import StateSpace, System
-from ..parallel import one_thread
-from ..plant import StandardPlant
-from ..values import short
-from .central import require_shown
-from .controller import (
+from ...lti.interconnection import lft
+from ...lti.norms import hinf_norm
+from ...lti.preparation import Prepared, departure_from_normal, prepared
+from ...lti.responses import Responder, remembered, responder
+from ...lti.statespace import StateSpace, System
+from ...parallel import one_thread
+from ...plant import StandardPlant
+from ..controller import (
     Controller,
     SolvedController,
     SynthesisMethod,
@@ -34,12 +33,13 @@ from .controller import (
     reached_norms,
     with_left_out,
 )
+from ..lmi.full_lmi import Lmi
+from ..lmi.structured_lmi import SmallestGamma, StructuredLmi
+from ..reach import posed, require_reach
+from .central import require_shown
 from .hinf_riccati import Riccati
-from .lmi import Lmi
 from .lower_bound import lower_bound, pointwise_bound, raised_bound
-from .reach import posed, require_reach
 from .singular import ADDED
-from .structured_lmi import SmallestGamma, StructuredLmi
 
 #: A beside its poles, from which on coordinates are blamed for a failure
 _MIXED = 1e3

@@ -9,15 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..loop.hidden_modes import hidden_modes
-from ..loop.report import nyquist_count
-from ..lti.frequency import Frf
-from ..lti.grid import SOUGHT, highest, resonance_grid
-from ..lti.interconnection import loop_poles
-from ..lti.joining import stacked
-from ..lti.responses import responder
-from ..lti.statespace import StateSpace
-from ..values import ComplexArray, FloatArray, IntArray
+from ...checks import ComplexArray, FloatArray, IntArray
+from ...loop.hidden_modes import hidden_modes
+from ...loop.report import nyquist_count
+from ...lti.frequency import Frf
+from ...lti.grid import SOUGHT, highest, resonance_grid
+from ...lti.interconnection import loop_poles
+from ...lti.joining import stacked
+from ...lti.responses import responder
+from ...lti.statespace import StateSpace
 from .law import Law
 
 #: logarithmic part of a grid through the resonances, and times that it is refined

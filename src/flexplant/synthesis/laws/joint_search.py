@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..values import ComplexArray, FloatArray, IntArray
+from ...checks import ComplexArray, FloatArray, IntArray
 from .axis_law import AxisLaw
 from .joint_plant import Coupling, JointPlant, Worst
 from .law import Law, tustin_s

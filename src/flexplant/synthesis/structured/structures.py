@@ -9,16 +9,16 @@ from typing import Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import FlexplantError, ModelError, ShapeError, counted
-from ..lti.balancing import balanced
-from ..lti.discretisation import bilinear, tustin
-from ..lti.preparation import Prepared
-from ..lti.riccati import control_care, solve_care
-from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
-from ..values import FloatArray, Value, function, instance, real_array, whole
-from .hinf import design_hinf
-from .structured_loop import Matrices
+from ...checks import FloatArray, Value, function, instance, real_array, whole
+from ...errors import FlexplantError, ModelError, ShapeError, counted
+from ...lti.balancing import balanced
+from ...lti.discretisation import bilinear, tustin
+from ...lti.preparation import Prepared
+from ...lti.riccati import control_care, solve_care
+from ...lti.statespace import StateSpace
+from ...plant import StandardPlant
+from ..hinf.hinf_design import design_hinf
+from ..structured_loop import Matrices
 
 #: step of a derivative by differences, and the steps and weights of fourth order
 _STEP = 1e-3

@@ -8,18 +8,18 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, SolverError
-from ..lti.interconnection import lft
-from ..lti.norms import peak_gain
-from ..lti.preparation import Prepared
-from ..lti.responses import responses
-from ..lti.statespace import StateSpace
-from ..parallel import Progress
-from ..values import Value, positive
+from ...checks import Value, positive
+from ...errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, SolverError
+from ...lti.interconnection import lft
+from ...lti.norms import peak_gain
+from ...lti.preparation import Prepared
+from ...lti.responses import responses
+from ...lti.statespace import StateSpace
+from ...parallel import Progress
+from ..controller import SolvedController
+from ..reach import beyond_rounding
 from .central import OnAxisError, central, indefinite, quadratic, riccati_solutions
-from .controller import SolvedController
 from .lower_bound import parrott
-from .reach import beyond_rounding
 from .singular import made_regular, missing_ranks, require_ranks
 
 #: distances from the smallest gamma: 5 % of it cost 3 to 5 % of rms and 0.02 of margin; near it

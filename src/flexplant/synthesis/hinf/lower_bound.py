@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import FlexplantError
-from ..lti.grid import highest, resonance_grid
-from ..lti.preparation import Prepared
-from ..lti.responses import responses
-from ..values import ComplexArray, FloatArray
+from ...checks import ComplexArray, FloatArray
+from ...errors import FlexplantError
+from ...lti.grid import highest, resonance_grid
+from ...lti.preparation import Prepared
+from ...lti.responses import responses
+from ..lmi.structured_lmi import StructuredLmi
 from .central import OnAxisError, indefinite, stabilising
-from .structured_lmi import StructuredLmi
 
 #: points of the sweep, and times that it is refined
 _POINTS, _REFINEMENTS = 200, 2

@@ -21,11 +21,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import FlexplantError, SolverError, counted
-from ..lti.preparation import Prepared
-from ..parallel import Progress
-from ..values import FloatArray, Value
-from .controller import SolvedController
+from ...checks import FloatArray, Value
+from ...errors import FlexplantError, SolverError, counted
+from ...lti.preparation import Prepared
+from ...parallel import Progress
+from ..controller import SolvedController
+from ..hinf.singular import made_regular
 from .interior_point import STEPS, Iterate, smallest
 from .lmi_solution import (
     LOOSER,
@@ -44,7 +45,6 @@ from .lmi_solution import (
     reconstructed,
     same_states,
 )
-from .singular import made_regular
 
 #: R, S, gamma and the blocks of the LMIs at the start, in a plant scaled to gamma near 1
 _START = 10.0

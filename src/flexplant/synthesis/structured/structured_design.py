@@ -7,18 +7,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import CertificateError, InfeasibleError, ModelError
-from ..lti.interconnection import lft
-from ..lti.preparation import Prepared, prepared
-from ..lti.responses import responder
-from ..lti.statespace import System
-from ..parallel import Progress, one_thread
-from ..plant import StandardPlant, standard_plant
-from ..values import FloatArray, Rng, generator, short, whole
-from .controller import Controller, certified_norm, reached_norms, with_left_out
+from ...checks import FloatArray, Rng, generator, short, whole
+from ...errors import CertificateError, InfeasibleError, ModelError
+from ...lti.interconnection import lft
+from ...lti.preparation import Prepared, prepared
+from ...lti.responses import responder
+from ...lti.statespace import System
+from ...parallel import Progress, one_thread
+from ...plant import StandardPlant, standard_plant
+from ..controller import Controller, certified_norm, reached_norms, with_left_out
+from ..reach import require_stabilisable
+from ..structured_loop import DECAY, ScaledLoop
 from .nonsmooth import Pieces, bfgs, decrease_left, joined, minimax
-from .reach import require_stabilisable
-from .structured_loop import DECAY, ScaledLoop
 from .structures import ControllerFamily, ControllerStructure, as_system
 
 #: steps for stability, from each start towards the least norm, and on from the best of them

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ModelError
-from ..values import positive, real_array, whole
+from ...checks import positive, real_array, whole
+from ...errors import ModelError
 from .law import Section, SingleElement
 
 

@@ -1,0 +1,1 @@
+"""H-infinity by Riccati equations: design, bounds, singular problems and loop shaping."""

@@ -1,0 +1,1 @@
+"""Laws made of elements, by hand or by a search over all axes."""

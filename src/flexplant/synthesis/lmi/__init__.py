@@ -1,0 +1,1 @@
+"""H-infinity by linear matrix inequalities."""

@@ -1,0 +1,1 @@
+"""Rigid-body decoupled servos: their loop, and the search for a bandwidth."""

@@ -1,0 +1,1 @@
+"""Controllers of a given structure: their parameters, and the search for them."""
