@@ -11,14 +11,14 @@ import scipy.sparse as sp
 from ...checks import FloatArray, IntArray
 from ...errors import ModelError, SolverError
 from ...sparse.factor import by_rows, diagonal, is_positive_definite, unit_diagonal
-from ...sparse.lowest import ROUNDING, Lowest, lowest_modes
+from ...sparse.lowest import PRECISION, ROUNDING, Lowest, lowest_modes
 from ..definite import are_rigid, are_swapped, unstable_stiffness
 from ..matrices import FEMatrices
 from ..model import FEModel
 from ..precision import loss, shown_digits
 from ..rigid import RigidMass, orthonormalised, rigid_mass, rigid_motions
 from ..singular_mass import empty_rows, left_out, null_motions
-from ..soft_springs import PRECISION, pieces, unheld
+from ..soft_springs import pieces, unheld
 from ..zero_energy import ZeroEnergy, beyond, own_motions, zero_energy
 
 #: requested from the solver: six rigid-body motions and some elastic modes, a few beside more
