@@ -23,7 +23,7 @@ HERE = Path(__file__).parent
 WORK = """
 import numpy as np, sys
 import flexplant as fx
-from flexplant import progress
+from flexplant import parallel as progress
 from stages import RATE, Z8, ports, reduced, some_modes
 
 rng = np.random.default_rng(0)
@@ -130,7 +130,7 @@ for name, work in {**WORK, "machines": study}.items():
         timer.join()
     found[name] = {
         "threads": threads() == before,
-        "bars": len(progress._inside()),
+        "bars": len(progress._open_bars()),
         "children": len(multiprocessing.active_children()),
         "alive": threading.active_count(),
     }

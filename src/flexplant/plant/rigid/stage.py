@@ -159,25 +159,25 @@ def stage_weights(
     5 Hz::
 
         bandwidth  changed                   gamma   to [Hz]  |S| [dB]  at u [dB]  |S| at 5 Hz
-               30                             0.98      36       6.7       5.6      0.0066
-               50                             1.02      57       6.5       6.2      0.0015
-               80                             1.11      85       6.5       7.3      0.0004
-              100                             1.19     101       7.5       8.9      0.0002
-               80  peak 1.3                   1.62      85       6.2       7.0      0.0005
-               80  peak 6                     0.38      86       6.7       7.5      0.0004
-               80  disturbance 1              1.54      67       7.6       7.3      0.0006
-               80  disturbance 6              0.99      99       6.9       7.9      0.0003
-               80  effort 1                   1.56      98       8.0       9.5      0.0002
-               80  effort 6                   0.94      82       5.8       6.6      0.0006
-               80  disturbance 1, effort 1    2.38      80       9.0      10.3      0.0003
-               80  disturbance 6, effort 6    0.86      98       6.3       7.1      0.0006
-               80  noise 0.5                  1.45      71       7.4       8.4      0.0005
-              100  noise 0.005                1.19     101       7.5      11.1      0.0002
+               30                             0.95      38       7.2       5.2      0.0063
+               50                             0.99      60       5.9       5.7      0.0014
+               80                             1.07      89       6.2       7.6      0.0004
+              100                             1.15     105       7.1       8.9      0.0002
+               80  peak 1.3                   1.56      89       5.9       7.2      0.0005
+               80  peak 6                     0.37      89       6.3       7.8      0.0003
+               80  disturbance 1              1.48      69       7.3       8.0      0.0006
+               80  disturbance 6              0.95     105       6.6       7.9      0.0003
+               80  effort 1                   1.50     100       7.6       9.5      0.0002
+               80  effort 6                   0.91      87       5.5       6.7      0.0006
+               80  disturbance 1, effort 1    2.29      82       8.7      10.5      0.0003
+               80  disturbance 6, effort 6    0.83     107       6.0       7.1      0.0005
+               80  noise 0.5                  1.40      72       7.2       8.3      0.0005
+              100  noise 0.005                1.15     105       7.1      12.9      0.0002
 
     A larger disturbance lowers |S| at low frequency and widens the bandwidth, a larger effort
     makes the loop slower, both together make it better damped; peak and noise matter little
     here: noise below 0.02 leaves the controller more gain at the modes that the model lacks (at
-    100 Hz |S| at u is then 11 dB, where 0.05 gives 8.9), above 0.15 it costs bandwidth. 0.3 for
+    100 Hz |S| at u is then 13 dB, where 0.05 gives 8.9), above 0.15 it costs bandwidth. 0.3 for
     disturbance and effort weight S alone, at the expense of |S| at u.
 
     At 1 % damping updating hardly matters on this machine (80 Hz: 7.5 dB at u designed on the
