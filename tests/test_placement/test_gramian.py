@@ -22,7 +22,7 @@ def masses():
     modes = solve_modes(model, count=3, damping=ModalDamping(0.001))
     at = {n: {f"{i}:z": w for i, w in enumerate(row)} for n, row in SEES.items()}
     sensors = [Sensor(name, at=place, asd=1e-9) for name, place in at.items()]
-    actuators = [Actuator(name, at=place) for name, place in at.items()]
+    actuators = [Actuator(f"{name}u", at=place) for name, place in at.items()]
     ports = Ports(
         w=[Disturbance("f", at="2:z", asd=1e-3)],
         u=actuators[2:],

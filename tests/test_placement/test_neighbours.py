@@ -32,7 +32,7 @@ from flexplant.placement import (
     score_sensors,
 )
 from flexplant.placement.layouts import layouts_of
-from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
+from flexplant.plant import Actuator, Disturbance, Poi, Ports, Reference, Sensor, assemble_plant
 from flexplant.structure import FEModel, ModalDamping
 from placement_plate import plate_modes
 
@@ -192,6 +192,13 @@ def test_a_short_list_by_the_hinf_level():
     assert by_level.best == ("s0",)
     assert np.all(np.diff(by_level.values) > 0.01)
     assert score_sensors(plant, singles, PoiVariance()).best == ("s3",)
+    # a reference that has no weight is no way to a lower level, and one that has is a task more
+    followed = plant.with_ports(plant.assembled.ports.replace(references=[Reference("die")]))
+    np.testing.assert_allclose(
+        score_sensors(followed, singles, level).values, by_level.values, rtol=1e-3, atol=0.0
+    )
+    tracked = level.replace(w={"f": 1.0, "die:ref": 1e-6}, z={"die:error": 1e6})
+    assert tracked(followed) > level(plant)
     # one rule for scores and places
     off = score_sensors(plant, singles, PoiVariance(), constraints=[OffPoi()])
     assert off.layouts[2] == ("s3",)

@@ -39,7 +39,7 @@ from flexplant.placement import (
 from flexplant.placement.candidates import with_side
 from flexplant.placement.criterion import OnPlant
 from flexplant.placement.layouts import layouts_of
-from flexplant.plant import BaseAcceleration, building
+from flexplant.plant import BaseAcceleration, Reference, building
 from placement_plate import plate_modes
 
 METHODS = (Exchange(starts=4), Exhaustive(), BranchAndBound(starts=2))
@@ -255,8 +255,10 @@ def test_plants_are_assembled_once_not_per_choice(monkeypatch, use, way, shape):
 
 @pytest.mark.parametrize("shape", [None, lowpass(60.0)], ids=["white", "shaped"])
 @pytest.mark.parametrize("delay", [1.0, 1.5])
-def test_on_a_shaken_floor_fast_scores_are_those_of_the_criteria(shape, delay):
+@pytest.mark.parametrize("references", [(), (Reference("die"),)], ids=["", "reference"])
+def test_on_a_shaken_floor_fast_scores_are_those_of_the_criteria(shape, delay, references):
     plant, sensors, actuators = _shaken(6, shape)
+    plant = plant.with_ports(plant.assembled.ports.replace(references=references))
     plant = plant.continuous.discretized(4e3, delay=delay)
     for side, criterion, ports, size in (
         ("y", PoiVariance("die"), sensors, 4),

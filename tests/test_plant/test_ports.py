@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from flexplant.errors import FlexplantError, LabelError, ModelError, ShapeError
+from flexplant.lti import StateSpace
+from flexplant.placement import place_both, place_sensors
 from flexplant.plant import (
     Actuator,
     Disturbance,
@@ -13,10 +15,12 @@ from flexplant.plant import (
     Reference,
     RigidForce,
     Sensor,
+    StandardPlant,
     assemble_plant,
 )  # fmt: skip
 from flexplant.store import load
 from flexplant.structure import chain
+from flexplant.testbeds import three_masses
 from stages import ports
 
 P = (0.1, 0.2, 0.0)
@@ -187,3 +191,25 @@ def test_the_axes_of_a_poi_replace_the_direction_of_its_label():
     poi = Poi("die", at="2:x")
     with pytest.raises(LabelError, match=r"at '2:x' with the axes \('z',\), .* no DOF '2:z'"):
         assemble_plant(two, Ports(w=[Disturbance("d", at="1:x")], z=[poi]))
+
+
+def test_an_actuator_and_a_sensor_of_one_name_are_refused_where_the_plant_is_made():
+    """Filters and loops connect by name: they failed later, and said less."""
+    plant = three_masses()
+    own = plant.assembled.ports
+    alike = [own.y[0].replace(name="u1"), own.y[1]]
+    g = plant.Gyu.renamed(outputs={"y1": "u1"})
+    swap = StateSpace(
+        [], np.zeros((0, 1)), np.zeros((1, 0)), [[1.0]], inputs=["y1"], outputs=["u1"]
+    )
+    ways = [
+        lambda: assemble_plant(plant.assembled.realisation, own.replace(y=alike)),
+        lambda: plant.with_ports(own.replace(y=alike)),
+        lambda: plant.through(swap),
+        lambda: StandardPlant.from_statespace(g, u=["u1"], y=["u1", "y2"]),
+        lambda: place_sensors(plant, alike, 1),
+        lambda: place_both(plant, alike, ["u1"], (1, 1)),
+    ]
+    for way in ways:
+        with pytest.raises(LabelError, match=r"\['u1'\] are names in u and in y"):
+            way()

@@ -6,13 +6,15 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.signal import sosfilt
+from scipy.signal import freqz_sos, sosfilt
 
 import flexplant as fx
 from flexplant.errors import AssumptionError, CertificateError, LabelError, ModelError
-from flexplant.lti import StateSpace, lft, tustin
+from flexplant.lti import StateSpace, frequency_response, lft, minimal, tustin
+from flexplant.lti.discretisation import discretized
 from flexplant.synthesis import (
     anti_windup_form,
+    design_ncf,
     discretise_controller,
     reduce_controller,
     second_order_sections,
@@ -172,6 +174,54 @@ def test_sections_filter_like_the_controller():
     np.testing.assert_allclose(got, wanted, atol=1e-6 * np.abs(wanted).max())
     with pytest.raises(ModelError, match="discretise_controller"):
         second_order_sections(designed(False)[1])
+
+
+def slow_beside_fast(freq, rate=0.0, delay=0.0):
+    """Two modes of equal mass: a suspension of 5 % and one of 1 % at 3 kHz."""
+    omega, zeta = 2 * np.pi * np.array([freq, 3e3]), np.array([0.05, 0.01])
+    A = np.kron(np.diag(omega), [[0.0, 1.0], [-1.0, 0.0]])
+    A[[1, 3], [1, 3]] = -2 * zeta * omega
+    B = np.array([[0.0, 1 / omega[0], 0.0, 1 / omega[1]]]).T
+    g = StateSpace(A, B, [[1.0, 0.0, 1.0, 0.0]], [[0.0]], inputs=["f"], outputs=["s"])
+    return discretized(g, rate, delay=delay) if rate else g
+
+
+@pytest.mark.parametrize("freq", [3.0, 0.3, 0.03])
+@pytest.mark.parametrize("delay", [0.0, 1.0, 2.5])
+def test_sections_of_fewer_zeros_than_poles_are_not_early(freq, delay):
+    """One sample early is little beside a slow peak, and the wrong sign at half the rate."""
+    K = slow_beside_fast(freq, 2e4, delay)
+    sections = second_order_sections(K)["s", "f"]
+    x, wanted = K.B[:, 0], [K.D[0, 0]]
+    for _ in range(300):
+        wanted.append((K.C @ x)[0])
+        x = K.A @ x
+    got = sosfilt(sections, np.eye(1, 301)[0])
+    np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-6 * np.abs(wanted).max())
+
+
+def test_sections_name_the_rate_where_their_coefficients_are_too_coarse():
+    with pytest.raises(CertificateError, match=r"a pole at 0.003 Hz .* 20000 Hz .* Lower the rate"):
+        second_order_sections(slow_beside_fast(0.003, 2e4))
+
+
+@pytest.mark.parametrize("rate", [0.0, 2e4], ids=["continuous", "sampled"])
+@pytest.mark.parametrize("gain", [1e3, 1e8])
+def test_a_slow_suspension_beside_a_fast_mode_stays_in_the_controller(rate, gain):
+    """Neither mode is small at its own frequency, though their peaks are 1e10 apart."""
+    plant = slow_beside_fast(0.03, rate)
+    assert minimal(plant).n_states == 4
+    found = design_ncf(plant, before=np.array([[gain]]))
+    assert found.gamma < 1.11 * found.lower
+    K = minimal(found.system)
+    assert K.n_states == 4
+    both = [0.03, 3e3]
+    responses = [frequency_response(sys, both).data[0, 0] for sys in (K, found.system)]
+    np.testing.assert_allclose(*responses, rtol=1e-6)
+    if rate:
+        sections = second_order_sections(found)["f", "s"]
+        _, response = freqz_sos(sections, both, fs=rate)
+        np.testing.assert_allclose(response, responses[1], rtol=1e-4)
 
 
 DRIVER = """

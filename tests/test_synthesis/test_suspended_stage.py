@@ -8,10 +8,15 @@ import pytest
 from flexplant.errors import AssumptionError
 from flexplant.estimation import design_kalman, design_static
 from flexplant.loop import close_loop
+from flexplant.modes import solve_modes
 from flexplant.plant import (
     Actuator,
+    Disturbance,
     GroundSpring,
     Poi,
+    Ports,
+    Reference,
+    Sensor,
     assemble_plant,
     reference_errors,
     stage_weights,
@@ -19,7 +24,7 @@ from flexplant.plant import (
 )
 from flexplant.plant.rigid.rigid_motion import rigid_gain
 from flexplant.simulation import simulate
-from flexplant.structure import FEModel
+from flexplant.structure import FEModel, ModalDamping, Spring, kirchhoff_plate, solid_block
 from flexplant.synthesis import design_hinf, design_servo
 from plates import make_plate
 from stages import (
@@ -241,6 +246,69 @@ def test_weights_of_a_suspended_stage_are_the_free_ones_and_its_hinf_loop():
         gammas.append((found.gamma, weights.w["amp1"], loop.modulus_margin))
     np.testing.assert_allclose(gammas[1][1], gammas[0][1], rtol=1e-9)
     np.testing.assert_allclose(gammas[1], gammas[0], rtol=0.05)
+
+
+def plate_on_springs(stiffness):
+    """A steel plate and where it is held, pushed and seen."""
+    plate = kirchhoff_plate(
+        size=(0.4, 0.3),
+        thickness=0.02,
+        elements=(8, 6),
+        density=7850.0,
+        youngs_modulus=210e9,
+        poisson_ratio=0.3,
+    )
+    corners = [(x, y, 0.0) for x in (0.0, 0.4) for y in (0.0, 0.3)]
+    inner = [((x, y, 0.0), "z") for x in (0.1, 0.3) for y in (0.075, 0.225)]
+    held = plate.with_parts([Spring(p, stiffness) for p in corners])
+    return held, inner, [(p, "z") for p in corners], AXES
+
+
+def block_on_springs(stiffness, directions):
+    """A solid block, in six axes; what no spring holds is free."""
+    block = solid_block(
+        size=(0.4, 0.3, 0.05),
+        elements=(4, 3, 1),
+        density=2700.0,
+        youngs_modulus=70e9,
+        poisson_ratio=0.33,
+    )
+    corners = [(x, y, z) for x in (0.0, 0.4) for y in (0.0, 0.3) for z in (0.0, 0.05)]
+    held = block.with_parts(
+        [Spring(p, stiffness, direction=d) for p in corners for d in directions]
+    )
+    places = [((0, 0, 0), "z"), ((0.4, 0, 0), "z"), ((0, 0.3, 0), "z")]
+    places += [((0, 0.1, 0.05), "x"), ((0.1, 0, 0), "y"), ((0.3, 0, 0.05), "y")]
+    return held, places, places, ("z", "x", "y", "rx", "ry", "rz")
+
+
+SUSPENDED = {
+    "plate": (plate_on_springs, 4650.0),
+    "plate, soft": (plate_on_springs, 4.65e-3),
+    "block, six axes": (block_on_springs, 2325.0, "xyz"),
+    "block, soft": (block_on_springs, 2.325, "xyz"),
+    "block, three axes free": (block_on_springs, 2325.0, "z"),
+}
+
+
+@pytest.mark.parametrize("case", SUSPENDED)
+def test_hinf_of_plates_and_solids_on_springs_reaches_what_the_weights_require(case):
+    make, *how = SUSPENDED[case]
+    model, pushed, seen, axes = make(*how)
+    at_hand = Ports(
+        w=[Disturbance(f"d{i}", at=p, direction=d, asd=1e-3) for i, (p, d) in enumerate(pushed)],
+        u=[Actuator(f"u{i}", at=p, direction=d) for i, (p, d) in enumerate(pushed)],
+        z=[Poi("die", at=(0.2, 0.15, 0.0), axes=axes)],
+        y=[Sensor(f"y{i}", at=p, direction=d, asd=1e-11) for i, (p, d) in enumerate(seen)],
+        references=[Reference("die")],
+    )
+    modes = solve_modes(model, count=10, damping=ModalDamping(0.01))
+    plant = assemble_plant(modes, at_hand).discretized(5e3, delay=1)
+    errors, weights = reference_errors(plant), stage_weights(plant, 30.0)
+    found = design_hinf(plant.through(errors).weighted(z=weights.z, w=weights.w))
+    assert found.gamma < 1.0
+    assert found.gamma < 1.02 * found.lower
+    assert close_loop(plant, errors, found).spectral_radius < 1.0
 
 
 def test_axes_that_do_not_span_the_suspended_body():

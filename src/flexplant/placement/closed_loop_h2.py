@@ -15,6 +15,7 @@ from ..errors import ModelError
 from ..estimation import design_kalman
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import control_dare
+from ..lti.statespace import as_statespace
 from ..plant import StandardPlant
 from ..synthesis import design_hinf
 from .candidates import PlantChannel, Port, side_of
@@ -308,7 +309,10 @@ class HinfLevel(Criterion):
         """
         z = {name: self.z.get(name) for name in plant.z}
         w = {name: self.w.get(name) for name in plant.w}
-        z |= {f"{name}:effort": self.effort for name in plant.u}
-        w |= {f"{name}:noise": self.noise for name in plant.y}
-        level = design_hinf(plant.weighted(z=z, w=w)).gamma
+        z |= {name: self.effort for name in z if name.endswith(":effort")}
+        w |= {name: self.noise for name in w if name.endswith(":noise")}
+        # a reference that is not weighted is zero in y: D21 would lack rank
+        read = [name for name in plant.y if w.get(name, 1.0) is not None]
+        rows = as_statespace(np.eye(len(read))).replace(inputs=read, outputs=read)
+        level = design_hinf(plant.weighted(z=z, w=w).through(rows)).gamma
         return np.inf if level is None else level

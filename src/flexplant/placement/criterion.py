@@ -12,6 +12,7 @@ import numpy as np
 
 from ..checks import FloatArray, Value, function, short, with_unit
 from ..errors import FlexplantError, ModelError
+from ..estimation.estimator_channels import sensors
 from ..plant import StandardPlant
 from .candidates import Port, Side, sides_of, with_side
 
@@ -89,10 +90,14 @@ class OnPlant(Scorer):
 
     @property
     def rows_only(self) -> bool:
-        """Whether no noise but their own reaches the sensors at once."""
-        quiet = [name for name in self.whole.w if not name.endswith(":noise")]
-        g = self.whole.system
-        return not np.any(g.D[np.ix_(g.output_index(self.whole.y), g.input_index(quiet))])
+        """Whether nothing but their own noise reaches the sensors at once.
+
+        A reference in y reaches itself at once: it is no sensor.
+        """
+        read = sensors(self.whole)
+        own = {f"{name}:noise" for name in read}
+        at_once = [name for name in self.whole.w if name not in own]
+        return not np.any(self.whole.system.select(read, at_once).D)
 
     def value(self, chosen: Sequence[int]) -> Any:
         """Return what the function gives on the plant with this choice."""

@@ -351,8 +351,6 @@ def problem_of(
     listed = {side: _listed(plant, side, given) for side, (given, _) in wanted.items()}
     ports = tuple(port for part in listed.values() for port in part)
     names = [port.name for port in ports]
-    if len(set(names)) < len(names):
-        raise LabelError("a sensor and an actuator have the same name: rename one.")
     kept = _required(names, required)
     counts = {
         side: whole(count, "count", maximum=max(len(listed[side]), 1))

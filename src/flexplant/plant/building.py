@@ -27,7 +27,7 @@ from .ports import Ports
 from .realisation import ModalRealisation
 from .residual_form import modes_of
 from .sampling import sampled_physical
-from .selection import selected
+from .subplant import selected
 
 P = TypeVar("P", bound=Partition)
 

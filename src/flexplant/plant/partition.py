@@ -44,6 +44,12 @@ class Partition(Value):
             raise LabelError(f"inputs {self.system.inputs} are not [w; u] = {self.w + self.u}.")
         if (*self.z, *self.y) != tuple(self.system.outputs):
             raise LabelError(f"outputs {self.system.outputs} are not [z; y] = {self.z + self.y}.")
+        if both := [name for name in self.u if name in self.y]:
+            raise LabelError(
+                f"{short(both)} are names in u and in y: loops, filters and controllers connect "
+                "channels by name, and would take a command for a measurement. Rename the "
+                "actuators or the sensors."
+            )
         require_known("w channel with an asd", self.asd, self.w)
         asd = {name: positive(a, f"asd of {name!r}", zero=True) for name, a in self.asd.items()}
         self._set(asd=asd)

@@ -54,7 +54,7 @@ class StandardPlant(Partition):
     Raises
     ------
     LabelError
-        When the names are not those of the system's channels, in this order.
+        When the names are not those of the system's channels, in this order, or u and y share one.
     ModelError
         When a density is negative or not finite.
 
@@ -355,7 +355,7 @@ def assemble_plant(
     Raises
     ------
     LabelError
-        When a place is not on the structure.
+        When a place is not on the structure, or an actuator and a sensor have the same name.
     ModelError
         When the model or the ports have another type, or a side is empty.
 

@@ -332,6 +332,7 @@ def _motions(model: Structure) -> Any:
         outputs=nothing,
         motion=motion,
         at_once=lambda row: np.zeros(n),
+        once=lambda key, found: found(),
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, short
+from ...checks import ComplexArray, FloatArray, short
 from ...errors import CertificateError, LabelError, ModelError
 from ...lti.frequency import frequency_response
 from ...lti.grid import resonance_grid
@@ -241,7 +241,8 @@ def second_order_sections(controller: Any) -> Mapping[tuple[str, str], FloatArra
     Raises
     ------
     CertificateError
-        When the sections differ from the channel by more than 1e-6 of its largest gain.
+        When the sections differ from the channel by more than 1e-6 of its largest gain, as where
+        the rate is so high above a pole that rounded coefficients move it.
     ModelError
         When the controller is continuous.
 
@@ -274,19 +275,59 @@ def _sections(g: StateSpace) -> FloatArray:
     size = float(np.abs(wanted).max(initial=0.0))
     if not size:
         return np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
-    z = np.exp(2j * np.pi * grid * (g.dt or 1.0))
+    back = np.expm1(-2j * np.pi * grid * (g.dt or 1.0))  # 1/z - 1
+    shape = _product(poles, zeros, back)
     at = int(np.argmax(np.abs(wanted)))
-    shape = np.prod(z[at] - zeros) / np.prod(z[at] - poles)
-    gain = float((wanted[at] / shape).real)
+    gain = float((wanted[at] / shape[at]).real)
+    # with a zero at z = 0 for each that is missing: so many samples too early
     sections = np.asarray(zpk2sos(zeros, poles, gain, pairing="nearest"), dtype=np.float64)
-    got = np.ones(z.size, dtype=np.complex128)
-    for b0, b1, b2, a0, a1, a2 in sections:
-        got *= (b0 + b1 / z + b2 / z**2) / (a0 + a1 / z + a2 / z**2)
-    off = float(np.abs(got - wanted).max()) / size
+    late = len(poles) - len(zeros)
+    for row in sections:
+        while late and not row[2]:
+            row[:3], late = [0.0, *row[:2]], late - 1
+    off = float(np.abs(_response(sections, back) - wanted).max()) / size
     if not off <= _AGREEMENT:
+        exact = float(np.abs(gain * shape - wanted).max()) / size
         raise CertificateError(
             f"the sections of {g.outputs[0]!r} from {g.inputs[0]!r} differ from it by {off:.1e} of "
-            "its largest gain: poles and zeros of so many states are lost to rounding. Reduce the "
-            "controller first (reduce_controller), or export its states (write_c)."
+            f"its largest gain: {_cause(exact, poles, g.dt)}, or export its states (write_c)."
         )
     return sections
+
+
+def _product(poles: ComplexArray, zeros: ComplexArray, back: ComplexArray) -> ComplexArray:
+    """Return ``prod (z - zeros) / prod (z - poles)`` at 1/z - 1 = back."""
+    z = 1.0 / (1.0 + back)
+    rise = -back * z  # z - 1
+    found = np.ones(z.size, dtype=np.complex128)
+    for root in zeros:
+        found *= rise + (1.0 - root)
+    for root in poles:
+        found /= rise + (1.0 - root)
+    return found
+
+
+def _response(sections: FloatArray, back: ComplexArray) -> ComplexArray:
+    """Return the response of sections: in powers of 1/z - 1, small where coefficients cancel."""
+    found = np.ones(back.size, dtype=np.complex128)
+    for row in sections:
+        above, below = (
+            (c0 + c1 + c2) + (c1 + 2.0 * c2) * back + c2 * back**2
+            for c0, c1, c2 in (row[:3], row[3:])
+        )
+        found *= above / below
+    return found
+
+
+def _cause(exact: float, poles: ComplexArray, dt: float) -> str:
+    """Return why sections differ, and what helps: the product of their factors differs less."""
+    if exact > _AGREEMENT:
+        return (
+            "poles and zeros of so many states are lost to rounding. Reduce the controller first "
+            "(reduce_controller)"
+        )
+    slow = float(np.abs(poles - 1.0).min()) / (2.0 * np.pi * dt)
+    return (
+        f"a pole at {slow:.3g} Hz is so near z = 1 at a rate of {1.0 / dt:g} Hz that coefficients "
+        "in double precision cannot hold it: 1 + a1 + a2 is (w dt)^2. Lower the rate"
+    )
