@@ -8,6 +8,7 @@ import flexplant as fx
 from flexplant.errors import ModelError
 from flexplant.loop import in_axes, report_loops
 from flexplant.loop.axis_scaling import scaled_size
+from flexplant.loop.report import loop_margins
 from flexplant.lti import Frf, StateSpace, append, discretized, frequency_response
 from flexplant.lti.interconnection import loop_poles
 from flexplant.plant import assemble_plant, decouple
@@ -44,6 +45,25 @@ def test_margins_in_closed_form():
     least = np.abs(1 + 2.0 / (s * (s + 1) * (s + 2))).min()
     assert loop.modulus_margin == pytest.approx(least, rel=1e-6)
     assert "phase margin 33 deg" in repr(report)
+
+
+@pytest.mark.parametrize("count", [12, 300])
+def test_many_crossings_take_no_more_responses_than_few(count):
+    """(1 + sin(2 pi f) / 2) exp(-7 i f) crosses 1 at each k / 2, the real axis at k pi / 7 Hz."""
+    freq, calls = np.linspace(0.2, 0.7 + 0.5 * count, 40 * count), []
+
+    def L(f):
+        calls.append(f)
+        return (1.0 + 0.5 * np.sin(2 * np.pi * f)) * np.exp(-7j * f)
+
+    found = loop_margins("u", freq, L(freq), L)
+    assert len(calls) < 60
+    np.testing.assert_allclose(found.crossovers, 0.5 * np.arange(1, count + 2), rtol=1e-9)
+    phases = np.abs(np.angle(L(0.5 * np.arange(1, count + 2)), deg=True))
+    assert found.phase_margin == pytest.approx(phases.min(), abs=1e-6)
+    real = L(np.arange(1, int(freq[-1] * 7 / np.pi) + 1) * np.pi / 7).real
+    assert found.gain_margin == pytest.approx(1 / real[(real > 0) & (real < 1)].max(), rel=1e-9)
+    assert found.gain_reduction == pytest.approx(1 / real[real > 1].min(), rel=1e-9)
 
 
 def test_an_unstable_plant_may_lose_gain_too():

@@ -5,6 +5,7 @@ import pytest
 import scipy.linalg as la
 import scipy.sparse as sp
 
+import flexplant as fx
 import meshes
 from flexplant import DofSet
 from flexplant.errors import ModelError
@@ -204,6 +205,31 @@ def test_any_multiplicity_is_found(copies, count):
     assert squares.size == count
     assert_modes_of(model, squares, phi, np.repeat(one, copies))
     assert certificate["counted"] == certificate["found"]
+
+
+@pytest.mark.slow
+def test_the_last_copies_of_many_modes_are_accurate():
+    """Sixty free chains: the last copies of the third mode come late."""
+    one = fx.chain(masses=np.ones(80), stiffnesses=np.full(79, 1e6))
+    M, K = (sp.block_diag([part] * 60, format="csc") for part in (one.M, one.K))
+    dofs = DofSet(np.arange(4800), ["x"] * 4800, np.arange(4800)[:, None] * [1.0, 0.0, 0.0])
+    modes = fx.solve_modes(FEModel(M, K, dofs=dofs), count=200)
+    expected = 2e3 * np.sin(np.pi * np.arange(1, 4) / 160)
+    np.testing.assert_allclose(modes.omega[60:], np.repeat(expected, 60)[:140], rtol=1e-8)
+    assert modes.residual[60:].max() < 1e-9
+
+
+@pytest.mark.slow
+def test_bodies_far_from_the_origin_are_free():
+    """Rounding of coordinates leaves forces at a few DOFs only; a spring as soft stays one."""
+    mesh = meshes.solid(4, 4, 2)
+    model = copies_of(mesh, 25)
+    assert model.rigid_body.shape[1] == 6 * 25
+    report = fx.check(model)
+    assert (report.ok, report.n_rigid, report.n_zero) == (True, 6 * 25, 6 * 25)
+    one, last = model.dofs.nodes[-1], model.n_dof - 1
+    held = model.with_parts([fx.Spring(f"{one}:z", 1e-9 * model.K[last, last])])
+    assert held.rigid_body.shape[1] == 6 * 25 - 1
 
 
 def test_bodies_that_nothing_joins_keep_their_motions():

@@ -162,7 +162,8 @@ def joined(
     rigid_body = left_motions(parts, groups, every, matrices["M"], kept, free=True)
     expected = rigid_body.shape[1]
     if not any(part.is_reduced for part in parts):  # by energy, as the model finds them
-        rigid_body = rigid_body_basis(matrices["M"], matrices["K"], motions)
+        xyz = _all_dofs(parts).xyz[done.kept]
+        rigid_body = rigid_body_basis(matrices["M"], matrices["K"], motions, xyz)
     patches = patch_errors(links, parts)
     certificate = certified(parts, links, done, matrices, groups, rigid_body, expected, patches)
     common = {"joint_motions": motions, "joining": certificate}

@@ -21,6 +21,8 @@ _INTEGRATES = 1e-9
 _REAL = 0.05
 #: slope of its size over frequency at the first line below which it is taken to be level
 _LEVEL = 0.5
+#: relative accuracy of the frequencies of crossovers: margins there are right to nine digits
+_ACCURATE = 1e-12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -227,9 +229,8 @@ def report_loops(
         exact = None
         if parts.measured is None:
 
-            def exact(freq: float) -> complex:
-                there = inverted(parts.gain(np.array([freq]), at))
-                return complex(1.0 - 1.0 / there[0, i, i])
+            def exact(freq: FloatArray) -> ComplexArray:
+                return np.asarray(1.0 - 1.0 / inverted(parts.gain(freq, at))[:, i, i])
 
         return loop_margins(names[i], grid, 1.0 - 1.0 / S[:, i, i], exact, sampled=bool(parts.dt))
 
@@ -272,22 +273,22 @@ def loop_margins(
     name: str,
     freq: FloatArray,
     L: ComplexArray,
-    exact: Callable[[float], complex] | None = None,
+    exact: Callable[[FloatArray], ComplexArray] | None = None,
     *,
     sampled: bool = False,
 ) -> LoopMargins:
     """Return the margins of one loop gain (n_freq,); the critical point is +1."""
 
-    def between(f: float) -> complex:
-        return complex(np.interp(f, freq, L.real) + 1j * np.interp(f, freq, L.imag))
+    def between(f: FloatArray) -> ComplexArray:
+        return np.asarray(np.interp(f, freq, L.real) + 1j * np.interp(f, freq, L.imag))
 
     from scipy.optimize import minimize_scalar
 
     find = between if exact is None else exact
-    crossovers = _roots(freq, np.abs(L) - 1.0, lambda f: abs(find(f)) - 1.0)
-    phases = [abs(np.degrees(np.angle(find(f)))) for f in crossovers]
+    crossovers = _roots(freq, np.abs(L) - 1.0, lambda f: np.abs(find(f)) - 1.0)
+    phases = np.abs(np.degrees(np.angle(find(crossovers))))
     # L is real where the imaginary part changes sign; positive: towards the critical point
-    reals = [find(f).real for f in _roots(freq, L.imag, lambda f: find(f).imag)]
+    reals = find(_roots(freq, L.imag, lambda f: find(f).imag)).real.tolist()
     # and at its ends, half the rate and zero frequency (unless it integrates), where it is real
     slope = (
         np.log(abs(L[1] / L[0])) / np.log(freq[1] / freq[0])
@@ -303,34 +304,45 @@ def loop_margins(
     where, margin = float(freq[least]), float(size[least])
     if exact is not None and 0 < least < freq.size - 1:
         low, high = float(freq[least - 1]), float(freq[least + 1])
-        closer = minimize_scalar(lambda f: abs(1 - find(f)), bounds=(low, high), method="bounded")
+        closer = minimize_scalar(
+            lambda f: abs(1 - find(np.array([f]))[0]), bounds=(low, high), method="bounded"
+        )
         if closer.fun < margin:
             where, margin = float(closer.x), float(closer.fun)
     return LoopMargins(
         name,
-        tuple(crossovers),
+        tuple(crossovers.tolist()),
         1.0 / max(below) if below else float("inf"),
         1.0 / min(above) if above else 0.0,
-        float(min(phases, default=180.0)),
+        float(phases.min(initial=180.0)),
         margin,
         where,
     )
 
 
-def _roots(freq: FloatArray, values: FloatArray, function: Callable[[float], float]) -> list[float]:
-    """Return the zeros of a function of frequency between the lines where its sign changes."""
-    from scipy.optimize import brentq
+def _roots(
+    freq: FloatArray, values: FloatArray, function: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """Return the zeros of a function of frequency between the lines where its sign changes.
 
-    places = np.flatnonzero((values[1:] > 0) != (values[:-1] > 0))
-    found = []
-    for i in places.tolist():
-        low, high = float(freq[i]), float(freq[i + 1])
-        ends = function(low), function(high)
-        if ends[0] * ends[1] >= 0:  # rounding at a line
-            found.append(low if abs(ends[0]) < abs(ends[1]) else high)
-        else:
-            found.append(float(brentq(function, low, high, xtol=1e-9 * low)))
-    return found
+    All at once: a response at many frequencies costs little more than at one.
+    """
+    from scipy.optimize.elementwise import find_root
+
+    first = np.flatnonzero((values[1:] > 0) != (values[:-1] > 0))
+    if not first.size:
+        return np.zeros(0)
+    low, high = freq[first], freq[first + 1]
+    ends = function(low), function(high)
+    found = np.where(np.abs(ends[0]) < np.abs(ends[1]), low, high)
+    real = ends[0] * ends[1] < 0  # else rounding at a line
+    if real.any():
+        found[real] = find_root(
+            function,
+            (low[real], high[real]),
+            tolerances={"xatol": 0.0, "xrtol": _ACCURATE, "fatol": 0.0, "frtol": 0.0},
+        ).x
+    return np.asarray(found)
 
 
 #: how far the phase of det(I - L) may be from where its ends have to be

@@ -40,8 +40,9 @@ _SEARCHES = 8
 _RESIDUAL = 1e-11
 #: residuals below this many roundings of K phi are not reduced by more steps
 _ROUNDINGS = 10.0
-#: errors of Ritz vectors, in terms of the residuals let pass, that Lanczos is stopped at
-_PARTS = (1.0, 0.03)
+#: errors of Ritz vectors, in terms of the residuals let pass, that Lanczos is stopped at: of many
+#: copies of a mode the last ones come late, each search beginning with what the one before it left
+_PARTS = (1.0, *[0.03] * 5)
 #: shapes that are judged at a time, while the memory is at its peak
 _JUDGED = 8
 

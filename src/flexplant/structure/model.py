@@ -168,7 +168,9 @@ class FEModel(Placed, Value):
         have few digits (down to four), rotations are the null vectors of K next to theirs; what a
         spring holds, however softly, has none.
         """
-        return np.asarray(frozen(rigid_body_basis(self.M, self.K, self.body_motions)))
+        return np.asarray(
+            frozen(rigid_body_basis(self.M, self.K, self.body_motions, self.dofs.xyz))
+        )
 
     @cached_property
     def body_motions(self) -> FloatArray:

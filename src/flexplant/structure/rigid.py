@@ -78,6 +78,12 @@ def place_motion(dofs: DofSet, at: Place, direction: str) -> FloatArray:
     return own
 
 
+def farness(xyz: FloatArray) -> float:
+    """Return the largest coordinate of a body, in terms of its size; at least 1."""
+    size = float(np.ptp(xyz, axis=0).max()) if xyz.size else 0.0
+    return max(1.0, float(np.abs(xyz).max()) / size) if size else 1.0
+
+
 def body_motions(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
     """Return the M-orthonormal rigid-body motions (n, r) of every piece of a structure.
 
@@ -97,21 +103,22 @@ def body_motions(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
     return np.hstack(found)
 
 
-def rigid_body_basis(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
+def rigid_body_basis(M: Matrix, K: Matrix, motions: FloatArray, xyz: FloatArray) -> FloatArray:
     """Return the M-orthonormal rigid-body vectors (n, r) of a structure, ``K R = 0``.
 
     They are those of the `motions` of its pieces, from `body_motions`, that cost no energy. They
     come from the coordinates, not from an eigenvalue solver, so that they are exact. Partly held
     structures (a hinge, say) keep the combinations that cost none. Where coordinates have few
-    digits, rotations are the null vectors of K next to theirs. Each body is judged by itself.
+    digits, rotations are the null vectors of K next to theirs. Each body is judged by itself,
+    with the rounding that its coordinates `xyz` (n, 3) have.
     """
     parts = _bodies_of(motions)
     if len(parts) < 2:
-        return _free(M, K, motions)
+        return _free(M, K, motions, farness(xyz))
     found, mass, stiffness = [], cast(Any, M), cast(Any, K)
     for rows, columns in parts:
         own = mass[rows][:, rows], stiffness[rows][:, rows], motions[np.ix_(rows, columns)]
-        free = _free(*own)
+        free = _free(*own, farness(xyz[rows]))
         found.append(np.zeros((motions.shape[0], free.shape[1])))
         found[-1][rows] = free
     return np.hstack(found)
@@ -125,7 +132,7 @@ def _bodies_of(motions: FloatArray) -> list[tuple[IntArray, IntArray]]:
     return [(np.flatnonzero(moved[:, one].any(axis=1)), one) for one in columns]
 
 
-def _free(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
+def _free(M: Matrix, K: Matrix, motions: FloatArray, far: float) -> FloatArray:
     """Return the M-orthonormal motions of one body that cost no energy."""
     # K r and |K| |r|, row by row: forces of rounding size say that no energy is stored
     K = by_rows(K)
@@ -135,7 +142,7 @@ def _free(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
     force = np.asarray(K @ motions) / scale
     free = np.linalg.norm(force, axis=0) < _ENERGY_TOLERANCE
     if np.all(free):
-        return _not_held(M, K, motions)
+        return _not_held(M, K, motions, far)
     # of the small triangle: the left factor of all DOFs would be a full square matrix
     _, found, right = la.svd(la.qr(force, mode="economic")[1])
     values = np.zeros(scale.size)
@@ -144,7 +151,7 @@ def _free(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
     basis = motions[:, free]
     if null.shape[1] > basis.shape[1]:
         basis = orthonormalised(M, motions @ (null / scale[:, None]))
-    basis = _not_held(M, K, basis)
+    basis = _not_held(M, K, basis, far)
     near = right[(values >= _ENERGY_TOLERANCE) & (values < _NEARLY)].T
     if not near.shape[1]:
         return basis
@@ -154,9 +161,9 @@ def _free(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
     return _null_vectors(M, K, size_of_K, motions, basis, nearly) if nearly.shape[1] else basis
 
 
-def _not_held(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
+def _not_held(M: Matrix, K: Matrix, motions: FloatArray, far: float) -> FloatArray:
     """Return the almost force-free motions, or combinations, that no soft spring holds."""
-    mix = unheld(K, motions)
+    mix = unheld(K, motions, far=far)
     if np.array_equal(mix, np.eye(*mix.shape)[:, : mix.shape[1]]):
         return motions[:, : mix.shape[1]]
     if np.count_nonzero(mix) == mix.shape[1]:

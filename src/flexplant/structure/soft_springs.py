@@ -26,7 +26,9 @@ ENERGY = 90.0
 _COHERENT = 4.0
 
 
-def unheld(K: Matrix, motions: FloatArray, rounding: float = PRECISION) -> FloatArray:
+def unheld(
+    K: Matrix, motions: FloatArray, rounding: float = PRECISION, far: float = 1.0
+) -> FloatArray:
     """Return the combinations (r, m) of almost force-free motions (n, r) that no spring holds.
 
     Rounding of K leaves forces at all DOFs, of about the same size relative to what cancels there.
@@ -37,9 +39,10 @@ def unheld(K: Matrix, motions: FloatArray, rounding: float = PRECISION) -> Float
     if not motions.size:
         return mix
     size_of_K = Absolute(K)
-    for free in (_beside_few_springs, _beside_many_springs):
-        if mix.shape[1]:
-            mix = mix @ free(K, size_of_K, motions @ mix, rounding)
+    mix = mix @ _beside_few_springs(K, size_of_K, motions, max(rounding, PRECISION * far))
+    if mix.shape[1]:
+        # errors of coordinates are of second order in the energy
+        mix = mix @ _beside_many_springs(K, size_of_K, motions @ mix, rounding)
     return mix
 
 

@@ -13,7 +13,7 @@ from ..errors import ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..sparse.factor import by_rows, dense
 from ..sparse.lowest import PRECISION, ROUNDING
-from .rigid import orthonormalised, rigid_motions
+from .rigid import farness, orthonormalised, rigid_motions
 from .soft_springs import bodies, unheld
 
 #: times the energy that rounding of the entries allows: free
@@ -66,7 +66,7 @@ def zero_energy(
     present = np.any(motions != 0, axis=0)
     several = bodies(K, M, dofs)
     possible = motions if joint_motions is None else np.hstack([motions, joint_motions])
-    every, basis = _of_bodies(K, M, possible, several, rounding)
+    every, basis = _of_bodies(K, M, possible, several, rounding, dofs.xyz)
     left = motions - basis @ (basis.T @ motions)
     free = present & (np.linalg.norm(left, axis=0) < _RANK * np.linalg.norm(motions, axis=0))
     return ZeroEnergy(
@@ -86,7 +86,12 @@ def zero_energy(
 
 
 def _of_bodies(
-    K: Any, M: Any, motions: FloatArray, several: list[IntArray], rounding: float
+    K: Any,
+    M: Any,
+    motions: FloatArray,
+    several: list[IntArray],
+    rounding: float,
+    xyz: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return orthonormal motions of all bodies: all of them, and those that nothing holds."""
     every: list[FloatArray] = []
@@ -96,7 +101,8 @@ def _of_bodies(
         stiffness, mass = (A if whole or A is None else A[rows][:, rows] for A in (K, M))
         own = own_motions(mass, motions[rows])
         found = _free_motions(stiffness, abs(stiffness), own, _MARGIN * rounding)
-        mix = unheld(by_rows(stiffness), found, rounding * PRECISION / ROUNDING)
+        written, far = rounding * PRECISION / ROUNDING, farness(xyz[rows])
+        mix = unheld(by_rows(stiffness), found, written, far)
         for part, kept in ((every, _independent(own)), (free, _independent(found @ mix))):
             part.append(np.zeros((motions.shape[0], kept.shape[1])))
             part[-1][rows] = kept

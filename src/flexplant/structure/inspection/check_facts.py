@@ -16,7 +16,7 @@ from ..definite import are_rigid, are_swapped, unstable_stiffness
 from ..matrices import FEMatrices
 from ..model import FEModel
 from ..precision import loss, shown_digits
-from ..rigid import RigidMass, orthonormalised, rigid_mass, rigid_motions
+from ..rigid import RigidMass, farness, orthonormalised, rigid_mass, rigid_motions
 from ..singular_mass import empty_rows, left_out, null_motions
 from ..soft_springs import pieces, unheld
 from ..zero_energy import ZeroEnergy, beyond, own_motions, zero_energy
@@ -199,7 +199,9 @@ def _rounding(K: Any, M: Any, given: FEMatrices, digits: int | None) -> float:
     scale = np.linalg.norm(sizes, axis=0)
     relative = np.linalg.norm(force, axis=0) / np.where(scale > 0, scale, 1.0)
     motions = motions[:, (scale > 0) & (relative < _FREE)]
-    motions = motions @ unheld(by_rows(K), motions, max(PRECISION, written))
+    motions = motions @ unheld(
+        by_rows(K), motions, max(PRECISION, written), farness(given.dofs.xyz)
+    )
     moved = np.abs(motions)
     work = np.einsum("ij,ij->j", moved, np.abs(np.asarray(K @ motions)))
     most = np.einsum("ij,ij->j", moved, np.asarray(size @ moved))
