@@ -3,6 +3,7 @@
 import csv
 import re
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -286,7 +287,10 @@ def turned(P, condition, seed=3, speed=1.0):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["AC4", "HE1", "TMD", "WEC1", "DLR1", "BDT1", "CM1", "JE3"])
 def test_coordinates_and_units_of_time_change_nothing(name):
-    """The same gamma within 0.1 %, or a message that blames the coordinates.
+    """The same gamma within 0.2 %, or a message that blames the coordinates.
+
+    0.2 % is a fifth of the 1 % that gamma is left above the optimum. Without feedback, K = 0, is
+    what a stable plant is left with where its coordinates hide the rest.
 
     WEC1 alone may differ: two of its poles coincide, which dense coordinates split into nearly
     parallel modes. The Riccati equations may fail there; the LMIs come nearer to the bound.
@@ -295,16 +299,23 @@ def test_coordinates_and_units_of_time_change_nothing(name):
     best = design_hinf(P, u=u, y=y)
     for condition, speed in ((1.0, 1.0), (1e3, 1.0), (1.0, 1e6), (1.0, 1e-6), (1e5, 1.0), (1e6, 1)):
         try:
-            found = design_hinf(turned(P, condition, speed=speed), u=u, y=y)
+            with warnings.catch_warnings(record=True) as seen:
+                warnings.simplefilter("always")
+                found = design_hinf(turned(P, condition, speed=speed), u=u, y=y)
         except SolverError as error:
             assert condition > 1e3
             assert "coordinates of the plant's states are badly conditioned" in str(error)
         else:
-            assert found.lower <= found.gamma
+            assert found.lower <= found.gamma < np.inf
+            if found.method == "no feedback":
+                assert condition > 1e3
+                assert "coordinates of the plant's states are badly" in str(seen[0].message)
+                continue
+            assert not seen
             if name == "WEC1" and condition > 1.0 and found.gamma < 1.01 * found.lower:
                 assert found.gamma >= best.lower * (1 - 1e-3)
             else:
-                assert found.gamma == pytest.approx(best.gamma, rel=1e-3, abs=0)
+                assert found.gamma == pytest.approx(best.gamma, rel=2e-3, abs=0)
 
 
 def test_a_gamma_that_hangs_on_the_last_digits_of_the_plant_is_refused():

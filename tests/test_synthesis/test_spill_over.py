@@ -234,7 +234,7 @@ def by_servo(bandwidth):
         (lambda: [by_lmi(Lmi(), 5.0)], "low"),
         (lambda: [by_lmi(Lmi(), 15.0)], "high"),
         pytest.param(lambda: [by_lmi(Lmi(), 100.0)], "unstable", marks=pytest.mark.slow),
-        pytest.param(lambda: [by_lmi(Riccati(), 17.0)], "high", marks=pytest.mark.slow),
+        pytest.param(lambda: [by_lmi(Riccati(), 14.0)], "high", marks=pytest.mark.slow),
         (lambda: by_servo(10.0), "low"),
         (lambda: by_servo(32.0), "high"),
         (lambda: by_servo(50.0), "unstable"),
