@@ -9,7 +9,7 @@ import scipy.linalg as la
 from flexplant.errors import CertificateError, SolverError
 from flexplant.estimation import design_kalman, design_static
 from flexplant.loop import close_loop
-from flexplant.lti import StateSpace, h2_norm, lyapunov, solve_stein
+from flexplant.lti import StateSpace, equations, h2_norm, solve_stein
 from flexplant.lti import norms as h2_norms
 from flexplant.plant import Sensor, assemble_plant
 from flexplant.synthesis import design_servo
@@ -74,7 +74,7 @@ def test_the_gramians_judge_each_other(monkeypatch):
 
 def test_the_residual_judges_the_series(monkeypatch):
     g = kalman_loop(0.01, 30.0).system
-    exact = lyapunov.doubled
-    monkeypatch.setattr(lyapunov, "doubled", lambda A, Q: (1 + 1e-3) * exact(A, Q))
+    exact = equations.doubled
+    monkeypatch.setattr(equations, "doubled", lambda A, Q: (1 + 1e-3) * exact(A, Q))
     with pytest.raises(SolverError, match="of its terms"):
         solve_stein(g.A, g.B @ g.B.T)

@@ -10,10 +10,12 @@ from flexplant.errors import ModelError, ShapeError, SolverError
 from flexplant.lti import (
     StateSpace,
     controllability_gramian,
+    equations,
     observability_gramian,
     solve_lyapunov,
     solve_stein,
 )
+from flexplant.lti import lyapunov as lyapunov_module
 from oracles_lti import lyapunov, stein
 
 
@@ -148,3 +150,18 @@ def test_a_nearly_triangular_matrix_of_any_sizes():
     found = solve_lyapunov(A + np.tril(np.full((n, n), 1e-300), -1), np.eye(n))
     size = np.sqrt(np.outer(X.diagonal(), X.diagonal()))
     np.testing.assert_allclose(found / size, X / size, rtol=0, atol=1e-14)
+
+
+def test_the_residual_refuses_a_wrong_lyapunov_solution(monkeypatch):
+    exact = equations.lyapunov
+    monkeypatch.setattr(lyapunov_module, "lyapunov", lambda A, Q: (1 + 1e-6) * exact(A, Q))
+    with pytest.raises(SolverError, match="of its terms"):
+        solve_lyapunov(np.diag([-1.0, -2.0]), np.eye(2))
+
+
+def test_sylvester_equation_of_two_matrices():
+    rng = np.random.default_rng(3)
+    A, B = rng.standard_normal((5, 5)), rng.standard_normal((3, 3)) + 9 * np.eye(3)
+    X = rng.standard_normal((5, 3))
+    found = equations.sylvester(A, B, X @ B - A @ X)
+    np.testing.assert_allclose(found, X, rtol=0, atol=1e-12 * np.abs(X).max())

@@ -16,7 +16,7 @@ from flexplant.errors import (
     SolverError,
 )
 from flexplant.lti import lowpass
-from flexplant.placement import PoiLqr, PoiVariance, score_actuators, score_sensors
+from flexplant.placement import PoiLqr, PoiVariance, quadratic, score_actuators, score_sensors
 from flexplant.placement.layouts import layouts_of
 from flexplant.placement.quadratic import Quadratic
 from flexplant.plant import Sensor, StandardPlant
@@ -122,6 +122,19 @@ def test_names_stand_for_sensors(make):
     assert scores.best == ("s0", "s4", "s5")
     assert [s.name for s in scores.on(plant).assembled.ports.y] == ["s0", "s4", "s5"]
     assert PoiVariance()(scores.on(plant)) == pytest.approx(scores.values[0], rel=1e-9, abs=0.0)
+
+
+def test_a_doubling_that_is_wrong_is_refused_by_its_residual(monkeypatch):
+    A, items = np.array([[0.9, 0.2], [0.0, 0.7]]), np.array([[1.0, 0.0], [0.5, 1.0]])
+    cost = quadratic.quadratic(A, np.eye(2), np.eye(2), items)
+    truth, exact = cost.value([0]), quadratic.doubled_riccati
+
+    def wrong(A, G, H, *, quick):
+        X, steps = exact(A, G, H, quick=quick)
+        return (1 + 1e-6) * X, steps
+
+    monkeypatch.setattr(quadratic, "doubled_riccati", wrong)
+    assert cost.value([0]) == pytest.approx(truth, rel=1e-9, abs=0)
 
 
 def test_ports_with_filters_take_the_slow_way(make):

@@ -13,7 +13,8 @@ from ..errors import AssumptionError, CertificateError, ModelError, warn
 from ..labels import DofSet
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
-from ..lti.lyapunov import accumulated, doubled, scale_of, solve_stein
+from ..lti.equations import accumulated, scale_of, shifted_columns, stein, sylvester
+from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..plant import StandardPlant
@@ -165,7 +166,7 @@ def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
     values, T, inverse = _eigenvectors(joint)
     see, entering = _right(joint.E[:, :n], T), _right(joint.A[n:, :n], T)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        V = _columns(own, 1 / values, entering / values)
+        V = shifted_columns(own, 1 / values, entering / values)
     # not finite where the observer has a pole there as well: that mode is not followed
     V = np.where(np.all(np.isfinite(V), axis=0), V, 0.0)
     gap = np.maximum(1 - np.abs(values) ** 2, np.finfo(np.float64).eps)
@@ -228,7 +229,7 @@ def _followed(A: FloatArray, n: int, entering: FloatArray, kept: FloatArray) -> 
     """Return V of ``A V - V A_rr = -entering``; n states stand before the observer's."""
     V = np.zeros_like(entering)
     start = 0 if np.any(entering[:n]) else n
-    V[start:] = la.solve_sylvester(A[start:, start:], -kept, -entering[start:])
+    V[start:] = sylvester(A[start:, start:], kept, entering[start:])
     return V
 
 
@@ -298,26 +299,13 @@ def _chosen(T: ComplexArray, columns: IntArray) -> ComplexArray:
     return np.asarray(found.reshape(2 * len(T), columns.size))
 
 
-def _columns(A: FloatArray, shifts: ComplexArray, right: ComplexArray) -> ComplexArray:
-    """Return X with ``(I - shifts_j A) X_j = right_j``, by one Schur form of A."""
-    if not A.size:
-        return right
-    schur, U = la.schur(A.astype(np.complex128), output="complex")
-    turned = U.conj().T @ right
-    X = np.empty_like(turned)
-    for i in range(A.shape[0] - 1, -1, -1):
-        rest = shifts * (schur[i, i + 1 :] @ X[i + 1 :])
-        X[i] = (turned[i] + rest) / (1 - shifts * schur[i, i])
-    return np.asarray(U @ X)
-
-
 def _primal(joint: _Joint) -> FloatArray:
     """Return ``E X E'`` with ``X = A X A' + noise noise'``."""
     values, A, coupling, driven, noise = _modal_parts(joint)
     n = joint.n_elastic
     inner = (driven @ driven.conj().T) / (1 - np.outer(values, values.conj()))
     entering = coupling @ inner
-    cross = _columns(A, values.conj(), entering * values.conj() + noise @ driven.conj().T)
+    cross = shifted_columns(A, values.conj(), entering * values.conj() + noise @ driven.conj().T)
     half = A @ cross @ coupling.conj().T
     entered = np.real(entering @ coupling.conj().T) + noise @ noise.T
     own = _own(A, entered + np.real(half + half.conj().T), _sizes(joint))
@@ -340,9 +328,7 @@ def _sizes(joint: _Joint) -> FloatArray:
 def _own(A: FloatArray, load: FloatArray, d: FloatArray) -> FloatArray:
     """Return X of ``X = A X A' + load`` in states of sizes d; the load may be indefinite."""
     As, Qs = A * d / d[:, None], 0.5 * (load + load.T) / d / d[:, None]
-    X = doubled(As, Qs)
-    X = X + doubled(As, As @ X @ As.T + Qs - X)
-    return np.asarray(X * d * d[:, None])
+    return np.asarray(stein(As, Qs) * d * d[:, None])
 
 
 def _dual(joint: _Joint) -> FloatArray:
@@ -355,7 +341,7 @@ def _dual(joint: _Joint) -> FloatArray:
     own = np.array([_own(A.T, np.outer(row, row), sizes) for row in keep])
     right = A.T @ own @ coupling + keep[:, :, None] * see[:, None, :]
     # the columns of all rows side by side, by one Schur form
-    cross = _columns(A.T, np.tile(values, len(keep)), np.hstack(list(right)))
+    cross = shifted_columns(A.T, np.tile(values, len(keep)), np.hstack(list(right)))
     found = []
     for row, mine, across in zip(see, own, np.split(cross, len(keep), axis=1), strict=True):
         back = coupling.conj().T @ across * values

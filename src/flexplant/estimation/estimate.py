@@ -11,7 +11,7 @@ import numpy as np
 
 from ..checks import BoolArray, FloatArray, Value, instance, known_units, real_array, sizes_of
 from ..errors import LabelError, counted, unknown_label, warn
-from ..lti.lyapunov import scale_of
+from ..lti.equations import scale_of
 from ..parallel import one_thread
 from .estimator_channels import estimates
 from .filter_model import FilterModel, Sight, Steady

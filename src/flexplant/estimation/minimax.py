@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg as la
 
 from ..checks import FloatArray, members, whole
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
-from ..lti.lyapunov import DOUBLINGS, scale_of, solve_stein
+from ..lti.equations import powers, scale_of, summed, sylvester
+from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace, System
 from ..parallel import Progress, one_thread, tick
 from ..plant import StandardPlant, UncertainPlant
@@ -261,8 +261,6 @@ def _searched(
 
 #: what a filter may miss of a rigid-body motion that it should follow without error
 _MISSED = 1e-7
-#: norm of a power of the filter, states of unit size, that adds nothing any more
-_VANISHED = 1e-17
 
 
 class Gains(NamedTuple):
@@ -287,14 +285,9 @@ class FilterPart(NamedTuple):
 def filter_part(m: FilterModel, gains: Gains, scale: FloatArray, unit: FloatArray) -> FilterPart:
     """Return the part of the errors that does not depend on the machine."""
     K, L, C0 = gains.K / scale[:, None], gains.L_z / unit, m.C2 * scale
-    power = m.A * scale / scale[:, None] - K @ C0
-    powers, E = [power], m.C1 * scale / unit - L @ C0
-    while not (size := np.linalg.norm(power)) < _VANISHED:
-        if len(powers) > DOUBLINGS or not np.isfinite(size):
-            raise SolverError("the filter is not stable: its error has no variance.")
-        power = power @ power
-        powers.append(power)
-    return FilterPart(K, L, powers, C0, E, _summed(powers, powers, E.T @ E, turned=True))
+    repeated = powers(m.A * scale / scale[:, None] - K @ C0)
+    E = m.C1 * scale / unit - L @ C0
+    return FilterPart(K, L, repeated, C0, E, summed(repeated, repeated, E.T @ E, turned=True))
 
 
 class MachineError(NamedTuple):
@@ -332,10 +325,10 @@ class MachineError(NamedTuple):
         N[:, own:] -= self.driven
         E = self.C1e - part.L @ self.C
         entering = B @ self.X
-        X_oe = _summed(part.powers, powers, entering @ A.T + N[:, own:] @ self.G.T)
+        X_oe = summed(part.powers, powers, entering @ A.T + N[:, own:] @ self.G.T)
         half = A_o @ X_oe @ B.T
-        X_oo = _summed(part.powers, part.powers, entering @ B.T + half + half.T + N @ N.T)
-        Y_oe = _summed(part.powers, powers, A_o.T @ Y @ B - part.E.T @ E, turned=True)
+        X_oo = summed(part.powers, part.powers, entering @ B.T + half + half.T + N @ N.T)
+        Y_oe = summed(part.powers, powers, A_o.T @ Y @ B - part.E.T @ E, turned=True)
         direct = part.L @ self.root
         to_e, to_o = E @ self.X - part.E @ X_oe, E @ X_oe.T - part.E @ X_oo
         value = float(np.sum(to_e * E) - np.sum(to_o * part.E) + np.sum(direct**2))
@@ -351,16 +344,6 @@ class MachineError(NamedTuple):
         while len(self.powers) < count:
             self.powers.append(self.powers[-1] @ self.powers[-1])
         return self.powers
-
-
-def _summed(
-    left: list[FloatArray], right: list[FloatArray], first: FloatArray, *, turned: bool = False
-) -> FloatArray:
-    """Return the sum of ``A^j first B'^j`` (``A'^j first B^j`` when turned) by doubling."""
-    X = first
-    for P, Q in zip(left, right, strict=False):
-        X = X + (P.T @ X @ Q if turned else P @ X @ Q.T)
-    return X
 
 
 def machine_error(
@@ -385,9 +368,9 @@ def machine_error(
     back, driven = np.zeros((m.A.shape[0], rest.size)), np.zeros((m.A.shape[0], G.shape[1]))
     if rigid.size:
         if np.any(er):  # filters of sensors follow the motion too
-            V_e = la.solve_sylvester(A, -rr, -er)
+            V_e = sylvester(A, rr, er)
             C_r, C1_r, G, A = C_r + C @ V_e, C1_r + C1e @ V_e, G - V_e @ G_all[rigid], A - V_e @ re
-        V = la.solve_sylvester(m.A - start.K @ m.C2, -rr, -start.K @ C_r)
+        V = sylvester(m.A - start.K @ m.C2, rr, start.K @ C_r)
         missed = [(m.C2 @ V - C_r) / _size(C_r), (m.C1 @ V - C1_r) / _size(C1_r)]
         if max(float(np.max(np.abs(part))) for part in missed) > _MISSED:
             raise AssumptionError(

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg as la
 from scipy.sparse import csgraph
 
 from ..checks import BoolArray, FloatArray, IntArray
+from ..lti.equations import sylvester
 from ..lti.lyapunov import solve_stein
 from ..lti.recursion import Recursion
 from .filter_model import FilterGains, FilterModel, Sight, Steady, gains
@@ -505,7 +505,7 @@ def stationary_start(model: FilterModel) -> Start:
     A, Q = model.A[np.ix_(rest, rest)], model.Q[np.ix_(rest, rest)]
     entering = model.A[np.ix_(rest, kept)]
     if np.any(entering):
-        V = la.solve_sylvester(A, -model.A[np.ix_(kept, kept)], -entering)
+        V = sylvester(A, model.A[np.ix_(kept, kept)], entering)
         Z[rest] = V
         A = A - V @ model.A[np.ix_(kept, rest)]
         left = np.zeros((rest.size, n))

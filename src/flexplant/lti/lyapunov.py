@@ -1,4 +1,4 @@
-"""Stein and Lyapunov equations by doubling, and the Gramians that follow from them."""
+"""Stein and Lyapunov equations, and the Gramians that follow from them."""
 
 from __future__ import annotations
 
@@ -6,16 +6,12 @@ import numpy as np
 import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, real_array
-from ..errors import ModelError, SolverError
+from ..errors import SolverError
 from ..parallel import one_thread
+from .equations import accumulated, lyapunov, relative, scale_of, stein, symmetric, symmetrised
 from .joining import is_block_diagonal
-from .scaling import even_scale, state_scale
+from .scaling import even_scale, reciprocal, state_scale
 from .statespace import StateSpace, System, as_statespace
-
-#: doublings: 2^60 terms of the series; a slower decay is not distinguished from none
-DOUBLINGS = 60
-#: largest accepted residual, relative to the terms of the equation
-TOLERANCE = 1e-10
 
 
 @one_thread()
@@ -63,13 +59,10 @@ def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
         return Q
     d = scale_of(accumulated(A, Q))
     As, Qs = A * d / d[:, None], Q / d / d[:, None]
-    X = doubled(As, Qs)
-    # one correction with its own residual: the series alone loses digits when A is far from normal
-    X = X + doubled(As, As @ X @ As.T + Qs - X)
+    X = stein(As, Qs)
     residual = np.abs(As @ X @ As.T + Qs - X)
     terms = np.sum(np.abs(As) @ np.abs(X) * np.abs(As), axis=1) + np.abs(Qs.diagonal())
-    size = np.sqrt(np.outer(terms, terms))
-    _check(float(np.max(residual / np.where(size > 0, size, 1.0))), "X = A X A' + Q")
+    _check(float(np.max(residual * reciprocal(np.sqrt(np.outer(terms, terms))))), "X = A X A' + Q")
     return X * d * d[:, None]
 
 
@@ -108,9 +101,9 @@ def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     # A alone: a chain of lags is solved to 1e-16 in the units that make it even, to 1e-11 beside Q
     d = even_scale(A)
     As, Qs = A * d / d[:, None], Q / d / d[:, None]
-    X = solve_continuous(As, Qs)
-    terms = 2 * float(np.linalg.norm(As) * np.linalg.norm(X))
-    _check(float(np.linalg.norm(As @ X + X @ As.T + Qs)) / (terms or 1.0), "A X + X A' + Q = 0")
+    X = lyapunov(As, Qs)
+    size = 2 * float(np.linalg.norm(As) * np.linalg.norm(X))
+    _check(relative(As @ X + X @ As.T + Qs, size), "A X + X A' + Q = 0")
     return X * d * d[:, None]
 
 
@@ -222,86 +215,17 @@ def _modal_gramian(
     X = np.linalg.solve(kron, right).reshape(b, b, 2, 2)
     padded = X.transpose(0, 2, 1, 3).reshape(2 * b, 2 * b)
     keep = np.flatnonzero(real.reshape(-1))
-    return _sym(padded[np.ix_(keep, keep)])
+    return symmetrised(padded[np.ix_(keep, keep)])
 
 
-@np.errstate(over="ignore", invalid="ignore")
-def doubled(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return the sum of ``A^k Q A'^k``, k = 0, 1, ..., by doubling (scaled inputs)."""
-    X, A = Q, A.copy()
-    for _ in range(DOUBLINGS):
-        step = A @ X @ A.T
-        X = _sym(X + step)
-        size, change = np.linalg.norm(X), np.linalg.norm(step)
-        if not np.isfinite(size):
-            break
-        if change <= 1e-17 * size:
-            return X
-        A = A @ A
-    raise SolverError(
-        "the Stein series does not end: A is not strictly stable (an eigenvalue on or outside the "
-        "unit circle, such as a rigid-body mode that is left open)."
-    )
+#: largest residual beside the terms of the equation: rounding leaves 1e-13 of some hundred states
+TOLERANCE = 1e-10
 
 
-def solve_continuous(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return X of ``A X + X A' + Q = 0`` by Schur form and one correction (scaled inputs)."""
-    schur, U = la.schur(A, output="complex")
-    if (largest := float(np.max(schur.diagonal().real))) >= 0:
+def _check(residual: float, equation: str) -> None:
+    if not residual <= TOLERANCE:
         raise SolverError(
-            f"A is not strictly stable (largest real part {largest:.2e} rad/s): "
-            "A X + X A' + Q = 0 has no solution of meaning. Take rigid-body modes out."
-        )
-
-    def solved(right: FloatArray) -> FloatArray:
-        X, scale, _ = la.lapack.ztrsyl(schur, schur, -(U.conj().T @ right @ U), tranb="C")
-        return _sym((U @ (X / scale) @ U.conj().T).real)
-
-    X = solved(Q)
-    return X + solved(A @ X + X @ A.T + Q)
-
-
-@np.errstate(over="ignore", invalid="ignore")
-def accumulated(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return the diagonal of ``sum |A^k Q A'^k|`` over 256 steps (fewer when it grows)."""
-    X = Q.copy()
-    size = max(float(np.linalg.norm(A)), 1.0)
-    for _ in range(8):
-        X = X + A @ X @ A.T
-        A = A @ A
-        if not np.isfinite(A).all() or np.linalg.norm(A) > 1e6 * size:
-            break
-    return np.abs(X.diagonal())
-
-
-def scale_of(variance: FloatArray) -> FloatArray:
-    """Return the square roots as powers of two, which scale without rounding; 1 for zeros."""
-    safe = np.where((variance > 0) & np.isfinite(variance), variance, 1.0)
-    return np.asarray(np.exp2(np.round(0.5 * np.log2(safe))))
-
-
-def symmetric(value: FloatArray, name: str, n: int) -> FloatArray:
-    """Return `value` as a symmetric (n, n) array."""
-    array = real_array(value, name, (n, n))
-    scale = np.sqrt(np.abs(array.diagonal()))
-    bound = 1e-8 * (np.outer(scale, scale) + 1e-4 * np.max(np.abs(array), initial=0.0))
-    if np.any(np.abs(array - array.T) > bound):
-        worst = np.unravel_index(np.argmax(np.abs(array - array.T)), array.shape)
-        raise ModelError(
-            f"{name} must be symmetric, entries {tuple(int(i) for i in worst)} and its mirror are "
-            f"{array[worst]:.6g} and {array.T[worst]:.6g}. Symmetrise it where it is made."
-        )
-    return _sym(array)
-
-
-def _sym(X: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (X + X.T))
-
-
-def _check(relative: float, equation: str) -> None:
-    if not relative <= TOLERANCE:
-        raise SolverError(
-            f"{equation}: the residual is {relative:.1e} of its terms, more than {TOLERANCE:.0e}. "
+            f"{equation}: the residual is {residual:.1e} of its terms, more than {TOLERANCE:.0e}. "
             "A is too close to instability, or too badly conditioned, for double precision."
         )
 

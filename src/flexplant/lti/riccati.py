@@ -21,7 +21,16 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, Value, real_array
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
-from .lyapunov import accumulated, doubled, scale_of, solve_continuous, symmetric
+from .equations import (
+    accumulated,
+    doubled,
+    doubled_riccati,
+    lyapunov,
+    relative,
+    scale_of,
+    symmetric,
+    symmetrised,
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -124,7 +133,7 @@ def solve_dare(
     >>> print(f"{solve_dare(one, one, Q=one, R=one).P[0, 0]:.12f}")  # the golden ratio
     1.618033988750
     """
-    return RiccatiSolution(*solved(_problem(A, C, Q, R, S), Discrete()))
+    return solved(_problem(A, C, Q, R, S), Discrete())
 
 
 def solve_care(
@@ -166,7 +175,7 @@ def solve_care(
     >>> found.P.round(9), found.poles.real.round(9)  # p^2 = 4
     (array([[2.]]), array([-2.]))
     """
-    return RiccatiSolution(*solved(_problem(A, C, Q, R, S), Continuous()))
+    return solved(_problem(A, C, Q, R, S), Continuous())
 
 
 def control_dare(
@@ -296,8 +305,6 @@ def _problem(
 
 #: largest accepted relative residual, and last Newton correction, in states of unit variance
 RESIDUAL, CORRECTION = 1e-9, 1e-7
-#: doublings: a closed loop with 1 - radius above 2^-40 has converged by then
-DOUBLINGS = 50
 NEWTON_STEPS = 10
 
 
@@ -337,7 +344,7 @@ class Discrete:
 
     def doubling(self, p: RiccatiProblem) -> tuple[FloatArray, int]:
         """Return P and the number of doublings."""
-        return _doubling(p.A.T, p.G, p.Q)
+        return doubled_riccati(p.A.T, p.G, p.Q)
 
     def gain(self, p: RiccatiProblem, P: FloatArray) -> FloatArray:
         """Return the gain K (n, p) that belongs to P."""
@@ -364,7 +371,7 @@ class Discrete:
 
     def relative(self, p: RiccatiProblem, residual: FloatArray, P: FloatArray) -> float:
         """Return the size of a residual relative to the terms of the equation."""
-        return float(np.linalg.norm(residual) / (np.linalg.norm(P) or 1.0))
+        return relative(residual, float(np.linalg.norm(P)))
 
     def defect(self, p: RiccatiProblem) -> str:
         """Return which mode makes a stabilising solution impossible, or ""."""
@@ -378,20 +385,20 @@ class Continuous:
 
     def start(self, p: RiccatiProblem) -> FloatArray:
         """Return the first scale of the states, from accumulated noise and information."""
-        A, Q, G, _ = self._cayley(p)
+        A, Q, G = self._cayley(p)
         return _scale(accumulated(A.T, Q), accumulated(A, G))
 
     def doubling(self, p: RiccatiProblem) -> tuple[FloatArray, int]:
         """Return P and the number of doublings."""
-        A, Q, G, _ = self._cayley(p)
-        return _doubling(A, G, Q)
+        A, Q, G = self._cayley(p)
+        return doubled_riccati(A, G, Q)
 
-    def _cayley(self, p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """Return the discrete (control form) problem of the same solution, and the shift."""
+    def _cayley(self, p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the discrete (control form) problem of the same solution: A, Q and G."""
         n = p.A.shape[0]
         moduli = np.abs(la.eigvals(np.block([[p.A.T, -p.G], [-p.Q, -p.A]])))
         typical = np.exp(np.mean(np.log(np.maximum(moduli, 1e-6 * np.max(moduli, initial=1e-300)))))
-        best: tuple[float, tuple[FloatArray, FloatArray, FloatArray, float]] | None = None
+        best: tuple[float, tuple[FloatArray, FloatArray, FloatArray]] | None = None
         for factor in (1.0, 1.7, 0.6, 3.1, 0.33):
             shift = float(typical * factor)
             moved = p.A.T - shift * np.eye(n)
@@ -407,7 +414,7 @@ class Continuous:
                 A = np.eye(n) + 2 * shift * inverse
                 G = 2 * shift * np.linalg.solve(moved, p.G) @ inverse.T
                 Q = 2 * shift * inverse.T @ p.Q @ np.linalg.inv(moved)
-                best = condition, (A, 0.5 * (Q + Q.T), 0.5 * (G + G.T), shift)
+                best = condition, (A, symmetrised(Q), symmetrised(G))
             if best[0] < 1e8:
                 break
         if best is None:
@@ -428,7 +435,7 @@ class Continuous:
 
     def correction(self, closed: FloatArray, residual: FloatArray) -> FloatArray:
         """Return the Newton correction for a residual."""
-        return solve_continuous(closed, residual)
+        return lyapunov(closed, residual)
 
     def stable(self, poles: ComplexArray) -> bool:
         """Return whether the closed loop is strictly stable."""
@@ -440,32 +447,22 @@ class Continuous:
 
     def relative(self, p: RiccatiProblem, residual: FloatArray, P: FloatArray) -> float:
         """Return the size of a residual relative to the terms of the equation."""
-        size = np.linalg.norm(p.A) * np.linalg.norm(P) + np.linalg.norm(p.Q)
-        return float(np.linalg.norm(residual) / (size or 1.0))
+        drift, driven = np.linalg.norm(p.A) * np.linalg.norm(P), np.linalg.norm(p.Q)
+        return relative(residual, float(drift), float(driven))
 
     def defect(self, p: RiccatiProblem) -> str:
         """Return which mode makes a stabilising solution impossible, or ""."""
         return _defect(p, np.real, 0.0)
 
 
-class DoublingResult(NamedTuple):
-    """P, the gain on the caller's outputs, closed-loop poles, relative residual, iterations."""
-
-    P: FloatArray
-    gain: FloatArray
-    poles: ComplexArray
-    residual: float
-    iterations: int
-
-
 @one_thread()
 @np.errstate(over="ignore", invalid="ignore")
-def solved(problem: RiccatiProblem, kind: Discrete | Continuous) -> DoublingResult:
+def solved(problem: RiccatiProblem, kind: Discrete | Continuous) -> RiccatiSolution:
     """Return the stabilising solution, scaled back."""
     n = problem.A.shape[0]
     if not n:
         empty = np.zeros((0, problem.C.shape[0]))
-        return DoublingResult(np.zeros((0, 0)), empty, np.zeros(0, dtype=np.complex128), 0.0, 0)
+        return RiccatiSolution(np.zeros((0, 0)), empty, np.zeros(0, dtype=np.complex128), 0.0, 0)
     d = kind.start(problem)
     first = problem.scaled(d)
     try:
@@ -490,25 +487,7 @@ def solved(problem: RiccatiProblem, kind: Discrete | Continuous) -> DoublingResu
     if kind.slow(poles) and (reason := kind.defect(first)):
         raise SolverError(f"{kind.equation}: {reason}")
     gain = ((K + scaled.gain) * d[:, None]) @ problem.whitening
-    return DoublingResult(P * d * d[:, None], gain, poles, residual, doublings + steps)
-
-
-def _doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, int]:
-    """Return X of ``X = A' X (I + G X)^-1 A + H`` by doubling; quadratic convergence."""
-    eye = np.eye(A.shape[0])
-    for k in range(1, DOUBLINGS + 1):
-        solved = np.linalg.solve(eye + G @ H, np.hstack([A, G]))
-        left, right = np.split(solved, 2, axis=1)
-        step = A.T @ H @ left
-        G = G + A @ right @ A.T
-        G, step = 0.5 * (G + G.T), 0.5 * (step + step.T)
-        H, A = H + step, A @ left
-        size = np.linalg.norm(H)
-        if not np.isfinite(size) or not np.isfinite(G).all():
-            raise SolverError("the doubling overflows: no stabilising solution was found.")
-        if np.linalg.norm(step) <= 1e-15 * size:
-            return H, k
-    raise SolverError(f"no convergence in {DOUBLINGS} doublings: no stabilising solution.")
+    return RiccatiSolution(P * d * d[:, None], gain, poles, residual, doublings + steps)
 
 
 def _newton(
@@ -522,7 +501,7 @@ def _newton(
         size = float(np.linalg.norm(change) / np.linalg.norm(P)) if np.any(P) else 0.0
         # far from the solution the second step may be the larger one: the first one is arbitrary
         if size < last or last > CORRECTION:
-            P = 0.5 * (P + change + (P + change).T)
+            P = symmetrised(P + change)
         if size < 1e-11 or (size >= 0.5 * last and last < CORRECTION):
             break
         last = min(size, last)

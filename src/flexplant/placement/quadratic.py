@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack
 
 from ..checks import FloatArray, IntArray, Value
 from ..errors import SolverError
-from ..lti.lyapunov import doubled
+from ..lti.equations import doubled, doubled_riccati, relative
 from ..lti.riccati import control_dare
 from .criterion import Scorer
 from .tangent import Convex, Tangent
 
-#: a doubling has converged when every diagonal entry grows by less than this: the next one would
-#: add the square of it
-CONVERGED = 1e-8
-DOUBLINGS = 50
 #: largest residual of the Riccati equation, relative, that is taken without another solver
 RESIDUAL = 1e-10
 #: variance beside the largest that counts as none, and the part of a gradient that must agree
@@ -159,37 +155,13 @@ def quadratic(
 
 def solved(A: FloatArray, H: FloatArray, g: FloatArray) -> FloatArray:
     """Return X of ``X = A' (X^-1 + g' g)^-1 A + H``: doubling, its residual checked."""
-    X = _doubled(A, g.T @ g, H)
-    if X is not None:
+    with suppress(SolverError):
+        X = doubled_riccati(A, g.T @ g, H, quick=True)[0]
         residual = A.T @ measured(X, g)[1] @ A + H - X
         # closed loops that are barely stable look converged: `control_dare` distinguishes them
-        if np.linalg.norm(residual) <= RESIDUAL * np.linalg.norm(X):
+        if relative(residual, float(np.linalg.norm(X))) <= RESIDUAL:
             return X
     return control_dare(A, g.T, Q=H, R=np.eye(g.shape[0])).P
-
-
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _doubled(A: FloatArray, G: FloatArray, H: FloatArray) -> FloatArray | None:
-    """Return X by doubling (see `lti.doubling`), or None when it does not converge."""
-    n = A.shape[0]
-    for _ in range(DOUBLINGS):
-        W = G @ H
-        W.flat[:: n + 1] += 1.0
-        _, _, solution, info = lapack.dgesv(W, np.concatenate([A, G], axis=1), 1, 1)
-        if info:
-            return None
-        left, right = solution[:, :n], solution[:, n:]
-        step = A.T @ (H @ left)
-        G = G + A @ right @ A.T
-        H = H + step
-        A = A @ left
-        H, G = 0.5 * (H + H.T), 0.5 * (G + G.T)
-        growth = float(np.max(step.diagonal() / np.maximum(H.diagonal(), 1e-300)))
-        if not np.isfinite(growth):
-            return None
-        if growth < CONVERGED:
-            return H
-    return None
 
 
 def _compressed(g: FloatArray) -> FloatArray:

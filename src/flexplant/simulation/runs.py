@@ -13,6 +13,7 @@ from ..errors import AssumptionError, ModelError
 from ..loop import ClosedLoop
 from ..loop.blocks import joined
 from ..loop.budget import WhiteNoise
+from ..lti.lyapunov import solve_stein
 from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, Recursion, cheapest
 from .nonlinear_elements import Acting, Conditions, Moving
 from .stepping import Buffers, Drawn, Machine, machine, step_through
@@ -352,8 +353,8 @@ def _back(loop: ClosedLoop, A: FloatArray, C: FloatArray, radius: float) -> Floa
     V, S = Z[:, :slow], T[:slow, :slow]
     see = C[:, own] @ V
     see = see / np.abs(see).max(initial=1e-300)
-    inverse = np.linalg.inv(S / radius)
-    X = la.solve_discrete_lyapunov(inverse.T, inverse.T @ see.T @ see @ inverse)
+    inverse = np.asarray(np.linalg.inv(S / radius), dtype=np.float64)
+    X = solve_stein(inverse.T, inverse.T @ see.T @ see @ inverse)
     values = np.linalg.eigvalsh(X)
     if values[0] <= _SEEN * values[-1]:
         raise ModelError(

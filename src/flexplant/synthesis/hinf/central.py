@@ -9,28 +9,13 @@ import numpy as np
 import scipy.linalg as la
 
 from ...checks import FloatArray
-from ...errors import AssumptionError, SolverError
-from ...lti.lyapunov import solve_continuous
+from ...errors import AssumptionError
+from ...lti.equations import OnAxisError, stabilising
 from ...lti.preparation import Prepared
-from ...lti.scaling import state_scale
 from ...lti.statespace import StateSpace
 
-#: relative: what counts as on the imaginary axis; the largest residual of a Riccati equation
-_AXIS, _RESIDUAL = 1e-10, 1e-6
-#: residuals that are examined: Newton's correction between them squares the error
-_CORRECTIONS = 4
-#: relative: a difference of the costs of z that is rounding
-_CANCELLED = 1e-12
 #: sensitivity at infinite frequency below which a controller is taken for one of infinite gain
 _SINGULAR = 1e-3
-
-
-class OnAxisError(Exception):
-    """A Hamiltonian has eigenvalues on the imaginary axis."""
-
-    def __init__(self, omega: FloatArray) -> None:
-        super().__init__(f"eigenvalues at {omega} rad/s")
-        self.omega = omega
 
 
 def riccati_solutions(
@@ -146,15 +131,6 @@ def _missed_by_w(p: Prepared, found: OnAxisError) -> AssumptionError:
     )
 
 
-def _correction(closed: FloatArray, residual: FloatArray, d: FloatArray) -> FloatArray:
-    """Return Newton's correction: what rounding of the invariant subspace left, in states x / d."""
-    try:
-        found = solve_continuous(closed * d[:, None] / d, residual * d * d[:, None])
-    except SolverError as error:
-        raise la.LinAlgError("the solution found does not stabilise.") from error
-    return np.asarray(found / d / d[:, None])
-
-
 def _require_full_columns(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> None:
     """Raise OnAxisError when [A - s I, B; C, D] loses rank at an undamped pole s of A.
 
@@ -174,60 +150,6 @@ def _listed(p: Prepared, found: OnAxisError) -> str:
     omega = float(np.min(found.omega))
     # a double pole at zero comes out of rounding beside it
     return f"{p.frequency(omega if omega > 1e-6 else 0.0):.3g} Hz"
-
-
-def stabilising(
-    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return X and F of ``A'X + X A - (X B + S) R^-1 (B'X + S') + Q = 0``, A + B F stable.
-
-    R is indefinite. By the stable invariant subspace of the Hamiltonian: unlike doubling it does
-    not need X to be reached from zero, which an indefinite R does not guarantee.
-    """
-    n = A.shape[0]
-    inner = np.linalg.solve(R, np.hstack([B.T, S.T]))
-    BR, SR = inner[:, :n], inner[:, n:]
-    if not n:
-        return np.zeros((0, 0)), np.asarray(-SR)
-    drift, spread = A - B @ SR, B @ BR
-    rest = Q - S @ SR
-    # units of the states from A, B and C together, and one of the adjoint states: still Hamiltonian
-    d = state_scale(A, B, np.sqrt(np.abs(Q.diagonal()))[None, :])
-    scaled = (
-        drift * d / d[:, None],
-        spread / d / d[:, None],
-        rest * d * d[:, None],
-        Q * d * d[:, None],
-    )
-    inner_size, reach, cost, own = (float(np.linalg.norm(part)) for part in scaled)
-    if cost <= _CANCELLED * own:  # nothing but rounding: X has the size of drift over spread
-        cost = inner_size**2 / reach if reach else 0.0
-    unit = float(2.0 ** np.round(0.5 * np.log2(cost / reach))) if cost and reach else 1.0
-    scale = np.concatenate([d, unit / d])
-    hamiltonian = np.block([[drift, -spread], [-rest, -drift.T]])
-    balanced = hamiltonian * scale / scale[:, None]
-    triangle, vectors, count = la.schur(balanced, sort="lhp")
-    values = la.eigvals(triangle)
-    margin = _AXIS * (np.abs(values) + 1e-2 * np.linalg.norm(balanced))
-    on_axis = np.abs(values.real) <= margin
-    if count != n or np.any(on_axis):
-        near = np.argsort(np.abs(values.real))[:2]
-        raise OnAxisError(np.unique(np.abs(values.imag[on_axis if np.any(on_axis) else near])))
-    basis = vectors[:, :n] * scale[:, None]
-    top, bottom = basis[:n], basis[n:]
-    X = np.linalg.solve(top.T, bottom.T).T
-    X = 0.5 * (X + X.T)
-    for _ in range(_CORRECTIONS):
-        moved, bent = drift.T @ X, X @ spread @ X
-        residual = moved + moved.T - bent + rest
-        # Q itself: where it cancels with S R^-1 S' the solution is zero but for rounding
-        sizes = (float(np.linalg.norm(term)) for term in (moved, bent, Q))
-        if np.linalg.norm(residual) <= _RESIDUAL * sum(sizes):
-            break
-        X = X + _correction((drift - spread @ X).T, residual, d)
-    else:
-        raise la.LinAlgError("the stabilising solution is too inaccurate.")
-    return X, np.asarray(-(BR @ X + SR))
 
 
 def indefinite(X: FloatArray, size: float) -> bool:

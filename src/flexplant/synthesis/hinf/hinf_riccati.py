@@ -10,6 +10,7 @@ import scipy.linalg as la
 
 from ...checks import Value, positive
 from ...errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, SolverError
+from ...lti.equations import OnAxisError
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
 from ...lti.preparation import Prepared
@@ -18,7 +19,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ..controller import SolvedController
 from ..reach import beyond_rounding
-from .central import OnAxisError, central, indefinite, quadratic, riccati_solutions
+from .central import central, indefinite, quadratic, riccati_solutions
 from .lower_bound import parrott
 from .singular import made_regular, missing_ranks, require_ranks
 
@@ -123,7 +124,7 @@ class Riccati(Value):
         try:
             least = quadratic(problem)
             unit = _seen(problem, least)
-        except la.LinAlgError:
+        except (la.LinAlgError, SolverError):
             unit = np.inf
         if not np.isfinite(unit):
             raise SolverError(
@@ -263,7 +264,7 @@ def _attempt(problem: Prepared, gamma: float) -> _Attempt:
         return _Attempt(
             None, any(_bound_at(problem, w) >= gamma * (1 - _SLACK) for w in found.omega)
         )
-    except (la.LinAlgError, ValueError):
+    except (la.LinAlgError, ValueError, SolverError):
         return _Attempt(None)
     coupling = float(np.max(la.eigvals(X @ Y).real, initial=0.0))
     speed = float(np.linalg.norm(problem.A)) or 1.0

@@ -9,12 +9,13 @@ import numpy as np
 import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray
-from ...errors import FlexplantError
+from ...errors import FlexplantError, SolverError
+from ...lti.equations import OnAxisError, stabilising
 from ...lti.grid import highest, resonance_grid
 from ...lti.preparation import Prepared
 from ...lti.responses import responses
 from ..lmi.structured_lmi import StructuredLmi
-from .central import OnAxisError, indefinite, stabilising
+from .central import indefinite
 
 #: points of the sweep, and times that it is refined
 _POINTS, _REFINEMENTS = 200, 2
@@ -207,7 +208,7 @@ def _refuted(sides: tuple[FullInformation, FullInformation], gamma: float) -> bo
     for one in sides:
         try:
             X = one.value(gamma)
-        except (OnAxisError, la.LinAlgError):
+        except (OnAxisError, SolverError, la.LinAlgError):
             continue
         if X is None:
             return True

@@ -1,0 +1,246 @@
+"""The solvers of matrix equations that all rooms share: Stein, Lyapunov, Sylvester, Riccati.
+
+They take states in sizes near one (`scale_of`), correct a solution with its own residual, and
+leave to the caller which residual is small enough (`relative`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg as la
+
+from ..checks import ComplexArray, FloatArray, real_array
+from ..errors import ModelError, SolverError
+from .scaling import state_scale
+
+_Schur = tuple[ComplexArray, ComplexArray]
+#: doublings: 2^60 terms of a series; a slower decay is not distinguished from none
+DOUBLINGS = 60
+#: a term of this part of its sum is below rounding (2e-16), and so is all that follows
+_LAST = 1e-17
+#: a doubled Riccati equation has converged: the next term would be the square of this
+_CONVERGED, _CONVERGED_QUICKLY = 1e-15, 1e-8
+#: relative: eigenvalues of a Hamiltonian count as on the imaginary axis; Q - S R^-1 S' is rounding
+_AXIS, _CANCELLED = 1e-10, 1e-12
+#: largest residual of an equation with indefinite R: near the least gamma X grows without bound
+_OFF = 1e-6
+#: residuals that are examined: Newton's correction between them squares the error
+_CORRECTIONS = 4
+
+
+def relative(residual: FloatArray, *sizes: float) -> float:
+    """Return the norm of a residual beside the sizes of the terms of its equation."""
+    return float(np.linalg.norm(residual)) / (sum(sizes) or 1.0)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def doubled(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return the sum of ``A^k Q A'^k``, k = 0, 1, ..., by doubling."""
+    X, A = Q, A.copy()
+    for _ in range(DOUBLINGS):
+        step = A @ X @ A.T
+        X = symmetrised(X + step)
+        size, change = np.linalg.norm(X), np.linalg.norm(step)
+        if not np.isfinite(size):
+            break
+        if change <= _LAST * size:
+            return X
+        A = A @ A
+    raise SolverError(
+        "the Stein series does not end: A is not strictly stable (an eigenvalue on or outside the "
+        "unit circle, such as a rigid-body mode that is left open)."
+    )
+
+
+def stein(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return X of ``X = A X A' + Q``: the series loses digits when A is far from normal."""
+    X = doubled(A, Q)
+    return X + doubled(A, A @ X @ A.T + Q - X)
+
+
+def powers(A: FloatArray) -> list[FloatArray]:
+    """Return A, A^2, A^4, ... until they vanish: for many Stein equations of one A (`summed`)."""
+    found = [A]
+    while not (size := np.linalg.norm(found[-1])) < _LAST:
+        if len(found) > DOUBLINGS or not np.isfinite(size):
+            raise SolverError("A is not strictly stable: the powers of A do not vanish.")
+        found.append(found[-1] @ found[-1])
+    return found
+
+
+def summed(
+    left: list[FloatArray], right: list[FloatArray], first: FloatArray, *, turned: bool = False
+) -> FloatArray:
+    """Return the sum of ``A^j first B'^j`` (``A'^j first B^j`` when turned) by doubling."""
+    X = first
+    for P, Q in zip(left, right, strict=False):
+        X = X + (P.T @ X @ Q if turned else P @ X @ Q.T)
+    return X
+
+
+def sylvester(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
+    """Return X of ``A X - X B + C = 0``, by Schur forms and one correction."""
+    if not C.size:
+        return C
+    forms = (la.schur(A, output="complex"), la.schur(B, output="complex"))
+    X = _by_schur(forms, C)
+    return X + _by_schur(forms, A @ X - X @ B + C)
+
+
+def lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return X of ``A X + X A' + Q = 0`` with A stable, by its Schur form and one correction."""
+    form = la.schur(A, output="complex")
+    if (largest := float(np.max(form[0].diagonal().real))) >= 0:
+        raise SolverError(
+            f"A is not strictly stable (largest real part {largest:.2e} rad/s): "
+            "A X + X A' + Q = 0 has no solution of meaning. Take rigid-body modes out."
+        )
+    X = symmetrised(_by_schur((form, None), Q))
+    return X + symmetrised(_by_schur((form, None), A @ X + X @ A.T + Q))
+
+
+def _by_schur(forms: tuple[_Schur, _Schur | None], C: FloatArray) -> FloatArray:
+    """Solve the Sylvester equation once; without a second Schur form B is ``-A'``."""
+    (T, U), (S, V) = forms[0], forms[1] or forms[0]
+    kind = {"isgn": -1} if forms[1] else {"tranb": "C"}
+    X, scale, _ = la.lapack.ztrsyl(T, S, -(U.conj().T @ C @ V), **kind)
+    return np.asarray((U @ (X / scale) @ V.conj().T).real)
+
+
+def shifted_columns(A: FloatArray, shifts: ComplexArray, right: ComplexArray) -> ComplexArray:
+    """Return X with ``(I - shifts_j A) X_j = right_j``, by one Schur form of A."""
+    if not A.size:
+        return right
+    schur, U = la.schur(A.astype(np.complex128), output="complex")
+    turned = U.conj().T @ right
+    X = np.empty_like(turned)
+    for i in range(A.shape[0] - 1, -1, -1):
+        rest = shifts * (schur[i, i + 1 :] @ X[i + 1 :])
+        X[i] = (turned[i] + rest) / (1 - shifts * schur[i, i])
+    return np.asarray(U @ X)
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def doubled_riccati(
+    A: FloatArray, G: FloatArray, H: FloatArray, *, quick: bool = False
+) -> tuple[FloatArray, int]:
+    """Return X of ``X = A' X (I + G X)^-1 A + H`` and the number of doublings [Chu2004]_.
+
+    Quick: converged once no variance grows by 1e-8, which a closed loop that is barely
+    stable may seem to reach: check the residual.
+    """
+    n = A.shape[0]
+    for k in range(1, DOUBLINGS + 1):
+        inner = G @ H
+        inner.flat[:: n + 1] += 1.0
+        _, _, solution, info = la.lapack.dgesv(inner, np.concatenate([A, G], axis=1), 1, 1)
+        if info:
+            raise SolverError("the doubling is singular: no stabilising solution was found.")
+        left, right = solution[:, :n], solution[:, n:]
+        step = A.T @ (H @ left)
+        G, H, A = symmetrised(G + A @ right @ A.T), symmetrised(H + step), A @ left
+        size = float(np.linalg.norm(H))
+        if not np.isfinite(size) or not np.isfinite(G).all():
+            raise SolverError("the doubling overflows: no stabilising solution was found.")
+        if np.linalg.norm(step) <= _CONVERGED * size:
+            return H, k
+        if quick and np.all(step.diagonal() <= _CONVERGED_QUICKLY * H.diagonal()):
+            return H, k
+    raise SolverError(f"no convergence in {DOUBLINGS} doublings: no stabilising solution.")
+
+
+class OnAxisError(Exception):
+    """A Hamiltonian has eigenvalues on the imaginary axis."""
+
+    def __init__(self, omega: FloatArray) -> None:
+        super().__init__(f"eigenvalues at {omega} rad/s")
+        self.omega = omega
+
+
+def stabilising(
+    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return X and F of ``A'X + X A - (X B + S) R^-1 (B'X + S') + Q = 0``, A + B F stable.
+
+    R is indefinite. By the stable invariant subspace of the Hamiltonian: unlike doubling it does
+    not need X to be reached from zero, which an indefinite R does not guarantee.
+    """
+    n = A.shape[0]
+    inner = np.linalg.solve(R, np.hstack([B.T, S.T]))
+    BR, SR = inner[:, :n], inner[:, n:]
+    if not n:
+        return np.zeros((0, 0)), np.asarray(-SR)
+    drift, spread = A - B @ SR, B @ BR
+    rest = Q - S @ SR
+    # units of the states from A, B and C together, and one of the adjoint states: still Hamiltonian
+    d = state_scale(A, B, np.sqrt(np.abs(Q.diagonal()))[None, :])
+    scaled = (
+        drift * d / d[:, None],
+        spread / d / d[:, None],
+        rest * d * d[:, None],
+        Q * d * d[:, None],
+    )
+    inner_size, reach, cost, own = (float(np.linalg.norm(part)) for part in scaled)
+    if cost <= _CANCELLED * own:  # nothing but rounding: X has the size of drift over spread
+        cost = inner_size**2 / reach if reach else 0.0
+    unit = float(2.0 ** np.round(0.5 * np.log2(cost / reach))) if cost and reach else 1.0
+    scale = np.concatenate([d, unit / d])
+    hamiltonian = np.block([[drift, -spread], [-rest, -drift.T]])
+    balanced = hamiltonian * scale / scale[:, None]
+    triangle, vectors, count = la.schur(balanced, sort="lhp")
+    values = la.eigvals(triangle)
+    margin = _AXIS * (np.abs(values) + 1e-2 * np.linalg.norm(balanced))
+    on_axis = np.abs(values.real) <= margin
+    if count != n or np.any(on_axis):
+        near = np.argsort(np.abs(values.real))[:2]
+        raise OnAxisError(np.unique(np.abs(values.imag[on_axis if np.any(on_axis) else near])))
+    basis = vectors[:, :n] * scale[:, None]
+    top, bottom = basis[:n], basis[n:]
+    X = symmetrised(np.linalg.solve(top.T, bottom.T).T)
+    for _ in range(_CORRECTIONS):
+        moved, bent = drift.T @ X, X @ spread @ X
+        residual = moved + moved.T - bent + rest
+        # Q itself: where it cancels with S R^-1 S' the solution is zero but for rounding
+        if relative(residual, *(float(np.linalg.norm(term)) for term in (moved, bent, Q))) <= _OFF:
+            return X, np.asarray(-(BR @ X + SR))
+        closed = (drift - spread @ X).T
+        X = X + lyapunov(closed * d[:, None] / d, residual * d * d[:, None]) / d / d[:, None]
+    raise SolverError("the stabilising solution is too inaccurate.")
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def accumulated(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return the diagonal of ``sum |A^k Q A'^k|`` over 256 steps (fewer when it grows)."""
+    X = Q.copy()
+    size = max(float(np.linalg.norm(A)), 1.0)
+    for _ in range(8):
+        X = X + A @ X @ A.T
+        A = A @ A
+        if not np.isfinite(A).all() or np.linalg.norm(A) > 1e6 * size:
+            break
+    return np.abs(X.diagonal())
+
+
+def scale_of(variance: FloatArray) -> FloatArray:
+    """Return the square roots as powers of two, which scale without rounding; 1 for zeros."""
+    safe = np.where((variance > 0) & np.isfinite(variance), variance, 1.0)
+    return np.asarray(np.exp2(np.round(0.5 * np.log2(safe))))
+
+
+def symmetric(value: FloatArray, name: str, n: int) -> FloatArray:
+    """Return `value` as a symmetric (n, n) array."""
+    array = real_array(value, name, (n, n))
+    scale = np.sqrt(np.abs(array.diagonal()))
+    bound = 1e-8 * (np.outer(scale, scale) + 1e-4 * np.max(np.abs(array), initial=0.0))
+    if np.any(np.abs(array - array.T) > bound):
+        worst = np.unravel_index(np.argmax(np.abs(array - array.T)), array.shape)
+        raise ModelError(
+            f"{name} must be symmetric, entries {tuple(int(i) for i in worst)} and its mirror are "
+            f"{array[worst]:.6g} and {array.T[worst]:.6g}. Symmetrise it where it is made."
+        )
+    return symmetrised(array)
+
+
+def symmetrised(X: FloatArray) -> FloatArray:
+    """Return the symmetric part of a matrix."""
+    return np.asarray(0.5 * (X + X.T))
