@@ -133,7 +133,7 @@ def solve_dare(
     >>> print(f"{solve_dare(one, one, Q=one, R=one).P[0, 0]:.12f}")  # the golden ratio
     1.618033988750
     """
-    return solved(_problem(A, C, Q, R, S), Discrete())
+    return _solved(_problem(A, C, Q, R, S, discrete=True))
 
 
 def solve_care(
@@ -175,7 +175,7 @@ def solve_care(
     >>> found.P.round(9), found.poles.real.round(9)  # p^2 = 4
     (array([[2.]]), array([-2.]))
     """
-    return solved(_problem(A, C, Q, R, S), Continuous())
+    return _solved(_problem(A, C, Q, R, S, discrete=False))
 
 
 def control_dare(
@@ -274,7 +274,13 @@ def _dual(
 
 
 def _problem(
-    A: FloatArray, C: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray | None
+    A: FloatArray,
+    C: FloatArray,
+    Q: FloatArray,
+    R: FloatArray,
+    S: FloatArray | None,
+    *,
+    discrete: bool,
 ) -> RiccatiProblem:
     A = real_array(A, "A", (None, None))
     n = A.shape[0]
@@ -300,12 +306,14 @@ def _problem(
     J = np.sign(values)
     C, cross = whitening @ C, cross @ whitening.T
     shift = cross * J
-    return RiccatiProblem(A - shift @ C, C, Q - shift @ cross.T, J, shift, whitening)
+    return RiccatiProblem(A - shift @ C, C, Q - shift @ cross.T, J, shift, whitening, discrete)
 
 
 #: largest accepted relative residual, and last Newton correction, in states of unit variance
 RESIDUAL, CORRECTION = 1e-9, 1e-7
-NEWTON_STEPS = 10
+#: relative: a correction that the next one would square to below rounding ends Newton's steps;
+#: they double the digits, so that ten are more than a solution from the doubling can need
+SETTLED, NEWTON_STEPS = 1e-11, 10
 
 
 class RiccatiProblem(NamedTuple):
@@ -317,6 +325,7 @@ class RiccatiProblem(NamedTuple):
     J: FloatArray  # (p,) of +1 and -1
     gain: FloatArray  # (n, p), what the cross term adds to the gain
     whitening: FloatArray  # (p, p), whitened y = whitening y
+    discrete: bool
 
     @property
     def G(self) -> FloatArray:
@@ -333,176 +342,120 @@ class RiccatiProblem(NamedTuple):
         )
 
 
-class Discrete:
-    """The steps of the solution for the discrete equation."""
-
-    equation = "discrete Riccati equation"
-
-    def start(self, p: RiccatiProblem) -> FloatArray:
-        """Return the first scale of the states, from accumulated noise and information."""
-        return _scale(accumulated(p.A, p.Q), accumulated(p.A.T, p.G))
-
-    def doubling(self, p: RiccatiProblem) -> tuple[FloatArray, int]:
-        """Return P and the number of doublings."""
-        return doubled_riccati(p.A.T, p.G, p.Q)
-
-    def gain(self, p: RiccatiProblem, P: FloatArray) -> FloatArray:
-        """Return the gain K (n, p) that belongs to P."""
-        inner = (p.C @ P) @ p.C.T + np.diag(p.J)
-        return np.asarray(la.solve(inner, p.C @ P @ p.A.T, assume_a="sym").T)
-
-    def residual(self, p: RiccatiProblem, P: FloatArray, K: FloatArray) -> FloatArray:
-        """Return the residual of the equation, given the gain of P."""
-        # Joseph form: a sum of squares in P and J, so rounding stays relative to P
-        closed = p.A - K @ p.C
-        return np.asarray(closed @ P @ closed.T + (K * p.J) @ K.T + p.Q - P)
-
-    def correction(self, closed: FloatArray, residual: FloatArray) -> FloatArray:
-        """Return the Newton correction for a residual."""
-        return doubled(closed, residual)
-
-    def stable(self, poles: ComplexArray) -> bool:
-        """Return whether the closed loop is strictly stable."""
-        return bool(np.max(np.abs(poles), initial=0.0) < 1.0)
-
-    def slow(self, poles: ComplexArray) -> bool:
-        """Return whether the closed loop is so slow that its stability may be rounding."""
-        return bool(np.max(np.abs(poles)) > 0.99)
-
-    def relative(self, p: RiccatiProblem, residual: FloatArray, P: FloatArray) -> float:
-        """Return the size of a residual relative to the terms of the equation."""
-        return relative(residual, float(np.linalg.norm(P)))
-
-    def defect(self, p: RiccatiProblem) -> str:
-        """Return which mode makes a stabilising solution impossible, or ""."""
-        return _defect(p, lambda s: np.abs(s) - 1.0, 1.0)
+def _growth(p: RiccatiProblem, poles: ComplexArray) -> FloatArray:
+    """Return by how much poles lie beyond the limit of stability."""
+    return np.asarray(np.abs(poles) - 1.0 if p.discrete else poles.real)
 
 
-class Continuous:
-    """The steps of the solution for the continuous equation."""
+def _slow(p: RiccatiProblem, poles: ComplexArray) -> bool:
+    """Return whether the closed loop is so slow that its stability may be rounding."""
+    size = 1.0 if p.discrete else float(np.max(np.abs(poles)))
+    return bool(np.max(_growth(p, poles)) > -0.01 * size)
 
-    equation = "continuous Riccati equation"
 
-    def start(self, p: RiccatiProblem) -> FloatArray:
-        """Return the first scale of the states, from accumulated noise and information."""
-        A, Q, G = self._cayley(p)
-        return _scale(accumulated(A.T, Q), accumulated(A, G))
-
-    def doubling(self, p: RiccatiProblem) -> tuple[FloatArray, int]:
-        """Return P and the number of doublings."""
-        A, Q, G = self._cayley(p)
-        return doubled_riccati(A, G, Q)
-
-    def _cayley(self, p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the discrete (control form) problem of the same solution: A, Q and G."""
-        n = p.A.shape[0]
-        moduli = np.abs(la.eigvals(np.block([[p.A.T, -p.G], [-p.Q, -p.A]])))
-        typical = np.exp(np.mean(np.log(np.maximum(moduli, 1e-6 * np.max(moduli, initial=1e-300)))))
-        best: tuple[float, tuple[FloatArray, FloatArray, FloatArray]] | None = None
-        for factor in (1.0, 1.7, 0.6, 3.1, 0.33):
-            shift = float(typical * factor)
-            moved = p.A.T - shift * np.eye(n)
-            try:
-                inner = moved + p.G @ np.linalg.solve(moved.T, p.Q)
-                condition = float(np.linalg.cond(moved) * np.linalg.cond(inner))
-            except np.linalg.LinAlgError:
-                continue  # a pole lies at the shift: the next one misses it
-            if not np.isfinite(condition):
-                continue
-            if best is None or condition < best[0]:
-                inverse = np.linalg.inv(inner)
-                A = np.eye(n) + 2 * shift * inverse
-                G = 2 * shift * np.linalg.solve(moved, p.G) @ inverse.T
-                Q = 2 * shift * inverse.T @ p.Q @ np.linalg.inv(moved)
-                best = condition, (A, symmetrised(Q), symmetrised(G))
-            if best[0] < 1e8:
-                break
-        if best is None:
-            raise SolverError(
-                "continuous Riccati equation: no shift makes its Cayley transform regular, so it "
-                "has no stabilising solution. Is an unstable mode without input or output?"
-            )
-        return best[1]
-
-    def gain(self, p: RiccatiProblem, P: FloatArray) -> FloatArray:
-        """Return the gain K (n, p) that belongs to P."""
+def _gain(p: RiccatiProblem, P: FloatArray) -> FloatArray:
+    """Return the gain K (n, p) that belongs to P."""
+    if not p.discrete:
         return np.asarray(P @ p.C.T * p.J)
+    inner = (p.C @ P) @ p.C.T + np.diag(p.J)
+    return np.asarray(la.solve(inner, p.C @ P @ p.A.T, assume_a="sym").T)
 
-    def residual(self, p: RiccatiProblem, P: FloatArray, K: FloatArray) -> FloatArray:
-        """Return the residual of the equation, given the gain of P."""
-        closed = p.A - K @ p.C
-        return np.asarray(closed @ P + P @ closed.T + (K * p.J) @ K.T + p.Q)
 
-    def correction(self, closed: FloatArray, residual: FloatArray) -> FloatArray:
-        """Return the Newton correction for a residual."""
-        return lyapunov(closed, residual)
+def _residual(p: RiccatiProblem, P: FloatArray, K: FloatArray) -> tuple[FloatArray, float]:
+    """Return the residual of the equation, given the gain of P, and its size beside the terms."""
+    closed = p.A - K @ p.C
+    # Joseph form: a sum of squares in P and J, so rounding stays relative to P
+    driven = (K * p.J) @ K.T + p.Q
+    size = float(np.linalg.norm(P))
+    if p.discrete:
+        residual = closed @ P @ closed.T + driven - P
+        return residual, relative(residual, size)
+    residual = closed @ P + P @ closed.T + driven
+    return residual, relative(residual, float(np.linalg.norm(p.A)) * size, float(la.norm(p.Q)))
 
-    def stable(self, poles: ComplexArray) -> bool:
-        """Return whether the closed loop is strictly stable."""
-        return bool(np.max(poles.real, initial=-np.inf) < 0.0)
 
-    def slow(self, poles: ComplexArray) -> bool:
-        """Return whether the closed loop is so slow that its stability may be rounding."""
-        return bool(np.max(poles.real) > -0.01 * np.max(np.abs(poles)))
-
-    def relative(self, p: RiccatiProblem, residual: FloatArray, P: FloatArray) -> float:
-        """Return the size of a residual relative to the terms of the equation."""
-        drift, driven = np.linalg.norm(p.A) * np.linalg.norm(P), np.linalg.norm(p.Q)
-        return relative(residual, float(drift), float(driven))
-
-    def defect(self, p: RiccatiProblem) -> str:
-        """Return which mode makes a stabilising solution impossible, or ""."""
-        return _defect(p, np.real, 0.0)
+def _sampled(p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return A, G, Q of the discrete equation (control form) of the same solution, by Cayley."""
+    if p.discrete:
+        return p.A.T, p.G, p.Q
+    n = p.A.shape[0]
+    moduli = np.abs(la.eigvals(np.block([[p.A.T, -p.G], [-p.Q, -p.A]])))
+    typical = np.exp(np.mean(np.log(np.maximum(moduli, 1e-6 * np.max(moduli, initial=1e-300)))))
+    best: tuple[float, tuple[FloatArray, FloatArray, FloatArray]] | None = None
+    for factor in (1.0, 1.7, 0.6, 3.1, 0.33):
+        shift = float(typical * factor)
+        moved = p.A.T - shift * np.eye(n)
+        try:
+            inner = moved + p.G @ np.linalg.solve(moved.T, p.Q)
+            condition = float(np.linalg.cond(moved) * np.linalg.cond(inner))
+        except np.linalg.LinAlgError:
+            continue  # a pole lies at the shift: the next one misses it
+        if not np.isfinite(condition):
+            continue
+        if best is None or condition < best[0]:
+            inverse = np.linalg.inv(inner)
+            A = np.eye(n) + 2 * shift * inverse
+            G = 2 * shift * np.linalg.solve(moved, p.G) @ inverse.T
+            Q = 2 * shift * inverse.T @ p.Q @ np.linalg.inv(moved)
+            best = condition, (A, symmetrised(G), symmetrised(Q))
+        if best[0] < 1e8:
+            break
+    if best is None:
+        raise SolverError(
+            "continuous Riccati equation: no shift makes its Cayley transform regular, so it "
+            "has no stabilising solution. Is an unstable mode without input or output?"
+        )
+    return best[1]
 
 
 @one_thread()
 @np.errstate(over="ignore", invalid="ignore")
-def solved(problem: RiccatiProblem, kind: Discrete | Continuous) -> RiccatiSolution:
+def _solved(problem: RiccatiProblem) -> RiccatiSolution:
     """Return the stabilising solution, scaled back."""
     n = problem.A.shape[0]
     if not n:
         empty = np.zeros((0, problem.C.shape[0]))
         return RiccatiSolution(np.zeros((0, 0)), empty, np.zeros(0, dtype=np.complex128), 0.0, 0)
-    d = kind.start(problem)
+    equation = f"{'discrete' if problem.discrete else 'continuous'} Riccati equation"
+    A, G, Q = _sampled(problem)
+    d = _scale(accumulated(A.T, Q), accumulated(A, G))
     first = problem.scaled(d)
     try:
-        P, doublings = kind.doubling(first)
+        P, doublings = doubled_riccati(*_sampled(first))
         # to unit variances: there residual and correction are relative
         unit = scale_of(np.abs(P.diagonal()))
         d, P = d * unit, P / unit / unit[:, None]
         scaled = problem.scaled(d)
-        P, K, residual, steps = _newton(scaled, kind, P)
+        P, K, residual, steps = _newton(scaled, P)
     except (SolverError, np.linalg.LinAlgError) as error:
-        reason = kind.defect(first) or str(error)
-        raise SolverError(f"{kind.equation}: {reason}") from error
+        raise SolverError(f"{equation}: {_defect(first) or error}") from error
     poles = np.asarray(la.eigvals(scaled.A - K @ scaled.C), dtype=np.complex128)
-    if not kind.stable(poles) or residual > RESIDUAL:
-        reason = kind.defect(first) or (
+    stable = np.max(_growth(first, poles)) < 0.0
+    if not stable or not residual <= RESIDUAL:
+        reason = _defect(first) or (
             f"the residual is {residual:.1e} of P (allowed {RESIDUAL:.0e}), the closed loop is "
-            f"{'' if kind.stable(poles) else 'not '}strictly stable. The problem is too badly "
+            f"{'' if stable else 'not '}strictly stable. The problem is too badly "
             "conditioned for double precision."
         )
-        raise SolverError(f"{kind.equation}: {reason}")
+        raise SolverError(f"{equation}: {reason}")
     # noise that misses a rigid-body mode but for rounding gives a slow, meaningless loop
-    if kind.slow(poles) and (reason := kind.defect(first)):
-        raise SolverError(f"{kind.equation}: {reason}")
+    if _slow(first, poles) and (reason := _defect(first)):
+        raise SolverError(f"{equation}: {reason}")
     gain = ((K + scaled.gain) * d[:, None]) @ problem.whitening
     return RiccatiSolution(P * d * d[:, None], gain, poles, residual, doublings + steps)
 
 
-def _newton(
-    p: RiccatiProblem, kind: Discrete | Continuous, P: FloatArray
-) -> tuple[FloatArray, FloatArray, float, int]:
+def _newton(p: RiccatiProblem, P: FloatArray) -> tuple[FloatArray, FloatArray, float, int]:
     """Correct P by Newton (Kleinman) steps until the correction is rounding."""
-    last = np.inf
+    last, correction = np.inf, doubled if p.discrete else lyapunov
     for taken in range(1, NEWTON_STEPS + 1):  # noqa: B007 - its last value is returned
-        K = kind.gain(p, P)
-        change = kind.correction(p.A - K @ p.C, kind.residual(p, P, K))
+        K = _gain(p, P)
+        change = correction(p.A - K @ p.C, _residual(p, P, K)[0])
         size = float(np.linalg.norm(change) / np.linalg.norm(P)) if np.any(P) else 0.0
         # far from the solution the second step may be the larger one: the first one is arbitrary
         if size < last or last > CORRECTION:
             P = symmetrised(P + change)
-        if size < 1e-11 or (size >= 0.5 * last and last < CORRECTION):
+        if size < SETTLED or (size >= 0.5 * last and last < CORRECTION):
             break
         last = min(size, last)
     else:
@@ -510,8 +463,8 @@ def _newton(
             f"the solution is determined to {last:.1e} only (Newton steps stall there): a mode is "
             "hardly excited by Q, or hardly seen in the outputs."
         )
-    K = kind.gain(p, P)
-    return P, K, kind.relative(p, kind.residual(p, P, K), P), taken
+    K = _gain(p, P)
+    return P, K, _residual(p, P, K)[1], taken
 
 
 def _scale(states: FloatArray, information: FloatArray) -> FloatArray:
@@ -524,13 +477,12 @@ def _scale(states: FloatArray, information: FloatArray) -> FloatArray:
     return scale_of(variance)
 
 
-def _defect(
-    p: RiccatiProblem, growth: Callable[[ComplexArray], FloatArray], marginal: float
-) -> str:
+def _defect(p: RiccatiProblem) -> str:
     """Return why no strictly stabilising solution exists, or "" (Popov-Belevitch-Hautus)."""
+    marginal = 1.0 if p.discrete else 0.0
     lam = la.eigvals(p.A).astype(np.complex128)
-    size = max(1.0 if marginal else 0.0, float(np.max(np.abs(lam), initial=0.0)))
-    critical = lam[growth(lam) >= -1e-9 * size]
+    size = max(marginal, float(np.max(np.abs(lam), initial=0.0)))
+    critical = lam[_growth(p, lam) >= -1e-9 * size]
     # a Jordan block of a rigid-body mode comes out of eigvals at the root of the rounding
     near = np.abs(critical - marginal) < 1e-6 * size
     distinct = [complex(marginal)] if near.any() else []
@@ -546,7 +498,7 @@ def _defect(
                 "the outputs (reached by the inputs, in the control form), so their error is "
                 "unbounded. Add or move sensors (actuators)."
             )
-        missed = _unseen(shifted.conj().T, p.Q) if growth(np.array(value)) < 1e-6 * size else 0
+        missed = _unseen(shifted.conj().T, p.Q) if _growth(p, np.array(value)) < 1e-6 * size else 0
         if missed:
             return (
                 f"{missed} mode(s) of A at {value:.6g} (rigid-body) are not excited by the noise Q "
