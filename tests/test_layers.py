@@ -15,7 +15,8 @@ ROOT = Path(flexplant.__file__).parent
 ROOMS = (
     (
         *("errors", "rooms", "checks", "store", "certificates", "versions", "parallel"),
-        *("fingerprint", "work", "dof_columns", "labels", "bibliography", "foreign_names"),
+        *("tolerances", "fingerprint", "work", "dof_columns", "labels", "bibliography"),
+        "foreign_names",
     ),
     "lti",
     "sparse",

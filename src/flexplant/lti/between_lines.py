@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..checks import ComplexArray, FloatArray, IntArray
+from ..tolerances import TINY
 
 #: change of a response between two lines, beside its size, below which it is a straight line
 _STRAIGHT = 1e-9
@@ -54,7 +55,7 @@ def steps_between(lines: FloatArray, data: ComplexArray, places: IntArray) -> Fl
     for first in (places - 1, places):
         first = np.clip(first, 0, lines.size - 3)
         c = _circle(lines, data, first)[1]
-        pole = lines[first] - 1.0 / np.where(c == 0.0, 1e-300, c)
+        pole = lines[first] - 1.0 / np.where(c == 0.0, TINY, c)
         near = pole.real + np.abs(pole.imag) * AROUND[:, None]
         found += list(np.clip(near, low + 0.01 * wide, low + 0.99 * wide))
     return np.unique(np.concatenate(found))

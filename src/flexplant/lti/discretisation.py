@@ -11,6 +11,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, IntArray, between, positive
 from ..errors import ModelError, warn
+from ..tolerances import TINY, divisor
 from .joining import Matrices
 from .lyapunov import compressed
 from .statespace import StateSpace, System, as_statespace
@@ -195,7 +196,7 @@ def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArra
     by ``I(2 t) = I(t) + e^(A t) I(t)``: no division by small frequencies.
     """
     size = float(np.max(np.abs(pairs).sum(axis=2))) * h
-    doublings = max(0, int(np.ceil(np.log2(max(size, 1e-300) / 0.5))))
+    doublings = max(0, int(np.ceil(np.log2(max(size, TINY) / 0.5))))
     t = h / 2**doublings
     identity = np.broadcast_to(np.eye(2), pairs.shape)
     term = identity * t
@@ -219,7 +220,7 @@ def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
     N = pairs - mean[:, None, None] * np.eye(2)
     q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
     root = np.sqrt(np.abs(q))
-    safe = np.where(root > 0, root, 1.0)
+    safe = divisor(root)
     swing = q < 0
     determinant = pairs[:, 0, 0] * pairs[:, 1, 1] - pairs[:, 0, 1] * pairs[:, 1, 0]
     large = mean + np.where(mean > 0, root, -root)
@@ -410,7 +411,7 @@ def accumulated_noise(
     size = min(rate * time, 2.0 * n)
     count, doublings = _NODES + int(np.ceil(0.5 * size + 4.0 * np.cbrt(size))), 0
     if count * m >= n:
-        count, doublings = _NODES, max(0, int(np.ceil(np.log2(max(rate * time, 1e-300)))))
+        count, doublings = _NODES, max(0, int(np.ceil(np.log2(max(rate * time, TINY)))))
     piece = time / 2**doublings
     nodes, weights = np.polynomial.legendre.leggauss(count)
     parts = [

@@ -24,6 +24,7 @@ from ..checks import (
     signal_names,
 )
 from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
+from ..tolerances import SAME
 from .grid import checked_freq as checked_freq
 from .grid import default_freq as default_freq
 from .grid import sampled_freq as sampled_freq
@@ -144,7 +145,7 @@ def _operand(given: Any, frf: Any) -> Operand:
         g = as_statespace(given)
         return Operand(responses(g, frf.freq), None, g.inputs, g.outputs, dict(g.units), None)
     own: Any = given
-    if own.freq.shape != frf.freq.shape or not np.allclose(own.freq, frf.freq, rtol=1e-9, atol=0.0):
+    if own.freq.shape != frf.freq.shape or not np.allclose(own.freq, frf.freq, rtol=SAME, atol=0.0):
         raise ShapeError(
             f"responses are combined line by line, but one has {_lines(frf)} and the other "
             f"{_lines(own)}. Compute or measure both at the same frequencies."
@@ -305,7 +306,7 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
         coherence = self.coherence
         if coherence is not None:
             coherence = real_array(coherence, "coherence", data.shape)
-            if coherence.size and (coherence.min() < 0 or coherence.max() > 1 + 1e-9):
+            if coherence.size and (coherence.min() < 0 or coherence.max() > 1 + SAME):
                 raise ModelError("coherence must lie between 0 and 1.")
         variance = self.variance
         if variance is not None:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray, IntArray, positive, positive_array
 from ..errors import ModelError
+from ..tolerances import ROUNDING, TINY
 from .responses import continuous_poles, responder
 from .statespace import StateSpace, System, as_statespace
 
@@ -72,12 +73,12 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     poles = continuous_poles(g)
     size = np.abs(poles) / (2 * np.pi)
     top = 0.5 / g.dt if g.dt else np.inf
-    moving = size[(size > 1e-12 * size.max(initial=0.0)) & (size < top)]
+    moving = size[(size > ROUNDING * size.max(initial=0.0)) & (size < top)]
     low, high = (0.1 * moving.min(), 10 * moving.max()) if moving.size else (0.01, 100.0)
     high = min(high, top)
     low = min(low, 1e-3 * high)
     freq = [np.geomspace(low, high, 200)]
-    zeta = np.abs(poles.real) / np.maximum(np.abs(poles), 1e-300)
+    zeta = np.abs(poles.real) / np.maximum(np.abs(poles), TINY)
     undamped: list[float] = []
     around = np.sinh(np.linspace(-4.0, 4.0, 9)) / np.sinh(1.0)
     for f, z in zip(np.abs(poles.imag) / (2 * np.pi), zeta, strict=True):
@@ -127,7 +128,7 @@ def _seen(data: ComplexArray) -> ComplexArray:
     """Return log H (n_channel, n_freq), what is negligible beside its row and column flattened."""
     size = np.abs(data)
     scale = np.sqrt(size.max(axis=1, keepdims=True) * size.max(axis=0, keepdims=True))
-    floor = np.maximum(FLOOR * scale, 1e-300)
+    floor = np.maximum(FLOOR * scale, TINY)
     shown = np.where(size > floor, data, floor)
     return np.asarray(np.log(shown).reshape(-1, data.shape[2]))
 
@@ -246,7 +247,7 @@ def checked_freq(freq: npt.ArrayLike) -> FloatArray:
 def sampled_freq(freq: npt.ArrayLike, dt: float) -> FloatArray:
     """Return frequencies [Hz] at which a system of sampling time dt has a response."""
     grid = checked_freq(freq)
-    if dt and grid.size and grid.max() > 0.5 / dt * (1 + 1e-12):
+    if dt and grid.size and grid.max() > 0.5 / dt * (1 + ROUNDING):
         raise ModelError(
             f"frequency {grid.max():g} Hz lies above half the sampling rate ({0.5 / dt:g} Hz), "
             "where a sampled system has no response of its own. Stay below."

@@ -14,6 +14,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, IntArray, short
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
+from ..tolerances import ROUNDING
 
 #: A, B, C, D
 Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
@@ -101,7 +102,7 @@ def stacked(matrices: Sequence[FloatArray]) -> FloatArray:
 def common_dt(systems: Iterable[Any]) -> float:
     """Return the sampling time that systems share; static gains fit any."""
     found = {sys.dt for sys in systems if sys.n_states} or {sys.dt for sys in systems}
-    if len(found) > 1 and not np.allclose(list(found), next(iter(found)), rtol=1e-12, atol=0):
+    if len(found) > 1 and not np.allclose(list(found), next(iter(found)), rtol=ROUNDING, atol=0):
         raise ModelError(
             f"systems with sampling times {sorted(found)} s cannot be connected (0 is continuous). "
             "Discretise them to one rate first."

@@ -9,6 +9,7 @@ import scipy.sparse as sp
 
 from ..checks import ComplexArray, FloatArray, between
 from ..errors import ModelError, ShapeError
+from ..tolerances import SAME
 
 #: samples of a window that stand for all lengths
 SAMPLES = 256
@@ -27,7 +28,7 @@ def checked_correlation(value: Any, shape: tuple[int, ...]) -> ComplexArray:
     unit = np.eye(shape[0])[:, :, None]
     hermitian = np.abs(correlation - correlation.conj().transpose(1, 0, 2))
     wrong = np.maximum(np.abs(correlation * unit - unit), hermitian)
-    if not (np.all(np.abs(correlation) <= 1 + 1e-9) and np.all(wrong <= 1e-9)):
+    if not (np.all(np.abs(correlation) <= 1 + SAME) and np.all(wrong <= SAME)):
         raise ModelError(
             "correlation must be Hermitian with ones on the diagonal and none larger than one. "
             "Divide a covariance by the standard deviations of both outputs."

@@ -10,6 +10,7 @@ import scipy.linalg as la
 from scipy.sparse import csgraph
 
 from ..checks import ComplexArray, FloatArray, between
+from ..tolerances import TINY
 from .joining import is_block_diagonal, joined_blocks, stacked
 from .lyapunov import controllability_factor, observability_factor
 from .modal import modal_form, part_of, split_stable
@@ -194,7 +195,7 @@ def _omega(poles: ComplexArray, dt: float) -> FloatArray:
     """Return the frequencies [rad/s] at which modes act: the sizes of their continuous poles."""
     if not dt:
         return np.asarray(np.abs(poles))
-    logs = np.log(np.where(poles == 0, 1e-300, poles))
+    logs = np.log(np.where(poles == 0, TINY, poles))
     return np.asarray(np.minimum(np.abs(logs), np.pi) / dt)
 
 

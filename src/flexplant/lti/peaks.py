@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray
+from ..tolerances import divisor
 from .responses import ModalPairs, diagonal_form, modal_pairs
 from .statespace import StateSpace
 
@@ -136,7 +137,7 @@ def _zones(
     gaps = np.where(first[:, None], np.inf, (top - one.values)[:, None] - spread[:, :, None])
     along1, along2 = (np.linalg.norm(A * first[:, None], axis=2)[:, None] for A in (one.A1, one.A2))
     along = along1 + along2 * r[:, :, None] + (cubic * r**2)[:, :, None]
-    pull = np.sum(along**2 / np.where(gaps > 0.0, gaps, 1.0), axis=2)
+    pull = np.sum(along**2 / divisor(gaps), axis=2)
     block = first[:, :, None] & first[:, None]
     slope = np.linalg.norm(one.A1 * block, axis=(1, 2))[:, None]
     others = np.eye(first.shape[1]) * np.where(first, 0.0, -2.0 * size2)[:, None]

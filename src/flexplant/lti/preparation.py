@@ -16,6 +16,7 @@ import scipy.linalg as la
 
 from ..checks import FloatArray, Value, inner_names
 from ..errors import ModelError, counted
+from ..tolerances import ROUNDING, divisor
 from .discretisation import bilinear, image_freq, tustin
 from .modal import modal_form
 from .scaling import bordered_scale, mean_speed, state_scale
@@ -111,7 +112,7 @@ class Prepared(Value):
         """Return the controller of the original plant from that of the scaled problem."""
         # the plant's own D22 is subtracted: u = K (y - D22 u)
         inner = np.eye(D.shape[0]) + D @ self.D22
-        if la.svdvals(inner)[-1] < 1e-12 * (1.0 + float(np.linalg.norm(D @ self.D22))):
+        if la.svdvals(inner)[-1] < ROUNDING * (1.0 + float(np.linalg.norm(D @ self.D22))):
             raise ModelError(
                 "the controller and the feedthrough from u to y (D22, as of accelerometers) make "
                 "an algebraic loop that has no solution. Give u a sample of delay or a low-pass."
@@ -194,7 +195,7 @@ def normalised(D: FloatArray, own: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     m = D.shape[1]
     columns = np.hypot(np.linalg.norm(D, axis=0), own)
-    columns = np.where(columns > 0, columns, 1.0)
+    columns = divisor(columns)
     left, values, right = la.svd(D / columns, full_matrices=True)
     sizes = np.zeros(m)
     sizes[: values.size] = values

@@ -21,6 +21,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, Value, real_array
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
+from ..tolerances import RANK, SPLIT, TINY, divisor
 from .equations import (
     accumulated,
     doubled,
@@ -297,7 +298,7 @@ def _problem(
             "non-singular R. Give every output noise (every input a cost)."
         )
     values, vectors = np.linalg.eigh(R / largest / largest[:, None])
-    if p and np.min(np.abs(values)) < 1e-13:
+    if p and np.min(np.abs(values)) < RANK:
         raise ModelError(
             f"R is singular to working precision (scaled eigenvalue {np.min(np.abs(values)):.1e}). "
             "Give every combination of outputs noise (of inputs a cost)."
@@ -380,7 +381,7 @@ def _sampled(p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
         return p.A.T, p.G, p.Q
     n = p.A.shape[0]
     moduli = np.abs(la.eigvals(np.block([[p.A.T, -p.G], [-p.Q, -p.A]])))
-    typical = np.exp(np.mean(np.log(np.maximum(moduli, 1e-6 * np.max(moduli, initial=1e-300)))))
+    typical = np.exp(np.mean(np.log(np.maximum(moduli, 1e-6 * np.max(moduli, initial=TINY)))))
     best: tuple[float, tuple[FloatArray, FloatArray, FloatArray]] | None = None
     for factor in (1.0, 1.7, 0.6, 3.1, 0.33):
         shift = float(typical * factor)
@@ -471,8 +472,8 @@ def _scale(states: FloatArray, information: FloatArray) -> FloatArray:
     """Return d for which noise and information have equal size in x / d."""
     variance = np.where(
         (states > 0) & (information > 0),
-        np.sqrt(states) / np.sqrt(np.where(information > 0, information, 1.0)),
-        np.where(states > 0, states, 1.0 / np.where(information > 0, information, 1.0)),
+        np.sqrt(states) / np.sqrt(divisor(information)),
+        np.where(states > 0, states, 1.0 / divisor(information)),
     )
     return scale_of(variance)
 
@@ -484,10 +485,10 @@ def _defect(p: RiccatiProblem) -> str:
     size = max(marginal, float(np.max(np.abs(lam), initial=0.0)))
     critical = lam[_growth(p, lam) >= -1e-9 * size]
     # a Jordan block of a rigid-body mode comes out of eigvals at the root of the rounding
-    near = np.abs(critical - marginal) < 1e-6 * size
+    near = np.abs(critical - marginal) < SPLIT * size
     distinct = [complex(marginal)] if near.any() else []
     for value in critical[~near]:
-        if all(abs(value - seen) > 1e-6 * size for seen in distinct):
+        if all(abs(value - seen) > SPLIT * size for seen in distinct):
             distinct.append(complex(value))
     for value in distinct:
         shifted = p.A - value * np.eye(p.A.shape[0])
@@ -498,7 +499,7 @@ def _defect(p: RiccatiProblem) -> str:
                 "the outputs (reached by the inputs, in the control form), so their error is "
                 "unbounded. Add or move sensors (actuators)."
             )
-        missed = _unseen(shifted.conj().T, p.Q) if _growth(p, np.array(value)) < 1e-6 * size else 0
+        missed = _unseen(shifted.conj().T, p.Q) if _growth(p, np.array(value)) < SPLIT * size else 0
         if missed:
             return (
                 f"{missed} mode(s) of A at {value:.6g} (rigid-body) are not excited by the noise Q "
@@ -520,4 +521,4 @@ def _unseen(shifted: ComplexArray, weight: FloatArray) -> int:
         return int(np.count_nonzero(spread == 0))
     values = la.eigvalsh(form / spread / spread[:, None])
     # as a covariance: 3e-7 of an amplitude; below that it is rounding
-    return int(np.count_nonzero(np.abs(values) < 1e-13))
+    return int(np.count_nonzero(np.abs(values) < RANK))

@@ -6,6 +6,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray
+from ..tolerances import SPLIT, divisor
 
 #: size of B and C beside A: enough to hold the states of a chain together
 BORDER = 1.0
@@ -67,10 +68,10 @@ def mean_speed(poles: ComplexArray) -> float:
     Free masses come out at rounding, which says nothing about the others.
     """
     sizes = np.abs(poles)
-    moving = sizes[sizes > 1e-6 * sizes.max(initial=0.0)]
+    moving = sizes[sizes > SPLIT * sizes.max(initial=0.0)]
     return float(np.exp(np.mean(np.log(moving)))) if moving.size else 1.0
 
 
 def reciprocal(size: FloatArray) -> FloatArray:
     """Return ``1 / size``, and 1 for what is of no size."""
-    return np.asarray(1.0 / np.where(size > 0, size, 1.0))
+    return np.asarray(1.0 / divisor(size))

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray, real_array
 from ..errors import ModelError
+from ..tolerances import ROUNDING, SPLIT
 from .joining import cascaded, stacked
 
 
@@ -81,7 +82,7 @@ def _roots(values: npt.ArrayLike, name: str) -> ComplexArray:
     roots = np.atleast_1d(np.asarray(values, dtype=np.complex128)).ravel()
     if not np.all(np.isfinite(roots)):
         raise ModelError(f"{name} must be finite numbers, got {values!r}.")
-    lonely = [root for root in roots if not np.isclose(roots, root.conj(), rtol=1e-6).any()]
+    lonely = [root for root in roots if not np.isclose(roots, root.conj(), rtol=SPLIT).any()]
     if lonely:
         raise ModelError(
             f"{name} need the conjugate of {lonely[0]:.6g}: complex ones of a real system come in "
@@ -96,9 +97,9 @@ def _damping(pole: complex, dt: float) -> float:
 
 def paired(values: ComplexArray) -> list[ComplexArray]:
     """Return conjugate pairs, pairs of neighbouring real values, and one that is left over."""
-    upper = values.imag > 1e-12 * np.abs(values)
+    upper = values.imag > ROUNDING * np.abs(values)
     pairs = [np.array([v, np.conj(v)]) for v in values[upper]]
-    real = np.sort(values[np.abs(values.imag) <= 1e-12 * np.abs(values)].real).astype(complex)
+    real = np.sort(values[np.abs(values.imag) <= ROUNDING * np.abs(values)].real).astype(complex)
     return pairs + [real[i : i + 2] for i in range(0, real.size, 2)]
 
 

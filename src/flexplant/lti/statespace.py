@@ -24,6 +24,7 @@ from ..checks import (
     signal_names,
 )
 from ..errors import ModelError, ShapeError, counted
+from ..tolerances import divisor
 from .joining import (
     Channels,
     block_eigenvalues,
@@ -130,10 +131,10 @@ class SystemArithmetic(Value):
 
     def __truediv__(self, other: float) -> Self:
         """Return the system with its outputs divided by a number."""
-        divisor = float(real_array(other, "the divisor", ()))
-        if not divisor:
+        number = float(real_array(other, "the divisor", ()))
+        if not number:
             raise ModelError("a system is divided by a number other than 0: pass one.")
-        return self * (1.0 / divisor)
+        return self * (1.0 / number)
 
 
 #: what functions of systems accept: ours, or one of python-control or SciPy
@@ -332,7 +333,7 @@ class StateSpace(SystemArithmetic):
         n = self.n_states
         matrix = real_array(T, "T", (n, n))
         size = np.linalg.norm(matrix, axis=0)
-        condition = float(np.linalg.cond(matrix / np.where(size > 0, size, 1.0))) if n else 1.0
+        condition = float(np.linalg.cond(matrix / divisor(size))) if n else 1.0
         if not condition < 1e14:
             raise ModelError(
                 f"T is singular (condition {condition:.1e}): its columns must be n independent "

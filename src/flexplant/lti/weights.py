@@ -9,6 +9,7 @@ import numpy as np
 
 from ..checks import positive, real_array
 from ..errors import ModelError
+from ..tolerances import SAME
 from .interconnection import series
 from .statespace import StateSpace
 
@@ -256,9 +257,9 @@ def pade(delay: float, *, order: int = 2) -> StateSpace:
     n = int(order)
     powers = np.cumprod([1.0, *((n - k) / ((2 * n - k) * (k + 1)) for k in range(n))])
     poles = np.roots(powers[::-1])
-    upper = poles[poles.imag > 1e-9 * np.abs(poles)]
+    upper = poles[poles.imag > SAME * np.abs(poles)]
     line = StateSpace([], [], [], [[1.0]], inputs=["in"], outputs=["out"])
-    for pole in poles[np.abs(poles.imag) <= 1e-9 * np.abs(poles)].real:
+    for pole in poles[np.abs(poles.imag) <= SAME * np.abs(poles)].real:
         line = series(line, first_order(-1.0, 1.0, -pole / time).replace(states=["real"]))
     for i, pole in enumerate(upper, 1):
         size = abs(pole)

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray
+from ..tolerances import SPLIT, divisor
 from .scaling import mean_speed, reciprocal, state_scale
 
 #: a zero closer to the limit than this, relative to its size, is tested as if it were on it
@@ -110,11 +111,11 @@ def axis_zeros(g: Any) -> ComplexArray:
     on = near / np.abs(near) if g.dt else 1j * near.imag
     found: list[complex] = []
     for zero in np.sort_complex(on):
-        if any(abs(zero - other) < 1e-6 * max(abs(zero), 1e-3) for other in found):
+        if any(abs(zero - other) < SPLIT * max(abs(zero), 1e-3) for other in found):
             continue
         whole = np.block([[A - zero * np.eye(n), B], [C, D]])
         columns = np.linalg.norm(whole, axis=0)
-        if np.linalg.svd(whole / np.where(columns > 0, columns, 1.0), compute_uv=False)[-1] < _LOST:
+        if np.linalg.svd(whole / divisor(columns), compute_uv=False)[-1] < _LOST:
             found.append(complex(zero))
     return np.array(found, dtype=np.complex128) * speed
 
