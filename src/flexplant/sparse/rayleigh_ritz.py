@@ -10,6 +10,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..checks import FloatArray
+from ..tolerances import divisor
 from .factor import by_rows
 
 #: eigenvalues closer together than this are found to 1e-9 of themselves in one go
@@ -121,7 +122,7 @@ def beyond(M: Any, V: FloatArray, part: FloatArray, *, dependent: float = _DEPEN
     if not part.shape[1]:
         return part
     length = np.sqrt(np.sum(part * np.asarray(M @ part), axis=0))
-    part = part / np.where(length > 0, length, 1.0)
+    part = part / divisor(length)
     for _ in range(2):
         part = part - V @ (V.T @ np.asarray(M @ part))
     gram = part.T @ np.asarray(M @ part)
