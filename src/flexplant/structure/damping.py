@@ -13,6 +13,7 @@ from ..checks import FloatArray, Matrix, Value, flag, positive, real_array, shor
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..sparse.factor import dense
+from ..tolerances import ROUNDING, divisor
 from .eigen import elastic_modes
 
 
@@ -287,7 +288,7 @@ class Rayleigh(Damping):
         scale = np.linalg.norm(terms, axis=0)
         if hertz.size == 2:
             found = np.linalg.solve(terms / scale, ratio) / scale
-            found[np.abs(found * scale) < 1e-12 * np.abs(ratio).max()] = 0.0
+            found[np.abs(found * scale) < ROUNDING * np.abs(ratio).max()] = 0.0
             if found.min() < 0:
                 bound = float(hertz.max() / hertz.min())
                 raise ModelError(
@@ -306,7 +307,7 @@ class Rayleigh(Damping):
     def zeta(self, omega: FloatArray) -> FloatArray:
         """Return the damping ratios (k,) of modes at `omega` [rad/s]; 0 for rigid-body modes."""
         omega = real_array(omega, "omega", (None,))
-        safe = np.where(omega > 0, omega, 1.0)
+        safe = divisor(omega)
         ratio = 0.5 * (self.alpha / safe + self.beta * safe)
         return np.asarray(np.where(omega > 0, ratio, 0.0), dtype=np.float64)
 

@@ -13,6 +13,7 @@ import scipy.sparse as sp
 from ..checks import FloatArray, Matrix, Value, between, element_mask, instance, real_array, short
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
+from ..tolerances import divisor
 from .attachments import Spring, added_matrices
 from .damping import Damping
 
@@ -175,7 +176,7 @@ class Hysteretic(Damping):
         gap: FloatArray = np.abs(alone[:, None] - coupled) / squares[:, None]
         first, second = linear_sum_assignment(gap)
         eta, true = alone[first].imag / squares[first], coupled[second].imag / coupled[second].real
-        found[elastic[first]] = np.abs(eta - true) / np.where(true > 0, true, 1.0)
+        found[elastic[first]] = np.abs(eta - true) / divisor(true)
         return found
 
     def error(
@@ -198,11 +199,11 @@ class Hysteretic(Damping):
             When a frequency is negative, or regions need the ratios.
         """
         at, own = _frequencies(freq, "freq")[:, None], _frequencies(natural, "natural")
-        r = at / np.where(own > 0, own, 1.0)
+        r = at / divisor(own)
         eta = 2.0 * (self.zeta(own) if zeta is None else real_array(zeta, "zeta", own.shape))
         size = np.sqrt((1 - r**2) ** 2 + (eta * r) ** 2)
         # without loss both are infinite at resonance, and the same
-        found = eta * np.abs(1 - r) / np.where(size > 0, size, 1.0)
+        found = eta * np.abs(1 - r) / divisor(size)
         return np.asarray(np.where(own > 0, found, 0.0), dtype=np.float64)
 
     def response_error(
@@ -239,7 +240,7 @@ class Hysteretic(Damping):
         eta = 2.0 * (self.zeta(own) if zeta is None else real_array(zeta, "zeta", own.shape))
         at, omega = 2 * np.pi * real_array(freq, "freq")[:, None], 2 * np.pi * own
         stiffness = np.abs(omega**2 * (1 + 1j * eta) - at**2)
-        part = relative / np.where(stiffness > 0, stiffness, 1.0)
+        part = relative / divisor(stiffness)
         return np.asarray(part @ weights, dtype=np.float64)
 
 

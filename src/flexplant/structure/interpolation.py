@@ -11,6 +11,7 @@ import numpy as np
 from ..checks import FloatArray, IntArray, instance, positive, real_array
 from ..errors import LabelError, ModelError, counted
 from ..labels import DIRECTIONS, DofSet, Interpolation
+from ..tolerances import TINY
 from .model import FEModel
 
 #: up to this many nodes one smooth interpolant serves everywhere; beyond, the nearest nodes do
@@ -166,7 +167,7 @@ class _Field:
         self.centre = self.nodes.mean(axis=0)
         _, size, axes = np.linalg.svd(self.nodes - self.centre, full_matrices=False)
         self.extent = float(np.ptp(self.nodes, axis=0).max())
-        self.axes = axes[size > _SAME * max(size[0], 1e-300)]  # (d, 3): line, plane or solid
+        self.axes = axes[size > _SAME * max(size[0], TINY)]  # (d, 3): line, plane or solid
         self.flat = (self.nodes - self.centre) @ self.axes.T
         self.tree = KDTree(self.nodes)
         if not self.extent:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..checks import FloatArray, real_array
 from ..labels import DofSet, Place
+from ..tolerances import divisor
 from .rigid import rigid_motions
 
 #: relative: a rigid-body motion that the shapes of a model make up to this is one of theirs. Those
@@ -67,4 +68,4 @@ class Placed:
 def missed(made: FloatArray, wanted: FloatArray) -> FloatArray:
     """Return how far motions (n, r) that a model makes are from those wanted, relative to these."""
     size = np.linalg.norm(wanted, axis=0)
-    return np.asarray(np.linalg.norm(made - wanted, axis=0) / np.where(size > 0, size, 1.0))
+    return np.asarray(np.linalg.norm(made - wanted, axis=0) / divisor(size))

@@ -17,6 +17,7 @@ from ..labels import DIRECTIONS, DofSet, Place
 from ..sparse.factor import by_rows
 from ..sparse.lowest import ROUNDING, definite_solver
 from ..sparse.rayleigh_ritz import Absolute
+from ..tolerances import divisor
 from .soft_springs import bodies, unheld
 
 #: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
@@ -138,7 +139,7 @@ def _free(M: Matrix, K: Matrix, motions: FloatArray, far: float) -> FloatArray:
     K = by_rows(K)
     size_of_K = Absolute(K)
     scale = np.linalg.norm(size_of_K @ np.abs(motions), axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
+    scale = divisor(scale)
     force = np.asarray(K @ motions) / scale
     free = np.linalg.norm(force, axis=0) < _ENERGY_TOLERANCE
     if np.all(free):
@@ -186,10 +187,10 @@ def force_parts(K: Matrix, motions: FloatArray) -> FloatArray:
 
 def _largest_parts(K: Matrix, size_of_K: Absolute, motions: FloatArray) -> FloatArray:
     entries: Any = K.diagonal()
-    weight = 1 / np.sqrt(np.where(entries > 0, entries, 1.0))[:, None]
+    weight = 1 / np.sqrt(divisor(entries))[:, None]
     force = np.abs(weight * np.asarray(K @ motions)).max(axis=0)
     most = (weight * (size_of_K @ np.abs(motions))).max(axis=0)
-    return np.asarray(force / np.where(most > 0, most, 1.0))
+    return np.asarray(force / divisor(most))
 
 
 def _null_vectors(

@@ -14,6 +14,7 @@ from ..labels import DofSet
 from ..sparse.factor import by_rows, diagonal
 from ..sparse.lowest import PRECISION
 from ..sparse.rayleigh_ritz import Absolute
+from ..tolerances import divisor
 
 #: times the usual rounding of a row: a force larger than this is of a spring
 _OUTLIER = 30.0
@@ -72,7 +73,7 @@ def _beside_many_springs(
     """Return the combinations (r, m) without an energy that is more than rounding."""
     moved = np.abs(motions)
     most = np.sqrt(np.einsum("ij,ij->j", moved, size_of_K @ moved))
-    most = np.where(most > 0, most, 1.0)
+    most = divisor(most)
     energy, mix = la.eigh(motions.T @ np.asarray(K @ motions) / most / most[:, None])
     mix = mix / most[:, None]
     held = _held_everywhere(K, motions @ mix, energy, rounding)

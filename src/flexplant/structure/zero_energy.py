@@ -13,6 +13,7 @@ from ..errors import ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..sparse.factor import by_rows, dense
 from ..sparse.lowest import PRECISION, ROUNDING
+from ..tolerances import divisor
 from .rigid import farness, orthonormalised, rigid_motions
 from .soft_springs import bodies, unheld
 
@@ -139,7 +140,7 @@ def _free_combinations(K: Any, size: Any, motions: FloatArray, allowed: float) -
     A hinge leaves one rotation about itself, which is none of those about the middle.
     """
     most = np.einsum("ij,ij->j", np.abs(motions), np.asarray(size @ np.abs(motions)))
-    scaled = motions / np.sqrt(np.where(most > 0, most, 1.0))
+    scaled = motions / np.sqrt(divisor(most))
     values, vectors = la.eigh(scaled.T @ np.asarray(K @ scaled))
     return _independent(scaled @ vectors[:, np.abs(values) < allowed])
 

@@ -12,6 +12,7 @@ from ...checks import FloatArray, IntArray
 from ...errors import ModelError, SolverError
 from ...sparse.factor import by_rows, diagonal, is_positive_definite, unit_diagonal
 from ...sparse.lowest import PRECISION, ROUNDING, Lowest, lowest_modes
+from ...tolerances import divisor
 from ..definite import are_rigid, are_swapped, unstable_stiffness
 from ..matrices import FEMatrices
 from ..model import FEModel
@@ -197,7 +198,7 @@ def _rounding(K: Any, M: Any, given: FEMatrices, digits: int | None) -> float:
     sizes = np.asarray(size @ np.abs(motions))
     force = np.asarray(K @ motions)
     scale = np.linalg.norm(sizes, axis=0)
-    relative = np.linalg.norm(force, axis=0) / np.where(scale > 0, scale, 1.0)
+    relative = np.linalg.norm(force, axis=0) / divisor(scale)
     motions = motions[:, (scale > 0) & (relative < _FREE)]
     motions = motions @ unheld(
         by_rows(K), motions, max(PRECISION, written), farness(given.dofs.xyz)
@@ -306,5 +307,5 @@ def _damping(D: Any, motions: ZeroEnergy | None, proven: bool) -> dict[str, Any]
         size: Any = abs(D)
         scale = np.linalg.norm(np.asarray(size @ np.abs(motions.rigid)), axis=0)
         force = np.linalg.norm(np.asarray(D @ motions.rigid), axis=0)
-        drag = float(np.max(force / np.where(scale > 0, scale, 1.0), initial=0.0))
+        drag = float(np.max(force / divisor(scale), initial=0.0))
     return {"definite": definite, "drag": drag}

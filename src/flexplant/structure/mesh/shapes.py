@@ -13,6 +13,7 @@ import numpy as np
 from ...checks import FloatArray, real_array
 from ...errors import LabelError, counted
 from ...labels import Interpolation
+from ...tolerances import SAME
 from .element_matrices import brick_shape, brick_slopes, hermite, plate_coefficients, plate_terms
 from .grid_matrices import Grid
 
@@ -120,7 +121,7 @@ class PlateShape(GridShape):
                 f"a plate in bending has no motion {direction!r}: use one of z, rx, ry."
             )
         point = real_array(xyz, "xyz", (3,))
-        slack = 1e-9 * max(self.size)
+        slack = SAME * max(self.size)
         if not _inside(point[:2], self.size, slack):
             raise self._off(point, float(np.max(self.thickness)))
         element, (s, t), (a, b) = self._located(point, self.size, lambda: self._in_hole(point))
@@ -141,9 +142,9 @@ class PlateShape(GridShape):
         grid, size, count = self._grid, np.array(self.size), np.array(self.elements)
         place = np.clip(points[:, :2] / size, 0.0, 1.0) * count
         nearest = np.round(place)
-        place = np.where(np.abs(place - nearest) < 1e-9 * count, nearest, place)
+        place = np.where(np.abs(place - nearest) < SAME * count, nearest, place)
         x, y = element = np.minimum(place.astype(np.int64), count - 1).T
-        slack = 1e-9 * max(self.size)
+        slack = SAME * max(self.size)
         depth = np.broadcast_to(np.asarray(self.thickness), grid.present.shape)[y, x]
         plain = np.all((points[:, :2] >= -slack) & (points[:, :2] <= size + slack), axis=1)
         plain &= grid.present[y, x] & (np.abs(points[:, 2]) <= 0.5 * depth + slack)
@@ -216,7 +217,7 @@ class BeamShape(GridShape):
         if direction not in ("z", "ry"):
             raise LabelError(f"a beam in bending has no motion {direction!r}: use one of z, ry.")
         point = real_array(xyz, "xyz", (3,))
-        slack = 1e-9 * self.length
+        slack = SAME * self.length
         if not _inside(point[:1], (self.length,), slack) or np.abs(point[1:]).max() > slack:
             raise LabelError(
                 f"the point {tuple(point.tolist())} is off the beam, whose axis reaches from "
@@ -283,7 +284,7 @@ class BlockShape(GridShape):
                 f"(0, 0, 0) to {self.size} m: its motion is not known. Coordinates are in metres."
             )
 
-        if not _inside(point, self.size, 1e-9 * max(self.size)):
+        if not _inside(point, self.size, SAME * max(self.size)):
             raise off("outside")
         element, inside, sizes = self._located(point, self.size, lambda: off("in a hole of"))
         kind = _BLOCK_MOTIONS.index(direction)
