@@ -15,6 +15,7 @@ from ..sparse.pardiso import Pardiso
 from ..sparse.rayleigh_ritz import Absolute, beyond
 from ..structure import FEModel
 from ..structure.definite import signed_square
+from ..tolerances import ROUNDING, TINY, divisor
 from .modes import Modes
 from .normal_form import NormalForm, normal_form
 from .shifted import stiffness_factor
@@ -67,7 +68,7 @@ def damped_modes(
         )
         wrong = np.flatnonzero(size > limit)
         if not wrong.size:
-            part = np.where(limit > 0, size / np.where(limit > 0, limit, 1.0), 0.0)
+            part = np.where(limit > 0, size / divisor(limit), 0.0)
             return leaving_overdamped(
                 form,
                 Modes(
@@ -181,9 +182,9 @@ def damper_forces(model: FEModel) -> FloatArray:
 
 def is_rayleigh(model: FEModel) -> bool:
     """Return whether ``D = alpha M + beta K``, seen on one vector."""
-    x = np.random.default_rng(0).standard_normal(model.n_dof) / np.sqrt(diagonal(model.K) + 1e-300)
+    x = np.random.default_rng(0).standard_normal(model.n_dof) / np.sqrt(diagonal(model.K) + TINY)
     sides: Any = [np.asarray(part @ x) for part in (model.M, model.K)]
     basis = np.column_stack([side / np.linalg.norm(side) for side in sides])
     damped = np.asarray(model.D @ x)  # type: ignore[operator]
     left = damped - basis @ np.linalg.lstsq(basis, damped)[0]
-    return bool(np.linalg.norm(left) <= 1e-12 * np.linalg.norm(damped))
+    return bool(np.linalg.norm(left) <= ROUNDING * np.linalg.norm(damped))

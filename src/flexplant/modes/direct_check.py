@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..checks import ComplexArray, FloatArray
+from ..tolerances import TINY
 from .dynamic_basis import DynamicBasis
 from .shifted import held_factor
 
@@ -127,7 +128,7 @@ def _points(
     peaks = []
     if inside.size:
         size = np.abs(find(inside))
-        share = (size / np.maximum(size.max(axis=0), 1e-300)).max(axis=(1, 2))
+        share = (size / np.maximum(size.max(axis=0), TINY)).max(axis=(1, 2))
         # beside them: repeated modes may hold one that is not damped
         peaks = (inside * (1 + _BESIDE))[np.argsort(-share, kind="stable")].tolist()
     deep = antiresonances(find, basis.freq, low, high).tolist() if high > low else []
@@ -168,7 +169,7 @@ def dips(
     lowest = size[place + 1, channel]
     ends = zip(place.tolist(), channel, strict=True)
     sides = np.array([_lower_side(size[:, own], at + 1) for at, own in ends])
-    first = np.argsort(lowest / np.maximum(sides, 1e-300), kind="stable")[:_MOST]
+    first = np.argsort(lowest / np.maximum(sides, TINY), kind="stable")[:_MOST]
     place, channel, lowest, sides = place[first], channel[first], lowest[first], sides[first]
     left, centre, right = grid[place], grid[place + 1], grid[place + 2]
     part = np.linspace(0.0, 1.0, 9)[1:-1]
@@ -181,7 +182,7 @@ def dips(
         centre, lowest = inside[rows, best], found[rows, best]
         edges = np.column_stack([left, inside, right])
         left, right = edges[rows, best], edges[rows, best + 2]
-    share = lowest / np.maximum(sides, 1e-300)
+    share = lowest / np.maximum(sides, TINY)
     order = np.argsort(share, kind="stable")
     return np.asarray(centre[order][share[order] < _DEPTH])
 

@@ -16,6 +16,7 @@ from ..sparse.multifrontal import ComplexSymmetricFactor
 from ..sparse.rayleigh_ritz import beyond
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping, Rayleigh
 from ..structure.definite import signed_root, unstable_stiffness
+from ..tolerances import divisor
 from .attachment_vectors import static_response
 from .damped_modes import damper_forces
 from .modes import Modes
@@ -98,7 +99,7 @@ class DynamicBasis:
     def damped_freq(self) -> FloatArray:
         """Frequencies [Hz] of the elastic modes whose response at resonance is finite."""
         size = np.sqrt(np.abs(self.squares))
-        rates = self._rates + self._loss / np.where(size > 0, size, 1.0)
+        rates = self._rates + self._loss / divisor(size)
         own = rates[self.n_rigid : self.n_modes]
         return np.asarray(self.freq[own > _UNDAMPED * 2 * np.pi * self.freq])
 
@@ -227,7 +228,7 @@ class DynamicBasis:
             step = solve(left)
             found = found + step
             size_of = np.linalg.norm(found, axis=0)
-            change = np.linalg.norm(step, axis=0) / np.where(size_of > 0, size_of, 1.0)
+            change = np.linalg.norm(step, axis=0) / divisor(size_of)
             if np.all(change <= _SETTLED):
                 break
         if not np.all(change <= _UNSETTLED):

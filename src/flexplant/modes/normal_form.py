@@ -15,6 +15,7 @@ from ..sparse.factor import dense
 from ..structure.definite import signed_square
 from ..structure.eigen import elastic_modes
 from ..structure.rigid import orthonormalised
+from ..tolerances import SAME, divisor
 
 #: coupling of modes by D, relative to the largest modal damping, that still counts as rounding
 PROPORTIONAL = 1e-9
@@ -87,7 +88,7 @@ class NormalForm(Value):
         omega, rate = np.abs(self.omega), -self.poles.real
         rate[self._unstable] = 0.5 * (rate[self._unstable] - self.decaying)
         rate[: self.n_rigid] = 0.0
-        return np.asarray(rate / np.where(omega > 0, omega, 1.0))
+        return np.asarray(rate / divisor(omega))
 
     def overdamped_below(self, rate: float) -> str:
         """Return a note of the real poles up to a rate [1/s], "" when there are none."""
@@ -354,7 +355,7 @@ def _kinds(values: ComplexArray) -> tuple[IntArray, IntArray, IntArray]:
     """Return which eigenvalues grow, decay, both the fastest first, or oscillate, the slowest."""
     order = np.argsort(np.abs(values), kind="stable")
     sorted_ = values[order]
-    real = np.abs(sorted_.imag) <= 1e-9 * np.abs(sorted_)
+    real = np.abs(sorted_.imag) <= SAME * np.abs(sorted_)
     up, down = order[real & (sorted_.real > 0)][::-1], order[real & (sorted_.real < 0)][::-1]
     return up, down, order[~real & (sorted_.imag > 0)]
 
@@ -362,7 +363,7 @@ def _kinds(values: ComplexArray) -> tuple[IntArray, IntArray, IntArray]:
 def _unstable_pairs(grow: ComplexArray, decay: ComplexArray) -> ComplexArray:
     """Return shapes (k, u) of which growing and decaying ones are ``Re +- Im``; both are real."""
     both = np.hstack([grow, decay])
-    if np.abs(both.imag).max() > 1e-9 * np.abs(both).max():
+    if np.abs(both.imag).max() > SAME * np.abs(both).max():
         raise SolverError(
             f"the real poles of an unstable mode cannot be paired: damping and negative stiffness "
             f"mix them with other motions. {PLANT} Else lower the damping."

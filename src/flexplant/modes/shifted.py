@@ -18,6 +18,7 @@ from ..sparse.pardiso import Pardiso, PardisoCholesky
 from ..sparse.rayleigh_ritz import rounding_of
 from ..structure.definite import unstable_stiffness
 from ..structure.model import FEModel
+from ..tolerances import TINY, divisor
 
 #: the shift, in roundings of the energies of rigid-body motions: far below the first elastic mode
 #: of nearly all models, yet K - sigma M is well away from singular
@@ -101,10 +102,10 @@ class StiffnessFactor:
             residual -= force * length
             residual -= inertia @ (R.T @ residual)
             # measured in energy: in forces, rounding of stiff directions would hide the rest
-            part = np.sqrt(new * length / np.maximum(np.sum(u * (self.K @ u), axis=0), 1e-300))
+            part = np.sqrt(new * length / np.maximum(np.sum(u * (self.K @ u), axis=0), TINY))
             if np.all((part <= 1e-12) | (wanted == 0)) or np.all(part >= best):
                 break
-            best, old = part, np.where(new > 0, new, 1.0)
+            best, old = part, divisor(new)
         if not np.all((part <= 1e-7) | (wanted == 0)):
             raise SolverError(
                 f"a static response is not found (the last step is {part.max():.1g} of it): K is "

@@ -20,6 +20,7 @@ from ..sparse.rayleigh_ritz import Absolute, column_groups, rounding_of
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping
 from ..structure.definite import signed_root, signed_square
 from ..structure.eigen import elastic_modes, signed
+from ..tolerances import divisor
 from .attachment_vectors import attachment_vectors, labels_of, places, projected_zeta
 from .damped_modes import damped_modes, is_rayleigh, leaving_overdamped, wider
 from .modes import Modes
@@ -406,4 +407,4 @@ def rigid_residual(model: FEModel) -> float:
     """Return ``||K R||``, in terms of what would be there if nothing cancelled."""
     K, R = by_rows(model.K), model.rigid_body
     whole = np.linalg.norm(abs(K) @ np.abs(R), axis=0)
-    return float(np.max(np.linalg.norm(K @ R, axis=0) / np.where(whole > 0, whole, 1.0)))
+    return float(np.max(np.linalg.norm(K @ R, axis=0) / divisor(whole)))
