@@ -15,6 +15,7 @@ from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..sparse.factor import dense, unit_diagonal
 from ..structure import Damping, FEModel, ModalDamping
+from ..tolerances import RANK, TINY
 from .condensation import DofPartition
 from .methods import ReductionMethod
 from .projection import (
@@ -170,10 +171,10 @@ class _FreeInterface(ReductionMethod):
         at = vectors[rows]
         scaled, _ = unit_diagonal(at @ at.T)
         values = la.eigvalsh(dense(scaled))
-        if not values[0] > 1e-13 * values[-1]:
+        if not values[0] > RANK * values[-1]:
             raise ModelError(
                 "the residual flexibility of the boundary is singular (condition "
-                f"{values[-1] / max(float(values[0]), 1e-300):.3g}): some of its DOFs move "
+                f"{values[-1] / max(float(values[0]), TINY):.3g}): some of its DOFs move "
                 "together. Leave one of them out, or keep fewer modes."
             )
         # u_b = phi_b p + V_b g

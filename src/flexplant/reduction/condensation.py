@@ -15,6 +15,7 @@ from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..sparse.factor import unit_diagonal
 from ..structure import Damping, FEModel, ModalDamping
+from ..tolerances import ROUNDING
 from .methods import ReductionMethod, refused_partition
 from .projection import (
     Solver,
@@ -256,7 +257,7 @@ def _rates(M: FloatArray, K: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _settled(squares: FloatArray, before: FloatArray, tolerance: float) -> bool:
-    floor = 1e-12 * squares[-1]
+    floor = ROUNDING * squares[-1]
     return bool(np.all(np.abs(squares - before) <= tolerance * np.abs(squares) + floor))
 
 

@@ -13,6 +13,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, Value, instance, name_list, positive, whole
 from ..errors import LabelError, ModelError, ShapeError, counted
 from ..modes.modes import Modes
+from ..tolerances import TINY, divisor
 
 #: shapes at DOFs, real or complex
 Rows: TypeAlias = FloatArray | ComplexArray
@@ -106,9 +107,9 @@ class EffectiveIndependence(SelectionCriterion):
             return []
         fixed, p = required.shape[0], pool.shape[0]
         # orthonormal columns, so that no unit of a mode matters
-        both = np.vstack([required, pool])
+        both: FloatArray = np.vstack([required, pool])
         length = np.linalg.norm(both, axis=0)
-        both = both / np.where(length > 0, length, 1.0)
+        both = both / divisor(length)
         vectors, size, _ = la.svd(both, full_matrices=False)
         rows = np.array(vectors[:, size > _UNSEEN * size[0]])
         wanted = max(count, min(rows.shape[1] - fixed, p))
@@ -192,7 +193,7 @@ def _smallest_with(taken: Rows, pool: Rows) -> FloatArray:
     low, high = np.zeros(pool.shape[0]), np.minimum(size, max(values[0], 0.0))
     for _ in range(60):
         middle = 0.5 * (low + high)
-        gap = np.maximum(values[None, :] - middle[:, None], 1e-300)
+        gap = np.maximum(values[None, :] - middle[:, None], TINY)
         above = size - middle - np.sum(share / gap, axis=1) > 0
         low, high = np.where(above, middle, low), np.where(above, high, middle)
     return np.asarray(0.5 * (low + high))

@@ -19,6 +19,7 @@ from ..modes.modes import Modes
 from ..modes.shifted import held_factor
 from ..modes.solve import modes_reaching
 from ..structure import FEModel, Hysteretic
+from ..tolerances import SAME, divisor
 from .bounds import ErrorBound
 from .mode_pairs import paired
 
@@ -310,7 +311,7 @@ def _modal_response(
         r = modes.n_rigid
         poles = np.asarray(modes.poles)
         phi = np.asarray(modes.phi)
-        swing = np.where(poles.imag > 0, poles.imag, 1.0)
+        swing = divisor(poles.imag)
         one = np.where(np.arange(poles.size) < r, 1 / s**2, 1 / (2j * swing * (s - poles)))
         two = np.where(np.arange(poles.size) < r, 0.0, 1 / (-2j * swing * (s - poles.conj())))
         total = np.einsum("pk,fk,kq->fpq", C @ phi, one, phi.T @ B)
@@ -448,7 +449,7 @@ class ReductionQuality(Value):
         A bound that does not cover all modes that were compared with is none (`bounded`).
         """
         limit = self.band_bound if self.bounded else None
-        return limit is None or self.true_error <= limit * (1 + 1e-9)
+        return limit is None or self.true_error <= limit * (1 + SAME)
 
     def __repr__(self) -> str:
         lost = int(np.count_nonzero(np.isnan(self.freq)))

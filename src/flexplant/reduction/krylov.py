@@ -19,6 +19,7 @@ from ..modes.modes import Modes
 from ..modes.shifted import stiffness_factor
 from ..sparse.factor import DENSE_LIMIT, dense, dynamic_lu
 from ..structure import Damping, FEModel
+from ..tolerances import RANK, TINY
 from .methods import ReductionMethod
 from .projection import checked_damping, fe_model, projected
 from .reduced import ReducedModel
@@ -183,10 +184,10 @@ def _factorised(matrix: Any, omega: float) -> Callable[[Any], Any]:
     is_sparse = sp.issparse(matrix)
     if small or not is_sparse:
         full = matrix.toarray() if hasattr(matrix, "toarray") else np.asarray(matrix)
-        size = 1.0 / np.sqrt(np.abs(np.diag(full)).clip(1e-300))
+        size = 1.0 / np.sqrt(np.abs(np.diag(full)).clip(TINY))
         factor = la.lu_factor(full * size[:, None] * size)
         pivots = np.abs(np.diag(factor[0]))
-        if pivots.min() < 1e-13 * pivots.max():
+        if pivots.min() < RANK * pivots.max():
             raise ModelError(
                 f"the expansion frequency {at} is a resonance of the undamped model: its response "
                 "is infinite there. Move it a little."
@@ -200,7 +201,7 @@ def _factorised(matrix: Any, omega: float) -> Callable[[Any], Any]:
         # pivots kept on the diagonal: one refinement brings the digits back
         found = found + lu.solve(loads - matrix @ found)
         left = np.linalg.norm(loads - matrix @ found, axis=0)
-        if not np.all(left <= 1e-6 * np.linalg.norm(loads, axis=0).clip(1e-300)):
+        if not np.all(left <= 1e-6 * np.linalg.norm(loads, axis=0).clip(TINY)):
             raise SolverError(
                 f"the response at {at} leaves a residual of {left.max():.2g}: a resonance is too "
                 "near. Move the expansion frequency."
@@ -212,7 +213,7 @@ def _factorised(matrix: Any, omega: float) -> Callable[[Any], Any]:
 
 def _normed(model: FEModel, vectors: FloatArray) -> FloatArray:
     square = np.sum(vectors * np.asarray(model.M @ vectors), axis=0)
-    return np.asarray(vectors / np.sqrt(square.clip(1e-300)))
+    return np.asarray(vectors / np.sqrt(square.clip(TINY)))
 
 
 def _without(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArray:
@@ -237,6 +238,6 @@ def extended(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArr
         fresh = fresh - basis @ (basis.T @ np.asarray(model.M @ fresh))
         gram = dense(fresh.T @ np.asarray(model.M @ fresh))
         values, mix = la.eigh(gram)
-        good = values > 1e-6 * max(float(values[-1]) if values.size else 0.0, 1e-300)
+        good = values > 1e-6 * max(float(values[-1]) if values.size else 0.0, TINY)
         fresh = fresh @ (mix[:, good] / np.sqrt(values[good]))
     return np.hstack([basis, fresh])

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, IntArray
+from ..tolerances import TINY
 
 #: modes closer than this, relatively, are compared as one subspace: any change mixes their shapes
 CLUSTER = 1e-3
@@ -81,7 +82,7 @@ def _assigned(
     partner[rigid] = rigid
     if k > n_rigid:
         r = n_rigid
-        ratio = np.maximum(other_freq[None, r:], 1e-300) / np.maximum(freq[r:, None], 1e-300)
+        ratio = np.maximum(other_freq[None, r:], TINY) / np.maximum(freq[r:, None], TINY)
         far = np.minimum(np.abs(np.log(ratio)), 1.0)
         from scipy.optimize import linear_sum_assignment
 

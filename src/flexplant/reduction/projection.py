@@ -17,6 +17,7 @@ from ..sparse.factor import DENSE_LIMIT, dense, unit_diagonal
 from ..sparse.multifrontal import MultifrontalCholesky
 from ..structure import Damping, FEModel
 from ..structure.eigen import elastic_modes
+from ..tolerances import RANK, TINY
 from .bounds import ErrorBound
 from .reduced import ReducedModel
 
@@ -154,10 +155,10 @@ def projected(
     M, K = inner(model.M, T), inner(model.K, T)
     scaled, scale = unit_diagonal(M)
     values = la.eigvalsh(dense(scaled))
-    if not values[0] > 1e-13 * values[-1]:
+    if not values[0] > RANK * values[-1]:
         raise ModelError(
             f"the {T.shape[1]} coordinates of {method} depend on each other (condition of M* "
-            f"{values[-1] / max(float(values[0]), 1e-300):.3g}): M* would be singular. "
+            f"{values[-1] / max(float(values[0]), TINY):.3g}): M* would be singular. "
             + (singular or "Take fewer.")
         )
     rigid = np.zeros((T.shape[1], 0))
