@@ -11,6 +11,7 @@ from ..checks import ComplexArray, FloatArray, IntArray, instance, mapping
 from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
+from ..tolerances import divisor
 from .frf_errors import MeasuredParts, side_by_side, variance_of, warn_of_errors
 from .frf_joints import (
     FrfLink,
@@ -255,7 +256,7 @@ def _coupled(
         own = np.abs(B_out) @ np.abs(lines) @ np.abs(B_in.T)
         most_of = np.sqrt(own.max(axis=(1, 2)))[:, None]
         above, below = own.max(axis=2) / most_of, own.max(axis=1) / most_of
-    above, below = (np.where(size > 0, size, 1.0) for size in (above, below))
+    above, below = (divisor(size) for size in (above, below))
     scaled = stretch / above[:, :, None] / below[:, None, :]
     left_part, values, right_part = np.linalg.svd(scaled, full_matrices=False)
     left_part, values, right_part = left_part[:, :, :rank], values[:, :rank], right_part[:, :rank]

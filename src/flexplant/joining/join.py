@@ -21,6 +21,7 @@ from ..sparse.factor import DENSE_LIMIT, dense
 from ..structure import FEModel
 from ..structure.placed import SPANNED
 from ..structure.rigid import orthonormalised, rigid_body_basis
+from ..tolerances import TINY, divisor
 from .component import Component, JoinedShape, Model, Pose, components_of
 from .ends import split_end
 from .frf_coupling import joined_frfs
@@ -202,7 +203,7 @@ def _sizes(parts: Sequence[Component]) -> FloatArray:
         else:
             found.append(weight)
     size = np.concatenate(found)
-    return np.where(size > 0, size, 1.0)
+    return divisor(size)
 
 
 def _matrices(
@@ -372,7 +373,7 @@ def left_motions(
             mixes.append(body.T @ part.model.inertia(part.model.rigid_motions()))
             missed = np.maximum(missed, part.model.missed_motions())
         scale = np.abs(motions).max(axis=0, initial=0.0)
-        motions = motions / np.where(scale > 0, scale, 1.0)
+        motions = motions / divisor(scale)
         whole = np.vstack(mixes) * scale[:, None]
         stretch = np.asarray(rows @ motions)
         most = np.asarray(abs(rows) @ np.abs(motions)).max(axis=1, initial=0.0)
@@ -401,10 +402,10 @@ def null_space(stretch: FloatArray) -> FloatArray:
     if not stretch.size:
         return np.eye(stretch.shape[1])
     size = np.linalg.norm(stretch, axis=1)
-    _, values, right = la.svd(stretch / np.where(size > 0, size, 1.0)[:, None])
+    _, values, right = la.svd(stretch / divisor(size)[:, None])
     full = np.zeros(stretch.shape[1])
     full[: values.size] = values
-    return np.asarray(right[full <= _NONE * max(float(full.max(initial=0.0)), 1e-300)].T)
+    return np.asarray(right[full <= _NONE * max(float(full.max(initial=0.0)), TINY)].T)
 
 
 #: patches of more displacements are not examined: each is a load of the component
@@ -447,7 +448,7 @@ def compliances(
     W, A = W[list(axes)], A[:, list(axes)]
     mean = np.diag(W @ C @ W.T)
     # motions of A cost no energy here, so that C is invertible where the patch can move at all
-    beside = float(np.trace(C)) / max(float(np.sum(A**2)), 1e-300)
+    beside = float(np.trace(C)) / max(float(np.sum(A**2)), TINY)
     stiffness = la.pinvh(C + beside * A @ A.T, rtol=_RANK)
     rigid = np.diag(la.inv(A.T @ stiffness @ A)) - beside
     return np.asarray(mean), np.asarray(rigid)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..checks import FloatArray, IntArray, Value
 from ..errors import CertificateError, counted
+from ..tolerances import TINY, divisor
 from .component import Component
 from .links import Elimination, Link, machine_size, rows_of
 
@@ -105,7 +106,7 @@ def certified(
     opening: Any = abs(B @ done.T).max(axis=1)
     most: Any = (abs(B) @ abs(done.T)).max(axis=1)
     opening, most = (np.asarray(part.todense()).ravel() for part in (opening, most))
-    gap = float(np.max(opening / np.where(most > 0, most, 1.0), initial=0.0))
+    gap = float(np.max(opening / divisor(most), initial=0.0))
     size = np.array([1.0] * 3 + [machine_size(parts)] * 3)
     felt = [(link.joint.is_rigid, float(np.abs(link.carried / size).max())) for link in links]
     balance = max((part for is_rigid, part in felt if is_rigid), default=0.0)
@@ -153,7 +154,7 @@ def _force(K: Any, motions: FloatArray) -> float:
     # a motion that no spring feels has nothing but rounding of its largest entries there
     moved = np.abs(motions) + _ENTRY * np.abs(motions).max(axis=0, initial=0.0)
     most = np.linalg.norm(np.asarray(abs(K) @ moved), axis=0)
-    return float(np.max(force / np.where(most > 0, most, 1.0), initial=0.0))
+    return float(np.max(force / divisor(most), initial=0.0))
 
 
 def _inertia(parts: Sequence[Component], M: Any, kept: IntArray) -> tuple[FloatArray, float]:
@@ -169,7 +170,7 @@ def _inertia(parts: Sequence[Component], M: Any, kept: IntArray) -> tuple[FloatA
         if part.is_reduced:
             missed = np.maximum(missed, part.model.missed_motions())
     whole = np.vstack(own)[kept]
-    size = np.sqrt(np.maximum(np.diag(apart), 1e-300))
+    size = np.sqrt(np.maximum(np.diag(apart), TINY))
     error = np.abs(whole.T @ np.asarray(M @ whole) - apart) / np.outer(size, size)
     made = missed < _MADE
     return apart, float(error[np.ix_(made, made)].max(initial=0.0))
