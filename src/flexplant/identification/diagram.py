@@ -14,6 +14,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, IntArray, Value, between, real_array
 from ..errors import ModelError, ShapeError, SolverError, counted
+from ..tolerances import TINY
 
 #: flags of a pole, each including the ones before
 NEW, FREQUENCY, DAMPING, STABLE = 0, 1, 2, 3
@@ -187,7 +188,7 @@ class StabilisationDiagram(Value):
         known = np.unique(self.tracks)
         centres = np.array([np.median(self.freq[self.tracks == track]) for track in known])
         lengths = np.array([np.sum(self.tracks == track) for track in known])
-        away: Any = np.abs(centres[None, :] / np.maximum(wanted, 1e-300)[:, None] - 1.0)
+        away: Any = np.abs(centres[None, :] / np.maximum(wanted, TINY)[:, None] - 1.0)
         # a long track is meant rather than a short one a hair nearer
         cost = np.where(away < 0.03, away + 0.01 / np.maximum(lengths, 1)[None, :], 1e3)
         if cost.shape[1] < wanted.size:
@@ -270,7 +271,7 @@ def _followed(
             alike[i, group] = np.linalg.norm(basis.conj().T @ new.shapes[:, i]) ** 2 >= tol_mac
     stable = damped & alike
     flag = np.max(near * 1 + damped * 1 + stable * 1, axis=1)
-    distance = np.abs(new.poles[:, None] - old.poles) / (f_old + 1e-300)
+    distance = np.abs(new.poles[:, None] - old.poles) / (f_old + TINY)
     cost = np.where(stable, distance, np.where(near, 10.0 + distance, 1e3))
     rows, columns = so.linear_sum_assignment(cost)
     # a pole whose damping jumps is followed, but is not stable

@@ -13,6 +13,7 @@ from ..checks import ComplexArray, FloatArray, between, instance, positive, real
 from ..errors import LabelError, ModelError, ShapeError, SolverError, counted, require_known
 from ..lti.frequency import Frf
 from ..parallel import Progress, one_thread
+from ..tolerances import ROUNDING, TINY
 from .diagram import Moments, OrderPoles, PoleSelection, StabilisationDiagram, built_diagram
 from .line_weights import PreparedLines, prepared
 from .pole_test import (
@@ -226,7 +227,7 @@ def _identified(
     tried = UPPER if upper is None else (whole(upper, "upper", minimum=0),)
     max_iterations = whole(max_iterations, "max_iterations")
     rate = None if hold is None else positive(hold, "hold")
-    if rate is not None and high > rate / 2 * (1 + 1e-12):
+    if rate is not None and high > rate / 2 * (1 + ROUNDING):
         raise ModelError(f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together.")
     labels = checked_channels(dofs, frf)
     listed = checked_orders(orders)
@@ -361,7 +362,7 @@ def windows(ready: PreparedLines) -> list[Window]:
     n_freq = ready.freq.size
     count = max(1, round(n_freq / LINES))
     power = np.sum(np.abs(ready.data * ready.weight) ** 2, axis=(0, 1))
-    power = ndi.uniform_filter1d(np.log(power + 1e-300), 9)
+    power = ndi.uniform_filter1d(np.log(power + TINY), 9)
     cuts = [0]
     for i in range(1, count):
         middle, reach = round(i * n_freq / count), n_freq // (4 * count)

@@ -25,6 +25,7 @@ from ..checks import (
 from ..errors import LabelError, ModelError, ShapeError, counted
 from ..labels import Place
 from ..modes import Modes
+from ..tolerances import SAME, TINY
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -279,7 +280,7 @@ def _checked_covariance(value: Any, count: int) -> FloatArray:
         matrix = np.diag(np.concatenate([variance, variance]) / 2)
     else:
         matrix = real_array(value, "covariance", (2 * count, 2 * count))
-    if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
+    if not np.allclose(matrix, matrix.T, rtol=SAME, atol=0.0):
         raise ModelError("covariance must be symmetric: pass (C + C.T)/2 if that is meant.")
     try:
         la.cholesky(matrix)
@@ -450,6 +451,6 @@ def _likeness(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -> F
     for j in range(elastic.size):
         family = np.flatnonzero(np.abs(omega / omega[j] - 1.0) <= FAMILY)
         basis, size, _ = np.linalg.svd(phi[:, family], full_matrices=False)
-        basis = basis[:, size > 1e-9 * max(float(size[0]), 1e-300)]
+        basis = basis[:, size > 1e-9 * max(float(size[0]), TINY)]
         alike[:, j] = np.linalg.norm(basis.conj().T @ unit, axis=0) ** 2
     return alike

@@ -10,6 +10,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, Value, generator, positive, real_array, whole
 from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf
+from ..tolerances import TINY
 from .spectra import Records, error_statistics
 
 #: a line counts as excited when the weakest direction of the inputs is not this much below the rest
@@ -211,7 +212,7 @@ def _coherence(y: ComplexArray, left: ComplexArray, periods: int, n_in: int) -> 
     """Return the share of the outputs' power in a period that is not noise."""
     noise = np.einsum("foo->of", left).real
     power = np.mean(np.abs(y) ** 2, axis=2).T + (periods - 1) * noise
-    coherence = np.clip(1.0 - periods * noise / np.maximum(power, 1e-300), 0.0, 1.0)
+    coherence = np.clip(1.0 - periods * noise / np.maximum(power, TINY), 0.0, 1.0)
     return np.repeat(coherence[:, None, :], n_in, axis=1)
 
 
@@ -340,7 +341,7 @@ def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: flo
     if spectra.shape[2] < 2:
         return True
     power = np.sum(np.abs(spectra) ** 2, axis=(0, 1))
-    ratio = float(np.median(power[0] / np.maximum(power[1:].mean(axis=0), 1e-300)))
+    ratio = float(np.median(power[0] / np.maximum(power[1:].mean(axis=0), TINY)))
     if ratio < PERIODIC:
         warn(
             f"the inputs are not periodic: at half of the lines or more their power is "
@@ -362,7 +363,7 @@ def _change(x: FloatArray) -> FloatArray:
     energy = np.concatenate([[0.0], np.cumsum(np.sum(x**2, axis=(0, 1)))])
     lag = np.arange(n_time)
     both = energy[n_time - lag] + energy[-1] - energy[lag]
-    return np.asarray(np.maximum(1.0 - 2.0 * product / np.maximum(both, 1e-300), 0.0))
+    return np.asarray(np.maximum(1.0 - 2.0 * product / np.maximum(both, TINY), 0.0))
 
 
 @dataclass(frozen=True)

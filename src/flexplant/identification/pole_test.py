@@ -10,6 +10,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray
 from ..errors import SolverError, warn
+from ..tolerances import RANK
 from .refine import Fit, Lines, projected_cost, projected_model, projected_normal, refined
 
 #: probability that noise anywhere in the band passes for a pole
@@ -92,7 +93,7 @@ class _Costs:
             both = np.array([*kept, *(k + self.m for k in kept)])
             total = 0.0
             for N, g, square in self.parts:
-                x = la.lstsq(N[np.ix_(both, both)], g[both], cond=1e-13)[0]
+                x = la.lstsq(N[np.ix_(both, both)], g[both], cond=RANK)[0]
                 total += square - float(g[both] @ x)
             self.known[key] = total
         return self.known[key]

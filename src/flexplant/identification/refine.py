@@ -13,6 +13,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, counted
+from ..tolerances import RANK, TINY
 
 #: largest entry of a participation vector beside the one held at 1
 RUNAWAY = 5.0
@@ -116,7 +117,7 @@ def refined(
     enough = FINE if fine else COARSE
     for number in range(steps):
         N, g = now.gradient()
-        size = np.sqrt(np.maximum(np.diag(N), 1e-300))
+        size = np.sqrt(np.maximum(np.diag(N), TINY))
         scaled, slope = N / np.outer(size, size), g / size
         # a pole outside the band may come to the axis: it stays there, the others go on
         held = np.flatnonzero((poles.real >= -1.01 * LEAST * poles.imag) & (g[: poles.size] > 0))
@@ -203,9 +204,9 @@ class _Projected:
         self.bases: list[tuple[FloatArray, FloatArray]] = []
         self.cost = 0.0
         for o, (right, stacked) in enumerate(zip(lines.goals, self._stacked(), strict=True)):
-            size = np.maximum(np.linalg.norm(stacked, axis=0), 1e-300)
+            size = np.maximum(np.linalg.norm(stacked, axis=0), TINY)
             Q, R = _qr(stacked / size)
-            x = la.lstsq(R, Q.T @ right, cond=1e-13)[0] / size
+            x = la.lstsq(R, Q.T @ right, cond=RANK)[0] / size
             self.shapes[o] = x[:m] + 1j * x[m:]
             self.triangles.append((R, size))
             error = right - Q @ (Q.T @ right)
@@ -320,7 +321,7 @@ class _Projected:
         for o, (Q, _) in enumerate(self.bases):
             J, common = self._jacobian(o)
             R, size = self.triangles[o]
-            inverse = la.pinv(R, rtol=1e-13) / size[:, None]
+            inverse = la.pinv(R, rtol=RANK) / size[:, None]
             rows = (Q @ inverse.T).reshape(n_in, 2, n_freq, 2 * self.m)
             maps.append((-inverse @ common, rows[:, 0] + 1j * rows[:, 1]))
             N += J.T @ J

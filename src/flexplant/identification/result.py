@@ -12,6 +12,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray
 from ..errors import ModelError, SolverError, warn
 from ..lti.frequency import Frf, checked_freq
+from ..tolerances import RANK, TINY
 from .diagram import StabilisationDiagram
 from .line_weights import PreparedLines
 from .measured import MeasuredModes
@@ -79,9 +80,9 @@ def answer(
 
 def _covariance(fit: Fit, ready: PreparedLines) -> FloatArray:
     """Return the covariance of [Re lambda; Im lambda] of all poles."""
-    size = np.sqrt(np.maximum(np.diag(fit.N), 1e-300))
+    size = np.sqrt(np.maximum(np.diag(fit.N), TINY))
     # participation of repeated poles is known up to a rotation only: it gets no variance
-    inverse = la.pinvh(fit.N / np.outer(size, size), rtol=1e-13) / np.outer(size, size)
+    inverse = la.pinvh(fit.N / np.outer(size, size), rtol=RANK) / np.outer(size, size)
     both = 2 * fit.poles.size
     if ready.independent:
         chosen = inverse[:both, :both]
@@ -103,8 +104,8 @@ def _channel_covariance(fit: Fit, ready: PreparedLines) -> ComplexArray:
     is shared: near a resonance it moves all outputs along the shape, which is scale.
     """
     m, n_out, n_in = fit.poles.size, len(fit.shape_maps), fit.participation.shape[0]
-    size = np.sqrt(np.maximum(np.diag(fit.N), 1e-300))
-    inverse = la.pinvh(fit.N / np.outer(size, size), rtol=1e-13) / np.outer(size, size)
+    size = np.sqrt(np.maximum(np.diag(fit.N), TINY))
+    inverse = la.pinvh(fit.N / np.outer(size, size), rtol=RANK) / np.outer(size, size)
     slopes = np.array([slope for slope, _ in fit.shape_maps]).reshape(n_out, 2, m, -1)
     direct = [own for _, own in fit.shape_maps]
     common, mixed = inverse, np.zeros((n_out, inverse.shape[0], 2 * m))

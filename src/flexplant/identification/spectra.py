@@ -12,6 +12,7 @@ from ..checks import ComplexArray, FloatArray, Value, positive, real_array, sign
 from ..errors import ModelError, ShapeError, warn
 from ..lti.frequency import Frf
 from ..lti.line_correlation import checked_overlap, checked_window
+from ..tolerances import ROUNDING, TINY
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -212,7 +213,7 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
         inverse = _inverse(back @ _solved(found.block("r", "r"), back.conj().transpose(0, 2, 1)))
         coherent = np.einsum("fyu,fuy->fy", found.block("y", "r"), explained).real
     power = np.einsum("fyy->fy", found.block("y", "y")).real
-    coherence = np.clip(coherent / np.maximum(power, 1e-300), 0.0, 1.0)
+    coherence = np.clip(coherent / np.maximum(power, TINY), 0.0, 1.0)
     left = _left_over(found, G, with_reference=data.r is not None)
     left = left * (found.count / (found.count - n_ref))
     variance, correlation = error_statistics(left, inverse / found.count)
@@ -236,7 +237,7 @@ def error_statistics(left: ComplexArray, inverse: ComplexArray) -> tuple[FloatAr
     noise = np.maximum(np.einsum("foo->fo", left).real, 0.0)
     gain = np.einsum("fii->fi", inverse).real
     variance = noise[:, :, None] * gain[:, None, :]
-    size = np.sqrt(np.maximum(noise, 1e-300))
+    size = np.sqrt(np.maximum(noise, TINY))
     correlation = left / (size[:, :, None] * size[:, None, :])
     correlation = (correlation + correlation.conj().transpose(0, 2, 1)) / 2
     correlation /= np.maximum(1.0, np.abs(correlation))
@@ -279,7 +280,7 @@ def _open_loop(found: Averages, method: SpectralMethod) -> ComplexArray:
 def _total(found: Averages, output: int) -> ComplexArray:
     places = np.array([output, *range(found.n_out, found.n_out + found.n_in)])
     S = found.S[:, places[:, None], places]
-    size = np.sqrt(np.maximum(np.einsum("faa->fa", S).real, 1e-300))
+    size = np.sqrt(np.maximum(np.einsum("faa->fa", S).real, TINY))
     vectors = np.linalg.eigh(S / (size[:, :, None] * size[:, None, :]))[1][:, :, 0].conj()
     # of the smallest eigenvalue: v_y y + v_u u = 0
     vectors = vectors / size
@@ -308,7 +309,7 @@ def _inverse(a: ComplexArray) -> ComplexArray:
 
 def _solved(a: ComplexArray, b: ComplexArray) -> ComplexArray:
     size = np.linalg.svd(a, compute_uv=False)
-    if np.any(size[:, -1] <= 1e-12 * size[:, 0]):
+    if np.any(size[:, -1] <= ROUNDING * size[:, 0]):
         raise ModelError(
             "the inputs (or references) are dependent at some lines: excite all inputs there, "
             "independently or in as many experiments as there are inputs."

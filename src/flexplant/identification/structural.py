@@ -13,6 +13,7 @@ from ..labels import DofSet
 from ..modes import Modes
 from ..structure import interpolated
 from ..structure.rigid import rigid_motions
+from ..tolerances import divisor
 from .result import IdentifiedModes
 
 #: part of the largest eigenvalue of an inertia or a flexibility below which one is noise, and by
@@ -252,7 +253,7 @@ class MeasuredPlaces:
         some = dofs.select([dofs.labels[i] for i in rows])
         motions = rigid_motions(some, some.xyz.mean(axis=0))
         size = np.linalg.norm(motions, axis=0)
-        U = la.orth(motions / np.where(size > 0, size, 1.0), rcond=1e-9)
+        U = la.orth(motions / divisor(size), rcond=1e-9)
         r = U.shape[1]
         pairs = [(i, j) for i in range(r) for j in range(i, r)]
         made = []
@@ -287,7 +288,7 @@ class MeasuredPlaces:
 def _imaginary(shapes: ComplexArray) -> FloatArray:
     """Return the relative size (m,) of the shapes' imaginary parts."""
     size = np.linalg.norm(shapes, axis=0)
-    return np.asarray(np.linalg.norm(shapes.imag, axis=0) / np.where(size > 0, size, 1.0))
+    return np.asarray(np.linalg.norm(shapes.imag, axis=0) / divisor(size))
 
 
 def _root(S: FloatArray, trouble: str) -> FloatArray:
@@ -397,5 +398,5 @@ def shape_deviations(
     values = np.maximum(values[:, ::-1], 0.0)
     kept = min(kept, values.shape[1])
     part = values[:, :kept].sum(axis=1, keepdims=True)
-    more = values.sum(axis=1, keepdims=True) / np.where(part > 0, part, 1.0)
+    more = values.sum(axis=1, keepdims=True) / divisor(part)
     return np.asarray(vectors[:, :, ::-1][:, :, :kept] * np.sqrt(values[:, :kept] * more)[:, None])
