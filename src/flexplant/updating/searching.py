@@ -9,6 +9,7 @@ import numpy as np
 
 from ..checks import FloatArray, Rng, generator, real_array, whole
 from ..errors import FlexplantError, ModelError, ShapeError, SolverError
+from ..tolerances import divisor
 from .judgement.goodness import chance, chi_square, is_bad
 from .parameters.added import PointParameter
 from .residuals.eigenvalues import Eigenvalues
@@ -265,7 +266,7 @@ def scattered(objective: Objective, count: int, rng: Rng) -> list[FloatArray]:
     every = list(range(eigen.poles.size))
     moved = np.abs(objective.family.sensitivity(eigen, every)) / np.abs(eigen.poles)[:, None]
     typical = np.median(moved, axis=0)
-    scale = np.where(typical > 0, FIRST_CHANGE / np.where(typical > 0, typical, 1.0), 0.0)
+    scale = np.where(typical > 0, FIRST_CHANGE / divisor(typical), 0.0)
     scale = np.where(objective.has_prior, objective.prior_std, scale)
     chance = generator(rng)
     added = np.array([isinstance(q, PointParameter) for q in objective.parameters])

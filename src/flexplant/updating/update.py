@@ -11,6 +11,7 @@ from ..checks import FloatArray, Rng, flag, generator, instance, positive, whole
 from ..errors import ModelError, SolverError, counted, warn
 from ..parallel import Progress
 from ..structure.model import FEModel
+from ..tolerances import TINY
 from .full_basis import MOST_ROUNDS, FullBasis, is_large
 from .judgement.goodness import chi_square, covariance, is_bad, worst
 from .parameters.added import Parameter
@@ -343,4 +344,4 @@ def moved(objective: Objective, p: FloatArray, before: FloatArray) -> float:
     if not objective.noise_known:
         left = objective.values(point)
         size = float(left @ left) / max(left.size - p.size, 1)
-    return float((change @ change / max(size, 1e-300) / p.size) ** 0.5)
+    return float((change @ change / max(size, TINY) / p.size) ** 0.5)

@@ -9,6 +9,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ...checks import FloatArray
+from ...tolerances import TINY, divisor
 from ..point_model import Point
 from ..search import Objective
 
@@ -37,7 +38,7 @@ def chi_square(objective: Objective, point: Point, free: FloatArray) -> tuple[fl
     total = float(r @ r)
     if J.shape[1]:
         length = np.linalg.norm(J, axis=0)
-        Q = la.qr(J / np.where(length > 0, length, 1.0), mode="economic")[0]
+        Q = la.qr(J / divisor(length), mode="economic")[0]
         total -= float(np.sum((Q.T @ r) ** 2))
     return max(total, 0.0), max(dof, 0)
 
@@ -97,9 +98,9 @@ def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, F
     J, r = objective.slopes(point), objective.values(point)
     q = J.shape[1]
     length = np.linalg.norm(J, axis=0)
-    safe = np.where(length > 0, length, 1.0)
+    safe = divisor(length)
     U, s, Vt = np.linalg.svd(J / safe, full_matrices=False)
-    inverse = np.where(s > SINGULAR * s[0], 1 / np.maximum(s, 1e-300), 0.0)
+    inverse = np.where(s > SINGULAR * s[0], 1 / np.maximum(s, TINY), 0.0)
     half = (Vt.T * inverse) / safe[:, None]
     unit = half @ half.T
     spare = r.size - q
@@ -109,7 +110,7 @@ def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, F
     elif spare > 0:
         found = unit * float(r @ r) / spare
     std = np.sqrt(np.diag(unit))
-    size = np.where(std > 0, std, 1.0)
+    size = divisor(std)
     correlation = unit / np.outer(size, size)
     np.fill_diagonal(correlation, 1.0)
     regular = s.size == q and bool(s[-1] > SINGULAR * s[0])

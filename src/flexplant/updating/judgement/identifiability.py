@@ -10,6 +10,7 @@ import numpy as np
 
 from ...checks import FloatArray, Value
 from ...errors import counted
+from ...tolerances import TINY, divisor
 from ..family import repeated_groups
 from ..parameters.added import Parameter
 from ..search import Objective, checked_residuals
@@ -155,14 +156,14 @@ def identifiability(
     J = objective.slopes(point, prior=False)
     names = tuple(q.name for q in listed)
     length = np.linalg.norm(J, axis=0)
-    own = np.abs(J).max(initial=0.0) * 1e-12
+    own = np.abs(J).max(initial=0.0) * ROUNDING
     omega = float(np.median(np.abs(point.eigen.poles))) if point.eigen.poles.size else 1.0
     reach = objective.family.strength(omega)
     # a column far below what the parameter can do to this model is rounding: beside the strongest
     # one, and, as a single one is its own strongest, as a relative change of what is measured
     strongest = float(np.max(length / reach, initial=0.0))
     whole = objective.size(point)
-    change = np.linalg.norm(J / np.where(whole > 0, whole, 1.0)[:, None], axis=0)
+    change = np.linalg.norm(J / divisor(whole)[:, None], axis=0)
     seen = (length > own) & (length > 1e-9 * strongest * reach)
     seen &= change > ROUNDING * reach / omega
     scaled = np.where(seen, J / np.where(seen, length, 1.0), 0.0)
@@ -173,7 +174,7 @@ def identifiability(
     unit = half @ half.T
     lost = np.sum(Vt[~clear] ** 2, axis=0) > 1e-6
     std = np.where(lost | ~seen, np.inf, np.sqrt(np.diag(unit)) / np.where(seen, length, 1.0))
-    size = np.where(lost, 1.0, np.sqrt(np.maximum(np.diag(unit), 1e-300)))
+    size = np.where(lost, 1.0, np.sqrt(np.maximum(np.diag(unit), TINY)))
     correlation = np.where(np.outer(~lost, ~lost), unit / np.outer(size, size), np.eye(lost.size))
     mixed = []
     for vector in Vt[~clear]:

@@ -11,6 +11,7 @@ import scipy.linalg as la
 
 from ...checks import FloatArray
 from ...errors import ModelError, SolverError
+from ...tolerances import TINY, divisor
 from ..family import ROUNDING, Eigen, Family, factors
 from ..point_model import Point
 from ..search import Objective, TrustRegion
@@ -232,7 +233,7 @@ class Subsets:
         J, r = self.whole.slopes(point), self.whole.values(point)
         J, r = _beside(J[:, : self.count], J[:, self.beside], r)
         length = np.linalg.norm(J, axis=0)
-        J = J / np.where(length > 1e-12 * length.max(initial=0.0), length, np.inf)
+        J = J / np.where(length > ROUNDING * length.max(initial=0.0), length, np.inf)
         a, overlap = J.T @ r, J.T @ J
         room = 1 - overlap**2
         both = a[:, None] ** 2 + a[None] ** 2 - 2 * overlap * np.outer(a, a)
@@ -369,7 +370,7 @@ def _share(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
     J, r = _beside(J, beside, r)
     length = np.sum(J**2, axis=0)
     # a candidate that is all nuisance explains nothing of its own
-    own = length > 1e-12 * whole
+    own = length > ROUNDING * whole
     return np.asarray((J.T @ r) ** 2 / np.where(own, length, np.inf))
 
 
@@ -410,7 +411,7 @@ def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | N
     low = squares <= (BEYOND * top) ** 2
     high = np.flatnonzero(~low)
     coupled, sizes, _ = la.svd(family.D[np.ix_(high, low)], full_matrices=False)
-    coupled = coupled[:, sizes > ROUNDING * np.abs(family.D).max(initial=1e-300)]
+    coupled = coupled[:, sizes > ROUNDING * np.abs(family.D).max(initial=TINY)]
     forces = np.hstack([loads[high], coupled])
     kept = int(low.sum())
     if kept + SHIFTS * forces.shape[1] > WORTHWHILE * squares.size:
@@ -420,7 +421,7 @@ def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | N
     shifts = top**2 * (1 - np.cos(angle)) / 2
     moved = np.hstack([forces / (squares[high] - shift)[:, None] for shift in shifts])
     size = np.linalg.norm(moved, axis=0)
-    Z = la.orth(moved / np.where(size > 0, size, 1.0), rcond=1e-10)
+    Z = la.orth(moved / divisor(size), rcond=1e-10)
     turn = la.eigh((Z.T * squares[high]) @ Z)[1]
     B = np.zeros((squares.size, kept + Z.shape[1]))
     B[np.flatnonzero(low), np.arange(kept)] = 1.0

@@ -14,6 +14,7 @@ from ...errors import ModelError, ShapeError, counted, require_known, warn
 from ...labels import DIRECTIONS, Place
 from ...lti import Frf
 from ...lti.frequency import ORDERS
+from ...tolerances import divisor
 from ..family import Family
 from ..point_model import Point
 from .point_residuals import Held
@@ -162,7 +163,7 @@ class _BoundFrf(Bound):
             sigma = np.sqrt(np.moveaxis(residual.variance[:, :, lines], 2, 0) / 2)
         else:
             rms = np.sqrt(np.mean(np.abs(self.data) ** 2, axis=0))
-            sigma = np.broadcast_to(np.where(rms > 0, rms, 1.0), self.data.shape)
+            sigma = np.broadcast_to(divisor(rms), self.data.shape)
             if self.magnitude:
                 sigma = np.abs(self.data)
         if self.magnitude:
@@ -177,7 +178,7 @@ class _BoundFrf(Bound):
         whole = 1 / sigma
         if not self.magnitude:
             whole = np.sqrt(np.mean(np.abs(self.data) ** 2, axis=0)) / sigma
-        self.size = np.tile(np.where(whole > 0, whole, 1.0).ravel(), 1 if self.magnitude else 2)
+        self.size = np.tile(divisor(whole).ravel(), 1 if self.magnitude else 2)
         self._freq, self._pairs = (
             frf.freq[lines],
             [f"{o} / {i}" for o in frf.outputs for i in frf.inputs],

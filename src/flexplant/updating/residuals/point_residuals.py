@@ -12,6 +12,7 @@ import scipy.linalg as la
 from ...checks import ComplexArray, FloatArray, positive, positive_array, real_array
 from ...errors import ModelError, ShapeError, counted, require_known
 from ...labels import DIRECTIONS, Place
+from ...tolerances import SPLIT, TINY
 from ..family import Family
 from ..parameters.added import checked_place
 from ..point_model import Point
@@ -163,7 +164,7 @@ class _BoundZeros(Bound):
             np.abs(alpha) * w0
         )
         s = np.where(finite, alpha, 0) / np.where(finite, beta, 1) * w0
-        finite &= s.imag > 1e-6 * w0
+        finite &= s.imag > SPLIT * w0
         columns = np.flatnonzero(finite)
         columns = columns[self._nearest(s[columns])]
         zeros = np.asarray(s[columns], dtype=np.complex128)
@@ -261,7 +262,7 @@ class _BoundStatic(Bound):
         R = point.family.rigid @ point.family.rigid_left(point.p)
         r = R.shape[1]
         border = M @ R
-        size = np.abs(K).max() / max(float(np.abs(border).max(initial=0.0)), 1e-300) if r else 1.0
+        size = np.abs(K).max() / max(float(np.abs(border).max(initial=0.0)), TINY) if r else 1.0
         system = np.block([[K, border * size], [border.T * size, np.zeros((R.shape[1],) * 2)]])
         loads = np.zeros((system.shape[0], 2))
         loads[:k, 0], loads[:k, 1] = self.b, self.c
@@ -325,7 +326,7 @@ class Held:
         moved = la.cho_solve(self.factor, np.hstack([K, D, B]), check_finite=False)
         self.MK, self.MD, self.MB = moved[:, :k], moved[:, k : 2 * k], moved[:, 2 * k :]
         # inputs in units that make their column as large as the others
-        self.unit = max(float(np.abs(self.MB).max(initial=0.0)) * self.T, 1e-300)
+        self.unit = max(float(np.abs(self.MB).max(initial=0.0)) * self.T, TINY)
         S = np.zeros((2 * k + i, 2 * k + i))
         S[np.arange(k), k + np.arange(k)] = self.size
         S[k : 2 * k] = np.hstack([-self.MK / self.size, -self.MD, self.MB / self.unit])
@@ -373,7 +374,7 @@ class Held:
         n = 2 * self.k
         row = self.C / np.abs(self.C).max()
         gain = self.stepped[:n, n:]
-        size = max(float(np.abs(gain).max()), 1e-300)
+        size = max(float(np.abs(gain).max()), TINY)
         system = np.block([[self.stepped[:n, :n], gain / size], [row, np.zeros((1, 1))]])
         unit = np.diag(np.append(np.ones(n), 0.0))
         solve: Any = la.eig
@@ -381,7 +382,7 @@ class Held:
         # what is infinite has beta of rounding
         kept = np.flatnonzero(np.abs(beta) > 1e-10 * np.abs(alpha))
         z = alpha[kept] / beta[kept]
-        s = np.log(np.where(z == 0, 1e-300, z)) / self.T
+        s = np.log(np.where(z == 0, TINY, z)) / self.T
         upper = (s.imag > 1e-9 / self.T) & (s.imag < (np.pi - 1e-9) / self.T)
         kept, z, s = kept[upper], z[upper], s[upper]
         x, u = right[:n, kept], right[n:, kept] / size

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...checks import FloatArray
 from ...errors import ModelError, SolverError
+from ...tolerances import ROUNDING, TINY
 from .objective import Objective
 from .trust_region import TrustRegion
 from .update_method import PenalisedMethod, SearchEnd, Trail, units
@@ -113,7 +114,7 @@ def _lasso(
 
 def bic(error: float, rows: int, count: int, noisy: bool) -> float:
     """Return ``chi^2 + k ln n``, or ``n ln(e/n) + k ln n`` where the noise is not known."""
-    misfit = error if noisy else rows * float(np.log(max(error, 1e-300) / rows))
+    misfit = error if noisy else rows * float(np.log(max(error, TINY) / rows))
     return misfit + count * float(np.log(rows))
 
 
@@ -186,7 +187,7 @@ def _sparse(
             except ModelError:
                 fraction /= 2
                 continue
-            if total(changed, trial.p) <= total(r, p) * (1 + 1e-12):
+            if total(changed, trial.p) <= total(r, p) * (1 + ROUNDING):
                 break
             fraction /= 2
         else:

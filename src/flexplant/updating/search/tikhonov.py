@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...checks import FloatArray
+from ...tolerances import TINY
 from .objective import Objective
 from .trust_region import TrustRegion, minimised
 from .update_method import PenalisedMethod, SearchEnd, units
@@ -84,9 +85,7 @@ class Tikhonov(PenalisedMethod):
             one = solved(size, begin)
             begin = one.p
             change = float(np.linalg.norm((one.p - start) / unit))
-            curve.append(
-                (np.log(max(one.trail.error[-1], 1e-300)) / 2, np.log(max(change, 1e-300)))
-            )
+            curve.append((np.log(max(one.trail.error[-1], TINY)) / 2, np.log(max(change, TINY))))
             found.append(one)
         return found[corner(np.array(curve))]
 

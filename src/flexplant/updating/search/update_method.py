@@ -10,6 +10,7 @@ import numpy as np
 
 from ...checks import FloatArray, Value, positive
 from ...parallel import tick
+from ...tolerances import divisor
 from .objective import Objective
 
 #: what a bar calls the steps of all searches
@@ -117,7 +118,7 @@ def units(objective: Objective, J: FloatArray) -> FloatArray:
     """Return what counts as one change of each parameter."""
     width = (objective.upper - objective.lower) / 2
     length = np.linalg.norm(J, axis=0)
-    felt = 1 / np.where(length > 0, length, 1.0)
+    felt = 1 / divisor(length)
     unit = np.where(np.isfinite(width), width, felt)
     return np.asarray(np.where(objective.has_prior, objective.prior_std, unit), dtype=np.float64)
 
