@@ -12,6 +12,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, Value
 from ..errors import AssumptionError, unknown_label
 from ..lti.discretisation import block_diagonal
+from ..tolerances import SAME, TINY
 from .partition import Partition
 from .reach_and_sight import Assumption, full_ranks, no_zeros, reach_and_sight, response_at
 
@@ -139,7 +140,7 @@ def aliased_modes(plant: Partition) -> str:
     rate = 1.0 / plant.dt
     count = plant.assembled.realisation.n_modes
     freq = np.sqrt(np.maximum(np.linalg.det(plant.modal_blocks[:count]), 0.0)) / (2 * np.pi)
-    above = np.flatnonzero(freq >= 0.5 * rate * (1 - 1e-9))
+    above = np.flatnonzero(freq >= 0.5 * rate * (1 - SAME))
     if not above.size:
         return ""
     seen = np.round(np.abs(freq - rate * np.round(freq / rate)) / rate, 9) * rate
@@ -274,7 +275,7 @@ def _entry(
     for side, (names, gains) in sides.items():
         if not names:
             continue
-        share = gains[k] / np.maximum(gains.max(axis=0), 1e-300)
+        share = gains[k] / np.maximum(gains.max(axis=0), TINY)
         best = int(np.argmax(share))
         shares[side], channels[side] = float(share[best]), names[best]
     return ModeVisibility(number, omega / (2 * np.pi), zeta, shares, channels)

@@ -9,6 +9,7 @@ import numpy as np
 from ..errors import LabelError, ModelError
 from ..lti.statespace import StateSpace
 from ..reduction import ReducedModel
+from ..tolerances import SAME
 from .building import sampled_like, with_modes_of
 from .partition import is_plant
 from .realisation import Structure
@@ -76,7 +77,7 @@ def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:
             )
     if plant.dt and not larger.dt:
         return sampled_like(plant, larger)
-    same = bool(np.isclose(larger.dt, plant.dt, rtol=1e-9, atol=0.0))
+    same = bool(np.isclose(larger.dt, plant.dt, rtol=SAME, atol=0.0))
     if not same or larger.delay != plant.delay:
         raise ModelError(
             f"the larger plant has dt {larger.dt:g} s and delay {larger.delay:g}, the plant "

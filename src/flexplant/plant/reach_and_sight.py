@@ -14,6 +14,7 @@ from ..labels import DIRECTIONS
 from ..lti.scaling import state_scale
 from ..lti.statespace import StateSpace
 from ..lti.zeros import axis_zeros
+from ..tolerances import ROUNDING, SPLIT, TINY, divisor
 from .partition import Partition
 from .rigid.rigid_motion import body_of, rigid_modes
 
@@ -129,8 +130,8 @@ def _persistent(g: StateSpace) -> list[_Pole]:
     """Return the poles on or beyond the stability limit, upper half plane, each once."""
     poles = g.poles()
     margin = np.abs(poles) - 1 if g.dt else poles.real / np.maximum(np.abs(poles), 1.0)
-    size = max(float(np.linalg.norm(g.A, 2)), 1e-300) if poles.size else 1.0
-    near = 1e-7 * float(np.max(np.abs(poles), initial=1e-300))
+    size = max(float(np.linalg.norm(g.A, 2)), TINY) if poles.size else 1.0
+    near = 1e-7 * float(np.max(np.abs(poles), initial=TINY))
     found: list[_Pole] = []
     for pole in poles[(margin > -_AXIS) & (poles.imag >= 0)]:
         if any(abs(pole - other.value) < near for other in found):
@@ -245,7 +246,7 @@ def response_at(block: StateSpace, at: complex) -> ComplexArray:
 def _part(rows: FloatArray | ComplexArray, basis: ComplexArray) -> ComplexArray:
     """Return rows @ basis, rounding set to zero: a channel without part has exactly none."""
     product = np.asarray(rows @ basis, dtype=np.complex128)
-    product[np.abs(product) < 1e-12 * np.linalg.norm(rows, axis=1)[:, None]] = 0.0
+    product[np.abs(product) < ROUNDING * np.linalg.norm(rows, axis=1)[:, None]] = 0.0
     return product
 
 
@@ -256,9 +257,9 @@ def _named(plant: Partition, pole: complex) -> str:
     if plant.modal_blocks.size:
         own = np.linalg.eigvals(plant.modal_blocks)
         off = np.minimum(np.abs(own - pole), np.abs(own - pole.conjugate())).min(axis=1)
-        if off.min() < 1e-6 * abs(pole) and int(np.argmin(off)) + 1 in plant.unstable_modes:
+        if off.min() < SPLIT * abs(pole) and int(np.argmin(off)) + 1 in plant.unstable_modes:
             return f"the unstable rigid-body {plant.unstable_modes[int(np.argmin(off)) + 1]}"
-        if off.min() < 1e-6 * abs(pole):
+        if off.min() < SPLIT * abs(pole):
             return f"mode {int(np.argmin(off)) + 1} ({abs(pole) / (2 * np.pi):.4g} Hz)"
     return f"the pole {pole:.4g}"
 
@@ -323,7 +324,7 @@ def full_ranks(plant: Partition) -> list[Assumption]:
     ):
         sizes = np.linalg.norm(matrix, axis=0)
         free = [name for name, size in zip(names, sizes, strict=True) if not size]
-        scaled = matrix / np.where(sizes > 0, sizes, 1.0)
+        scaled = matrix / divisor(sizes)
         rank = int(np.linalg.matrix_rank(scaled, tol=1e-9)) if scaled.size else 0
         if free:
             found.append(Assumption(key, False, f"{', '.join(free)} {text}.", remedy))
@@ -376,7 +377,7 @@ def _transposed(g: StateSpace) -> StateSpace:
 def _frequency(plant: Partition, zero: complex) -> str:
     """Return a zero on the stability limit as a frequency, with the mode it belongs to."""
     omega = abs(np.log(zero)) / plant.dt if plant.dt else abs(zero)
-    if omega < 1e-6 * _fastest(plant):
+    if omega < SPLIT * _fastest(plant):
         return "zero frequency (a rigid-body motion or an integrator)"
     text = f"{omega / (2 * np.pi):.4g} Hz"
     own = np.sqrt(np.abs(np.linalg.det(plant.modal_blocks)))
@@ -390,7 +391,7 @@ def _frequency(plant: Partition, zero: complex) -> str:
 def _fastest(plant: Partition) -> float:
     if plant.dt:
         return float(np.pi / plant.dt)
-    return float(np.max(np.abs(plant.system.poles()), initial=1e-300))
+    return float(np.max(np.abs(plant.system.poles()), initial=TINY))
 
 
 @dataclass(frozen=True, eq=False)

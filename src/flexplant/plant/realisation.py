@@ -20,6 +20,7 @@ from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..structure.definite import signed_square
 from ..structure.placed import Structure as Structure
+from ..tolerances import SAME, TINY
 
 T = TypeVar("T")
 
@@ -210,7 +211,7 @@ def _where(real: RealForm, *, overdamped: bool = False) -> str:
     values, left, right = la.eig(A, left=True)
     overlap = np.abs(np.sum(left.conj() * right, axis=0))
     if overdamped:
-        overlap = np.where(np.abs(values.imag) <= 1e-9 * np.abs(values), overlap, 2.0)
+        overlap = np.where(np.abs(values.imag) <= SAME * np.abs(values), overlap, 2.0)
     worst = right[:, int(np.argmin(overlap))]
     i = int(np.argmax(np.abs(worst[:k]) ** 2 + np.abs(worst[k:]) ** 2))
     return f"near mode {r + i + 1} ({omega[i] / (2 * np.pi):.4g} Hz undamped)"
@@ -224,7 +225,7 @@ def _dense(model: Structure, real: RealForm, why: str) -> ModalRealisation:
     """
     r, C, phi = real.n_rigid, real.C.copy(), real.phi.copy()
     if r:
-        size = PROPORTIONAL * max(float(np.abs(C).max()), 1e-300)
+        size = PROPORTIONAL * max(float(np.abs(C).max()), TINY)
         rank, turned = _turned(C[:, :r], size)
         phi[:, :r] = phi[:, :r] @ turned
         C[:, :r] = C[:, :r] @ turned

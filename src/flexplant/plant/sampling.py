@@ -14,6 +14,7 @@ from ..errors import AssumptionError
 from ..lti.discretisation import accumulated_noise, acting, block_diagonal, pair_expm
 from ..lti.lyapunov import compressed
 from ..lti.statespace import StateSpace
+from ..tolerances import SAME, TINY
 
 
 class Late(NamedTuple):
@@ -27,7 +28,7 @@ class Late(NamedTuple):
         """Split delays [s] at a sampling time; what is whole to rounding is whole."""
         samples = np.array([delays.get(name, 0.0) for name in names]) / h
         near = np.round(samples)
-        samples = np.where(np.abs(samples - near) < 1e-9 * np.maximum(near, 1.0), near, samples)
+        samples = np.where(np.abs(samples - near) < SAME * np.maximum(near, 1.0), near, samples)
         whole = np.floor(samples).astype(np.int64)
         return cls(whole, (samples - whole) * h)
 
@@ -235,7 +236,7 @@ class Flow:
         h, t = head, n - head - 2 * b
         self.h, self.t, self.b = h, t, b
         # coupling no larger than the rates: large units would make expm square too often
-        rate = max(float(np.abs(A[self.modes, self.modes]).max(initial=0.0)), 1e-300)
+        rate = max(float(np.abs(A[self.modes, self.modes]).max(initial=0.0)), TINY)
         self.up = rate / max(float(np.abs(A[self.head, self.modes]).max(initial=0.0)), rate)
         self.down = rate / max(
             float(np.abs(A[self.modes, self.tail]).max(initial=0.0)),

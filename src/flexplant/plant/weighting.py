@@ -12,6 +12,7 @@ from ..errors import ModelError, require_known
 from ..lti.discretisation import tustin
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, System, as_statespace
+from ..tolerances import SAME
 from .building import P
 from .origin import Weighted
 from .partition import Partition
@@ -90,7 +91,7 @@ def at_rate(weight: StateSpace, name: str, dt: float) -> StateSpace:
         return weight.replace(dt=dt)
     if dt and not weight.dt:
         return tustin(weight, 1.0 / dt)
-    if not np.isclose(weight.dt, dt, rtol=1e-9, atol=0.0):
+    if not np.isclose(weight.dt, dt, rtol=SAME, atol=0.0):
         raise ModelError(
             f"the weight of {name!r} has dt {weight.dt:g} s, the plant {dt:g} s. Give it as a "
             "continuous system, which is sampled at the plant's rate."

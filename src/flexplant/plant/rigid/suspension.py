@@ -17,6 +17,7 @@ from ...reduction import ReducedModel
 from ...structure import Damper, FEModel, Spring
 from ...structure.placed import SPANNED
 from ...structure.rigid import orthonormalised
+from ...tolerances import TINY, divisor
 from ..port import checked_direction, checked_place
 from ..realisation import realised
 
@@ -166,8 +167,8 @@ def _untouched(rows: FloatArray, rigid: FloatArray) -> FloatArray:
     most = np.abs(rows).sum(axis=1, keepdims=True) * np.abs(rigid).max()
     stretch[np.abs(stretch) <= _SLACK * most] = 0.0  # a spring on the axis of a hinge
     size = np.linalg.norm(stretch, axis=1, keepdims=True)
-    _, values, right = np.linalg.svd(stretch / np.where(size > 0, size, 1.0), full_matrices=True)
-    rank = int(np.count_nonzero(values > _SLACK * max(values.max(initial=0.0), 1e-300)))
+    _, values, right = np.linalg.svd(stretch / divisor(size), full_matrices=True)
+    rank = int(np.count_nonzero(values > _SLACK * max(values.max(initial=0.0), TINY)))
     return np.asarray(right[rank:].T)
 
 

@@ -14,6 +14,7 @@ from ...lti.discretisation import bilinear, discretized, tustin
 from ...lti.interconnection import lft
 from ...lti.scaling import state_scale
 from ...lti.statespace import StateSpace
+from ...tolerances import ROUNDING, TINY, divisor
 from ..partition import Partition
 from .neglected import NeglectedModes, opened
 from .uncertain_plant import Delta, UncertainPlant, with_changes
@@ -195,10 +196,10 @@ class _EvenUnits(NamedTuple):
     @classmethod
     def of(cls, g: StateSpace) -> _EvenUnits:
         d = state_scale(g.A, g.B, g.C)
-        size = max(float(np.linalg.norm(g.A * d / d[:, None], 2)), 1e-300)
+        size = max(float(np.linalg.norm(g.A * d / d[:, None], 2)), TINY)
         into = np.abs(g.B / d[:, None]).max(axis=0, initial=0.0)
         out = np.abs(g.C * d).max(axis=1, initial=0.0)
-        into, out = (np.where(part > 0, part, 1.0) for part in (into, out))
+        into, out = (divisor(part) for part in (into, out))
         return cls(np.concatenate([1.0 / d, size / out]), np.concatenate([d, size / into]))
 
     def scaled(self, g: StateSpace) -> FloatArray:
@@ -314,7 +315,7 @@ def require_exact(
         np.eye(count) - whole[np.ix_(inner, inner)] @ amounts, whole[np.ix_(inner, columns)]
     )
     made = whole[np.ix_(outer, columns)] + whole[np.ix_(outer, inner)] @ amounts @ closed
-    allowed = 1e-6 * np.abs(wanted - base).max(axis=1) + 1e-12 * np.abs(wanted).max(axis=1)
+    allowed = 1e-6 * np.abs(wanted - base).max(axis=1) + ROUNDING * np.abs(wanted).max(axis=1)
     bad = np.flatnonzero(np.abs(made - wanted).max(axis=1) > allowed)
     if bad.size:
         name = (*plant.system.states, *plant.system.outputs)[int(bad[0])]

@@ -16,6 +16,7 @@ from ...lti.frequency import frequency_response
 from ...lti.interconnection import side_by_side
 from ...lti.modal import part_of
 from ...lti.statespace import StateSpace, System
+from ...tolerances import TINY
 from ..building import sampled_like, with_modes_of
 from ..partition import Partition, is_plant
 from ..realisation import Structure
@@ -428,7 +429,7 @@ class _Term:
 def _standing_out(freq: FloatArray, height: FloatArray, poles: ComplexArray) -> ComplexArray:
     """Return the poles at which the curve is far above what it is half an eighth away."""
     at = np.log(np.maximum(freq, freq[1]))
-    line = np.log(height + 1e-300)
+    line = np.log(height + TINY)
     own = np.log(np.abs(poles) / (2 * np.pi))
     top, low, high = (np.interp(own + step, at, line) for step in (0.0, -0.06, 0.06))
     return np.asarray(poles[top - np.minimum(low, high) > np.log(_PROMINENT)])
@@ -496,7 +497,7 @@ def _factor(constant: float, ends: dict[complex, complex], unit: float) -> State
     share = np.array(list(ends.values()), dtype=np.complex128)
     at = -(np.concatenate([poles, poles.conj()]) ** 2)
     root = np.sqrt(np.concatenate([share, share.conj()]))
-    n, top = at.size, float(np.abs(root).max(initial=1e-300))
+    n, top = at.size, float(np.abs(root).max(initial=TINY))
     # bordered, not divided by the constant: slow zeros would be lost in the rounding of fast ones
     left, right = np.diag(np.append(at, constant / top**2)), np.diag(np.append(np.ones(n), 0.0))
     left[:n, n] = left[n, :n] = root / top

@@ -15,6 +15,7 @@ from ...errors import LabelError, ModelError, unknown_label
 from ...identification import MeasuredModes
 from ...labels import Place
 from ...lti.statespace import StateSpace
+from ...tolerances import SAME, TINY
 from ...updating import UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters.added import Parameter
 from ..building import P, continuous_plant, rebuilt
@@ -241,7 +242,7 @@ def _channels(plant: Partition, deltas: Sequence[Delta]) -> _Channels:
         left[:, j] = np.where(plain, change @ R, seen[0])
         again[:, j] = np.where(plain, 0.0, seen[1] / rate_size)
         right[j] = R
-        even = np.sqrt(delta.scale * max(float(np.abs(left[:n, j]).max()), 1e-300))
+        even = np.sqrt(delta.scale * max(float(np.abs(left[:n, j]).max()), TINY))
         right[j] *= even
         left[:, j] *= delta.scale / even
         again[:, j] *= delta.scale / even
@@ -370,7 +371,7 @@ def by_parameters(
     for name in "MDK":
         own, others = getattr(model, name, None), getattr(fit.model, name)
         if own is None or own.shape != others.shape or not np.allclose(
-            _dense(own), _dense(others), rtol=1e-9, atol=0.0
+            _dense(own), _dense(others), rtol=SAME, atol=0.0
         ):  # fmt: skip
             raise ModelError(
                 f"the plant has another {name} than the fit's model. Assemble it from fit.model."
@@ -508,7 +509,7 @@ def _factors(plant: Partition, delta: Delta, base: FloatArray, q: int, v: int) -
     # displacements and velocities read the states, accelerations what else their rate holds
     size, rest, beyond = np.linalg.norm(seen, axis=1), seen.copy(), base[v].copy()
     rest[:, [q, v]], beyond[[q, v]] = 0.0, 0.0
-    amount = rest @ beyond / max(float(beyond @ beyond), 1e-300)
+    amount = rest @ beyond / max(float(beyond @ beyond), TINY)
     amount[np.linalg.norm(rest, axis=1) <= _ROUNDING * size] = 0.0
     plain = seen - np.outer(amount, base[v])
     motion, speed = (np.eye(base.shape[1])[i] for i in (q, v))
