@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..checks import ComplexArray, FloatArray
+from ..tolerances import TINY
 
 #: sweeps that balance rows against columns; a sweep gains the coupling squared, units at once
 _SWEEPS = 30
@@ -51,12 +52,12 @@ def _balanced(S: ComplexArray) -> FloatArray:
     k, n = S.shape[:2]
     power, log = np.abs(S) ** 2, np.zeros((k, n))
     power[:, range(n), range(n)] = 0.0
-    least = 1e-24 * np.sum(np.abs(S) ** 2, axis=(1, 2)) + 1e-300
+    least = 1e-24 * np.sum(np.abs(S) ** 2, axis=(1, 2)) + TINY
     for _ in range(_SWEEPS if n > 1 else 0):
         for i in range(n):
             row, column = power[:, i].sum(axis=1), power[:, :, i].sum(axis=1)
             one_way = np.minimum(row, column) <= least * 1e-6
-            step = 0.25 * np.log((column + 1e-300) / (row + 1e-300))
+            step = 0.25 * np.log((column + TINY) / (row + TINY))
             step = np.where(one_way, np.clip(step, -_LARGEST, _LARGEST), step)
             step = np.where(np.maximum(row, column) <= 1e-290, 0.0, step)
             log[:, i] += step

@@ -13,6 +13,7 @@ from ..lti.interconnection import connect
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..tolerances import SAME
 
 
 def joined(
@@ -109,7 +110,7 @@ def as_block(block: Any, place: int, dt: float) -> StateSpace:
             "StateSpace with inputs= and outputs=, or a value with such a .system."
         )
     sys = inner if isinstance(inner, StateSpace) else StateSpace.from_control(inner)
-    if sys.n_states and not np.isclose(sys.dt, dt, rtol=1e-9, atol=0.0):
+    if sys.n_states and not np.isclose(sys.dt, dt, rtol=SAME, atol=0.0):
         raise ModelError(
             f"block {place} {sys!r} has dt {sys.dt:g} s, the plant {dt:g} s (0 is continuous). "
             "Design it on plant.discretized(rate), or discretise it at the plant's rate."

@@ -23,6 +23,7 @@ from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..lti.responses import continuous_poles, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..tolerances import divisor
 
 #: relative: the variance by the two Lyapunov equations, and by the integral of the spectrum
 AGREEMENT = 1e-6
@@ -314,7 +315,7 @@ def integrated(find: Densities, monitored: StateSpace, variances: FloatArray) ->
 
     left, right = edges[:-1], edges[1:]
     fine, error = values(left, right)
-    size = np.where(variances > 0, variances, 1.0)[:, None]
+    size = divisor(variances)[:, None]
     for _ in range(ROUNDS):
         share = np.max(error / size, axis=0, initial=0.0)
         if share.sum() <= TOLERANCE:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray
 from ..lti.between_lines import AROUND, LINES, pole_between
+from ..tolerances import TINY
 
 #: damping ratio below which a mode is not considered: no structure has less
 _LEAST = 1e-5
@@ -39,7 +40,7 @@ class HiddenModes(NamedTuple):
 def low_slope(freq: FloatArray, plant: ComplexArray) -> float:
     """Return how P (ny, nu, n) falls at the lowest lines: 2 for a free body, 0 for a held one."""
     low = freq <= max(1.5 * freq[0], freq[min(3, freq.size - 1)])
-    size = np.maximum(np.linalg.norm(plant[:, :, low], axis=(0, 1)), 1e-300)
+    size = np.maximum(np.linalg.norm(plant[:, :, low], axis=(0, 1)), TINY)
     return -float(np.polyfit(np.log(freq[low]), np.log(size), 1)[0])
 
 

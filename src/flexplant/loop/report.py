@@ -11,6 +11,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, Value, whole
 from ..errors import counted, unknown_label
 from ..lti.responses import Responder
+from ..tolerances import TINY
 from .broken import BrokenLoop, inverted
 from .hidden_modes import FEWEST, HiddenModes, low_slope
 from .sensitivity import Loop, taken_apart
@@ -243,8 +244,8 @@ def report_loops(
 
 def _count(parts: BrokenLoop, grid: FloatArray, rigid: int, unstable: int) -> NyquistCount:
     poles = parts.poles()
-    distance = np.log(np.where(poles == 0, 1e-300, poles)) if parts.dt else poles
-    scale = 1.0 if parts.dt else np.max(np.abs(poles), initial=1e-300)
+    distance = np.log(np.where(poles == 0, TINY, poles)) if parts.dt else poles
+    scale = 1.0 if parts.dt else np.max(np.abs(poles), initial=TINY)
     if parts.measured is None:
         return NyquistCount(int(np.count_nonzero(distance.real >= 0.0)))
     if grid.size < FEWEST:

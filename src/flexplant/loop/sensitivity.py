@@ -16,6 +16,7 @@ from ..lti.interconnection import loop_poles
 from ..lti.responses import remembered, responder
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
+from ..tolerances import SAME
 from .broken import BrokenLoop, inverted, largest, moved
 from .closed import ClosedLoop
 
@@ -240,7 +241,7 @@ def _modelled(
     if (
         plant.n_states
         and controller.n_states
-        and not np.isclose(plant.dt, controller.dt, rtol=1e-9)
+        and not np.isclose(plant.dt, controller.dt, rtol=SAME)
     ):
         raise ModelError(
             f"plant and controller have dt {plant.dt:g} and {controller.dt:g} s: discretise one."

@@ -13,6 +13,7 @@ from ..certificates import in_words, stability_name
 from ..checks import FloatArray, IntArray, Value
 from ..errors import ModelError
 from ..lti.statespace import StateSpace
+from ..tolerances import TINY
 
 #: a mode with less than this part of the one that takes part most is not named
 _TAKES_PART = 0.3
@@ -176,7 +177,7 @@ def growing_modes(
         part = np.abs(left[:, i] * right[:, i])
         share = _summed(part, numbers)
         pole = np.log(values[i]) / loop.dt if loop.dt else values[i]
-        for number in np.flatnonzero(share >= max(_TAKES_PART * share.max(), 1e-300)).tolist():
+        for number in np.flatnonzero(share >= max(_TAKES_PART * share.max(), TINY)).tolist():
             found.setdefault(number, float(abs(pole.imag) / (2.0 * np.pi)))
     return tuple(found), tuple(found.values())
 
