@@ -10,6 +10,7 @@ from ..checks import ComplexArray, FloatArray, IntArray, with_unit
 from ..errors import counted
 from ..plant import StandardPlant
 from ..plant.uncertainty.uncertain_plant import Delta, with_changes
+from ..tolerances import SAME, TINY, divisor
 from .estimator import KalmanEstimator
 from .innovation_spectrum import InnovationLines, InnovationParts, impulse, parts_of, steady_gain
 from .whiteness import ExcessPeak
@@ -62,7 +63,7 @@ def outliers(
     spread = np.nanmedian(np.abs(normal), axis=0) / norm.ppf(0.75)
     # the median of n samples is known within 1.2 / sqrt(n): twice that on top
     limit = norm.isf(0.5 * alpha / count) * (1.0 + 2.4 / np.sqrt(len(normal)))
-    bound = limit * np.maximum(spread, 1e-300)
+    bound = limit * np.maximum(spread, TINY)
     if not np.any(np.abs(normal) > bound):
         return None
     left, plain = white.copy(), normal.copy()
@@ -132,13 +133,13 @@ def offset(observer: KalmanEstimator, white: FloatArray, alpha: float) -> Offset
     x = np.where(there[:, None], white, 0.0)
     mean = x.sum(axis=0) / n
     low = np.fft.rfft(x - np.where(there[:, None], mean, 0.0), axis=0)[1 : _LOWEST + 1]
-    around = max(float(np.mean(np.abs(low) ** 2)) / n, 1e-300)
+    around = max(float(np.mean(np.abs(low) ** 2)) / n, TINY)
     power = n * float(mean @ mean) / p
     if f.sf(power / around, p, 2 * p * _LOWEST) >= alpha or chi2.sf(power * p, p) >= alpha:
         return None
     gain, units = steady_gain(observer), observer.plant.units
     along = np.sum(gain**2, axis=0)
-    sizes = gain.T @ mean / np.where(along > 0, along, 1.0)
+    sizes = gain.T @ mean / divisor(along)
     rest = n * (mean @ mean - sizes**2 * along) / around
     possible = [i for i in np.argsort(rest) if rest[i] < chi2.isf(alpha, max(p - 1, 1)) or p == 1]
     if not possible:
@@ -206,7 +207,7 @@ def peak_verdict(
     top = np.max(kept.freq[kept.freq < 0.5 * rate], initial=0.0)
     highest = max(peaks, key=lambda one: one.height)
     at = highest.freq * rate
-    near = np.flatnonzero(np.abs(seen - at) <= _NEAR * np.maximum(seen, 1e-300))
+    near = np.flatnonzero(np.abs(seen - at) <= _NEAR * np.maximum(seen, TINY))
     near = near[np.argsort(np.abs(seen[near] - at))]
     i = next((int(j) for j in near if _changed(observer, lines, level, at, kept, int(j))), None)
     if i is not None:
@@ -312,7 +313,7 @@ def _changed(
         return True  # its modes cannot be changed one by one
     rate, mode = 1.0 / plant.dt, float(kept.freq[i])
     seen = float(folded(np.array([mode]), rate)[0])
-    sign = 1.0 if abs(mode - rate * np.round(mode / rate) - seen) <= 1e-9 * rate else -1.0
+    sign = 1.0 if abs(mode - rate * np.round(mode / rate) - seen) <= SAME * rate else -1.0
     reach = 3.0 * abs(at - seen) + 0.02 * at
     freq = lines.freq * rate
     band = np.flatnonzero(np.abs(freq - 0.5 * (at + seen)) <= reach)

@@ -20,6 +20,7 @@ from ..modes import Modes
 from ..plant import StandardPlant
 from ..reduction import ReducedModel
 from ..structure import FEModel
+from ..tolerances import SAME, TINY, divisor
 from .estimator_channels import estimates, poi_channels, read_alike, same_pois
 
 #: two ways to a variance agree to this, half a per cent of an rms: no machine is known so well;
@@ -59,7 +60,7 @@ def error_variances(
     those of a suspension. The elastic states are solved mode by mode, O(n^2) of them. The dual
     equation, from the output back to the noises, gives the same variances by another way.
     """
-    if not np.isclose(plant.dt, observer.dt, rtol=1e-9, atol=0.0):
+    if not np.isclose(plant.dt, observer.dt, rtol=SAME, atol=0.0):
         raise ModelError(
             "the error of an observer needs a plant of its sampling time, "
             f"{observer.dt:g} s, got {plant.dt:g} s."
@@ -71,7 +72,7 @@ def error_variances(
         dual = np.array([_dual_dense(joint, row) for row in joint.E])
     else:
         primal, dual = _primal(joint), _dual(joint)
-    size = np.where(primal > 0, primal, 1.0)
+    size = divisor(primal)
     # both have the same poles: how far rounding moves their damping shows in neither
     rounded = np.sum(missed.variances * (np.finfo(np.float64).eps / missed.gap), axis=1)
     difference = float(np.max((np.abs(dual - primal) + rounded) / size, initial=0.0))
@@ -173,7 +174,7 @@ def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
     moved = np.linalg.norm(_left(inverse, joint.noise[:n]), axis=1) / np.sqrt(gap)
     terms, missed = (np.abs(see) + np.abs(keep @ V)) * moved, np.abs(see + keep @ V) * moved
     size = np.linalg.norm(terms, axis=1, keepdims=True)
-    part = [np.linalg.norm(x / np.where(size > 0, size, 1.0), axis=0) for x in (missed, terms)]
+    part = [np.linalg.norm(x / divisor(size), axis=0) for x in (missed, terms)]
     known = part[0] < _FOLLOWED * part[1]
     if joint.modal is not None:
         known = np.repeat(known.reshape(-1, 2).all(axis=1), 2)
@@ -234,7 +235,7 @@ def _followed(A: FloatArray, n: int, entering: FloatArray, kept: FloatArray) -> 
 
 
 def _check_seen(plant: StandardPlant, seen: FloatArray, motion: FloatArray) -> None:
-    worst = np.linalg.norm(seen, axis=1) / np.maximum(np.linalg.norm(motion, axis=1), 1e-300)
+    worst = np.linalg.norm(seen, axis=1) / np.maximum(np.linalg.norm(motion, axis=1), TINY)
     if np.max(worst) > _SEEN:
         raise AssumptionError(
             f"the estimate of {poi_channels(plant)[int(np.argmax(worst))]!r} misses "
@@ -427,7 +428,7 @@ def nodes_per_wavelength(
         return None
     apart = np.sum((shapes[i] - shapes[j]) ** 2, axis=(0, 2))
     size = np.sum(shapes[i] ** 2 + shapes[j] ** 2, axis=(0, 2))
-    turn = np.arccos(np.clip(1.0 - apart / np.where(size > 0, size, 1.0), -1.0, 1.0))
+    turn = np.arccos(np.clip(1.0 - apart / divisor(size), -1.0, 1.0))
     return np.asarray(2.0 * np.pi / np.maximum(turn, 1e-9))
 
 
@@ -507,7 +508,7 @@ def unresolved_share(
     factor[larger.modal_states.reshape(-1, 2)[coarse].reshape(-1)] = 0.0
     still = larger.replace(origin=larger.assembled.replace(noise_factor=factor))
     rest = error_variances(read_alike(plant, still), observer).values
-    shares = 1.0 - rest / np.where(variances > 0, variances, 1.0)
+    shares = 1.0 - rest / divisor(variances)
     share = float(np.max(shares))
     if share > WARNED:
         named = [c for c, part in zip(poi_channels(plant), shares, strict=True) if part > WARNED]

@@ -12,6 +12,7 @@ from ..errors import AssumptionError, ShapeError, SolverError, counted
 from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..tolerances import divisor
 from .estimator_channels import estimates, poi_channels, sensors
 from .left_out import LeftOut
 
@@ -170,7 +171,7 @@ def check_precision(model: FilterModel, error: Exception) -> None:
     """Raise SolverError when the noise of a sensor is why a filter could not be computed."""
     moved = model.C2 @ model.Q @ model.C2.T
     motion, noise = np.sqrt(moved.diagonal()), np.sqrt(model.R.diagonal())
-    part = np.where(motion > 0, noise / np.where(motion > 0, motion, 1.0), np.inf)
+    part = np.where(motion > 0, noise / divisor(motion), np.inf)
     if np.min(part) > _LOST:
         return
     i = int(np.argmin(part))
@@ -241,7 +242,7 @@ def noise_root(model: FilterModel) -> tuple[FloatArray, FloatArray]:
     """
     n, joint = model.A.shape[0], np.block([[model.Q, model.S], [model.S.T, model.R]])
     size = np.sqrt(np.maximum(joint.diagonal(), 0.0))
-    size = np.where(size > 0, size, 1.0)
+    size = divisor(size)
     values, vectors = np.linalg.eigh(joint / size / size[:, None])
     root = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     return root[:n], root[n:]

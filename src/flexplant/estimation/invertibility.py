@@ -14,6 +14,7 @@ from ..errors import AssumptionError, require_known
 from ..lti.scaling import state_scale
 from ..lti.statespace import System
 from ..plant import StandardPlant
+from ..tolerances import SPLIT, TINY, divisor
 from .estimator_channels import checked_plant
 from .filter_model import FilterModel, filter_model
 
@@ -106,9 +107,9 @@ class Invertibility(Value):
         grows = f" that grows by {size:.6g} per sample" if size > 1 + _LIMIT else ""
         if abs(zero - 1) < 1e-5:
             return "a constant force (zero at 1: no sensor sees a displacement that it makes)"
-        if zero.real < 0 and abs(zero.imag) < 1e-6 * size:
+        if zero.real < 0 and abs(zero.imag) < SPLIT * size:
             return f"a force of alternating sign{grows} (zero at {zero.real:.6g}, by the sampling)"
-        if abs(zero.imag) < 1e-6 * size:
+        if abs(zero.imag) < SPLIT * size:
             return f"a force{grows} (zero at {zero.real:.6g})"
         freq = abs(np.angle(zero)) / (2 * np.pi * self.dt)
         return f"a force of {freq:.4g} Hz{grows}"
@@ -186,7 +187,7 @@ def entry(plant: StandardPlant, names: Sequence[str]) -> InputEntry:
 
 def judged(model: FilterModel, d: InputEntry, names: tuple[str, ...]) -> Invertibility:
     """Return ranks and zeros; see `invertibility`."""
-    out = 1.0 / np.sqrt(np.maximum(model.R.diagonal(), 1e-300))[:, None]
+    out = 1.0 / np.sqrt(np.maximum(model.R.diagonal(), TINY))[:, None]
     C, H = out * model.C2, out * d.H
     direct, delayed, m = _rank(H), _rank(C @ d.G), len(names)
     delay = 0 if direct == m else 1 if not direct and delayed == m else None
@@ -199,9 +200,9 @@ def judged(model: FilterModel, d: InputEntry, names: tuple[str, ...]) -> Inverti
 def _rank(matrix: FloatArray) -> int:
     """Return the rank, columns and rows of unit size."""
     columns = np.linalg.norm(matrix, axis=0)
-    scaled = matrix / np.where(columns > 0, columns, 1.0)
+    scaled = matrix / divisor(columns)
     rows = np.linalg.norm(scaled, axis=1, keepdims=True)
-    return int(np.linalg.matrix_rank(scaled / np.where(rows > 0, rows, 1.0), tol=_RANK))
+    return int(np.linalg.matrix_rank(scaled / divisor(rows), tol=_RANK))
 
 
 def _zeros(A: FloatArray, G: FloatArray, C: FloatArray, F: FloatArray, delay: int) -> ComplexArray:
@@ -217,18 +218,18 @@ def _zeros(A: FloatArray, G: FloatArray, C: FloatArray, F: FloatArray, delay: in
     d = state_scale(inner, G / size, C)
     inner, seen = inner * d / d[:, None], seen * d
     rows = np.linalg.norm(C * d, axis=1, keepdims=True)
-    seen = seen / np.where(rows > 0, rows, 1.0)
+    seen = seen / divisor(rows)
     found: list[complex] = []
     for value in la.eigvals(inner):
         size_of = abs(value)
         if size_of < 1 - 1e-5 or value.imag < -1e-9:
             continue
         near = 1.0 if abs(value - 1) < 1e-4 else value  # Jordan blocks come out at the root
-        if abs(near) < 1 - _LIMIT or any(abs(near - other) < 1e-6 for other in found):
+        if abs(near) < 1 - _LIMIT or any(abs(near - other) < SPLIT for other in found):
             continue
         test = np.vstack([near * np.eye(len(inner)) - inner, seen])
         columns = np.linalg.norm(test, axis=0)
-        if la.svdvals(test / np.where(columns > 0, columns, 1.0))[-1] < _UNSEEN:
+        if la.svdvals(test / divisor(columns))[-1] < _UNSEEN:
             found.append(complex(near))
     return np.array(found, dtype=np.complex128)
 
@@ -299,17 +300,17 @@ def _unseen(plant: StandardPlant, names: Sequence[str]) -> FloatArray:
     """Return the combinations (m, k) of constant forces that leave y at zero, in reduced form."""
     m, d = filter_model(plant), entry(plant, names)
     n = len(m.A)
-    noise = 1.0 / np.sqrt(np.maximum(m.R.diagonal(), 1e-300))[:, None]
+    noise = 1.0 / np.sqrt(np.maximum(m.R.diagonal(), TINY))[:, None]
     whole = np.block([[m.A - np.eye(n), d.G], [noise * m.C2, noise * d.H]])
     columns = np.linalg.norm(whole, axis=0)
-    whole = whole / np.where(columns > 0, columns, 1.0)
+    whole = whole / divisor(columns)
     rows = np.linalg.norm(whole, axis=1, keepdims=True)
-    _, sizes, right = np.linalg.svd(whole / np.where(rows > 0, rows, 1.0))
+    _, sizes, right = np.linalg.svd(whole / divisor(rows))
     null = right[sizes.size - np.count_nonzero(sizes < _UNDETERMINED) :, n:]
     # what is left at rest without a force is no bias
     _, parts, combinations = np.linalg.svd(null)
     forces = combinations[: np.count_nonzero(parts > _PART)]
-    forces = forces / np.where(columns[n:] > 0, columns[n:], 1.0)
+    forces = forces / divisor(columns[n:])
     # one axis for each combination, taken out of the others
     for row in range(len(forces)):
         axis = int(np.argmax(np.abs(forces[row])))

@@ -11,6 +11,7 @@ from ..checks import FloatArray, real_array
 from ..errors import CertificateError, SolverError
 from ..lti.lyapunov import solve_stein
 from ..plant import StandardPlant
+from ..tolerances import divisor
 from .estimator_channels import sensors
 from .filter_model import FilterModel, filter_model
 
@@ -115,7 +116,7 @@ def error_of(
     found = model.updated(P, gain)
     truth = np.einsum("ij,jk,ik->i", model.C1, found, model.C1)
     claim = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
-    size = np.where(truth > 0, truth, 1.0)
+    size = divisor(truth)
     difference = float(np.max(np.abs(claim - truth) / size))
     if not difference <= AGREEMENT:
         raise CertificateError(

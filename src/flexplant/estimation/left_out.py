@@ -17,6 +17,7 @@ from ..plant.ports import Ports
 from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
+from ..tolerances import TINY, divisor
 from .estimator_channels import read_alike, sensors
 
 #: a mode of the plant is one of the larger plant's within this part of its frequency
@@ -171,10 +172,10 @@ def _of_vectors(realisation: ModalRealisation) -> IntArray:
 def _paired(kept: _Blocks, larger: _Blocks, genuine: IntArray) -> tuple[IntArray, IntArray]:
     """Return the modes of both that are the same ones, by frequency and by compliance."""
     one, two = kept.static[genuine], larger.static
-    size = np.maximum(np.abs(two).max(axis=0, initial=0.0), 1e-300)
+    size = np.maximum(np.abs(two).max(axis=0, initial=0.0), TINY)
     one, two = ((part / size).reshape(part.shape[0], -1) for part in (one, two))
     lengths = np.outer(np.linalg.norm(one, axis=1), np.linalg.norm(two, axis=1))
-    alike = np.abs(one @ two.T) / np.where(lengths > 0, lengths, 1.0)
+    alike = np.abs(one @ two.T) / divisor(lengths)
     apart = np.abs(np.log(kept.omega[genuine][:, None] / larger.omega))
     from scipy.optimize import linear_sum_assignment
 

@@ -14,6 +14,7 @@ from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace, System
 from ..parallel import Progress, one_thread, tick
 from ..plant import StandardPlant, UncertainPlant
+from ..tolerances import TINY
 from .error import error_variances, moving_parts
 from .estimator_channels import same_pois
 from .filter_model import FilterModel, filter_model, filter_system, own_variances
@@ -397,4 +398,4 @@ def machine_error(
 
 
 def _size(rows: FloatArray) -> FloatArray:
-    return np.asarray(np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300))
+    return np.asarray(np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), TINY))

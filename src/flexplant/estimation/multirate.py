@@ -16,6 +16,7 @@ from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
+from ..tolerances import TINY
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, sensors
 from .filter_model import FilterModel, check_noises, filter_model, filter_system, weighed
 from .kalman_certificate import AGREEMENT
@@ -256,7 +257,7 @@ def design_multirate(
         moved = (model.A - predictor @ model.C2) @ moved
         P = ahead
     first = solution.P.diagonal()
-    known = first > 1e-300
+    known = first > TINY
     difference = float(np.max(np.abs(P.diagonal() - first)[known] / first[known], initial=0.0))
     radius = float(np.max(np.abs(np.linalg.eigvals(moved)), initial=0.0))
     if radius >= 1 or not difference <= AGREEMENT:

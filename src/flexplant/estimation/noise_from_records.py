@@ -14,6 +14,7 @@ from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
+from ..tolerances import SETTLED, TINY
 from .causes import settling
 from .consistency import consistency
 from .estimate import Estimate
@@ -257,7 +258,7 @@ def _spectrum(
     X = np.fft.rfft(innovations / size, axis=0)[line] / np.sqrt(count)
     freq = np.fft.rfftfreq(count)[line].astype(np.float64)
     ny = len(size)
-    d = np.sqrt(np.maximum(observer.predicted_covariance.diagonal(), 1e-300))
+    d = np.sqrt(np.maximum(observer.predicted_covariance.diagonal(), TINY))
     closed = (m.A - K @ m.C2) * d / d[:, None]
     parts = np.empty((len(sources), freq.size, ny, ny), dtype=np.complex128)
     for start in range(0, freq.size, _LINES):
@@ -297,7 +298,7 @@ def _scored(spectrum: _LevelSpectrum, start: FloatArray, lowest: FloatArray) -> 
     value, slope, information = _likelihood(spectrum, np.exp(log_t))
     damping = 1e-6
     for _ in range(_STEPS):
-        scale = np.sqrt(np.maximum(information.diagonal(), 1e-300))
+        scale = np.sqrt(np.maximum(information.diagonal(), TINY))
         free = (log_t > bottom) | (slope > 0)
         unit = information / np.outer(scale, scale) * np.outer(free, free)
         unit[np.diag_indices_from(unit)] = 1.0
@@ -311,7 +312,7 @@ def _scored(spectrum: _LevelSpectrum, start: FloatArray, lowest: FloatArray) -> 
             better = _likelihood(spectrum, np.exp(trial))
         except np.linalg.LinAlgError:
             better = (-np.inf, slope, information)
-        if better[0] >= value - 1e-9 * abs(value):
+        if better[0] >= value - SETTLED * abs(value):
             log_t, (value, slope, information) = trial, better
             damping = max(0.1 * damping, 1e-12)
         else:

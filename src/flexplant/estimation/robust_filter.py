@@ -16,6 +16,7 @@ from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
+from ..tolerances import TINY
 from .error import error_variances
 from .estimator_channels import poi_channels, row_of, same_pois, sensors
 from .filter_model import FilterModel, error_system, filter_system, own_variances, weighed
@@ -286,7 +287,7 @@ def _at(m: FilterModel, gamma: float) -> _HinfGains | None:
         P = solve_dare(m.A, rows, Q=m.Q, R=weight, S=cross).P
     except SolverError:
         return None
-    unit = np.sqrt(np.maximum(np.abs(P.diagonal()), 1e-300))
+    unit = np.sqrt(np.maximum(np.abs(P.diagonal()), TINY))
     if np.min(np.linalg.eigvalsh(P / unit / unit[:, None])) < -1e-9:
         return None
     innovation = m.innovation(P)

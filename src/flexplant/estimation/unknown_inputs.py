@@ -17,6 +17,7 @@ from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
+from ..tolerances import TINY, divisor
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of
 from .filter_model import FilterModel, check_noises, filter_model, weighed
 from .invertibility import InputEntry, Invertibility, entry, judged, unknown_names
@@ -210,7 +211,7 @@ def _first(m: FilterModel, d: InputEntry, late: bool) -> FloatArray:
 
 
 def _change(one: FloatArray, two: FloatArray) -> float:
-    size = np.where(two.diagonal() > 0, two.diagonal(), 1.0)
+    size = divisor(two.diagonal())
     return float(np.max(np.abs(one - two).diagonal() / size))
 
 
@@ -302,7 +303,7 @@ def _judged(m: FilterModel, g: _InputGains, claim: FloatArray, P: FloatArray) ->
     """Return the design with the variances of its errors, and what was checked about it."""
     left, noise = g.C - g.L @ m.C2, np.sum((g.L @ m.R) * g.L, axis=1)
     both = [np.sum((left @ X) * left, axis=1) + noise for X in (claim, P)]
-    difference = float(np.max(np.abs(both[0] - both[1]) / np.where(both[1] > 0, both[1], 1.0)))
+    difference = float(np.max(np.abs(both[0] - both[1]) / divisor(both[1])))
     radius = float(np.max(np.abs(np.linalg.eigvals(g.closed)), initial=0.0))
     nz = len(m.C1)
     certificate = InputCertificate(radius, g.bias, difference)
@@ -366,7 +367,7 @@ def _weighted(F: FloatArray, spread: FloatArray) -> FloatArray:
 
 
 def _size(G: FloatArray) -> FloatArray:
-    return np.asarray(np.maximum(np.abs(G).max(axis=0), 1e-300))
+    return np.asarray(np.maximum(np.abs(G).max(axis=0), TINY))
 
 
 def _largest(matrix: FloatArray) -> float:
