@@ -20,6 +20,7 @@ from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant, larger_plant
 from ..structure import FEModel
+from ..tolerances import ROUNDING, TINY
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -197,7 +198,7 @@ def _sweep(loop: StateSpace) -> FloatArray:
     """Return frequencies [Hz] from 0 up, dense around the resonances of a loop with states."""
     poles = loop.poles()
     if loop.dt:
-        poles = np.asarray(np.log(np.where(np.abs(poles) > 0, poles, 1e-300)) / loop.dt)
+        poles = np.asarray(np.log(np.where(np.abs(poles) > 0, poles, TINY)) / loop.dt)
     nyquist = 0.5 / loop.dt if loop.dt else np.inf
     speeds = np.abs(poles.imag[np.abs(poles.imag) > 0]) / (2 * np.pi)
     sizes = np.abs(poles) / (2 * np.pi)
@@ -220,7 +221,7 @@ def _peak(H: ComplexArray) -> tuple[float, int]:
     latter is too small there is nothing to compute.
     """
     size = np.sqrt(np.sum(H.real**2 + H.imag**2, axis=(0, 1)))
-    near = np.flatnonzero(size >= size.max() * (1.0 - 1e-12) / np.sqrt(min(H.shape[:2])))
+    near = np.flatnonzero(size >= size.max() * (1.0 - ROUNDING) / np.sqrt(min(H.shape[:2])))
     gains = np.linalg.norm(np.moveaxis(H[:, :, near], 2, 0), 2, axis=(1, 2))
     largest = int(np.argmax(gains))
     return float(gains[largest]), int(near[largest])

@@ -10,6 +10,7 @@ from ..errors import AssumptionError, ModelError
 from ..lti.preparation import Prepared
 from ..lti.statespace import System
 from ..plant import StandardPlant, standard_plant
+from ..tolerances import TINY
 
 #: relative: poles so small are zero, real parts above this are not stable
 _ZERO, _STABLE = 1e-6, -1e-10
@@ -67,7 +68,7 @@ def require_reach(problem: Prepared) -> None:
     """
     A = problem.A
     poles = np.linalg.eigvals(A)
-    size = max(float(np.linalg.norm(A, 2)) if A.size else 0.0, 1e-300)
+    size = max(float(np.linalg.norm(A, 2)) if A.size else 0.0, TINY)
     # the poles of a chain of integrators come out of rounding as a ring around zero
     poles = np.where(np.abs(poles) < _ZERO * size, 0.0, poles)
     for pole in poles[poles.real > _STABLE * size]:
@@ -75,7 +76,7 @@ def require_reach(problem: Prepared) -> None:
             (A, problem.B2, f"u ({', '.join(problem.u)}) does not reach"),
             (A.T, problem.C2.T, f"y ({', '.join(problem.y)}) does not see"),
         ):
-            reach = size * gain / max(float(np.linalg.norm(gain, 2)), 1e-300)
+            reach = size * gain / max(float(np.linalg.norm(gain, 2)), TINY)
             pencil = np.hstack([matrix - pole * np.eye(A.shape[0]), reach])
             if np.linalg.svd(pencil, compute_uv=False)[-1] < _MISSED * size:
                 raise AssumptionError(

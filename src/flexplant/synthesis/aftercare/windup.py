@@ -10,6 +10,7 @@ from ...checks import FloatArray, positive
 from ...errors import AssumptionError, ModelError
 from ...lti.riccati import solve_care, solve_dare
 from ...lti.statespace import StateSpace, as_statespace
+from ...tolerances import divisor
 
 #: D of a conditioned controller is inverted up to this condition
 _LARGEST = 1e8
@@ -106,7 +107,7 @@ def _observer(K: StateSpace, recovery: float) -> FloatArray:
     if not n:
         return np.zeros((0, len(K.outputs)))
     size = np.linalg.norm(K.C, axis=1)
-    C = K.C / np.where(size > 0, size, 1.0)[:, None]
+    C = K.C / divisor(size)[:, None]
     scale = np.linalg.norm(K.B, axis=1)
     scale = np.where(scale > 0, scale, np.max(scale, initial=1.0))
     grow = float(np.exp(K.dt / recovery)) if K.dt else 1.0 / recovery
@@ -121,4 +122,4 @@ def _observer(K: StateSpace, recovery: float) -> FloatArray:
             "integrators drive each actuator, or reduce the controller first."
         ) from error
     gain = found.gain / (grow if K.dt else 1.0)
-    return np.asarray(gain / np.where(size > 0, size, 1.0))
+    return np.asarray(gain / divisor(size))

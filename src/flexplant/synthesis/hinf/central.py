@@ -13,6 +13,7 @@ from ...errors import AssumptionError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.preparation import Prepared
 from ...lti.statespace import StateSpace
+from ...tolerances import ROUNDING, SPLIT
 
 #: sensitivity at infinite frequency below which a controller is taken for one of infinite gain
 _SINGULAR = 1e-3
@@ -76,7 +77,7 @@ def _contraction(M: FloatArray, left: FloatArray, right: FloatArray) -> FloatArr
     small = sizes < _SINGULAR
     pull = left.T @ U[:, small] @ Vt[small] @ right.T
     W, gains, Xt = la.svd(pull, full_matrices=False)
-    reached = gains > 1e-12 * np.max(gains, initial=0.0)
+    reached = gains > ROUNDING * np.max(gains, initial=0.0)
     return np.asarray(0.5 * W[:, reached] @ Xt[reached])
 
 
@@ -139,10 +140,10 @@ def _require_full_columns(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatA
     """
     poles = np.linalg.eigvals(A)
     size = float(np.linalg.norm(A, 2)) if A.size else 0.0
-    near = poles[np.abs(poles.real) <= 1e-6 * size]
-    for omega in np.unique(np.where(np.abs(near) < 1e-6 * size, 0.0, np.abs(near.imag))):
+    near = poles[np.abs(poles.real) <= SPLIT * size]
+    for omega in np.unique(np.where(np.abs(near) < SPLIT * size, 0.0, np.abs(near.imag))):
         pencil = np.block([[A - 1j * omega * np.eye(A.shape[0]), B], [C, D]])
-        if la.svdvals(pencil)[-1] < 1e-12 * size:
+        if la.svdvals(pencil)[-1] < ROUNDING * size:
             raise OnAxisError(np.array([omega]))
 
 

@@ -14,6 +14,7 @@ from ...lti.equations import OnAxisError, stabilising
 from ...lti.grid import highest, resonance_grid
 from ...lti.preparation import Prepared
 from ...lti.responses import responses
+from ...tolerances import divisor
 from ..lmi.structured_lmi import StructuredLmi
 from .central import indefinite
 
@@ -155,7 +156,7 @@ def full_information(
     T = np.eye(A.shape[0])
     while B2.shape[1]:
         sizes = np.linalg.norm(np.vstack([B2, D12]), axis=0)
-        B2, D12 = B2 / np.where(sizes > 0, sizes, 1.0), D12 / np.where(sizes > 0, sizes, 1.0)
+        B2, D12 = B2 / divisor(sizes), D12 / divisor(sizes)
         _, values, turn = la.svd(D12, full_matrices=True)
         rank = int(np.count_nonzero(values > _RANK))
         if rank == D12.shape[1]:

@@ -21,6 +21,7 @@ from ...lti.riccati import control_care, control_dare, solve_care, solve_dare
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import StandardPlant
+from ...tolerances import TINY
 from ..controller import Controller, with_left_out
 
 #: corner of the integral action of the recipe, beside the bandwidth
@@ -346,4 +347,4 @@ def _least_by_factors(shaped: StateSpace) -> float:
         root @ np.hstack([g.D, np.eye(R.shape[0])]),
     )
     size = hankel_norm(factors)
-    return float(1.0 / np.sqrt(max(1.0 - size**2, 1e-300)))
+    return float(1.0 / np.sqrt(max(1.0 - size**2, TINY)))

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ...checks import ComplexArray, FloatArray, IntArray
 from ...errors import SolverError
+from ...tolerances import TINY
 from .axis_law import AxisLaw
 from .law import Law, product, tustin_s
 
@@ -167,8 +168,8 @@ class LawSearch:
             need += " rigid= when the body is free"
         low, top = self.of.lowest, self.of.highest
         reach = f"from {low:.3g} to {top:.3g} Hz" if top > low else f"above {low:.3g} Hz"
-        worst = int(np.argmax(axis.deviation / np.maximum(np.abs(axis.G), 1e-300)))
-        share = axis.deviation[worst] / max(abs(axis.G[worst]), 1e-300)
+        worst = int(np.argmax(axis.deviation / np.maximum(np.abs(axis.G), TINY)))
+        share = axis.deviation[worst] / max(abs(axis.G[worst]), TINY)
         poor = (
             f" The line at {axis.freq[worst]:.4g} Hz has an error of {100 * share:.0f} %: measure "
             "longer, or leave out the lines that say little."

@@ -15,6 +15,7 @@ from ...lti.norms import peak_gain
 from ...lti.preparation import Prepared
 from ...lti.riccati import control_care, solve_care
 from ...lti.statespace import StateSpace
+from ...tolerances import RANK, TINY, divisor
 from ..controller import SolvedController
 
 #: what a closed loop may exceed its target by
@@ -204,7 +205,7 @@ class Plant(NamedTuple):
         """
         u_size = np.linalg.norm(np.vstack([self.B2, self.D12]), axis=0)
         y_size = np.linalg.norm(np.hstack([self.C2, self.D21]), axis=1)
-        u_size, y_size = (np.where(size > 0, size, 1.0) for size in (u_size, y_size))
+        u_size, y_size = (divisor(size) for size in (u_size, y_size))
         return self._replace(
             B2=self.B2 / u_size,
             D12=self.D12 / u_size,
@@ -283,14 +284,14 @@ def lqg_states(p: Plant) -> Plant:
     except (SolverError, la.LinAlgError) as error:
         raise SolverError("rounding hides every stabilising controller.") from error
     sizes = np.abs(np.concatenate([control.poles, filtered.poles]))
-    speed = float(np.exp(np.mean(np.log(np.maximum(sizes, 1e-300)))))
+    speed = float(np.exp(np.mean(np.log(np.maximum(sizes, TINY)))))
     return p.balanced(control.P, filtered.P).timed(speed)
 
 
 def factor(P: FloatArray) -> FloatArray:
     """Return L with ``L L' = P``, P kept barely positive definite."""
     values, vectors = la.eigh(half(P))
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 1e-13 * max(values[-1], 1e-300))))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, RANK * max(values[-1], TINY))))
 
 
 def half(M: Any) -> Any:
@@ -301,5 +302,5 @@ def half(M: Any) -> Any:
 def null_space(M: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the null space."""
     _, values, right = la.svd(M)
-    rank = int(np.count_nonzero(values > 1e-10 * max(float(values[0]), 1e-300)))
+    rank = int(np.count_nonzero(values > 1e-10 * max(float(values[0]), TINY)))
     return np.asarray(right[rank:].T)

@@ -25,6 +25,7 @@ from ...checks import FloatArray, Value
 from ...errors import FlexplantError, SolverError, counted
 from ...lti.preparation import Prepared
 from ...parallel import Progress
+from ...tolerances import RANK
 from ..controller import SolvedController
 from ..hinf.singular import made_regular
 from .interior_point import STEPS, Iterate, smallest
@@ -310,7 +311,7 @@ def _eliminated(Q: FloatArray, P: FloatArray, C: FloatArray) -> FloatArray:
         weight *= _FACTOR  # away from the boundary
         factor = la.cho_factor(weight * P @ P.T - Q, lower=True)
         moved = la.cho_solve(factor, C.T)
-        return np.asarray(-weight * np.linalg.lstsq(C @ moved, moved.T @ P, rcond=1e-13)[0].T)
+        return np.asarray(-weight * np.linalg.lstsq(C @ moved, moved.T @ P, rcond=RANK)[0].T)
     raise SolverError("rounding hides the controller of the LMIs.")
 
 

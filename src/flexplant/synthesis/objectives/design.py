@@ -24,6 +24,7 @@ from ...lti.scaling import mean_speed, state_scale
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
+from ...tolerances import TINY
 from ..controller import Controller, with_left_out
 from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
@@ -210,8 +211,8 @@ def _prepared(plant: StandardPlant) -> Plant:
     found = found.with_unit_channels()
     n = A.shape[0]
     # each channel counts alike: a little of everything, no rank is assumed
-    into = found.B1 / np.maximum(np.linalg.norm(found.B1, axis=0), 1e-300)
-    out = found.C1 / np.maximum(np.linalg.norm(found.C1, axis=1), 1e-300)[:, None]
+    into = found.B1 / np.maximum(np.linalg.norm(found.B1, axis=0), TINY)
+    out = found.C1 / np.maximum(np.linalg.norm(found.C1, axis=1), TINY)[:, None]
     Q, W = out.T @ out + 1e-6 * np.eye(n), into @ into.T + 1e-6 * np.eye(n)
     solve_control, solve_filter = (
         (control_dare, solve_dare) if plant.dt else (control_care, solve_care)
@@ -223,7 +224,7 @@ def _prepared(plant: StandardPlant) -> Plant:
     if plant.dt:
         balanced = balanced._replace(A=balanced.A - np.eye(n))
         closed = closed - 1.0
-    speeds = np.maximum(np.abs(closed), 1e-300)
+    speeds = np.maximum(np.abs(closed), TINY)
     return balanced.timed(float(np.exp(np.mean(np.log(speeds))))).with_unit_channels()
 
 

@@ -13,6 +13,7 @@ from ...lti.norms import h2_norm, peak_gain
 from ...lti.responses import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
+from ...tolerances import TINY
 
 #: samples of an impulse response that are computed together, and at most
 _TOGETHER, _LONGEST = 256, 4e6
@@ -172,7 +173,7 @@ class PoleRegion(Value):
         slow = poles[np.argmax(poles.real)]
         if slow.real > -self.decay * (1 - 1e-3) - (1e-9 if not self.decay else 0.0):
             return f"{slow:.4g} rad/s decays slower than {self.decay:g} rad/s"
-        ratio = -poles.real / np.maximum(np.abs(poles), 1e-300)
+        ratio = -poles.real / np.maximum(np.abs(poles), TINY)
         if self.damping is not None and ratio.min() < self.damping * (1 - 1e-3):
             return f"{poles[np.argmin(ratio)]:.4g} rad/s has the damping {ratio.min():.4g}"
         size = np.abs(poles) / (2 * np.pi)

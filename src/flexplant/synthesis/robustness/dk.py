@@ -15,6 +15,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...tolerances import ROUNDING
 from ..controller import Controller, SynthesisMethod, with_left_out
 from ..hinf.hinf_design import design_hinf
 from .sweep import covered
@@ -208,7 +209,7 @@ def _scales_of(plant: OpenPlant, loop: UncertainLoop, order: int) -> _DFilters:
         out += [one] * block.z
         for _ in range(block.w):
             weight = tall[:, column]
-            flat = np.ptp(weight) < 1e-12 * weight.max()
+            flat = np.ptp(weight) < ROUNDING * weight.max()
             into.append(
                 inverse(one) if flat else fitted_magnitude(omega, weight / d[:, i], order + 1)
             )

@@ -10,6 +10,7 @@ import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray
 from ...lti.statespace import StateSpace
+from ...tolerances import SPLIT, TINY
 from .uncertainty_blocks import (
     Block,
     FullBlock,
@@ -79,7 +80,7 @@ def _left(
 ) -> ComplexArray:
     """Return the block of the next left vector."""
     if isinstance(p.block, FullBlock):
-        return np.asarray(a[p.z] * (la.norm(w[p.w]) / max(la.norm(a[p.z]), 1e-300)))
+        return np.asarray(a[p.z] * (la.norm(w[p.w]) / max(la.norm(a[p.z]), TINY)))
     if p.block.real:
         q[i] = _real(q[i].real, a[p.z], b[p.w], w[p.w])
         return np.asarray(q[i] * w[p.w])
@@ -92,7 +93,7 @@ def _right(
 ) -> ComplexArray:
     """Return the block of the next right vector."""
     if isinstance(p.block, FullBlock):
-        return np.asarray(w[p.w] * (la.norm(a[p.z]) / max(la.norm(w[p.w]), 1e-300)))
+        return np.asarray(w[p.w] * (la.norm(a[p.z]) / max(la.norm(w[p.w]), TINY)))
     if p.block.real:
         q[i] = _real(q[i].real, a[p.z], b[p.w], w[p.w])
         return np.asarray(q[i] * a[p.z])
@@ -104,7 +105,7 @@ def _right(
 def _real(q: float, a: ComplexArray, b: ComplexArray, w: ComplexArray) -> float:
     """Return the next number of a real scalar, on its interval."""
     sign = 1.0 if q >= 0 else -1.0
-    moved = sign * la.norm(b) / max(la.norm(a), 1e-300) + float(np.vdot(a, w).real)
+    moved = sign * la.norm(b) / max(la.norm(a), TINY) + float(np.vdot(a, w).real)
     return float(np.clip(moved, -1.0, 1.0))
 
 
@@ -192,7 +193,7 @@ def crossing_multiple(
             middle = 0.5 * (low + high)
             value = eigenvalue(middle, value)
             low, high = (middle, high) if np.sign(value.imag) == sign else (low, middle)
-        if abs(value.imag) < 1e-6 * abs(value) and value.real > best[0]:
+        if abs(value.imag) < SPLIT * abs(value) and value.real > best[0]:
             best = value.real, 0.5 * (low + high)
     if not best[0] > 0:
         return None
@@ -317,7 +318,7 @@ def destabilising(
 ) -> Destabilising | None:
     """Return the smallest perturbation found that makes a loop unstable."""
     where = places(blocks)
-    least = 1.0 / max(level, 1e-300)
+    least = 1.0 / max(level, TINY)
     best: Destabilising | None = None
     for omega in omegas:
         gain = M.evaluated(1j * omega)

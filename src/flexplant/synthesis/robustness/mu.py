@@ -14,6 +14,7 @@ from ...lti.discretisation import bilinear, image_freq
 from ...lti.norms import obstacle
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
+from ...tolerances import TINY
 from .lower import crossing_multiple, destabilising, power_iteration
 from .sweep import covered
 from .uncertainty_blocks import (
@@ -190,6 +191,6 @@ def _real_multiple(
     if any(not (isinstance(p.block, RepeatedScalar) and p.block.real) for p in where):
         return None
     values = np.linalg.eigvals(M @ matrix_of(found, where))
-    real = np.abs(values.imag) < 1e-8 * np.abs(values).max(initial=1e-300)
+    real = np.abs(values.imag) < 1e-8 * np.abs(values).max(initial=TINY)
     best = float(np.max(values.real[real], initial=0.0))
     return (1.0 / best, found) if best > 0 else None

@@ -20,6 +20,7 @@ from ...lti.responses import responder
 from ...lti.scaling import state_scale
 from ...lti.statespace import StateSpace
 from ...parallel import tick
+from ...tolerances import ROUNDING, TINY
 from .uncertainty_blocks import Block, Scalings, places
 from .upper import centred, reached_level, simple_bound, upper_level
 
@@ -188,7 +189,7 @@ class _Cover:
             return 0.0 if not self._has(0.0) else 0.5 * gap.high
         middle = np.sqrt(max(gap.low, 1e-3 * gap.high) * gap.high)
         if inside.size and gap.high > 1.05 * gap.low:
-            return float(inside[np.argmin(np.abs(np.log(np.maximum(inside, 1e-300) / middle)))])
+            return float(inside[np.argmin(np.abs(np.log(np.maximum(inside, TINY) / middle)))])
         return 0.5 * (gap.low + gap.high)
 
     def _has(self, omega: float) -> bool:
@@ -204,7 +205,7 @@ class _Cover:
             tall = self.tall(low, high)
             if np.all(tall <= growth * own):
                 break
-            high = omega + 0.5 * (min(high, 4 * omega + 1e-300) - omega) if high > omega else high
+            high = omega + 0.5 * (min(high, 4 * omega + TINY) - omega) if high > omega else high
             low = omega - 0.5 * (omega - low)
         return Interval(low, high)
 
@@ -214,8 +215,8 @@ class _Cover:
         S = self.scalings.matrix(x, self.level)
         if self.by_hamiltonian:
             crossings = self._crossings(S, tall)
-            low = max([low, *crossings[crossings < omega * (1 - 1e-12)]])
-            high = min([high, *crossings[crossings > omega * (1 + 1e-12)]])
+            low = max([low, *crossings[crossings < omega * (1 - ROUNDING)]])
+            high = min([high, *crossings[crossings > omega * (1 + ROUNDING)]])
         points = self._points(low, high, omega)
         M = self.at(points) * tall
         W = np.concatenate(
@@ -223,7 +224,7 @@ class _Cover:
         )
         F = W.conj().swapaxes(1, 2) @ S @ W
         # relative to the sizes of its entries
-        size = np.sqrt(np.abs(np.einsum("nii->ni", F)) + 1e-300)
+        size = np.sqrt(np.abs(np.einsum("nii->ni", F)) + TINY)
         least = np.linalg.eigvalsh(F / size[:, :, None] / size[:, None, :])[:, 0]
         bad = points[least <= 0.0]
         below, above = bad[bad < omega], bad[bad > omega]

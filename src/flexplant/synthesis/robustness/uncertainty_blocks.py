@@ -12,6 +12,7 @@ import scipy.linalg as la
 from ...checks import ComplexArray, FloatArray, IntArray, Value, flag, short, whole
 from ...errors import ModelError, ShapeError
 from ...lti.statespace import StateSpace, as_statespace
+from ...tolerances import ROUNDING, TINY
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +221,7 @@ def osborne(M: ComplexArray, where: Sequence[Place]) -> FloatArray:
     k = len(where)
     size = np.array([[la.norm(M[a.z, b.w]) for b in where] for a in where])
     np.fill_diagonal(size, 0.0)
-    tiny = 1e-12 * max(float(size.max(initial=0.0)), 1e-300)
+    tiny = ROUNDING * max(float(size.max(initial=0.0)), TINY)
     d = np.ones(k)
     for _ in range(20):
         for i in range(k):

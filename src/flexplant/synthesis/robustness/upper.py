@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray, IntArray
+from ...tolerances import TINY
 from .uncertainty_blocks import Place, Scalings, osborne
 
 #: Newton decrement at which a centre is left; steps for one
@@ -196,7 +197,7 @@ def _skewed(
     moves = (scalings.owner != fixed) | scalings.leveled
     row, column, value = scalings.row[moves], scalings.column[moves], scalings.value[moves]
     first = np.searchsorted(scalings.owner[moves], np.arange(scalings.count))
-    level, best = 1.5 * max(reached, 1e-300), Certified(reached, x)
+    level, best = 1.5 * max(reached, TINY), Certified(reached, x)
     barriers = scalings.w + sum(basis.shape[1] for _, basis in scalings.d_ranges) - 1
     t = barriers / level
     for _ in range(_LEVELS):
@@ -224,7 +225,7 @@ def _skewed(
         reached = reached_level(W, scalings, x)
         if reached < best.level:
             best = Certified(reached, x)
-        if best.level <= enough or barriers / t <= _SETTLED * max(level, 1e-300):
+        if best.level <= enough or barriers / t <= _SETTLED * max(level, TINY):
             break
         t *= _GROWTH
     return Certified(max(best.level, 0.0), best.x)
@@ -234,7 +235,7 @@ def _newton(
     hessian: FloatArray, gradient: FloatArray, trace: FloatArray | None = None
 ) -> tuple[FloatArray, float]:
     """Return the Newton step, one that keeps a trace where there is one, and its decrement."""
-    size = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-300))
+    size = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), TINY))
     scaled = hessian * size * size[:, None]
     scaled[np.diag_indices_from(scaled)] += 1e-13
     right = gradient[:, None] if trace is None else np.column_stack([gradient, trace])

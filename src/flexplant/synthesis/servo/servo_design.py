@@ -20,6 +20,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import Poi, StandardPlant, larger_plant, standard_plant
 from ...plant.rigid.rigid_motion import RigidModes, require_weak
+from ...tolerances import SAME
 from ..controller import CLOSE, Controller, unchecked
 from .servo_loop import (
     TARGET,
@@ -343,7 +344,7 @@ class ServoTask:
 
     def largest(self, peak: float) -> float:
         """Return the largest bandwidth that holds a peak of |S| at u."""
-        slowest = max(3.0 * float(np.abs(self.motions.freq).max()) * (1 + 1e-9), 2e-4 * self.rate)
+        slowest = max(3.0 * float(np.abs(self.motions.freq).max()) * (1 + SAME), 2e-4 * self.rate)
         best: tuple[float, float, float] = (np.inf, np.nan, np.nan)
 
         def fine(loop: Any) -> bool:

@@ -18,6 +18,7 @@ from ...lti.responses import responder, responses
 from ...lti.statespace import StateSpace
 from ...plant import Foreign, Poi, StandardPlant
 from ...plant.rigid.rigid_motion import rigid_gain
+from ...tolerances import SAME, divisor
 from ..laws.controller_elements import LowPass, Notch, Pid
 from ..laws.law import Law
 
@@ -114,7 +115,7 @@ def decoupling(plant: StandardPlant, poi: Poi) -> FloatArray:
     plant.continuous.check().require(("stabilisable",), "a servo of the rigid body")
     gain = rigid_gain(plant, plant.rigid_motions, [poi.channel(a) for a in axes], plant.u)
     size = np.linalg.norm(gain, axis=1, keepdims=True)
-    if len(axes) != r or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < r:
+    if len(axes) != r or np.linalg.matrix_rank(gain / divisor(size)) < r:
         raise AssumptionError(
             f"POI {poi.name!r} has axes {axes}, the plant {counted(r, 'rigid-body mode')}: the "
             "servo needs axes that span them, one each (for a plate z, rx, ry). Give the POI these."
@@ -199,7 +200,7 @@ def observer_system(observer: Any, plant: StandardPlant, poi: Poi) -> StateSpace
         raise LabelError(
             f"the observer reads {', '.join(unknown)}, which the plant has neither in y nor in u."
         )
-    if inner.n_states and not np.isclose(inner.dt, plant.dt, rtol=1e-9, atol=0.0):
+    if inner.n_states and not np.isclose(inner.dt, plant.dt, rtol=SAME, atol=0.0):
         raise FlexplantError(
             f"the observer has dt {inner.dt:g} s, the plant {plant.dt:g} s: design both alike."
         )
@@ -302,5 +303,5 @@ def rigid_peak(body: StateSpace, axis: Axis) -> float:
     def size(freq: FloatArray) -> FloatArray:
         return np.asarray(1.0 / np.abs(1.0 - respond(freq)[0, 0] * axis.response(freq)))
 
-    freq = np.geomspace(1e-2 * axis.bandwidth, 0.5 * axis.rate * (1.0 - 1e-9), _POINTS)
+    freq = np.geomspace(1e-2 * axis.bandwidth, 0.5 * axis.rate * (1.0 - SAME), _POINTS)
     return highest(size, freq, 1)[0]

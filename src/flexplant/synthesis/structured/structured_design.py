@@ -15,6 +15,7 @@ from ...lti.responses import responder
 from ...lti.statespace import System
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant, standard_plant
+from ...tolerances import SAME
 from ..controller import Controller, certified_norm, reached_norms, with_left_out
 from ..reach import require_stabilisable
 from ..structured_loop import DECAY, ScaledLoop
@@ -202,7 +203,7 @@ def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> lis
                 "by u= and y=."
             )
         if (one.u, one.y) != (first.u, first.y) or not np.isclose(
-            one.dt, first.dt, rtol=1e-9, atol=0.0
+            one.dt, first.dt, rtol=SAME, atol=0.0
         ):
             raise ModelError(
                 f"plant {i} has other u, y or rate than the first: one controller cannot serve "
