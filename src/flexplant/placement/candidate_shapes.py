@@ -14,6 +14,7 @@ from ..errors import AssumptionError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..reduction import ReducedModel
 from ..structure import FEModel
+from ..tolerances import divisor
 from .criterion import Criterion, Scorer
 from .summed import SummedWorth, by_size
 
@@ -42,7 +43,7 @@ def shapes_of(plant: StandardPlant, ports: Sequence[Any]) -> Shapes:
     pairs = real.pairs[:m]
     omega = np.sqrt(np.abs(np.linalg.det(pairs)))
     omega[: real.n_rigid] = 0.0
-    zeta = -np.trace(pairs, axis1=1, axis2=2) / 2.0 / np.where(omega > 0, omega, 1.0)
+    zeta = -np.trace(pairs, axis1=1, axis2=2) / 2.0 / divisor(omega)
     full = real.inputs[:, 1 : 2 * m : 2]
     rows = [p.row(real) if isinstance(p, SensorPort) else p.push(real) for p in ports]
     stacked = np.array(rows).reshape(len(ports), full.shape[0])
@@ -58,7 +59,7 @@ def noise_sizes(ports: Sequence[Any]) -> FloatArray:
             f"sensors {', '.join(silent[:6])} have no noise (asd 0) beside others that have some: "
             "they would count without limit. Give all of them Sensor(..., asd=), or none."
         )
-    return np.where(sizes > 0, sizes, 1.0)
+    return divisor(sizes)
 
 
 class ByShapes(Criterion):
@@ -106,7 +107,7 @@ class LargestMac(Scorer):
         sizes = np.einsum("mii->mi", cross)
         scale = sizes[:, :, None] * sizes[:, None, :]
         # a mode that none of the sensors sees is like every other
-        mac = np.where(scale > 0, cross**2 / np.where(scale > 0, scale, 1.0), 1.0)
+        mac = np.where(scale > 0, cross**2 / divisor(scale), 1.0)
         i = np.arange(mac.shape[1])
         mac[:, i, i] = 0.0
         return np.asarray(mac.max(axis=(1, 2)))

@@ -18,6 +18,7 @@ from ..lti.riccati import control_dare
 from ..lti.statespace import as_statespace
 from ..plant import StandardPlant
 from ..synthesis import design_hinf
+from ..tolerances import divisor
 from .candidates import PlantChannel, Port, side_of
 from .criterion import Criterion, Scorer
 from .poi_axes import measured_rows, plain, poi_rows, pushed_columns, sensor_rows, structure_part
@@ -244,7 +245,7 @@ def of_actuators(p: Separation) -> Quadratic:
 def _root(X: FloatArray) -> FloatArray:
     """Return r with ``r' r = X``, which is positive semidefinite apart from rounding."""
     size = np.sqrt(np.maximum(X.diagonal(), 0.0))
-    unit = np.where(size > 0, size, 1.0)
+    unit = divisor(size)
     values, vectors = np.linalg.eigh(0.5 * (X + X.T) / unit / unit[:, None])
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T * unit)
 

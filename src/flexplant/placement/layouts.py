@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ..checks import FloatArray
 from ..errors import AssumptionError, CertificateError, counted
 from ..plant import Actuator, Assumption, SensorPort, StandardPlant, assemble_plant
+from ..tolerances import divisor
 from ..work import Work
 from .candidates import Port, Side, checked_plant, side_of, with_side
 from .closed_loop_h2 import ClosedLoopH2
@@ -146,7 +147,7 @@ class RigidPart:
                 own[:] = realisation.force(port.push(realisation))[1 : 2 * r : 2]
         rows = parts.reshape(len(candidates), -1)
         sizes = np.linalg.norm(rows, axis=1, keepdims=True)
-        return cls(rows / np.where(sizes > 0, sizes, 1.0))
+        return cls(rows / divisor(sizes))
 
     def missing(self, chosen: Sequence[int]) -> int:
         """Return how many rigid-body modes a choice has no part in: ranks decide."""

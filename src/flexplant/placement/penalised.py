@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ..checks import FloatArray, function, one_of, positive
 from ..errors import AssumptionError
 from ..plant import StandardPlant, larger_plant
+from ..tolerances import TINY
 from .candidate_shapes import Shapes, shapes_of
 from .candidates import SIDES, side_of, sides_of
 from .criterion import Criterion, Scorer, Wrapping, as_criterion
@@ -27,7 +28,7 @@ class Share(Scorer):
     def value(self, chosen: Sequence[int]) -> float:
         """Return it for one choice."""
         kept = list(chosen)
-        return float(np.sum(self.parts[kept]) / max(float(np.sum(self.wholes[kept])), 1e-300))
+        return float(np.sum(self.parts[kept]) / max(float(np.sum(self.wholes[kept])), TINY))
 
     def bound(self, count: int, required: Sequence[int]) -> float:
         """Return 0."""

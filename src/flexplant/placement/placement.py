@@ -9,6 +9,7 @@ import numpy as np
 from ..checks import Value
 from ..errors import counted
 from ..plant import StandardPlant
+from ..tolerances import SETTLED
 from .candidates import Port, Side, side_of, with_side
 from .criterion import in_words
 
@@ -67,7 +68,7 @@ class Placement(Value):
 
     def __repr__(self) -> str:
         ends = [steps[-1] for steps in self.history]
-        agree = sum(end <= self.value + 1e-9 * abs(self.value) for end in ends)
+        agree = sum(end <= self.value + SETTLED * abs(self.value) for end in ends)
         if self.proven:
             proof = "the optimum, proven"
         elif not np.isfinite(self.bound) or (self.unit and self.bound <= 0.0):

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_array
 
 from ..checks import FloatArray, IntArray
+from ..tolerances import SETTLED, TINY
 
 #: what rounding may have added to a sum
 _SLACK = 1e-9
@@ -128,7 +129,7 @@ class LinearRows:
         low = np.zeros(total)
         low[list(required)] = 1.0
         found = milp(
-            -np.asarray(worth) / max(float(np.max(np.abs(worth))), 1e-300),
+            -np.asarray(worth) / max(float(np.max(np.abs(worth))), TINY),
             constraints=[
                 LinearConstraint(csr_array(self.A), self.lower - slack, self.upper + slack),
                 LinearConstraint(np.ones((1, total)), count, count),
@@ -250,13 +251,13 @@ def ascended(
         if close(value, most):
             break
         if before is None:
-            step = 0.3 / max(float(np.max(np.abs(rise))), 1e-300)
+            step = 0.3 / max(float(np.max(np.abs(rise))), TINY)
         else:
             moved, turned = weights - before[0], before[1] - rise
             bend = float(moved @ turned)
             step = float(moved @ moved) / bend if bend > 0 else 2.0 * step
         before = weights, rise
         weights = branch.nearest(weights + step * rise)
-        if np.max(np.abs(weights - before[0])) < 1e-9:
+        if np.max(np.abs(weights - before[0])) < SETTLED:
             break
     return most, kept

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray
+from ..tolerances import TINY
 from .criterion import Scorer
 from .rows import Branch, ascended
 from .tangent import Below, Convex
@@ -94,7 +95,7 @@ class SummedMatrices(Convex):
         """Return log det at weights and its gradient ``tr(F^-1 W_i)``."""
         n = self.matrices.shape[1]
         F = (weights @ self.matrices.reshape(self.total, -1)).reshape(n, n)
-        size = np.sqrt(np.maximum(F.diagonal(), 1e-300))
+        size = np.sqrt(np.maximum(F.diagonal(), TINY))
         sign, logs = np.linalg.slogdet(F / size / size[:, None])
         if sign <= 0:
             return None
@@ -109,7 +110,7 @@ class SummedMatrices(Convex):
             total += self.matrices[rows[:, j]]
         if self.measure == "least":
             return np.asarray(-np.linalg.eigvalsh(total)[:, 0])
-        size = np.sqrt(np.maximum(np.einsum("mii->mi", total), 1e-300))
+        size = np.sqrt(np.maximum(np.einsum("mii->mi", total), TINY))
         try:
             root = np.linalg.cholesky(total / size[:, :, None] / size[:, None, :])
             part = np.einsum("mii->mi", root)
