@@ -13,6 +13,7 @@ from ..errors import ModelError, require_known, unknown_label
 from ..loop import ClosedLoop
 from ..loop.blocks import with_known
 from ..plant import StandardPlant
+from ..tolerances import divisor
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -115,7 +116,7 @@ class Acting:
                 else:
                     self.limit[i] = one.limit
                     self.change[i] = np.inf if one.rate is None else one.rate * dt
-        self.step, self.coarse = np.where(step > 0, step, 1.0), step > 0
+        self.step, self.coarse = divisor(step), step > 0
         self.below = -self.limit
         self.counts, self.limits = bool(np.any(self.coarse)), bool(np.any(np.isfinite(self.limit)))
         self.is_slow = bool(np.any(np.isfinite(self.change)))

@@ -15,6 +15,7 @@ from ..loop.blocks import joined
 from ..loop.budget import WhiteNoise
 from ..lti.lyapunov import solve_stein
 from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, Recursion, cheapest
+from ..tolerances import TINY
 from .nonlinear_elements import Acting, Conditions, Moving
 from .stepping import Buffers, Drawn, Machine, machine, step_through
 
@@ -352,7 +353,7 @@ def _back(loop: ClosedLoop, A: FloatArray, C: FloatArray, radius: float) -> Floa
         return L
     V, S = Z[:, :slow], T[:slow, :slow]
     see = C[:, own] @ V
-    see = see / np.abs(see).max(initial=1e-300)
+    see = see / np.abs(see).max(initial=TINY)
     inverse = np.asarray(np.linalg.inv(S / radius), dtype=np.float64)
     X = solve_stein(inverse.T, inverse.T @ see.T @ see @ inverse)
     values = np.linalg.eigvalsh(X)

@@ -25,6 +25,7 @@ from ..loop.blocks import DERIVATIVES, references
 from ..loop.budget import white_noise
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant
+from ..tolerances import SAME
 from .motion import SetPoint
 from .nonlinear_elements import Element, conditions, finer_loop
 from .response import Response
@@ -286,7 +287,7 @@ def _check_setpoint(move: SetPoint, name: str, time: FloatArray) -> None:
     """Warn of a set-point that the run cuts off, or that switches between its samples."""
     dt = float(time[1]) if time.size > 1 else 0.0
     end = float(time[-1]) + dt
-    if move.duration > end * (1.0 + 1e-9):
+    if move.duration > end * (1.0 + SAME):
         warn(
             f"{name} lasts {move.duration:.6g} s, longer than the run of {end:.6g} s: it is cut "
             f"off at {float(move.at(end).position):.6g} on its way to {move.stop:.6g}. Simulate "

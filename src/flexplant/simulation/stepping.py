@@ -11,6 +11,7 @@ from ..loop import ClosedLoop
 from ..loop.budget import WhiteNoise
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..tolerances import divisor
 from .nonlinear_elements import Acting
 
 
@@ -166,7 +167,7 @@ class Drawn:
         self.thin = noise.factor.shape[0] <= _MANY
         if self.thin:
             size = np.linalg.norm(noise.factor, axis=1)
-            unit = noise.factor / np.where(size > 0, size, 1.0)[:, None]
+            unit = noise.factor / divisor(size)[:, None]
             U, s, V = np.linalg.svd(unit, full_matrices=False)
             kept = int(np.count_nonzero(s > _NO_NOISE * s.max(initial=0.0)))
             self.factor = size[:, None] * U[:, :kept] * s[:kept]
