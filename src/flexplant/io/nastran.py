@@ -14,6 +14,7 @@ from ..checks import FloatArray
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
 from ..labels import DIRECTIONS, DofSet
+from ..tolerances import ROUNDING
 from .file_shapes import FileShapes
 from .numbers import decimal
 from .paths import USUAL, defined_twice, file_path
@@ -196,7 +197,7 @@ class _Systems:
         origin, on_z, in_xz = (self.position(base, np.array(numbers[i : i + 3])) for i in (0, 3, 6))
         z = on_z - origin
         y = np.cross(z, in_xz - origin)
-        if not np.linalg.norm(z) or np.linalg.norm(y) < 1e-12 * np.linalg.norm(z):
+        if not np.linalg.norm(z) or np.linalg.norm(y) < ROUNDING * np.linalg.norm(z):
             raise ModelError(
                 f"{self.path!r}: the three points of {kind} {name} lie on a line, which gives no "
                 "axes. Correct the card."

@@ -14,6 +14,7 @@ import numpy as np
 from ..checks import FloatArray, short
 from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS
+from ..tolerances import SAME
 from .paths import GLOBAL, file_path, refused, unread
 
 
@@ -23,7 +24,7 @@ def check_systems(parts: list[dict[str, Any]], path: str) -> None:
     for part in parts:
         listed = zip(part["CS_sys_labels"], part["CS_types"], part["CS_matrices"], strict=True)
         for label, kind, matrix in listed:
-            if label in (0, 1) and (kind or np.abs(np.asarray(matrix) - straight).max() > 1e-9):
+            if label in (0, 1) and (kind or np.abs(np.asarray(matrix) - straight).max() > SAME):
                 what = f"gives nodes in coordinate system {int(label)}, turned, moved or curved"
                 raise unread(path, f"{what} by dataset 2420", GLOBAL)
 
