@@ -12,6 +12,7 @@ from ..checks import ComplexArray, FloatArray, short
 from ..errors import FlexplantError, ModelError
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import as_statespace
+from ..tolerances import TINY
 from ._axes import POINTS, Style, role_of, styles
 
 #: of a magnitude below the largest one that is drawn, nothing can be read: zeros at half the rate
@@ -87,7 +88,7 @@ def _response(one: Any, freq: FloatArray | None) -> Frf:
 
 def decibel(values: ComplexArray | FloatArray) -> FloatArray:
     """Return 20 log10 of sizes; zero is far below all."""
-    return np.asarray(20.0 * np.log10(np.maximum(np.abs(values), 1e-300)))
+    return np.asarray(20.0 * np.log10(np.maximum(np.abs(values), TINY)))
 
 
 def readable(ax: Axes) -> None:

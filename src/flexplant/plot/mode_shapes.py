@@ -14,6 +14,7 @@ from ..checks import ComplexArray, FloatArray, IntArray, in_unit, instance, posi
 from ..errors import ModelError
 from ..labels import DofSet
 from ..modes import Modes
+from ..tolerances import divisor
 from ._axes import BLACK, GREY, solid_axes
 
 _COLOURS = "viridis"
@@ -326,7 +327,7 @@ def _edges(xyz: FloatArray, triangles: IntArray) -> IntArray:
     normal = np.cross(b - a, c - a)
     area = np.linalg.norm(normal, axis=1, keepdims=True)
     known = np.flatnonzero(area[:, 0] > _FLAT * area.max())
-    normal = normal / np.where(area > 0, area, 1.0)
+    normal = normal / divisor(area)
     sides = np.sort(np.vstack([triangles[known][:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
     order = np.lexsort(sides.T)
     sides, owner = sides[order], np.tile(known, 3)[order]

@@ -15,6 +15,7 @@ from ..lti.between_lines import LINES, followed, steps_between
 from ..lti.frequency import Frf
 from ..lti.responses import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
+from ..tolerances import SAME, SPLIT
 from ._axes import GREY, RED, axes, finish, legend, styles
 from .gains import curves, labelled
 
@@ -225,9 +226,9 @@ def _continuous(roots: ComplexArray, g: StateSpace) -> ComplexArray:
 
 
 def _draw(ax: Axes, roots: ComplexArray, marker: str, color: str, label: str) -> None:
-    upper = roots[roots.imag >= -1e-9 * np.abs(roots)]
+    upper = roots[roots.imag >= -SAME * np.abs(roots)]
     size = np.abs(upper)
-    still = size < 1e-6 * size.max(initial=0.0)
+    still = size < SPLIT * size.max(initial=0.0)
     if still.any():
         label = f"{label}, {int(still.sum())} more at 0 Hz"
     freq: FloatArray = size[~still] / (2 * np.pi)

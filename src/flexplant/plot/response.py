@@ -19,6 +19,7 @@ from ..lti.recursion import Recursion
 from ..lti.responses import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
 from ..simulation import Response
+from ..tolerances import SPLIT
 from ._axes import GREY, finish, legend, named, panel_axes, quantity_of, shown_in, styles
 from .gains import labelled
 
@@ -283,7 +284,7 @@ def _duration(g: StateSpace) -> float:
     """Return the time [s] in which the slowest pole decays or has turned often."""
     poles = continuous_poles(g)
     size = np.abs(poles)
-    moving = poles[size > 1e-6 * size.max(initial=0.0)]
+    moving = poles[size > SPLIT * size.max(initial=0.0)]
     if not moving.size:
         return 100.0 * g.dt if g.dt else 1.0
     decay = _DECAY / np.maximum(np.abs(moving.real), 1e-12 * np.abs(moving))

@@ -13,6 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from ..checks import ComplexArray, FloatArray, in_unit, instance
 from ..errors import counted
 from ..lti.frequency import Frf
+from ..tolerances import TINY
 from ..updating import Correlation, FrfResidual, Residual, UpdateResult, correlate
 from ..updating.search import Objective
 from ._axes import BLUE, CYCLE, GREY, LIGHT, POINTS, STYLES, axes, finish, legend, named, shown_in
@@ -192,7 +193,7 @@ def _parameters(ax: Axes, fit: UpdateResult, level: float) -> None:
 
 def _convergence(ax: Axes, fit: UpdateResult) -> None:
     steps = np.arange(len(fit.history) + 1)
-    ax.semilogy(steps, np.maximum(fit.history.error, 1e-300), "o-", color=BLUE, markersize=4)
+    ax.semilogy(steps, np.maximum(fit.history.error, TINY), "o-", color=BLUE, markersize=4)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     finish(ax, x="iteration", y=error_label(fit), title="convergence")
 
@@ -293,7 +294,7 @@ def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
     """
     ax = axes(ax, figsize=(7.0, 4.0))
     steps = np.arange(len(fit.history) + 1)
-    error = np.maximum(fit.history.error, 1e-300)
+    error = np.maximum(fit.history.error, TINY)
     ax.semilogy(steps, error, "o-", color=BLUE)
     ax.set_xticks(steps)
     return finish(ax, x="iteration", y=error_label(fit))

@@ -23,6 +23,7 @@ from ...plant import StandardPlant
 from ...reduction import ReducedModel
 from ...simulation import ErrorMap, ExposureErrors, Response, Verdict
 from ...synthesis import Controller
+from ...tolerances import divisor
 from ...updating import Localisation, UpdateResult
 from ..bode import bode, singular_values
 from ..budget import budget
@@ -245,7 +246,7 @@ def moving_shapes(modes: Modes) -> str:
     xyz, shapes = xyz[chosen], shapes[chosen]
     centre, size = (xyz.max(axis=0) + xyz.min(axis=0)) / 2, float(np.ptp(xyz, axis=0).max()) or 1.0
     largest = np.linalg.norm(shapes, axis=1).max(axis=0)
-    shapes = shapes / np.where(largest > 0, largest, 1.0)
+    shapes = shapes / divisor(largest)
     count = shapes.shape[2]
     data = {
         "xyz": _whole((xyz - centre) / size),
