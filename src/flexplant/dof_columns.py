@@ -13,6 +13,7 @@ import numpy as np
 
 from .checks import FloatArray, IntArray, Value, check_names, name_list, short
 from .errors import LabelError, ShapeError, unknown_label
+from .tolerances import SAME
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 #: a place: a DOF label, a point (x, y, z) [m], or a mapping {label or point: weight}
@@ -273,5 +274,5 @@ def in_box(xyz: FloatArray, box: Any) -> Any:
             f"box must be its lowest and its highest corner, [(x, y, z), (x, y, z)] in metres, "
             f"got {box!r:.120}. Use -inf and inf for open sides."
         )
-    slack = 1e-9 * float(np.ptp(xyz, axis=0).max(initial=0.0))
+    slack = SAME * float(np.ptp(xyz, axis=0).max(initial=0.0))
     return np.all((xyz >= corners[0] - slack) & (xyz <= corners[1] + slack), axis=1)

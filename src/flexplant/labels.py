@@ -27,6 +27,7 @@ from .dof_columns import (
 from .dof_columns import Interpolation as Interpolation
 from .dof_columns import Place as Place
 from .errors import LabelError, ShapeError, counted, require_known, unknown_label
+from .tolerances import SAME
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -363,7 +364,7 @@ class DofSet(Value):
         label = self.nearest(point, direction)
         row[self.index(label)] = 1.0
         offset = float(np.linalg.norm(self.xyz[self.index(label)] - point))
-        if offset > 1e-9 * max(1.0, float(np.ptp(self.xyz, axis=0).max())):
+        if offset > SAME * max(1.0, float(np.ptp(self.xyz, axis=0).max())):
             raise LabelError(
                 f"the point {tuple(point.tolist())} is {offset:.3g} m from the nearest node with "
                 f"direction {direction!r} ({label!r}), and this model has no shape functions to "
