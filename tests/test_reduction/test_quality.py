@@ -8,8 +8,8 @@ import oracles_reduction as oracle
 import oracles_structure
 from flexplant.errors import ModelError
 from flexplant.modes import solve_modes
+from flexplant.modes.matching import paired
 from flexplant.reduction import CraigBampton, Guyan, ModalBalanced, ModalTruncation, reduce
-from flexplant.reduction.mode_pairs import paired
 from flexplant.structure import Damper, ModalDamping, Rayleigh
 from plates import make_plate
 

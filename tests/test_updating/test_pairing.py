@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from flexplant.updating.point_model import mac, pair
+from flexplant.modes.matching import mac
+from flexplant.updating.point_model import pair
 
 
 def turned(degrees):

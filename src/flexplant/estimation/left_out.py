@@ -10,6 +10,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, IntArray, Value
 from ..errors import ModelError, counted
 from ..lti.statespace import StateSpace
+from ..modes.matching import assigned
 from ..plant import StandardPlant
 from ..plant.building import with_flexibility
 from ..plant.dynamics import structure_system
@@ -177,11 +178,9 @@ def _paired(kept: _Blocks, larger: _Blocks, genuine: IntArray) -> tuple[IntArray
     lengths = np.outer(np.linalg.norm(one, axis=1), np.linalg.norm(two, axis=1))
     alike = np.abs(one @ two.T) / divisor(lengths)
     apart = np.abs(np.log(kept.omega[genuine][:, None] / larger.omega))
-    from scipy.optimize import linear_sum_assignment
-
-    rows, columns = linear_sum_assignment(np.minimum(apart, 1.0) + _SHAPE * (1.0 - alike))
-    near = apart[rows, columns] < _SAME
-    return genuine[rows[near]], columns[near]
+    partner = assigned(np.minimum(apart, 1.0) + _SHAPE * (1.0 - alike))
+    near = (partner >= 0) & (apart[np.arange(partner.size), partner] < _SAME)
+    return genuine[near], partner[near]
 
 
 def _may_follow(plant: StandardPlant, ports: Ports) -> FloatArray:

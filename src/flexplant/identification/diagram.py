@@ -14,6 +14,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, IntArray, Value, between, real_array
 from ..errors import ModelError, ShapeError, SolverError, counted
+from ..modes.matching import assigned, in_span
 from ..tolerances import TINY
 
 #: flags of a pole, each including the ones before
@@ -180,8 +181,6 @@ class StabilisationDiagram(Value):
         ModelError
             When there are no frequencies, or no pole lies within 3 % of one.
         """
-        import scipy.optimize as so
-
         wanted = real_array(freq, "freq", (None,))
         if not wanted.size:
             raise ModelError("select needs at least one frequency.")
@@ -193,14 +192,14 @@ class StabilisationDiagram(Value):
         cost = np.where(away < 0.03, away + 0.01 / np.maximum(lengths, 1)[None, :], 1e3)
         if cost.shape[1] < wanted.size:
             raise ModelError(f"{wanted.size} frequencies, but only {known.size} poles are there.")
-        rows, columns = so.linear_sum_assignment(cost)
-        lost = [float(wanted[i]) for i, j in zip(rows, columns, strict=True) if cost[i, j] > 1]
+        columns = assigned(cost, most=1.0)
+        lost = wanted[columns < 0].tolist()
         if lost:
             raise ModelError(
                 f"no pole of its own within 3 % of {lost} Hz: look at "
                 "plot.stabilisation(diagram), raise the orders or leave these out."
             )
-        return self._chosen([int(known[j]) for j in columns])
+        return self._chosen(known[columns].tolist())
 
     def _chosen(self, tracks: Sequence[int]) -> PoleSelection:
         inside = np.isin(self.tracks, tracks)
@@ -226,9 +225,8 @@ def built_diagram(
         flag = np.zeros(result.poles.size, dtype=np.int64)
         track = np.full(result.poles.size, -1, dtype=np.int64)
         if before is not None and before.poles.size and result.poles.size:
-            pairs, flag = _followed(before, result, tolerances)
-            for old, new in pairs:
-                track[new] = before_tracks[old]
+            old, flag = _followed(before, result, tolerances)
+            track = np.where(old >= 0, before_tracks[old], -1)
         fresh = track < 0
         track[fresh] = count + np.arange(fresh.sum())
         count += int(fresh.sum())
@@ -252,10 +250,8 @@ def built_diagram(
 
 def _followed(
     old: OrderPoles, new: OrderPoles, tolerances: tuple[float, float, float]
-) -> tuple[list[tuple[int, int]], IntArray]:
-    """Return which new pole continues which old one, and the flags of the new ones."""
-    import scipy.optimize as so
-
+) -> tuple[IntArray, IntArray]:
+    """Return which old pole each new one continues, -1 for none, and the flags of the new ones."""
     tol_freq, tol_damping, tol_mac = tolerances
     f_old, f_new = np.abs(old.poles), np.abs(new.poles)
     z_old, z_new = -old.poles.real / f_old, -new.poles.real / f_new
@@ -267,16 +263,13 @@ def _followed(
         reach = np.maximum(-3.0 * np.maximum(old.poles.real, pole.real), 1e-4 * abs(pole))
         group = np.flatnonzero(near[i] & (np.abs(old.poles - pole) <= reach))
         if group.size:
-            basis = np.linalg.qr(old.shapes[:, group])[0]
-            alike[i, group] = np.linalg.norm(basis.conj().T @ new.shapes[:, i]) ** 2 >= tol_mac
+            alike[i, group] = in_span(old.shapes[:, group], new.shapes[:, [i]]) >= tol_mac
     stable = damped & alike
     flag = np.max(near * 1 + damped * 1 + stable * 1, axis=1)
     distance = np.abs(new.poles[:, None] - old.poles) / (f_old + TINY)
     cost = np.where(stable, distance, np.where(near, 10.0 + distance, 1e3))
-    rows, columns = so.linear_sum_assignment(cost)
     # a pole whose damping jumps is followed, but is not stable
-    pairs = [(int(j), int(i)) for i, j in zip(rows, columns, strict=True) if cost[i, j] < 100.0]
-    return pairs, flag
+    return assigned(cost, most=100.0), flag
 
 
 #: part of the unit circle that the band is laid around; the rest separates its two ends

@@ -25,7 +25,8 @@ from ..checks import (
 from ..errors import LabelError, ModelError, ShapeError, counted
 from ..labels import Place
 from ..modes import Modes
-from ..tolerances import SAME, TINY
+from ..modes.matching import assigned, in_span
+from ..tolerances import SAME
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -379,8 +380,6 @@ def numbered(
     >>> fx.numbered(measured, model).modes
     (2,)
     """
-    import scipy.optimize as so
-
     instance(measured, MeasuredModes, "measured", "Pass identify_modes(frf).")
     modes = model.modes() if hasattr(model, "modes") and not isinstance(model, Modes) else model
     instance(modes, Modes, "model", "Solve it first: solve_modes(model, count=...).")
@@ -393,10 +392,8 @@ def numbered(
     alike = _likeness(measured, modes, elastic, at)
     allowed = (distance <= width) & (alike >= least_mac)
     cost = np.where(allowed, (distance / width) ** 2 + 1.0 - alike, 1e6)
-    rows, columns = so.linear_sum_assignment(cost)
-    pairs = {
-        int(i): int(elastic[j]) + 1 for i, j in zip(rows, columns, strict=True) if allowed[i, j]
-    }
+    partner = assigned(cost, most=2.0).tolist()
+    pairs = {i: int(elastic[j]) + 1 for i, j in enumerate(partner) if j >= 0}
     lost = [i for i in range(len(measured)) if i not in pairs]
     if lost and (not partial or not pairs):
         worst = lost[0]
@@ -445,12 +442,9 @@ def _likeness(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -> F
     phi: ComplexArray = np.array(
         [modes.at(place)[elastic] for place in places], dtype=np.complex128
     )
-    unit = measured.shapes / np.linalg.norm(measured.shapes, axis=0)
     alike = np.zeros((len(measured), elastic.size))
     omega = modes.omega[elastic]
     for j in range(elastic.size):
         family = np.flatnonzero(np.abs(omega / omega[j] - 1.0) <= FAMILY)
-        basis, size, _ = np.linalg.svd(phi[:, family], full_matrices=False)
-        basis = basis[:, size > 1e-9 * max(float(size[0]), TINY)]
-        alike[:, j] = np.linalg.norm(basis.conj().T @ unit, axis=0) ** 2
+        alike[:, j] = in_span(phi[:, family], measured.shapes)
     return alike

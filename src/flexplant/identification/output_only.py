@@ -10,6 +10,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, positive, real_array, whole
 from ..errors import ModelError, SolverError
+from ..modes.matching import assigned, mac
 from ..parallel import Progress, tick
 from .diagram import OrderPoles, built_diagram
 from .identify import checked_orders
@@ -242,14 +243,11 @@ def _spread(found: OrderPoles, again: list[OrderPoles]) -> tuple[FloatArray, Any
 
 def _like(found: OrderPoles, other: OrderPoles) -> ComplexArray:
     """Return the poles of another result that are those found, by frequency and shape, or NaN."""
-    from scipy.optimize import linear_sum_assignment
-
     moved = np.full(found.poles.size, np.nan + 0j)
     if not other.poles.size:
         return moved
     far = np.abs(other.poles - found.poles[:, None]) / np.abs(found.poles)[:, None]
-    unlike = 1 - np.abs(found.shapes.conj().T @ other.shapes) ** 2
-    for i, j in zip(*linear_sum_assignment(far / NEAR + unlike), strict=True):
-        if far[i, j] < NEAR:
-            moved[i] = other.poles[j]
+    like = assigned(far / NEAR - mac(found.shapes, other.shapes))
+    same = (like >= 0) & (far[np.arange(like.size), like] < NEAR)
+    moved[same] = other.poles[like[same]]
     return moved

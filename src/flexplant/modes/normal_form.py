@@ -16,6 +16,7 @@ from ..structure.definite import signed_square
 from ..structure.eigen import elastic_modes
 from ..structure.rigid import orthonormalised
 from ..tolerances import SAME, divisor
+from .matching import runs
 
 #: coupling of modes by D, relative to the largest modal damping, that still counts as rounding
 PROPORTIONAL = 1e-9
@@ -328,12 +329,8 @@ def complex_modes(omega: FloatArray, C: FloatArray, *, lowest: int | None) -> Co
     # what x^T (2 lambda + C) x is made: s1 - s2, s2 - s1 and 2 i Im(lambda)
     apart = poles[:u].real - poles[u : 2 * u].real
     scale = np.concatenate([apart, -apart, 2j * poles[2 * u :].imag])
-    start = 0
-    for i in range(1, listed.size + 1):
-        if i == listed.size or abs(poles[i] - poles[i - 1]) > _CLUSTER * abs(poles[i]):
-            cluster = slice(start, i)
-            mix[:, cluster] = _normalised(poles[cluster], mix[:, cluster], C, scale[cluster])
-            start = i
+    for cluster in runs(poles, _CLUSTER):
+        mix[:, cluster] = _normalised(poles[cluster], mix[:, cluster], C, scale[cluster])
     mix = _polished(poles, mix, C, scale)
     worst = float(_left(poles, mix, omega, C).max(initial=0.0))
     if not worst < _RESIDUAL:

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 
 from ..checks import ComplexArray, FloatArray
 from ..errors import ModelError
+from ..modes.matching import clusters
 from ..sparse.factor import dense
 from ..structure.definite import refuse_unstable
 from ..structure.eigen import elastic_modes
@@ -289,24 +290,12 @@ class Family:
         return np.asarray((sizes[0] * omega + sizes[1] + sizes[2] / omega) / 2, dtype=np.float64)
 
 
-def groups(poles: ComplexArray, *, gap: float) -> list[list[int]]:
-    """Return runs of neighbours in |lambda| that are closer than `gap`, relatively."""
-    order = np.argsort(np.abs(poles), kind="stable").tolist()
-    runs: list[list[int]] = []
-    for i in order:
-        if runs and abs(abs(poles[i]) - abs(poles[runs[-1][-1]])) <= gap * abs(poles[i]):
-            runs[-1].append(i)
-        else:
-            runs.append([i])
-    return [sorted(run) for run in runs if len(run) > 1]
-
-
 def repeated_groups(poles: ComplexArray) -> list[list[int]]:
     """Return the groups of exactly repeated modes: equal frequency and damping."""
     found: list[list[int]] = []
-    for run in groups(poles, gap=REPEATED):
+    for run in clusters(poles, REPEATED):
         # equal |lambda| with different damping has vectors of its own
-        left = list(run)
+        left = run.tolist()
         while left:
             near = [i for i in left if abs(poles[i] - poles[left[0]]) <= REPEATED * abs(poles[i])]
             left = [i for i in left if i not in near]

@@ -9,7 +9,8 @@ import numpy as np
 
 from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
-from .family import Eigen, Family, groups
+from ..modes.matching import assigned, clusters, in_span, mac
+from .family import Eigen, Family
 
 #: entries of bordered systems that are solved together
 TOGETHER = 1_000_000
@@ -132,13 +133,6 @@ FOREIGN = 1e-4
 NEARNESS = 1.0
 
 
-def mac(X: ComplexArray, Y: ComplexArray) -> FloatArray:
-    """Return the modal assurance criterion of each column of X with each of Y, from 0 to 1."""
-    product = np.abs(X.conj().T @ Y) ** 2
-    sizes = np.outer(np.sum(np.abs(X) ** 2, axis=0), np.sum(np.abs(Y) ** 2, axis=0))
-    return np.asarray(product / sizes, dtype=np.float64)
-
-
 def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntArray:
     """Return for each old mode the column of the new mode that continues it, -1 for none.
 
@@ -147,20 +141,13 @@ def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntAr
     nothing of each other keep to themselves and may cross, all others keep their order of
     frequency, since two modes that couple veer instead of crossing.
     """
-    from scipy.optimize import linear_sum_assignment
-
     shapes = mac(old_X, X)
-    score = shapes.copy()
-    clusters = groups(old_poles, gap=CLUSTER)
-    for cluster in clusters:
-        basis = np.linalg.qr(old_X[:, cluster])[0]
-        inside = np.sum(np.abs(basis.conj().T @ X) ** 2, axis=0) / np.sum(np.abs(X) ** 2, axis=0)
-        score[cluster] = inside
-    found = np.full(old_poles.size, -1, dtype=np.int64)
-    rows, columns = linear_sum_assignment(-score)
-    found[rows] = columns
-    for cluster in clusters:
-        members = np.array([i for i in cluster if found[i] >= 0], dtype=np.int64)
+    score, close = shapes.copy(), clusters(old_poles, CLUSTER)
+    for cluster in close:
+        score[cluster] = in_span(old_X[:, cluster], X)
+    found = assigned(-score)
+    for cluster in close:
+        members = cluster[found[cluster] >= 0]
         found[members] = _inside(shapes, members, found[members])
     return found
 
@@ -172,10 +159,8 @@ def measured_pairs(
 
     Minimises the sum of ``1 - MAC + |ln(f_j / f_i)|`` over the pairs.
     """
-    from scipy.optimize import linear_sum_assignment
-
     far = np.abs(np.log(np.abs(poles) / np.abs(psi_poles)[:, None]))
-    return np.asarray(linear_sum_assignment(NEARNESS * far - mac(psi, X))[1], dtype=np.int64)
+    return assigned(NEARNESS * far - mac(psi, X))
 
 
 def _inside(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:

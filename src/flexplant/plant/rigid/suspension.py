@@ -13,6 +13,7 @@ from ...checks import ComplexArray, FloatArray, Value, positive, real_array
 from ...errors import ModelError, counted
 from ...labels import Place
 from ...modes import Modes, normal_form
+from ...modes.matching import runs
 from ...reduction import ReducedModel
 from ...structure import Damper, FEModel, Spring
 from ...structure.placed import SPANNED
@@ -297,18 +298,14 @@ def suspended(
 
 def _shapes(poles: ComplexArray, see: ComplexArray, push: ComplexArray) -> ComplexArray:
     """Return phi (n, k) with ``phi phi' = 2i Im(lambda) see push'`` for each pole."""
-    phi, start = np.zeros_like(see), 0
-    for i in range(1, poles.size + 1):
-        if i < poles.size and abs(poles[i] - poles[i - 1]) <= _CLUSTER * abs(poles[i]):
-            continue
-        own = slice(start, i)
+    phi = np.zeros_like(see)
+    for own in runs(poles, _CLUSTER):
         ratio = np.linalg.lstsq(see[:, own], push[:, own], rcond=None)[0]
         off = np.linalg.norm(see[:, own] @ ratio - push[:, own]) / np.linalg.norm(push[:, own])
         if off > _SYMMETRIC:
             raise ModelError(
-                f"the shapes at the pole {poles[start]:.6g} rad/s are not reciprocal (by {off:.1e})"
-                ": these complex modes are not those of symmetric matrices, or two modes coalesce."
+                f"the shapes at the pole {poles[own[0]]:.6g} rad/s are not reciprocal (by "
+                f"{off:.1e}): these complex modes are not those of symmetric matrices, or two modes coalesce."
             )
         phi[:, own] = see[:, own] @ la.sqrtm(2j * poles[own].imag.mean() * ratio)
-        start = i
     return phi

@@ -11,9 +11,8 @@ import numpy as np
 from ...checks import ComplexArray, FloatArray, Value, short
 from ...errors import ModelError, ShapeError
 from ...identification import MeasuredModes
-from ...reduction.mode_pairs import groups_alike, likeness
+from ...modes import matching
 from ..point_model import Point
-from ..point_model import mac as _mac
 from ..residuals.frf_residual import FrfResidual
 from ..residuals.mode_shapes import ModeShapes
 from ..search import Objective, checked_residuals
@@ -50,7 +49,7 @@ def mac(X: Any, Y: Any) -> FloatArray:
     left, right = _shapes(X, "X"), _shapes(Y, "Y")
     if left.shape[0] != right.shape[0]:
         raise ShapeError(f"X has {left.shape[0]} rows and Y {right.shape[0]}.")
-    return _mac(left, right)
+    return matching.mac(left, right)
 
 
 def frac(H: Any, G: Any) -> FloatArray:
@@ -260,7 +259,8 @@ def _alike(seen: ComplexArray, point: Point, columns: list[int]) -> tuple[tuple[
     """Return the numbers of modes in the range of those compared that look alike at the sensors."""
     inside = np.arange(min(columns), max(columns) + 1)
     inside = inside[(point.labels[inside] > 0) & np.any(seen[:, inside] != 0, axis=0)]
-    group = groups_alike(likeness(seen[:, inside], np.abs(point.eigen.poles[inside])))
+    near = matching.likeness(seen[:, inside], np.abs(point.eigen.poles[inside]))
+    group = matching.groups_alike(near)
     numbers = point.labels[inside]
     found = [np.sort(numbers[group == first]).tolist() for first in np.unique(group)]
     return tuple(tuple(members) for members in found if len(members) > 1)

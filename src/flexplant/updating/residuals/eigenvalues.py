@@ -11,7 +11,8 @@ import scipy.linalg as la
 from ...checks import ComplexArray, FloatArray, instance, positive, positive_array
 from ...errors import LabelError
 from ...identification import MeasuredModes
-from ..family import Family, groups
+from ...modes.matching import clusters
+from ..family import Family
 from ..point_model import Point
 from .mode_shapes import chosen_modes
 from .residual import Bound, Residual, split_parts
@@ -118,7 +119,8 @@ class BoundEigenvalues(Bound):
         measured = residual.measured
         self.numbers = measured.modes or ()
         m = len(measured)
-        self.clusters = groups(measured.poles, gap=residual.clusters) if residual.clusters else []
+        close = clusters(measured.poles, residual.clusters) if residual.clusters else []
+        self.clusters = [group.tolist() for group in close]
         alone = [[i] for i in range(m) if not any(i in group for group in self.clusters)]
         self.mean = np.zeros((len(alone) + len(self.clusters), m))
         for row, group in zip(self.mean, [*alone, *self.clusters], strict=True):

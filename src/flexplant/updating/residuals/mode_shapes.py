@@ -22,7 +22,8 @@ from ...checks import (
 from ...errors import LabelError, ModelError, ShapeError, counted, require_known
 from ...identification import MeasuredModes
 from ...labels import DIRECTIONS, Place
-from ..family import Family, groups
+from ...modes.matching import clusters
+from ..family import Family
 from ..parameters.added import checked_place
 from ..point_model import CLUSTER, Point, measured_pairs
 from .residual import Bound, Residual, channel_places, place_rows, split_parts
@@ -145,7 +146,7 @@ class BoundShapes(Bound):
     def __init__(self, residual: ModeShapes, family: Family) -> None:
         measured = residual.measured
         own = measured.modes or ()
-        near = groups(measured.poles, gap=CLUSTER)
+        near = [group.tolist() for group in clusters(measured.poles, CLUSTER)]
         alone = [[i] for i in range(len(own)) if not any(i in group for group in near)]
         #: columns of the measurement that are compared together
         self.sets = [*alone, *near]

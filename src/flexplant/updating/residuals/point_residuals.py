@@ -12,6 +12,7 @@ import scipy.linalg as la
 from ...checks import ComplexArray, FloatArray, positive, positive_array, real_array
 from ...errors import ModelError, ShapeError, counted, require_known
 from ...labels import DIRECTIONS, Place
+from ...modes.matching import assigned
 from ...tolerances import SPLIT, TINY
 from ..family import Family
 from ..parameters.added import checked_place
@@ -133,14 +134,12 @@ class _BoundZeros(Bound):
         return self._last[1:]
 
     def _nearest(self, s: Any) -> Any:
-        from scipy.optimize import linear_sum_assignment
-
         if s.size < self.target.size:
             raise ModelError(
                 f"the model has {counted(s.size, 'antiresonance')} there, {self.target.size} were "
                 "measured."
             )
-        return linear_sum_assignment(np.abs(self.target[:, None] - s))[1]
+        return assigned(np.abs(self.target[:, None] - s))
 
     def _found(self, point: Point) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
         """Return the zeros nearest to the measured ones with right and left vectors."""

@@ -1,4 +1,4 @@
-"""Which mode of one model is which of another: one to one, by shape and frequency."""
+"""Which modes are the same: likeness of shapes, clusters of close modes, pairs one to one."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, IntArray
 from ..tolerances import TINY
 
+#: shapes below this part of the largest one of their span are none: rounding
+_NONE = 1e-9
 #: modes closer than this, relatively, are compared as one subspace: any change mixes their shapes
 CLUSTER = 1e-3
 #: MAC from which on two modes are the same one
@@ -24,6 +26,44 @@ ALIKE = 0.9
 _RANK = 1e-12
 #: part of the MAC that a frequency ratio of e counts for: it decides where shapes do not
 _FREQUENCY = 0.1
+
+
+def mac(X: Any, Y: Any) -> FloatArray:
+    """Return the modal assurance criterion of each column of X with each of Y, from 0 to 1."""
+    sizes = np.outer(np.sum(np.abs(X) ** 2, axis=0), np.sum(np.abs(Y) ** 2, axis=0))
+    return np.asarray(np.abs(X.conj().T @ Y) ** 2 / sizes, dtype=np.float64)
+
+
+def in_span(X: Any, Y: Any) -> FloatArray:
+    """Return how much of each column of Y lies in the span of X (k,): of one column their MAC."""
+    basis, size, _ = np.linalg.svd(X, full_matrices=False)
+    inside = basis[:, size > _NONE * size[0]].conj().T @ Y
+    return np.asarray(np.sum(np.abs(inside) ** 2, axis=0) / np.sum(np.abs(Y) ** 2, axis=0))
+
+
+def runs(values: Any, gap: float) -> list[IntArray]:
+    """Return the places of neighbours in a list whose relative distance is `gap` at most."""
+    far = np.abs(np.diff(values)) > gap * np.abs(values[1:])
+    return [run for run in np.split(np.arange(len(values)), np.flatnonzero(far) + 1) if run.size]
+
+
+def clusters(values: Any, gap: float) -> list[IntArray]:
+    """Return the places of `runs` of rising size, those of one alone left out."""
+    order = np.argsort(np.abs(values), kind="stable")
+    return [np.sort(order[run]) for run in runs(np.abs(values)[order], gap) if run.size > 1]
+
+
+def assigned(cost: FloatArray, most: float = np.inf) -> IntArray:
+    """Return the column of each row, one to one with the least total cost.
+
+    -1 where none is left, or where the cost is above `most`.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    rows, columns = linear_sum_assignment(cost)
+    found = np.full(len(cost), -1, dtype=np.int64)
+    found[rows] = np.where(cost[rows, columns] <= most, columns, -1)
+    return found
 
 
 class ModePairs(NamedTuple):
@@ -50,16 +90,17 @@ def paired(
     """
     size, other_size = np.real(np.diag(gram)), np.real(np.diag(other_gram))
     alike = np.abs(cross) ** 2 / np.outer(size, other_size)
-    clusters = _clusters(freq, n_rigid)
+    first = np.arange(min(n_rigid, freq.size))
+    spans = [first] + [n_rigid + run for run in runs(freq[n_rigid:], CLUSTER)]
     score = alike.copy()
-    for members in clusters:
+    for members in spans:
         if members.size > 1:
             score[members] = _share(gram[np.ix_(members, members)], cross[members], other_size)
-    partner = _assigned(freq, other_freq, score, n_rigid)
-    mac = np.array([alike[i, j] if j >= 0 else 0.0 for i, j in enumerate(partner.tolist())])
-    chosen = np.array([score[i, j] if j >= 0 else 0.0 for i, j in enumerate(partner.tolist())])
-    partner[chosen < PARTNER] = -1
-    for members in clusters:
+    partner = _by_shape(freq, other_freq, score, n_rigid)
+    rows = np.arange(freq.size)
+    mac = np.where(partner >= 0, alike[rows, partner], 0.0)
+    partner[score[rows, partner] < PARTNER] = -1
+    for members in spans:
         if members.size > 1:
             found = np.sort(partner[members][partner[members] >= 0])
             holders = _holders(alike[np.ix_(members, found)])
@@ -70,35 +111,20 @@ def paired(
                 cross[np.ix_(members, found)],
                 other_gram[np.ix_(found, found)],
             )
-    return ModePairs(partner, mac, groups_alike(np.abs(gram) ** 2 / np.outer(size, size), clusters))
+    return ModePairs(partner, mac, groups_alike(np.abs(gram) ** 2 / np.outer(size, size), spans))
 
 
-def _assigned(
+def _by_shape(
     freq: FloatArray, other_freq: FloatArray, score: FloatArray, n_rigid: int
 ) -> IntArray:
-    partner = np.full(freq.size, -1, dtype=np.int64)
-    k = min(freq.size, other_freq.size)
-    rigid = np.arange(min(n_rigid, k))
-    partner[rigid] = rigid
-    if k > n_rigid:
-        r = n_rigid
+    """Return the partner of each mode: rigid-body modes in order, others by shape and frequency."""
+    r, k = n_rigid, min(freq.size, other_freq.size)
+    partner = np.where(np.arange(freq.size) < k, np.arange(freq.size), -1)
+    if k > r:
         ratio = np.maximum(other_freq[None, r:], TINY) / np.maximum(freq[r:, None], TINY)
-        far = np.minimum(np.abs(np.log(ratio)), 1.0)
-        from scipy.optimize import linear_sum_assignment
-
-        rows, columns = linear_sum_assignment(_FREQUENCY * far - score[r:, r:])
-        partner[rows + r] = columns + r
+        found = assigned(_FREQUENCY * np.minimum(np.abs(np.log(ratio)), 1.0) - score[r:, r:])
+        partner[r:] = np.where(found >= 0, found + r, -1)
     return partner
-
-
-def _clusters(freq: FloatArray, n_rigid: int) -> list[IntArray]:
-    """Return the modes that are compared together: rigid-body modes, then close ones."""
-    first = [
-        i
-        for i in range(freq.size)
-        if i in (0, n_rigid) or (i > n_rigid and freq[i] - freq[i - 1] > CLUSTER * freq[i])
-    ]
-    return [np.arange(a, b) for a, b in zip(first, [*first[1:], freq.size], strict=True)]
 
 
 def _share(gram: Any, cross: Any, other_size: FloatArray) -> FloatArray:
@@ -118,10 +144,7 @@ def _holders(alike: FloatArray) -> IntArray:
     """Return which members of a cluster hold its partners: all by rising frequency, else by MAC."""
     if alike.shape[0] == alike.shape[1]:
         return np.arange(alike.shape[0])
-    from scipy.optimize import linear_sum_assignment
-
-    rows, columns = linear_sum_assignment(-alike)
-    return np.asarray(rows[np.argsort(columns)], dtype=np.int64)
+    return assigned(-alike.T)
 
 
 def _cosines(gram: Any, cross: Any, other_gram: Any) -> FloatArray:
@@ -144,8 +167,7 @@ def likeness(shapes: ComplexArray, freq: FloatArray) -> FloatArray:
     are nearly dependent, else 0. A mode with a node at all places is like no other.
     """
     order = np.argsort(freq, kind="stable")
-    apart = np.flatnonzero(np.diff(freq[order]) > CLUSTER * freq[order][1:]) + 1
-    spans = np.split(order, apart)
+    spans = [order[run] for run in runs(freq[order], CLUSTER)]
     alike = np.eye(freq.size)
     largest = np.linalg.norm(shapes, axis=0).max(initial=0.0)
     bases = []
@@ -162,11 +184,11 @@ def likeness(shapes: ComplexArray, freq: FloatArray) -> FloatArray:
     return alike
 
 
-def groups_alike(alike: FloatArray, clusters: Sequence[IntArray] = ()) -> IntArray:
+def groups_alike(alike: FloatArray, spans: Sequence[IntArray] = ()) -> IntArray:
     """Return for each mode the first one whose shape cannot be distinguished from its own."""
     group = np.arange(len(alike), dtype=np.int64)
-    for members in clusters:
-        group[members] = members[0]
+    for members in spans:
+        group[members] = members[:1]
     for i, j in np.argwhere(np.triu(alike > ALIKE, 1)).tolist():
         group[group == group[j]] = group[i]
     return group
