@@ -305,7 +305,8 @@ def _shapes(poles: ComplexArray, see: ComplexArray, push: ComplexArray) -> Compl
         if off > _SYMMETRIC:
             raise ModelError(
                 f"the shapes at the pole {poles[own[0]]:.6g} rad/s are not reciprocal (by "
-                f"{off:.1e}): these complex modes are not those of symmetric matrices, or two modes coalesce."
+                f"{off:.1e}): these complex modes are not those of symmetric matrices, or two "
+                "modes coalesce."
             )
         phi[:, own] = see[:, own] @ la.sqrtm(2j * poles[own].imag.mean() * ratio)
     return phi
