@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -17,25 +17,27 @@ from ..tolerances import ROUNDING, TINY
 from .diagram import Moments, OrderPoles, PoleSelection, StabilisationDiagram, built_diagram
 from .line_weights import PreparedLines, prepared
 from .pole_test import (
-    BROADEST,
-    backed,
-    completed,
-    exact,
-    fewest_terms,
+    UPPER,
+    dropped,
+    fewer_terms,
     freedom,
+    improved,
+    missed,
+    more_terms,
     relocated,
-    separated,
+    split,
     supported,
     unexplained,
+    unwindowed,
     warned,
 )
 from .refine import Lines, refined
-from .result import IdentifiedModes, answer, hann_segment, leakage_warned, no_pole, seen_better
+from .result import IdentifiedModes, answer, hann_segment, leakage_warned, of_segments
 
-#: numbers of residual terms of modes above the band that are tried
-UPPER = (3, 5, 7, 9)
-#: of an identification, for its bar: the diagram, twice fit and completion, the answer
+#: of an identification, for its bar: the diagram, twice fit and growth, the answer
 STAGES = 6
+#: changes of one kind that are accepted
+MOST = 6
 
 
 def stabilisation_diagram(
@@ -204,7 +206,12 @@ def identify_modes(
     (array([ 34.46, 147.  ]), array([ 34.46, 147.  ]))
     """
     with one_thread(), Progress(STAGES, "modes", progress=progress) as bar:
-        found = _identified(frf, band, orders, start, lower, upper, hold, dofs, max_iterations, bar)
+        try:
+            found = _identified(
+                frf, band, orders, start, lower, upper, hold, dofs, max_iterations, bar
+            )
+        except SolverError as error:
+            raise of_segments(frf, error) from None
         bar.advance(STAGES - bar.done)
         return found
 
@@ -224,7 +231,7 @@ def _identified(
     ready = prepared(frf, band)
     low, high = float(ready.freq[0]), float(ready.freq[-1])
     lower = whole(lower, "lower", minimum=0)
-    tried = UPPER if upper is None else (whole(upper, "upper", minimum=0),)
+    most = UPPER[-1] if upper is None else whole(upper, "upper", minimum=0)
     max_iterations = whole(max_iterations, "max_iterations")
     rate = None if hold is None else positive(hold, "hold")
     if rate is not None and high > rate / 2 * (1 + ROUNDING):
@@ -238,10 +245,7 @@ def _identified(
     diagram = None
     if start is None:
         diagram = diagram_of(ready, _affordable(listed, ready), (0.01, 0.05, 0.95), 0.2)
-        try:
-            chosen = diagram.automatic()
-        except SolverError as error:
-            raise no_pole(frf, error) from None
+        chosen = diagram.automatic()
     elif start.participation.shape[0] != ready.data.shape[1]:
         raise ShapeError(
             f"start was chosen with {counted(start.participation.shape[0], 'reference')}, this FRF "
@@ -251,59 +255,38 @@ def _identified(
         chosen = start
     poles, part = chosen.poles, chosen.participation
     bar.advance()
+    alone, free = start is None, upper is None
+    reducing = [(unwindowed, 1), (dropped, int(alone)), (fewer_terms, int(free))]
+    growing = [
+        *((missed, MOST), (more_terms, int(free))),
+        *((split, MOST), (relocated, MOST), (missed, MOST)),
+    ]
     for _ in range(1 if ready.known else 2):
         # with all residual terms, so that no pole is kept or moved to stand in for one
-        lines = Lines(ready.freq, ready.data, ready.weight, lower, tried[-1], rate, ready.known)
-        lines = replace(
-            lines,
+        lines = Lines(
+            *(ready.freq, ready.data, ready.weight, lower, most, rate, ready.known),
             inflation=ready.inflation,
             variance_freedom=frf.freedom,
             segment=hann_segment(frf),
         )
-        if start is None:
+        if alone:
             poles, part = supported(lines, poles, part)
-            if not poles.size:
-                raise no_pole(frf, _unsupported(low, high))
         # poles that turn out to be none may keep it from settling: judged at the end
-        fit = refined(lines, poles, part, steps=max_iterations, strict=start is not None)
-        lines, fit = seen_better(lines, fit, poles, part, steps=max_iterations)
-        if start is None:
-            light = np.flatnonzero(-fit.poles.real < BROADEST * np.abs(fit.poles))
-            fewer, part = supported(lines, fit.poles[light], fit.participation[:, light])
-            if not fewer.size:
-                raise no_pole(frf, _unsupported(low, high))
-            if fewer.size < fit.poles.size:
-                fit = refined(lines, fewer, part, steps=max_iterations, strict=False)
-        lines, fit = fewest_terms(lines, fit, tried[:-1], steps=max_iterations)
+        fit = refined(lines, poles, part, steps=max_iterations, strict=not alone)
+        lines, fit = improved(lines, fit, reducing, steps=max_iterations)
         bar.advance()
-        if start is None:
-            fit, _ = completed(lines, fit, steps=max_iterations)
-            if not exact(lines, fit.model):
-                if upper is None:
-                    lines, fit = backed(lines, fit, steps=max_iterations)
-                fit = separated(lines, fit, steps=max_iterations)
-                fit = relocated(lines, fit, steps=max_iterations)
+        if alone:
+            lines, fit = improved(lines, fit, growing, steps=max_iterations, rough=True)
             bar.advance()
-            fit, left = completed(lines, fit, steps=max_iterations)
-        else:
-            left = unexplained(lines, fit)
         poles, part = fit.poles, fit.participation
         if not ready.known:
             share = 1.0 - freedom(lines, poles.size) / (2 * fit.model.size)
             ready = ready.from_residuals(ready.data - fit.model, share)
     fit = refined(lines, fit.poles, fit.participation, steps=max_iterations, fine=True)
-    warned(left)
+    warned(unexplained(lines, fit))
     found = answer(frf, ready, lines, fit, (low, high), labels, diagram)
     leakage_warned(frf, found)
     return found
-
-
-def _unsupported(low: float, high: float) -> SolverError:
-    return SolverError(
-        f"no resonance between {low:.4g} and {high:.4g} Hz stands out of the noise: what the poles "
-        "of the diagram explain could be chance. Move or widen the band, measure longer, or pick "
-        "poles by hand with stabilisation_diagram(frf).select(freq=[...])."
-    )
 
 
 def _affordable(orders: list[int], ready: PreparedLines) -> list[int]:

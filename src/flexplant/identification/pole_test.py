@@ -1,9 +1,10 @@
-"""Which poles the data support: poles that noise explains are left out (one in 1000 stays)."""
+"""Which poles and terms the data support: changes are proposed, and accepted by one criterion."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
@@ -20,8 +21,8 @@ CHANCE = 1e-3
 def supported(
     lines: Lines, poles: ComplexArray, part: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Leave out, one by one, poles that noise alone may explain."""
-    least = price(lines)
+    """Leave out, one by one, poles that noise alone may explain; SolverError when none is left."""
+    least = pole_price(lines, lines.freq.size)
     costs = _Costs(lines, poles, part)
     kept = list(range(poles.size))
     while len(kept) > 1:
@@ -31,6 +32,13 @@ def supported(
             break
         kept.pop(int(np.argmin(losses)))
     kept = [k for k in kept if len(kept) == 1 or _seen(lines, poles, part, kept, k)]
+    if not kept:
+        raise SolverError(
+            f"no resonance between {lines.freq[0]:.4g} and {lines.freq[-1]:.4g} Hz stands out of "
+            "the noise: what the poles of the diagram explain could be chance. Move or widen the "
+            "band, measure longer, or pick poles by hand with "
+            "stabilisation_diagram(frf).select(freq=[...])."
+        )
     return poles[kept], part[:, kept]
 
 
@@ -52,30 +60,34 @@ def corroborated(lines: Lines, less: ComplexArray, more: ComplexArray) -> bool:
     other lines by chance only: those lower the cost by a chi-square of four degrees, of the pole
     and its size.
     """
-    from scipy.special import chdtri
-
     before, after = (
         np.sum(np.abs((lines.data - model) * lines.weight) ** 2, axis=(0, 1))
         for model in (less, more)
     )
     gain = before - after
     unit = max(1.0, float(np.sum(after)) / (2 * lines.data.size))
-    return float(np.sum(np.sort(gain)[:-2])) > unit * lines.inflation * float(chdtri(4, CHANCE))
+    return float(np.sum(np.sort(gain)[:-2])) > unit * price(lines, 4, CHANCE)
 
 
-def price(lines: Lines) -> float:
-    """Return by how much a pole must lower the cost.
+def price(lines: Lines, count: int, chance: float) -> float:
+    """Return by how much noise lowers the cost with so many numbers more: a chi-square quantile.
 
-    Its pole, shape and participation are 2 (n_out + n_in) numbers, so noise lowers the cost by a
-    chi-square of that many degrees; it has as many places to do so as there are lines. Where
-    errors of neighbouring lines are correlated, noise that changes little over a few lines has
-    `inflation` times the power of independent errors. A pole kept in vain costs little; one left
-    out biases its neighbours by up to the root of this amount.
+    Where errors of neighbouring lines are correlated, noise that changes little over a few lines
+    has `inflation` times the power of independent errors.
     """
     from scipy.special import chdtri
 
-    n_out, n_in, n_freq = lines.data.shape
-    return lines.inflation * float(chdtri(2 * (n_out + n_in), CHANCE / n_freq))
+    return lines.inflation * float(chdtri(count, chance))
+
+
+def pole_price(lines: Lines, places: int) -> float:
+    """Return by how much a pole at one of some places must lower the cost.
+
+    Its pole, shape and participation are 2 (n_out + n_in) numbers. A pole kept in vain costs
+    little; one left out biases its neighbours by up to the root of this amount.
+    """
+    n_out, n_in, _ = lines.data.shape
+    return price(lines, 2 * (n_out + n_in), CHANCE / places)
 
 
 class _Costs:
@@ -111,61 +123,144 @@ def freedom(lines: Lines, m: int) -> float:
 
 #: half the distance at which a pole is taken apart, in parts of its damping
 APART = 0.5
-#: numbers of residual terms tried where 9 leave more than noise
-MORE = (25, 17, 13)
+#: numbers of residual terms of modes above the band: as few, and where these leave more than noise
+UPPER, MORE = (3, 5, 7, 9), (25, 17, 13)
+#: probability that noise passes for a residual term: one too many costs next to nothing, one too
+#: few is a bias
+FEW = 0.1
 #: what a weak pole must lower the cost by elsewhere
 GAIN = 0.1
 #: a pole is weak whose cost is less than so many times the least that is required of one
 WEAK = 4.0
+#: damping ratio above which a pole is no mode, and how much broader than all a new one may be
+BROADEST, BROADER = 0.2, 1.1
+#: rivals that are refined, and the part of what is required that they must gain before
+RIVALS, BEFORE = 3, 0.25
 
 
-def separated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
-    r"""Return the fit with those poles taken apart that are two.
+class Trial(NamedTuple):
+    """A changed fit before it is refined, its gain then, and by how much it must lower the cost."""
+
+    lines: Lines
+    poles: ComplexArray
+    participation: ComplexArray
+    gain: float
+    least: float
+
+
+#: the rivals of each place at which something may be changed, the best ones first
+Proposals: TypeAlias = Iterable[list[Trial]]
+#: what proposes one kind of change
+Kind: TypeAlias = Callable[[Lines, Fit], Proposals]
+
+
+def improved(
+    lines: Lines, fit: Fit, kinds: Sequence[tuple[Kind, int]], *, steps: int, rough: bool = False
+) -> tuple[Lines, Fit]:
+    """Return the fit with the changes that lower its cost by more than noise does.
+
+    Each kind proposes changes, until none of them is accepted or so many are: refined, it lowers
+    the cost by what it must, without a pole becoming broader than a mode (it would replace
+    something else), and a pole more is borne out by several lines. `rough`: a fit that leaves
+    nothing but rounding is changed no more.
+    """
+    for propose, most in kinds:
+        for _ in range(most):
+            if rough and exact(lines, fit.model):
+                return lines, fit
+            trials = (one for rivals in propose(lines, fit) for one in rivals[:RIVALS])
+            more = next(filter(None, (_accepted(lines, fit, one, steps) for one in trials)), None)
+            if more is None:
+                break
+            lines, fit = more
+    return lines, fit
+
+
+def _accepted(lines: Lines, fit: Fit, trial: Trial, steps: int) -> tuple[Lines, Fit] | None:
+    """Return the refined fit of a trial where it is better by more than noise makes it."""
+    if trial.gain < min(trial.least, BEFORE * trial.least):
+        return None
+    more_poles = trial.poles.size > fit.poles.size
+    below = fit.cost - trial.least
+    start = trial.poles, trial.participation
+    try:
+        more = refined(trial.lines, *start, steps=steps, strict=more_poles, below=below)
+    except SolverError:
+        return None
+    zeta, before = (-each.poles.real / np.abs(each.poles) for each in (more, fit))
+    if more.cost >= below or zeta.max() >= max(BROADEST, BROADER * before.max()):
+        return None
+    if more_poles and not corroborated(lines, fit.model, more.model):
+        return None
+    return trial.lines, more
+
+
+def _unit(lines: Lines, fit: Fit) -> float:
+    """Return the misfit, 1 at least, by which an estimated variance is off everywhere."""
+    return max(1.0, fit.cost / freedom(lines, fit.poles.size))
+
+
+def unwindowed(lines: Lines, fit: Fit) -> Proposals:
+    """Propose lines that are not seen through the window of segments.
+
+    H1 of an input that is white over a few lines is what the window makes of the response; H2, Hv
+    and bursts that end within a segment are not.
+    """
+    if lines.segment is not None:
+        plain = replace(lines, segment=None)
+        yield [Trial(plain, fit.poles, fit.participation, np.inf, 0.0)]
+
+
+def dropped(lines: Lines, fit: Fit) -> Proposals:
+    """Propose the poles that are modes and that noise alone does not explain."""
+    light = np.flatnonzero(-fit.poles.real < BROADEST * np.abs(fit.poles))
+    poles, part = supported(lines, fit.poles[light], fit.participation[:, light])
+    if poles.size < fit.poles.size:
+        yield [Trial(lines, poles, part, np.inf, -np.inf)]
+
+
+def _terms(lines: Lines, fit: Fit, upper: int, chance: float) -> Trial:
+    """Return the fit with another number of residual terms of modes above the band."""
+    other, count = replace(lines, upper=upper), upper - lines.upper
+    channels = lines.data.shape[0] * lines.data.shape[1]
+    gain = fit.cost - projected_cost(other, fit.poles, fit.participation)
+    least = np.sign(count) * _unit(lines, fit) * price(lines, channels * abs(count), chance)
+    return Trial(other, fit.poles, fit.participation, gain, least)
+
+
+def fewer_terms(lines: Lines, fit: Fit) -> Proposals:
+    """Propose the fewest residual terms that the data let pass."""
+    trials = (_terms(lines, fit, upper, FEW) for upper in UPPER if upper < lines.upper)
+    yield [trial for trial in trials if trial.gain > trial.least]
+
+
+def more_terms(lines: Lines, fit: Fit) -> Proposals:
+    """Propose more residual terms where the data require them.
+
+    Sampling folds modes of more than half the rate into the band: each is weak and as broad as
+    its frequency and damping were, many together are no noise. What a first few of these terms
+    leave is too little to be seen and enough to bias, and in a wide band they cost next to
+    nothing: so as many as the lines afford.
+    """
+    count = lines.freq.size
+    afforded = [u for u in MORE if u > lines.upper and count >= 8 * (u + lines.lower)]
+    trials = (_terms(lines, fit, upper, CHANCE) for upper in afforded)
+    yield [trial for trial in trials if trial.gain > trial.least]
+
+
+def split(lines: Lines, fit: Fit) -> Proposals:
+    r"""Propose to take those poles apart that are two.
 
     A pole of two modes, repeated or so close that one pole passes for both, requires residues
     of rank two (several inputs), or for a pole of its own at each output (one input):
 
     .. math:: \frac{\psi l^T}{s-\lambda} \to \frac{\psi l^T + \psi' l_\perp^T}{s-\lambda}
         \quad\text{or}\quad \frac{\psi l^T}{s-\lambda-\delta} + \frac{\psi' l^T}{s-\lambda+\delta}
-
-    Both are tried at every pole; the fit that follows must lower chi-square by more than noise
-    does at any of them once in a thousand times.
     """
-    for _ in range(fit.poles.size):
-        better = _apart(lines, fit, steps)
-        if better is None:
-            break
-        fit = better
-    return fit
-
-
-def least_of(lines: Lines, places: int) -> float:
-    """Return by how much a second pole must lower the cost at one of some places."""
-    from scipy.special import chdtri
-
-    n_out, n_in, _ = lines.data.shape
-    return float(chdtri(2 * (n_out + n_in), CHANCE / places))
-
-
-def _apart(lines: Lines, fit: Fit, steps: int) -> Fit | None:
-    unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
-    least = least_of(lines, fit.poles.size) * unit
-    trials = []
-    for k in range(fit.poles.size):
-        for poles, part in _pairs(fit, k):
-            trials.append((fit.cost - projected_cost(lines, poles, part), poles, part))
-    trials.sort(key=lambda trial: -trial[0])
-    for gain, poles, part in trials[:3]:
-        if gain < least / 3:
-            break
-        try:
-            more = refined(lines, poles, part, steps=steps, below=fit.cost - least)
-        except SolverError:
-            continue
-        enough = fit.cost - more.cost > least and _narrow(more, fit)
-        if enough and corroborated(lines, fit.model, more.model):
-            return more
-    return None
+    least = pole_price(lines, fit.poles.size) * _unit(lines, fit)
+    pairs = [pair for k in range(fit.poles.size) for pair in _pairs(fit, k)]
+    trials = [Trial(lines, *one, fit.cost - projected_cost(lines, *one), least) for one in pairs]
+    yield sorted(trials, key=lambda trial: -trial.gain)
 
 
 def _pairs(fit: Fit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
@@ -183,63 +278,40 @@ def _pairs(fit: Fit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
     return pairs
 
 
-def _narrow(more: Fit, fit: Fit) -> bool:
-    """Whether no pole became broader than any was: then it replaced something else."""
-    zeta = [-f.poles.real / np.abs(f.poles) for f in (more, fit)]
-    return bool(zeta[0].max() <= 1.5 * zeta[1].max())
-
-
-def relocated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
-    """Return the fit with weak poles moved to where they lower the cost most.
+def relocated(lines: Lines, fit: Fit) -> Proposals:
+    """Propose other places for weak poles, within seven half-widths.
 
     Noise gives the likelihood of a mode that is hardly seen several peaks; the fit climbs the one
-    that it is started at. Its neighbourhood of seven half-widths is searched.
+    that it is started at.
     """
-    for k in range(fit.poles.size):
-        pole = fit.poles[k]
+    for k, pole in enumerate(fit.poles):
         rest = np.delete(fit.poles, k)
         if not rest.size or -pole.real > 0.05 * abs(pole):
             continue
         without = projected_cost(lines, rest, np.delete(fit.participation, k, axis=1))
-        if without - fit.cost > WEAK * price(lines):
+        if without - fit.cost > WEAK * pole_price(lines, lines.freq.size):
             continue
         trials = []
         for shift in np.arange(-7.0, 7.1, 0.7):
             poles = fit.poles.copy()
             poles[k] = pole + 1j * shift * abs(pole.real)
-            trials.append((projected_cost(lines, poles, fit.participation), poles))
-        for _, poles in sorted(trials, key=lambda trial: trial[0])[:3]:
-            if abs(poles[k] - pole) < 1.0 * abs(pole.real):
-                continue
-            try:
-                more = refined(lines, poles, fit.participation, steps=steps, below=fit.cost - GAIN)
-            except SolverError:
-                continue
-            if more.cost < fit.cost - GAIN and _narrow(more, fit):
-                fit = more
-    return fit
+            gain = fit.cost - projected_cost(lines, poles, fit.participation)
+            trials.append((gain, abs(shift), poles))
+        best = sorted(trials, key=lambda trial: -trial[0])[:RIVALS]
+        # refined, it is to lower the cost: where it begins it does so seldom
+        yield [
+            Trial(lines, poles, fit.participation, np.inf, GAIN)
+            for _, shift, poles in best
+            if shift >= 1.0
+        ]
 
 
-def backed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Lines, Fit]:
-    """Return the fit with more residual terms where the data require them.
-
-    Sampling folds modes of more than half the rate into the band: each is weak and as broad as
-    its frequency and damping were, many together are no noise. What a first few of these terms
-    leave is too little to be seen and enough to bias, and in a wide band they cost next to
-    nothing: so as many as the lines afford.
-    """
-    from scipy.special import chdtri
-
-    channels = lines.data.shape[0] * lines.data.shape[1]
-    unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
-    for upper in MORE:
-        if lines.freq.size < 8 * (upper + lines.lower) or upper <= lines.upper:
-            continue
-        more = replace(lines, upper=upper)
-        gain = fit.cost - projected_cost(more, fit.poles, fit.participation)
-        if gain > unit * chdtri(channels * (upper - lines.upper), CHANCE):
-            return more, refined(more, fit.poles, fit.participation, steps=steps, strict=False)
-    return lines, fit
+def missed(lines: Lines, fit: Fit) -> Proposals:
+    """Propose a pole at the two highest peaks of what is left, single lines apart."""
+    least = pole_price(lines, lines.freq.size) * _unit(lines, fit)
+    for peak in [peak for peak in unexplained(lines, fit) if not peak.isolated][:2]:
+        poles, part, cost = candidate(lines, fit.model, fit.poles, fit.participation, peak)
+        yield [Trial(lines, poles, part, fit.cost - cost, least)]
 
 
 #: lengths [lines] of the stretches that are examined
@@ -252,10 +324,6 @@ DAMPING = (0.0005, 0.002, 0.008, 0.03)
 ROUNDING = 1e-9
 #: and without noise, what is left is seldom a mode where it is less than this share of the response
 SHARE = 0.01
-#: poles that may be added, and the damping ratio above which one is no mode
-MOST, BROADEST = 6, 0.2
-
-
 #: lines around a peak, and standard deviations of their sum without the two highest, of a mode
 AROUND, NEARBY = 6, 2.5
 
@@ -382,51 +450,6 @@ def candidate(
     more = np.concatenate([poles, best[1]])
     parts = np.concatenate([part, best[2].astype(np.complex128)], axis=1)
     return more, parts, projected_cost(lines, more, parts)
-
-
-def fewest_terms(lines: Lines, fit: Fit, fewer: Sequence[int], *, steps: int) -> tuple[Lines, Fit]:
-    """Return the fit with the fewest residual terms of modes above that the data let pass."""
-    from scipy.special import chdtri
-
-    unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
-    channels = lines.data.shape[0] * lines.data.shape[1]
-    for upper in fewer:
-        less = replace(lines, upper=upper)
-        lost = projected_cost(less, fit.poles, fit.participation) - fit.cost
-        # a term too many costs next to nothing; one too few a bias: so noise may pass 1 in 10
-        if lost < unit * lines.inflation * chdtri(channels * (lines.upper - upper), 0.1):
-            return less, refined(less, fit.poles, fit.participation, steps=steps, strict=False)
-    return lines, fit
-
-
-def completed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Fit, list[Peak]]:
-    """Return the fit with the poles added that its residual requires, and the peaks still left."""
-    left = unexplained(lines, fit)
-    for _ in range(MOST):
-        resolved = [peak for peak in left if not peak.isolated][:2]
-        better = next(filter(None, (_added(lines, fit, peak, steps) for peak in resolved)), None)
-        if better is None:
-            break
-        fit = better
-        left = unexplained(lines, fit)
-    return fit, left
-
-
-def _added(lines: Lines, fit: Fit, peak: Peak, steps: int) -> Fit | None:
-    unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
-    least = price(lines) * unit
-    poles, part, cost = candidate(lines, fit.model, fit.poles, fit.participation, peak)
-    if fit.cost - cost < least / 4:
-        return None
-    try:
-        more = refined(lines, poles, part, steps=steps, below=fit.cost - least)
-    except SolverError:
-        return None
-    zeta, before = (-each.poles.real / np.abs(each.poles) for each in (more, fit))
-    # where a broad pole stands behind the others already, none shall become broader
-    broadest = max(BROADEST, 1.1 * before.max())
-    enough = fit.cost - more.cost > least and corroborated(lines, fit.model, more.model)
-    return more if enough and zeta.max() < broadest else None
 
 
 def unexplained(lines: Lines, fit: Fit) -> list[Peak]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from .diagram import StabilisationDiagram
 from .line_weights import PreparedLines
 from .measured import MeasuredModes
 from .pole_test import freedom
-from .refine import Fit, Lines, axis, refined, residual_terms, seen_terms
+from .refine import Fit, Lines, axis, residual_terms, seen_terms
 
 
 def answer(
@@ -51,10 +51,9 @@ def answer(
     inside = np.array([k for k in order if band[0] <= freq[k] <= band[1]], dtype=np.int64)
     outside = np.array([k for k in order if not band[0] <= freq[k] <= band[1]], dtype=np.int64)
     if not inside.size:
-        lost = SolverError(
+        raise SolverError(
             f"the fit moved every pole out of the band {band[0]:.4g} to {band[1]:.4g} Hz. Widen it."
         )
-        raise no_pole(frf, lost)
     both = np.concatenate([inside, inside + fit.poles.size])
     return IdentifiedModes(
         fit.poles[inside],
@@ -218,21 +217,6 @@ def hann_segment(frf: Frf) -> float | None:
     return 1.0 / float(frf.resolution or 1.0) if known else None
 
 
-def seen_better(
-    lines: Lines, fit: Fit, poles: ComplexArray, participation: ComplexArray, *, steps: int
-) -> tuple[Lines, Fit]:
-    """Return the fit through the window, or without it where that leaves less.
-
-    H1 of an input that is white over a few lines is what the window makes of the response; H2, Hv
-    and bursts that end within a segment are not.
-    """
-    if lines.segment is None:
-        return lines, fit
-    plain = replace(lines, segment=None)
-    other = refined(plain, poles, participation, steps=steps, strict=False)
-    return (plain, other) if other.cost < fit.cost else (lines, fit)
-
-
 def leakage_warned(frf: Frf, found: IdentifiedModes) -> None:
     r"""Warn of resonances narrower than about four lines of windowed segments.
 
@@ -264,8 +248,8 @@ def leakage_warned(frf: Frf, found: IdentifiedModes) -> None:
     )
 
 
-def no_pole(frf: Frf, error: SolverError) -> SolverError:
-    """Return the error of a search that found no pole, with leakage as a possible cause."""
+def of_segments(frf: Frf, error: SolverError) -> SolverError:
+    """Return the error of an identification that failed, with leakage as a possible cause."""
     if frf.window is None or frf.resolution is None:
         return error
     return SolverError(
