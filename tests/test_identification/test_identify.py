@@ -20,7 +20,7 @@ from flexplant.identification import (
     stabilisation_diagram,
 )
 from flexplant.identification.pole_test import improved, missed, split, unexplained
-from flexplant.identification.refine import LEAST, Lines, _Projected, refined
+from flexplant.identification.refine import LEAST, Fit, Lines, refined
 from flexplant.lti import Frf
 from flexplant.store import load
 from oracles_identification import held_mode, mac, modal_frf, noisy, pole
@@ -377,9 +377,9 @@ def test_slopes_against_central_differences():
         free = [(1, 0), (1, 1), (0, 2)]
         for k, place in enumerate(free):
             moved[place] += x[6 + k] + 1j * x[9 + k]
-        return _Projected(lines, poles + x[:3] + 1j * x[3:6], moved, pivots).cost
+        return Fit(lines, poles + x[:3] + 1j * x[3:6], moved, pivots).cost
 
-    g = _Projected(lines, poles, part, pivots).gradient()[1]
+    g = Fit(lines, poles, part, pivots).gradient()[1]
     step = np.array([1e-4] * 6 + [1e-5] * 6)
     for k in range(12):
         e = np.zeros(12)

@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray
 from ..errors import SolverError, warn
 from ..tolerances import RANK
-from .refine import Fit, Lines, projected_cost, projected_model, projected_normal, refined
+from .refine import Fit, Lines, refined
 
 #: probability that noise anywhere in the band passes for a pole
 CHANCE = 1e-3
@@ -48,7 +48,7 @@ def _seen(lines: Lines, poles: ComplexArray, part: ComplexArray, kept: list[int]
     if -poles[k].real > spacing:
         return True
     rest = [other for other in kept if other != k]
-    less, more = (projected_model(lines, poles[some], part[:, some]) for some in (rest, kept))
+    less, more = (Fit(lines, poles[some], part[:, some]).model for some in (rest, kept))
     return corroborated(lines, less, more)
 
 
@@ -95,7 +95,7 @@ class _Costs:
 
     def __init__(self, lines: Lines, poles: ComplexArray, part: ComplexArray) -> None:
         self.m = poles.size
-        self.parts = projected_normal(lines, poles, part)
+        self.parts = Fit(lines, poles, part).linear
         self.known: dict[tuple[int, ...], float] = {}
 
     def of(self, kept: list[int]) -> float:
@@ -223,7 +223,7 @@ def _terms(lines: Lines, fit: Fit, upper: int, chance: float) -> Trial:
     """Return the fit with another number of residual terms of modes above the band."""
     other, count = replace(lines, upper=upper), upper - lines.upper
     channels = lines.data.shape[0] * lines.data.shape[1]
-    gain = fit.cost - projected_cost(other, fit.poles, fit.participation)
+    gain = fit.cost - Fit(other, fit.poles, fit.participation).cost
     least = np.sign(count) * _unit(lines, fit) * price(lines, channels * abs(count), chance)
     return Trial(other, fit.poles, fit.participation, gain, least)
 
@@ -259,7 +259,7 @@ def split(lines: Lines, fit: Fit) -> Proposals:
     """
     least = pole_price(lines, fit.poles.size) * _unit(lines, fit)
     pairs = [pair for k in range(fit.poles.size) for pair in _pairs(fit, k)]
-    trials = [Trial(lines, *one, fit.cost - projected_cost(lines, *one), least) for one in pairs]
+    trials = [Trial(lines, *one, fit.cost - Fit(lines, *one).cost, least) for one in pairs]
     yield sorted(trials, key=lambda trial: -trial.gain)
 
 
@@ -288,14 +288,14 @@ def relocated(lines: Lines, fit: Fit) -> Proposals:
         rest = np.delete(fit.poles, k)
         if not rest.size or -pole.real > 0.05 * abs(pole):
             continue
-        without = projected_cost(lines, rest, np.delete(fit.participation, k, axis=1))
+        without = Fit(lines, rest, np.delete(fit.participation, k, axis=1)).cost
         if without - fit.cost > WEAK * pole_price(lines, lines.freq.size):
             continue
         trials = []
         for shift in np.arange(-7.0, 7.1, 0.7):
             poles = fit.poles.copy()
             poles[k] = pole + 1j * shift * abs(pole.real)
-            gain = fit.cost - projected_cost(lines, poles, fit.participation)
+            gain = fit.cost - Fit(lines, poles, fit.participation).cost
             trials.append((gain, abs(shift), poles))
         best = sorted(trials, key=lambda trial: -trial[0])[:RIVALS]
         # refined, it is to lower the cost: where it begins it does so seldom
@@ -449,7 +449,7 @@ def candidate(
     assert best is not None  # noqa: S101 - trials were made
     more = np.concatenate([poles, best[1]])
     parts = np.concatenate([part, best[2].astype(np.complex128)], axis=1)
-    return more, parts, projected_cost(lines, more, parts)
+    return more, parts, Fit(lines, more, parts).cost
 
 
 def unexplained(lines: Lines, fit: Fit) -> list[Peak]:

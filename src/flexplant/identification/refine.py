@@ -69,23 +69,6 @@ class Lines:
         return found
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """Poles (m,), participation (n_in, m), shapes (n_out, m), terms (n_out, n_in, n_terms)."""
-
-    poles: ComplexArray
-    participation: ComplexArray
-    shapes: ComplexArray
-    terms: FloatArray
-    cost: float
-    N: FloatArray  # normal matrix of the nonlinear parameters
-    jacobian: list[ComplexArray]  # per output (n_in, n_freq, n_parameters)
-    pivots: IntArray  # the entry of each column of the participation that is held at 1
-    model: ComplexArray  # the fitted responses
-    settled: bool = True
-    shape_maps: tuple[tuple[FloatArray, ComplexArray], ...] = ()  # see _Projected.normal
-
-
 def refined(
     lines: Lines,
     poles: ComplexArray,
@@ -111,8 +94,8 @@ def refined(
     pivots = np.argmax(np.abs(participation), axis=0)
     columns = np.arange(poles.size)
     participation = participation / participation[pivots, columns]
-    now = _projected(lines, poles, participation, pivots)
-    damping, settled, idle = 1e-6, True, 0
+    now = Fit(lines, poles, participation, pivots)
+    damping, idle = 1e-6, 0
     power = float(np.sum(np.abs(lines.data * lines.weight) ** 2))
     enough = FINE if fine else COARSE
     for number in range(steps):
@@ -130,7 +113,7 @@ def refined(
             step = _step(scaled, slope, damping) / size
             trial = _moved(poles, participation, pivots, step)
             if np.abs(trial[1]).max() < 1e6 and np.all(trial[0].imag > 0):
-                better = _projected(lines, *trial, pivots)
+                better = Fit(lines, *trial, pivots)
                 gained = now.cost - better.cost
                 if gained >= 0:
                     break
@@ -144,7 +127,7 @@ def refined(
             # the entry held at 1 is next to none: another is held
             pivots = np.argmax(np.abs(participation), axis=0)
             participation = participation / participation[pivots, columns]
-            now = _projected(lines, poles, participation, pivots)
+            now = Fit(lines, poles, participation, pivots)
         # a step of so few standard deviations of what is left is none
         if predicted <= enough * now.cost / (2 * lines.data.size):
             break
@@ -154,23 +137,9 @@ def refined(
         if idle >= 3 or (idle and damping <= 1e-3) or now.cost <= 1e-24 * power:
             break
     else:
-        settled = False
         if strict:
             raise unsettled(poles.size, steps)
-    N, jacobian, maps = now.normal()
-    return Fit(
-        poles,
-        participation,
-        now.shapes,
-        now.terms,
-        now.cost,
-        N,
-        jacobian,
-        pivots,
-        now.model,
-        settled,
-        maps,
-    )
+    return now
 
 
 def unsettled(count: int, steps: int) -> SolverError:
@@ -181,21 +150,20 @@ def unsettled(count: int, steps: int) -> SolverError:
     )
 
 
-class _Projected:
-    """The fit at given poles and participation, and its derivatives when required."""
+class Fit:
+    """The best shapes and residual terms at given poles (m,) and participation (n_in, m).
+
+    `pivots` are the entries of its columns that are held at 1 where they are parameters.
+    """
 
     def __init__(
-        self,
-        lines: Lines,
-        poles: ComplexArray,
-        participation: ComplexArray,
-        pivots: Any,
+        self, lines: Lines, poles: ComplexArray, participation: ComplexArray, pivots: Any = None
     ) -> None:
         s = axis(lines.freq)
         n_out = lines.data.shape[0]
         m = poles.size
-        self.lines, self.pivots, self.m = lines, pivots, m
-        self.participation = participation
+        self.lines, self.poles, self.participation, self.m = lines, poles, participation, m
+        self.pivots: IntArray = np.zeros(m, dtype=int) if pivots is None else pivots
         self.plus, self.slope = seen_terms(poles, s, lines.hold, lines.segment)
         self.minus, self.slope_minus = seen_terms(poles.conj(), s, lines.hold, lines.segment)
         self.shapes = np.zeros((n_out, m), dtype=np.complex128)
@@ -247,7 +215,7 @@ class _Projected:
             ]
         )
 
-    @property
+    @cached_property
     def model(self) -> ComplexArray:
         """The fitted responses."""
         return np.asarray(self.modal + self.terms @ self.lines.smooth)
@@ -330,10 +298,6 @@ class _Projected:
         return N, kept, tuple(maps)
 
 
-def _projected(lines: Lines, poles: ComplexArray, part: ComplexArray, pivots: Any) -> _Projected:
-    return _Projected(lines, poles, part, pivots)
-
-
 def _moved(
     poles: ComplexArray, participation: ComplexArray, pivots: Any, step: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
@@ -365,23 +329,6 @@ def _qr(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _off(Q: FloatArray, rows: FloatArray) -> FloatArray:
     return np.asarray(rows - Q @ (np.swapaxes(Q, -1, -2) @ rows))
-
-
-def projected_normal(
-    lines: Lines, poles: ComplexArray, participation: ComplexArray
-) -> list[tuple[FloatArray, FloatArray, float]]:
-    """Return per output the normal equations of shapes, free of residual terms, and the power."""
-    return _Projected(lines, poles, participation, np.zeros(poles.size, dtype=int)).linear
-
-
-def projected_cost(lines: Lines, poles: ComplexArray, participation: ComplexArray) -> float:
-    """Return the cost with the best shapes and residual terms."""
-    return _Projected(lines, poles, participation, np.zeros(poles.size, dtype=int)).cost
-
-
-def projected_model(lines: Lines, poles: ComplexArray, participation: ComplexArray) -> ComplexArray:
-    """Return the responses with the best shapes and residual terms."""
-    return _Projected(lines, poles, participation, np.zeros(poles.size, dtype=int)).model
 
 
 #: |x| below which the functions are summed as series, and the terms of that

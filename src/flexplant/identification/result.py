@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray
 from ..errors import ModelError, SolverError, warn
 from ..lti.frequency import Frf, checked_freq
-from ..tolerances import RANK, TINY
+from ..tolerances import TINY
 from .diagram import StabilisationDiagram
 from .line_weights import PreparedLines
 from .measured import MeasuredModes
@@ -31,7 +31,7 @@ def answer(
 ) -> IdentifiedModes:
     """Return the identified modes of a fit, sorted, those inside the band."""
     misfit = fit.cost / freedom(lines, fit.poles.size)
-    covariance = _covariance(fit, ready) * max(1.0, misfit)
+    covariance, spread = (part * max(1.0, misfit) for part in _covariances(fit, ready))
     shapes, part, terms = fit.shapes, fit.participation, fit.terms
     if ready.swapped:
         shapes, part, terms = part, shapes, terms.transpose(1, 0, 2)
@@ -40,9 +40,8 @@ def answer(
     shared = [(outputs.index(dof), i) for i, dof in enumerate(inputs) if dof in outputs]
     raw, unscaled = shapes, part
     shapes, part, normalised = _scaled(fit.poles, shapes, part, shared if labels else [])
-    spread = _channel_covariance(fit, ready) * max(1.0, misfit)
     if ready.swapped:
-        turned = np.roll(np.arange(spread.shape[1]), -len(fit.shape_maps))
+        turned = np.roll(np.arange(spread.shape[1]), -len(fit.shapes))
         spread = spread[:, turned][:, :, turned]
     T = _scale_errors((raw, unscaled), (shapes, part), shared if normalised else [])
     spread = T @ spread @ T.conj().transpose(0, 2, 1)
@@ -77,43 +76,29 @@ def answer(
     )
 
 
-def _covariance(fit: Fit, ready: PreparedLines) -> FloatArray:
-    """Return the covariance of [Re lambda; Im lambda] of all poles."""
-    size = np.sqrt(np.maximum(np.diag(fit.N), TINY))
-    # participation of repeated poles is known up to a rotation only: it gets no variance
-    inverse = la.pinvh(fit.N / np.outer(size, size), rtol=RANK) / np.outer(size, size)
-    both = 2 * fit.poles.size
-    if ready.independent:
-        chosen = inverse[:both, :both]
-    else:
-        slopes = [np.einsum("ifp,qp->ifq", J, inverse[:both]) for J in fit.jacobian]
-        chosen = np.zeros((both, both))
-        for a, J in enumerate(slopes):
-            for b, other in enumerate(slopes):
-                chosen += _inner(J, ready.spread(a, b, other))
-    return np.asarray((chosen + chosen.T) / 2)
+def _covariances(fit: Fit, ready: PreparedLines) -> tuple[FloatArray, ComplexArray]:
+    r"""Return the covariance of [Re lambda; Im lambda] and that of shapes and participation.
 
-
-def _channel_covariance(fit: Fit, ready: PreparedLines) -> ComplexArray:
-    r"""Return E[n n^H] of the errors n (n_out + n_in,) of each mode's shape and participation.
-
-    With poles and participation theta, the error of the shape at output a is
-    ``S_a d theta + D_a^T e_a``, ``d theta = N^{-1} sum_b J_b^T e_b``; D_a and J_a are orthogonal,
-    so that the two are independent unless outputs share errors. Noise that acts on the machine
-    is shared: near a resonance it moves all outputs along the shape, which is scale.
+    The latter E[n n^H] of the errors n (n_out + n_in,) of each mode. With poles and participation
+    theta, the error of the shape at output a is ``S_a d theta + D_a^T e_a``,
+    ``d theta = N^{-1} sum_b J_b^T e_b``; D_a and J_a are orthogonal, so that the two are
+    independent unless outputs share errors. Noise that acts on the machine is shared: near a
+    resonance it moves all outputs along the shape, which is scale.
     """
-    m, n_out, n_in = fit.poles.size, len(fit.shape_maps), fit.participation.shape[0]
-    size = np.sqrt(np.maximum(np.diag(fit.N), TINY))
-    inverse = la.pinvh(fit.N / np.outer(size, size), rtol=RANK) / np.outer(size, size)
-    slopes = np.array([slope for slope, _ in fit.shape_maps]).reshape(n_out, 2, m, -1)
-    direct = [own for _, own in fit.shape_maps]
+    N, jacobian, maps = fit.normal()
+    m, n_out, n_in = fit.poles.size, len(maps), fit.participation.shape[0]
+    size = np.sqrt(np.maximum(np.diag(N), TINY))
+    # participation of repeated poles is known up to a rotation only: it gets no variance
+    inverse = la.pinvh(N / np.outer(size, size), rtol=1e-13) / np.outer(size, size)
+    slopes = np.array([slope for slope, _ in maps]).reshape(n_out, 2, m, -1)
+    direct = [own for _, own in maps]
     common, mixed = inverse, np.zeros((n_out, inverse.shape[0], 2 * m))
     held = np.zeros((n_out, n_out, 2 * m, 2 * m))
     if ready.independent:
         for a, own in enumerate(direct):
             held[a, a] = _inner(own, own)
     else:
-        gains = [np.einsum("ifp,qp->ifq", J, inverse) for J in fit.jacobian]
+        gains = [np.einsum("ifp,qp->ifq", J, inverse) for J in jacobian]
         common = np.zeros_like(inverse)
         for a in range(n_out):
             for b in range(n_out):
@@ -133,7 +118,8 @@ def _channel_covariance(fit: Fit, ready: PreparedLines) -> ComplexArray:
         S[:n_out] += cross.transpose(2, 3, 0, 1)
         S[:n_out, :, :n_out] += held[:, :, :, k, :, k].transpose(0, 2, 1, 3)
         found[k] = S[:, 0, :, 0] + S[:, 1, :, 1] + 1j * (S[:, 1, :, 0] - S[:, 0, :, 1])
-    return np.asarray((found + found.conj().transpose(0, 2, 1)) / 2)
+    chosen = common[: 2 * m, : 2 * m]
+    return (chosen + chosen.T) / 2, np.asarray(found + found.conj().transpose(0, 2, 1)) / 2
 
 
 def _free_entries(fit: Fit) -> FloatArray:
