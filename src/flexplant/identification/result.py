@@ -119,7 +119,8 @@ def _covariances(fit: Fit, ready: PreparedLines) -> tuple[FloatArray, ComplexArr
         S[:n_out, :, :n_out] += held[:, :, :, k, :, k].transpose(0, 2, 1, 3)
         found[k] = S[:, 0, :, 0] + S[:, 1, :, 1] + 1j * (S[:, 1, :, 0] - S[:, 0, :, 1])
     chosen = common[: 2 * m, : 2 * m]
-    return (chosen + chosen.T) / 2, np.asarray(found + found.conj().transpose(0, 2, 1)) / 2
+    both: ComplexArray = found + found.conj().transpose(0, 2, 1)
+    return (chosen + chosen.T) / 2, both / 2
 
 
 def _free_entries(fit: Fit) -> FloatArray:
