@@ -217,33 +217,27 @@ def built_diagram(
     results: Sequence[OrderPoles], band: FloatArray, tolerances: tuple[float, float, float]
 ) -> StabilisationDiagram:
     """Return the diagram of results by ascending order: flags and tracks."""
-    poles, orders, flags, tracks, shapes, parts = [], [], [], [], [], []
-    before: OrderPoles | None = None
-    before_tracks = np.zeros(0, dtype=np.int64)
+    flags: list[IntArray] = []
+    tracks: list[IntArray] = []
     count = 0
-    for result in results:
+    for before, result in zip([None, *results], results, strict=False):
         flag = np.zeros(result.poles.size, dtype=np.int64)
         track = np.full(result.poles.size, -1, dtype=np.int64)
         if before is not None and before.poles.size and result.poles.size:
             old, flag = _followed(before, result, tolerances)
-            track = np.where(old >= 0, before_tracks[old], -1)
+            track = np.where(old >= 0, tracks[-1][old], -1)
         fresh = track < 0
         track[fresh] = count + np.arange(fresh.sum())
         count += int(fresh.sum())
-        before, before_tracks = result, track
-        poles.append(result.poles)
-        orders.append(np.full(result.poles.size, result.order))
         flags.append(flag)
         tracks.append(track)
-        shapes.append(result.shapes)
-        parts.append(result.participation)
     return StabilisationDiagram(
-        np.concatenate(orders),
-        np.concatenate(poles),
+        np.concatenate([np.full(one.poles.size, one.order) for one in results]),
+        np.concatenate([one.poles for one in results]),
         np.concatenate(flags),
         np.concatenate(tracks),
-        shapes=np.concatenate(shapes, axis=1),
-        participation=np.concatenate(parts, axis=1),
+        shapes=np.concatenate([one.shapes for one in results], axis=1),
+        participation=np.concatenate([one.participation for one in results], axis=1),
         band=band,
     )
 

@@ -298,16 +298,18 @@ class Fit:
         return N, kept, tuple(maps)
 
 
+def free_inputs(pivots: Any, n_in: int) -> IntArray:
+    """Return the inputs (n_in - 1, m) whose participation is free, those of each mode rising."""
+    others = np.arange(n_in - 1)[:, None]
+    return np.asarray(others + (others >= pivots))
+
+
 def _moved(
     poles: ComplexArray, participation: ComplexArray, pivots: Any, step: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    m, n_in = poles.size, participation.shape[0]
-    parts = step.reshape(2 * n_in, m)
-    moved = participation.copy()
-    for k in range(m):
-        free = [i for i in range(n_in) if i != pivots[k]]
-        for j, i in enumerate(free):
-            moved[i, k] += parts[2 + 2 * j, k] + 1j * parts[3 + 2 * j, k]
+    n_in, m = participation.shape
+    parts, moved = step.reshape(2 * n_in, m), participation.copy()
+    moved[free_inputs(pivots, n_in), np.arange(m)] += parts[2::2] + 1j * parts[3::2]
     real, imag = poles.real + parts[0], poles.imag + parts[1]
     return np.minimum(real, -LEAST * np.abs(imag)) + 1j * imag, moved
 

@@ -17,7 +17,7 @@ from .diagram import StabilisationDiagram
 from .line_weights import PreparedLines
 from .measured import MeasuredModes
 from .pole_test import freedom
-from .refine import Fit, Lines, axis, residual_terms, seen_terms
+from .refine import Fit, Lines, axis, free_inputs, residual_terms, seen_terms
 
 
 def answer(
@@ -127,10 +127,9 @@ def _free_entries(fit: Fit) -> FloatArray:
     """Return the derivatives (n_in, 2, m, n_parameters) of Re and Im of the participation."""
     n_in, m = fit.participation.shape
     found = np.zeros((n_in, 2, m, 2 * m * n_in))
-    for k, pivot in enumerate(fit.pivots.tolist()):
-        free = [i for i in range(n_in) if i != pivot]
-        for j, i in enumerate(free):
-            found[i, 0, k, (2 + 2 * j) * m + k] = found[i, 1, k, (3 + 2 * j) * m + k] = 1.0
+    place = 2 * m * (1 + np.arange(n_in - 1)[:, None]) + np.arange(m)
+    free = free_inputs(fit.pivots, n_in)
+    found[free, 0, np.arange(m), place] = found[free, 1, np.arange(m), place + m] = 1.0
     return found
 
 

@@ -17,17 +17,7 @@ from ..tolerances import ROUNDING, TINY
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class SpectralMethod(Value):
-    """Averages of windowed, overlapping segments (Welch); the base of H1, H2 and Hv.
-
-    Parameters
-    ----------
-    segment : float, optional
-        Length of a segment [s]; its inverse is the resolution. An eighth of the record by default.
-    overlap : float
-        Share of a segment that the next one sees again, 0 to below 1.
-    window : str or tuple
-        As `scipy.signal.get_window` takes; "boxcar" where all signals are periodic in a segment.
-    """
+    """Averages of windowed, overlapping segments (Welch); the base of H1, H2 and Hv."""
 
     segment: float | None = None
     overlap: float = 0.5
@@ -50,11 +40,11 @@ class H1Estimator(SpectralMethod):
     Parameters
     ----------
     segment : float, optional
-        Length of a segment [s]; an eighth of the record when not given.
+        Length of a segment [s]; its inverse is the resolution. An eighth of the record by default.
     overlap : float
         Share of a segment that the next one sees again, 0 to below 1.
     window : str or tuple
-        As `scipy.signal.get_window` takes.
+        As `scipy.signal.get_window` takes; "boxcar" where all signals are periodic in a segment.
 
     Raises
     ------

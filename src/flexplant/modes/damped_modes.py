@@ -49,11 +49,7 @@ def damped_modes(
     Rayleigh-Ritz in real vectors V: the undamped modes, the static responses to the forces of
     dampers, and ``(K - sigma M)^-1`` times what the complex modes leave in ``(lambda^2 M + lambda D
     + K) x = 0``, again and again (Davidson's method for the quadratic problem), until they leave no
-    more than undamped modes may.
-
-    References
-    ----------
-    [Sleijpen1996]_.
+    more than undamped modes may [Sleijpen1996]_.
     """
     factor, r = stiffness_factor(model, method), model.rigid_body.shape[1]
     V = np.hstack([phi, beyond(model.M, phi, factor.solve(damper_forces(model)))])

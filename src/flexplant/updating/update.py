@@ -304,9 +304,6 @@ def corrected(
         r(p) = r_reduced(p) + d + d' (p - p_0),   d = r_full(p_0) - r_reduced(p_0)
 
     Where a round moves the estimate no more, r and dr/dp are those of the full model.
-
-    References
-    ----------
     [Stetter1978]_; [AlexandrovLewis2001]_ (the derivative).
     """
     first = end.trail.p[0]

@@ -69,6 +69,11 @@ class Parameter(Value):
         """Return the parameter counted from a value, of a model that has it already."""
         return self
 
+    def _check_known(self) -> None:
+        """Check what is known beforehand."""
+        bounds, prior = checked_bounds(self.bounds, self.name), checked_prior(self.prior, self.name)
+        self._set(bounds=bounds, prior=prior)
+
     def text(self, value: float) -> str:
         """Return name, value and unit in one phrase."""
         return f"{self.name} = {value:.6g} {self.unit}"
@@ -76,30 +81,7 @@ class Parameter(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointParameter(Parameter):
-    """A parameter that acts at one place r on one of the matrices, as p r r^T.
-
-    Parameters
-    ----------
-    at : str, (3,) array [m] or mapping
-        DOF label, point (interpolated between nodes) or {label: weight}.
-    direction : str
-        Of the motion at a point; labels carry their own.
-    name : str, optional
-        For results; made from the place when not given.
-    to : str, (3,) array [m] or mapping, optional
-        The other end; the ground when not given. Then r = row(at) - row(to).
-    bounds : (lowest, highest), optional
-        The parameter is kept between them; None or an infinity is no bound.
-    prior : (mean, standard deviation), optional
-        What is known beforehand, a normal distribution.
-
-    Raises
-    ------
-    LabelError
-        When the direction is unknown or `at` or `to` is no place.
-    ModelError
-        When bounds or prior make no sense.
-    """
+    """A parameter p r r^T of one of the matrices, ``r = row(at) - row(to)``."""
 
     at: Place
     direction: str = field(default="z", kw_only=True)
@@ -119,22 +101,14 @@ class PointParameter(Parameter):
             other, end = checked_place(other, self.direction, "to")
             text += f" to {end}"
         name = checked_text(self.name, "name") or f"{self.quantity} at {text}"
-        self._set(at=place, direction=self.direction, name=name, to=other)
-        self._set(bounds=checked_bounds(self.bounds, name), prior=checked_prior(self.prior, name))
+        self._set(at=place, name=name, to=other)
+        self._check_known()
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.name} [{self.unit}]>"
 
     def matrices(self, model: Any) -> Derivatives:
-        """Return (dM, dD, dK) of the model, r r^T in the place of this quantity.
-
-        Sparse where the model's mass matrix is.
-
-        Parameters
-        ----------
-        model : ReducedModel or FEModel
-            Anything with `row(at, direction)`, or `dofs` with it.
-        """
+        """Return (dM, dD, dK) of the model: r r^T in one of them, sparse where M is."""
         rows = model if hasattr(model, "row") else model.dofs
         row = np.asarray(rows.row(self.at, self.direction), dtype=np.float64)
         if self.to is not None:
@@ -167,7 +141,7 @@ class AddedMass(PointParameter):
     to : str, (3,) array [m] or mapping, optional
         The other end; the ground when not given.
     bounds : (lowest, highest), optional
-        The parameter is kept between them.
+        The parameter is kept between them; None or an infinity is no bound.
     prior : (mean, standard deviation), optional
         What is known beforehand, a normal distribution.
 

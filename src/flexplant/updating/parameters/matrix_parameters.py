@@ -25,7 +25,7 @@ from ...modes import solve_modes
 from ...sparse.factor import DENSE_LIMIT, dense
 from ...structure import ModalDamping
 from ...structure.eigen import elastic_modes
-from .added import MAKES, Derivatives, Parameter, checked_bounds, checked_prior, checked_text
+from .added import MAKES, Derivatives, Parameter, checked_text
 
 #: entries of a symmetric matrix differ by less than this, relatively, from their mirror images
 SYMMETRIC = 1e-9
@@ -48,10 +48,8 @@ class MatrixParameter(Parameter):
         Symmetric; of the model's own DOFs or of the full structure's.
     unit : str
         Of p; none for a relative change.
-    bounds : (lowest, highest), optional
-        The parameter is kept between them.
-    prior : (mean, standard deviation), optional
-        What is known beforehand, a normal distribution.
+    bounds, prior : optional
+        As for `AddedMass`.
 
     Raises
     ------
@@ -83,8 +81,8 @@ class MatrixParameter(Parameter):
         }
         if all(part is None for part in parts.values()):
             raise ModelError(f"{self.name} changes nothing: give dM=, dD= or dK=, not all zero.")
-        bounds, prior = checked_bounds(self.bounds, self.name), checked_prior(self.prior, self.name)
-        self._set(**parts, bounds=bounds, prior=prior, unit=checked_text(self.unit, "unit"))
+        self._set(**parts, unit=checked_text(self.unit, "unit"))
+        self._check_known()
 
     def __repr__(self) -> str:
         parts = ", ".join(a[1] for a in ("dM", "dD", "dK") if getattr(self, a) is not None)
@@ -171,10 +169,8 @@ class MatrixParameter(Parameter):
             Which elements, in the shape that `build` takes. They may overlap.
         value : float or array
             Of the model that is updated; an array has the shape of the regions.
-        bounds : (lowest, highest), optional
-            Of each relative change.
-        prior : (mean, standard deviation), optional
-            Of each relative change.
+        bounds, prior : optional
+            Of each relative change, as for `AddedMass`.
 
         Returns
         -------
@@ -247,10 +243,8 @@ class ModeDamping(Parameter):
         Number from 1, rigid-body modes included, of the undamped model that is updated.
     name : str, optional
         For results.
-    bounds : (lowest, highest), optional
-        The parameter is kept between them.
-    prior : (mean, standard deviation), optional
-        What is known beforehand, a normal distribution.
+    bounds, prior : optional
+        As for `AddedMass`.
 
     Raises
     ------
@@ -273,8 +267,8 @@ class ModeDamping(Parameter):
     def __post_init__(self) -> None:
         number = whole(self.mode, "mode")
         name = checked_text(self.name, "name") or f"damping ratio of mode {number}"
-        bounds, prior = checked_bounds(self.bounds, name), checked_prior(self.prior, name)
-        self._set(mode=number, name=name, bounds=bounds, prior=prior)
+        self._set(mode=number, name=name)
+        self._check_known()
 
     def __repr__(self) -> str:
         return f"<ModeDamping: {self.name}>"

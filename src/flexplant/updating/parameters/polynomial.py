@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from math import comb
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from ...checks import FloatArray, Matrix, function, positive, real_array, whole
 from ...errors import LabelError, ModelError, ShapeError
-from .added import MAKES, Derivatives, Parameter, checked_bounds, checked_prior, checked_text
+from .added import MAKES, Derivatives, Parameter, checked_bounds, checked_text
 from .matrix_parameters import checked_matrix, projected
 
 #: relative to the change of a matrix: what its polynomial may miss between the points of it, and
@@ -40,7 +41,7 @@ class PolynomialParameter(Parameter):
     unit : str
         Of p.
     bounds, prior : optional
-        As for `MatrixParameter`.
+        As for `AddedMass`.
     missed : float
         Part of the largest change of a matrix that the polynomials were seen to miss.
 
@@ -84,8 +85,8 @@ class PolynomialParameter(Parameter):
             parts[label] = tuple(checked)
         if not any(parts.values()):
             raise ModelError(f"{self.name} changes nothing: give dM=, dD= or dK=, not all zero.")
-        bounds, prior = checked_bounds(self.bounds, self.name), checked_prior(self.prior, self.name)
-        self._set(**parts, bounds=bounds, prior=prior, unit=checked_text(self.unit, "unit"))
+        self._set(**parts, unit=checked_text(self.unit, "unit"))
+        self._check_known()
 
     def __repr__(self) -> str:
         parts = [
@@ -162,14 +163,12 @@ class PolynomialParameter(Parameter):
 
     def terms(self, model: Any) -> list[Derivatives]:
         """Return the matrices of all powers in the model's DOFs."""
+        powers = zip_longest(self.dM, self.dD, self.dK)
         return [
-            (
-                projected(_at(self.dM, k), model, self.name),
-                projected(_at(self.dD, k), model, self.name),
-                projected(_at(self.dK, k), model, self.name),
-            )
-            for k in range(self._degree)
-        ]
+            (projected(M, model, self.name), projected(D, model, self.name),
+             projected(K, model, self.name))
+            for M, D, K in powers
+        ]  # fmt: skip
 
     def matrices(self, model: Any) -> Derivatives:
         """Return the derivatives (dM, dD, dK) at p = 0."""
@@ -241,10 +240,6 @@ def _interpolated(
             for k, part in enumerate(kept)
         ]
     return found, missed
-
-
-def _at(parts: Sequence[Matrix | None], k: int) -> Matrix | None:
-    return parts[k] if k < len(parts) else None
 
 
 def _sum(weights: Any, parts: Sequence[Any]) -> Any:

@@ -348,20 +348,10 @@ class ShapeCorrelation(ModeShapes):
 
     Parameters
     ----------
-    measured : MeasuredModes
-        Poles with their mode numbers.
-    shapes : (m, modes) real or complex array, optional
-        In the order of the poles; any scale. None: those of `measured`.
-    at : sequence of m places or mapping, optional
-        DOF labels, points or mappings; as in `ModeShapes`.
-    direction : str
-        Of the motion at points.
-    std : float or (m, modes) array, optional
-        Weighs the entries in the MAC by 1/std; the residuals themselves have no known noise.
-    covariance : (modes, m, m) array, optional
-        Instead of `std`.
-    assign : bool
-        Whether modes are assigned by MAC with the measured shapes.
+    measured, shapes, at, direction, assign
+        As in `ModeShapes`.
+    std, covariance : optional
+        As in `ModeShapes`: weighs the entries in the MAC; the residuals have no known noise.
 
     Raises
     ------
@@ -405,17 +395,10 @@ class _BoundMac(BoundShapes):
             for i in group:
                 Phi, Q, psi = self._parts(point, group, i)
                 dPhi = self.white[i] @ dY
-                plus = _inverse(Phi, Q)
+                plus = np.linalg.pinv(Phi)
                 left = psi - Q @ (Q.conj().T @ psi)
                 # d |P psi|^2 = 2 Re (left^H dPhi Phi^+ psi)
                 change = np.real((dPhi @ (plus @ psi)) @ left.conj())
                 inside = float(np.linalg.norm(Q.conj().T @ psi))
                 found.append(-float(np.linalg.norm(psi)) * change / inside**3)
         return np.array(found)
-
-
-def _inverse(Phi: Any, Q: Any) -> Any:
-    """Return the pseudo-inverse of shapes, of one with its unit vector Q at once."""
-    if Phi.shape[1] > 1:
-        return np.linalg.pinv(Phi)
-    return Q.conj().T / np.linalg.norm(Phi)
