@@ -27,10 +27,10 @@ EVEN = 0.1
 ENOUGH = 1e-3
 
 
-def approached(
+def _approach(
     objective: Objective, begin: FloatArray, most: int | None, tolerance: float
-) -> list[FloatArray]:
-    """Return the points on the way from `begin` to a better start, `begin` alone if none is.
+) -> Trail | None:
+    """Return the way from `begin` to a better start, None if there is none; `objective` follows it.
 
     Complex responses have a minimum wherever a peak of the model lies between two measured ones;
     the logarithm of their magnitude, all entries weighted equally, hardly any. Shapes turn when
@@ -38,7 +38,7 @@ def approached(
     """
     easier = _easier(objective.residuals)
     if easier is None:
-        return [begin]
+        return None
     stage = Objective(
         objective.family.model,
         objective.parameters,
@@ -46,16 +46,19 @@ def approached(
         prior=objective.uses_prior,
         family=objective.family,
     )
+    trail, near = Trail(), max(tolerance, ENOUGH)
     try:
-        near = max(tolerance, ENOUGH)
         found = TrustRegion().search(stage, begin, most=most, tolerance=near)
+        path = [begin, *found.trail.p[1:]]
         # the modes are numbered at the start, and followed from there
         objective.begin(begin)
-        for p in found.trail.p[1:]:
+        for p in path:
             objective.at(p, refer=True)
+            trail.add(objective, p, 1.0 if trail.p else 0.0)
     except FlexplantError:
-        return [begin]
-    return [begin, *found.trail.p[1:]]
+        return None
+    objective.path = path[:-1]
+    return trail if len(path) > 1 else None
 
 
 def _easier(residuals: Sequence[Residual]) -> list[Residual] | None:
@@ -89,22 +92,6 @@ ABSURD = 0.1
 FAR = 1e-3
 #: other starts that are tried after such an end, for models of up to so many DOFs and larger ones
 RETRIES, SMALL, RETRIES_LARGE = 20, 100, 4
-
-
-def _approach(
-    objective: Objective, begin: FloatArray, most: int | None, tolerance: float
-) -> Trail | None:
-    """Return the way to a better start, None where there is none; `objective` follows it."""
-    path = approached(objective, begin, most, tolerance)
-    if len(path) == 1:
-        return None
-    trail = Trail()
-    objective.begin(begin)
-    for p in path:
-        objective.at(p, refer=True)
-        trail.add(objective, p, 1.0 if trail.p else 0.0)
-    objective.path = path[:-1]
-    return trail
 
 
 def from_one_start(
@@ -143,9 +130,7 @@ def from_one_start(
         if done:
             break
     objective.path = []
-    objective.begin(best.trail.p[0])
-    for p in best.trail.p[1:]:
-        objective.at(p, refer=True)
+    objective.follow(best.trail.p)
     return best, begins, ends
 
 

@@ -211,7 +211,8 @@ def update(
     fit = _result(model, objective, method, best, begins[0])
     fit = fit.replace(starts=summary(begins, ends), rounds=np.array(estimates))
     if method.least_squares and is_bad(fit.p_value):
-        fit = _widened(fit)
+        if fit.covariance is not None and fit.chi2 is not None:
+            fit = fit.replace(covariance=fit.covariance * (fit.chi2 / fit.dof))
         warn(_complaint(fit, objective, best.p))
     return fit
 
@@ -235,12 +236,7 @@ def _result(
         covariance=None if method.penalised else spread,
         correlation=correlation,
         model=changed_model(model, objective.parameters, best.p, objective.family),
-        history=History(
-            np.array(trail.p),
-            np.array(trail.poles),
-            np.array(trail.error),
-            np.array(trail.fraction),
-        ),
+        history=History(*map(np.array, (trail.p, trail.poles, trail.error, trail.fraction))),
         converged=best.converged,
         reason=best.reason,
         at_bound=at_bound,
@@ -248,13 +244,6 @@ def _result(
         chi2=chi2,
         dof=dof,
     )
-
-
-def _widened(fit: UpdateResult) -> UpdateResult:
-    """Return the result with a covariance that holds what the model does not explain."""
-    if fit.covariance is None or fit.chi2 is None:
-        return fit
-    return fit.replace(covariance=fit.covariance * (fit.chi2 / fit.dof))
 
 
 def _complaint(fit: UpdateResult, objective: Objective, p: FloatArray) -> str:

@@ -157,10 +157,7 @@ def sample_posterior(
             f"{max(4, 2 * q)}, steps 2, discard between 0 and 1."
         )
     draws = generator(rng)
-    objective.begin(fit.history.parameters[0])
-    for p in fit.history.parameters[1:]:
-        objective.at(p, refer=True)
-    objective.at(fit.values, refer=True)
+    objective.follow([*fit.history.parameters, fit.values])
 
     def density(p: FloatArray) -> float:
         if np.any(p < objective.lower) or np.any(p > objective.upper):

@@ -142,16 +142,8 @@ def validate(
     listed = checked_parameters(parameters)
     given, kept = checked_residuals(residuals), checked_residuals(unused)
     _check_apart(given, kept)
-    fit = update(
-        model,
-        listed,
-        given,
-        method=method,
-        start=start,
-        starts=starts,
-        rng=rng,
-        prior=prior,
-    )
+    options: Any = {"start": start, "starts": starts, "rng": rng, "prior": prior}
+    fit = update(model, listed, given, method=method, **options)
     begin = np.asarray(fit.history.parameters[0], dtype=np.float64)
     before, _ = _misfit(model, listed, given, begin, fit, spread=False)
     fitted = np.array([before[0], _per_freedom(fit, before)])
@@ -233,9 +225,8 @@ def _misfit(
     objective = Objective(model, parameters, residuals, prior=False)
     before = objective.values(objective.begin(start))
     # in steps, so that modes are followed and not lost
-    for part in np.linspace(0.0, 1.0, 6)[1:]:
-        objective.at(start + part * (fit.values - start), refer=True)
-    point = objective.at(fit.values)
+    steps = np.linspace(0.0, 1.0, 6)[:, None]
+    point = objective.follow([*(start + steps * (fit.values - start))])
     after = objective.values(point)
     rms = np.sqrt([np.mean(before**2), np.mean(after**2)])
     if not spread or not objective.noise_known or fit.covariance is None:

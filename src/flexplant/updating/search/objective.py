@@ -82,9 +82,16 @@ class Objective:
         point = first_point(self.family, path[0])
         if self.numbers:
             mode_columns(self.numbers, point.eigen)
-        point = self._set(self._assigned(self._turned(point)), refer=True)
+        point = self.place(point)
         for step in path[1:]:
             point = self.at(step, refer=True)
+        return point
+
+    def follow(self, points: Sequence[FloatArray]) -> Point:
+        """Return the model at the last of some points, its modes followed from the first one."""
+        point = self.begin(points[0])
+        for p in points[1:]:
+            point = self.at(p, refer=True)
         return point
 
     def at(self, p: FloatArray, *, refer: bool = False) -> Point:

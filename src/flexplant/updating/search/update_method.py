@@ -37,12 +37,8 @@ class Trail:
 
     def joined(self, later: Trail) -> Trail:
         """Return this way and the one that goes on where it ends."""
-        return Trail(
-            self.p + later.p[1:],
-            self.poles + later.poles[1:],
-            self.error + later.error[1:],
-            self.fraction + later.fraction[1:],
-        )
+        parts = zip(vars(self).values(), vars(later).values(), strict=True)
+        return Trail(*(own + more[1:] for own, more in parts))
 
 
 @dataclass
