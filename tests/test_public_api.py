@@ -33,7 +33,7 @@ StateSpace Frf frequency_response h2_norm hinf_norm peak_gain lft balanced minim
 lowpass discretized
 design_kalman design_static KalmanEstimator FixedLag Smoother
 design_servo servo_bandwidth design_h2 design_hinf design_ncf ncf_margin
-Riccati Lmi StructuredLmi Controller Pid Lead Notch LowPass design_loops tune_loops
+Riccati Lmi Controller Pid Lead Notch LowPass design_loops tune_loops
 score_sensors score_actuators place_sensors place_actuators place_both PoiVariance Placement
 sensor_map
 close_loop ClosedLoop compare_loops modulus_margin reading_along

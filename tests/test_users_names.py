@@ -77,7 +77,6 @@ USES = {
     "hinf, unweighted": lambda c: fx.design_hinf(c.plant),
     "hinf of a stage": lambda c: fx.design_hinf(c.stage()),
     "hinf with added noise": lambda c: fx.design_hinf(c.weighted, fx.Riccati(regularised=True)),
-    "hinf by structured LMIs": lambda c: fx.design_hinf(c.weighted, fx.StructuredLmi()),
     "hinf of a foreign system": lambda c: fx.design_hinf(
         c.weighted.system.to_control(), u=list(c.plant.u), y=list(c.plant.y)
     ),

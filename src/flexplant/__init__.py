@@ -119,7 +119,6 @@ from .synthesis import LowPass as LowPass
 from .synthesis import Notch as Notch
 from .synthesis import Pid as Pid
 from .synthesis import Riccati as Riccati
-from .synthesis import StructuredLmi as StructuredLmi
 from .synthesis import design_h2 as design_h2
 from .synthesis import design_hinf as design_hinf
 from .synthesis import design_loops as design_loops

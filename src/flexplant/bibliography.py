@@ -116,8 +116,6 @@
 .. [Hanus1987] Hanus, Kinnaert, Henrotte, Conditioning technique, a general anti-windup and bumpless
    transfer method, Automatica 23, 1987.
 .. [Hassibi1999] Hassibi, Sayed, Kailath, Indefinite-Quadratic Estimation and Control, SIAM, 1999.
-.. [Helmberg1996] Helmberg, Rendl, Vanderbei, Wolkowicz, An interior-point method for semidefinite
-   programming, SIAM J. Optim. 6, 1996.
 .. [HeylenLammens1996] Heylen, Lammens, FRAC: a consistent way of comparing frequency response
    functions, Identification in Engineering Systems, 1996.
 .. [Hosking1980] Hosking, The multivariate portmanteau statistic, J. Amer. Stat. Assoc. 75, 1980.
@@ -125,8 +123,6 @@
    CDC, 1991.
 .. [Imamovic1998] Imamovic, Validation of large structural dynamics models using modal test data,
    PhD thesis, Imperial College, 1998.
-.. [IwasakiSkelton1994] Iwasaki, Skelton, All controllers for the general H-infinity control
-   problem, Automatica 30, 1994.
 .. [JohnsonKienholz1982] Johnson, Kienholz, Finite element prediction of damping in structures with
    constrained viscoelastic layers, AIAA Journal 20, 1982.
 .. [JoshiBoyd2009] Joshi, Boyd, Sensor selection via convex optimization, IEEE Trans. Signal
@@ -198,8 +194,6 @@
    systems using Krylov subspace methods, Linear Algebra Appl. 415, 2006.
 .. [Scherer1997] Scherer, Gahinet, Chilali, Multiobjective output-feedback control via LMI
    optimization, IEEE Trans. Autom. Control 42, 1997.
-.. [Skelton1998] Skelton, Iwasaki, Grigoriadis, A Unified Algebraic Approach to Linear Control
-   Design, Taylor & Francis, 1998.
 .. [Skogestad2005] Skogestad, Postlethwaite, Multivariable Feedback Control, 2nd ed., Wiley, 2005.
 .. [Sleijpen1996] Sleijpen, Booten, Fokkema, van der Vorst, Jacobi-Davidson type methods for
    generalized eigenproblems and polynomial eigenproblems, BIT 36, 1996.

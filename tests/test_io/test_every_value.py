@@ -126,7 +126,6 @@ def made():
     yield from (
         lti.split_stable(more),
         synthesis.Lmi(),
-        synthesis.StructuredLmi(),
         synthesis.RepeatedScalar(2),
         synthesis.H2(z=["die:z"]),
         synthesis.Hinf(below=1.0),

@@ -46,7 +46,7 @@ def test_single_objectives_have_their_known_optima(sampled):
     assert found.certificate["LMI optimum"] == pytest.approx(lqg.gamma, rel=2e-3, abs=0)
     assert lqg.gamma * (1 - 1e-6) <= found.gamma <= 1.04 * lqg.gamma
     assert found.gamma == pytest.approx(fx.h2_norm(closed(given, found)), rel=1e-6, abs=0)
-    best = fx.design_hinf(given, fx.StructuredLmi())
+    best = fx.design_hinf(given, fx.Lmi())
     found = design_lmi(given, minimize=Hinf())
     assert found.gamma <= 1.05 * best.gamma
     assert found.gamma >= best.lower * (1 - 1e-3)

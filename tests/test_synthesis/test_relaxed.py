@@ -6,8 +6,13 @@ import scipy.linalg as la
 
 from flexplant.lti import StateSpace
 from flexplant.lti.preparation import prepared
-from flexplant.synthesis import design_hinf
-from flexplant.synthesis.hinf.lower_bound import full_information, pointwise_bound, relaxed_bound
+from flexplant.synthesis import Lmi, design_hinf
+from flexplant.synthesis.hinf.lower_bound import (
+    full_information,
+    pointwise_bound,
+    relaxed_bound,
+    zero_bound,
+)
 from oracles_lmi import output_feedback_gamma, state_feedback_gamma
 
 
@@ -86,3 +91,82 @@ def test_what_is_reduced():
     # u that moves nothing and costs nothing is no input at all
     none = full_information(A, B[:, :2], 0 * B[:, 2:], C[:2], D[:2, :2], D[:2, 2:])
     assert none.B2.shape[1] == 0 and none.A.shape == A.shape
+
+
+def test_the_pointwise_bound_by_hand():
+    """Two z, one u that moves the first only: the second is w's own gain, at most 2."""
+    P, u, y = named(
+        np.diag([-1.0, -1.0]),
+        np.array([[1.0, 1.0], [2.0, 0.0]]),
+        np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]]),
+        np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]]),
+        1,
+        1,
+    )
+    assert pointwise_bound(prepared(P, u, y)) == pytest.approx(2.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("side", ["u", "y"])
+@pytest.mark.parametrize("omega", [0.0, 2.0])
+def test_the_bound_of_a_zero_on_the_axis_by_hand(side, omega):
+    """``u -> z = (s^2 + omega^2) / (s + 1)^2`` (s / (s + 1)^2 at zero): there u moves nothing.
+
+    What is left is ``w -> z = 3 / (s + 1)^2 + 0.5`` at j omega.
+    """
+    A = np.array([[0.0, 1.0], [-1.0, -2.0]])
+    c = [omega**2 - 1.0, -2.0] if omega else [0.0, 1.0]
+    # x1 + r, r' = -r + 3 x3: w acts on the same states and on two more that u does not reach
+    A = la.block_diag(A, A)
+    B = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
+    C = np.array([[*c, 1.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    D = np.array([[0.5, 0.0, 1.0 if omega else 0.0], [0.0, 0.0, 0.0]])
+    parts = A, B, C, D
+    # y knows w: x3 of the dual is what u would have to move
+    problem = prepared(*named(*(parts if side == "u" else dual(*parts))))
+    best = abs(3.0 / (1.0 + 1j * omega) ** 2 + 0.5)
+    assert zero_bound(problem) == pytest.approx(best, rel=1e-9)
+
+
+def flexible(modes, seed=0):
+    """Modes of 0.1 % damping with a rigid body: forces, positions with noise, little effort."""
+    rng = np.random.default_rng(seed)
+    omega = np.concatenate([[0.0], np.geomspace(1.0, 30.0, modes - 1)])
+    zero, one = np.zeros((modes, modes)), np.eye(modes)
+    A = np.block([[zero, one], [-np.diag(omega**2), -np.diag(2e-3 * omega)]])
+    B = np.vstack([np.zeros((modes, 6)), rng.normal(size=(modes, 6))])
+    B[:, 2:4] = 0.0
+    C = np.hstack([rng.normal(size=(6, modes)), np.zeros((6, modes))])
+    C[2:4] = 0.0
+    D = np.zeros((6, 6))
+    D[4:, 2:4] = D[2:4, 4:] = 1e-2 * np.eye(2)
+    return named(A, B, C, D, 2, 2)
+
+
+@pytest.mark.parametrize("modes", [4, pytest.param(12, marks=pytest.mark.slow)])
+def test_rigid_body_and_light_damping(modes):
+    """Riccati equations beside the LMIs, each bound below what the other reaches."""
+    P, u, y = flexible(modes)
+    found = design_hinf(P, u=u, y=y)
+    assert found.lower <= found.gamma <= 1.06 * found.lower
+    if modes > 4:  # a minute of Clarabel
+        return
+    other = design_hinf(P, Lmi(), u=u, y=y)
+    assert other.gamma == pytest.approx(found.gamma, rel=0.06)
+    assert other.lower <= found.gamma
+    assert found.lower <= other.gamma
+
+
+def test_units_of_z_change_nothing():
+    P, u, y = flexible(4)
+    plain = design_hinf(P, u=u, y=y)
+    for unit in (1e-9, 1e-3, 1e6):
+        rows = np.where(np.arange(len(P.outputs)) < len(P.outputs) - len(y), unit, 1.0)[:, None]
+        found = design_hinf(P.replace(C=rows * P.C, D=rows * P.D), u=u, y=y)
+        assert found.gamma == pytest.approx(unit * plain.gamma, rel=3e-3, abs=0)
+        assert found.lower == pytest.approx(unit * plain.lower, rel=1e-3, abs=0)
+
+
+def test_what_was_tried_is_in_the_answer():
+    P, u, y = flexible(2)
+    found = design_hinf(P, u=u, y=y)
+    assert found.tried == {"Riccati()": found.gamma}

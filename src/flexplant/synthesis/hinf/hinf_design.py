@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -34,11 +34,10 @@ from ..controller import (
     with_left_out,
 )
 from ..lmi.full_lmi import Lmi
-from ..lmi.structured_lmi import SmallestGamma, StructuredLmi
 from ..reach import posed, require_reach
 from .central import require_shown
 from .hinf_riccati import Riccati
-from .lower_bound import lower_bound, pointwise_bound, raised_bound
+from .lower_bound import pointwise_bound, raised_bound
 from .singular import ADDED
 
 #: A beside its poles, from which on coordinates are blamed for a failure
@@ -68,12 +67,12 @@ def design_hinf(
     plant : StandardPlant
         Usually weighted; continuous or sampled. A labelled StateSpace (ours or python-control's)
         serves too: by the names of its channels, or with u and y named.
-    method : Riccati, StructuredLmi or Lmi, optional
-        Unless given they are tried in turn until one is verified close to its lower bound, else
-        the best one is taken: `Riccati()`, which adds a little noise and effort where D12 or D21
-        is singular; `Riccati(regularised=True)`, which adds them anyway; `StructuredLmi()`, which
-        needs none, up to 40 states. `Lmi()` is its readable form for less than 30. Where all fail,
-        a stable plant is left without feedback, K = 0, and the notes say why.
+    method : Riccati or Lmi, optional
+        Unless given `Riccati()`, which adds a little noise and effort where D12 or D21 is singular;
+        where what it finds is not close to its lower bound the better of it and
+        `Riccati(regularised=True)`, which adds them anyway. `Lmi()` needs no rank and suits up to
+        30 states. Where all fail, a stable plant is left without feedback, K = 0, and the notes
+        say why.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
@@ -88,9 +87,9 @@ def design_hinf(
     -------
     Controller
         `gamma` is the verified norm, `lower` a bound from below on what any controller reaches
-        (where it comes from LMIs: with Lyapunov matrices up to ten times as large as those that
-        they found), `certificate` what was checked, `reached` what is reached of each block of
-        the weights, `left_out` the check with the modes left out.
+        (from `Lmi()`: with Lyapunov matrices no larger than those that it found), `certificate`
+        what was checked, `reached` what is reached of each block of the weights, `left_out` the
+        check with the modes left out.
 
     Raises
     ------
@@ -128,8 +127,7 @@ def design_hinf(
     """
     if method is not None and not hasattr(method, "solve"):
         raise ModelError(
-            f"method must be Riccati(...), StructuredLmi(...) or Lmi(...), got {short(method)}. "
-            "Pass one, or none."
+            f"method must be Riccati(...) or Lmi(...), got {short(method)}. Pass one, or none."
         )
     plant = posed(plant, u, y, "H-infinity synthesis")
     problem = prepared(plant.system, plant.u, plant.y)
@@ -140,7 +138,7 @@ def design_hinf(
         if method is None:
             answer = best_answer(plant, problem, progress)
         else:
-            if progress is not None and isinstance(method, (Riccati, StructuredLmi, Lmi)):
+            if progress is not None and isinstance(method, (Riccati, Lmi)):
                 method = method.replace(progress=progress)
             answer = answered(plant, problem, method)
         _require_known(plant, problem, answer)
@@ -210,13 +208,10 @@ def _blamed(problem: Prepared, error: FlexplantError) -> FlexplantError:
     )
 
 
-#: an answer so close to the lower bound is taken at once (the methods stay 1 to 5 % away from it)
+#: an answer so close to the lower bound is taken at once (`Riccati` stays 1 to 5 % away from it)
 _CLOSE = 1.06
 #: and one so close to the best, found earlier, is preferred to it
 _SAME = 1.02
-#: problems of at most so many states go to the LMIs where no answer is close: where there is one
-#: already, and where there is none (their work grows with its sixth power)
-_SMALL, _LARGER = 30, 40
 
 
 class Answer(NamedTuple):
@@ -246,24 +241,72 @@ class Answer(NamedTuple):
 def answered(plant: StandardPlant, problem: Prepared, method: SynthesisMethod) -> Answer:
     """Return the answer of one method, verified on the plant."""
     one = _verified(plant, problem, method, method.solve(problem))
-    return one._replace(lower=lower_bound(problem, one.gamma, one.lower))
+    known = max(one.lower, pointwise_bound(problem))
+    return one._replace(lower=raised_bound(problem, one.gamma, known))
 
 
 def best_answer(plant: StandardPlant, problem: Prepared, progress: bool | None) -> Answer:
-    """Return the first answer that is close to its lower bound, or the best of all methods."""
-    search = _Search(plant, problem)
-    riccati = Riccati(progress=progress)
-    search.attempt("Riccati()", riccati, riccati.solve)
-    small = 0 < problem.A.shape[0] <= (_SMALL if search.answers else _LARGER)
-    if not search.is_close and small:
-        lmi = StructuredLmi(progress=progress)
-        bound = search.bounded(lmi)
-    if not search.is_close and not search.has_added:
-        added = Riccati(regularised=True, progress=progress)
-        search.attempt("Riccati(regularised=True)", added, added.solve)
-    if not search.is_close and small and bound is not None:
-        search.attempt("StructuredLmi()", lmi, lambda p: lmi.controller(p, bound))
-    return search.best()
+    """Return the answer of `Riccati`, or where it is not close to its bound the better of two."""
+    answers: list[Answer] = []
+    #: answers whose loop may be stable with a larger norm than the method claims
+    broken: list[tuple[SynthesisMethod, SolvedController]] = []
+    failures: dict[str, FlexplantError] = {}
+    tried: dict[str, float] = {}
+    lower = pointwise_bound(problem)
+    for name, regularised in (("Riccati()", None), ("Riccati(regularised=True)", True)):
+        method = Riccati(regularised=regularised, progress=progress)
+        tried[name] = np.inf
+        try:
+            found = method.solve(problem)
+        except FlexplantError as error:
+            if isinstance(error, InfeasibleError) and not answers:
+                raise
+            failures[name] = error
+            continue
+        try:
+            one = _verified(plant, problem, method, found)
+        except FlexplantError as error:
+            failures[name] = error
+            broken.append((method, found))
+        else:
+            answers.append(one)
+            tried[name] = one.gamma
+            lower = raised_bound(problem, one.gamma, max(lower, one.lower))
+        if ADDED in found.certificate or any(one.gamma <= _CLOSE * lower for one in answers):
+            break
+    if not answers:
+        for tried_method, claimed in broken:
+            with suppress(FlexplantError):
+                answers.append(_beyond_claim(plant, problem, tried_method, claimed))
+        if not answers:
+            raise _failure(failures)
+        lower = raised_bound(problem, min(one.gamma for one in answers), lower)
+    least = min(one.gamma for one in answers)
+    best = next(one for one in answers if one.gamma <= _SAME * least)
+    return best._replace(lower=min(lower, best.gamma), tried=tried)
+
+
+def _failure(failures: Mapping[str, FlexplantError]) -> FlexplantError:
+    """Return the first failure, which says what failed besides."""
+    (_, first), *others = failures.items()
+    said = [f"{name}: {'the same' if str(e) == str(first) else e}" for name, e in others]
+    return type(first)(str(first) + (f" (Tried besides: {' '.join(said)})" if said else ""))
+
+
+def _beyond_claim(
+    plant: StandardPlant, problem: Prepared, method: SynthesisMethod, found: SolvedController
+) -> Answer:
+    """Return an answer whose norm is only what was verified, with a note."""
+    one = _verified(plant, problem, method, found._replace(gamma=np.inf))
+    note = (
+        f"rounding costs {100 * (one.gamma / found.gamma - 1.0):.2g} % of gamma: "
+        f"{found.gamma:.6g} was found for the scaled plant, {one.gamma:.6g} verified for this "
+        "one. Its gains are close to infinite; weight the efforts and give the sensors noise."
+    )
+    return one._replace(
+        found=found._replace(notes=(*found.notes, note)),
+        certificate=one.certificate | {"claim": found.gamma},
+    )
 
 
 def idle_answer(plant: StandardPlant, problem: Prepared, failure: FlexplantError) -> Answer:
@@ -277,92 +320,6 @@ def idle_answer(plant: StandardPlant, problem: Prepared, failure: FlexplantError
     if not np.isfinite(one.gamma):  # the poles are stable by no more than their rounding
         raise CertificateError("the norm of the plant without feedback cannot be verified.")
     return one._replace(lower=min(pointwise_bound(problem), one.gamma))
-
-
-class _Search:
-    """The answers so far, the largest lower bound, and what failed."""
-
-    def __init__(self, plant: StandardPlant, problem: Prepared) -> None:
-        self.plant, self.problem = plant, problem
-        self.answers: list[Answer] = []
-        self.failures: list[tuple[str, FlexplantError]] = []
-        #: answers whose loop may be stable with a larger norm than the method claims
-        self.broken: list[tuple[SynthesisMethod, SolvedController]] = []
-        self.lower = pointwise_bound(problem)
-        self.tried: dict[str, float] = {}
-
-    @property
-    def is_close(self) -> bool:
-        return any(one.gamma <= _CLOSE * self.lower for one in self.answers)
-
-    @property
-    def has_added(self) -> bool:
-        found = [one.found for one in self.answers] + [one for _, one in self.broken]
-        return any(ADDED in one.certificate for one in found)
-
-    def attempt(
-        self,
-        name: str,
-        method: SynthesisMethod,
-        solve: Callable[[Prepared], SolvedController],
-    ) -> None:
-        """Keep the answer of a method, or why it failed."""
-        self.tried[name] = np.inf
-        try:
-            found = solve(self.problem)
-        except InfeasibleError:
-            if not self.answers:
-                raise
-            return
-        except FlexplantError as error:
-            self.failures.append((name, error))
-            return
-        try:
-            one = _verified(self.plant, self.problem, method, found)
-        except FlexplantError as error:
-            self.failures.append((name, error))
-            self.broken.append((method, found))
-        else:
-            self.answers.append(one)
-            self.tried[name] = one.gamma
-            known = max(self.lower, one.lower)
-            self.lower = raised_bound(self.problem, one.gamma, known)
-
-    def bounded(self, lmi: StructuredLmi) -> SmallestGamma | None:
-        """Return what the LMIs say of the smallest gamma, and raise the lower bound to it."""
-        try:
-            found = lmi.smallest(self.problem)
-        except FlexplantError as error:
-            self.failures.append(("StructuredLmi()", error))
-            return None
-        self.lower = max(self.lower, found.lower)
-        return found
-
-    def best(self) -> Answer:
-        """Return the answer with the smallest gamma, or an earlier one that is as good."""
-        for method, found in self.broken if not self.answers else ():
-            with suppress(FlexplantError):
-                self.answers.append(self._beyond_claim(method, found))
-        if self.answers:
-            least = min(one.gamma for one in self.answers)
-            one = next(one for one in self.answers if one.gamma <= _SAME * least)
-            return one._replace(lower=min(self.lower, one.gamma), tried=self.tried)
-        (_, first), *others = self.failures
-        said = [f"{name}: {'the same' if str(e) == str(first) else e}" for name, e in others]
-        raise type(first)(str(first) + (f" (Tried besides: {' '.join(said)})" if said else ""))
-
-    def _beyond_claim(self, method: SynthesisMethod, found: SolvedController) -> Answer:
-        """Return an answer whose norm is only what was verified, with a note."""
-        one = _verified(self.plant, self.problem, method, found._replace(gamma=np.inf))
-        note = (
-            f"rounding costs {100 * (one.gamma / found.gamma - 1.0):.2g} % of gamma: "
-            f"{found.gamma:.6g} was found for the scaled plant, {one.gamma:.6g} verified for this "
-            "one. Its gains are close to infinite; weight the efforts and give the sensors noise."
-        )
-        return one._replace(
-            found=found._replace(notes=(*found.notes, note)),
-            certificate=one.certificate | {"claim": found.gamma},
-        )
 
 
 def _verified(

@@ -2,48 +2,41 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray
-from ...errors import FlexplantError, SolverError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.grid import highest, resonance_grid
 from ...lti.preparation import Prepared
 from ...lti.responses import responses
+from ...lti.statespace import StateSpace
+from ...lti.zeros import axis_zeros
 from ...tolerances import divisor
-from ..lmi.structured_lmi import StructuredLmi
 from .central import indefinite
 
 #: points of the sweep, and times that it is refined
 _POINTS, _REFINEMENTS = 200, 2
 #: a gap between gamma and the bound that is left as it is: methods stay up to 5 % away
 _CLOSE = 0.0525
-#: up to so many states the LMIs, whose work grows with its sixth power, are solved for a bound
-_STATES = 24
+#: singular values of a pencil, its rows and columns of unit size, that are zero (`axis_zeros`)
+_LOST = 1e-9
 #: relative: a pole so close to the axis is taken for undamped, no point lies so close to it
 _UNDAMPED = 1e-6
 
 
-def lower_bound(problem: Prepared, gamma: float, known: float) -> float:
-    """Return the best lower bound on what controllers reach, at most gamma.
-
-    The largest of the one that the method gives and the pointwise one; where these are far from
-    gamma that of the Riccati equations (`relaxed_bound`), and for small problems that of the LMIs.
-    """
-    found = raised_bound(problem, gamma, max(known, pointwise_bound(problem)))
-    if found * (1.0 + _CLOSE) < gamma and problem.A.shape[0] <= _STATES:
-        with suppress(FlexplantError):  # what is known stays
-            found = max(found, StructuredLmi().smallest(problem).lower)
-    return min(found, gamma)
-
-
 def raised_bound(problem: Prepared, gamma: float, known: float) -> float:
-    """Return a known bound, or where it is far from gamma that of the Riccati equations."""
-    return known if known * (1.0 + _CLOSE) >= gamma else relaxed_bound(problem, gamma, known)
+    """Return a known lower bound on what controllers reach, raised where it is far from gamma.
+
+    By the zeros on the imaginary axis, then by the Riccati equations (`relaxed_bound`).
+    """
+    if known * (1.0 + _CLOSE) < gamma:
+        known = max(known, zero_bound(problem))
+    if known * (1.0 + _CLOSE) < gamma:
+        known = relaxed_bound(problem, gamma, known)
+    return min(known, gamma)
 
 
 def pointwise_bound(problem: Prepared) -> float:
@@ -66,6 +59,48 @@ def pointwise_bound(problem: Prepared) -> float:
 
     swept, _ = highest(bounds, grid, _REFINEMENTS)
     return max(swept, float(parrott(system.D[None], m1, p1)[0]))
+
+
+def zero_bound(p: Prepared) -> float:
+    """Return what no controller undercuts at the zeros of u -> z, and of w -> y, on the axis."""
+    sides = (
+        (p.A, p.B1, p.B2, p.C1, p.D11, p.D12),
+        (p.A.T, p.C1.T, p.C2.T, p.B1.T, p.D11.T, p.D21.T),
+    )
+    return max(_bound_at_zeros(*side) for side in sides)
+
+
+def _bound_at_zeros(
+    A: FloatArray,
+    B1: FloatArray,
+    B2: FloatArray,
+    C: FloatArray,
+    D11: FloatArray,
+    D12: FloatArray,
+) -> float:
+    """Return the largest ``|x' B1 + z' D11| / |z|`` with ``[x' z'] [A - s I, B2; C, D12] = 0``.
+
+    In any stable loop ``z' z(s) = (x' B1 + z' D11) w(s)``: x' times the equation of motion added.
+    """
+    n, outputs = A.shape[0], C.shape[0]
+    # the pencil of fewer outputs than inputs loses rank where its transpose does
+    tall = outputs >= B2.shape[1]
+    zeros = axis_zeros(StateSpace(A, B2, C, D12) if tall else StateSpace(A.T, C.T, B2.T, D12.T))
+    found = 0.0
+    for s in zeros:
+        pencil = np.block([[A - s * np.eye(n), B2], [C, D12]])
+        columns = np.linalg.norm(pencil, axis=0)
+        pencil = pencil / np.where(columns > 0, columns, 1.0)
+        rows = np.linalg.norm(pencil, axis=1)
+        rows = np.where(rows > 0, rows, 1.0)
+        left, values, _ = np.linalg.svd(pencil / rows[:, None])
+        rank = int(np.count_nonzero(values > _LOST))
+        null = (left[:, rank:] / rows[:, None]).conj().T
+        driven = null @ np.vstack([B1, D11])
+        turn, sizes, _ = np.linalg.svd(null[:, n:], full_matrices=False)
+        if sizes.size == len(null) and sizes[-1] > _LOST * sizes[0]:
+            found = max(found, float(np.linalg.norm(turn.conj().T @ driven / sizes[:, None], 2)))
+    return found
 
 
 def parrott(P: ComplexArray | FloatArray, m1: int, p1: int) -> FloatArray:

@@ -58,7 +58,7 @@ def require_ranks(lacking: Sequence[str]) -> None:
     if lacking:
         raise AssumptionError(
             f"{'; '.join(lacking)}, and nothing may be added (regularised=False). "
-            f"{_cure(lacking)} Or use StructuredLmi(), which needs no rank."
+            f"{_cure(lacking)} Or use Lmi(), which needs no rank."
         )
 
 

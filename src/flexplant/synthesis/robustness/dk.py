@@ -63,7 +63,7 @@ def design_mu(
         From `plant.uncertain(fit, neglected=larger)`, continuous or sampled.
     w, z : mapping {name: weight}, or sequence of str
         Weights of performance, as for `StandardPlant.weighted`.
-    method : Riccati, StructuredLmi or Lmi, optional
+    method : Riccati or Lmi, optional
         As for `design_hinf`.
     iterations : int
         Most steps.
