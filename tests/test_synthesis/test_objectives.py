@@ -12,7 +12,8 @@ from flexplant.errors import AssumptionError, InfeasibleError, LabelError, Model
 from flexplant.lti import StateSpace, lft
 from flexplant.lti.discretisation import held_exactly
 from flexplant.synthesis import H2, Hinf, PeakGain, PoleRegion, design_lmi
-from flexplant.synthesis.objectives.lmis import damped, within
+from flexplant.synthesis.objectives.design import _prepared
+from flexplant.synthesis.objectives.lmis import ObjectivePrograms, damped, within
 
 pytestmark = pytest.mark.slow
 
@@ -149,6 +150,18 @@ def test_the_regions_of_z_are_inside_those_of_s(ratio):
         held = np.abs(z - disc.centre) <= disc.radius
         assert not np.any(held & (np.abs(s) > speed * (1 + 1e-3)))
         assert np.count_nonzero(held) > 0.5 * np.count_nonzero(np.abs(s) <= speed)
+
+
+def test_the_rate_of_decay_is_searched():
+    """The least over 40 rates, each given to PeakGain, is found without naming one."""
+    given = mass()
+    found = design_lmi(given, minimize=PeakGain()).certificate["LMI optimum"]
+    plant = _prepared(given)
+    single = [
+        ObjectivePrograms(given, plant, PeakGain(decay=rate * plant.speed), ()).smallest(1.0)
+        for rate in np.geomspace(0.05, 2.0, 40)
+    ]
+    assert found == pytest.approx(min(single), rel=5e-3, abs=0)
 
 
 def test_the_peak_gain_of_a_sampled_plant_is_the_sum_of_its_impulse_response():

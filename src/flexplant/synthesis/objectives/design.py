@@ -38,6 +38,8 @@ from .specifications import H2, Hinf, PeakGain, PoleRegion
 _EXCESS = 1e-3
 #: rates of decay that are tried for peak gains, beside the plant's own speed
 _RATES = (0.1, 0.3, 1.0, 3.0)
+#: steps from the best of them, the last one so small that the optimum is flat within it
+_STEPS = tuple(3.0 ** (0.5**i) for i in range(1, 4))
 #: multiples of the back-off that are tried in turn, and multiples of the optimum after them
 _LOOSER, _FARTHER = (1.0, 2.0, 4.0, 8.0), (1.5, 2.5, 5.0, 12.0, 30.0)
 _KINDS = (H2, Hinf, PeakGain)
@@ -121,20 +123,8 @@ def design_lmi(
     require_reachable(given, subject_to)
     scaled = _prepared(given)
     problem = ObjectivePrograms(given, scaled, minimize, tuple(subject_to))
-    rates = _rates(problem)
+    claim, rate = _best_rate(problem)
     failures: list[Exception] = []
-    best: tuple[float, float] | None = None
-    for rate in rates:
-        try:
-            value = problem.smallest(rate)
-        except (SolverError, InfeasibleError) as error:
-            failures.append(error)
-            continue
-        if best is None or value < best[0]:
-            best = value, rate
-    if best is None:
-        raise failures[0]
-    claim, rate = best
     own_back_off = positive(back_off, "back_off")
     for factor in (*(1.0 + own_back_off * looser for looser in _LOOSER), *_FARTHER):
         bound = factor * claim
@@ -228,13 +218,35 @@ def _prepared(plant: StandardPlant) -> Plant:
     return balanced.timed(float(np.exp(np.mean(np.log(speeds))))).with_unit_channels()
 
 
-def _rates(problem: ObjectivePrograms) -> tuple[float, ...]:
-    """Return the rates of decay to be tried: one where none is needed."""
+def _best_rate(problem: ObjectivePrograms) -> tuple[float, float]:
+    """Return the smallest optimum over the rate of decay of peak gains, and that rate.
+
+    A grid, then steps to both sides of the best rate, each the root of the one before: the two
+    LMIs of a peak gain are convex only for a given rate.
+    """
+    values: dict[float, float] = {}
+    failures: list[Exception] = []
+
+    def attempt(rate: float) -> None:
+        try:
+            values[rate] = problem.smallest(rate)
+        except (SolverError, InfeasibleError) as error:
+            failures.append(error)
+
     free = any(
         isinstance(one, PeakGain) and one.decay is None
         for one in (problem.minimize, *problem.subject_to)
     )
-    return _RATES if free else (1.0,)
+    for rate in _RATES if free else (1.0,):
+        attempt(rate)
+    if not values:
+        raise failures[0]
+    for ratio in _STEPS if free else ():
+        best = min(values, key=values.__getitem__)
+        attempt(best / ratio)
+        attempt(best * ratio)
+    best = min(values, key=values.__getitem__)
+    return values[best], best
 
 
 def _verified(
