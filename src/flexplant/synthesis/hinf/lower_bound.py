@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray
+from ...errors import SolverError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.grid import highest, resonance_grid
 from ...lti.preparation import Prepared
