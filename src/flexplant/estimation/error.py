@@ -8,20 +8,20 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import ComplexArray, FloatArray, IntArray
+from ..checks import ComplexArray, FloatArray, IntArray, Value
 from ..errors import AssumptionError, CertificateError, ModelError, warn
 from ..labels import DofSet
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
 from ..lti.equations import accumulated, scale_of, shifted_columns, stein, sylvester
-from ..lti.lyapunov import solve_stein
-from ..lti.statespace import StateSpace
+from ..lti.lyapunov import accumulated, scale_of, solve_stein
+from ..lti.statespace import StateSpace, System
 from ..modes import Modes
 from ..plant import StandardPlant
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..tolerances import SAME, TINY, divisor
-from .estimator_channels import estimates, poi_channels, read_alike, same_pois
+from .estimator_channels import estimates, poi_channels, read_alike, row_of, same_pois, sensors
 
 #: two ways to a variance agree to this, half a per cent of an rms: no machine is known so well;
 #: what may be off below it is stated
@@ -391,6 +391,54 @@ def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop
 def _same(one: StateSpace, other: StateSpace) -> bool:
     pairs = ((one.A, other.A), (one.B, other.B), (one.C, other.C), (one.D, other.D))
     return all(np.array_equal(a, b) for a, b in pairs)
+
+
+class PoiFilter(Value):
+    """What stationary filters of the motions at the POIs have in common."""
+
+    system: StateSpace
+    plant: StandardPlant
+    variances: FloatArray
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The sensors, in the order of the columns of the gains."""
+        return sensors(self.plant)
+
+    def rms(self, channel: str, *, on: StandardPlant | ClosedLoop | System | None = None) -> float:
+        """Return the rms of the estimation error at the sample instants.
+
+        Parameters
+        ----------
+        channel : str
+            A POI's motion under any of its names: `die`, `die:z`, `die:hat`, `die:error`.
+        on : StandardPlant or ClosedLoop, optional
+            A plant that it runs on, sampled, with other modes or noises, u at rest; or a
+            closed loop around such a plant, where u moves what the filter does not know. In closed
+            form, exact. None: the predicted error.
+
+        Returns
+        -------
+        float [m or rad]
+
+        Raises
+        ------
+        LabelError
+            When it is no motion of a POI, or the other plant lacks a channel.
+        ModelError
+            When the other plant is not sampled alike, its noise is not known, or a loop has the
+            estimates of another filter.
+        AssumptionError
+            When the error would contain a rigid-body motion of the other plant, or the loop is not
+            stable.
+        """
+        row = row_of(poi_channels(self.plant), channel)
+        variances = self.variances
+        if isinstance(on, ClosedLoop):
+            variances = loop_variances(self.plant, self.system, on)
+        elif on is not None:
+            variances = error_variances(same_pois(self.plant, on), self.system).values
+        return float(np.sqrt(max(variances[row], 0.0)))
 
 
 #: nodes per wavelength below which a mode is badly resolved: frequencies are off by some 5 %

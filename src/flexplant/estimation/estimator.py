@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, Value, positive, real_array, short, sizes_of
+from ..checks import FloatArray, positive, real_array, short, sizes_of
 from ..errors import LabelError, ModelError, ShapeError, counted, require_known
-from ..loop import ClosedLoop
-from ..lti.statespace import StateSpace, System
+from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from .error import NODES, NOTED, error_variances, loop_variances
+from .error import NODES, NOTED, PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
-from .estimator_channels import poi_channels, row_of, same_pois, sensors
+from .estimator_channels import poi_channels
 from .filter_model import FilterModel, Sight, filter_model
 from .kalman_certificate import KalmanCertificate
 from .lag_report import LAGS, Filter, Lag, LagReport, lag_report
@@ -29,7 +28,7 @@ _STATED = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class KalmanEstimator(Value):
+class KalmanEstimator(PoiFilter):
     """A stationary Kalman filter of the motions at the POIs.
 
     ::
@@ -97,7 +96,7 @@ class KalmanEstimator(Value):
             beyond += f";\n  variances hold to {self.certificate.difference:.0e}"
         return (
             f"<KalmanEstimator: {counted(self.system.n_states, 'state')}, "
-            f"{counted(len(sensors(self.plant)), 'sensor')}, "
+            f"{counted(len(self.sensors), 'sensor')}, "
             f"spectral radius {self.certificate.spectral_radius:.6f}\n"
             f"  rms error {rms} ({beyond})>"
         )
@@ -123,46 +122,6 @@ class KalmanEstimator(Value):
             innovation = np.linalg.solve(still, model.R)
             P = P - K @ innovation @ K.T + moved @ innovation @ moved.T
         return np.asarray(0.5 * (P + P.T))
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """The sensors, in the order of the columns of `gain`."""
-        return sensors(self.plant)
-
-    def rms(self, channel: str, *, on: StandardPlant | ClosedLoop | System | None = None) -> float:
-        """Return the rms of the estimation error at the sample instants.
-
-        Parameters
-        ----------
-        channel : str
-            A POI's motion under any of its names: `die`, `die:z`, `die:hat`, `die:error`.
-        on : StandardPlant or ClosedLoop, optional
-            A plant that the filter runs on, sampled, with other modes or noises, u at rest; or a
-            closed loop around such a plant, where u moves what the filter does not know. In closed
-            form, exact. None: the predicted error.
-
-        Returns
-        -------
-        float [m or rad]
-
-        Raises
-        ------
-        LabelError
-            When it is no motion of a POI, or the other plant lacks a channel.
-        ModelError
-            When the other plant is not sampled alike, its noise is not known, or a loop has the
-            estimates of another filter.
-        AssumptionError
-            When the error would contain a rigid-body motion of the other plant, or the loop is not
-            stable.
-        """
-        row = row_of(poi_channels(self.plant), channel)
-        variances = self.variances
-        if isinstance(on, ClosedLoop):
-            variances = loop_variances(self.plant, self.system, on)
-        elif on is not None:
-            variances = error_variances(same_pois(self.plant, on), self.system).values
-        return float(np.sqrt(max(variances[row], 0.0)))
 
     def estimate(
         self,

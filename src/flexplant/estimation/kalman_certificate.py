@@ -9,11 +9,10 @@ import numpy as np
 from ..certificates import Certificate
 from ..checks import FloatArray, real_array
 from ..errors import CertificateError, SolverError
-from ..lti.lyapunov import solve_stein
 from ..plant import StandardPlant
 from ..tolerances import divisor
 from .estimator_channels import sensors
-from .filter_model import FilterModel, filter_model
+from .filter_model import FilterModel, filter_model, own_variances
 
 #: the covariance of the Riccati equation and that of the gain's own Stein equation agree to this
 AGREEMENT = 1e-6
@@ -110,11 +109,9 @@ def error_of(
             "that of a Kalman filter of this plant."
         )
     try:
-        P = solve_stein(closed, model.driven(predictor))
+        truth = own_variances(model, predictor, model.C1 @ gain)
     except SolverError as error:
         raise CertificateError(f"the estimation error could not be checked: {error}") from error
-    found = model.updated(P, gain)
-    truth = np.einsum("ij,jk,ik->i", model.C1, found, model.C1)
     claim = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
     size = divisor(truth)
     difference = float(np.max(np.abs(claim - truth) / size))

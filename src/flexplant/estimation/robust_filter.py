@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..certificates import Certificate
-from ..checks import FloatArray, Value, between, sizes_of
+from ..checks import FloatArray, between, sizes_of
 from ..errors import CertificateError, SolverError, counted
 from ..lti.norms import hinf_norm
 from ..lti.riccati import solve_dare
@@ -17,8 +17,8 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..tolerances import TINY
-from .error import error_variances
-from .estimator_channels import poi_channels, row_of, same_pois, sensors
+from .error import PoiFilter
+from .estimator_channels import poi_channels
 from .filter_model import FilterModel, error_system, filter_system, own_variances, weighed
 from .kalman import design_kalman
 
@@ -89,7 +89,7 @@ class MinimaxCertificate(Certificate):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RobustFilter(Value):
+class RobustFilter(PoiFilter):
     """A stationary filter of the motions at the POIs with two gains.
 
     ::
@@ -136,43 +136,9 @@ class RobustFilter(Value):
         rms = sizes_of({n: self.rms(n) for n in poi_channels(self.plant)}, self.plant.units)
         return (
             f"<RobustFilter: {counted(self.system.n_states, 'state')}, "
-            f"{counted(len(sensors(self.plant)), 'sensor')};\n"
+            f"{counted(len(self.sensors), 'sensor')};\n"
             f"  rms error on its own plant {rms};\n  {self.certificate!r}>"
         )
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """The sensors, in the order of the columns of the gains."""
-        return sensors(self.plant)
-
-    def rms(self, channel: str, *, on: StandardPlant | System | None = None) -> float:
-        """Return the rms of the estimation error at the sample instants, u at rest.
-
-        Parameters
-        ----------
-        channel : str
-            A POI's motion: `die`, `die:z`, `die:hat` or `die:error`.
-        on : StandardPlant, optional
-            A sampled plant that the filter runs on; None: that of its design.
-
-        Returns
-        -------
-        float [m or rad]
-
-        Raises
-        ------
-        LabelError
-            When it is no motion of a POI, or the other plant lacks a channel.
-        ModelError
-            When the other plant is not sampled alike, or its noise is not known.
-        AssumptionError
-            When the error would contain a rigid-body motion of the other plant.
-        """
-        row = row_of(poi_channels(self.plant), channel)
-        variances = self.variances
-        if on is not None:
-            variances = error_variances(same_pois(self.plant, on), self.system).values
-        return float(np.sqrt(max(variances[row], 0.0)))
 
 
 #: the gain of the error's own system may exceed the level of the Riccati equation by this part
