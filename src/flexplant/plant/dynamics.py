@@ -17,33 +17,50 @@ from .ports import Ports
 from .realisation import ModalRealisation
 
 
+class Channels(NamedTuple):
+    """What the ports of a structure push and see; sensors stand behind the motions of POIs."""
+
+    inputs: list[str]
+    outputs: list[str]
+    push: FloatArray  # (m, n) loads over the DOFs
+    ground: FloatArray  # (m, 6) rigid-body motions of the ground
+    seen: list[Seen]
+    orders: list[int]  # time derivatives that are seen
+    added: FloatArray  # (p, m) what is added to a sensor
+
+
+def channels(realisation: ModalRealisation, ports: Ports) -> Channels:
+    """Return the rows and loads of all ports."""
+    forces, sensors = ports.forces, ports.y
+    if not forces or not (ports.z or sensors):
+        raise ModelError(
+            f"a model needs inputs (w or u) and outputs (z or y), got {ports!r}. Add ports."
+        )
+    pois = [(poi, axis) for poi in ports.z for axis in poi.axes]
+    outputs = [*(poi.channel(axis) for poi, axis in pois), *(sensor.name for sensor in sensors)]
+    added = [[outputs.index(port.added_to) if port.added_to else -1] for port in forces]
+    return Channels(
+        [port.name for port in forces],
+        outputs,
+        np.array([port.push(realisation) for port in forces]),
+        np.array([port.ground for port in forces]),
+        [*(p.see(realisation, axis) for p, axis in pois), *(s.see(realisation) for s in sensors)],
+        [*(0 for _ in pois), *(sensor.order for sensor in sensors)],
+        np.equal(added, np.arange(len(outputs))).T.astype(np.float64),
+    )
+
+
 def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
     """Return the structure alone, from all forces to the motions of POIs and sensors."""
-    if not ports.forces or not (ports.z or ports.y):
-        raise ModelError(
-            f"a plant needs inputs (w or u) and outputs (z or y), got {ports!r}. Add ports."
-        )
-    push = np.array([port.push(realisation) for port in ports.forces])
-    B = np.array([realisation.force(load) for load in push]).T
-    motions = {
-        poi.channel(axis): poi.see(realisation, axis) for poi in ports.z for axis in poi.axes
-    }
-    found = [*motions.values(), *(sensor.see(realisation) for sensor in ports.y)]
-    orders = [*(0 for _ in motions), *(sensor.order for sensor in ports.y)]
-    ground = np.array([port.ground for port in ports.forces])
-    C = np.array([one.row for one in found])
-    D = np.array([followed(*one, push, ground) for one in zip(found, orders, strict=True)])
-    sensors = [sensor.name for sensor in ports.y]
-    for column, port in enumerate(ports.forces):
-        if port.added_to is not None:
-            D[len(motions) + sensors.index(port.added_to), column] = 1.0
+    own = channels(realisation, ports)
+    both = zip(own.seen, own.orders, strict=True)
     return StateSpace(
         realisation.A,
-        B,
-        C,
-        D,
-        inputs=[port.name for port in ports.forces],
-        outputs=[*motions, *sensors],
+        np.array([realisation.force(load) for load in own.push]).T,
+        np.array([one.row for one in own.seen]),
+        np.array([followed(*one, own.push, own.ground) for one in both]) + own.added,
+        inputs=own.inputs,
+        outputs=own.outputs,
         states=realisation.names,
         blocks=realisation.blocks,
     )
@@ -85,13 +102,11 @@ def _carried(realisation: ModalRealisation, ports: Ports) -> dict[str, Carried]:
     grounds = {port.name: port.ground for port in ports.forces if np.any(port.ground)}
     if not grounds:
         return {}
-    seen = {poi.channel(a): (0, poi.see(realisation, a)) for poi in ports.z for a in poi.axes}
-    seen |= {port.name: (port.order, port.see(realisation)) for port in ports.y if port.order < 2}
-    found = {}
-    for output, (order, one) in seen.items():
+    own, found = channels(realisation, ports), {}
+    for output, order, one in zip(own.outputs, own.orders, own.seen, strict=True):
         gains = {name: float(one.carried @ ground) for name, ground in grounds.items()}
         moved = {name: gain for name, gain in gains.items() if gain}
-        if moved:
+        if moved and order < 2:
             found[output] = Carried(order, moved)
     return found
 

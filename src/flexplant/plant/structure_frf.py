@@ -25,6 +25,7 @@ from ..modes.solve import modes_reaching
 from ..parallel import Progress
 from ..reduction import ReducedModel
 from ..structure import Damping, FEModel
+from .dynamics import channels
 from .ports import Ports
 from .realisation import Structure
 from .residual_form import modes_of
@@ -238,42 +239,24 @@ class _PortChannels:
     """The channels of ports over the coordinates of a model: loads, rows, filters, latencies."""
 
     def __init__(self, model: Structure, ports: Ports) -> None:
-        if not ports.forces or not (ports.z or ports.y):
-            raise ModelError(
-                f"a response needs inputs (w or u) and outputs (z or y), got {ports!r}. Add ports."
-            )
-        motions = _motions(model)
-        forces = ports.forces
-        self.inputs = [port.name for port in forces]
-        self.outputs = [
-            *(poi.channel(axis) for poi in ports.z for axis in poi.axes),
-            *(sensor.name for sensor in ports.y),
-        ]
-        self.units = ports.units
+        own = channels(_motions(model), ports)
+        self.inputs, self.outputs, self.units = own.inputs, own.outputs, ports.units
         seen_as = {sensor.quantity for sensor in ports.y} | {"displacement" for _ in ports.z}
         self._quantity = seen_as.pop() if len(seen_as) == 1 else None
-        seen = [poi.see(motions, axis) for poi in ports.z for axis in poi.axes]
-        orders = [0] * len(seen) + [sensor.order for sensor in ports.y]
-        seen += [sensor.see(motions) for sensor in ports.y]
-        self.loads = np.array([port.push(motions) for port in forces]).T
+        self.loads = own.push.T
         n = self.loads.shape[0]
         self._terms = [
             _PortTerm(row, order, i)
-            for i, one in enumerate(seen)
+            for i, one in enumerate(own.seen)
             for order, row in enumerate(one.row.reshape(3, n))
             if np.any(row)
         ]
         self.rows = np.array([term.row for term in self._terms]).reshape(-1, n)
-        ground = np.array([port.ground for port in forces])
-        self._carried = np.array([one.carried for one in seen]) @ ground.T
-        self._orders = np.array(orders)
-        self._added = np.zeros(self._carried.shape)
-        for j, port in enumerate(forces):
-            if port.added_to is not None:
-                self._added[self.outputs.index(port.added_to), j] = 1.0
+        self._carried = np.array([one.carried for one in own.seen]) @ own.ground.T
+        self._orders, self._added = np.array(own.orders), own.added
         late = ports.latencies
-        pois = len(seen) - len(ports.y)
-        self._before = [(port.filter, late.get(port.name, 0.0)) for port in forces]
+        pois = len(own.seen) - len(ports.y)
+        self._before = [(port.filter, late.get(port.name, 0.0)) for port in ports.forces]
         self._after: list[tuple[StateSpace | None, float]] = [(None, 0.0)] * pois
         self._after += [(s.filter, late.get(s.name, 0.0)) for s in ports.y]
         self._free = bool(getattr(model, "n_rigid", 0))
