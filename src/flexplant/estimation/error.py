@@ -13,8 +13,10 @@ from ..errors import AssumptionError, CertificateError, ModelError, warn
 from ..labels import DofSet
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
+from ..lti.discretisation import uncoupled_pairs
 from ..lti.equations import accumulated, scale_of, shifted_columns, stein, sylvester
 from ..lti.lyapunov import accumulated, scale_of, solve_stein
+from ..lti.modal import ModalMap
 from ..lti.statespace import StateSpace, System
 from ..modes import Modes
 from ..plant import StandardPlant
@@ -120,7 +122,27 @@ class _Joint(NamedTuple):
     E: FloatArray
     direct: FloatArray
     n_elastic: int
-    modal: tuple[ComplexArray, ComplexArray, ComplexArray] | None
+    modal: ModalMap | None
+
+    @property
+    def any_modal(self) -> ModalMap:
+        """The plant's modes, without eigenvalues that nearly coalesce."""
+        if self.modal is not None:
+            return self.modal
+        found: Any = la.eig(self.A[: self.n_elastic, : self.n_elastic], left=True)
+        values, left, right = found
+        overlap = np.sum(left.conj() * right, axis=0)
+        good = np.abs(overlap) * _DEFECTIVE > 1.0
+        inverse = (left[:, good] / overlap[good].conj()).conj().T
+        return ModalMap(values[good], right[:, good], inverse)
+
+    @property
+    def parts(self) -> tuple[ModalMap, FloatArray, ComplexArray, ComplexArray, FloatArray]:
+        """Modes, A_o, the coupling B_y C2 T, and both parts of the noise (modal, observer)."""
+        assert self.modal is not None  # noqa: S101
+        n, own = self.n_elastic, self.modal
+        coupling = own.seen(self.A[n:, :n])
+        return own, self.A[n:, n:], coupling, own.driven(self.noise[:n]), self.noise[n:]
 
 
 def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | None) -> _Joint:
@@ -164,14 +186,14 @@ def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
     """
     n = joint.n_elastic
     own, keep = joint.A[n:, n:], joint.E[:, n:]
-    values, T, inverse = _eigenvectors(joint)
-    see, entering = _right(joint.E[:, :n], T), _right(joint.A[n:, :n], T)
+    modes = joint.any_modal
+    values, see, entering = modes.poles, modes.seen(joint.E[:, :n]), modes.seen(joint.A[n:, :n])
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         V = shifted_columns(own, 1 / values, entering / values)
     # not finite where the observer has a pole there as well: that mode is not followed
     V = np.where(np.all(np.isfinite(V), axis=0), V, 0.0)
     gap = np.maximum(1 - np.abs(values) ** 2, np.finfo(np.float64).eps)
-    moved = np.linalg.norm(_left(inverse, joint.noise[:n]), axis=1) / np.sqrt(gap)
+    moved = np.linalg.norm(modes.driven(joint.noise[:n]), axis=1) / np.sqrt(gap)
     terms, missed = (np.abs(see) + np.abs(keep @ V)) * moved, np.abs(see + keep @ V) * moved
     size = np.linalg.norm(terms, axis=1, keepdims=True)
     part = [np.linalg.norm(x / divisor(size), axis=0) for x in (missed, terms)]
@@ -181,7 +203,7 @@ def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
     # one of each pair: the real and the imaginary part are its motion
     chosen = np.flatnonzero(known & (values.imag >= 0))
     left_over = _Missed(values[chosen], 2 * missed[:, chosen] ** 2, gap[chosen])
-    shapes = np.vstack([_chosen(T, chosen), V[:, chosen]])
+    shapes = np.vstack([modes.shapes(chosen), V[:, chosen]])
     motion: FloatArray = np.hstack([shapes.real, shapes.imag[:, values[chosen].imag > 0]])
     if not motion.size:
         return joint, left_over
@@ -194,18 +216,6 @@ def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
     E[:, rows] += E @ F
     noise = joint.noise - F @ joint.noise[rows]
     return joint._replace(A=A - F @ A[rows], noise=noise, E=E), left_over
-
-
-def _eigenvectors(joint: _Joint) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """Return eigenvalues of the plant, T and T^-1, without eigenvalues that nearly coalesce."""
-    if joint.modal is not None:
-        return joint.modal
-    n = joint.n_elastic
-    found: Any = la.eig(joint.A[:n, :n], left=True)
-    values, left, right = found
-    overlap = np.sum(left.conj() * right, axis=0)
-    good = np.abs(overlap) * _DEFECTIVE > 1.0
-    return values[good], right[:, good], (left[:, good] / overlap[good].conj()).conj().T
 
 
 def moving_parts(plant: StandardPlant) -> tuple[IntArray, IntArray]:
@@ -246,73 +256,29 @@ def _check_seen(plant: StandardPlant, seen: FloatArray, motion: FloatArray) -> N
         )
 
 
-def _eigen(
-    block: FloatArray, above: FloatArray
-) -> tuple[ComplexArray, ComplexArray, ComplexArray] | None:
-    """Return eigenvalues, T and T^-1 as pairs (b, 2), (b, 2, 2) of uncoupled modes, or None."""
-    n = block.shape[0]
-    if n % 2 or np.any(above):
-        return None
-    pairs = block.reshape(n // 2, 2, n // 2, 2)[np.arange(n // 2), :, np.arange(n // 2), :]
-    if np.count_nonzero(block) != np.count_nonzero(pairs):
+def _eigen(block: FloatArray, above: FloatArray) -> ModalMap | None:
+    """Return the modes of a plant whose modes are uncoupled, or None."""
+    pairs = None if np.any(above) else uncoupled_pairs(block)
+    if pairs is None:
         return None
     # states of one size: those of a mode are its omega q and dq/dt
     values, vectors = np.linalg.eig(pairs.astype(np.complex128))
-    if n and np.max(np.linalg.cond(vectors)) > _DEFECTIVE:
+    if values.size and np.max(np.linalg.cond(vectors)) > _DEFECTIVE:
         return None
-    return values.reshape(-1), vectors, np.linalg.inv(vectors)
-
-
-def _modal_parts(
-    joint: _Joint,
-) -> tuple[ComplexArray, FloatArray, ComplexArray, ComplexArray, FloatArray]:
-    """Return lambda, A_o, the coupling B_y C2 T, and both parts of the noise (modal, observer)."""
-    assert joint.modal is not None  # noqa: S101
-    values, T, inverse = joint.modal
-    n = joint.n_elastic
-    coupling = _right(joint.A[n:, :n], T)
-    return values, joint.A[n:, n:], coupling, _left(inverse, joint.noise[:n]), joint.noise[n:]
-
-
-def _right(rows: FloatArray, T: ComplexArray) -> ComplexArray:
-    """Return ``rows T``, T full or in pairs (b, 2, 2)."""
-    if T.ndim == 2:
-        return np.asarray(rows @ T)
-    p, b = len(rows), len(T)
-    return np.asarray(np.einsum("pbi,bij->pbj", rows.reshape(p, b, 2), T).reshape(p, 2 * b))
-
-
-def _left(inverse: ComplexArray, columns: FloatArray) -> ComplexArray:
-    """Return ``T^-1 columns``."""
-    if inverse.ndim == 2:
-        return np.asarray(inverse @ columns)
-    b, m = len(inverse), columns.shape[1]
-    both = np.einsum("bij,bjm->bim", inverse, columns.reshape(b, 2, m))
-    return np.asarray(both.reshape(2 * b, m))
-
-
-def _chosen(T: ComplexArray, columns: IntArray) -> ComplexArray:
-    """Return some columns of T."""
-    if T.ndim == 2:
-        return T[:, columns]
-    found = np.zeros((T.shape[0], 2, columns.size), dtype=np.complex128)
-    found[columns // 2, :, np.arange(columns.size)] = T[columns // 2, :, columns % 2]
-    return np.asarray(found.reshape(2 * len(T), columns.size))
+    return ModalMap(values.reshape(-1), vectors, np.linalg.inv(vectors))
 
 
 def _primal(joint: _Joint) -> FloatArray:
     """Return ``E X E'`` with ``X = A X A' + noise noise'``."""
-    values, A, coupling, driven, noise = _modal_parts(joint)
-    n = joint.n_elastic
+    modes, A, coupling, driven, noise = joint.parts
+    values, n = modes.poles, joint.n_elastic
     inner = (driven @ driven.conj().T) / (1 - np.outer(values, values.conj()))
     entering = coupling @ inner
     cross = shifted_columns(A, values.conj(), entering * values.conj() + noise @ driven.conj().T)
     half = A @ cross @ coupling.conj().T
     entered = np.real(entering @ coupling.conj().T) + noise @ noise.T
     own = _own(A, entered + np.real(half + half.conj().T), _sizes(joint))
-    assert joint.modal is not None  # noqa: S101
-    see = _right(joint.E[:, :n], joint.modal[1])
-    keep = joint.E[:, n:]
+    see, keep = modes.seen(joint.E[:, :n]), joint.E[:, n:]
     total = np.sum((see @ inner + 2 * keep @ cross) * see.conj(), axis=1).real
     return np.asarray(total + np.sum((keep @ own) * keep, axis=1))
 
@@ -334,10 +300,9 @@ def _own(A: FloatArray, load: FloatArray, d: FloatArray) -> FloatArray:
 
 def _dual(joint: _Joint) -> FloatArray:
     """Return ``trace(noise' Y noise)`` with ``Y = A' Y A + row' row`` for each row of E."""
-    values, A, coupling, driven, noise = _modal_parts(joint)
-    assert joint.modal is not None  # noqa: S101
-    n = joint.n_elastic
-    see, keep = _right(joint.E[:, :n], joint.modal[1]), joint.E[:, n:]
+    modes, A, coupling, driven, noise = joint.parts
+    values, n = modes.poles, joint.n_elastic
+    see, keep = modes.seen(joint.E[:, :n]), joint.E[:, n:]
     sizes = 1.0 / _sizes(joint)
     own = np.array([_own(A.T, np.outer(row, row), sizes) for row in keep])
     right = A.T @ own @ coupling + keep[:, :, None] * see[:, None, :]

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..checks import ComplexArray, FloatArray, IntArray, Value
 from ..errors import ModelError, counted
+from ..lti.modal import ModalMap
 from ..lti.statespace import StateSpace
 from ..modes.matching import assigned
 from ..plant import StandardPlant
@@ -139,16 +140,15 @@ def _blocks(realisation: ModalRealisation, ports: Ports) -> _Blocks:
     n = g.n_states // 2 - r
     A, B, C = g.A[2 * r :, 2 * r :], g.B[2 * r :], g.C[:, 2 * r :]
     if realisation.coupling is None:
-        poles, T = np.linalg.eig(realisation.pairs[r:].astype(np.complex128))
-        see = np.einsum("pbi,bij->pbj", C.reshape(-1, n, 2), T)
-        push = np.einsum("bij,bjm->bim", np.linalg.inv(T), B.reshape(n, 2, -1))
+        values, T = np.linalg.eig(realisation.pairs[r:].astype(np.complex128))
+        own = ModalMap(values.reshape(-1), T, np.linalg.inv(T))
     else:
         values, T = np.linalg.eig(A.astype(np.complex128))
         # conjugate pairs side by side, then the poles of overdamped modes
         order = np.lexsort((values.imag, np.round(np.abs(values), 9), values.imag == 0))
-        poles = values[order].reshape(n, 2)
-        see = (C @ T[:, order]).reshape(-1, n, 2)
-        push = np.linalg.inv(T)[order].reshape(n, 2, -1) @ B
+        own = ModalMap(values[order], T[:, order], np.linalg.inv(T)[order])
+    poles = own.poles.reshape(n, 2)
+    see, push = own.seen(C).reshape(-1, n, 2), own.driven(B).reshape(n, 2, -1)
     static = -np.real(np.einsum("pbi,bi,bim->bpm", see, 1 / poles, push))
     return _Blocks(poles, see, push, static)
 

@@ -169,14 +169,19 @@ def acting(direct: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 
 
 def diagonal_pairs(g: StateSpace) -> FloatArray | None:
-    """Return the (n/2, 2, 2) diagonal blocks of A, or None when A is not made of those alone."""
+    """Return the diagonal blocks of a system that is known to be made of pairs alone, or None."""
     if g.blocks is None or set(g.blocks) - {2}:
         return None
-    n = g.n_states
-    pairs = g.A.reshape(n // 2, 2, n // 2, 2)[np.arange(n // 2), :, np.arange(n // 2), :]
-    if np.count_nonzero(g.A) != np.count_nonzero(pairs):
+    return uncoupled_pairs(g.A)
+
+
+def uncoupled_pairs(A: FloatArray) -> FloatArray | None:
+    """Return the (n/2, 2, 2) diagonal blocks of A, or None when A is not made of those alone."""
+    b, odd = divmod(len(A), 2)
+    if odd:
         return None
-    return pairs
+    pairs = A.reshape(b, 2, b, 2)[np.arange(b), :, np.arange(b), :]
+    return pairs if np.count_nonzero(A) == np.count_nonzero(pairs) else None
 
 
 def block_diagonal(pairs: FloatArray) -> FloatArray:
