@@ -15,7 +15,7 @@ from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
 from ..lti.discretisation import uncoupled_pairs
 from ..lti.equations import accumulated, scale_of, shifted_columns, stein, sylvester
-from ..lti.lyapunov import accumulated, scale_of, solve_stein
+from ..lti.lyapunov import solve_stein
 from ..lti.modal import ModalMap
 from ..lti.statespace import StateSpace, System
 from ..modes import Modes
