@@ -280,8 +280,9 @@ def best_answer(plant: StandardPlant, problem: Prepared, progress: bool | None) 
                 answers.append(_beyond_claim(plant, problem, tried_method, claimed))
         if not answers:
             raise _failure(failures)
-        lower = raised_bound(problem, min(one.gamma for one in answers), lower)
     least = min(one.gamma for one in answers)
+    if np.isfinite(least):  # of a broken answer too
+        lower = raised_bound(problem, least, lower)
     best = next(one for one in answers if one.gamma <= _SAME * least)
     return best._replace(lower=min(lower, best.gamma), tried=tried)
 
