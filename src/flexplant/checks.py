@@ -14,6 +14,7 @@ import scipy.sparse as sp
 
 from .errors import FlexplantError, LabelError, ModelError, ShapeError
 from .store import Value as Value
+from .store import checked as checked
 from .store import frozen as frozen
 from .store import rebuild as rebuild
 
@@ -165,6 +166,16 @@ def sizes_of(sizes: Mapping[str, float], units: Mapping[str, str], most: int = 4
     return ", ".join(shown[:most] + more)
 
 
+def number(value: Any, name: str) -> float:
+    """Return `value` as one finite float."""
+    return float(real_array(value, name, ()))
+
+
+def numbers(value: Any, name: str, count: int) -> tuple[float, ...]:
+    """Return so many finite numbers as a tuple."""
+    return tuple(real_array(value, name, (count,)).tolist())
+
+
 def positive(value: Any, name: str, *, zero: bool = False) -> float:
     """Return `value` as a positive (or, with `zero`, non-negative) float."""
     if isinstance(value, bool | np.bool_):
@@ -275,19 +286,19 @@ def signal_names(names: Iterable[str], count: int, prefix: str, side: str) -> tu
     return listed
 
 
-def name_list(names: Any, what: str) -> tuple[str, ...]:
+def name_list(names: Any, name: str) -> tuple[str, ...]:
     """Return names as a tuple of str; one str is one name."""
     if isinstance(names, str):
         return (names,)
     if not isinstance(names, Iterable) or isinstance(names, bytes):
-        raise LabelError(f"{what} are chosen by name, got {short(names)}. Pass a list of names.")
+        raise LabelError(f"{name} are chosen by name, got {short(names)}. Pass a list of names.")
     listed = tuple(names)
-    wrong = [name for name in listed if not isinstance(name, str)]
+    wrong = [one for one in listed if not isinstance(one, str)]
     if wrong:
         raise LabelError(
-            f"{what} are chosen by name, got {short(wrong[0])} among them. Pass a list of names."
+            f"{name} are chosen by name, got {short(wrong[0])} among them. Pass a list of names."
         )
-    return tuple(str(name) for name in listed)
+    return tuple(str(one) for one in listed)
 
 
 def inner_names(names: Iterable[str], taken: Iterable[str]) -> tuple[str, ...]:

@@ -30,6 +30,12 @@ from .errors import LabelError, ShapeError, counted, require_known, unknown_labe
 from .tolerances import SAME
 
 
+def checked_direction(direction: Any, name: str = "direction") -> str:
+    """Return one of the six directions."""
+    require_known(name, [direction], DIRECTIONS)
+    return str(direction)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class DofSet(Value):
     """The degrees of freedom of a model, in the order of its matrices.
@@ -358,7 +364,7 @@ class DofSet(Value):
                 row += part * self.row(place, direction)
             return row
         point = real_array(at, "at", (3,))
-        require_known("direction", [direction], DIRECTIONS)
+        checked_direction(direction)
         if self.interpolation is not None:
             return self.interpolation.row(point, direction)
         label = self.nearest(point, direction)

@@ -7,7 +7,7 @@ import os
 import re
 import uuid
 from abc import ABC
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from html import escape
@@ -24,6 +24,14 @@ from .errors import FlexplantError
 _HEADER = "__flexplant__"
 
 
+def checked(check: Callable[..., Any], *, unit: str = "", **rules: Any) -> dict[str, Any]:
+    """Return the metadata of a field of a Value: ``check(value, name=..., **rules)`` returns it.
+
+    `name`, in messages, is the field's unless the rules have another; a default None passes.
+    """
+    return {"check": (check, rules), "unit": unit}
+
+
 class Value(ABC):  # noqa: B024 - its kinds have abstract methods
     """A frozen dataclass whose arrays are read-only copies, also after pickling and loading."""
 
@@ -34,8 +42,17 @@ class Value(ABC):  # noqa: B024 - its kinds have abstract methods
         Value.registry[cls.__name__] = cls
 
     def __post_init__(self) -> None:
-        """Make what is given read-only; a kind that checks it does both in a method of its own."""
-        self._set(**self._fields())
+        """Check each field by what it declares, and make it read-only.
+
+        What concerns several fields follows in the kind's own method, after this one.
+        """
+        values = self._fields()
+        for field in fields(self):  # type: ignore[arg-type]
+            given = values[field.name]
+            if "check" in field.metadata and (given is not None or field.default is not None):
+                check, rules = field.metadata["check"]
+                values[field.name] = check(given, **{"name": field.name} | rules)
+        self._set(**values)
 
     def _set(self, **values: Any) -> None:
         """Set fields during construction; arrays become read-only copies."""
@@ -44,6 +61,16 @@ class Value(ABC):  # noqa: B024 - its kinds have abstract methods
 
     def _fields(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+
+    def __repr__(self) -> str:
+        """Return the kind with the fields that differ from their defaults, with their units."""
+        shown = []
+        for field in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            text, unit = _shown(value), field.metadata.get("unit")
+            if field.repr and text != _shown(field.default) and np.size(value):
+                shown.append(f"{field.name}={text}{' ' + unit if unit else ''}")
+        return f"{type(self).__name__}({', '.join(shown)})"
 
     def __reduce__(self) -> tuple[Any, ...]:
         state = {
@@ -74,6 +101,24 @@ class Value(ABC):  # noqa: B024 - its kinds have abstract methods
             The file; `flexplant.load` reads it back.
         """
         save(self, path)
+
+
+def _shown(value: Any) -> str:
+    """Return a field's value for a repr: large arrays by their shape, long lists by their ends."""
+    if isinstance(value, float):
+        return f"{value:g}"
+    if sp.issparse(value) or (isinstance(value, np.ndarray) and value.size > 6):
+        return f"array {value.shape}"
+    if isinstance(value, tuple):
+        listed = [_shown(part) for part in value]
+        if len(listed) > 4:
+            listed[3:-1] = [f"... {len(listed) - 4} more ..."]
+        return f"[{', '.join(listed)}]"
+    if isinstance(value, MappingProxyType):
+        return repr(dict(value))
+    text = repr(value)
+    long = isinstance(value, Value) and len(text) > 80
+    return f"<{type(value).__name__} ...>" if long else text
 
 
 def rebuild(cls: type[Value], state: Mapping[str, Any]) -> Value:

@@ -9,9 +9,33 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray, IntArray, Matrix, Value, instance, positive, real_array
-from ..errors import LabelError, ModelError, counted, require_known
-from ..labels import DIRECTIONS, DofSet, Interpolation, Place
+from ..checks import (
+    FloatArray,
+    IntArray,
+    Matrix,
+    Value,
+    checked,
+    instance,
+    number,
+    numbers,
+    positive,
+    real_array,
+)
+from ..errors import LabelError, ModelError, counted
+from ..labels import DofSet, Interpolation, Place, checked_direction
+
+
+def checked_place(at: Any, name: str) -> Any:
+    """Return a label, a point as a tuple or a mapping as they are."""
+    if isinstance(at, str | Mapping):
+        return at
+    try:
+        return numbers(at, "at", 3)
+    except ValueError:
+        raise LabelError(
+            f"{name} must be at a DOF label like '41:z', a point (x, y, z) in metres or a mapping "
+            f"{{label: weight}}, got {at!r:.80}. Use dofs.nearest((x, y, z)), which finds a label."
+        ) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +67,12 @@ class PointMass(Value):
            [0., 4.]])
     """
 
-    at: Place
-    mass: float
+    at: Place = field(metadata=checked(checked_place, name="a point mass"))
+    mass: float = field(metadata=checked(positive, name="mass of a point mass", zero=True))
     inertia: float | Sequence[float] = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         inertia = real_array(self.inertia, "inertia")
         about = np.broadcast_to(inertia, (3,)) if inertia.size == 1 else inertia
         if about.shape != (3,) or np.any(about < 0):
@@ -55,17 +80,12 @@ class PointMass(Value):
                 f"inertia must be one number or three (about x, y, z), none negative, got "
                 f"{inertia.tolist()!r:.80}. Leave products of inertia out: turn the axes."
             )
-        at = checked_place(self.at, "a point mass")
-        if about.any() and isinstance(at, str | Mapping):
+        if about.any() and isinstance(self.at, str | Mapping):
             raise ModelError(
-                f"a point mass with inertia needs a point (x, y, z), got {at!r:.80}: a label names "
-                "one motion only. Use dofs.xyz of the node as the point."
+                f"a point mass with inertia needs a point (x, y, z), got {self.at!r:.80}: a label "
+                "names one motion only. Use dofs.xyz of the node as the point."
             )
-        self._set(
-            at=at,
-            mass=positive(self.mass, "mass of a point mass", zero=True),
-            inertia=tuple(about.tolist()),
-        )
+        self._set(inertia=tuple(about.tolist()))
 
     def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
         """Return (matrix, row, weight): the weight times row^T row is added to M."""
@@ -112,18 +132,12 @@ class Spring(Value):
            [-100.,  100.]])
     """
 
-    at: Place
-    stiffness: float
-    direction: str = field(default="z", kw_only=True)
-    to: Place | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        require_known("direction", [self.direction], DIRECTIONS)
-        self._set(
-            at=checked_place(self.at, "a spring"),
-            stiffness=float(real_array(self.stiffness, "stiffness of a spring", ())),
-            to=None if self.to is None else checked_place(self.to, "a spring"),
-        )
+    at: Place = field(metadata=checked(checked_place, name="a spring"))
+    stiffness: float = field(metadata=checked(number, name="stiffness of a spring"))
+    direction: str = field(default="z", kw_only=True, metadata=checked(checked_direction))
+    to: Place | None = field(
+        default=None, kw_only=True, metadata=checked(checked_place, name="a spring")
+    )
 
     def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
         """Return (matrix, row, weight): the weight times row^T row is added to K."""
@@ -160,18 +174,12 @@ class Damper(Value):
            [-2.,  2.]])
     """
 
-    at: Place
-    rate: float
-    direction: str = field(default="z", kw_only=True)
-    to: Place | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        require_known("direction", [self.direction], DIRECTIONS)
-        self._set(
-            at=checked_place(self.at, "a damper"),
-            rate=positive(self.rate, "rate of a damper", zero=True),
-            to=None if self.to is None else checked_place(self.to, "a damper"),
-        )
+    at: Place = field(metadata=checked(checked_place, name="a damper"))
+    rate: float = field(metadata=checked(positive, name="rate of a damper", zero=True))
+    direction: str = field(default="z", kw_only=True, metadata=checked(checked_direction))
+    to: Place | None = field(
+        default=None, kw_only=True, metadata=checked(checked_place, name="a damper")
+    )
 
     def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
         """Return (matrix, row, weight): the weight times row^T row is added to D."""
@@ -258,19 +266,6 @@ def summed(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:
     if sp.issparse(matrix):
         return sp.csc_array(matrix + sp.csc_array(change))
     return np.asarray(matrix + change, dtype=np.float64)
-
-
-def checked_place(at: Any, owner: str) -> Any:
-    """Return a label, a point as a tuple or a mapping as they are."""
-    if isinstance(at, str | Mapping):
-        return at
-    try:
-        return tuple(real_array(at, "at", (3,)).tolist())
-    except ValueError:
-        raise LabelError(
-            f"{owner} must be at a DOF label like '41:z', a point (x, y, z) in metres or a mapping "
-            f"{{label: weight}}, got {at!r:.80}. Use dofs.nearest((x, y, z)), which finds a label."
-        ) from None
 
 
 def _stretch(part: Spring | Damper, dofs: DofSet) -> FloatArray:

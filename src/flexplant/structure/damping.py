@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Matrix, Value, flag, positive, real_array, short, whole
+from ..checks import FloatArray, Matrix, Value, checked, flag, positive, real_array, short, whole
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..sparse.factor import dense
@@ -237,16 +237,9 @@ class Rayleigh(Damping):
     array([0.  , 0.01])
     """
 
-    alpha: float
-    beta: float
-    rigid: bool = field(default=False, kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._set(
-            alpha=positive(self.alpha, "alpha", zero=True),
-            beta=positive(self.beta, "beta", zero=True),
-        )
-        flag(self.rigid, "rigid")
+    alpha: float = field(metadata=checked(positive, zero=True))
+    beta: float = field(metadata=checked(positive, zero=True))
+    rigid: bool = field(default=False, kw_only=True, metadata=checked(flag))
 
     @classmethod
     def fitted(cls, freq: Iterable[float], zeta: Iterable[float]) -> Rayleigh:
