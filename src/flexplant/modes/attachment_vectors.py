@@ -22,28 +22,28 @@ from .shifted import stiffness_factor
 _NEGLIGIBLE = 1e-9
 
 
-def places(at: Place | Iterable[Place]) -> list[Place]:
-    """Return one place, or several, as a list."""
+def places(at: Place | Iterable[Place], name: str = "a place") -> tuple[Place, ...]:
+    """Return one place, or several, as a tuple."""
     if isinstance(at, str | Mapping):
-        return [at]
+        return (at,)
     try:
         listed: list[Any] = list(at)
     except TypeError as error:
-        raise _no_place(at) from error
+        raise _no_place(at, name) from error
     numbers = [item for item in listed if np.ndim(item) == 0 and not isinstance(item, str)]
     odd = [item for item in numbers if not isinstance(item, Mapping | int | float | np.number)]
     if odd:
-        raise _no_place(odd[0])
+        raise _no_place(odd[0], name)
     if listed and all(
         np.ndim(item) == 0 and not isinstance(item, str | Mapping) for item in listed
     ):
-        return [listed]
-    return listed
+        return (listed,)
+    return tuple(listed)
 
 
-def _no_place(given: object) -> ModelError:
+def _no_place(given: object, name: str) -> ModelError:
     return ModelError(
-        f"a place must be a DOF label, a point (x, y, z) or a mapping of these to weights, got "
+        f"{name} must be a DOF label, a point (x, y, z) or a mapping of these to weights, got "
         f"{short(given)}. Name it, such as '41:z', or several in a list."
     )
 

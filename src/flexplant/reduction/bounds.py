@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..checks import FloatArray, Value, name_list, positive, real_array, whole
+from ..checks import FloatArray, Value, checked, name_list, positive, real_array, whole
 from ..errors import counted
 from .ranking import peak_gains
 
@@ -43,23 +43,15 @@ class ErrorBound(Value):
     6.945e-06
     """
 
-    value: float
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
+    value: float = field(metadata=checked(positive, zero=True))
+    inputs: tuple[str, ...] = field(metadata=checked(name_list))
+    outputs: tuple[str, ...] = field(metadata=checked(name_list))
     rule: str
-    terms: FloatArray | None = field(default=None, kw_only=True)
-    static: float | None = field(default=None, kw_only=True)
-    covers: int | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._set(
-            value=positive(self.value, "value", zero=True),
-            inputs=name_list(self.inputs, "inputs"),
-            outputs=name_list(self.outputs, "outputs"),
-            terms=None if self.terms is None else real_array(self.terms, "terms", (None, 3)),
-            static=None if self.static is None else positive(self.static, "static", zero=True),
-            covers=None if self.covers is None else whole(self.covers, "covers"),
-        )
+    terms: FloatArray | None = field(
+        default=None, kw_only=True, metadata=checked(real_array, shape=(None, 3))
+    )
+    static: float | None = field(default=None, kw_only=True, metadata=checked(positive, zero=True))
+    covers: int | None = field(default=None, kw_only=True, metadata=checked(whole))
 
     def __repr__(self) -> str:
         some = (

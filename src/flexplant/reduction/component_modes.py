@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, positive, whole
+from ..checks import FloatArray, checked, positive, whole
 from ..errors import ModelError, counted
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
@@ -20,12 +20,10 @@ from .condensation import DofPartition
 from .methods import ReductionMethod
 from .projection import (
     block,
-    checked_damping,
     fe_model,
     inner,
     labels_given,
     projected,
-    shown,
 )
 from .reduced import ReducedModel
 
@@ -67,28 +65,14 @@ class CraigBampton(ReductionMethod):
     array([  0.  , 100.66, 174.35])
     """
 
-    boundary: Iterable[str]
-    modes: int = 0
-    below: float | None = field(default=None, kw_only=True)
-    damping: Damping | None = field(default=None, kw_only=True)
+    boundary: Iterable[str] = field(metadata=checked(labels_given, name="boundary DOFs"))
+    modes: int = field(default=0, metadata=checked(whole, minimum=0))
+    below: float | None = field(default=None, kw_only=True, metadata=checked(positive, unit="Hz"))
 
     def __post_init__(self) -> None:
-        number = whole(self.modes, "modes", minimum=0)
-        if self.below is not None and number:
+        super().__post_init__()
+        if self.below is not None and self.modes:
             raise ModelError("give the number of fixed-interface modes or below=, not both.")
-        self._set(
-            boundary=labels_given(self.boundary, "boundary DOFs"),
-            modes=number,
-            below=None if self.below is None else positive(self.below, "below"),
-            damping=checked_damping(self.damping),
-        )
-
-    def __repr__(self) -> str:
-        labels = tuple(self.boundary)
-        more = f"{self.modes}" if self.below is None else f"all below {self.below:g} Hz"
-        return (
-            f"<CraigBampton: {counted(len(labels), 'DOF')} ({shown(labels)}), fixed modes: {more}>"
-        )
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model; `reduce` is the public way."""
@@ -130,26 +114,11 @@ class CraigBampton(ReductionMethod):
 class _FreeInterface(ReductionMethod):
     """Free modes of the whole structure and its residual flexibility at the boundary."""
 
-    boundary: Iterable[str]
-    modes: int
-    damping: Damping | None = field(default=None, kw_only=True)
+    boundary: Iterable[str] = field(metadata=checked(labels_given, name="boundary DOFs"))
+    modes: int = field(metadata=checked(whole))
     #: whether the residual flexibility has no inertia, and what it is called
     _massless: ClassVar[bool]
     _kind: ClassVar[str]
-
-    def __post_init__(self) -> None:
-        self._set(
-            boundary=labels_given(self.boundary, "boundary DOFs"),
-            modes=whole(self.modes, "modes"),
-            damping=checked_damping(self.damping),
-        )
-
-    def __repr__(self) -> str:
-        labels = tuple(self.boundary)
-        return (
-            f"<{type(self).__name__}: {counted(len(labels), 'DOF')} ({shown(labels)}), "
-            f"{counted(self.modes, 'free mode')}>"
-        )
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model; `reduce` is the public way."""

@@ -9,23 +9,21 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, IntArray, positive, whole
+from ..checks import FloatArray, IntArray, checked, positive, whole
 from ..errors import ModelError, ShapeError, SolverError, counted
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..sparse.factor import unit_diagonal
-from ..structure import Damping, FEModel, ModalDamping
+from ..structure import FEModel, ModalDamping
 from ..tolerances import ROUNDING
 from .methods import ReductionMethod, refused_partition
 from .projection import (
     Solver,
     block,
-    checked_damping,
     fe_model,
     inner,
     labels_given,
     projected,
-    shown,
 )
 from .reduced import ReducedModel
 
@@ -58,6 +56,16 @@ def _loose(model: FEModel, kept: IntArray) -> str:
         f"the structure has no static shape. Keep {add} as well, say; or take Rubin or "
         "ModalTruncation, which need nothing held."
     )
+
+
+def mode_numbers(numbers: Any, name: str) -> tuple[int, ...]:
+    """Return mode numbers as a sorted tuple."""
+    if isinstance(numbers, str) or not isinstance(numbers, Iterable):
+        raise ModelError(f"{name} are given by their numbers, got {numbers!r:.60}: [1, 2, 3, 7].")
+    listed = [whole(number, "a mode number") for number in numbers]
+    if not listed or len(set(listed)) != len(listed):
+        raise ModelError(f"mode numbers must be there once each, got {listed!r:.80}.")
+    return tuple(sorted(listed))
 
 
 class DofPartition:
@@ -122,15 +130,7 @@ class Guyan(ReductionMethod):
            [-200000.,  200000.]])
     """
 
-    dofs: Iterable[str]
-    damping: Damping | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._set(dofs=labels_given(self.dofs, "kept DOFs"), damping=checked_damping(self.damping))
-
-    def __repr__(self) -> str:
-        labels = tuple(self.dofs)
-        return f"<Guyan: {counted(len(labels), 'DOF')} ({shown(labels)})>"
+    dofs: Iterable[str] = field(metadata=checked(labels_given, name="kept DOFs"))
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the condensed model; `reduce` is the public way."""
@@ -190,25 +190,9 @@ class Irs(ReductionMethod):
     [0.000105]
     """
 
-    dofs: Iterable[str]
-    iterations: int = field(default=1, kw_only=True)
-    tolerance: float = field(default=1e-12, kw_only=True)
-    damping: Damping | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._set(
-            dofs=labels_given(self.dofs, "kept DOFs"),
-            iterations=whole(self.iterations, "iterations"),
-            tolerance=positive(self.tolerance, "tolerance", zero=True),
-            damping=checked_damping(self.damping),
-        )
-
-    def __repr__(self) -> str:
-        labels = tuple(self.dofs)
-        return (
-            f"<Irs: {counted(len(labels), 'DOF')} ({shown(labels)}), at most "
-            f"{counted(self.iterations, 'iteration')}>"
-        )
+    dofs: Iterable[str] = field(metadata=checked(labels_given, name="kept DOFs"))
+    iterations: int = field(default=1, kw_only=True, metadata=checked(whole))
+    tolerance: float = field(default=1e-12, kw_only=True, metadata=checked(positive, zero=True))
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the condensed model; `reduce` is the public way."""
@@ -298,26 +282,17 @@ class Serep(ReductionMethod):
     array([  0.  , 100.66])
     """
 
-    dofs: Iterable[str]
-    modes: Iterable[int] | None = None
-    damping: Damping | None = field(default=None, kw_only=True)
+    dofs: Iterable[str] = field(metadata=checked(labels_given, name="kept DOFs"))
+    modes: Iterable[int] | None = field(default=None, metadata=checked(mode_numbers))
 
     def __post_init__(self) -> None:
-        labels = labels_given(self.dofs, "kept DOFs")
-        numbers = None if self.modes is None else mode_numbers(self.modes)
-        if numbers is not None and len(numbers) != len(labels):
+        super().__post_init__()
+        count = len(tuple(self.dofs))
+        if self.modes is not None and len(tuple(self.modes)) != count:
             raise ShapeError(
-                f"{len(labels)} DOFs for {len(numbers)} modes: phi_kk must be square, or M* would "
-                "be singular. Name as many modes as DOFs."
+                f"{count} DOFs for {len(tuple(self.modes))} modes: phi_kk must be square, or M* "
+                "would be singular. Name as many modes as DOFs."
             )
-        self._set(dofs=labels, modes=numbers, damping=checked_damping(self.damping))
-
-    def __repr__(self) -> str:
-        labels = tuple(self.dofs)
-        which = "lowest" if self.modes is None else "chosen"
-        return (
-            f"<Serep: the {which} {counted(len(labels), 'mode')} in as many DOFs ({shown(labels)})>"
-        )
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the model in these DOFs; `reduce` is the public way."""
@@ -336,16 +311,6 @@ class Serep(ReductionMethod):
             condition=condition,
             condition_of="phi_kk",
         )
-
-
-def mode_numbers(numbers: Any) -> tuple[int, ...]:
-    """Return mode numbers as a sorted tuple."""
-    if isinstance(numbers, str) or not isinstance(numbers, Iterable):
-        raise ModelError(f"modes are given by their numbers, got {numbers!r:.60}: [1, 2, 3, 7].")
-    listed = [whole(number, "a mode number") for number in numbers]
-    if not listed or len(set(listed)) != len(listed):
-        raise ModelError(f"mode numbers must be there once each, got {listed!r:.80}.")
-    return tuple(sorted(listed))
 
 
 def kept_columns(numbers: tuple[int, ...], modes: Modes) -> IntArray:

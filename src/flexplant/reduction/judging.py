@@ -124,8 +124,8 @@ def _band(band: Any) -> tuple[float, float]:
 
 
 def _channels(reduced: Reduced, inputs: Any, outputs: Any) -> tuple[list[Place], list[Place]]:
-    pushed: list[Any] = places(inputs)
-    watched: list[Any] = places(outputs)
+    pushed: Any = places(inputs)
+    watched: Any = places(outputs)
     if not pushed and reduced.bound is not None:
         known = (reduced.bound.inputs, reduced.bound.outputs)
         if all(label in reduced.full_dofs for names in known for label in names):

@@ -11,17 +11,17 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import FloatArray, real_array, whole
-from ..errors import ModelError, SolverError, counted
+from ..checks import FloatArray, checked, real_array, whole
+from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..modes.attachment_vectors import labels_of, places, static_response
 from ..modes.modes import Modes
 from ..modes.shifted import stiffness_factor
 from ..sparse.factor import DENSE_LIMIT, dense, dynamic_lu
-from ..structure import Damping, FEModel
+from ..structure import FEModel
 from ..tolerances import RANK, TINY
 from .methods import ReductionMethod
-from .projection import checked_damping, fe_model, projected
+from .projection import fe_model, projected
 from .reduced import ReducedModel
 
 #: M-norm of what is new in a vector, of the whole vector, below which it adds nothing
@@ -69,12 +69,12 @@ class Krylov(ReductionMethod):
     3
     """
 
-    inputs: Place | Iterable[Place]
+    inputs: Place | Iterable[Place] = field(metadata=checked(places))
     freq: FloatArray | float
-    moments: int = field(default=1, kw_only=True)
-    damping: Damping | None = field(default=None, kw_only=True)
+    moments: int = field(default=1, kw_only=True, metadata=checked(whole))
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         freq = np.atleast_1d(real_array(self.freq, "freq"))
         if freq.ndim > 1 or not freq.size or np.any(freq < 0):
             raise ModelError(
@@ -83,23 +83,9 @@ class Krylov(ReductionMethod):
             )
         if np.unique(freq).size < freq.size:
             raise ModelError("an expansion frequency is there twice: choose more moments.")
-        self._set(
-            inputs=tuple(places(self.inputs)),
-            freq=freq,
-            moments=whole(self.moments, "moments"),
-            damping=checked_damping(self.damping),
-        )
         if not self.inputs:
             raise ModelError("Krylov needs at least one input: the place of a load.")
-
-    def __repr__(self) -> str:
-        listed: Any = self.inputs
-        at = ", ".join(f"{f:g}" for f in np.atleast_1d(self.freq)[:4])
-        more = ", ..." if np.size(self.freq) > 4 else ""
-        return (
-            f"<Krylov: {counted(len(listed), 'input')}, {counted(self.moments, 'moment')} at "
-            f"{at}{more} Hz>"
-        )
+        self._set(freq=freq)
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model; `reduce` is the public way."""

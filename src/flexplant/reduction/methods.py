@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, Value
+from ..checks import FloatArray, Value, checked, instance
 from ..errors import FlexplantError, ModelError, ShapeError, counted
 from ..labels import DofSet, Place
 from ..modes.attachment_vectors import places
@@ -20,15 +20,17 @@ from ..parallel import Progress
 from ..structure import Damping, FEModel
 from ..structure.definite import refuse_unstable
 from .criteria import PivotedQr
-from .projection import checked_damping, labels_given, shown
+from .projection import labels_given, shown
 from .reduced import ReducedModel
 
 #: beyond this, rounding in K* (eps cond^2) spoils the low modes
 _CONDITION_LIMIT = 1e6
 #: part of the largest pivot above which a row of phi determines a mode of its own
 _TELLS = 1e-3
+_LAW = "Give ModalDamping or Rayleigh: ModalDamping(0.01) is 1 % in all modes."
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class ReductionMethod(Value):
     """The base class of methods from a structure to a reduced model.
 
@@ -38,6 +40,10 @@ class ReductionMethod(Value):
     >>> isinstance(fx.Guyan(["1:x"]), fx.reduction.ReductionMethod)
     True
     """
+
+    damping: Damping | None = field(
+        default=None, kw_only=True, metadata=checked(instance, kind=Damping, hint=_LAW)
+    )
 
     @abstractmethod
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
@@ -77,16 +83,8 @@ class DesiredDofs(ReductionMethod):
     ('1:x', '3:x')
     """
 
-    dofs: Iterable[str]
-    static_at: Place | Iterable[Place] = field(default=(), kw_only=True)
-    damping: Damping | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._set(
-            dofs=labels_given(self.dofs, "desired DOFs"),
-            static_at=tuple(places(self.static_at)),
-            damping=checked_damping(self.damping),
-        )
+    dofs: Iterable[str] = field(metadata=checked(labels_given, name="desired DOFs"))
+    static_at: Place | Iterable[Place] = field(default=(), kw_only=True, metadata=checked(places))
 
     def __repr__(self) -> str:
         labels = tuple(self.dofs)

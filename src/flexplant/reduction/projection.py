@@ -67,15 +67,15 @@ class Solver:
         return np.asarray(la.cho_solve(self._factor, loads * scale) * scale)
 
 
-def labels_given(dofs: Iterable[str], what: str) -> tuple[str, ...]:
+def labels_given(dofs: Iterable[str], name: str) -> tuple[str, ...]:
     """Return labels as a tuple, none of them twice."""
-    labels = name_list(dofs, what)
+    labels = name_list(dofs, name)
     if not labels:
-        raise LabelError(f"no {what} are given: name at least one DOF, such as '41:z'.")
+        raise LabelError(f"no {name} are given: name at least one DOF, such as '41:z'.")
     seen = set(labels)
     if len(seen) < len(labels):
         doubled = sorted(label for label in seen if labels.count(label) > 1)
-        raise LabelError(f"{what} {doubled} appear twice: what must be inverted would be singular.")
+        raise LabelError(f"{name} {doubled} appear twice: what must be inverted would be singular.")
     return labels
 
 
@@ -125,16 +125,6 @@ def modal_damping(
     force = M @ phi
     D = (force * (2 * zeta * omega)) @ force.T
     return np.asarray(0.5 * (D + D.T), dtype=np.float64)
-
-
-def checked_damping(damping: object) -> Damping | None:
-    """Return a damping law or None."""
-    if damping is None or isinstance(damping, Damping):
-        return damping
-    raise ModelError(
-        f"damping must be a ModalDamping or Rayleigh, got {type(damping).__name__}: "
-        "give ModalDamping(0.01) for 1 % in all modes."
-    )
 
 
 def projected(

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, IntArray, whole
+from ..checks import FloatArray, IntArray, checked, whole
 from ..errors import ModelError, counted
 from ..labels import Place
 from ..modes.attachment_vectors import attachment_vectors, labels_of, places, static_response
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
-from ..structure import Damping, FEModel, ModalDamping
+from ..structure import FEModel, ModalDamping
 from .bounds import ErrorBound
 from .condensation import kept_columns, mode_numbers
 from .methods import ReductionMethod
-from .projection import checked_damping, inner
+from .projection import inner
 from .ranking import channels, peak_gains, rank_modes
 from .reduced import STATIC, ReducedModel
 
@@ -71,31 +71,18 @@ class ModalTruncation(ReductionMethod):
     array([  0.  , 100.66])
     """
 
-    count: int | None = None
-    modes: Iterable[int] | None = field(default=None, kw_only=True)
-    static_at: Place | Iterable[Place] = field(default=(), kw_only=True)
-    inputs: Place | Iterable[Place] = field(default=(), kw_only=True)
-    outputs: Place | Iterable[Place] = field(default=(), kw_only=True)
-    damping: Damping | None = field(default=None, kw_only=True)
+    count: int | None = field(default=None, metadata=checked(whole))
+    modes: Iterable[int] | None = field(default=None, kw_only=True, metadata=checked(mode_numbers))
+    static_at: Place | Iterable[Place] = field(default=(), kw_only=True, metadata=checked(places))
+    inputs: Place | Iterable[Place] = field(default=(), kw_only=True, metadata=checked(places))
+    outputs: Place | Iterable[Place] = field(default=(), kw_only=True, metadata=checked(places))
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if (self.count is None) == (self.modes is None):
             raise ModelError(
                 "ModalTruncation needs count= (the lowest modes) or modes=, not both: give one."
             )
-        self._set(
-            count=None if self.count is None else whole(self.count, "count"),
-            modes=None if self.modes is None else mode_numbers(self.modes),
-            static_at=tuple(places(self.static_at)),
-            inputs=tuple(places(self.inputs)),
-            outputs=tuple(places(self.outputs)),
-            damping=checked_damping(self.damping),
-        )
-
-    def __repr__(self) -> str:
-        listed: Any = self.static_at
-        extra = f", static at {counted(len(listed), 'place')}" if listed else ""
-        return f"<ModalTruncation: {counted(len(self._numbers), 'mode')}{extra}>"
 
     @property
     def _numbers(self) -> tuple[int, ...]:
@@ -223,32 +210,18 @@ class ModalBalanced(ReductionMethod):
     array([  0.  , 100.66])
     """
 
-    count: int
-    inputs: Place | Iterable[Place]
-    outputs: Place | Iterable[Place] = field(default=(), kw_only=True)
-    among: int | None = field(default=None, kw_only=True)
-    static_at: Place | Iterable[Place] = field(default=(), kw_only=True)
-    damping: Damping | None = field(default=None, kw_only=True)
+    count: int = field(metadata=checked(whole))
+    inputs: Place | Iterable[Place] = field(metadata=checked(places))
+    outputs: Place | Iterable[Place] = field(default=(), kw_only=True, metadata=checked(places))
+    among: int | None = field(default=None, kw_only=True, metadata=checked(whole))
+    static_at: Place | Iterable[Place] = field(default=(), kw_only=True, metadata=checked(places))
 
     def __post_init__(self) -> None:
-        self._set(
-            count=whole(self.count, "count"),
-            inputs=tuple(places(self.inputs)),
-            outputs=tuple(places(self.outputs)),
-            among=None if self.among is None else whole(self.among, "among", minimum=self.count),
-            static_at=tuple(places(self.static_at)),
-            damping=checked_damping(self.damping),
-        )
+        super().__post_init__()
+        if self.among is not None:
+            whole(self.among, "among", minimum=self.count)
         if not self.inputs:
             raise ModelError("ModalBalanced needs inputs: the Hankel values are of channels.")
-
-    def __repr__(self) -> str:
-        into: Any = self.inputs
-        out: Any = self.outputs or self.inputs
-        return (
-            f"<ModalBalanced: {counted(self.count, 'mode')}, {counted(len(into), 'input')} to "
-            f"{counted(len(out), 'output')}>"
-        )
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the truncated model; `reduce` is the public way."""
