@@ -108,7 +108,7 @@ def _shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:g}"
     if sp.issparse(value) or (isinstance(value, np.ndarray) and value.size > 6):
-        return f"array {value.shape}"
+        return f"array {getattr(value, 'shape', '')}"
     if isinstance(value, tuple):
         listed = [_shown(part) for part in value]
         if len(listed) > 4:

@@ -211,7 +211,7 @@ def test_what_wrappers_refuse(make):
     plant, sensors, actuators = make(41)
     with pytest.raises(AssumptionError, match="no modes left out"):
         place_sensors(plant, sensors, 4, LeftOutModes())
-    with pytest.raises(ModelError, match="no machines"):
+    with pytest.raises(ModelError, match="at least one plant"):
         OverMachines(PoiVariance("die"), [])
     with pytest.raises(ModelError, match="does not depend on actuators"):
         place_actuators(plant, actuators, 4, AfterLoss(PoiVariance("die"), of="actuators"))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import FloatArray, positive, whole
+from ..checks import FloatArray, between, checked, whole
 from ..errors import ModelError, warn
 from ..parallel import Progress
 from ..work import Work
@@ -63,18 +63,18 @@ class BranchAndBound(Search):
     True
     """
 
-    gap: float = 0.0
-    branches: int = 20_000
-    starts: int = 4
-
-    def __post_init__(self) -> None:
-        self._set(
-            gap=positive(self.gap, "gap", zero=True),
-            branches=whole(self.branches, "branches", minimum=0),
-            starts=whole(self.starts, "starts"),
-        )
-        if self.gap >= 1:
-            raise ModelError(f"gap is a part of the value, below 1, got {self.gap:g}. Try 0.05.")
+    gap: float = field(
+        default=0.0,
+        metadata=checked(
+            between,
+            low=0.0,
+            high=1.0,
+            hint="It is a part of the value, below 1: try 0.05.",
+            ends="[",
+        ),
+    )
+    branches: int = field(default=20_000, metadata=checked(whole, minimum=0))
+    starts: int = field(default=4, metadata=checked(whole))
 
     def search(self, problem: Problem, work: Work) -> Found:
         """Return the best choice and the bound that was proven; see `Search.search`.

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..checks import FloatArray, flag, instance
+from ..checks import FloatArray, checked, flag, instance
 from ..errors import InfeasibleError, ModelError
 from ..plant import StandardPlant
 from ..reduction import EffectiveIndependence
@@ -53,12 +53,14 @@ class ByRows(Search):
     ('s1', 's3')
     """
 
-    method: SelectionCriterion = field(default_factory=EffectiveIndependence)
-    driving_point: bool = field(default=False, kw_only=True)
+    method: SelectionCriterion = field(
+        default_factory=EffectiveIndependence,
+        metadata=checked(instance, kind=SelectionCriterion, hint="Pass EffectiveIndependence()."),
+    )
+    driving_point: bool = field(default=False, kw_only=True, metadata=checked(flag))
 
     def __post_init__(self) -> None:
-        instance(self.method, SelectionCriterion, "method", "Pass EffectiveIndependence(), say.")
-        self._set(driving_point=flag(self.driving_point, "driving_point"))
+        super().__post_init__()
         if self.driving_point and not isinstance(self.method, EffectiveIndependence):
             raise ModelError("driving_point weights EffectiveIndependence(): leave one out.")
 
@@ -156,10 +158,7 @@ class ModeInformation(ByShapes):
     """
 
     sides: ClassVar[str] = "y"
-    elastic: bool = False
-
-    def __post_init__(self) -> None:
-        self._set(elastic=flag(self.elastic, "elastic"))
+    elastic: bool = field(default=False, metadata=checked(flag))
 
     def of(self, plant: StandardPlant, shapes: Shapes) -> ModeRows:
         """Return the information of choices."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ..checks import FloatArray, short
+from ..checks import FloatArray, checked, instance
 from ..errors import AssumptionError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..reduction import ReducedModel
@@ -173,14 +173,9 @@ class KineticEnergy(ByShapes):
     ('s1', 's3')
     """
 
-    model: Any = None
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.model, FEModel | ReducedModel | None):
-            raise ModelError(f"model must be an FEModel, got {short(self.model)}. Pass one.")
-
-    def __repr__(self) -> str:
-        return f"KineticEnergy({'' if self.model is None else 'model=...'})"
+    model: Any = field(
+        default=None, metadata=checked(instance, kind=FEModel | ReducedModel, hint="Pass one.")
+    )
 
     def of(self, plant: StandardPlant, shapes: Shapes) -> SummedWorth:
         """Return the energy of choices."""

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, positive, short
-from ..errors import ModelError
+from ..checks import FloatArray, checked, mapping, positive
 from ..estimation import design_kalman
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import control_dare
@@ -25,6 +24,8 @@ from .poi_axes import measured_rows, plain, poi_rows, pushed_columns, sensor_row
 from .poi_lqr import MotionAndEffort, confirmed
 from .poi_variance import PoiVariance
 from .quadratic import Quadratic, measured, quadratic
+
+_WEIGHTS = "Type HinfLevel(z={'die:z': 1e9}, w={'amp1': 1e-3})."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -280,28 +281,10 @@ class HinfLevel(Criterion):
     (0.1, 1e-09)
     """
 
-    z: Mapping[str, Any] = field(default_factory=dict)
-    w: Mapping[str, Any] = field(default_factory=dict)
-    effort: float = field(default=1.0, kw_only=True)
-    noise: float = field(default=1.0, kw_only=True)
-
-    def __post_init__(self) -> None:
-        for weights in (self.z, self.w):
-            if not isinstance(weights, Mapping):
-                raise ModelError(
-                    f"weights are a mapping from channel to weight, got {short(weights)}. Type "
-                    "HinfLevel(z={'die:z': 1e9}, w={'amp1': 1e-3})."
-                )
-        self._set(
-            z=dict(self.z),
-            w=dict(self.w),
-            effort=positive(self.effort, "effort"),
-            noise=positive(self.noise, "noise"),
-        )
-
-    def __repr__(self) -> str:
-        channels = ", ".join([*self.z, *self.w])
-        return f"HinfLevel({channels}, effort={self.effort:g}, noise={self.noise:g})"
+    z: Mapping[str, Any] = field(default_factory=dict, metadata=checked(mapping, hint=_WEIGHTS))
+    w: Mapping[str, Any] = field(default_factory=dict, metadata=checked(mapping, hint=_WEIGHTS))
+    effort: float = field(default=1.0, kw_only=True, metadata=checked(positive))
+    noise: float = field(default=1.0, kw_only=True, metadata=checked(positive))
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return the level that was reached and verified on a plant.

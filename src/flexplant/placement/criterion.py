@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ..checks import FloatArray, Value, function, short, with_unit
+from ..checks import FloatArray, Value, checked, function, short, with_unit
 from ..errors import FlexplantError, ModelError
 from ..estimation.estimator_channels import sensors
 from ..plant import StandardPlant
@@ -217,10 +217,9 @@ class Wrapping(Criterion):
         When it is not callable.
     """
 
-    criterion: Any
-
-    def __post_init__(self) -> None:
-        function(self.criterion, "a criterion", "Pass PoiVariance(), say.")
+    criterion: Any = field(
+        metadata=checked(function, name="a criterion", hint="Pass PoiVariance(), say.")
+    )
 
     @property
     def inner(self) -> Criterion:

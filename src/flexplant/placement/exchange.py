@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, function, whole
+from ..checks import FloatArray, checked, function, whole
 from ..work import Work
 from .layouts import layouts_of
 from .problem import Found, Problem, Search
@@ -50,10 +50,7 @@ class Exchange(Search):
     ('s1', 's3')
     """
 
-    starts: int = 10
-
-    def __post_init__(self) -> None:
-        self._set(starts=whole(self.starts, "starts"))
+    starts: int = field(default=10, metadata=checked(whole))
 
     def search(self, problem: Problem, work: Work) -> Found:
         """Return the best of all starts, bounded by relaxation; see `Search.search`."""
@@ -215,16 +212,11 @@ class Screened(Search):
     ('s1',)
     """
 
-    by: Any
-    keep: int = field(default=40, kw_only=True)
-    starts: int = field(default=6, kw_only=True)
-
-    def __post_init__(self) -> None:
-        function(self.by, "by, a criterion,", "Pass PoiVariance(), say.")
-        self._set(keep=whole(self.keep, "keep"), starts=whole(self.starts, "starts"))
-
-    def __repr__(self) -> str:
-        return f"Screened({self.by!r}, keep={self.keep})"
+    by: Any = field(
+        metadata=checked(function, name="by, a criterion,", hint="Pass PoiVariance(), say.")
+    )
+    keep: int = field(default=40, kw_only=True, metadata=checked(whole))
+    starts: int = field(default=6, kw_only=True, metadata=checked(whole))
 
     def search(self, problem: Problem, work: Work) -> Found:
         """Return the best of the first few, bounded by relaxation; see `Search.search`."""

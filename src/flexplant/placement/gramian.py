@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ..checks import FloatArray, one_of
+from ..checks import FloatArray, checked, one_of
 from ..errors import ModelError
 from ..plant import StandardPlant
 from ..plant.realisation import ModalRealisation
@@ -40,10 +40,7 @@ class ModalGramian(Criterion):
     """
 
     scale: ClassVar[float] = 1.0
-    measure: str = "log det"
-
-    def __post_init__(self) -> None:
-        self._set(measure=one_of(self.measure, "measure", MEASURES))
+    measure: str = field(default="log det", metadata=checked(one_of, choices=MEASURES))
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return minus the measure: infinite where a mode is missed, for log det."""
@@ -183,10 +180,7 @@ class SensorIndices(ByShapes):
     ('s1', 's3')
     """
 
-    norm: str = "h2"
-
-    def __post_init__(self) -> None:
-        self._set(norm=one_of(self.norm, "norm", ("h2", "hinf", "hankel")))
+    norm: str = field(default="h2", metadata=checked(one_of, choices=("h2", "hinf", "hankel")))
 
     def of(self, plant: StandardPlant, shapes: Shapes) -> SummedWorth:
         """Return the indices of choices."""

@@ -5,11 +5,21 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Value, name_list, one_of, positive, real_array, short, whole
+from ..checks import (
+    FloatArray,
+    Value,
+    checked,
+    mapping,
+    name_list,
+    number,
+    one_of,
+    positive,
+    short,
+    whole,
+)
 from ..errors import LabelError, ModelError
 from .candidates import Places, Zone
 from .rows import LinearRows
@@ -34,17 +44,12 @@ class Constraint(Value):
         return ()
 
 
-def limits(at_least: Any, at_most: Any) -> tuple[int | None, int | None]:
-    """Return two counts, checked; None where there is no limit."""
-    low, high = (
-        None if n is None else whole(n, name, minimum=0)
-        for n, name in ((at_least, "at_least"), (at_most, "at_most"))
-    )
+def check_limits(low: int | None, high: int | None) -> None:
+    """Raise ModelError when no count is within two limits; None is no limit."""
     if low is not None and high is not None and low > high:
         raise ModelError(
             f"at_least {low} is above at_most {high}: no choice is both. Exchange them."
         )
-    return low, high
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +126,8 @@ class Mirrored(Constraint):
     ('s1', 's3')
     """
 
-    axis: str
-    at: float
-
-    def __post_init__(self) -> None:
-        self._set(axis=one_of(self.axis, "axis", "xyz"), at=float(real_array(self.at, "at", ())))
+    axis: str = field(metadata=checked(one_of, choices="xyz"))
+    at: float = field(metadata=checked(number))
 
     def rows(self, places: Places) -> LinearRows:
         """Return x_i - x_j = 0 for images, x_i <= 0 without one."""
@@ -171,13 +173,13 @@ class Among(Constraint):
     ('s3',)
     """
 
-    names: Sequence[str]
-    at_least: int | None = field(default=None, kw_only=True)
-    at_most: int | None = field(default=None, kw_only=True)
+    names: Sequence[str] = field(metadata=checked(name_list))
+    at_least: int | None = field(default=None, kw_only=True, metadata=checked(whole, minimum=0))
+    at_most: int | None = field(default=None, kw_only=True, metadata=checked(whole, minimum=0))
 
     def __post_init__(self) -> None:
-        low, high = limits(self.at_least, self.at_most)
-        self._set(names=name_list(self.names, "names"), at_least=low, at_most=high)
+        super().__post_init__()
+        check_limits(self.at_least, self.at_most)
 
     def rows(self, places: Places) -> LinearRows:
         """Return the count of them between its limits."""
@@ -224,21 +226,16 @@ class Budget(Constraint):
     ('s3',)
     """
 
-    total: float
-    costs: Mapping[str, float] = field(default_factory=dict)
-    default: float = field(default=1.0, kw_only=True)
+    total: float = field(metadata=checked(positive, zero=True))
+    costs: Mapping[str, float] = field(
+        default_factory=dict, metadata=checked(mapping, hint="Give {name: cost}.")
+    )
+    default: float = field(default=1.0, kw_only=True, metadata=checked(positive, zero=True))
 
     def __post_init__(self) -> None:
-        if not isinstance(self.costs, Mapping):
-            raise ModelError(f"costs are a mapping from name to cost, got {short(self.costs)}.")
-        self._set(
-            total=positive(self.total, "total", zero=True),
-            costs={
-                str(name): positive(cost, f"cost of {name!r}", zero=True)
-                for name, cost in self.costs.items()
-            },
-            default=positive(self.default, "default", zero=True),
-        )
+        super().__post_init__()
+        given = self.costs.items()
+        self._set(costs={str(n): positive(cost, f"cost of {n!r}", zero=True) for n, cost in given})
 
     def rows(self, places: Places) -> LinearRows:
         """Return the sum of costs, at most the total."""

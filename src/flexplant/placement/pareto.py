@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Rng, Value, positive, real_array, short
+from ..checks import FloatArray, Rng, Value, positive, short
 from ..errors import InfeasibleError, ModelError
 from ..plant import Actuator, StandardPlant
 from .candidates import checked_plant
@@ -49,13 +49,6 @@ class ParetoCurve(Value):
     placements: Sequence[Placement]
     bounds: FloatArray
     by_cost: bool = False
-
-    def __post_init__(self) -> None:
-        self._set(
-            amounts=real_array(self.amounts, "amounts", (None,)),
-            placements=tuple(self.placements),
-            bounds=np.asarray(self.bounds, dtype=np.float64),
-        )
 
     def __repr__(self) -> str:
         what = "cost" if self.by_cost else "count"

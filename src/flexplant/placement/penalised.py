@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, function, one_of, positive
+from ..checks import FloatArray, checked, function, one_of, positive
 from ..errors import AssumptionError
 from ..plant import StandardPlant, larger_plant
 from ..tolerances import TINY
@@ -66,14 +66,7 @@ class LeftOutModes(Criterion):
 
     scale: ClassVar[float] = 1e-6
     larger: Any = None
-    of: str = field(default="sensors", kw_only=True)
-
-    def __post_init__(self) -> None:
-        one_of(self.of, "of", SIDES)
-
-    def __repr__(self) -> str:
-        given = ["larger=..."] if self.larger is not None else []
-        return f"LeftOutModes({', '.join([*given, f'of={self.of!r}'])})"
+    of: str = field(default="sensors", kw_only=True, metadata=checked(one_of, choices=SIDES))
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return the share of the plant's own sensors or actuators."""
@@ -153,12 +146,11 @@ class Penalised(Wrapping):
     """
 
     penalty: Any = None
-    weight: float = 1.0
+    weight: float = field(default=1.0, metadata=checked(positive))
 
     def __post_init__(self) -> None:
         super().__post_init__()
         function(self.penalty, "a penalty", "Name one.")
-        self._set(weight=positive(self.weight, "weight"))
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return it on a plant."""

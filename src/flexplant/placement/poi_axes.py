@@ -19,24 +19,24 @@ from .candidates import with_side
 Named: TypeAlias = "str | Sequence[str] | Mapping[str, float] | None"
 
 
-def checked_names(given: Any, what: str) -> tuple[str, ...] | Mapping[str, float] | None:
+def checked_names(given: Any, name: str) -> tuple[str, ...] | Mapping[str, float] | None:
     """Return names as a tuple, or as a mapping to factors; None stays None."""
     if given is None:
         return None
     if isinstance(given, Mapping):
-        named = {str(a): positive(f, f"factor of {what} {a!r}") for a, f in given.items()}
+        named = {str(a): positive(f, f"factor of {name} {a!r}") for a, f in given.items()}
     elif isinstance(given, str | Sequence):
         listed = (given,) if isinstance(given, str) else tuple(str(a) for a in given)
         if len(set(listed)) != len(listed):
-            raise LabelError(f"{what} {listed} twice: name each once, with a factor.")
+            raise LabelError(f"{name} {listed} twice: name each once, with a factor.")
         named = dict.fromkeys(listed, 1.0)
     else:
         raise ModelError(
-            f"{what} is a name, several, or a mapping to factors, got {short(given)}. Type "
+            f"{name} is a name, several, or a mapping to factors, got {short(given)}. Type "
             "('die', 'lens'), say."
         )
     if not named:
-        raise LabelError(f"a criterion without any {what} has nothing to sum over: name one.")
+        raise LabelError(f"a criterion without any {name} has nothing to sum over: name one.")
     return named if isinstance(given, Mapping) else tuple(named)
 
 

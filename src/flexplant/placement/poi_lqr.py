@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, positive
+from ..checks import FloatArray, IntArray, checked, positive
 from ..errors import CertificateError, SolverError
 from ..lti.discretisation import held_exactly
 from ..lti.lyapunov import solve_stein
@@ -35,16 +35,9 @@ from .quadratic import quadratic
 class MotionAndEffort(Criterion):
     """A mean square of the motion of POIs and of the effort; the base of such criteria."""
 
-    poi: Named = None
-    axes: Named = field(default=None)
-    effort: float = field(default=1e-9, kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._set(
-            poi=checked_names(self.poi, "POI"),
-            axes=checked_names(self.axes, "axis"),
-            effort=positive(self.effort, "effort"),
-        )
+    poi: Named = field(default=None, metadata=checked(checked_names, name="POI"))
+    axes: Named = field(default=None, metadata=checked(checked_names, name="axis"))
+    effort: float = field(default=1e-9, kw_only=True, metadata=checked(positive))
 
     def __repr__(self) -> str:
         given = [*shown(self.poi, self.axes), f"effort={self.effort:g}"]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, flag, one_of, short
+from ..checks import FloatArray, checked, flag, instance, one_of
 from ..errors import AssumptionError, ModelError
 from ..estimation import Filter, FixedLag, KalmanEstimator, Predictor, design_kalman
 from ..modes import Modes
@@ -30,6 +30,9 @@ from .poi_axes import (
     unit_of,
 )
 from .quadratic import WorstRow, quadratic
+
+_LAGS = "The end of a record does not depend on a sample: pass one of these."
+_STRUCTURES = "Every choice of sensors gets a plant of its own: pass a structure."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -80,34 +83,29 @@ class PoiVariance(Criterion):
     """
 
     sides = "y"
-    poi: Named = None
-    axes: Named = field(default=None)
-    measure: str = field(default="sum", kw_only=True)
-    lag: Predictor | Filter | FixedLag | None = field(default=None, kw_only=True)
-    larger: Any = field(default=None, kw_only=True)
-    own_modes: bool = field(default=False, kw_only=True)
+    poi: Named = field(default=None, metadata=checked(checked_names, name="POI"))
+    axes: Named = field(default=None, metadata=checked(checked_names, name="axis"))
+    measure: str = field(
+        default="sum", kw_only=True, metadata=checked(one_of, choices=("sum", "max"))
+    )
+    lag: Predictor | Filter | FixedLag | None = field(
+        default=None,
+        kw_only=True,
+        metadata=checked(instance, kind=Predictor | Filter | FixedLag, hint=_LAGS),
+    )
+    larger: Any = field(
+        default=None,
+        kw_only=True,
+        metadata=checked(instance, kind=FEModel | Modes | ReducedModel, hint=_STRUCTURES),
+    )
+    own_modes: bool = field(default=False, kw_only=True, metadata=checked(flag))
 
     def __post_init__(self) -> None:
-        self._set(
-            poi=checked_names(self.poi, "POI"),
-            axes=checked_names(self.axes, "axis"),
-            measure=one_of(self.measure, "measure", ("sum", "max")),
-            own_modes=flag(self.own_modes, "own_modes"),
-        )
-        if not isinstance(self.lag, Predictor | Filter | FixedLag | None):
-            raise ModelError(
-                f"lag must be Predictor(), Filter() or FixedLag(samples), got {short(self.lag)}: "
-                "the end of a record does not depend on a sample. Pass one of them."
-            )
+        super().__post_init__()
         if self.larger is not None and (self.own_modes or self._lagging):
             raise ModelError(
                 "larger= gives modes left out, own_modes=True (and a predictor or lag) leaves "
                 "them: pass one."
-            )
-        if not isinstance(self.larger, FEModel | Modes | ReducedModel | None):
-            raise ModelError(
-                f"larger must be a structure, got {short(self.larger)}: every choice of sensors "
-                "gets a plant of its own. Pass Modes, an FEModel or a ReducedModel."
             )
 
     def __repr__(self) -> str:

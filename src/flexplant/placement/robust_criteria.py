@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, one_of, short
+from ..checks import FloatArray, checked, one_of, short
 from ..errors import FlexplantError, ModelError
 from ..plant import StandardPlant
 from .candidates import SIDES, Port, checked_plant, side_of, sides_of, with_side
@@ -16,6 +16,16 @@ from .criterion import Scorer, Wrapping
 from .layouts import RigidPart
 
 _MEASURES = ("worst", "mean")
+
+
+def _plants(machines: Any, name: str) -> tuple[StandardPlant, ...]:
+    """Return the machines of a criterion, one at least."""
+    if isinstance(machines, str) or not isinstance(machines, Sequence) or not machines:
+        raise ModelError(
+            f"{name} are a list of at least one plant, got {short(machines)}. Pass "
+            "plant.uncertain(fit).sample(rng, 20), say."
+        )
+    return tuple(checked_plant(machine) for machine in machines)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,20 +80,8 @@ class OverMachines(Wrapping):
     ('s1',)
     """
 
-    machines: Sequence[StandardPlant]
-    measure: str = field(default="worst", kw_only=True)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if isinstance(self.machines, str) or not isinstance(self.machines, Sequence):
-            raise ModelError(
-                f"machines are a list of plants, got {short(self.machines)}. Pass "
-                "plant.uncertain(fit).sample(rng, 20), say."
-            )
-        if not self.machines:
-            raise ModelError("there are no machines: give at least one plant.")
-        machines = tuple(checked_plant(machine) for machine in self.machines)
-        self._set(machines=machines, measure=one_of(self.measure, "measure", _MEASURES))
+    machines: Sequence[StandardPlant] = field(metadata=checked(_plants))
+    measure: str = field(default="worst", kw_only=True, metadata=checked(one_of, choices=_MEASURES))
 
     def __repr__(self) -> str:
         return f"OverMachines({self.criterion!r}, {len(self.machines)} machines, {self.measure!r})"
@@ -161,13 +159,8 @@ class AfterLoss(Wrapping):
     True
     """
 
-    of: str = field(default="sensors", kw_only=True)
-    measure: str = field(default="worst", kw_only=True)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        one_of(self.of, "of", SIDES)
-        one_of(self.measure, "measure", _MEASURES)
+    of: str = field(default="sensors", kw_only=True, metadata=checked(one_of, choices=SIDES))
+    measure: str = field(default="worst", kw_only=True, metadata=checked(one_of, choices=_MEASURES))
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return it for the devices of a plant: infinite where the others do not suffice."""

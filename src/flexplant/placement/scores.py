@@ -320,9 +320,6 @@ class DeviceWorth(Value):
     without: FloatArray
     unit: str = ""
 
-    def __post_init__(self) -> None:
-        self._set(names=tuple(self.names), without=self.without)
-
     def __repr__(self) -> str:
         lines = [f"<DeviceWorth: {in_words(self.value, self.unit)} with all>"]
         order = np.argsort(-self.without, kind="stable").tolist()

@@ -57,9 +57,6 @@ class SensorMap(Value):
     excluded: Sequence[Rectangle | Disc] = ()
     unit: str = ""
 
-    def __post_init__(self) -> None:
-        self._set(points=self.points, values=self.values, excluded=tuple(self.excluded))
-
     def __repr__(self) -> str:
         x, y, z = self.best
         return (

@@ -8,12 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import positive, real_array, short
+from ..checks import checked, number, positive, short, whole
 from ..errors import ModelError
 from ..structure import Disc
 from .candidates import Places, Zone
-from .groups import Constraint, limits
+from .groups import Constraint, check_limits
 from .rows import LinearRows
+
+
+def _zones(given: Any, name: str) -> tuple[Zone, ...]:
+    listed = (given,) if isinstance(given, Zone) or not isinstance(given, Sequence) else given
+    for zone in listed:
+        if not isinstance(zone, Zone):
+            raise ModelError(
+                f"{name} is a Rectangle or a Disc, got {short(zone)}. Type "
+                "Disc((0.3, 0.3), radius=0.05)."
+            )
+    if not listed:
+        raise ModelError(f"there is no zone: {name} is a Rectangle or a Disc. Give one.")
+    return tuple(listed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +53,7 @@ class Excluded(Constraint):
     ('s3',)
     """
 
-    zones: Zone | Sequence[Zone]
-
-    def __post_init__(self) -> None:
-        self._set(zones=_zones(self.zones, "an excluded zone"))
+    zones: Zone | Sequence[Zone] = field(metadata=checked(_zones, name="an excluded zone"))
 
     def rows(self, places: Places) -> LinearRows:
         """Return x_i <= 0 inside."""
@@ -81,10 +91,7 @@ class OffPoi(Constraint):
     ('s2',)
     """
 
-    radius: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._set(radius=float(real_array(self.radius, "radius", ())))
+    radius: float = field(default=0.0, metadata=checked(number))
 
     def rows(self, places: Places) -> LinearRows:
         """Return x_i <= 0 near a POI."""
@@ -126,33 +133,20 @@ class Within(Constraint):
     ('s3',)
     """
 
-    zones: Zone | Sequence[Zone]
-    at_least: int | None = field(default=None, kw_only=True)
-    at_most: int | None = field(default=None, kw_only=True)
+    zones: Zone | Sequence[Zone] = field(metadata=checked(_zones, name="a zone"))
+    at_least: int | None = field(default=None, kw_only=True, metadata=checked(whole, minimum=0))
+    at_most: int | None = field(default=None, kw_only=True, metadata=checked(whole, minimum=0))
 
     def __post_init__(self) -> None:
-        low, high = limits(self.at_least, self.at_most)
-        self._set(zones=_zones(self.zones, "a zone"), at_least=low, at_most=high)
+        super().__post_init__()
+        check_limits(self.at_least, self.at_most)
 
     def rows(self, places: Places) -> LinearRows:
-        """Return the count inside between its limits, or x_i <= 0 outside."""
+        """Return the count inside between its check_limits, or x_i <= 0 outside."""
         inside = places.inside(_listed(self.zones))
         if self.at_least is None and self.at_most is None:
             return LinearRows.closed(inside == 0)
         return LinearRows.counted(inside, self.at_least, self.at_most)
-
-
-def _zones(given: Any, what: str) -> tuple[Zone, ...]:
-    listed = (given,) if isinstance(given, Zone) or not isinstance(given, Sequence) else given
-    for zone in listed:
-        if not isinstance(zone, Zone):
-            raise ModelError(
-                f"{what} is a Rectangle or a Disc, got {short(zone)}. Type "
-                "Disc((0.3, 0.3), radius=0.05)."
-            )
-    if not listed:
-        raise ModelError(f"there is no zone: {what} is a Rectangle or a Disc. Give one.")
-    return tuple(listed)
 
 
 def _listed(zones: Zone | Sequence[Zone]) -> tuple[Zone, ...]:
@@ -183,10 +177,7 @@ class MinimumDistance(Constraint):
     ('s1', 's3')
     """
 
-    distance: float
-
-    def __post_init__(self) -> None:
-        self._set(distance=positive(self.distance, "distance"))
+    distance: float = field(metadata=checked(positive))
 
     def rows(self, places: Places) -> LinearRows:
         """Return x_i + x_j <= 1 for each pair that is too close."""
