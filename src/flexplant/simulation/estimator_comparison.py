@@ -49,9 +49,6 @@ class EstimatorComparison(Value):
     errors: FloatArray
     level: float
 
-    def __post_init__(self) -> None:
-        self._set(names=tuple(self.names), errors=self.errors)
-
     def __getitem__(self, name: str) -> FloatArray:
         require_known("estimator", [name], self.names)
         found: FloatArray = self.errors[self.names.index(name)]

@@ -59,9 +59,6 @@ class ExposureErrors(Value):
     values: FloatArray
     window: float
 
-    def __post_init__(self) -> None:
-        self._set(channels=tuple(self.channels), units=tuple(self.units), values=self.values)
-
     def __getitem__(self, channel: str) -> ExposureFigures:
         require_known("channel", [channel], self.channels)
         return ExposureFigures(*self.values[self.channels.index(channel)].tolist())

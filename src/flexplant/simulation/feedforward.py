@@ -71,11 +71,6 @@ class Feedforward(Value):
     gains: FloatArray
     dt: float
 
-    def __post_init__(self) -> None:
-        self._set(
-            axes=tuple(self.axes), actuators=tuple(self.actuators), T=self.T, gains=self.gains
-        )
-
     def __repr__(self) -> str:
         places = f", {counted(len(self.gains), 'place')}" if len(self.gains) > 1 else ""
         driven = counted(len(self.actuators), "actuator")

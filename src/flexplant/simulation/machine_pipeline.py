@@ -236,7 +236,7 @@ class MachinePipeline(Value):
             )
             row = self._row(report)
         row["warnings"] = len(said)
-        return report.replace(row=row, warned=[str(one.message) for one in said])
+        return report.replace(row=row, warned=tuple(str(one.message) for one in said))
 
     def _measured(self, machine: Any, rng: Any) -> MeasuredModes:
         """Return the modes of a machine; those of an FRF without numbers."""
@@ -391,9 +391,6 @@ class MachineReport(Value):
     verdict: Verdict | None = None
     places: Localisation | None = None
     warned: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        self._set(row=dict(self.row), blocks=tuple(self.blocks), warned=tuple(self.warned))
 
     def __repr__(self) -> str:
         sections: dict[str, Sequence[Any]] = {

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..checks import FloatArray, Value, instance, positive, real_array, short, whole
+from ..checks import FloatArray, Value, checked, instance, positive, real_array, short, whole
 from ..errors import ModelError, require_known, unknown_label
 from ..loop import ClosedLoop
 from ..loop.blocks import with_known
 from ..plant import StandardPlant
 from ..tolerances import divisor
+
+
+def _limit(value: Any, name: str) -> float:
+    """Return a limit, which may be infinite."""
+    return np.inf if isinstance(value, float) and value == np.inf else positive(value, name)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,15 +49,13 @@ class Saturation(Value):
     0.001
     """
 
-    limit: float = np.inf
-    rate: float | None = None
+    limit: float = field(default=np.inf, metadata=checked(_limit))
+    rate: float | None = field(default=None, metadata=checked(positive))
 
     def __post_init__(self) -> None:
-        limit = self.limit if _is_infinite(self.limit) else positive(self.limit, "limit")
-        rate = None if self.rate is None else positive(self.rate, "rate")
-        if limit == np.inf and rate is None:
+        super().__post_init__()
+        if self.limit == np.inf and self.rate is None:
             raise ModelError("a Saturation without limits does nothing: give limit, rate or both.")
-        self._set(limit=limit, rate=rate)
 
     def __repr__(self) -> str:
         rate = "" if self.rate is None else f", rate {self.rate:g}/s"
@@ -85,13 +88,7 @@ class Quantiser(Value):
     True
     """
 
-    step: float
-
-    def __post_init__(self) -> None:
-        self._set(step=positive(self.step, "step"))
-
-    def __repr__(self) -> str:
-        return f"<Quantiser: step {self.step:g}>"
+    step: float = field(metadata=checked(positive))
 
 
 #: what may act on a channel: one, or a quantiser and a saturation together
@@ -172,10 +169,6 @@ def _listed(name: str, element: Any) -> list[Saturation | Quantiser]:
     if len(set(kinds)) < len(kinds):
         raise ModelError(f"{name!r} has two elements of one kind: give the tighter one.")
     return listed
-
-
-def _is_infinite(limit: object) -> bool:
-    return isinstance(limit, float) and limit == np.inf
 
 
 class Conditions(NamedTuple):

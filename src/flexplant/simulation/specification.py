@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Value, in_unit, instance, positive, short
+from ..checks import FloatArray, Value, checked, in_unit, instance, positive, short
 from ..errors import AssumptionError, ModelError, require_known
 from ..loop import ClosedLoop, bandwidth
 from .exposure import exposure_errors, settling_time
@@ -16,6 +16,13 @@ from .response import Response
 
 #: limits that need a run, in the order of the table
 _OF_RUNS = ("ma", "msd", "rms", "peak", "settling", "effort")
+
+
+def _efforts(value: Any, name: str) -> float | dict[str, float]:
+    """Return the limit of all actuators, or that of each."""
+    if isinstance(value, Mapping):
+        return {n: positive(limit, f"{name} of {n}") for n, limit in value.items()}
+    return positive(value, name)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,15 +57,6 @@ class Verdict(Value):
     values: FloatArray
     limits: FloatArray
     at_least: Any
-
-    def __post_init__(self) -> None:
-        self._set(
-            names=tuple(self.names),
-            units=tuple(self.units),
-            values=self.values,
-            limits=self.limits,
-            at_least=np.asarray(self.at_least, dtype=bool),
-        )
 
     def __bool__(self) -> bool:
         return self.passed
@@ -147,31 +145,27 @@ class Specification(Value):
     True
     """
 
-    ma: float | None = None
-    msd: float | None = None
-    rms: float | None = None
-    peak: float | None = None
-    settling: float | None = None
-    effort: float | Mapping[str, float] | None = None
-    noise: float | None = None
-    bandwidth: float | None = None
-    modulus_margin: float | None = None
+    ma: float | None = field(default=None, metadata=checked(positive))
+    msd: float | None = field(default=None, metadata=checked(positive))
+    rms: float | None = field(default=None, metadata=checked(positive))
+    peak: float | None = field(default=None, metadata=checked(positive))
+    settling: float | None = field(default=None, metadata=checked(positive))
+    effort: float | Mapping[str, float] | None = field(default=None, metadata=checked(_efforts))
+    noise: float | None = field(default=None, metadata=checked(positive))
+    bandwidth: float | None = field(default=None, metadata=checked(positive))
+    modulus_margin: float | None = field(default=None, metadata=checked(positive))
     channel: str = "die:error"
-    window: float = 5e-3
-    start: float = 0.0
+    window: float = field(default=5e-3, metadata=checked(positive))
+    start: float = field(default=0.0, metadata=checked(positive, zero=True))
 
     def __post_init__(self) -> None:
-        single = ("ma", "msd", "rms", "peak", "settling", "noise", "bandwidth", "modulus_margin")
-        for name in single:
-            if getattr(self, name) is not None:
-                self._set(**{name: positive(getattr(self, name), name)})
-        if isinstance(self.effort, Mapping):
-            self._set(effort={n: positive(v, f"effort of {n}") for n, v in self.effort.items()})
-        elif self.effort is not None:
-            self._set(effort=positive(self.effort, "effort"))
-        window, start = positive(self.window, "window"), positive(self.start, "start", zero=True)
-        self._set(window=window, start=start)
-        if all(getattr(self, name) is None for name in (*single, "effort")):
+        super().__post_init__()
+        limits = {
+            name: v
+            for name, v in self._fields().items()
+            if name not in ("channel", "window", "start")
+        }
+        if all(limit is None for limit in limits.values()):
             raise ModelError("a specification needs at least one limit: Specification(ma=5e-9).")
         if self.settling is not None and self.ma is None:
             raise ModelError("settling is the time to reach ma (and msd): give ma as well.")

@@ -196,9 +196,6 @@ class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
     columns: Mapping[str, npt.NDArray[Any]]
     failed: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        self._set(columns=dict(self.columns), failed=tuple(self.failed))
-
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         if name == "failed":
             return np.array(self.failed, dtype=np.str_)
