@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import Value, positive
+from ...checks import Value, checked, positive
 from ...errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, SolverError
 from ...lti.equations import OnAxisError
 from ...lti.interconnection import lft
@@ -82,18 +82,10 @@ class Riccati(Value):
     True
     """
 
-    back_off: float | None = None
-    tolerance: float = 1e-3
+    back_off: float | None = field(default=None, metadata=checked(positive, zero=True))
+    tolerance: float = field(default=1e-3, metadata=checked(positive))
     regularised: bool | None = None
     progress: bool | None = None
-
-    def __post_init__(self) -> None:
-        self._set(
-            back_off=None
-            if self.back_off is None
-            else positive(self.back_off, "back_off", zero=True),
-            tolerance=positive(self.tolerance, "tolerance"),
-        )
 
     def solve(self, problem: Prepared) -> SolvedController:
         """Return the controller of a prepared problem.

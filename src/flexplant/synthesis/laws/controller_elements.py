@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...checks import positive, real_array, whole
+from ...checks import checked, number, positive, whole
 from ...errors import ModelError
 from .law import Section, SingleElement
 
@@ -29,19 +29,18 @@ class Pid(SingleElement):
     Pid p 2 i 1 /s d 0.1 s pole 100 Hz
     """
 
-    p: float
-    i: float = 0.0
-    d: float = 0.0
-    pole: float | None = None
+    p: float = field(metadata=checked(number))
+    i: float = field(default=0.0, metadata=checked(number))
+    d: float = field(default=0.0, metadata=checked(number))
+    pole: float | None = field(default=None, metadata=checked(positive))
 
     def __post_init__(self) -> None:
-        gains = {name: float(real_array(getattr(self, name), name, ())) for name in "pid"}
-        if gains["d"] and self.pole is None:
+        super().__post_init__()
+        if self.d and self.pole is None:
             raise ModelError(
                 "a derivative without a pole has unbounded gain, and no system: give pole= [Hz], "
                 "some 3 to 10 times the bandwidth."
             )
-        self._set(**gains, pole=None if self.pole is None else positive(self.pole, "pole"))
 
     @classmethod
     def corners(
@@ -68,7 +67,7 @@ class Pid(SingleElement):
         ModelError
             When one of zero and pole is missing, or a number is not positive.
         """
-        k = float(real_array(gain, "gain", ()))
+        k = number(gain, "gain")
         w_i = 2.0 * np.pi * positive(integrator, "integrator", zero=True)
         if zero is None and pole is None:
             return cls(k, k * w_i)
@@ -122,11 +121,8 @@ class Lead(SingleElement):
     Lead 50 Hz ratio 9
     """
 
-    freq: float
-    ratio: float = 9.0
-
-    def __post_init__(self) -> None:
-        self._set(freq=positive(self.freq, "freq"), ratio=positive(self.ratio, "ratio"))
+    freq: float = field(metadata=checked(positive))
+    ratio: float = field(default=9.0, metadata=checked(positive))
 
     def __repr__(self) -> str:
         return f"Lead {self.freq:g} Hz ratio {self.ratio:g}"
@@ -158,16 +154,9 @@ class Notch(SingleElement):
     Notch 130 Hz depth 0.1 width 0.2
     """
 
-    freq: float
-    depth: float = 0.05
-    width: float = 0.3
-
-    def __post_init__(self) -> None:
-        self._set(
-            freq=positive(self.freq, "freq"),
-            depth=positive(self.depth, "depth", zero=True),
-            width=positive(self.width, "width"),
-        )
+    freq: float = field(metadata=checked(positive))
+    depth: float = field(default=0.05, metadata=checked(positive, zero=True))
+    width: float = field(default=0.3, metadata=checked(positive))
 
     def __repr__(self) -> str:
         return f"Notch {self.freq:.4g} Hz depth {self.depth:g} width {self.width:g}"
@@ -199,16 +188,9 @@ class LowPass(SingleElement):
     LowPass 400 Hz order 2
     """
 
-    freq: float
-    order: int = 2
-    damping: float = float(np.sqrt(0.5))
-
-    def __post_init__(self) -> None:
-        self._set(
-            freq=positive(self.freq, "freq"),
-            order=whole(self.order, "order", maximum=2),
-            damping=positive(self.damping, "damping"),
-        )
+    freq: float = field(metadata=checked(positive))
+    order: int = field(default=2, metadata=checked(whole, maximum=2))
+    damping: float = field(default=float(np.sqrt(0.5)), metadata=checked(positive))
 
     def __repr__(self) -> str:
         return f"LowPass {self.freq:g} Hz order {self.order}"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
-from ...checks import Value
+from ...checks import Value, checked, positive, whole
 from ...errors import FlexplantError, InfeasibleError, SolverError
 from ...lti.preparation import Prepared
 from ...parallel import Progress
@@ -18,7 +18,6 @@ from .lmi_solution import (
     Plant,
     check_cost,
     check_size,
-    checked_settings,
     first_verified,
     lqg_states,
     same_states,
@@ -73,13 +72,10 @@ class Lmi(Value):
     True
     """
 
-    back_off: float = 0.05
-    tolerance: float = 1e-9
-    max_states: int = 30
+    back_off: float = field(default=0.05, metadata=checked(positive))
+    tolerance: float = field(default=1e-9, metadata=checked(positive))
+    max_states: int = field(default=30, metadata=checked(whole))
     progress: bool | None = None
-
-    def __post_init__(self) -> None:
-        self._set(**checked_settings(self))
 
     def solve(self, problem: Prepared) -> SolvedController:
         """Return the controller of a prepared problem.

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import FloatArray, positive, whole
+from ...checks import FloatArray
 from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
@@ -118,15 +118,6 @@ class Candidate(NamedTuple):
     name: str
     target: float
     compute: Callable[[], Matrices]
-
-
-def checked_settings(method: Any) -> dict[str, Any]:
-    """Return the settings of a method, each checked."""
-    return {
-        "back_off": positive(method.back_off, "back_off"),
-        "tolerance": positive(method.tolerance, "tolerance"),
-        "max_states": whole(method.max_states, "max_states"),
-    }
 
 
 def check_size(method: Any, problem: Prepared) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...checks import FloatArray, Value, name_list, positive
-from ...errors import ModelError, require_known
+from ...checks import FloatArray, Value, between, checked, name_list, positive
+from ...errors import require_known
 from ...lti.norms import h2_norm, peak_gain
 from ...lti.responses import continuous_poles
 from ...lti.statespace import StateSpace
@@ -23,17 +22,9 @@ _TOGETHER, _LONGEST = 256, 4e6
 class _ChannelNorm(Value):
     """Some w, some z, and a bound on what happens between."""
 
-    w: tuple[str, ...] | None = None
-    z: tuple[str, ...] | None = None
-    below: float | None = None
-
-    def __post_init__(self) -> None:
-        for side in "wz":
-            given: Any = getattr(self, side)
-            if given is not None:
-                self._set(**{side: name_list(given, side)})
-        if self.below is not None:
-            self._set(below=positive(self.below, "below"))
+    w: tuple[str, ...] | None = field(default=None, metadata=checked(name_list))
+    z: tuple[str, ...] | None = field(default=None, metadata=checked(name_list))
+    below: float | None = field(default=None, metadata=checked(positive))
 
     def __repr__(self) -> str:
         sides = f"w={list(self.w or ['all'])}, z={list(self.z or ['all'])}"
@@ -119,12 +110,7 @@ class PeakGain(_ChannelNorm):
     PeakGain(w=['amp'], z=['die:x'], below=1)
     """
 
-    decay: float | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.decay is not None:
-            self._set(decay=positive(self.decay, "decay"))
+    decay: float | None = field(default=None, metadata=checked(positive))
 
     def measured(self, closed: StateSpace) -> float:
         """Return the largest integral or sum of an absolute impulse response."""
@@ -152,18 +138,11 @@ class PoleRegion(Value):
     PoleRegion(decay=10.0, damping=0.1, bandwidth=None)
     """
 
-    decay: float = 0.0
-    damping: float | None = None
-    bandwidth: float | None = None
-
-    def __post_init__(self) -> None:
-        self._set(decay=positive(self.decay, "decay", zero=True))
-        if self.damping is not None:
-            self._set(damping=positive(self.damping, "damping"))
-            if self.damping >= 1:
-                raise ModelError(f"damping is a ratio below 1, got {self.damping:g}.")
-        if self.bandwidth is not None:
-            self._set(bandwidth=positive(self.bandwidth, "bandwidth"))
+    decay: float = field(default=0.0, metadata=checked(positive, zero=True))
+    damping: float | None = field(
+        default=None, metadata=checked(between, low=0.0, high=1.0, hint="It is a ratio below 1.")
+    )
+    bandwidth: float | None = field(default=None, metadata=checked(positive))
 
     def outside(self, closed: StateSpace) -> str:
         """Return which pole of a closed loop lies outside, in words; empty when none does."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray, IntArray, Value, flag, short, whole
+from ...checks import ComplexArray, FloatArray, IntArray, Value, checked, flag, short, whole
 from ...errors import ModelError, ShapeError
 from ...lti.statespace import StateSpace, as_statespace
 from ...tolerances import ROUNDING, TINY
@@ -35,12 +35,9 @@ class RepeatedScalar(Value):
     2
     """
 
-    size: int = 1
-    real: bool = True
+    size: int = field(default=1, metadata=checked(whole))
+    real: bool = field(default=True, metadata=checked(flag))
     name: str = ""
-
-    def __post_init__(self) -> None:
-        self._set(size=whole(self.size, "size"), real=flag(self.real, "real"))
 
     @property
     def w(self) -> int:
@@ -71,12 +68,9 @@ class FullBlock(Value):
     FullBlock(w=2, z=3, name='')
     """
 
-    w: int = 1
-    z: int = 1
+    w: int = field(default=1, metadata=checked(whole))
+    z: int = field(default=1, metadata=checked(whole))
     name: str = ""
-
-    def __post_init__(self) -> None:
-        self._set(w=whole(self.w, "w"), z=whole(self.z, "z"))
 
 
 Block: TypeAlias = RepeatedScalar | FullBlock

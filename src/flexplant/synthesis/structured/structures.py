@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from ...checks import FloatArray, Value, function, instance, real_array, whole
+from ...checks import FloatArray, Value, checked, function, instance, real_array, whole
 from ...errors import FlexplantError, ModelError, ShapeError, counted
 from ...lti.balancing import balanced
 from ...lti.discretisation import bilinear, tustin
@@ -84,22 +84,16 @@ class FixedOrder(Value):
     FixedOrder(2)
     """
 
-    order: int = 0
+    order: int = field(default=0, metadata=checked(whole, minimum=0))
     pattern: npt.NDArray[np.bool_] | None = None
     start: StateSpace | None = None
 
     def __post_init__(self) -> None:
-        order = whole(self.order, "order", minimum=0)
-        pattern = self.pattern
-        if pattern is not None:
-            if order:
+        super().__post_init__()
+        if self.pattern is not None:
+            if self.order:
                 raise ModelError("a pattern is that of a static gain: leave order out, or it.")
-            pattern = real_array(pattern, "pattern", (None, None)) != 0
-        self._set(order=order, pattern=pattern)
-
-    def __repr__(self) -> str:
-        free = "" if self.pattern is None else f", {int(self.pattern.sum())} entries free"
-        return f"FixedOrder({self.order}{free})"
+            self._set(pattern=real_array(self.pattern, "pattern", (None, None)) != 0)
 
     def family(self, plant: StandardPlant, prepared: Prepared) -> _Entries:
         """Return the structure made ready for a plant.
@@ -229,9 +223,6 @@ class ObserverGains(Value):
     >>> fx.synthesis.ObserverGains()
     ObserverGains()
     """
-
-    def __repr__(self) -> str:
-        return "ObserverGains()"
 
     def family(self, plant: StandardPlant, prepared: Prepared) -> _Gains:
         """Return the structure made ready for a plant.

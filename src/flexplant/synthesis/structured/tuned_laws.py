@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import FloatArray, Value, name_list, rebuild
+from ...checks import FloatArray, Value, checked, name_list, rebuild
 from ...errors import ModelError, require_known
 from ...lti.preparation import Prepared
 from ...lti.statespace import System
@@ -63,18 +63,11 @@ class TunedLaws(Value):
     laws: Element | Mapping[str, Element]
     before: System | FloatArray | None = None
     after: System | FloatArray | None = None
-    free: Sequence[str] = _FREE
+    free: Sequence[str] = field(default=_FREE, metadata=checked(name_list, name="free numbers"))
 
     def __post_init__(self) -> None:
-        free = name_list(self.free, "free numbers")
-        require_known("number of an element", free, _NUMBERS)
-        laws = dict(self.laws) if isinstance(self.laws, Mapping) else self.laws
-        self._set(free=free, laws=laws)
-
-    def __repr__(self) -> str:
-        if not isinstance(self.laws, Mapping):
-            return f"TunedLaws({self.laws!r})"
-        return "TunedLaws(" + ", ".join(f"{k}: {v!r}" for k, v in self.laws.items()) + ")"
+        super().__post_init__()
+        require_known("number of an element", self.free, _NUMBERS)
 
     def family(self, plant: StandardPlant, prepared: Prepared) -> _Laws:
         """Return the structure made ready for a plant.
