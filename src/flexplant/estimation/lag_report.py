@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, Value, positive_array, whole
+from ..checks import FloatArray, Value, checked, positive_array, whole
 from ..errors import FlexplantError, require_known
 from ..lti.lyapunov import solve_stein
 from ..parallel import one_thread
@@ -228,10 +228,7 @@ class FixedLag(Value):
     FixedLag(samples=5)
     """
 
-    samples: int
-
-    def __post_init__(self) -> None:
-        self._set(samples=whole(self.samples, "samples"))
+    samples: int = field(metadata=checked(whole))
 
 
 @dataclass(frozen=True, eq=False)

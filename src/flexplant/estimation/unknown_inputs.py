@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
 from ..certificates import Certificate
-from ..checks import FloatArray, Value, instance, positive, sizes_of
+from ..checks import FloatArray, Value, checked, instance, positive, sizes_of
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError, counted
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import solve_dare
@@ -68,13 +68,8 @@ class Augmented(Value):
     (1.0, 1000.0)
     """
 
-    drift: float
-    corner: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._set(
-            drift=positive(self.drift, "drift"), corner=positive(self.corner, "corner", zero=True)
-        )
+    drift: float = field(metadata=checked(positive))
+    corner: float = field(default=0.0, metadata=checked(positive, zero=True))
 
     def step(self, dt: float) -> tuple[float, float]:
         """Return the pole and the variance per sample."""

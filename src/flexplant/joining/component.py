@@ -258,10 +258,6 @@ class JoinedShape(Interpolation):
     expansion: sp.csc_array | None = None
     motions: FloatArray | None = None
 
-    def __post_init__(self) -> None:
-        self._set(names=tuple(self.names), parts=tuple(self.parts))
-        self._set(expansion=self.expansion, motions=self.motions)
-
     def __repr__(self) -> str:
         return f"<JoinedShape of {', '.join(self.names)}>"
 

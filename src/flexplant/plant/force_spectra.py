@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..checks import FloatArray, Value, between, positive
+from ..checks import FloatArray, Value, between, checked, positive
 from ..errors import unknown_label
 from ..labels import Place
 from ..lti.statespace import StateSpace
@@ -111,11 +111,8 @@ class FirstOrder(_Spectrum):
     (0.001784124116152771, <StateSpace: 1 state, continuous, u1 -> y1>)
     """
 
-    rms: float
-    corner: float
-
-    def __post_init__(self) -> None:
-        self._set(rms=positive(self.rms, "rms"), corner=positive(self.corner, "corner"))
+    rms: float = field(metadata=checked(positive))
+    corner: float = field(metadata=checked(positive))
 
     @property
     def asd(self) -> float:
@@ -159,13 +156,12 @@ class NarrowBand(_Spectrum):
     0.01
     """
 
-    rms: float
-    freq: float
-    zeta: float = 0.01
-
-    def __post_init__(self) -> None:
-        zeta = between(self.zeta, "zeta", 0.0, 1.0, "No band is that wide: use FirstOrder.")
-        self._set(rms=positive(self.rms, "rms"), freq=positive(self.freq, "freq"), zeta=zeta)
+    rms: float = field(metadata=checked(positive))
+    freq: float = field(metadata=checked(positive))
+    zeta: float = field(
+        default=0.01,
+        metadata=checked(between, low=0.0, high=1.0, hint="No band is that wide: use FirstOrder."),
+    )
 
     @property
     def asd(self) -> float:
@@ -210,11 +206,8 @@ class RandomWalk(_Spectrum):
     <StateSpace: 1 state, continuous, u1 -> y1>
     """
 
-    drift: float
-    corner: float = 1e-4
-
-    def __post_init__(self) -> None:
-        self._set(drift=positive(self.drift, "drift"), corner=positive(self.corner, "corner"))
+    drift: float = field(metadata=checked(positive))
+    corner: float = field(default=1e-4, metadata=checked(positive))
 
     @property
     def rms(self) -> float:

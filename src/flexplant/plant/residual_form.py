@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..checks import Value, instance, positive
+from ..checks import Value, checked, instance, positive
 from ..errors import ModelError, warn
 from .realisation import MODAL, ModalRealisation, Structure, realised
 
@@ -67,11 +67,7 @@ class Feedthrough(ResidualForm):
     Feedthrough(above=1000.0)
     """
 
-    above: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.above is not None:
-            self._set(above=positive(self.above, "above"))
+    above: float | None = field(default=None, metadata=checked(positive))
 
     def applied(self, realisation: ModalRealisation) -> ModalRealisation:
         """Return the realisation with its fast pairs replaced by their static gain.

@@ -79,9 +79,6 @@ class Sensitivities(Value):
     S: ComplexArray
     parameters: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        self._set(modes=tuple(self.modes), poles=self.poles, S=self.S)
-
     def __repr__(self) -> str:
         return (
             f"<Sensitivities: {counted(len(self.modes), 'mode')} to {', '.join(self.parameters)}>"

@@ -167,16 +167,6 @@ class Correlation(Value):
     fdac: FloatArray
     alike: tuple[tuple[int, ...], ...] = ()
 
-    def __post_init__(self) -> None:
-        self._set(
-            freq_error=self.freq_error,
-            zeta_error=self.zeta_error,
-            mac=self.mac,
-            frac=self.frac,
-            fdac=self.fdac,
-            alike=tuple(tuple(int(n) for n in group) for group in self.alike),
-        )
-
     def __repr__(self) -> str:
         parts = []
         if self.freq_error.size:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -51,8 +51,6 @@ class Lasso(PenalisedMethod):
     >>> fx.update(drawing, masses, [fx.Eigenvalues(measured)], method=method).values.round(2)
     array([0. , 0. , 0.2])
     """
-
-    weight: float | None = field(default=None, kw_only=True)
 
     @property
     def least_squares(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -43,8 +43,6 @@ class Tikhonov(PenalisedMethod):
     >>> fx.update(drawing, ends, [poles], method=fx.updating.Tikhonov(weight=1e-3)).values.round(3)
     array([0.058, 0.058])
     """
-
-    weight: float | None = field(default=None, kw_only=True)
 
     @property
     def least_squares(self) -> bool:

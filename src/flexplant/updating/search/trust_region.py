@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import FloatArray, one_of, positive
+from ...checks import FloatArray, checked, one_of, positive
 from ...errors import ModelError
 from .objective import Objective
 from .update_method import SearchEnd, Trail, UpdateMethod, units
@@ -59,12 +59,8 @@ class TrustRegion(UpdateMethod):
     array([0.1])
     """
 
-    loss: Loss = field(default="linear", kw_only=True)
-    scale: float = field(default=1.0, kw_only=True)
-
-    def __post_init__(self) -> None:
-        one_of(self.loss, "loss", LOSSES)
-        self._set(scale=positive(self.scale, "scale"))
+    loss: Loss = field(default="linear", kw_only=True, metadata=checked(one_of, choices=LOSSES))
+    scale: float = field(default=1.0, kw_only=True, metadata=checked(positive))
 
     @property
     def least_squares(self) -> bool:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...checks import FloatArray, Value, positive
+from ...checks import FloatArray, Value, checked, positive
 from ...parallel import tick
 from ...tolerances import divisor
 from .objective import Objective
@@ -119,14 +119,11 @@ def units(objective: Objective, J: FloatArray) -> FloatArray:
     return np.asarray(np.where(objective.has_prior, objective.prior_std, unit), dtype=np.float64)
 
 
+@dataclass(frozen=True, eq=False)
 class PenalisedMethod(UpdateMethod):
     """A method with a penalty of some weight; None: the weight is chosen from the data."""
 
-    weight: float | None
-
-    def __post_init__(self) -> None:
-        if self.weight is not None:
-            self._set(weight=positive(self.weight, "weight"))
+    weight: float | None = field(default=None, kw_only=True, metadata=checked(positive))
 
     @property
     def penalised(self) -> bool:
