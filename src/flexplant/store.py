@@ -63,12 +63,11 @@ class Value(ABC):  # noqa: B024 - its kinds have abstract methods
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
-        """Return the kind with the fields that differ from their defaults, with their units."""
+        """Return the kind with its fields and their units; None and empty ones are left out."""
         shown = []
         for field in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
-            text, unit = _shown(value), field.metadata.get("unit")
-            if field.repr and text != _shown(field.default) and np.size(value):
+            text, unit = _shown(getattr(self, field.name)), field.metadata.get("unit")
+            if text not in ("None", "''", "[]", "{}"):
                 shown.append(f"{field.name}={text}{' ' + unit if unit else ''}")
         return f"{type(self).__name__}({', '.join(shown)})"
 
@@ -107,8 +106,8 @@ def _shown(value: Any) -> str:
     """Return a field's value for a repr: large arrays by their shape, long lists by their ends."""
     if isinstance(value, float):
         return f"{value:g}"
-    if sp.issparse(value) or (isinstance(value, np.ndarray) and value.size > 6):
-        return f"array {getattr(value, 'shape', '')}"
+    if sp.issparse(value) or (isinstance(value, np.ndarray) and not 0 < value.size <= 6):
+        return f"array {value.shape}" if value.size else "[]"  # type: ignore[union-attr]
     if isinstance(value, tuple):
         listed = [_shown(part) for part in value]
         if len(listed) > 4:

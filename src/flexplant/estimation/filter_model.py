@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..checks import FloatArray, IntArray, Value
-from ..errors import AssumptionError, ShapeError, SolverError, counted
+from ..errors import AssumptionError, ShapeError, SolverError
 from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
@@ -72,13 +72,6 @@ class FilterModel(Value):
     channels: tuple[str, ...]
     sensors: tuple[str, ...]
     commands: tuple[str, ...]
-
-    def __repr__(self) -> str:
-        n, ny = self.C2.T.shape
-        return (
-            f"<FilterModel: {counted(n, 'state')}, {counted(ny, 'sensor')}, "
-            f"{counted(self.C1.shape[0], 'POI channel')}>"
-        )
 
     def scaled(self, d: FloatArray, s: FloatArray) -> FilterModel:
         """Return the model with states x / d and measurements y / s."""

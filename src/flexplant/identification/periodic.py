@@ -54,9 +54,6 @@ class Periodic(Value):
         whole(self.discard, "discard", minimum=0)
         _check_band(self.band)
 
-    def __repr__(self) -> str:
-        return f"Periodic(period of {self.period:g} s, {self.discard} discarded)"
-
 
 def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
     r"""Return ``G = Y X^H (U X^H)^-1`` from the mean periods; X is U, or R of a reference.

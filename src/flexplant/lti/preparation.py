@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..checks import FloatArray, Value, inner_names
-from ..errors import ModelError, counted
+from ..errors import ModelError
 from ..tolerances import ROUNDING, divisor
 from .discretisation import bilinear, image_freq, tustin
 from .modal import modal_form
@@ -53,12 +53,6 @@ class Prepared(Value):
     y: Sequence[str]
     departure: float = 1.0
     direct: bool = False
-
-    def __repr__(self) -> str:
-        return (
-            f"<Prepared: {counted(self.A.shape[0], 'state')}, unit of frequency {self.speed:.3g} "
-            "rad/s>"
-        )
 
     @property
     def system(self) -> StateSpace:

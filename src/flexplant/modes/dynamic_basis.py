@@ -10,7 +10,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..checks import ComplexArray, FloatArray
-from ..errors import ModelError, SolverError, counted
+from ..errors import ModelError, SolverError
 from ..sparse.factor import DENSE_LIMIT, dense
 from ..sparse.multifrontal import ComplexSymmetricFactor
 from ..sparse.rayleigh_ritz import beyond
@@ -79,11 +79,6 @@ class DynamicBasis:
         self._inertia = np.asarray(model.M @ self.V)
         self.losses = self._losses(damping)
         self._damped()
-
-    def __repr__(self) -> str:
-        return (
-            f"<DynamicBasis: {counted(self.n_modes, 'mode')} and {counted(self.n_shapes, 'shape')}>"
-        )
 
     @property
     def n_shapes(self) -> int:

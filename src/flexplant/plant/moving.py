@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import FloatArray, Value, real_array
-from ..errors import LabelError, ModelError, counted, unknown_label
+from ..errors import LabelError, ModelError, unknown_label
 from .building import rebuilt
 from .forces import Actuator, Disturbance
 from .partition import Partition
@@ -51,9 +51,6 @@ class Along(Value):
     C: FloatArray
     D: FloatArray
     B: FloatArray
-
-    def __repr__(self) -> str:
-        return f"<Along {counted(self.points.shape[0], 'point')}: {', '.join(self.channels)}>"
 
 
 def moved(ports: Ports, places: Any) -> Ports:

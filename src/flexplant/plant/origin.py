@@ -59,9 +59,6 @@ class Assembled(_Unknown, Value):
     delay: float = 0.0
     continuous: Any = None
 
-    def __repr__(self) -> str:
-        return f"<Assembled: {type(self.realisation.model).__name__}, {self.ports!r}>"
-
     @property
     def structure(self) -> Assembled:
         """What is known of the structure: this value."""

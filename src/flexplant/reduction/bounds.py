@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..checks import FloatArray, Value, checked, name_list, positive, real_array, whole
-from ..errors import counted
 from .ranking import peak_gains
 
 
@@ -43,7 +42,7 @@ class ErrorBound(Value):
     6.945e-06
     """
 
-    value: float = field(metadata=checked(positive, zero=True))
+    value: float = field(metadata=checked(positive, zero=True, unit="m/N"))
     inputs: tuple[str, ...] = field(metadata=checked(name_list))
     outputs: tuple[str, ...] = field(metadata=checked(name_list))
     rule: str
@@ -52,16 +51,6 @@ class ErrorBound(Value):
     )
     static: float | None = field(default=None, kw_only=True, metadata=checked(positive, zero=True))
     covers: int | None = field(default=None, kw_only=True, metadata=checked(whole))
-
-    def __repr__(self) -> str:
-        some = (
-            "" if self.covers is None else f", of the {counted(self.covers, 'mode')} solved alone"
-        )
-        return (
-            f"<ErrorBound {self.value:.4g} m/N, {counted(len(self.inputs), 'input')} to "
-            f"{len(self.outputs)} "
-            f"outputs: {self.rule}{some}>"
-        )
 
     def below(self, freq: float) -> float:
         """Return the bound [m/N] for all frequencies up to one.

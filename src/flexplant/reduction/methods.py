@@ -34,6 +34,11 @@ _LAW = "Give ModalDamping or Rayleigh: ModalDamping(0.01) is 1 % in all modes."
 class ReductionMethod(Value):
     """The base class of methods from a structure to a reduced model.
 
+    Parameters
+    ----------
+    damping : ModalDamping or Rayleigh, optional
+        With an FEModel: of the reduced model, in place of its D.
+
     Examples
     --------
     >>> import flexplant as fx
