@@ -22,6 +22,7 @@ from .tangent import Convex
 _ROUND = 8
 #: a branch of at most so many choices is screened, and ended when so few are left to be scored
 _SCREENED, _SCORED = 600, 40
+_PART = "It is a part of the value, below 1: try 0.05."
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,14 +65,7 @@ class BranchAndBound(Search):
     """
 
     gap: float = field(
-        default=0.0,
-        metadata=checked(
-            between,
-            low=0.0,
-            high=1.0,
-            hint="It is a part of the value, below 1: try 0.05.",
-            ends="[",
-        ),
+        default=0.0, metadata=checked(between, low=0.0, high=1.0, hint=_PART, ends="[")
     )
     branches: int = field(default=20_000, metadata=checked(whole, minimum=0))
     starts: int = field(default=4, metadata=checked(whole))
