@@ -55,10 +55,9 @@ def _seen(lines: Lines, poles: ComplexArray, part: ComplexArray, kept: list[int]
 def corroborated(lines: Lines, less: ComplexArray, more: ComplexArray) -> bool:
     """Return whether other lines than the two that gain most bear a pole out.
 
-    A disturbance of one frequency, or a variance that came out too small at one line, makes an
-    outlier. A pole of next to no damping, there or between two lines, explains it and changes
-    other lines by chance only: those lower the cost by a chi-square of four degrees, of the pole
-    and its size.
+    A disturbance of one frequency, or a variance that came out too small there, is explained by a
+    pole of next to no damping that changes other lines by chance only: by a chi-square of four
+    degrees, of the pole and its size.
     """
     before, after = (
         np.sum(np.abs((lines.data - model) * lines.weight) ** 2, axis=(0, 1))
@@ -237,10 +236,9 @@ def fewer_terms(lines: Lines, fit: Fit) -> Proposals:
 def more_terms(lines: Lines, fit: Fit) -> Proposals:
     """Propose more residual terms where the data require them.
 
-    Sampling folds modes of more than half the rate into the band: each is weak and as broad as
-    its frequency and damping were, many together are no noise. What a first few of these terms
-    leave is too little to be seen and enough to bias, and in a wide band they cost next to
-    nothing: so as many as the lines afford.
+    Sampling folds modes of more than half the rate into the band, weak and broad ones. What a few
+    terms leave of them is too little to be seen and enough to bias, and terms cost next to nothing
+    in a wide band: so as many as the lines afford.
     """
     count = lines.freq.size
     afforded = [u for u in MORE if u > lines.upper and count >= 8 * (u + lines.lower)]

@@ -206,10 +206,9 @@ def hann_segment(frf: Frf) -> float | None:
 def leakage_warned(frf: Frf, found: IdentifiedModes) -> None:
     r"""Warn of resonances narrower than about four lines of windowed segments.
 
-    Random excitation through a window smears the response over the main lobe of ``|W|^2``. Its
-    second moment is 4/3 of a squared line for a Hann window, so that damping is overestimated by
-    1 % at 10 lines, by some 10 % at 4, and one resonance becomes two poles below
-    ([BendatPiersol2010]_, section 11.6). Where the window is fitted through: half a line.
+    A Hann window smears the response over its main lobe: damping is overestimated by 1 % at 10
+    lines, by some 10 % at 4, and one resonance becomes two poles below ([BendatPiersol2010]_,
+    section 11.6). Where the window is fitted through: half a line.
     """
     if frf.window is None or frf.resolution is None:
         return

@@ -101,9 +101,8 @@ def attachment_vectors(
 def static_response(M: Matrix, K: Matrix, rigid: FloatArray, loads: FloatArray) -> FloatArray:
     """Return the elastic static response (n, m) to loads, M-orthogonal to the rigid-body motions.
 
-    ``K u = f - M R R^T f``: the load less the inertia of the rigid-body acceleration it causes.
-    The structure is held at r DOFs, where its rigid-body motions are best distinguished; in
-    balance, these carry no force, and the rigid-body part of the answer is taken out afterwards.
+    ``K u = f - M R R^T f``: the load less the inertia of the rigid-body acceleration it causes,
+    held at the r DOFs that distinguish rigid-body motions best; in balance these carry no force.
     """
     balanced = loads - np.asarray(M @ (rigid @ (rigid.T @ loads)))
     n, r = rigid.shape

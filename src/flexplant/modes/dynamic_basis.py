@@ -151,8 +151,7 @@ class DynamicBasis:
         """Return the basis with what all of the matrices add at some frequencies.
 
         The motions that a factor of the stiffness finds for what the basis leaves of the loads join
-        it, until next to nothing of that is left in terms of energy; None where it does not settle,
-        since modes are missing or wrong: then only a direct solution says more.
+        it, until next to nothing of that is left in energy; None where it does not settle.
         """
         n, count = self.n_modes, freq.size
         inner, basis, first = self._inertia[:, :n], self, np.zeros(0)

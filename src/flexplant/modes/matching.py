@@ -161,10 +161,9 @@ def _cosines(gram: Any, cross: Any, other_gram: Any) -> FloatArray:
 def likeness(shapes: ComplexArray, freq: FloatArray) -> FloatArray:
     """Return the MAC (m, m) of modes with each other, repeated ones by the span of their shapes.
 
-    A solver returns repeated modes in any rotation, so that only their span means anything: beside
-    another span they are as like as the nearest two shapes of both (the cosine squared of the
-    smallest principal angle); among themselves 1 where their shapes, as far as they are known,
-    are nearly dependent, else 0. A mode with a node at all places is like no other.
+    Two spans are as like as their nearest shapes (cosine squared of the smallest principal angle);
+    repeated modes among themselves 1 where their shapes, as far as they are known, are nearly
+    dependent, else 0. A mode with a node at all places is like no other.
     """
     order = np.argsort(freq, kind="stable")
     spans = [order[run] for run in runs(freq[order], CLUSTER)]

@@ -223,10 +223,8 @@ class RealForm(NamedTuple):
     def condition(self, form: NormalForm) -> float:
         """Return the largest condition of a complex mode: how much rounding grows in its residue.
 
-        With states ``(Omega p, p')`` and ``v = (Omega x, lambda x)`` an eigenvector, the left one
-        is v with its first half negated, so that the condition is
-        ``|v|^2 / (2 |lambda| |Im lambda|)``: 1 for real modes, without bound where two modes
-        coalesce or one becomes critically damped.
+        ``|v|^2 / (2 |lambda| |Im lambda|)`` with ``v = (Omega x, lambda x)``: 1 for real modes,
+        without bound where two modes coalesce or one becomes critically damped.
         """
         r = self.n_rigid
         swing = slice(r + form.decaying.size, None)  # real pairs +-s are always apart

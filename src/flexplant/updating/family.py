@@ -58,11 +58,9 @@ class Eigen:
 class Family:
     """The pencils of a model over its parameters, in coordinates where M = I and K is diagonal.
 
-    In SI a reduced pencil's rigid-body modes come out at 1e-4 rad/s and its lowest elastic modes
-    lose digits to the highest; in the modal coordinates of the start, the rigid-body basis
-    deflated, neither happens. DOFs that no mass and no damper touches (rotations of a lumped mass
-    matrix, the boundary of MacNeal's reduction) are condensed statically at each value of the
-    parameters; then the coordinates are the model's own.
+    In SI rigid-body modes come out at 1e-4 rad/s and the lowest elastic ones lose digits to the
+    highest. With DOFs that have neither mass nor damper the coordinates are the model's own: these
+    are condensed statically at each value of the parameters.
     """
 
     def __init__(

@@ -50,10 +50,9 @@ def is_large(model: Any) -> bool:
 class FullBasis:
     """The full model ``M + p dM`` and so on, at any `p`, as a large reduced model made at this p.
 
-    Its basis holds the lowest modes of the full structure at `p`, four times as many as the
-    reduced model has coordinates, the static response ``u = G f`` to unit forces f at all places of
-    the measurement and of the parameters, and ``G M u``. Modes are those of the full model up to
-    rounding; responses have an error of order ``(f / f_cut)^8`` of what the truncated modes give.
+    Its basis holds the lowest modes of the full structure at `p`, the static response ``u = G f``
+    to unit forces f at all places of measurement and parameters, and ``G M u``: responses have an
+    error of order ``(f / f_cut)^8`` of what the truncated modes give.
     """
 
     def __init__(

@@ -104,10 +104,8 @@ def from_one_start(
 ) -> tuple[SearchEnd, list[FloatArray], list[SearchEnd | None]]:
     """Return the best end, the objective being there, all starts that were tried and their ends.
 
-    Where responses alone are fitted and the first end explains nothing of them (a peak of the
-    model lies on a wrong measured one), other starts are tried until one does; so where poles
-    alone are fitted by several parameters and the end is far from them: modes may have been paired
-    wrongly, which shapes would have shown.
+    Where the end explains nothing of responses (a peak of the model lies on a wrong measured one),
+    or is far from poles alone (modes may have been paired wrongly), other starts are tried.
     """
     begins = [begin]
     best = _led(objective, begin, method, most, tolerance)

@@ -355,8 +355,7 @@ def changed_model(
 ) -> Any:
     """Return the model with the parameters at `p`; a sparse FEModel stays sparse.
 
-    Of a reduced model the rigid-body basis is brought up to date, as far as it is left; `family`
-    is that of the model and the parameters, where it is there already.
+    A reduced model has the rigid-body basis that is left; `family`: of the same parameters.
     """
     if isinstance(model, FEModel):
         return _changed_structure(model, parameters, p)
@@ -405,10 +404,8 @@ def _changed_structure(model: FEModel, parameters: Sequence[Parameter], p: Float
 def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
     """Return the model when its D fails for nothing but a slight negative drag of rigid motion.
 
-    A damper to ground that is found from elastic poles comes out at a small number of either sign.
-    What it does to rigid-body motion is left out wherever it is below 1e-4 of the first elastic
-    frequency (`normal_form`), so that its sign there does not matter. With d the drag,
-    ``D + d M`` must be positive semi-definite: no elastic mode gains more than that.
+    A drag d below 1e-4 of the first elastic frequency is left out wherever it is (`normal_form`):
+    its sign does not matter. ``D + d M`` must be positive semi-definite.
     """
     D = changes["D"]
     if D is None or not model.rigid_body.shape[1]:

@@ -204,9 +204,7 @@ def _missing(
 ) -> dict[str, tuple[int, ...]]:
     """Return the unmeasured modes that determine a lost combination, for poorly known parameters.
 
-    A mode that moves with a parameter adds nothing where it moves with the others alike: only
-    the change of its eigenvalue along the combination counts, against what the parts of the
-    combination change it by.
+    The change of an eigenvalue along the combination counts, against that by its parts.
     """
     numbers = [int(n) for n in point.labels if n and n not in objective.numbers]
     if not poor:

@@ -53,8 +53,7 @@ class Subsets:
     """Fits of subsets of the candidates, the nuisance beside them, each done once.
 
     Where modes alone are compared and the changes are of low rank, each is fitted in few
-    coordinates (see `flexplant.updating.confined`); what it leaves is that of all coordinates to
-    second order, and it is fitted in all of them where these differ, or by `polish`.
+    `coordinates`; in all of them where these differ, or by `polish`.
     """
 
     def __init__(self, whole: Objective, residuals: Any, count: int) -> None:

@@ -29,10 +29,9 @@ class Defect(NamedTuple):
 class Objective:
     """``1/2 |r(p)|^2`` with r the whitened residuals and ``(p - mean) / std`` of the priors.
 
-    A parameter with two finite bounds and no prior has one from them: normal, the model itself
-    (zero, or the bound nearest to it) the most probable, the farther bound three standard
-    deviations away. The priors take part where the noise of every residual is known (else their
-    weight against the data would not be).
+    Two finite bounds without a prior make one: the model itself (zero, or the bound nearest to it)
+    the most probable, the farther bound three standard deviations away. Priors take part where the
+    noise of every residual is known: else their weight against the data would not be.
     """
 
     def __init__(
