@@ -216,6 +216,7 @@ def accumulated(A: FloatArray, Q: FloatArray) -> FloatArray:
     for _ in range(8):
         X = X + A @ X @ A.T
         A = A @ A
+        # unstable: what it has come to is scale enough, and later terms would hide the others
         if not np.isfinite(A).all() or np.linalg.norm(A) > 1e6 * size:
             break
     return np.abs(X.diagonal())
@@ -231,6 +232,7 @@ def symmetric(value: FloatArray, name: str, n: int) -> FloatArray:
     """Return `value` as a symmetric (n, n) array."""
     array = real_array(value, name, (n, n))
     scale = np.sqrt(np.abs(array.diagonal()))
+    # the last digits of a covariance that went through single precision or a file
     bound = 1e-8 * (np.outer(scale, scale) + 1e-4 * np.max(np.abs(array), initial=0.0))
     if np.any(np.abs(array - array.T) > bound):
         worst = np.unravel_index(np.argmax(np.abs(array - array.T)), array.shape)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray, IntArray, positive, positive_array
 from ..errors import ModelError
-from ..tolerances import ROUNDING, TINY
+from ..tolerances import ROUNDING, SPLIT, TINY
 from .responses import continuous_poles, responder
 from .statespace import StateSpace, System, as_statespace
 
@@ -83,6 +83,7 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     around = np.sinh(np.linspace(-4.0, 4.0, 9)) / np.sinh(1.0)
     for f, z in zip(np.abs(poles.imag) / (2 * np.pi), zeta, strict=True):
         if low < f < high and z < 0.3:
+            # narrower ones are lines at any scale of a plot
             near = f * (1 + max(z, 1e-6) * around)
             if z <= UNDAMPED:  # infinite there: a gap is left around it
                 near, undamped = np.delete(near, around.size // 2), [*undamped, f]
@@ -152,11 +153,12 @@ def resonance_grid(
     """Return frequencies [Hz], log-spaced over all poles and dense around each resonance."""
     s: ComplexArray = np.array(poles, dtype=np.complex128)
     if dt:
-        s = np.asarray(np.log(s[np.abs(s) > 1e-12]) / dt, dtype=np.complex128)
+        # poles at zero are delays: no frequency
+        s = np.asarray(np.log(s[np.abs(s) > ROUNDING]) / dt, dtype=np.complex128)
     nyquist = 0.5 / dt if dt else np.inf
     size = np.abs(s) / (2 * np.pi)
     # rigid-body poles and rounding of them at 0 or 1 say nothing about the frequencies of interest
-    size_seen = size[size > 1e-6 * np.max(size, initial=0.0)]
+    size_seen = size[size > SPLIT * np.max(size, initial=0.0)]
     if not size_seen.size:
         size_seen = np.array([0.01 * nyquist if dt else 1.0])
     high = nyquist if dt else 100.0 * float(size_seen.max())

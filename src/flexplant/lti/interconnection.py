@@ -10,6 +10,7 @@ from scipy.sparse import csgraph
 
 from ..checks import ComplexArray, FloatArray, inner_names, name_list
 from ..errors import LabelError, ModelError, ShapeError, require_known
+from ..tolerances import ROUNDING
 from .joining import Matrices, common_dt, common_fields, joined_units, stacked, state_names
 from .scaling import balanced_matrix
 from .statespace import StateSpace, System, as_statespace
@@ -334,7 +335,7 @@ def _well_posed(loop: FloatArray) -> FloatArray:
         inside = np.flatnonzero(part == i)
         balanced = balanced_matrix(loop[np.ix_(inside, inside)])
         condition = float(np.linalg.cond(np.eye(inside.size) - balanced))
-        if condition > 1e12:
+        if condition > 1.0 / ROUNDING:
             raise ModelError(
                 f"the algebraic loop is ill-posed: I - D D has condition {condition:.1e}. Break it "
                 "with a sample of delay or a controller without direct feedthrough."

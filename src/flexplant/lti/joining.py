@@ -140,10 +140,8 @@ def block_eigenvalues(A: FloatArray, blocks: Sequence[int]) -> ComplexArray:
     sizes = np.asarray(blocks)
     ones, twos = starts[sizes == 1], starts[sizes == 2]
     poles[ones] = A[ones, ones]
-    a, b, c, d = (A[twos + i, twos + j] for i in (0, 1) for j in (0, 1))
-    # (a-d)^2/4 + b c rather than mean^2 - det: no cancellation for rigid-body pairs (b or c = 0)
-    root = np.sqrt((0.25 * (a - d) ** 2 + b * c).astype(np.complex128))
-    poles[twos], poles[twos + 1] = 0.5 * (a + d) + root, 0.5 * (a + d) - root
+    entries = [A[twos + i, twos + j] for i in (0, 1) for j in (0, 1)]
+    poles[twos], poles[twos + 1] = pair_eigenvalues(*entries)
     for start, size in zip(starts[sizes > 2], sizes[sizes > 2], strict=True):
         part = slice(start, start + size)
         poles[part] = la.eigvals(A[part, part])
@@ -214,3 +212,12 @@ def rows_of(known: Sequence[str], names: Iterable[str], side: str, owner: str | 
             raise unknown_label(side, name, known, owner or "")
         rows.append(position[name])
     return np.array(rows, dtype=np.int64)
+
+
+def pair_eigenvalues(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return both eigenvalues of matrices [a, b; c, d]."""
+    # (a-d)^2/4 + b c rather than mean^2 - det: no cancellation for rigid-body pairs (b or c = 0)
+    root: ComplexArray = np.sqrt((0.25 * (a - d) ** 2 + b * c).astype(np.complex128))
+    return 0.5 * (a + d) + root, 0.5 * (a + d) - root

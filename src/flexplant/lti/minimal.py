@@ -283,6 +283,7 @@ def _stabilised(g: StateSpace) -> StateSpace:
         radius = float(np.max(np.abs(poles)))
         if radius < 1 and g.is_stable:
             return g
+        # at most to a decay within five samples
         speed = min(_speed(g, g.A - radius * eye), 0.2)
         return g.replace(A=g.A / (radius + (speed or 0.2)))
     growth = float(poles.real.max())

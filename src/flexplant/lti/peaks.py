@@ -222,8 +222,8 @@ def _largest(X: ComplexArray) -> FloatArray:
     return np.asarray(np.linalg.svd(X, compute_uv=False)[..., 0])
 
 
-#: a distance that counts as none
-TINY = 1e-100
+#: a distance that counts as none: its cube divides without overflow
+NONE = 1e-100
 #: entries of all residues from which on they are not formed
 LARGEST = 5_000_000
 
@@ -282,7 +282,7 @@ class Residues(NamedTuple):
         """
         total = np.zeros(omega.size)
         for apart in self.apart(omega):
-            free = np.maximum(apart - radius, TINY)
+            free = np.maximum(apart - radius, NONE)
             for _ in range(order + 1):
                 free *= apart
             total += self.sizes @ (1.0 / free)

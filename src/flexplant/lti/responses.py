@@ -12,6 +12,7 @@ from scipy.sparse import csgraph
 from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..parallel import one_thread
+from .joining import pair_eigenvalues
 from .scaling import scaled_schur, state_scale
 from .statespace import StateSpace
 
@@ -270,11 +271,7 @@ def _closed_form(
     a, b, c, d = (pairs[:, i, j].copy() for i in (0, 1) for j in (0, 1))
     # a 1 x 1 block gets a partner that nothing drives, with a pole at no frequency of interest
     d[~real[:, 1]] = 0.0 if g.dt else -1.0
-    root = np.sqrt((0.25 * (a - d) ** 2 + b * c).astype(np.complex128))
-    mean = 0.5 * (a + d)
-    first: ComplexArray = np.asarray(mean + root, dtype=np.complex128)
-    second: ComplexArray = np.asarray(mean - root, dtype=np.complex128)
-    return a, b, c, d, first, second
+    return a, b, c, d, *pair_eigenvalues(a, b, c, d)
 
 
 def _substitution(g: Part, pairs: FloatArray, slots: IntArray, coupling: FloatArray) -> Solver:

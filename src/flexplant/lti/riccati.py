@@ -317,6 +317,14 @@ RESIDUAL, CORRECTION = 1e-9, 1e-7
 SETTLED, NEWTON_STEPS = 1e-11, 10
 
 
+#: relative to the mean speed of the closed loop: shifts of the Cayley transform, tried in turn
+#: until its condition leaves half of the digits to Newton's steps
+SHIFTS, WELL = (1.0, 1.7, 0.6, 3.1, 0.33), 1e8
+#: relative: a closed loop that decays in over a hundred steps (or periods) is examined for modes
+#: that only rounding stabilises; a pole, or a singular value, that is undamped but for rounding
+SLOW, EDGE = 0.01, 1e-9
+
+
 class RiccatiProblem(NamedTuple):
     """A problem with whitened outputs (R is J, a diagonal of signs) and no cross term."""
 
@@ -351,7 +359,7 @@ def _growth(p: RiccatiProblem, poles: ComplexArray) -> FloatArray:
 def _slow(p: RiccatiProblem, poles: ComplexArray) -> bool:
     """Return whether the closed loop is so slow that its stability may be rounding."""
     size = 1.0 if p.discrete else float(np.max(np.abs(poles)))
-    return bool(np.max(_growth(p, poles)) > -0.01 * size)
+    return bool(np.max(_growth(p, poles)) > -SLOW * size)
 
 
 def _gain(p: RiccatiProblem, P: FloatArray) -> FloatArray:
@@ -381,9 +389,10 @@ def _sampled(p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
         return p.A.T, p.G, p.Q
     n = p.A.shape[0]
     moduli = np.abs(la.eigvals(np.block([[p.A.T, -p.G], [-p.Q, -p.A]])))
+    # a rigid-body mode does not say how fast the closed loop is
     typical = np.exp(np.mean(np.log(np.maximum(moduli, 1e-6 * np.max(moduli, initial=TINY)))))
     best: tuple[float, tuple[FloatArray, FloatArray, FloatArray]] | None = None
-    for factor in (1.0, 1.7, 0.6, 3.1, 0.33):
+    for factor in SHIFTS:
         shift = float(typical * factor)
         moved = p.A.T - shift * np.eye(n)
         try:
@@ -399,7 +408,7 @@ def _sampled(p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
             G = 2 * shift * np.linalg.solve(moved, p.G) @ inverse.T
             Q = 2 * shift * inverse.T @ p.Q @ np.linalg.inv(moved)
             best = condition, (A, symmetrised(G), symmetrised(Q))
-        if best[0] < 1e8:
+        if best[0] < WELL:
             break
     if best is None:
         raise SolverError(
@@ -483,7 +492,7 @@ def _defect(p: RiccatiProblem) -> str:
     marginal = 1.0 if p.discrete else 0.0
     lam = la.eigvals(p.A).astype(np.complex128)
     size = max(marginal, float(np.max(np.abs(lam), initial=0.0)))
-    critical = lam[_growth(p, lam) >= -1e-9 * size]
+    critical = lam[_growth(p, lam) >= -EDGE * size]
     # a Jordan block of a rigid-body mode comes out of eigvals at the root of the rounding
     near = np.abs(critical - marginal) < SPLIT * size
     distinct = [complex(marginal)] if near.any() else []
@@ -512,7 +521,7 @@ def _defect(p: RiccatiProblem) -> str:
 def _unseen(shifted: ComplexArray, weight: FloatArray) -> int:
     """Return how many directions of the null space of `shifted` the quadratic form misses."""
     _, sizes, right = la.svd(shifted)
-    null = right[sizes < 1e-9 * max(1.0, float(sizes[0]))].conj().T
+    null = right[sizes < EDGE * max(1.0, float(sizes[0]))].conj().T
     if not null.size:
         return 0
     form = null.conj().T @ weight @ null

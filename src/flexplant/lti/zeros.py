@@ -102,6 +102,7 @@ def axis_zeros(g: Any) -> ComplexArray:
     E = np.zeros((n + m, n + m))
     E[:n, :n] = np.eye(n)
     alpha, beta = la.eig(pencil, E, right=False, homogeneous_eigvals=True)
+    # beyond: rounding of a zero at infinity, which comes out at some 1 / (2e-16)
     finite = np.abs(beta) > 1e-14 * np.abs(alpha)
     speed = _speed(g)
     zeros = alpha[finite] / beta[finite]

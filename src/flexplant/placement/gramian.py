@@ -185,9 +185,9 @@ class SensorIndices(ByShapes):
     def of(self, plant: StandardPlant, shapes: Shapes) -> SummedWorth:
         """Return the indices of choices."""
         kept = shapes.elastic
-        seen = (
-            shapes.phi[:, kept] * (1e-12 / shapes.asd if self.sides == "y" else shapes.asd)[:, None]
-        )
+        # in sqrt(Hz) / pm, so that the indices are numbers of usual size
+        unit = 1e-12 / shapes.asd if self.sides == "y" else shapes.asd
+        seen = shapes.phi[:, kept] * unit[:, None]
         return SummedWorth(np.sum((seen * self.weights(plant)) ** 2, axis=1))
 
     def weights(self, plant: StandardPlant) -> FloatArray:

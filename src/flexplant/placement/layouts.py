@@ -16,7 +16,7 @@ from ..tolerances import divisor
 from ..work import Work
 from .candidates import Port, Side, checked_plant, side_of, with_side
 from .closed_loop_h2 import ClosedLoopH2
-from .criterion import Criterion, OnPlant, Scorer, as_criterion
+from .criterion import AGREEMENT, Criterion, OnPlant, Scorer, as_criterion
 from .poi_lqr import PoiLqr
 from .poi_variance import PoiVariance
 
@@ -79,7 +79,7 @@ class Layouts:
             return
         ports = [self.candidates[i] for i in sorted(chosen)]
         direct = float(self.criterion(with_side(self.plant, self.side, ports)))
-        if not abs(direct - value) <= 1e-6 * max(abs(direct), self.criterion.scale):
+        if not abs(direct - value) <= AGREEMENT * max(abs(direct), self.criterion.scale):
             raise CertificateError(
                 f"the fast score {value:.9g} of the best choice differs from {self.criterion!r} on "
                 f"its plant, {direct:.9g}. No score can be trusted: the problem is too badly "

@@ -15,7 +15,7 @@ from ..lti.lyapunov import solve_stein
 from ..lti.riccati import control_dare
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from .criterion import Criterion, Scorer
+from .criterion import AGREEMENT, Criterion, Scorer
 from .poi_axes import (
     Named,
     checked_names,
@@ -58,7 +58,7 @@ class MotionAndEffort(Criterion):
 
 def confirmed(cost: float, found: float) -> float:
     """Return the cost by Riccati equations, confirmed by that of the loop's covariance."""
-    if not abs(found - cost) <= 1e-6 * abs(cost):
+    if not abs(found - cost) <= AGREEMENT * abs(cost):
         raise CertificateError(
             f"the loop costs {found:.9g}, its Riccati equations say {cost:.9g}: the problem is "
             "too badly conditioned. Give a larger effort."

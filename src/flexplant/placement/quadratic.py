@@ -12,6 +12,7 @@ from ..checks import FloatArray, IntArray, Value
 from ..errors import SolverError
 from ..lti.equations import doubled, doubled_riccati, relative
 from ..lti.riccati import control_dare
+from ..tolerances import divisor
 from .criterion import Scorer
 from .tangent import Convex, Tangent
 
@@ -142,7 +143,7 @@ def quadratic(
     """Return the problem in states in which X, with all candidates, has a unit diagonal."""
     X = control_dare(A, items.T, Q=H, R=np.eye(items.shape[0])).P
     variance = np.maximum(X.diagonal(), 0.0)
-    s = np.sqrt(np.where(variance > 1e-200, variance, 1.0))
+    s = np.sqrt(divisor(variance))
     return Quadratic(
         A * s[:, None] / s,
         H / s / s[:, None],

@@ -209,7 +209,8 @@ class Branch:
 
 def _spread(rows: FloatArray, weights: FloatArray) -> tuple[float, FloatArray]:
     """Return the weighted variance of rows, and each row's place along its main direction."""
-    weights = weights + 1e-3 * np.max(weights) + 1e-12
+    # those of weight zero are to be cut as well
+    weights = weights + 1e-3 * np.max(weights) + TINY
     away = rows - weights @ rows / np.sum(weights)
     _, sizes, directions = np.linalg.svd(np.sqrt(weights)[:, None] * away, full_matrices=False)
     return float(np.sum(sizes**2)), np.asarray(away @ directions[0])
@@ -251,6 +252,7 @@ def ascended(
         if close(value, most):
             break
         if before is None:
+            # weights move by 0.3 of their range at first
             step = 0.3 / max(float(np.max(np.abs(rise))), TINY)
         else:
             moved, turned = weights - before[0], before[1] - rise

@@ -10,6 +10,7 @@ import scipy.linalg as la
 from ..checks import FloatArray, Matrix, Rng
 from ..errors import SolverError, counted
 from ..parallel import tick
+from ..tolerances import ROUNDING
 from .factor import by_rows, without_zeros
 from .rayleigh_ritz import column_groups, mixed
 
@@ -243,7 +244,8 @@ class BlockLanczos:
             # twice: the first turn is exact only to the condition of the block
             for _ in range(2):
                 size, turn = la.eigh(W.T @ loaded)
-                keep = size > 1e-24 * max(size[-1], 0.0)
+                # squares of lengths: 1e-12 of the longest direction is rounding
+                keep = size > ROUNDING**2 * max(size[-1], 0.0)
                 if size[-1] <= 0 or not np.any(keep):
                     empty = np.zeros((W.shape[0], 0))
                     return empty, empty, (along, np.zeros((0, over.shape[1])))
