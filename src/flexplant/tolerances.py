@@ -15,8 +15,11 @@ TINY = 1e-300
 RANK = 1e-13
 #: a number below this part of the terms it is a sum of is their rounding
 ROUNDING = 1e-12
-#: two numbers given as the same one, through a unit or a file, have at least nine digits alike
+#: two numbers given as the same one, through a unit or a binary file, have nine digits alike, and
+#: so have the coordinates of nodes: a motion that they show no more is none
 SAME = 1e-9
+#: numbers that were typed, or printed into a file by another program, have at least six digits
+TYPED = 1e-6
 #: a search whose value moves by less has ended: nothing in a machine is known to nine digits
 SETTLED = 1e-9
 #: eigenvalue solvers split a double pole, as of a rigid-body mode, by the root of their rounding
