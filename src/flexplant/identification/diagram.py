@@ -352,6 +352,7 @@ class Moments:
         companion[:m] = -A[1:].transpose(1, 0, 2).reshape(m, order * m)
         solved: Any = la.eig(companion, left=True, right=True)
         v, left, right = solved
+        # poles at zero: the leading coefficient is singular but for rounding
         keep = np.abs(v) > 1e-8
         v, left, right = v[keep], left[:m, keep].conj(), right[-m:, keep]
         z = 1.0 / v

@@ -80,6 +80,7 @@ class PreparedLines:
         return self._weighted(power, fitted_share)
 
     def _weighted(self, power: FloatArray, fitted_share: float) -> PreparedLines:
+        # 1e-13 of an amplitude: data without noise have no other error than rounding
         floor = 1e-26 * np.mean(np.abs(self.data) ** 2, axis=2, keepdims=True)
         variance = np.maximum(power / (1.0 - fitted_share), floor)
         return replace(self, weight=np.sqrt(2.0 / variance))

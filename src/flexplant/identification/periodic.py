@@ -10,7 +10,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, Value, generator, positive, real_array, whole
 from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf
-from ..tolerances import TINY
+from ..tolerances import TINY, TYPED
 from .spectra import Records, error_statistics
 
 #: a line counts as excited when the weakest direction of the inputs is not this much below the rest
@@ -69,7 +69,7 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
     """
     n_exp, n_in, n_time = data.u.shape
     samples = round(method.period * data.rate)
-    if abs(samples - method.period * data.rate) > 1e-6 * samples or samples < 4:
+    if abs(samples - method.period * data.rate) > TYPED * samples or samples < 4:
         raise ModelError(
             f"a period of {method.period:g} s is {method.period * data.rate:g} samples at "
             f"{data.rate:g} Hz: it must be a whole number from 4, or the spectrum leaks."
@@ -267,7 +267,7 @@ def multisine(
     _check_band(band)
     exact = positive(period, "period") * positive(rate, "rate")
     samples = round(exact)
-    if abs(samples - exact) > 1e-6 * exact or samples < 4:
+    if abs(samples - exact) > TYPED * exact or samples < 4:
         raise ModelError(f"a period must be a whole number of samples from 4, got {exact:g}.")
     lines = np.arange(1, (samples + 1) // 2)
     if band is not None:
@@ -419,6 +419,7 @@ def transient(
         explained = (pattern @ local.T).real / size[:, None]
         best = np.argmax(explained, axis=0)
         mine = explained[best, np.arange(freq.size)]
+        # a line that explains all leaves rounding
         rest = np.maximum(total - mine, 1e-12 * total) / (count - 2)
         freedom = 2.0 * length * e.shape[0] * outputs
         limit = fisher.isf(CHANCE / (freq.size * z.size), freedom, freedom * (count - 2))

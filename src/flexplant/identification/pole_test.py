@@ -432,6 +432,7 @@ def candidate(
     """
     error = (lines.data - model) * lines.weight**2
     best: tuple[float, ComplexArray, ComplexArray] | None = None
+    # dampings that a resolved peak can have
     own = np.clip(peak.width / (2 * peak.freq) * np.array([0.3, 1.0]), 1e-5, 0.15)
     for zeta in np.unique([*DAMPING, *own.tolist()]):
         for shift in (-0.5, -0.2, 0.0, 0.2, 0.5):

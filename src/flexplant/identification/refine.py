@@ -94,8 +94,9 @@ def refined(
     pivots = np.argmax(np.abs(participation), axis=0)
     columns = np.arange(poles.size)
     participation = participation / participation[pivots, columns]
-    now = Fit(lines, poles, participation, pivots)
-    damping, idle = 1e-6, 0
+    now = _projected(lines, poles, participation, pivots)
+    # nearly Gauss-Newton from the start, whose poles are good
+    damping, settled, idle = 1e-6, True, 0
     power = float(np.sum(np.abs(lines.data * lines.weight) ** 2))
     enough = FINE if fine else COARSE
     for number in range(steps):
@@ -118,6 +119,7 @@ def refined(
                 if gained >= 0:
                     break
             better = None
+            # tenfold up to a step that helps, from the least that changes anything
             damping = max(10.0 * damping, 1e-8)
         if better is None:
             break
@@ -133,6 +135,7 @@ def refined(
             break
         if number >= PATIENCE and now.cost - HOPE * predicted > below:
             raise unsettled(poles.size, number)
+        # a gain of rounding, thrice; or all that is there is explained, to 1e-12 of an amplitude
         idle = idle + 1 if gained <= 1e-12 * now.cost else 0
         if idle >= 3 or (idle and damping <= 1e-3) or now.cost <= 1e-24 * power:
             break

@@ -253,6 +253,7 @@ class MeasuredPlaces:
         some = dofs.select([dofs.labels[i] for i in rows])
         motions = rigid_motions(some, some.xyz.mean(axis=0))
         size = np.linalg.norm(motions, axis=0)
+        # nodes on a line have no rotation about it
         U = la.orth(motions / divisor(size), rcond=1e-9)
         r = U.shape[1]
         pairs = [(i, j) for i in range(r) for j in range(i, r)]
