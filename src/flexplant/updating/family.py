@@ -340,6 +340,7 @@ def _oscillating(omega: FloatArray, D: FloatArray, r: int) -> tuple[ComplexArray
     if np.sum(size) - np.trace(size) <= UNCOUPLED * np.max(size, initial=0.0):
         half = np.diag(D) / 2
         root = np.sqrt(np.maximum(omega**2 - half**2, 0.0))
+        # rigid-body modes come out at the root of rounding of the highest one
         keep = np.flatnonzero(root > 1e-7 * np.max(omega, initial=0.0))
         keep = keep[keep >= r]
         poles = -half[keep] + 1j * root[keep]
@@ -349,6 +350,7 @@ def _oscillating(omega: FloatArray, D: FloatArray, r: int) -> tuple[ComplexArray
     A[e + r + np.arange(e), np.arange(e)] = -omega[r:]
     A[e:, e:] = -D
     poles, states = la.eig(A, check_finite=False)
+    # rigid-body modes come out at the root of rounding of the fastest pole
     keep = np.flatnonzero(poles.imag > 1e-7 * np.abs(poles).max(initial=0.0))
     keep = keep[np.argsort(np.abs(poles[keep]), kind="stable")]
     # the velocity lambda q of each mode, its length 1, is its shape

@@ -148,6 +148,7 @@ def eigenvalue_sensitivities(
             G = family.group_derivative(rotation.eigen, group)
             size = np.abs(G).max(axis=(1, 2), keepdims=True)
             off = np.abs(G) * (1 - np.eye(len(group))) / _nonzero(size)
+            # within a group of equal eigenvalues, as accurate as these are equal
             if off.max() > 1e-6:
                 raise ModelError(
                     f"modes {[i + eigen.n_rigid + 1 for i in group]} are repeated, and "

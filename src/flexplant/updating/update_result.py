@@ -96,6 +96,7 @@ class Starts(Value):
 
     def __repr__(self) -> str:
         best = float(np.min(self.cost))
+        # minima that are one but for where the search ended
         same = int(np.sum(self.cost <= best + 1e-6 * max(abs(best), 1e-12)))
         failed = int(np.sum(~np.isfinite(self.cost)))
         return f"<Starts: {same} of {self.cost.size} at the least cost {best:.3g}, {failed} failed>"

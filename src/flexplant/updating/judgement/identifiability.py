@@ -164,6 +164,7 @@ def identifiability(
     strongest = float(np.max(length / reach, initial=0.0))
     whole = objective.size(point)
     change = np.linalg.norm(J / divisor(whole)[:, None], axis=0)
+    # nine decades below the strongest nothing is seen but rounding
     seen = (length > own) & (length > 1e-9 * strongest * reach)
     seen &= change > ROUNDING * reach / omega
     scaled = np.where(seen, J / np.where(seen, length, 1.0), 0.0)
@@ -172,6 +173,7 @@ def identifiability(
     clear = s > LOST * s[0]
     half = Vt[clear].T / s[clear]
     unit = half @ half.T
+    # squares: a share of 1e-3 of a lost combination
     lost = np.sum(Vt[~clear] ** 2, axis=0) > 1e-6
     std = np.where(lost | ~seen, np.inf, np.sqrt(np.diag(unit)) / np.where(seen, length, 1.0))
     size = np.where(lost, 1.0, np.sqrt(np.maximum(np.diag(unit), TINY)))
@@ -228,5 +230,6 @@ def _missing(
         share = np.max(clear[:, own], axis=1, initial=0.0)
         order = np.argsort(-share, kind="stable")[:NAMED]
         largest = share.max(initial=0.0)
+        # modes that take no part but for rounding
         found[name] = tuple(numbers[i] for i in order if share[i] > 1e-6 * largest > 0)
     return found

@@ -236,6 +236,7 @@ class Subsets:
         a, overlap = J.T @ r, J.T @ J
         room = 1 - overlap**2
         both = a[:, None] ** 2 + a[None] ** 2 - 2 * overlap * np.outer(a, a)
+        # parallel columns are one parameter: the second explains nothing more
         gain = np.where(room > 1e-6, both / np.maximum(room, 1e-6), 0.0)
         i, j = np.triu_indices(self.count, 1)
         order = np.argsort(-gain[i, j], kind="stable")[: 2 * JOIN]
@@ -420,6 +421,7 @@ def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | N
     shifts = top**2 * (1 - np.cos(angle)) / 2
     moved = np.hstack([forces / (squares[high] - shift)[:, None] for shift in shifts])
     size = np.linalg.norm(moved, axis=0)
+    # the shifts give vectors that are nearly alike: what differs less is rounding
     Z = la.orth(moved / divisor(size), rcond=1e-10)
     turn = la.eigh((Z.T * squares[high]) @ Z)[1]
     B = np.zeros((squares.size, kept + Z.shape[1]))

@@ -23,6 +23,7 @@ from ...errors import LabelError, ModelError, ShapeError, counted, require_known
 from ...identification import MeasuredModes
 from ...labels import DIRECTIONS, Place
 from ...modes.matching import clusters
+from ...tolerances import SAME, TYPED
 from ..family import Family
 from ..parameters.added import checked_place
 from ..point_model import CLUSTER, Point, measured_pairs
@@ -305,9 +306,9 @@ def _checked_covariance(value: Any, size: tuple[int, int]) -> Any:
     imag = real_array(np.imag(value), "the imaginary part of covariance", shape)
     whole = real + 1j * imag if np.any(imag) else real
     mirrored = np.swapaxes(whole, 1, 2).conj()
-    if not np.allclose(whole, mirrored, rtol=1e-6, atol=1e-9 * np.abs(whole).max(initial=0.0)):
+    if not np.allclose(whole, mirrored, rtol=TYPED, atol=SAME * np.abs(whole).max(initial=0.0)):
         raise ModelError("covariance of shapes must be Hermitian: E[n n^H] of each.")
-    if np.linalg.eigvalsh(whole).min() < -1e-9 * np.abs(whole).max(initial=0.0):
+    if np.linalg.eigvalsh(whole).min() < -SAME * np.abs(whole).max(initial=0.0):
         raise ModelError("covariance of shapes must be positive semi-definite, E[n n^H] of each.")
     return (whole + mirrored) / 2
 

@@ -382,6 +382,7 @@ class Held:
         kept = np.flatnonzero(np.abs(beta) > 1e-10 * np.abs(alpha))
         z = alpha[kept] / beta[kept]
         s = np.log(np.where(z == 0, TINY, z)) / self.T
+        # pairs strictly between 0 Hz and half the rate
         upper = (s.imag > 1e-9 / self.T) & (s.imag < (np.pi - 1e-9) / self.T)
         kept, z, s = kept[upper], z[upper], s[upper]
         x, u = right[:n, kept], right[n:, kept] / size

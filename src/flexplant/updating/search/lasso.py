@@ -97,6 +97,7 @@ def _lasso(
         # the path only has to say which parameters change; these are fitted anew
         found = _sparse(objective, start, unit, size, PATH_STEPS, 1e-4)
         change = np.abs((found.p - start) / unit)
+        # zeros of the l1 problem, as accurate as its solver is
         judged(tuple(np.flatnonzero(change > 1e-6 * change.max()).tolist()), found.p)
     if best is None:
         raise SolverError("no weight of the l1 penalty leaves a sparse change: nothing differs.")
@@ -126,6 +127,7 @@ def refitted(
 ) -> SearchEnd:
     """Minimise over some parameters, the others held at the start."""
     lower, upper = objective.lower, objective.upper
+    # bounds must differ: nine digits are held
     held = 1e-9 * np.maximum(np.abs(start), 1e-9)
     try:
         objective.lower = np.where(active, lower, start - held)
@@ -176,6 +178,7 @@ def _sparse(
         problem.solve(solver=cp.CLARABEL)
         if x.value is None:
             raise SolverError(f"the l1 problem was not solved: {problem.status}.")
+        # zeros of the l1 problem, as accurate as its solver is
         aim = np.where(np.abs(x.value) > max(1e-7 * np.abs(x.value).max(), NOTHING), x.value, 0.0)
         step, fraction = (aim - now) * unit, 1.0
         for _ in range(20):

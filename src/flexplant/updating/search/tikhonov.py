@@ -77,6 +77,7 @@ class Tikhonov(PenalisedMethod):
         if self.weight is not None:
             return solved(self.weight, start)
         largest = float(np.linalg.norm(J * unit, 2))
+        # from all to next to nothing of the prior
         sizes = np.geomspace(largest, 1e-6 * largest, PATH)
         curve, found, begin = [], [], start
         for size in sizes.tolist():
