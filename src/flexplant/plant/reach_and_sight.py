@@ -14,7 +14,7 @@ from ..labels import DIRECTIONS
 from ..lti.scaling import state_scale
 from ..lti.statespace import StateSpace
 from ..lti.zeros import axis_zeros
-from ..tolerances import ROUNDING, SPLIT, TINY, divisor
+from ..tolerances import ROUNDING, SAME, SPLIT, TINY, TYPED, divisor
 from .partition import Partition
 from .rigid.rigid_motion import body_of, rigid_modes
 
@@ -90,7 +90,7 @@ def _counted(plant: Partition, poles: list[_Pole]) -> list[str]:
     for pole in poles:
         size = abs(pole.value) / (2 * np.pi)
         if plant.is_assembled and pole.value.imag and abs(pole.value.real) <= _AXIS * size:
-            weak = np.any(np.abs(known - size) <= 1e-6 * size)
+            weak = np.any(np.abs(known - size) <= TYPED * size)
             kind = "undamped suspension mode" if weak else "undamped mode"
             kinds[kind] += [size] * pole.left.shape[1]
     for kind, freq in kinds.items():
@@ -131,6 +131,7 @@ def _persistent(g: StateSpace) -> list[_Pole]:
     poles = g.poles()
     margin = np.abs(poles) - 1 if g.dt else poles.real / np.maximum(np.abs(poles), 1.0)
     size = max(float(np.linalg.norm(g.A, 2)), TINY) if poles.size else 1.0
+    # a double pole at the edge comes out at the root of rounding
     near = 1e-7 * float(np.max(np.abs(poles), initial=TINY))
     found: list[_Pole] = []
     for pole in poles[(margin > -_AXIS) & (poles.imag >= 0)]:
@@ -234,6 +235,7 @@ def _lacks(plant: Partition, group: list[_Pole], case: _Case, rate: float) -> li
 def response_at(block: StateSpace, at: complex) -> ComplexArray:
     """Return the response of a block at a point of the plane; beside it where it has a pole."""
     eye = np.eye(block.n_states)
+    # beside a pole the response is large, but a number
     for point in (at, at + 1e-6 * max(abs(at), 1.0)):
         try:
             found = block.D + block.C @ np.linalg.solve(point * eye - block.A, block.B)
@@ -325,7 +327,7 @@ def full_ranks(plant: Partition) -> list[Assumption]:
         sizes = np.linalg.norm(matrix, axis=0)
         free = [name for name, size in zip(names, sizes, strict=True) if not size]
         scaled = matrix / divisor(sizes)
-        rank = int(np.linalg.matrix_rank(scaled, tol=1e-9)) if scaled.size else 0
+        rank = int(np.linalg.matrix_rank(scaled, tol=SAME)) if scaled.size else 0
         if free:
             found.append(Assumption(key, False, f"{', '.join(free)} {text}.", remedy))
         elif rank < len(names):

@@ -163,6 +163,7 @@ def _at_once(model: ReducedModel) -> ModalRealisation:
     heavy, follow, flexibility = model.condensed()
     found = realised(heavy)
     values, vectors = np.linalg.eigh(flexibility)
+    # flexibilities beside the softest: what is left out is stiff enough to be rigid
     kept = values > 1e-15 * values[-1]
     half = vectors[:, kept] * np.sqrt(values[kept])
     return found.replace(

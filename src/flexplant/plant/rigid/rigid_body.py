@@ -13,6 +13,7 @@ from ...labels import DIRECTIONS
 from ...structure import FEModel
 from ...structure.placed import SPANNED
 from ...structure.rigid import turned_about
+from ...tolerances import SAME
 from ..realisation import ModalRealisation, Structure
 
 #: part of a channel's largest motion that counts as seen
@@ -133,7 +134,7 @@ def _independent(motions: FloatArray, exists: list[int]) -> list[int]:
     kept: list[int] = []
     for i in exists:
         trial = motions[:, [*kept, i]]
-        if np.linalg.matrix_rank(trial / np.linalg.norm(trial, axis=0), tol=1e-9) > len(kept):
+        if np.linalg.matrix_rank(trial / np.linalg.norm(trial, axis=0), tol=SAME) > len(kept):
             kept.append(i)
     return kept
 

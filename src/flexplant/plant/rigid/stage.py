@@ -301,6 +301,7 @@ def _arm(plant: StandardPlant, ports: Ports, motions: RigidModes) -> float:
         return 1.0
     R = seen(plant, motions, turning)
     S = seen(plant, motions, [s.name for s in ports.y]) / np.sqrt(len(ports.y))
+    # directions in which no axis turns come out as rounding of the others
     turn = np.linalg.pinv(R, rcond=1e-6)
     straight = S @ (np.eye(R.shape[1]) - turn @ R)
     sheared = S @ turn

@@ -315,6 +315,7 @@ def require_exact(
         np.eye(count) - whole[np.ix_(inner, inner)] @ amounts, whole[np.ix_(inner, columns)]
     )
     made = whole[np.ix_(outer, columns)] + whole[np.ix_(outer, inner)] @ amounts @ closed
+    # of the change six digits, where rounding of the whole leaves them
     allowed = 1e-6 * np.abs(wanted - base).max(axis=1) + ROUNDING * np.abs(wanted).max(axis=1)
     bad = np.flatnonzero(np.abs(made - wanted).max(axis=1) > allowed)
     if bad.size:

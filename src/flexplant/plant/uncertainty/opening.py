@@ -306,6 +306,7 @@ def _check_poles(
             raise unknown_label("elastic mode of the plant", number, map(str, known))
         own = np.linalg.eigvals(realisation.pairs[number - 1])
         off = np.min(np.abs(own - pole)) / abs(pole)
+        # strict: poles that were typed
         if off > (1e-6 if strict else 0.1):
             raise ModelError(
                 f"mode {number} has the pole {pole:.6g} in the "
