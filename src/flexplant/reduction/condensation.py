@@ -15,7 +15,7 @@ from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..sparse.factor import unit_diagonal
 from ..structure import FEModel, ModalDamping
-from ..tolerances import ROUNDING
+from ..tolerances import ROUNDING, SAME
 from .methods import ReductionMethod, refused_partition
 from .projection import (
     Solver,
@@ -41,13 +41,14 @@ def _loose(model: FEModel, kept: IntArray) -> str:
     _, sizes, turned = la.svd(rigid[kept])
     held = np.zeros(rigid.shape[1])
     held[: sizes.size] = sizes
-    left = rigid @ turned[held < 1e-9 * max(largest, held.max(initial=0.0))].T
+    left = rigid @ turned[held < SAME * max(largest, held.max(initial=0.0))].T
     # the displacements that move most, one after the other; rotations where there are no others
     names = model.dofs.labels
     straight = model.dofs.kinds < 3
     order = la.qr(np.where(straight[:, None], left, 0.0).T, mode="r", pivoting=True)
     count = left.shape[1]
     corner = np.abs(np.diag(order[0]))
+    # displacements alone leave a rotation about the line on which they lie
     if corner.size < count or corner[count - 1] < 1e-6 * corner[0]:
         order = la.qr(left.T, mode="r", pivoting=True)
     add = ", ".join(repr(names[i]) for i in order[1][:count])
@@ -83,7 +84,7 @@ class DofPartition:
         if rigid.shape[1]:
             # held at the kept DOFs, no rigid-body motion may be left
             size = la.svdvals(rigid[self.kept] / np.linalg.norm(rigid, axis=0))
-            if size.size < rigid.shape[1] or size[-1] < 1e-9 * size[0]:
+            if size.size < rigid.shape[1] or size[-1] < SAME * size[0]:
                 raise ModelError(_loose(model, self.kept))
         self.stiffness = block(model.K, self.others, self.others)
         self.solver = Solver(self.stiffness, _SINGULAR)

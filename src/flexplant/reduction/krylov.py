@@ -26,6 +26,8 @@ from .reduced import ReducedModel
 
 #: M-norm of what is new in a vector, of the whole vector, below which it adds nothing
 _DEPENDENT = 1e-9
+#: residual, relative to the loads, that one refinement leaves unless K + s^2 M is singular
+_UNSOLVED = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -187,7 +189,7 @@ def _factorised(matrix: Any, omega: float) -> Callable[[Any], Any]:
         # pivots kept on the diagonal: one refinement brings the digits back
         found = found + lu.solve(loads - matrix @ found)
         left = np.linalg.norm(loads - matrix @ found, axis=0)
-        if not np.all(left <= 1e-6 * np.linalg.norm(loads, axis=0).clip(TINY)):
+        if not np.all(left <= _UNSOLVED * np.linalg.norm(loads, axis=0).clip(TINY)):
             raise SolverError(
                 f"the response at {at} leaves a residual of {left.max():.2g}: a resonance is too "
                 "near. Move the expansion frequency."
@@ -224,6 +226,7 @@ def extended(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArr
         fresh = fresh - basis @ (basis.T @ np.asarray(model.M @ fresh))
         gram = dense(fresh.T @ np.asarray(model.M @ fresh))
         values, mix = la.eigh(gram)
+        # squares of lengths: the rest is a combination but for 1e-3, and comes again orthogonal
         good = values > 1e-6 * max(float(values[-1]) if values.size else 0.0, TINY)
         fresh = fresh @ (mix[:, good] / np.sqrt(values[good]))
     return np.hstack([basis, fresh])

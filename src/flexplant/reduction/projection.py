@@ -45,6 +45,7 @@ class Solver:
             self._factor = la.cho_factor(dense(scaled), lower=True)
         except la.LinAlgError as error:
             raise ModelError(singular) from error
+        # a root: pivots below 1e-14 of a unit diagonal are rounding
         if matrix.shape[0] and np.diag(self._factor[0]).min() < 1e-7:
             raise ModelError(singular)
 

@@ -16,6 +16,7 @@ from ..modes.attachment_vectors import attachment_vectors, labels_of, places, st
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..structure import FEModel, ModalDamping
+from ..tolerances import SAME
 from .bounds import ErrorBound
 from .condensation import kept_columns, mode_numbers
 from .methods import ReductionMethod
@@ -301,7 +302,7 @@ def _corrected(
     rows = np.array([kept.dofs.row(place) for place in static])
     moved = (rows @ shapes).T / omega[:, None] ** 2
     vectors, values, _ = la.svd(moved, full_matrices=False)
-    if not values.size or values[-1] <= 1e-9 * values[0] or moved.shape[1] > moved.shape[0]:
+    if not values.size or values[-1] <= SAME * values[0] or moved.shape[1] > moved.shape[0]:
         raise ModelError(
             f"the truncated modes cannot give {counted(len(static), 'independent static shape')} "
             f"at {', '.join(names)}: they are too few, or a place is there twice."
