@@ -13,6 +13,7 @@ from ..errors import ModelError
 from ..labels import DofSet
 from ..sparse.factor import DENSE_LIMIT, dense, unit_diagonal
 from ..sparse.rayleigh_ritz import rayleigh_ritz, rounding_of, soft_group
+from ..tolerances import TYPED
 from .definite import are_rigid, signed_root
 from .zero_energy import beyond, most_moved
 
@@ -179,5 +180,5 @@ def check_stiffness(
 def signed(phi: FloatArray) -> FloatArray:
     """Return shapes with the first of their largest entries positive: repeatable signs."""
     size = np.abs(phi)
-    first = np.argmax(size >= (1 - 1e-6) * size.max(axis=0), axis=0)
+    first = np.argmax(size >= (1 - TYPED) * size.max(axis=0), axis=0)
     return np.asarray(phi * np.where(phi[first, np.arange(phi.shape[1])] < 0, -1.0, 1.0))

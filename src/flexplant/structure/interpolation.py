@@ -179,6 +179,7 @@ class _Field:
 
     def spans(self, axis: int) -> bool:
         """Return whether the nodes vary along x, y or z, so that slopes along it are known."""
+        # 1 where the axis lies in the span of the nodes, less by the square of what is missing
         return bool(np.linalg.norm(self.axes[:, axis]) > 1.0 - 1e-6)
 
     def values(self, points: FloatArray) -> FloatArray:

@@ -25,6 +25,7 @@ from ..dof_columns import at_nodes, node_numbers
 from ..errors import LabelError, ModelError, ShapeError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
+from ..tolerances import TYPED
 from .definite import SEMIDEFINITE, are_swapped
 from .model import FEModel
 from .precision import digits_of, endangered, held_by_rounding, shown_digits
@@ -417,7 +418,7 @@ def cosines(dofs: DofSet, rotations: Any) -> Any:
     instance(rotations, Mapping, "rotations", "Pass {node: (3, 3) cosines}.", LabelError)
     for node, given in rotations.items():
         matrix = real_array(given, f"rotations[{node}]", (3, 3))
-        if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-6:
+        if np.abs(matrix @ matrix.T - np.eye(3)).max() > TYPED:
             raise ModelError(
                 f"the direction cosines of node {node} are not orthogonal, got "
                 f"{matrix.round(6).tolist()}: row i holds the global components of local axis i."

@@ -17,7 +17,7 @@ from ..labels import DIRECTIONS, DofSet, Place
 from ..sparse.factor import by_rows
 from ..sparse.lowest import ROUNDING, definite_solver
 from ..sparse.rayleigh_ritz import Absolute
-from ..tolerances import divisor
+from ..tolerances import SAME, divisor
 from .soft_springs import bodies, unheld
 
 #: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
@@ -243,7 +243,7 @@ def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -
             for _ in range(2):
                 vector = vector - done @ (loaded.T @ vector)
         left = _length(M, vector) if length else 0.0
-        if left <= 1e-9 * length:
+        if left <= SAME * length:
             if dependent == "drop":
                 continue
             raise ModelError(

@@ -214,6 +214,7 @@ def _length_factor(K: Any, dofs: DofSet, motions: FloatArray, free: Any) -> floa
             continue
         factor = -float(by_moving @ by_turning) / square
         rest = np.linalg.norm(factor * by_moving + by_turning)
+        # rounding of forces that cancel between stiff elements
         if rest < 1e-6 * np.linalg.norm(by_turning) and factor > 0:
             factors.append(factor)
     if not factors or np.ptp(factors) > 1e-3 * factors[0] or abs(factors[0] - 1) < 1e-3:

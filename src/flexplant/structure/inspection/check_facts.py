@@ -12,7 +12,7 @@ from ...checks import FloatArray, IntArray
 from ...errors import ModelError, SolverError
 from ...sparse.factor import by_rows, diagonal, is_positive_definite, unit_diagonal
 from ...sparse.lowest import PRECISION, ROUNDING, Lowest, lowest_modes
-from ...tolerances import divisor
+from ...tolerances import SAME, divisor
 from ..definite import are_rigid, are_swapped, unstable_stiffness
 from ..matrices import FEMatrices
 from ..model import FEModel
@@ -301,7 +301,7 @@ def _lowest(
 
 def _damping(D: Any, motions: ZeroEnergy | None, proven: bool) -> dict[str, Any]:
     kept = np.flatnonzero(~empty_rows(D))
-    definite = proven or not kept.size or is_positive_definite(D[kept][:, kept], 1e-9)
+    definite = proven or not kept.size or is_positive_definite(D[kept][:, kept], SAME)
     drag = 0.0
     if motions is not None and motions.n_rigid and kept.size:
         size: Any = abs(D)

@@ -12,6 +12,7 @@ from ...checks import FloatArray
 from ...errors import counted
 from ...labels import DIRECTIONS, DofSet
 from ...sparse.factor import diagonal
+from ...tolerances import TYPED
 from ..rigid import rigid_motions
 from ..zero_energy import ZeroEnergy, most_moved
 from .check_facts import Facts
@@ -128,6 +129,7 @@ def _damping_line(found: Facts) -> Line:
             "D is not positive semi-definite: it feeds energy in",
             "look for a sign; gyroscopic terms are not symmetric and do not belong into D",
         )
+    # of the terms, which cancel to rounding
     if found.damping["drag"] > 1e-9:
         return (
             "note",
@@ -260,7 +262,7 @@ def masses(found: Facts) -> Iterator[Line]:
     if not known.any():
         return
     shown = [f"{m:.6g} kg in {d}" for m, d, k in zip(mass, "xyz", known, strict=False) if k]
-    same = np.ptp(mass[known]) <= 1e-6 * np.abs(mass[known]).max()
+    same = np.ptp(mass[known]) <= TYPED * np.abs(mass[known]).max()
     if same:
         text = f"{mass[known][0]:.6g} kg in {', '.join(d for d, k in zip('xyz', known) if k)}"  # noqa: B905
         yield ("ok", "total mass", text, "")
@@ -401,7 +403,7 @@ def unusual(found: Facts) -> tuple[str, str] | None:
     if not straight.any():
         return None
     rate = float(np.median(np.sqrt(stiff[straight] / heavy[straight])))
-    filled = bool(np.all(size > 1e-6 * size.max()))
+    filled = bool(np.all(size > TYPED * size.max()))
     volume = float(np.prod(size)) if filled else float(np.linalg.norm(size)) ** 3
     density, dense = mass / volume, _DENSITY if filled else _FLAT
     kinds = set(dofs.kinds.tolist())
