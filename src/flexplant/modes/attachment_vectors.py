@@ -87,6 +87,7 @@ def attachment_vectors(
     gram = response.T @ np.asarray(M @ response)
     size = np.sqrt(np.diag(gram))
     lowest = la.eigvalsh(gram / np.outer(size, size))[0]
+    # squares: vectors whose angle is below 1e-5 are one
     if lowest < 1e-10:
         raise ModelError(
             f"the attachment vectors of {', '.join(named(place) for place in at)} depend on each "

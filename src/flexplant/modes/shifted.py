@@ -18,7 +18,7 @@ from ..sparse.pardiso import Pardiso, PardisoCholesky
 from ..sparse.rayleigh_ritz import rounding_of
 from ..structure.definite import unstable_stiffness
 from ..structure.model import FEModel
-from ..tolerances import TINY, divisor
+from ..tolerances import ROUNDING, TINY, divisor
 
 #: the shift, in roundings of the energies of rigid-body motions: far below the first elastic mode
 #: of nearly all models, yet K - sigma M is well away from singular
@@ -69,6 +69,7 @@ class StiffnessFactor:
             ) from error
 
     def __repr__(self) -> str:
+        # four or eight bytes each
         size = self._cholesky.n_entries * (4e-9 if self.single else 8e-9)
         return f"<StiffnessFactor: {counted(self.K.shape[0], 'DOF')}, {size:.2g} GB>"
 
@@ -103,9 +104,10 @@ class StiffnessFactor:
             residual -= inertia @ (R.T @ residual)
             # measured in energy: in forces, rounding of stiff directions would hide the rest
             part = np.sqrt(new * length / np.maximum(np.sum(u * (self.K @ u), axis=0), TINY))
-            if np.all((part <= 1e-12) | (wanted == 0)) or np.all(part >= best):
+            if np.all((part <= ROUNDING) | (wanted == 0)) or np.all(part >= best):
                 break
             best, old = part, divisor(new)
+        # an energy: the shapes that are made of it keep ten digits and more
         if not np.all((part <= 1e-7) | (wanted == 0)):
             raise SolverError(
                 f"a static response is not found (the last step is {part.max():.1g} of it): K is "
