@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ..checks import FloatArray, IntArray, Value, check_names, known_units, positive, real_array
 from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
 from ..loop import Spectrum
+from ..tolerances import TYPED
 
 #: one number, or one per run
 Numbers: TypeAlias = "float | FloatArray"
@@ -67,7 +68,7 @@ class Response(Value, Mapping[str, FloatArray]):
         check_names(names, "channels")
         time = real_array(self.time, "time", (None,))
         steps = np.diff(time)
-        if steps.size and (steps.min() <= 0 or np.ptp(steps) > 1e-6 * steps.mean()):
+        if steps.size and (steps.min() <= 0 or np.ptp(steps) > TYPED * steps.mean()):
             raise ModelError("time must increase in equal steps: moving windows count samples.")
         data = real_array(self.data, "data")
         if data.ndim not in (2, 3) or data.shape[-2:] != (len(names), time.size):

@@ -25,7 +25,7 @@ from ..loop.blocks import DERIVATIVES, references
 from ..loop.budget import white_noise
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant
-from ..tolerances import SAME
+from ..tolerances import SAME, TYPED
 from .motion import SetPoint
 from .nonlinear_elements import Element, conditions, finer_loop
 from .response import Response
@@ -295,7 +295,7 @@ def _check_setpoint(move: SetPoint, name: str, time: FloatArray) -> None:
         )
     if move.rate is not None and dt:
         ratio = 1.0 / (move.rate * dt)
-        if abs(ratio - round(ratio)) > 1e-6 * ratio or round(ratio) < 1:
+        if abs(ratio - round(ratio)) > TYPED * ratio or round(ratio) < 1:
             warn(
                 f"{name} switches on a grid of {move.rate:g} Hz, between the samples of the loop's "
                 f"{1.0 / dt:g} Hz: its derivatives are not in phase there. Make it with "
