@@ -16,6 +16,7 @@ from ..dof_columns import in_box
 from ..errors import ModelError, warn
 from ..labels import DIRECTIONS, DofSet
 from ..structure.rigid import rigid_motions
+from ..tolerances import TYPED
 from .component import Component, Model, Pose, components_of
 from .ends import JointEnd, joint_axes
 from .joint import Joint
@@ -209,7 +210,7 @@ def coincident_joints(
     [<Joint stage/1 - frame/1 along x, rigid>]
     """
     parts = components_of(components, placed)
-    reach = 1e-6 * machine_size(parts) if tolerance is None else positive(tolerance, "tolerance")
+    reach = TYPED * machine_size(parts) if tolerance is None else positive(tolerance, "tolerance")
     found: list[Joint] = []
     for one, other in combinations(parts, 2):
         found += _joints(one, other, box, reach)
