@@ -442,6 +442,7 @@ def nodes_per_wavelength(
     apart = np.sum((shapes[i] - shapes[j]) ** 2, axis=(0, 2))
     size = np.sum(shapes[i] ** 2 + shapes[j] ** 2, axis=(0, 2))
     turn = np.arccos(np.clip(1.0 - apart / divisor(size), -1.0, 1.0))
+    # a rigid-body motion has no wave: any large number of nodes will do
     return np.asarray(2.0 * np.pi / np.maximum(turn, 1e-9))
 
 

@@ -105,6 +105,7 @@ class Invertibility(Value):
     def _described(self, zero: complex) -> str:
         size = abs(zero)
         grows = f" that grows by {size:.6g} per sample" if size > 1 + _LIMIT else ""
+        # a double zero at 1 comes out at the root of rounding times its condition
         if abs(zero - 1) < 1e-5:
             return "a constant force (zero at 1: no sensor sees a displacement that it makes)"
         if zero.real < 0 and abs(zero.imag) < SPLIT * size:
@@ -285,6 +286,7 @@ def check_bias(plant: StandardPlant | System, inputs: Sequence[str]) -> None:
         return
     listed = []
     for column in sorted(missing.T, key=lambda one: int(np.argmax(np.abs(one)))):
+        # what takes no part in a motion comes out as rounding
         parts = np.flatnonzero(np.abs(column) > 1e-6 * np.abs(column).max())
         listed.append(" + ".join(f"{column[i]:.3g} {names[i]}" for i in parts))
         if parts.size == 1:

@@ -296,6 +296,7 @@ def _scored(spectrum: _LevelSpectrum, start: FloatArray, lowest: FloatArray) -> 
     bottom = np.log(lowest)
     log_t = np.log(start)
     value, slope, information = _likelihood(spectrum, np.exp(log_t))
+    # nearly a Newton step: the first one is seldom far
     damping = 1e-6
     for _ in range(_STEPS):
         scale = np.sqrt(np.maximum(information.diagonal(), TINY))

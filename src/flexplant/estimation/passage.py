@@ -265,6 +265,7 @@ class _Walk:
                 return False, x, Z
             x, Z = x + Z @ self.found.value, Z[:, :0]
         excess = float(np.sum(weight * (P - self.steady.P)))
+        # beside the rounding of both covariances
         return abs(excess) < SETTLED + 1e-13 * size, x, Z
 
     @property
@@ -393,6 +394,7 @@ def excess(
         more = more + X @ X.T
     sizes, vectors = np.linalg.eigh(0.5 * (more + more.T))
     below = vectors[:, sizes < 0] * np.sqrt(-sizes[sizes < 0])
+    # beside the rounding of the terms
     if np.sum((weight @ below) * below) > FADED + 1e-13 * np.sum(np.abs(weight * steady.P)):
         return None
     return kept(weight, vectors[:, sizes > 0] * np.sqrt(sizes[sizes > 0]))
@@ -452,6 +454,7 @@ class KnownParameters(NamedTuple):
         """Return the variance (p,) that delta adds where it enters by rows (p, r)."""
         variance = np.sum((rows @ self.X) ** 2, axis=1)
         missed = np.linalg.norm(rows @ self.open, axis=1)
+        # the root of rounding: an unknown motion enters the square
         return np.where(missed > 1e-8 * np.linalg.norm(rows, axis=1), np.inf, variance)
 
 

@@ -254,6 +254,7 @@ def _at(m: FilterModel, gamma: float) -> _HinfGains | None:
     except SolverError:
         return None
     unit = np.sqrt(np.maximum(np.abs(P.diagonal()), TINY))
+    # rounding leaves 1e-12 of a unit diagonal; a solution of the wrong sign some 1
     if np.min(np.linalg.eigvalsh(P / unit / unit[:, None])) < -1e-9:
         return None
     innovation = m.innovation(P)

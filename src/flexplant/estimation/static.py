@@ -145,6 +145,7 @@ def design_static(
     R_y, R_z = seen(plant, motions, used), seen(plant, motions, channels)
     gain = R_z @ np.linalg.pinv(R_y, rcond=_MISSED)
     missed = np.linalg.norm(R_z - gain @ R_y, axis=1)
+    # displacements of a static solution have nine digits
     bad = missed > 1e-6 * np.linalg.norm(R_z, axis=1)
     if np.any(bad):
         raise AssumptionError(
