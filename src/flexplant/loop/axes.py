@@ -113,6 +113,7 @@ def line_variance(frf: Frf) -> FloatArray | None:
     if frf.coherence is None:
         return None
     averages = 2.0 if frf.freedom is None else frf.freedom + 1.0
+    # lower ones are zero: such lines count for nothing
     sure = np.maximum(frf.coherence, 1e-6)
     return np.asarray(np.abs(frf.data) ** 2 * (1.0 - np.minimum(sure, 1.0)) / (sure * averages))
 

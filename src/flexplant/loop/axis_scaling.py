@@ -52,6 +52,7 @@ def _balanced(S: ComplexArray) -> FloatArray:
     k, n = S.shape[:2]
     power, log = np.abs(S) ** 2, np.zeros((k, n))
     power[:, range(n), range(n)] = 0.0
+    # a coupling of 1e-12 of the whole is rounding; all sums are squares
     least = 1e-24 * np.sum(np.abs(S) ** 2, axis=(1, 2)) + TINY
     for _ in range(_SWEEPS if n > 1 else 0):
         for i in range(n):

@@ -411,6 +411,7 @@ def bandwidth(loop: Loop) -> float:
     grid = parts.grid
     loop_low = parts.gain(grid[:1])[0]
     vectors, gains, _ = np.linalg.svd(loop_low)
+    # axes without an actuator: their gain is rounding of the others
     acting = np.asarray(vectors[:, gains >= 1e-6 * gains[0]], dtype=np.complex128)
     values = _sensitivity_along(acting, parts, grid)
     if not np.any(values < 1.0):
