@@ -112,6 +112,7 @@ def _observer(K: StateSpace, recovery: float) -> FloatArray:
     scale = np.where(scale > 0, scale, np.max(scale, initial=1.0))
     grow = float(np.exp(K.dt / recovery)) if K.dt else 1.0 / recovery
     A = K.A * grow if K.dt else K.A + grow * np.eye(n)
+    # all states a little, so that each has a stabilising gain
     Q = np.diag(scale**2) * 1e-6
     seen = float(np.sum((C * scale) ** 2)) or 1.0
     try:

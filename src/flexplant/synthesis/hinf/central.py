@@ -156,4 +156,5 @@ def _listed(p: Prepared, found: OnAxisError) -> str:
 def indefinite(X: FloatArray, size: float) -> bool:
     """Return whether X has a negative eigenvalue beyond rounding; size is what X comes from."""
     values = la.eigvalsh(X) if X.size else np.zeros(1)
+    # an accurate X to 1e-6 of its size (the residual), and beyond what its equation rounds
     return bool(values[0] < -1e-5 * max(values[-1], -values[0]) and values[0] < -1e-9 * size)

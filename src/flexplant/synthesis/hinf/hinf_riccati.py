@@ -261,6 +261,7 @@ def _attempt(problem: Prepared, gamma: float) -> _Attempt:
     coupling = float(np.max(la.eigvals(X @ Y).real, initial=0.0))
     speed = float(np.linalg.norm(problem.A)) or 1.0
     sizes = (float(np.linalg.norm(part)) ** 2 / speed for part in (problem.C1, problem.B1))
+    # as accurate as X and Y are
     if any(map(indefinite, (X, Y), sizes)) or coupling > gamma**2 * (1.0 + 1e-5):
         return _Attempt(None, True)
     try:

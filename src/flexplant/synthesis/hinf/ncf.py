@@ -236,6 +236,7 @@ def hidden_mode(G: StateSpace, K: StateSpace) -> AssumptionError:
     poles = _four_block(G, K).poles()
     pole = complex(poles[int(np.argmax(np.abs(poles) if G.dt else poles.real))])
     speed = abs(np.log(pole)) / G.dt if G.dt and pole else abs(pole)
+    # integrators come out of eigenvalues beside zero
     rounding = 1e-9 * (1.0 / G.dt if G.dt else float(np.abs(poles).max()))
     speed = speed if speed > rounding else 0.0
     shifted = G.A - pole * np.eye(G.n_states)

@@ -164,6 +164,7 @@ def solve_program(
         if not _is_lmi(constraint):
             continue
         values = la.eigvalsh(half(M))
+        # solvers return them symmetric: else the constraint is not the one meant
         if np.max(np.abs(M - M.T)) > 1e-9 * max(float(values[-1]), 1.0):
             raise SolverError(
                 "an LMI was not symmetric, and so not imposed as it was meant. Report it."

@@ -236,6 +236,7 @@ class Plant(NamedTuple):
         """
         Lx, Ly = factor(X), factor(Y)
         left, values, right = la.svd(Lx.T @ Ly)
+        # directions that are uncontrollable or unobservable but for rounding
         root = np.sqrt(np.maximum(values, 1e-12 * values[0]))
         T, back = (left / root).T @ Lx.T, Ly @ right.T / root
         return self._replace(
@@ -293,5 +294,6 @@ def half(M: Any) -> Any:
 def null_space(M: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the null space."""
     _, values, right = la.svd(M)
+    # channels are of unit size here, and prepared to some 1e-12
     rank = int(np.count_nonzero(values > 1e-10 * max(float(values[0]), TINY)))
     return np.asarray(right[rank:].T)

@@ -203,6 +203,7 @@ def _prepared(plant: StandardPlant) -> Plant:
     # each channel counts alike: a little of everything, no rank is assumed
     into = found.B1 / np.maximum(np.linalg.norm(found.B1, axis=0), TINY)
     out = found.C1 / np.maximum(np.linalg.norm(found.C1, axis=1), TINY)[:, None]
+    # a little of everything: no rank of z or w is assumed
     Q, W = out.T @ out + 1e-6 * np.eye(n), into @ into.T + 1e-6 * np.eye(n)
     solve_control, solve_filter = (
         (control_dare, solve_dare) if plant.dt else (control_care, solve_care)

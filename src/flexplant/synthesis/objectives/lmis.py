@@ -340,6 +340,7 @@ class ObjectivePrograms:
         """Return the smallest bound from one program, in some unit."""
         cp = modelling()
         v, level = self.variables(), cp.Variable()
+        # picks one of the many X and Y, and keeps them finite
         little = 1e-7 * (cp.trace(v.X) + cp.trace(v.Y))
         program = cp.Problem(cp.Minimize(level + little), self.program(v, level, unit, rate))
         self._solve(program)

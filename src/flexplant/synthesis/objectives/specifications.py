@@ -150,6 +150,7 @@ class PoleRegion(Value):
         if not poles.size:
             return ""
         slow = poles[np.argmax(poles.real)]
+        # a mille of what is required, or rounding of an integrator
         if slow.real > -self.decay * (1 - 1e-3) - (1e-9 if not self.decay else 0.0):
             return f"{slow:.4g} rad/s decays slower than {self.decay:g} rad/s"
         ratio = -poles.real / np.maximum(np.abs(poles), TINY)
@@ -198,6 +199,7 @@ def impulse_sum(closed: StateSpace) -> float:
     more than four million.
     """
     radius = float(np.abs(closed.poles()).max(initial=0.0))
+    # a loop of delays alone is over in a few samples
     speed = -np.log(max(radius, 1e-12))
     if not speed * _LONGEST > 25.0:
         return float("inf")

@@ -228,6 +228,7 @@ def fitted_magnitude(omega: FloatArray, size: FloatArray, order: int) -> StateSp
     """
     from scipy.optimize import least_squares  # not loaded with the package
 
+    # a fit of logarithms: zeros would count without limit
     goal = np.log(np.maximum(size, 1e-12 * size.max()))
     at = np.log(omega)
     found = StateSpace([], [], [], [[float(np.exp(goal.mean()))]])

@@ -346,6 +346,7 @@ def _ascended(
         one = None if candidate is None else smallest_multiple(M, blocks, candidate, least, most)
         if one is None:
             break
+        # no change of the perturbation for rounding
         if best is None or one.size < best.size * (1 - 1e-6):
             best = one
         candidate = worse_signs(M, blocks, one)

@@ -191,6 +191,7 @@ def _real_multiple(
     if any(not (isinstance(p.block, RepeatedScalar) and p.block.real) for p in where):
         return None
     values = np.linalg.eigvals(M @ matrix_of(found, where))
+    # a double eigenvalue comes out complex by the root of rounding
     real = np.abs(values.imag) < 1e-8 * np.abs(values).max(initial=TINY)
     best = float(np.max(values.real[real], initial=0.0))
     return (1.0 / best, found) if best > 0 else None

@@ -244,6 +244,7 @@ class _Cover:
         top = 100.0 * float(np.abs(self.poles).max(initial=1.0))
         end = min(high, max(top, 10 * low))
         base = np.linspace(low, end, _POINTS)
+        # six decades, where the interval begins at 0 Hz
         more = np.geomspace(max(low, 1e-6 * end), end, _POINTS)
         points = np.unique(np.concatenate([near, base, more, [omega]]))
         return points[(points >= low) & (points <= end)]

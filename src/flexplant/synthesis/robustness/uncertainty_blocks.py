@@ -276,6 +276,7 @@ def realised(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
 def _all_pass(number: complex, omega: float) -> StateSpace:
     """Return a real system of gain |number| that is the number at omega [rad/s]."""
     phase, size = float(np.angle(number)), abs(number)
+    # a real number needs no filter; of smaller phases the pole would be beyond all others
     if abs(np.sin(phase)) < 1e-9 or not omega > 0:
         return as_statespace(np.array([[size * (1.0 if np.cos(phase) >= 0 else -1.0)]]))
     sign = 1.0 if phase > 0 else -1.0

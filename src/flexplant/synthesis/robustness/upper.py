@@ -149,9 +149,11 @@ def centred(
         )
         _add_of_D(scalings, x, gradient, hessian)
         step, decrement = _newton(hessian, gradient, trace)
+        # the value is off by the square of it
         if not decrement > 1e-6:
             break
         t = 1.0 / (1.0 + decrement) if decrement > _CENTRED else 1.0
+        # shorter steps are rounding of x
         while t > 1e-8:
             moved = x + t * step
             new = _barrier(W, scalings, moved, level)
@@ -211,6 +213,7 @@ def _skewed(
             gradient[fixed], hessian[fixed, fixed] = level_gradient + t, level_curve
             step, decrement = _newton(hessian, gradient)
             size = 1.0 if decrement < _CENTRED else 1.0 / (1.0 + decrement)
+            # shorter steps are rounding of x
             while size > 1e-10:
                 moved = x + size * step
                 there = level + size * step[fixed]
@@ -237,6 +240,7 @@ def _newton(
     """Return the Newton step, one that keeps a trace where there is one, and its decrement."""
     size = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), TINY))
     scaled = hessian * size * size[:, None]
+    # of a unit diagonal: keeps a singular Hessian solvable
     scaled[np.diag_indices_from(scaled)] += 1e-13
     right = gradient[:, None] if trace is None else np.column_stack([gradient, trace])
     try:

@@ -136,6 +136,7 @@ def servo_loop(
     if observer is not None:
         poles = np.concatenate([poles, observer.poles()])
     grid = resonance_grid(poles, plant.dt, points=300)
+    # half the rate itself, where a hold has no answer, is left out
     grid = grid[grid < 0.5 / plant.dt * (1.0 - 1e-6)]
     T_u = decoupling(known, poi)
     if observer is None:

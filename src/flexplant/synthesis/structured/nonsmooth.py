@@ -103,6 +103,7 @@ def bfgs(
         s, change = step * direction, at - gradient
         x, value, gradient = x + s, new, at
         curvature = float(s @ change)
+        # no update from rounding: H stays positive definite
         if curvature > 1e-14 * float(np.linalg.norm(s) * np.linalg.norm(change)):
             if np.array_equal(H, np.eye(x.size)):
                 H = H * (curvature / float(change @ change))
