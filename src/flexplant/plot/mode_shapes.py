@@ -267,6 +267,7 @@ def surface_of(dofs: DofSet) -> Surface:
     xyz = np.asarray(dofs.xyz[first])
     rank = _rank(xyz)
     if rank < 2 or numbers.size < rank + 1:
+        # along x, of equal ones along y, then z
         order = np.argsort(xyz @ np.array([1.0, 1e-3, 1e-6]))
         chain = np.column_stack([order[:-1], order[1:]])
         return Surface(xyz, rows, np.zeros((0, 3), dtype=np.int64), chain)

@@ -287,6 +287,7 @@ def _duration(g: StateSpace) -> float:
     moving = poles[size > SPLIT * size.max(initial=0.0)]
     if not moving.size:
         return 100.0 * g.dt if g.dt else 1.0
+    # undamped modes are drawn for their periods alone
     decay = _DECAY / np.maximum(np.abs(moving.real), 1e-12 * np.abs(moving))
     return float(np.max(np.minimum(decay, 2.0 * np.pi * _PERIODS / np.abs(moving))))
 

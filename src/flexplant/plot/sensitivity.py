@@ -251,6 +251,7 @@ def _limit(ax: Axes, weight: Any, what: str, lines: Sequence[_Line]) -> None:
         )
     ends = [f for freq, _ in lines for f in (freq[0], freq[-1])]
     top = min(max(ends), 0.5 / g.dt) if g.dt else max(ends)
+    # six decades, where a line begins at 0 Hz
     freq = np.geomspace(max(min(ends), 1e-6 * top), top, 400)
     size = np.abs(frequency_response(g, freq).data[0, 0])
     ax.semilogx(freq, -decibel(size), label=f"1 / |W| of {what}", **STYLES["bound"])

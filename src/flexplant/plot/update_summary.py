@@ -254,6 +254,7 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
         for part, style, values in (("Re", "--", gap.real), ("Im", "-", gap.imag)):
             ax.semilogy(
                 steps,
+                # exact values have a place on a logarithmic axis
                 np.maximum(np.abs(values), 1e-13 * abs(goal[i])),
                 style,
                 marker="os^D"[i % 4],

@@ -302,6 +302,7 @@ def _thinned(xyz: FloatArray) -> IntArray:
     cells = 4 * _NODES
     chosen: IntArray = np.arange(len(xyz))
     while chosen.size > _NODES:
+        # a plane has no third extent to be divided into cells
         extent = np.maximum(np.ptp(xyz, axis=0), 1e-12)
         present = extent > 1e-6 * extent.max()
         edge = (np.prod(extent[present]) / cells) ** (1.0 / max(int(present.sum()), 1))
@@ -331,6 +332,7 @@ def neighbours(xyz: FloatArray) -> IntArray:
     radius = 0.5 * np.linalg.norm(b - a, axis=1)
     closest, _ = tree.query((a + b) / 2, k=min(3, len(xyz)))
     # the pair itself is at the radius; a third node inside or on the sphere is nearer or as near
+    # nodes of a regular mesh lie on the sphere: rounding must not decide
     inside = np.atleast_2d(closest)[:, : min(3, len(xyz))] < radius[:, None] * (1.0 - 1e-6)
     on = np.sum(closest <= radius[:, None] * (1.0 + 1e-6), axis=1) > 2
     return np.asarray(pairs[~inside.any(axis=1) & ~on], dtype=np.int64)
