@@ -117,6 +117,7 @@ def read_dmig(
         notes=_rows_missing(given, order.size),
     )
     local = {} if nodes is None else {n: axes.T for n, axes in nodes.axes.items() if n in ids}
+    # axes that are those of the file, to the rounding of a rotation matrix
     turned = {n: C for n, C in local.items() if np.abs(C - np.eye(3)).max() > 1e-14}
     if not turned:
         return found

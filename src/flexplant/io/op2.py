@@ -174,6 +174,7 @@ def _masses(found: list[Block], numbers: IntArray, eigenvalues: FloatArray) -> F
             if not set(numbers.tolist()) <= set(order):
                 continue
             rows = table[[order[n] for n in numbers.tolist()]].astype(np.float64)
+            # single precision; eigenvalues of free motions are exact zeros in such tables
             if np.allclose(rows[:, 2], eigenvalues, rtol=1e-5, atol=1e-30):
                 return np.asarray(rows[:, 5])
     return None
