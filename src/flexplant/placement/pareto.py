@@ -114,16 +114,10 @@ def pareto_curve(
 
     Raises
     ------
-    ModelError
-        When the plant, a candidate, an amount or the method is not what is needed.
-    LabelError
-        When a name or a place is unknown or doubled.
-    AssumptionError
-        When even all candidates miss a rigid-body mode, or the criterion has no meaning here.
+    ModelError, LabelError, AssumptionError, CertificateError
+        As `place_sensors`.
     InfeasibleError
         When there is no choice for any amount.
-    CertificateError
-        When a score is not confirmed by the other route.
 
     Examples
     --------

@@ -212,15 +212,8 @@ def score_actuators(
 
     Raises
     ------
-    ModelError
-        When the plant is not sampled or has no structure, a layout is empty or something is no
-        actuator.
-    LabelError
-        When a name or a place is unknown, or an actuator is twice in a layout.
-    AssumptionError
-        When the criterion has no meaning on this plant, whatever the actuators.
-    CertificateError
-        When the best layout's score is not confirmed by the other route.
+    ModelError, LabelError, AssumptionError, CertificateError
+        As `score_sensors`.
 
     Examples
     --------

@@ -146,17 +146,8 @@ def place_actuators(
 
     Raises
     ------
-    ModelError
-        When the plant, a candidate, count or method is not what is needed.
-    LabelError
-        When a name or a place is unknown or doubled.
-    AssumptionError
-        When even all candidates leave a rigid-body mode alone, which is named, or the criterion
-        has no meaning on this plant.
-    InfeasibleError
-        When no choice of this size has a finite score.
-    CertificateError
-        When the score is not confirmed by the other route.
+    ModelError, LabelError, AssumptionError, InfeasibleError, CertificateError
+        As `place_sensors`.
 
     Examples
     --------
@@ -217,16 +208,8 @@ def place_both(
 
     Raises
     ------
-    ModelError
-        When the plant, a candidate, a count or the method is not what is needed.
-    LabelError
-        When a name or a place is unknown or doubled.
-    AssumptionError
-        When even all candidates miss a rigid-body mode, which is named.
-    InfeasibleError
-        When no choice of these sizes has a finite score.
-    CertificateError
-        When the score is not confirmed by the other route.
+    ModelError, LabelError, AssumptionError, InfeasibleError, CertificateError
+        As `place_sensors`; or when counts are not two.
 
     Examples
     --------
