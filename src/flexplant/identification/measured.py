@@ -25,8 +25,8 @@ from ..checks import (
 from ..errors import LabelError, ModelError, ShapeError, counted
 from ..labels import Place
 from ..modes import Modes
-from ..modes.matching import assigned
-from ..tolerances import SAME, TINY
+from ..modes.matching import assigned, in_span
+from ..tolerances import SAME
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -446,7 +446,5 @@ def _likeness(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -> F
     omega = modes.omega[elastic]
     for j in range(elastic.size):
         family = np.flatnonzero(np.abs(omega / omega[j] - 1.0) <= FAMILY)
-        basis, size, _ = np.linalg.svd(phi[:, family], full_matrices=False)
-        basis = basis[:, size > SAME * max(float(size[0]), TINY)]
-        alike[:, j] = np.linalg.norm(basis.conj().T @ unit, axis=0) ** 2
+        alike[:, j] = in_span(phi[:, family], measured.shapes)
     return alike

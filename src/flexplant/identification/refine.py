@@ -94,9 +94,9 @@ def refined(
     pivots = np.argmax(np.abs(participation), axis=0)
     columns = np.arange(poles.size)
     participation = participation / participation[pivots, columns]
-    now = _projected(lines, poles, participation, pivots)
+    now = Fit(lines, poles, participation, pivots)
     # nearly Gauss-Newton from the start, whose poles are good
-    damping, settled, idle = 1e-6, True, 0
+    damping, idle = 1e-6, 0
     power = float(np.sum(np.abs(lines.data * lines.weight) ** 2))
     enough = FINE if fine else COARSE
     for number in range(steps):
