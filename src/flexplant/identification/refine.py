@@ -438,8 +438,8 @@ def pole_terms(
     T = 1.0 / hold
     turn = np.exp(poles * T)[:, None]
     # 1 - exp(-gap T) loses digits near the pole unless computed by expm1
-    distance = turn * _expm1(gap * T)
-    gain = (_expm1(poles * T) / poles)[:, None]
+    distance = turn * np.expm1(gap * T)
+    gain = (np.expm1(poles * T) / poles)[:, None]
     slope = (turn * T - gain) / poles[:, None]
     return gain / distance, slope / distance + gain * T * turn / distance**2
 
@@ -457,7 +457,7 @@ def residual_terms(
         term = s ** (-float(power))
         if hold is not None:
             T = 1.0 / hold
-            back = _expm1(s * T)
+            back: Any = np.expm1(s * T)
             held = back / (np.exp(s * T) * s * T)
             known = {1: T / back, 2: T**2 * (back + 2.0) / (2.0 * back**2)}
             term = known.get(power, term * held)
@@ -469,9 +469,3 @@ def residual_terms(
 def axis(freq: FloatArray) -> ComplexArray:
     """Return s = 2 pi i f."""
     return np.asarray(2j * np.pi * freq)
-
-
-def _expm1(x: ComplexArray) -> ComplexArray:
-    return np.asarray(np.expm1(x.real) * np.cos(x.imag) - 2.0 * np.sin(x.imag / 2) ** 2) + 1j * (
-        np.exp(x.real) * np.sin(x.imag)
-    )

@@ -14,7 +14,6 @@ import scipy.sparse as sp
 
 from ..checks import ComplexArray, FloatArray
 from ..errors import ModelError
-from ..modes.matching import clusters
 from ..sparse.factor import dense
 from ..structure.definite import refuse_unstable
 from ..structure.eigen import elastic_modes
@@ -290,16 +289,12 @@ class Family:
 
 def repeated_groups(poles: ComplexArray) -> list[list[int]]:
     """Return the groups of exactly repeated modes: equal frequency and damping."""
-    found: list[list[int]] = []
-    for run in clusters(poles, REPEATED):
-        # equal |lambda| with different damping has vectors of its own
-        left = run.tolist()
-        while left:
-            near = [i for i in left if abs(poles[i] - poles[left[0]]) <= REPEATED * abs(poles[i])]
-            left = [i for i in left if i not in near]
-            if len(near) > 1:
-                found.append(near)
-    return found
+    if not poles.size:
+        return []
+    near = np.abs(poles[:, None] - poles) <= REPEATED * np.abs(poles)[:, None]
+    first = np.argmax(near, axis=1)
+    found = (np.flatnonzero(first == i) for i in np.unique(first))
+    return [group.tolist() for group in found if group.size > 1]
 
 
 def _stacked(stack: FloatArray) -> Any:

@@ -11,6 +11,7 @@ import scipy.linalg as la
 
 from ...checks import FloatArray
 from ...errors import ModelError, SolverError
+from ...modes.matching import mac
 from ...tolerances import TINY, divisor
 from ..family import ROUNDING, Eigen, Family, factors
 from ..point_model import Point
@@ -316,10 +317,7 @@ class Subsets:
             objective.family.weighted(point.eigen.X)[:, own]
             for point, own in zip((begin, end), columns, strict=True)
         )
-        cosine = np.abs(np.sum(X.conj() * Y, axis=0))
-        if np.all(
-            cosine**2 >= SAME * np.sum(np.abs(X) ** 2, axis=0) * np.sum(np.abs(Y) ** 2, axis=0)
-        ):
+        if np.all(np.diag(mac(X, Y)) >= SAME):
             return [first]
         return [first + part * (guess - first) for part in WAY]
 
