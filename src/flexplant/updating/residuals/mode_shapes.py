@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
@@ -141,6 +141,14 @@ class ModeShapes(Residual):
         return BoundShapes(self, family)
 
 
+class _Batch(NamedTuple):
+    """Measured shapes that are compared at once, each with the span of as many modes."""
+
+    sets: list[list[int]]  # their numbers
+    white: Any  # (b, m, m)
+    psi: Any  # (b, m, 1)
+
+
 class BoundShapes(Bound):
     """Shapes at unit variance, each compared with the nearest multiple of the model's."""
 
@@ -148,26 +156,24 @@ class BoundShapes(Bound):
         measured = residual.measured
         own = measured.modes or ()
         near = [group.tolist() for group in clusters(measured.poles, CLUSTER)]
-        alone = [[i] for i in range(len(own)) if not any(i in group for group in near)]
-        #: columns of the measurement that are compared together
-        self.sets = [*alone, *near]
-        self.alone, self.near = [i for (i,) in alone], near
-        self.own = own
-        self.numbers = own
+        alone = [i for i in range(len(own)) if not any(i in group for group in near)]
+        self.own = self.numbers = own
         self.noisy = residual.std is not None or residual.covariance is not None
         self.rows = place_rows(family, list(residual.at or ()), residual.direction)
         self.poles = measured.poles
         self.psi = np.asarray(residual.shapes)
-        self.white = _whitening(self.psi, residual)
-        m = self.psi.shape[0]
-        #: of the modes that are compared by themselves, all at once
-        self.whites = np.array([self.white[i] for i in self.alone]).reshape(-1, m, m)
-        self.psis = np.matmul(self.whites, self.psi.T[self.alone][:, :, None])
+        white = np.array(_whitening(self.psi, residual))
+        self.batches = []
+        for chosen, sets in [(alone, [[i] for i in alone]), *((g, [g] * len(g)) for g in near)]:
+            if chosen:
+                psi = white[chosen] @ self.psi.T[chosen][:, :, None]
+                modes = [[own[i] for i in one] for one in sets]
+                self.batches.append(_Batch(modes, white[chosen], psi))
         self.assign = residual.assign
-        order = [i for group in self.sets for i in group]
-        lengths = [float(np.linalg.norm(self.white[i] @ self.psi[:, i])) for i in order]
         parts = 2 if np.iscomplexobj(self.psi) else 1
-        self._order, self._rows_each = order, self.psi.shape[0] * parts
+        self._order = [i for group in (alone, *near) for i in group]
+        self._rows_each = self.psi.shape[0] * parts
+        lengths = [float(np.linalg.norm(one)) for batch in self.batches for one in batch.psi]
         self.size = np.repeat(lengths, self._rows_each)
         self.name = f"shapes of modes {', '.join(map(str, own))}"
 
@@ -193,73 +199,48 @@ class BoundShapes(Bound):
         changed.turned = point.turned
         return changed
 
-    def _parts(self, point: Point, group: list[int], i: int) -> tuple[Any, Any, Any]:
-        """Return the whitened model shapes of a group (m, s), its basis Q and the measured one."""
-        columns = point.columns([self.own[j] for j in group])
-        white = self.white[i]
-        Phi = white @ (self.rows @ point.eigen.X[:, columns])
+    def _parts(self, point: Point, batch: _Batch) -> tuple[Any, Any, Any]:
+        """Return the model's shapes (b, m, s), their basis Q, and what it leaves of psi."""
+        X = point.eigen.X[:, [point.columns(numbers) for numbers in batch.sets]]
+        Phi = batch.white @ np.moveaxis(np.tensordot(self.rows, X, axes=1), 0, 1)
         if not np.any(Phi.imag):
             Phi = Phi.real
-        # of one mode the basis is the shape itself
-        Q = Phi / np.linalg.norm(Phi) if len(group) == 1 else np.linalg.qr(Phi)[0]
-        return Phi, Q, white @ self.psi[:, i]
+        Q = np.linalg.qr(Phi)[0]
+        return Phi, Q, batch.psi - Q @ (_adjoint(Q) @ batch.psi)
 
-    def _singles(self, point: Point) -> tuple[Any, Any, Any]:
-        """Return |phi| (a, 1, 1), phi/|phi| (a, m, 1) and the rest of psi, of modes alone."""
-        X = point.eigen.X[:, point.columns([self.own[i] for i in self.alone])]
-        Phi = np.matmul(self.whites, (self.rows @ X).T[:, :, None])
-        if not np.any(Phi.imag):
-            Phi = Phi.real
-        length = np.linalg.norm(Phi, axis=1, keepdims=True)
-        q = Phi / length
-        return length, q, self.psis - q * _along(q, self.psis)
+    def _moved(self, point: Point, batch: _Batch, Phi: Any) -> tuple[Any, Any, Any]:
+        """Return dPhi (b, m, q, s), ``dPhi Phi^+ psi`` (b, m, q) and Phi^+ (b, s, m)."""
+        dY = np.array([self.rows @ dX for dX, _ in point.subspaces(batch.sets)])
+        b, q, m, s = dY.shape
+        dY = (dY if np.iscomplexobj(Phi) else dY.real).transpose(0, 2, 1, 3)
+        dPhi = (batch.white @ dY.reshape(b, m, q * s)).reshape(b, m, q, s)
+        plus = np.linalg.pinv(Phi)
+        return dPhi, (dPhi @ (plus @ batch.psi)[:, None])[..., 0], plus
 
     def values(self, point: Point) -> FloatArray:
         """Return what of the measured shapes the model's do not explain."""
-        found = [self._stacked(one[:, 0]) for one in self._singles(point)[2]]
-        for group in self.near:
-            for i in group:
-                _, Q, psi = self._parts(point, group, i)
-                found.append(self._stacked(psi - Q @ (Q.conj().T @ psi)))
-        return np.concatenate(found)
+        left = [one[:, 0] for batch in self.batches for one in self._parts(point, batch)[2]]
+        return np.concatenate([self._stacked(one) for one in left])
 
     def slopes(self, point: Point) -> FloatArray:
         """Return their derivatives."""
-        found = [self._slopes_alone(point)] if self.alone else []
-        for group in self.near:
-            dX, _ = point.subspace([self.own[j] for j in group])
-            dY = self.rows @ dX
-            for i in group:
-                Phi, Q, psi = self._parts(point, group, i)
-                dPhi = self.white[i] @ (dY if np.iscomplexobj(Phi) else dY.real)
-                plus = np.linalg.pinv(Phi)
-                left = psi - Q @ (Q.conj().T @ psi)
-                inner = dPhi @ (plus @ psi)
-                inner = inner - (inner @ Q.conj()) @ Q.T
-                outer = (dPhi.conj().transpose(0, 2, 1) @ left) @ plus.conj()
-                found.append(self._stacked(-(inner + outer).T))
+        found = []
+        for batch in self.batches:
+            Phi, Q, left = self._parts(point, batch)
+            dPhi, inner, plus = self._moved(point, batch, Phi)
+            inner = inner - Q @ (_adjoint(Q) @ inner)
+            outer = _adjoint(plus) @ np.einsum("bmqs,bm->bsq", dPhi.conj(), left[:, :, 0])
+            found += [self._stacked(one) for one in -(inner + outer)]
         return np.concatenate(found)
-
-    def _slopes_alone(self, point: Point) -> FloatArray:
-        """Return the rows of modes by themselves, all at once."""
-        length, q, left = self._singles(point)
-        sets = point.subspaces([[self.own[i]] for i in self.alone])
-        # (a, m, q)
-        dPhi = np.array([self.rows @ dX[:, :, 0].T for dX, _ in sets])
-        dPhi = np.matmul(self.whites, dPhi if np.iscomplexobj(q) else dPhi.real)
-        inner = dPhi * (_along(q, self.psis) / length)
-        inner = inner - q * _along(q, inner)
-        outer = q / length * np.matmul(left.transpose(0, 2, 1), dPhi.conj())
-        return np.concatenate([self._stacked(one) for one in -(inner + outer)])
 
     def _stacked(self, part: Any) -> FloatArray:
         complex_data = np.iscomplexobj(self.psi)
         return split_parts(np.asarray(part, dtype=complex)) if complex_data else np.real(part)
 
 
-def _along(q: Any, X: Any) -> Any:
-    """Return q^H X of stacks of vectors and matrices."""
-    return np.matmul(q.conj().transpose(0, 2, 1), X)
+def _adjoint(X: Any) -> Any:
+    """Return X^H of stacks of matrices."""
+    return X.conj().transpose(0, 2, 1)
 
 
 def chosen_modes(measured: MeasuredModes, modes: Sequence[int]) -> tuple[MeasuredModes, list[int]]:
@@ -380,26 +361,25 @@ class _BoundMac(BoundShapes):
         super().__init__(residual, family)
         self.noisy, self.size, self._rows_each = False, 1.0, 1
 
+    def _inside(self, batch: _Batch, Q: Any) -> tuple[FloatArray, FloatArray]:
+        """Return |psi| and |Q^H psi| (b,)."""
+        both = (batch.psi, _adjoint(Q) @ batch.psi)
+        whole, inside = (np.linalg.norm(part, axis=(1, 2)) for part in both)
+        return whole, inside
+
     def values(self, point: Point) -> FloatArray:
         found = []
-        for group in self.sets:
-            for i in group:
-                _, Q, psi = self._parts(point, group, i)
-                found.append(np.linalg.norm(psi) / np.linalg.norm(Q.conj().T @ psi) - 1)
-        return np.array(found)
+        for batch in self.batches:
+            whole, inside = self._inside(batch, self._parts(point, batch)[1])
+            found.append(whole / inside - 1)
+        return np.concatenate(found)
 
     def slopes(self, point: Point) -> FloatArray:
         found = []
-        for group in self.sets:
-            dX, _ = point.subspace([self.own[j] for j in group])
-            dY = self.rows @ dX
-            for i in group:
-                Phi, Q, psi = self._parts(point, group, i)
-                dPhi = self.white[i] @ dY
-                plus = np.linalg.pinv(Phi)
-                left = psi - Q @ (Q.conj().T @ psi)
-                # d |P psi|^2 = 2 Re (left^H dPhi Phi^+ psi)
-                change = np.real((dPhi @ (plus @ psi)) @ left.conj())
-                inside = float(np.linalg.norm(Q.conj().T @ psi))
-                found.append(-float(np.linalg.norm(psi)) * change / inside**3)
-        return np.array(found)
+        for batch in self.batches:
+            Phi, Q, left = self._parts(point, batch)
+            whole, inside = self._inside(batch, Q)
+            # d |P psi|^2 = 2 Re (left^H dPhi Phi^+ psi)
+            change = np.real(_adjoint(left) @ self._moved(point, batch, Phi)[1])[:, 0]
+            found.append(-change * (whole / inside**3)[:, None])
+        return np.concatenate(found)
