@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 import flexplant.parallel
-from conftest import machine
 from flexplant.errors import ModelError, SolverError
 from flexplant.estimation import FixedLag
 from flexplant.lti import lowpass
@@ -40,7 +39,7 @@ from flexplant.placement.candidates import with_side
 from flexplant.placement.criterion import OnPlant
 from flexplant.placement.layouts import layouts_of
 from flexplant.plant import BaseAcceleration, Reference, building
-from placement_plate import plate_modes
+from placement_plate import machine, plate_modes
 
 METHODS = (Exchange(starts=4), Exhaustive(), BranchAndBound(starts=2))
 
@@ -85,7 +84,7 @@ SCRIPT = """
 import sys
 sys.path[:0] = {paths!r}
 from test_scale import Slow
-from conftest import machine
+from placement_plate import machine
 from flexplant.placement import Exhaustive, place_sensors
 plant, sensors, _ = machine(12, count=11)
 place_sensors(plant, sensors, 4, Slow({folder!r}), method=Exhaustive(), checkpoint={path!r})

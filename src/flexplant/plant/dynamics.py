@@ -17,7 +17,7 @@ from .ports import Ports
 from .realisation import ModalRealisation
 
 
-class Channels(NamedTuple):
+class PortRows(NamedTuple):
     """What the ports of a structure push and see; sensors stand behind the motions of POIs."""
 
     inputs: list[str]
@@ -29,7 +29,7 @@ class Channels(NamedTuple):
     added: FloatArray  # (p, m) what is added to a sensor
 
 
-def channels(realisation: ModalRealisation, ports: Ports) -> Channels:
+def channels(realisation: ModalRealisation, ports: Ports) -> PortRows:
     """Return the rows and loads of all ports."""
     forces, sensors = ports.forces, ports.y
     if not forces or not (ports.z or sensors):
@@ -39,7 +39,7 @@ def channels(realisation: ModalRealisation, ports: Ports) -> Channels:
     pois = [(poi, axis) for poi in ports.z for axis in poi.axes]
     outputs = [*(poi.channel(axis) for poi, axis in pois), *(sensor.name for sensor in sensors)]
     added = [[outputs.index(port.added_to) if port.added_to else -1] for port in forces]
-    return Channels(
+    return PortRows(
         [port.name for port in forces],
         outputs,
         np.array([port.push(realisation) for port in forces]),

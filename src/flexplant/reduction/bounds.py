@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..checks import FloatArray, Value, checked, name_list, positive, real_array, whole
+from ..errors import counted
 from .ranking import peak_gains
 
 
@@ -51,6 +52,15 @@ class ErrorBound(Value):
     )
     static: float | None = field(default=None, kw_only=True, metadata=checked(positive, zero=True))
     covers: int | None = field(default=None, kw_only=True, metadata=checked(whole))
+
+    def __repr__(self) -> str:
+        some = (
+            "" if self.covers is None else f", of the {counted(self.covers, 'mode')} solved alone"
+        )
+        return (
+            f"<ErrorBound {self.value:.4g} m/N, {counted(len(self.inputs), 'input')} to "
+            f"{len(self.outputs)} outputs: {self.rule}{some}>"
+        )
 
     def below(self, freq: float) -> float:
         """Return the bound [m/N] for all frequencies up to one.
