@@ -174,4 +174,4 @@ def test_names_of_a_user_meet_none_of_ours(names, tmp_path):
     for export in EXPORTS.values():
         export(one, tmp_path)
     again = fx.load(tmp_path / "v.npz")
-    assert again.inputs == one.h2.inputs
+    assert again.system.inputs == one.h2.system.inputs

@@ -119,7 +119,7 @@ def test_modes_left_out_count_as_in_the_filter():
     search = Exchange(starts=1)
     best = place_sensors(default, candidates, 4, PoiVariance("die"), method=search, rng=1)
     assert best.bound == -np.inf and "no bound" in repr(best)
-    with pytest.raises(ModelError, match="larger must be a structure"):
+    with pytest.raises(ModelError, match="gets a plant of its own: pass a structure"):
         PoiVariance("die", larger=plant)
     with pytest.raises(ModelError, match="pass one"):
         PoiVariance("die", larger=many, own_modes=True)

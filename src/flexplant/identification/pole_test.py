@@ -22,7 +22,7 @@ def supported(
     lines: Lines, poles: ComplexArray, part: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray]:
     """Leave out, one by one, poles that noise alone may explain; SolverError when none is left."""
-    least = pole_price(lines, lines.freq.size)
+    least = pole_price(lines)
     costs = _Costs(lines, poles, part)
     kept = list(range(poles.size))
     while len(kept) > 1:
@@ -79,14 +79,15 @@ def price(lines: Lines, count: int, chance: float) -> float:
     return lines.inflation * float(chdtri(count, chance))
 
 
-def pole_price(lines: Lines, places: int) -> float:
-    """Return by how much a pole at one of some places must lower the cost.
+def pole_price(lines: Lines) -> float:
+    """Return by how much a pole must lower the cost, wherever in the band it is.
 
     Its pole, shape and participation are 2 (n_out + n_in) numbers. A pole kept in vain costs
-    little; one left out biases its neighbours by up to the root of this amount.
+    little; one left out biases its neighbours by up to the root of this amount. A pole that is
+    split off another one is no cheaper: the fit takes it where noise suits it.
     """
-    n_out, n_in, _ = lines.data.shape
-    return price(lines, 2 * (n_out + n_in), CHANCE / places)
+    n_out, n_in, n_freq = lines.data.shape
+    return price(lines, 2 * (n_out + n_in), CHANCE / n_freq)
 
 
 class _Costs:
@@ -255,7 +256,7 @@ def split(lines: Lines, fit: Fit) -> Proposals:
     .. math:: \frac{\psi l^T}{s-\lambda} \to \frac{\psi l^T + \psi' l_\perp^T}{s-\lambda}
         \quad\text{or}\quad \frac{\psi l^T}{s-\lambda-\delta} + \frac{\psi' l^T}{s-\lambda+\delta}
     """
-    least = pole_price(lines, fit.poles.size) * _unit(lines, fit)
+    least = pole_price(lines) * _unit(lines, fit)
     pairs = [pair for k in range(fit.poles.size) for pair in _pairs(fit, k)]
     trials = [Trial(lines, *one, fit.cost - Fit(lines, *one).cost, least) for one in pairs]
     yield sorted(trials, key=lambda trial: -trial.gain)
@@ -287,7 +288,7 @@ def relocated(lines: Lines, fit: Fit) -> Proposals:
         if not rest.size or -pole.real > 0.05 * abs(pole):
             continue
         without = Fit(lines, rest, np.delete(fit.participation, k, axis=1)).cost
-        if without - fit.cost > WEAK * pole_price(lines, lines.freq.size):
+        if without - fit.cost > WEAK * pole_price(lines):
             continue
         trials = []
         for shift in np.arange(-7.0, 7.1, 0.7):
@@ -306,7 +307,7 @@ def relocated(lines: Lines, fit: Fit) -> Proposals:
 
 def missed(lines: Lines, fit: Fit) -> Proposals:
     """Propose a pole at the two highest peaks of what is left, single lines apart."""
-    least = pole_price(lines, lines.freq.size) * _unit(lines, fit)
+    least = pole_price(lines) * _unit(lines, fit)
     for peak in [peak for peak in unexplained(lines, fit) if not peak.isolated][:2]:
         poles, part, cost = candidate(lines, fit.model, fit.poles, fit.participation, peak)
         yield [Trial(lines, poles, part, fit.cost - cost, least)]
