@@ -32,7 +32,7 @@ assemble_plant StandardPlant decouple stage_weights reference_errors
 StateSpace Frf frequency_response h2_norm hinf_norm peak_gain lft balanced minimal modal_form
 lowpass discretized
 design_kalman design_static KalmanEstimator FixedLag Smoother
-design_servo servo_bandwidth design_h2 design_hinf design_ncf ncf_margin
+design_servo servo_bandwidth design_h2 design_hinf design_stage design_ncf ncf_margin
 Riccati Lmi Controller Pid Lead Notch LowPass design_loops tune_loops
 score_sensors score_actuators place_sensors place_actuators place_both PoiVariance Placement
 sensor_map

@@ -124,6 +124,7 @@ from .synthesis import design_hinf as design_hinf
 from .synthesis import design_loops as design_loops
 from .synthesis import design_ncf as design_ncf
 from .synthesis import design_servo as design_servo
+from .synthesis import design_stage as design_stage
 from .synthesis import ncf_margin as ncf_margin
 from .synthesis import servo_bandwidth as servo_bandwidth
 from .synthesis import tune_loops as tune_loops

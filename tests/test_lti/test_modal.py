@@ -320,3 +320,19 @@ def test_scale_of_a_triangular_matrix_stays_moderate():
     np.testing.assert_allclose(
         np.sort(la.eigvals(balanced_matrix(A)).imag), np.sort(g.poles().imag), rtol=1e-5
     )
+
+
+@pytest.mark.parametrize("split", [0.0, 1e-8, 1e-5])
+def test_a_double_pole_that_rounding_splits_shares_a_block(split):
+    """Apart, its modes would cancel each other in a thousand times what they do together."""
+    chain = np.array([[-10.0, 1.0], [-split, -10.0]])
+    A = la.block_diag(chain, [[-0.5]], [[-1.0, 40.0], [-40.0, -1.0]])
+    T = np.linalg.qr(np.random.default_rng(4).normal(size=A.shape))[0] * np.geomspace(1, 30, 5)
+    g = StateSpace(T @ A @ np.linalg.inv(T), T @ np.ones((5, 1)), np.ones((1, 5)), [[0.0]])
+    form = modal_form(g)
+    assert not form.reason
+    assert sorted(form.system.blocks) == [1, 2, 2]
+    assert form.condition < 1e3
+    size = np.abs(form.system.B[:, 0] * form.system.C[0]).max()
+    assert size < 1e3
+    assert error(form.system, g, np.array([0.01, 1.0, 6.4])) < 1e-9

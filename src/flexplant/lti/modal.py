@@ -17,6 +17,9 @@ from .statespace import StateSpace, System, as_statespace
 
 #: speed of a rigid-body pair, relative to A, below which there is none
 RIGID = 1e-6
+#: relative distance of two poles, and sine of the angle between their eigenvectors, below which
+#: they share a block: apart, what each does would be a thousand times what both do together
+_PARALLEL = 1e-3
 #: largest accepted distance of the transformed A from the blocks, relative to A
 RESIDUAL = 1e-9
 
@@ -134,9 +137,16 @@ def _basis(A: FloatArray, centre: float) -> tuple[FloatArray, FloatArray, list[i
         parts += [centre * np.eye(2) + np.array([[0.0, w], [0.0, 0.0]]) for w in chain[1]]
     else:
         near[:] = False
+    done = near.copy()
     for k in np.lexsort((values.imag, np.abs(values - centre))):
         pole, vector = values[k], vectors[:, k]
-        if near[k] or pole.imag < 0:
+        if done[k] or pole.imag < 0:
+            continue
+        twin = _parallel(int(k), values, vectors, done)
+        if twin is not None:
+            done[twin] = True
+            columns.append(_plane(A, values, [int(k), twin]))
+            parts.append(columns[-1].T @ A @ columns[-1])
             continue
         if not pole.imag:
             columns.append(vector.real[:, None])
@@ -147,6 +157,35 @@ def _basis(A: FloatArray, centre: float) -> tuple[FloatArray, FloatArray, list[i
         columns.append(np.stack([turned.real, turned.imag], axis=1) * np.sqrt(2.0))
         parts.append(np.array([[pole.real, pole.imag], [-pole.imag, pole.real]]))
     return np.hstack(columns), la.block_diag(*parts), [len(part) for part in parts]
+
+
+def _parallel(
+    k: int, values: ComplexArray, vectors: ComplexArray, done: np.typing.NDArray[np.bool_]
+) -> int | None:
+    """Return the pole whose eigenvector is nearly parallel to that of pole k, or None.
+
+    The other of two real poles, or the conjugate of pole k: a double one that rounding split.
+    """
+    others = values == values[k].conj() if values[k].imag else (values.imag == 0.0) & ~done
+    others &= np.abs(values - values[k]) < _PARALLEL * np.abs(values[k])
+    others[k] = False
+    if not others.any():
+        return None
+    along = vectors[:, k].conj() @ vectors
+    sine = np.linalg.norm(vectors - np.outer(vectors[:, k], along), axis=0)
+    twin = int(np.argmin(np.where(others, sine, np.inf)))
+    return twin if sine[twin] < _PARALLEL else None
+
+
+def _plane(A: FloatArray, values: ComplexArray, two: list[int]) -> FloatArray:
+    """Return an orthonormal basis (n, 2) of the invariant plane of two poles (Schur)."""
+    rest = np.delete(values, two)
+
+    def chosen(real: float, imag: float) -> bool:
+        away = np.abs(values[two] - complex(real, imag))
+        return bool(away.min() < np.min(np.abs(rest - complex(real, imag)), initial=np.inf))
+
+    return np.asarray(la.schur(A, sort=chosen)[1][:, :2])
 
 
 def _chains(N: FloatArray, count: int) -> tuple[FloatArray, FloatArray] | None:

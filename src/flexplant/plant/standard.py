@@ -213,15 +213,17 @@ class StandardPlant(Partition):
 
     def uncertain(
         self,
-        source: Any,
+        source: Any = None,
         parameters: Any = None,
         *,
+        frequency: Any = None,
+        damping: Any = None,
         modes: Sequence[int] | None = None,
         deviations: float = 2.0,
         neglected: Any = None,
         shapes: FloatArray | None = None,
     ) -> UncertainPlant[StandardPlant]:
-        """Return the plant with the uncertainty of a fit as real Deltas on its modes.
+        """Return the plant with the uncertainty of a fit, or a stated one, as Deltas on its modes.
 
         The covariance of the parameters goes to the modes by the eigenvalue sensitivities,
         ``J C J'``; each chosen mode's stiffness omega^2 and damping 2 zeta omega becomes a channel
@@ -231,11 +233,15 @@ class StandardPlant(Partition):
 
         Parameters
         ----------
-        source : UpdateResult or MeasuredModes
+        source : UpdateResult or MeasuredModes, optional
             A fit whose `model` this plant was assembled from, or measured poles with mode numbers
             and a covariance.
         parameters : sequence of Parameter, optional
             Those that were given to `update`, in its order; those the fit keeps when not given.
+        frequency, damping : float, (m,) array or {mode: float}, optional
+            In place of a source: by what share frequencies and damping of modes may be off, at
+            delta = 1; one for all, one for each of `modes`, or by mode. ``frequency=0.005`` is
+            what an updated model of a structure seldom does better than where it was not measured.
         modes : sequence of int, optional
             Numbers from 1, rigid-body modes included; all elastic (or all measured) ones when not
             given.
@@ -266,6 +272,8 @@ class StandardPlant(Partition):
             self,
             source,
             parameters,
+            frequency=frequency,
+            damping=damping,
             modes=modes,
             deviations=deviations,
             neglected=neglected,

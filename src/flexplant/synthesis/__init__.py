@@ -14,6 +14,7 @@ from .hinf.ncf import design_ncf as design_ncf
 from .hinf.ncf import ncf_margin as ncf_margin
 from .hinf.shaping import ShapedLoop as ShapedLoop
 from .hinf.shaping import shape_loop as shape_loop
+from .hinf.stage_design import design_stage as design_stage
 from .laws.controller_elements import Lead as Lead
 from .laws.controller_elements import LowPass as LowPass
 from .laws.controller_elements import Notch as Notch

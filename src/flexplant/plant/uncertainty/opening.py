@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -11,7 +11,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ...checks import ComplexArray, FloatArray, positive, real_array
-from ...errors import LabelError, ModelError, unknown_label
+from ...errors import LabelError, ModelError, require_known, unknown_label
 from ...identification import MeasuredModes
 from ...labels import Place
 from ...lti.statespace import StateSpace
@@ -43,9 +43,11 @@ _PROBE = 0.25
 
 def uncertain(
     plant: P,
-    source: UpdateResult | MeasuredModes,
+    source: UpdateResult | MeasuredModes | None = None,
     parameters: Sequence[Parameter] | None = None,
     *,
+    frequency: Any = None,
+    damping: Any = None,
     modes: Sequence[int] | None = None,
     deviations: float = 2.0,
     neglected: Any = None,
@@ -53,6 +55,15 @@ def uncertain(
 ) -> UncertainPlant[P]:
     """Return a plant with channels for Deltas; see `StandardPlant.uncertain`."""
     many = positive(deviations, "deviations")
+    if frequency is not None or damping is not None:
+        if source is not None or parameters is not None or shapes is not None:
+            raise ModelError(
+                "frequency= and damping= state an uncertainty by hand; a fit or measured modes "
+                "bring their own. Pass one or the other."
+            )
+        deltas = _stated(modal_realisation(plant), frequency, damping, modes)
+        own = np.eye(len(deltas)) / many**2
+        return _with_deltas(plant, deltas, own, many, neglected)
     if shapes is not None and not isinstance(source, MeasuredModes):
         raise ModelError(
             "deviations of shapes go with measured modes; those of a fit follow from its "
@@ -72,7 +83,8 @@ def uncertain(
         numbers, poles, covariance = _measured_poles(source, modes)
     else:
         raise ModelError(
-            f"uncertainty comes from an UpdateResult or MeasuredModes, got {type(source).__name__}."
+            "uncertainty comes from an UpdateResult or MeasuredModes, got "
+            f"{type(source).__name__}: pass one, or state it: frequency=0.005, damping=0.3."
         )
     _check_poles(realisation, numbers, poles, isinstance(source, UpdateResult))
     G = _relative(poles)
@@ -89,29 +101,82 @@ def uncertain(
     if not keep:
         raise ModelError(f"modes {list(numbers)} have no variance: there is nothing uncertain.")
     deltas = tuple(every[i] for i in keep)
-    _check_range(deltas, many)
-    system = _opened(plant.continuous, deltas)
     own = covariance[np.ix_(keep, keep)] / np.outer(scale[keep], scale[keep])
+    fit = source if isinstance(source, UpdateResult) else None
+    more: Sequence[Delta] = ()
     if shapes is not None and isinstance(source, MeasuredModes):
         more = shape_deltas(plant, shapes, source.modes or (), numbers, many)
-        if more:
-            system = with_shape_channels(plant.continuous, system, deltas, more)
-        deltas = (*deltas, *more)
-        own = la.block_diag(own, np.eye(len(more)) / many**2)
+    about = about_fit(fit, parameters or ()) if fit else ()
+    return _with_deltas(plant, deltas, own, many, neglected, more, fit, about)
+
+
+def _stated(
+    realisation: ModalRealisation, frequency: Any, damping: Any, modes: Sequence[int] | None
+) -> tuple[Delta, ...]:
+    """Return Deltas of stated relative uncertainties of frequency and damping, mode by mode."""
+    elastic = range(realisation.n_rigid + 1, realisation.n_modes + 1)
+    chosen = tuple(elastic if modes is None else modes)
+    for number in chosen:
+        if number not in elastic:
+            raise unknown_label("elastic mode of the plant", number, map(str, elastic))
+    sizes = {
+        kind: _by_mode(given, f"{name} of a mode", chosen)
+        for kind, name, given in (("freq", "frequency", frequency), ("damping", "damping", damping))
+    }
+    # stiffness is omega^2
+    scales = {"freq": 2.0 * sizes["freq"], "damping": sizes["damping"]}
+    kinds: tuple[Literal["freq", "damping"], ...] = ("freq", "damping")
+    deltas = [
+        Delta(f"mode{number}:{kind}", number, kind, float(scales[kind][i]))
+        for i, number in enumerate(chosen)
+        for kind in kinds
+        if scales[kind][i] > _KNOWN
+    ]
+    if not deltas:
+        raise ModelError("frequency= and damping= are zero: there is nothing uncertain.")
+    return tuple(deltas)
+
+
+def _by_mode(given: Any, name: str, modes: Sequence[int]) -> FloatArray:
+    """Return a number for each mode: of one for all, an array, or {mode: number}."""
+    if given is None:
+        return np.zeros(len(modes))
+    if isinstance(given, Mapping):
+        require_known("uncertain mode", map(str, given), map(str, modes))
+        given = [given.get(number, 0.0) for number in modes]
+    elif np.ndim(given) == 0:
+        given = [given] * len(modes)
+    values = real_array(given, name, (len(modes),))
+    if np.any(values < 0):
+        raise ModelError(
+            f"the {name} is uncertain by a share of it, 0 or more, got {values.min()}."
+        )
+    return values
+
+
+def _with_deltas(
+    plant: P,
+    deltas: tuple[Delta, ...],
+    covariance: FloatArray,
+    deviations: float,
+    neglected: Any,
+    shapes: Sequence[Delta] = (),
+    fit: UpdateResult | None = None,
+    parameters: tuple[Parameter, ...] = (),
+) -> UncertainPlant[P]:
+    """Return a plant with channels for Deltas of modes, of shapes and of neglected modes."""
+    _check_range(deltas, deviations)
+    system = _opened(plant.continuous, deltas)
+    if shapes:
+        system = with_shape_channels(plant.continuous, system, deltas, shapes)
+        covariance = la.block_diag(covariance, np.eye(len(shapes)) / deviations**2)
     weight = None
     if neglected is not None:
         known = isinstance(neglected, NeglectedModes)
         weight = neglected if known else neglected_modes(plant, neglected)
         system = opened(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
     return UncertainPlant(
-        plant,
-        system,
-        deltas,
-        own,
-        many,
-        weight,
-        source if isinstance(source, UpdateResult) else None,
-        about_fit(source, parameters or ()) if isinstance(source, UpdateResult) else (),
+        plant, system, (*deltas, *shapes), covariance, deviations, weight, fit, parameters
     )
 
 

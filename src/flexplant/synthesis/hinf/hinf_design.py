@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...checks import short
+from ...checks import instance, short
 from ...errors import (
     AssumptionError,
     CertificateError,
@@ -16,6 +16,7 @@ from ...errors import (
     InfeasibleError,
     ModelError,
     SolverError,
+    counted,
     warn,
 )
 from ...lti.interconnection import lft
@@ -25,6 +26,7 @@ from ...lti.responses import Responder, remembered, responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import StandardPlant
+from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import (
     Controller,
     SolvedController,
@@ -38,10 +40,13 @@ from ..reach import posed, require_reach
 from .central import require_shown
 from .hinf_riccati import Riccati
 from .lower_bound import pointwise_bound, raised_bound
+from .mode_channels import mode_channels, rebalanced, tolerated, with_channels
 from .singular import ADDED
 
 #: A beside its poles, from which on coordinates are blamed for a failure
 _MIXED = 1e3
+#: in the certificate: the upper bound of real mu of all uncertain frequencies together
+TOLERATED = "all frequencies at once"
 #: relative change of gamma by rounding of such a plant for which they are, over so many draws
 _SENSITIVE, _DRAWS = 2e-4, 3
 
@@ -53,6 +58,7 @@ def design_hinf(
     *,
     u: Sequence[str] | None = None,
     y: Sequence[str] | None = None,
+    uncertain: UncertainPlant[Any] | None = None,
     larger: Any = None,
     progress: bool | None = None,
 ) -> Controller:
@@ -75,6 +81,13 @@ def design_hinf(
         say why.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
+    uncertain : UncertainPlant, optional
+        Of the plant that was weighted, ``plant.uncertain(frequency=0.005)``: its frequencies are
+        tolerated. Each mode gets a channel by which a change of its frequency acts, scaled by the
+        disturbances and with the shift of real mu, and the problem is solved twice, the scales
+        evened out in closed loop between. `gamma` is then with these channels (above 1 is no
+        failure), `certificate` has ``all frequencies at once``: below 1 no machine of the
+        uncertainty has a pole on the grid. ``ClosedLoop.mode_tolerances`` says what each may be.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes that the plant left out, as for `larger_plant`: the loop is checked
         there too, sampled and delayed alike. Unless given, with those that the plant's reduced
@@ -130,6 +143,41 @@ def design_hinf(
             f"method must be Riccati(...) or Lmi(...), got {short(method)}. Pass one, or none."
         )
     plant = posed(plant, u, y, "H-infinity synthesis")
+    if uncertain is not None:
+        return with_left_out(tolerant(plant, uncertain, method, progress), plant, larger)
+    return with_left_out(_designed(plant, method, progress), plant, larger)
+
+
+def tolerant(
+    plant: StandardPlant,
+    uncertain: UncertainPlant[Any],
+    method: SynthesisMethod | None = None,
+    progress: bool | None = None,
+) -> Controller:
+    """Return the controller of a plant with channels for its modes, evened out in closed loop."""
+    instance(uncertain, UncertainPlant, "uncertain", "Make it by plant.uncertain(frequency=0.005).")
+    channels = mode_channels(plant, uncertain)
+    open_plant = with_channels(plant, channels)
+    first = _designed(open_plant, method, progress)
+    channels = rebalanced(channels, open_plant, first.system)
+    open_plant = with_channels(plant, channels)
+    answer = _designed(open_plant, method, progress)
+    share = tolerated(channels, open_plant, answer.system)
+    return answer.replace(
+        certificate=dict(answer.certificate or {}) | {TOLERATED: share},
+        reached={},  # of the weights beside the channels of modes
+        tried={"before the scales were evened out": first.gamma, "after": answer.gamma},
+        notes=(
+            *answer.notes,
+            f"gamma is with a channel for each of {counted(len(channels), 'mode')}",
+        ),
+    )
+
+
+def _designed(
+    plant: StandardPlant, method: SynthesisMethod | None, progress: bool | None
+) -> Controller:
+    """Return the verified controller of a plant."""
     problem = prepared(plant.system, plant.u, plant.y)
     try:
         require_reach(problem)
@@ -142,8 +190,10 @@ def design_hinf(
                 method = method.replace(progress=progress)
             answer = answered(plant, problem, method)
         _require_known(plant, problem, answer)
-    except (AssumptionError, SolverError, CertificateError) as error:
+    except (AssumptionError, InfeasibleError, SolverError, CertificateError) as error:
         blamed = _blamed(problem, error)
+        if isinstance(blamed, InfeasibleError):  # of this plant, whatever its coordinates
+            raise
         named = isinstance(error, AssumptionError)  # what physically lacks is not for a note
         if named or method is not None or not plant.system.is_stable:
             raise blamed from error
@@ -153,7 +203,7 @@ def design_hinf(
             raise blamed from error
         warn(answer.found.notes[0])
     found = answer.found
-    one = Controller(
+    return Controller(
         answer.controller,
         f"H-infinity by {type(answer.method).__name__}" if answer.method else "no feedback",
         gamma=answer.gamma,
@@ -163,7 +213,6 @@ def design_hinf(
         notes=found.notes,
         tried=answer.tried,
     )
-    return with_left_out(one, plant, larger)
 
 
 def _require_known(plant: StandardPlant, problem: Prepared, answer: Answer) -> None:

@@ -1,0 +1,224 @@
+"""Channels of uncertain modes in an H-infinity problem: frequencies that a loop shall tolerate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ...checks import ComplexArray, FloatArray, Value
+from ...errors import AssumptionError, ModelError
+from ...lti.grid import resonance_grid
+from ...lti.interconnection import lft
+from ...lti.responses import points, responder
+from ...lti.statespace import StateSpace
+from ...plant import StandardPlant
+from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...tolerances import RANK, TINY
+from ..robustness.uncertainty_blocks import FullBlock, osborne, places
+
+#: G over D of real mu, as a part of the response of a channel at its resonance
+_SHIFT = 0.7
+#: factor by which a scaling is changed at most in closed loop
+_REBALANCED = 4.0
+
+
+@dataclass(frozen=True)
+class ModeChannel(Value):
+    """One mode whose frequency may be off by a share r, scaled by D: d pushes it, q is seen of it.
+
+    ``q = D v x / (1 + c^2)^(1/2)``, driven by ``h d / D``, with v such that the response from d to
+    q at the resonance is ``-j r / zeta`` (delta = 1 in ``omega^2 (1 + 2 r delta)``). Deltas are
+    real: ``c = 0.7 r / zeta`` is G over D of the upper bound of real mu, added to q as an all-pass
+    of the first order whose value at the resonance is j c.
+    """
+
+    mode: int
+    states: list[int]
+    theta: float
+    h: FloatArray
+    v: FloatArray
+    c: float
+    D: float
+
+    def parts(self, dt: float) -> tuple[FloatArray, FloatArray, float, float, float, float]:
+        """Return the input column (2,), output row (2,), and (a, b, c, d) of the all-pass."""
+        size = 1.0 / np.hypot(1.0, self.c)
+        if dt:
+            a = (1.0 - np.sin(self.theta)) / np.cos(self.theta)
+            root = np.sqrt(max(1.0 - a * a, 0.0))
+            shift = a, root, -self.c * root * size, self.c * a * size
+        else:  # c (s - omega) / (s + omega)
+            root = np.sqrt(2.0 * self.theta)
+            shift = -self.theta, root, -self.c * root * size, self.c * size
+        return self.h / self.D, self.D * self.v * size, *shift
+
+
+def mode_channels(
+    weighted: StandardPlant, uncertain: UncertainPlant[Any]
+) -> tuple[ModeChannel, ...]:
+    """Return a channel for each mode of uncertain frequency that the weighted plant moves.
+
+    D is one over the modal force of the weighted disturbances: what a Delta feeds back then counts
+    as a disturbance does.
+    """
+    own: Any = uncertain.plant
+    g, dt = weighted.system, weighted.dt
+    ranges = {d.mode: 0.5 * d.scale for d in uncertain.deltas if d.kind == "freq"}
+    if not ranges or dt != own.dt:
+        raise ModelError(
+            "design_hinf(uncertain=) needs Deltas of frequencies on the plant that is weighted, "
+            f"got {uncertain!r}. Make them by plant.uncertain(frequency=0.005)."
+        )
+    names = own.assembled.realisation.names
+    if not set(names) <= set(g.states):
+        raise ModelError(
+            "the weighted plant lacks the modes of the uncertain one: weight uncertain.plant, "
+            "uncertain.plant.through(errors).weighted(z=..., w=...)."
+        )
+    columns = {side: g.input_index(getattr(weighted, side)) for side in "wu"}
+    found, forces = [], []
+    for mode, share in ranges.items():
+        first = g.states.index(names[2 * mode - 2])
+        states = [first, first + 1]
+        pair = own.assembled.realisation.pairs[mode - 1]
+        A, h = _moved_by_force(pair, dt)
+        omega, zeta = _pole(pair)
+        theta = omega * np.sqrt(1.0 - zeta**2) * (dt or 1.0)
+        z = np.exp(1j * theta) if dt else 1j * theta
+        at = np.linalg.solve(z * np.eye(2) - A, h)
+        wanted = -1j * share / zeta
+        v = np.linalg.solve(np.array([at.real, at.imag]), np.array([wanted.real, wanted.imag]))
+        feeds = g.A[states].copy()
+        feeds[:, states] = 0.0
+        rows = {
+            "w": g.B[states][:, columns["w"]],
+            "u": np.hstack([g.B[states][:, columns["u"]], feeds]),
+        }
+        forces.append([la.norm(h @ rows[side]) / (h @ h) for side in "wu"])
+        found.append(ModeChannel(mode, states, theta, h, v, _SHIFT * share / zeta, 1.0))
+    w, u = np.array(forces).T
+    if not np.any(w):
+        raise AssumptionError(
+            "no weighted disturbance moves the uncertain modes: nothing says how large their "
+            "forces are. Weight forces on the structure, w={'amp1': ...}."
+        )
+    # a mode that actuators move and disturbances do not counts as if they stood where these do
+    size = np.maximum(w, u * w.max() / max(u.max(), TINY))
+    moved = size > RANK * size.max()
+    return tuple(
+        one.replace(D=1.0 / float(force))
+        for one, force, some in zip(found, size, moved, strict=True)
+        if some
+    )
+
+
+def _moved_by_force(pair: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+    """Return A and the input column of a unit modal force, held over a sample."""
+    if not dt:
+        return pair, np.array([0.0, 1.0])
+    both = np.zeros((3, 3))
+    both[:2, :2], both[1, 2] = pair, 1.0
+    moved = la.expm(both * dt)
+    return moved[:2, :2], moved[:2, 2]
+
+
+def _pole(pair: FloatArray) -> tuple[float, float]:
+    """Return the frequency [rad/s] and damping ratio of a mode."""
+    omega = float(np.sqrt(np.linalg.det(pair)))
+    zeta = -0.5 * float(np.trace(pair)) / omega
+    if not 0.0 < zeta < 1.0:
+        raise AssumptionError(
+            f"a mode of uncertain frequency has the damping ratio {zeta:.3g}: its resonance must "
+            "be damped, and swing. Give it damping, or leave it out of modes=."
+        )
+    return omega, zeta
+
+
+def with_channels(weighted: StandardPlant, channels: Sequence[ModeChannel]) -> StandardPlant:
+    """Return a weighted plant with the channels before its own w and z."""
+    g, n, m = weighted.system, weighted.system.n_states, len(channels)
+    A, D = la.block_diag(g.A, np.zeros((m, m))), la.block_diag(np.zeros((m, m)), g.D)
+    B = np.zeros((n + m, m + g.B.shape[1]))
+    C = np.zeros((m + g.C.shape[0], n + m))
+    B[:n, m:], C[m:, :n] = g.B, g.C
+    for k, one in enumerate(channels):
+        push, see, *shift = one.parts(weighted.dt)
+        B[one.states, k], C[k, one.states] = push, see
+        A[n + k, n + k], B[n + k, k], C[k, n + k], D[k, k] = shift
+    into, out = (tuple(f"mode{one.mode}:{side}" for one in channels) for side in ("push", "seen"))
+    system = StateSpace(
+        A, B, C, D, g.dt, inputs=[*into, *g.inputs], outputs=[*out, *g.outputs], units=g.units
+    )
+    return StandardPlant.from_statespace(
+        system,
+        w=[*into, *weighted.w],
+        u=weighted.u,
+        z=[*out, *weighted.z],
+        y=weighted.y,
+    )
+
+
+def rebalanced(
+    channels: Sequence[ModeChannel], plant: StandardPlant, controller: StateSpace
+) -> tuple[ModeChannel, ...]:
+    """Return channels whose rows and columns of the closed loop are alike at their resonances."""
+    loop = lft(plant.system, controller)
+    found = []
+    for k, one in enumerate(channels):
+        M = loop.evaluated(np.exp(1j * one.theta) if plant.dt else 1j * one.theta)
+        row, column = la.norm(np.delete(M[k], k)), la.norm(np.delete(M[:, k], k))
+        change = np.sqrt(max(column, TINY) / max(row, TINY))
+        found.append(one.replace(D=one.D * float(np.clip(change, 1.0 / _REBALANCED, _REBALANCED))))
+    return tuple(found)
+
+
+def tolerated(
+    channels: Sequence[ModeChannel], plant: StandardPlant, controller: StateSpace
+) -> float:
+    r"""Return an upper bound of real mu of the channels, the largest over a grid of frequencies.
+
+    Below 1 no Deltas of size 1, all at once, put a pole on the grid's frequencies: with M from all
+    d to all q without the shift, and any positive D and real G, both diagonal,
+
+    .. math:: \bar\sigma\left((I + G^2)^{-1/4} (D M D^{-1} - j G) (I + G^2)^{-1/4}\right) \le 1
+
+    excludes ``det(I - M \Delta) = 0`` [Young1990]_. D by Osborne's iteration, G the imaginary part
+    of the shift that the design counted on.
+    """
+    loop = lft(plant.system, controller)
+    m = len(channels)
+    part = loop.select(loop.outputs[:m], loop.inputs[:m])
+    freq = resonance_grid(loop.poles(), loop.dt)
+    z = points(loop, freq)
+    seen: ComplexArray = np.moveaxis(responder(part)(freq), 2, 0)
+    shift = np.array([_shift(one, z, loop.dt) for one in channels]).T
+    size = np.hypot(1.0, [one.c for one in channels])
+    M = seen * size[:, None] - shift[:, :, None] * np.eye(m)
+    where = places([FullBlock(1, 1) for _ in channels])
+    most = 0.0
+    for each, G in zip(M, -shift.imag, strict=True):
+        bound = _scaled_size(each, G)  # D of the design first
+        if bound > 1.0:
+            d = np.sqrt(osborne(each, where))
+            scaled = each * d[:, None] / d
+            bound = min(bound, _scaled_size(scaled, G), float(la.norm(scaled, 2)))
+        most = max(most, bound)
+    return most
+
+
+def _scaled_size(M: ComplexArray, G: FloatArray) -> float:
+    """Return sigma_max of ``(I + G^2)^-1/4 (M - j G) (I + G^2)^-1/4``."""
+    root = (1.0 + G**2) ** -0.25
+    return float(la.norm((M - 1j * np.diag(G)) * root[:, None] * root, 2))
+
+
+def _shift(one: ModeChannel, z: ComplexArray, dt: float) -> ComplexArray:
+    """Return the all-pass at points, before it is scaled."""
+    if not dt:
+        return np.asarray(one.c * (z - one.theta) / (z + one.theta))
+    a = (1.0 - np.sin(one.theta)) / np.cos(one.theta)
+    return np.asarray(-one.c * (1.0 - a * z) / (z - a))

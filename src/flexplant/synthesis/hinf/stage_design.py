@@ -1,0 +1,209 @@
+"""design_stage: the fastest H-infinity controller of a stage that tolerates errors of its modes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...checks import instance, positive
+from ...errors import AssumptionError, FlexplantError, InfeasibleError, ModelError
+from ...loop import ClosedLoop, close_loop
+from ...lti.interconnection import series
+from ...parallel import Progress
+from ...plant import StandardPlant, reference_errors, stage_weights
+from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ..controller import Controller, with_left_out
+from .hinf_design import tolerant
+
+#: |S| crosses 1 at about two thirds of the bandwidth of these weights, which bound the efforts
+_CROSSES = 2.0 / 3.0
+#: first guess: |S| crosses 1 at this part of the first frequency that the actuators move
+_FIRST = 1.0 / 3.0
+#: factor between bandwidths tried, how many, and halvings of the last interval: 3 % of a bandwidth
+_STEP, _MOST, _HALVINGS = 1.3, 8, 2
+#: modulus margin that is kept with any one mode off, as a part of that of the plant itself
+_KEPT = 0.875
+#: most of the rate at which the weights can be sampled
+_OF_RATE = 0.1
+
+
+def design_stage(
+    plant: StandardPlant | UncertainPlant[Any],
+    *,
+    bandwidth: float | None = None,
+    margin: float = 0.4,
+    poi: str | None = None,
+    disturbance: float = 20.0,
+    effort: float = 10.0,
+    larger: Any = None,
+    progress: bool | None = None,
+) -> Controller:
+    """Return the fastest H-infinity controller of a stage that tolerates errors of its modes.
+
+    `stage_weights` of rising bandwidths on ``plant.through(reference_errors(plant))``, each solved
+    by ``design_hinf(uncertain=)``; the largest bandwidth is kept at which the modulus margin at u
+    is at least `margin`, and 7/8 of it with the frequency of any one mode off as far as it is
+    uncertain.
+
+    Parameters
+    ----------
+    plant : StandardPlant or UncertainPlant
+        Of a stage with a reference, continuous or sampled. A plant of which nothing is said is
+        taken with all its frequencies uncertain by 0.5 %; ``plant.uncertain(frequency={...})``
+        and ``plant.uncertain(fit)`` say more. Deltas other than of frequencies are left out.
+    bandwidth : float [Hz], optional
+        Below which |S| from the reference to the error shall stay under 1, about; the largest
+        that holds when not given.
+    margin : float
+        Least modulus margin, broken at u.
+    poi : str, optional
+        As for `stage_weights` and `reference_errors`.
+    disturbance, effort : float
+        As for `stage_weights`; these let the modes be damped as much as they are pushed.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes that the plant left out, as for `larger_plant`.
+    progress : bool, optional
+        A bar, as for `design_hinf`.
+
+    Returns
+    -------
+    Controller
+        From the sensors and the reference to the actuators: ``close_loop(plant, controller)``.
+        `tried` lists each bandwidth of the weights and the modulus margin that came with it, 0
+        where the loop does not tolerate its modes; `certificate` has the one kept.
+
+    Raises
+    ------
+    AssumptionError, LabelError
+        As for `stage_weights` and `reference_errors`.
+    InfeasibleError
+        When no bandwidth that was tried holds; the message lists them.
+    ModelError
+        When a number is out of range, or the plant was not assembled from a structure.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> controller = fx.design_stage(plant, bandwidth=10.0)
+    >>> fx.close_loop(plant, controller).modulus_margin > 0.4
+    True
+    """
+    uncertain: UncertainPlant[Any]
+    if isinstance(plant, UncertainPlant):
+        uncertain = plant
+    else:
+        given = instance(
+            plant, StandardPlant, "plant", "Assemble it, or pass plant.uncertain(...)."
+        )
+        uncertain = given.uncertain(frequency=0.005)
+    task = _StageTask(uncertain, positive(margin, "margin"), poi, disturbance, effort)
+    with Progress(_MOST, "bandwidths", progress=progress) as bar:
+        if bandwidth is not None:
+            task.holds(positive(bandwidth, "bandwidth") / _CROSSES)
+        else:
+            task.search(bar)
+    return with_left_out(task.answer(), uncertain.plant, larger)
+
+
+class _StageTask:
+    """The designs of rising bandwidths, and what came of each."""
+
+    def __init__(
+        self,
+        uncertain: UncertainPlant[Any],
+        margin: float,
+        poi: str | None,
+        disturbance: float,
+        effort: float,
+    ) -> None:
+        if margin >= 1.0:
+            raise ModelError(f"margin must be below 1, got {margin}: no loop that acts keeps it.")
+        self.uncertain, self.margin, self.poi = uncertain, margin, poi
+        self.disturbance, self.effort = disturbance, effort
+        self.ranges = {d.mode: 0.5 * d.scale for d in uncertain.deltas if d.kind == "freq"}
+        if not self.ranges:
+            raise ModelError(
+                f"no frequency of {uncertain!r} is uncertain: nothing limits the bandwidth. Pass "
+                "plant.uncertain(frequency=0.005)."
+            )
+        self.plant: StandardPlant = uncertain.plant
+        self.errors = reference_errors(self.plant, poi=poi)
+        self.through = self.plant.through(self.errors)
+        self.tried: dict[float, float] = {}
+        self.failures: dict[float, FlexplantError] = {}
+        self.best: tuple[float, Controller] | None = None
+
+    def holds(self, bandwidth: float) -> bool:
+        """Design for a bandwidth of the weights, and return whether the loop holds."""
+        weights = stage_weights(
+            self.plant, bandwidth, poi=self.poi, disturbance=self.disturbance, effort=self.effort
+        )
+        weighted = self.through.weighted(z=weights.z, w=weights.w)
+        try:
+            found = tolerant(weighted, self.uncertain)
+        except (AssumptionError, ModelError):
+            raise
+        except FlexplantError as error:
+            self.failures[bandwidth], self.tried[bandwidth] = error, 0.0
+            return False
+        block = series(self.errors, found.system).replace(name="stage")
+        loop = close_loop(self.plant, block)
+        margin = loop.modulus_margin if loop.is_stable else 0.0
+        if margin >= self.margin and not self._tolerates(loop):
+            margin = 0.0
+        self.tried[bandwidth] = margin
+        if margin < self.margin:
+            return False
+        if self.best is None or bandwidth > self.best[0]:
+            self.best = bandwidth, found.replace(system=block, method="H-infinity of a stage")
+        return True
+
+    def _tolerates(self, loop: ClosedLoop) -> bool:
+        """Return whether any one mode may be off as far as it is uncertain."""
+        found = loop.mode_tolerances(margin=_KEPT * self.margin)
+        needed = np.array([self.ranges.get(int(mode), 0.0) for mode in found.modes])
+        return not np.any(found.least < needed)
+
+    def search(self, bar: Progress) -> None:
+        """Try rising bandwidths until one fails, or falling ones until one holds; then between."""
+        now = self._first()
+        up = self.holds(now)
+        for _ in range(_MOST):
+            bar.advance()
+            other = now * _STEP if up else now / _STEP
+            if other > self.highest or self.holds(other) != up:
+                break
+            now = other
+        if self.best is None:
+            return
+        low, high = self.best[0], min(self.best[0] * _STEP, self.highest)
+        for _ in range(_HALVINGS):
+            middle = float(np.sqrt(low * high))
+            low, high = (middle, high) if self.holds(middle) else (low, middle)
+
+    @property
+    def highest(self) -> float:
+        """The highest bandwidth [Hz] whose weights can be sampled."""
+        return _OF_RATE / self.plant.dt if self.plant.dt else np.inf
+
+    def _first(self) -> float:
+        """Return a bandwidth [Hz] of the weights from the first mode of uncertain frequency."""
+        pairs = self.plant.assembled.realisation.pairs[min(self.ranges) - 1]
+        lowest = float(np.sqrt(np.linalg.det(pairs))) / (2.0 * np.pi)
+        return min(_FIRST * lowest / _CROSSES, self.highest)
+
+    def answer(self) -> Controller:
+        """Return the best controller, with what was tried."""
+        tried = {f"{f:.4g} Hz": margin for f, margin in self.tried.items()}
+        if self.best is None:
+            causes = "; ".join(f"{f:.4g} Hz: {error}" for f, error in self.failures.items())
+            raise InfeasibleError(
+                f"no bandwidth of {', '.join(tried)} gives a loop that keeps the modulus margin "
+                f"{self.margin:g} with its modes off as far as they are uncertain. Measure their "
+                "poles, lower margin=, or move the actuators." + (f" ({causes})" if causes else "")
+            )
+        bandwidth, controller = self.best
+        certificate = dict(controller.certificate or {}) | {"weights for Hz": bandwidth}
+        return controller.replace(tried=tried, certificate=certificate, reached={})

@@ -1,0 +1,146 @@
+"""How far each mode may be off: eigenvalues of loops assembled by hand are the judge."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+
+import flexplant as fx
+from flexplant.errors import AssumptionError, FlexplantWarning, ModelError
+from stages import RATE, ports, sampled, some_modes
+
+ZETA, COUNT = 1e-3, 15
+
+
+@cache
+def plant():
+    return sampled(some_modes(ZETA, COUNT, attached=False), ports(asd=1e-2))
+
+
+@cache
+def loop(bandwidth=90.0):
+    """A loop of high gain at modes of 0.1 % damping, designed as if their frequencies were sure."""
+    P, errors = plant(), fx.reference_errors(plant())
+    weights = fx.stage_weights(P, bandwidth)
+    controller = fx.design_hinf(P.through(errors).weighted(z=weights.z, w=weights.w))
+    return fx.close_loop(P, fx.lti.series(errors, controller.system).replace(name="all"))
+
+
+@cache
+def tolerances():
+    return loop().mode_tolerances()
+
+
+def changed(mode, freq=0.0, damping=0.0):
+    """A of the closed loop with one mode changed, and what S at u is made of: all by hand.
+
+    The two states of a mode are its position and speed; u is held and one sample late.
+    """
+    g = plant().continuous.system
+    A = g.A.copy()
+    own = [g.states.index(f"mode{mode}:{part}") for part in "qv"]
+    A[own[1], own[0]] *= (1.0 + freq) ** 2  # its stiffness: the damping force stays
+    A[own[1], own[1]] *= 1.0 + damping
+    B = g.B[:, g.input_index(plant().u)]
+    C = g.C[g.output_index(plant().y)]
+    n, m = B.shape
+    both = la.expm(np.block([[A, B], [np.zeros((m, n + m))]]) / RATE)
+    late = np.block([[both[:n]], [np.zeros((m, n + m))]])
+    F, G = late, np.vstack([np.zeros((n, m)), np.eye(m)])
+    H = np.hstack([C, np.zeros((len(C), m))])
+    (block,) = loop().blocks
+    K = {name: getattr(block.select(plant().u, plant().y), name) for name in "ABCD"}
+    closed = np.block([[F + G @ K["D"] @ H, G @ K["C"]], [K["B"] @ H, K["A"]]])
+    return closed, (F, G, H), K
+
+
+def radius(mode, **change):
+    return np.abs(np.linalg.eigvals(changed(mode, **change)[0])).max()
+
+
+def margin(mode, change, around):
+    """The modulus margin at u within 5 % of a frequency [Hz], the lowest place halved in."""
+    _, (F, G, H), K = changed(mode, freq=change)
+
+    def size(f):
+        z = np.exp(2j * np.pi * f / RATE)
+        P = H @ np.linalg.solve(z * np.eye(len(F)) - F, G)
+        C = K["C"] @ np.linalg.solve(z * np.eye(len(K["A"])) - K["A"], K["B"]) + K["D"]
+        return la.svdvals(np.eye(G.shape[1]) - C @ P)[-1]
+
+    freq = np.linspace(0.95, 1.05, 1001) * around
+    for _ in range(2):
+        sizes = [size(f) for f in freq]
+        k = int(np.argmin(sizes))
+        freq = np.linspace(freq[max(k - 1, 0)], freq[min(k + 1, freq.size - 1)], 31)
+    return min(sizes)
+
+
+def test_the_loop_by_hand_is_the_loop():
+    assert radius(4) == pytest.approx(np.abs(loop().poles()).max(), abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["freq", "damping"])
+def test_a_pole_crosses_the_boundary_at_each_tolerance_and_not_before(kind):
+    found = tolerances()
+    ends = found.stable if kind == "freq" else found.damping
+    where = np.argwhere(np.isfinite(ends))
+    assert len(where) >= (4 if kind == "freq" else 0)
+    for row, side in where:
+        mode, change = int(found.modes[row]), ends[row, side]
+        assert np.sign(change) == (-1, 1)[side]
+        assert radius(mode, **{kind: 0.99 * change}) < 1.0 < radius(mode, **{kind: 1.01 * change})
+
+
+def test_a_mode_without_a_tolerance_may_be_anywhere_in_the_range():
+    found = tolerances()
+    free = [i for i in range(found.modes.size) if not np.isfinite(found.stable[i]).any()]
+    assert free
+    for row in free[:3]:
+        for change in np.linspace(-1.0, 1.0, 21) * found.limit[row]:
+            assert radius(int(found.modes[row]), freq=change) < 1.0
+
+
+def test_the_margin_falls_to_what_was_stated():
+    """At its grid the code sees a peak to 3 %."""
+    found = tolerances()
+    for row in np.argsort(found.least)[:3]:
+        ends = found.within[row]
+        assert np.isfinite(ends).all()
+        for change in ends:
+            least = margin(int(found.modes[row]), change, found.freq[row] * (1.0 + change))
+            assert least == pytest.approx(0.35, rel=0.03)
+
+
+def test_what_is_known_of_a_mode_stands_beside_its_tolerance():
+    found = tolerances()
+    worst = int(np.argmin(found.least))
+    mode = int(found.modes[worst])
+    with pytest.warns(FlexplantWarning, match=f"mode {mode} .* holds to .* known to 1 %"):
+        beside = loop().mode_tolerances(known=plant().uncertain(frequency={mode: 0.01}))
+    assert beside.critical == (mode,)
+    assert "known to" in repr(beside) and "!" in repr(beside)
+    np.testing.assert_array_equal(beside.stable, found.stable)
+    assert loop().mode_tolerances(known=1e-7).critical == ()
+    assert str(mode) in found.summary and "leads to" in found.summary
+
+
+def test_a_loop_that_tolerates_all_says_so():
+    observer = fx.design_kalman(plant())
+    servo = fx.design_servo(plant(), bandwidth=5.0, observer=observer)
+    found = fx.close_loop(plant(), observer, servo).mode_tolerances(known=0.01)
+    assert found.critical == ()
+    assert "does harm" in found.summary
+
+
+def test_what_cannot_be_judged_is_refused():
+    with pytest.raises(ModelError, match="below 1"):
+        loop().mode_tolerances(margin=1.0)
+    with pytest.raises(ModelError, match="known has the shape"):
+        loop().mode_tolerances(known=[0.1, 0.2])
+    (block,) = loop().blocks
+    with pytest.warns(FlexplantWarning, match="unstable"):
+        wild = fx.close_loop(plant(), block.replace(B=-block.B, D=-block.D))
+    with pytest.raises(AssumptionError, match="unstable as it is"):
+        wild.mode_tolerances()

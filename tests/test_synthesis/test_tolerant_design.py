@@ -1,0 +1,110 @@
+"""Controllers that tolerate errors of modes, on machines whose modes are off."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import flexplant as fx
+from flexplant.errors import InfeasibleError, ModelError
+from flexplant.modes import solve_modes
+from flexplant.structure import FEModel, ModalDamping
+from plates import make_plate
+from stages import ports, sampled, some_modes
+
+#: modes 14 and 15 are a pair
+ZETA, COUNT, SHARE = 1e-3, 15, 0.005
+CHANNELS = ports(asd=1e-2)
+
+
+@cache
+def plant():
+    return sampled(some_modes(ZETA, COUNT, attached=False), CHANNELS)
+
+
+@cache
+def weighted(bandwidth=100.0):
+    weights = fx.stage_weights(plant(), bandwidth, effort=10.0, disturbance=20.0)
+    return plant().through(fx.reference_errors(plant())).weighted(z=weights.z, w=weights.w)
+
+
+@cache
+def design(tolerant=True):
+    uncertain = plant().uncertain(frequency=SHARE) if tolerant else None
+    return fx.design_hinf(weighted(), uncertain=uncertain)
+
+
+@cache
+def machine(seed):
+    """A machine of the same kind whose frequencies are all off, by hand: phi from another E."""
+    model = make_plate()
+    found = solve_modes(model, count=COUNT, damping=ModalDamping(ZETA))
+    rng = np.random.default_rng(seed)
+    off = 1.0 + SHARE * rng.choice([-1.0, 1.0], size=COUNT) * (seed > 0)
+    off[:3] = 1.0
+    phi = model.M @ found.phi
+    # K + sum (s^2 - 1) omega^2 M phi phi' M moves one frequency each and keeps its shape
+    more = phi @ np.diag((off**2 - 1.0) * found.omega**2) @ phi.T
+    moved = FEModel(model.M, model.K + more, dofs=model.dofs).with_damping(ModalDamping(ZETA))
+    other = solve_modes(moved, count=COUNT)
+    return sampled(other, CHANNELS)
+
+
+def loop_on(machine_plant, controller):
+    return fx.close_loop(machine_plant, fx.reference_errors(machine_plant), controller)
+
+
+def radius(machine_plant, controller):
+    return np.abs(loop_on(machine_plant, controller).poles()).max()
+
+
+@pytest.mark.filterwarnings("ignore:the closed loop is unstable")
+def test_what_the_plain_design_does_not_tolerate_the_tolerant_one_does():
+    machines = [machine(seed) for seed in range(1, 9)]
+    assert radius(machine(0), design(False)) < 1.0
+    assert sum(radius(one, design(False)) > 1.0 for one in machines) >= 4
+    margins = [loop_on(one, design()).modulus_margin for one in machines]
+    assert min(margins) > 0.3
+
+
+def test_the_certificate_is_below_one_and_each_mode_holds_alone():
+    share = design().certificate["all frequencies at once"]
+    assert share < 1.0
+    tolerances = loop_on(plant(), design()).mode_tolerances()
+    assert np.abs(tolerances.stable).min() > SHARE
+
+
+def test_what_was_tried_is_in_the_result():
+    assert list(design().tried) == ["before the scales were evened out", "after"]
+    assert any("a channel for each of 12 modes" in note for note in design().notes)
+
+
+def test_uncertainty_of_another_plant_is_refused():
+    other = fx.testbeds.three_masses()
+    with pytest.raises(ModelError, match=r"weighted"):
+        fx.design_hinf(weighted(), uncertain=other.uncertain(frequency=0.01))
+    with pytest.raises(ModelError, match="Deltas of frequencies"):
+        fx.design_hinf(weighted(), uncertain=plant().uncertain(damping=0.3))
+    with pytest.raises(ModelError, match="uncertain"):
+        fx.design_hinf(weighted(), uncertain=0.005)
+
+
+@pytest.mark.slow
+def test_a_stage_is_as_fast_as_its_uncertainty_allows():
+    small = sampled(some_modes(ZETA, 8, attached=False), CHANNELS)
+    sure = fx.design_stage(small.uncertain(frequency=0.001))
+    unsure = fx.design_stage(small.uncertain(frequency=0.02))
+    for found, share in ((sure, 0.001), (unsure, 0.02)):
+        loop = fx.close_loop(small, found)
+        assert loop.modulus_margin >= 0.4
+        assert (loop.mode_tolerances(margin=0.35).least > share).all()
+        assert len(found.tried) >= 3
+    fast, slow = (one.certificate["weights for Hz"] for one in (sure, unsure))
+    assert fast > 1.2 * slow
+
+
+def test_a_bandwidth_that_cannot_be_kept_is_refused_with_what_was_tried():
+    with pytest.raises(InfeasibleError, match="no bandwidth of 600 Hz"):
+        fx.design_stage(plant().uncertain(frequency=0.03), bandwidth=400.0)
+    with pytest.raises(ModelError, match="margin must be below 1"):
+        fx.design_stage(plant(), margin=1.2)
