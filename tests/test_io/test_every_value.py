@@ -75,7 +75,7 @@ def made():
     servo = fx.design_servo(sampled, bandwidth=40.0)
     loop = close_loop(sampled, static, servo)
     yield fx.compare_loops({"servo": loop})
-    yield loop.budget("die:error")
+    yield from (loop.budget("die:error"), loop.mode_tolerances(known=1e-9))
     yield fx.loop.SpillOver(0.99, True, 0.5, 0.6, 100.0, 490)
     yield LeftOut(np.array([25]), np.eye(4), np.eye(3), np.zeros((3, 4)), plant)
     point = fx.setpoint(distance=1e-3, velocity=0.1, acceleration=1.0, jerk=100.0)
