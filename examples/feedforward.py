@@ -23,6 +23,7 @@ import numpy as np
 import flexplant as fx
 import wafer_stage as stage
 from flexplant import simulation as sim
+from paper_plate import updated
 
 DAMPING, DURATION = 0.001, 0.5  # 1, s
 MOVE = fx.setpoint(
@@ -34,9 +35,9 @@ TERMS = ("acceleration", "jerk", "snap")
 # %% The machine, and its updated and nominal models
 def models() -> dict[str, Any]:
     """Return machine and models as `wafer_stage` makes them."""
-    machine = fx.testbeds.wafer_stage(damping=DAMPING, rate=stage.RATE, delay=stage.DELAY)
+    machine = fx.testbeds.wafer_stage(elements=(8, 8), damping=DAMPING, rate=stage.RATE)
     drawing, bare = stage.reduced(DAMPING), stage.plate.with_damping(fx.ModalDamping(DAMPING))
-    fit = stage.updated(drawing, machine.poles([6, 7]))
+    fit = updated(drawing, machine.poles([6, 7]))
     full = {"drawing": bare, "updated": fit.applied_to(bare)}
     return {
         "machine": machine,

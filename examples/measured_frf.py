@@ -113,7 +113,7 @@ def merit(frf: fx.Frf, model: Any) -> dict[str, tuple[float, float]]:
 # %% The run
 def main() -> dict[str, Any]:
     """Return everything that the table and the pictures show."""
-    machine = fx.testbeds.wafer_stage(damping=0.01, rate=RATE)
+    machine = fx.testbeds.wafer_stage(elements=(8, 8), rate=RATE)
     frf = measured(machine)
     identified, numbered = poles(frf)
     eigenvalues = fx.Eigenvalues(numbered)

@@ -31,7 +31,8 @@ from flexplant.placement import (
     device_worth,
     pareto_curve,
 )
-from wafer_stage import DELAY, RATE, L, ports, reduced, updated
+from paper_plate import DELAY, updated
+from wafer_stage import RATE, L, ports, reduced
 
 OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 ENCODER = 5e-12  # m/sqrt(Hz)
@@ -50,7 +51,7 @@ AXES = {"z": 1.0, "rx": 0.013, "ry": 0.013}
 # %% The machine: updated, and as uncertain as its measurement
 def machine(rng: int = 1) -> tuple[fx.StandardPlant, list[fx.StandardPlant]]:
     """Return the sampled plant of the updated model, and three machines that it could be too."""
-    hidden = fx.testbeds.wafer_stage(damping=0.01, rate=RATE, delay=DELAY)
+    hidden = fx.testbeds.wafer_stage(elements=(8, 8), rate=RATE, delay=DELAY)
     exact = hidden.poles([6, 7])
     measured = fx.MeasuredModes(
         poles=exact.poles, modes=[6, 7], covariance=np.diag(np.repeat((2.0, 0.5), 2) ** 2)

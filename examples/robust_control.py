@@ -56,7 +56,7 @@ def updated() -> tuple[fx.UpdateResult, fx.FEMatrices | Any]:
     modes = fx.solve_modes(plate, count=24, compliance_at=[z8])
     spots = [(x, y, 0.0) for y in np.linspace(0.0, L, 5) for x in np.linspace(0.0, L, 5)]
     rom = fx.reduce(modes, fx.DesiredDofs([plate.dofs.nearest(p, "z") for p in spots]))
-    machine = fx.testbeds.wafer_stage(damping=DAMPING)
+    machine = fx.testbeds.wafer_stage(elements=(8, 8), damping=DAMPING)
     measured = machine.poles([6, 7]).replace(covariance=[ERROR**2, ERROR**2])
     fit = fx.update(rom, [fx.AddedMass(z8)], [fx.Eigenvalues(measured)])
     return fit, fit.applied_to(plate)

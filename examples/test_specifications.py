@@ -41,7 +41,7 @@ LOOP = fx.Specification(bandwidth=40.0, modulus_margin=0.5, noise=1.5e-9)
 @cache
 def machine() -> fx.ClosedLoop:
     """Return the closed loop on the machine."""
-    truth = fx.testbeds.wafer_stage(damping=0.01, rate=RATE, delay=DELAY)
+    truth = fx.testbeds.wafer_stage(elements=(8, 8), rate=RATE, delay=DELAY)
     plate = fx.kirchhoff_plate(
         size=(SIDE, SIDE), thickness=0.0272, elements=(8, 8),
         density=2702, youngs_modulus=70e9, poisson_ratio=0.35,

@@ -31,7 +31,7 @@ block = fx.solid_block(size=(0.4, 0.3, 0.1), elements=(12, 9, 4), density=2700,
                        youngs_modulus=70e9, poisson_ratio=0.33)
 rom = reduced()
 at = rom.full_dofs.nearest(Z8, "z")
-poles = fx.testbeds.wafer_stage().poles([6, 7]).replace(covariance=0.1 * np.eye(4))
+poles = fx.testbeds.wafer_stage(elements=(8, 8)).poles([6, 7]).replace(covariance=0.1 * np.eye(4))
 unknowns = [fx.AddedMass(at, bounds=(0.0, 2.0)), fx.AddedDamping(at, bounds=(-20.0, 20.0))]
 small = fx.assemble_plant(some_modes(count=8, attached=False), ports())
 weights = fx.stage_weights(small, 50.0)

@@ -64,7 +64,9 @@ def made():
     fe, modes, rom = full(), some_modes(), reduced()
     at = rom.full_dofs.nearest(Z8, "z")
     unknowns = [fx.AddedMass(at), fx.AddedDamping(at)]
-    poles = fx.testbeds.wafer_stage().poles([6, 7]).replace(covariance=0.1 * np.eye(4))
+    poles = (
+        fx.testbeds.wafer_stage(elements=(8, 8)).poles([6, 7]).replace(covariance=0.1 * np.eye(4))
+    )
     residual = fx.Eigenvalues(poles)
     fit = fx.update(rom, unknowns, [residual])
     plant = fx.assemble_plant(rom, ports())
@@ -120,7 +122,7 @@ def made():
     yield synthesis.RobustStability(0.5, 0.4, 10.0, one, plant, zero, zero, {"machines": 1.0})
     yield synthesis.WorstCaseGain(2.0, 1.9, 1.0, 10.0, one, plant, zero, zero)
     yield from of_estimators(sampled, small)
-    yield from (fx.Riccati(), fx.testbeds.wafer_stage(), sensors, solution)
+    yield from (fx.Riccati(), fx.testbeds.wafer_stage(elements=(8, 8)), sensors, solution)
     more = a_system()
     yield from (lti.balanced(more, order=2), lti.modal_form(more), lti.norm_report(more))
     yield from (

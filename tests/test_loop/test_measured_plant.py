@@ -76,7 +76,9 @@ def test_margin_and_bandwidth_on_a_dense_frf_are_those_of_the_model():
 @cache
 def measured():
     """The stage under feedback, its noise acting; the machine's delay put in by its phase."""
-    frf = wafer_stage().measure_frf(ports(asd=1e-4), period=0.5, periods=4, amplitude=30.0, rng=3)
+    frf = wafer_stage(elements=(8, 8)).measure_frf(
+        ports(asd=1e-4), period=0.5, periods=4, amplitude=30.0, rng=3
+    )
     return frf.replace(data=frf.data * np.exp(-2j * np.pi * frf.freq / RATE))
 
 

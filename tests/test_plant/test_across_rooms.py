@@ -72,7 +72,9 @@ def test_points_as_keys_are_drawn():
 def test_a_fit_alone_opens_its_uncertainty():
     rom = reduced()
     at = rom.full_dofs.nearest(Z8, "z")
-    poles = fx.testbeds.wafer_stage().poles([6, 7]).replace(covariance=0.1 * np.eye(4))
+    poles = (
+        fx.testbeds.wafer_stage(elements=(8, 8)).poles([6, 7]).replace(covariance=0.1 * np.eye(4))
+    )
     unknowns = [fx.AddedMass(at), fx.AddedDamping(at)]
     fit = fx.update(rom, unknowns, [fx.Eigenvalues(poles)])
     plant = fx.assemble_plant(fit.model, ports())

@@ -31,7 +31,7 @@ def rows():
 
 @cache
 def machine(damping=0.001):
-    return wafer_stage(damping=damping, rate=RATE, delay=1)
+    return wafer_stage(elements=(8, 8), damping=damping, rate=RATE, delay=1)
 
 
 @cache

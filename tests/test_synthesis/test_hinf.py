@@ -36,7 +36,7 @@ BANDWIDTH = 30.0
 
 @cache
 def machine():
-    return wafer_stage(damping=0.01, rate=RATE, delay=1)
+    return wafer_stage(elements=(8, 8), damping=0.01, rate=RATE, delay=1)
 
 
 @cache

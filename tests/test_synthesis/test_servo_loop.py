@@ -21,7 +21,7 @@ U, Y = [f"u{i}" for i in range(1, 5)], [f"y{i}" for i in range(1, 5)]
 
 @cache
 def machine():
-    return wafer_stage(damping=0.001, rate=RATE, delay=1)
+    return wafer_stage(elements=(8, 8), damping=0.001, rate=RATE, delay=1)
 
 
 @cache

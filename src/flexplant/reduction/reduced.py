@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.linalg as la
@@ -12,6 +13,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, IntArray, Value, name_list, positive, real_array
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
+from ..modes.calibration import calibrated_matrices, measured_poles
 from ..modes.damped_modes import leaving_overdamped
 from ..modes.modes import Modes
 from ..modes.normal_form import normal_form
@@ -306,6 +308,35 @@ class ReducedModel(Spanned, Value):
             coordinates=names,
         )
         return model, follow, flexibility
+
+    def calibrated(self, measured: Any) -> ReducedModel:
+        """Return the model with the measured poles of some modes, and its own shapes.
+
+        ``K* + M* phi diag(omega_m^2 - omega^2) phi^T M*``, D* likewise. Modes left out stay as
+        they are, rigid-body modes at 0.
+
+        Parameters
+        ----------
+        measured : MeasuredModes
+            With mode numbers, from 1, rigid-body modes included.
+
+        Raises
+        ------
+        ModelError, LabelError
+            When it has no numbers, one is of no elastic mode of the structure here, or the model
+            is not free of massless coordinates and of magnets.
+        SolverError
+            When damping couples the modes too much.
+        """
+        if self.massless.size or self.n_unstable:
+            raise ModelError(
+                "a model with massless coordinates or unstable modes has no modes that measured "
+                "poles could take the place of. Reduce it by DesiredDofs, or calibrate the Modes."
+            )
+        free = self.rigid_body.shape[1]
+        places, poles = measured_poles(measured, range(free + 1, self.n_dof - self.n_vectors + 1))
+        D, K = calibrated_matrices(self.M, self.D, self.K, free, places, poles)
+        return self.replace(D=D, K=K, bound=None)
 
     def completed(self) -> ReducedModel:
         """Return the model with the modes that were left out, as further coordinates.

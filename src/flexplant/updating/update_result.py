@@ -310,6 +310,29 @@ class UpdateResult(Value):
             raise ModelError("this result does not hold its parameters: run update() once more.")
         return applied(model, self.unknowns, self.values)
 
+    def calibrated(self, measured: Any) -> Any:
+        """Return the updated model with the measured poles of some modes; see `ReducedModel`.
+
+        The parameters explain shapes, POIs and modes that were not measured; what is measured of
+        a mode is put in as it is.
+
+        Parameters
+        ----------
+        measured : MeasuredModes
+            With mode numbers.
+
+        Raises
+        ------
+        ModelError
+            When the model is an FEModel: calibrate its `modes()`.
+        """
+        if not hasattr(self.model, "calibrated"):
+            raise ModelError(
+                "a full model has more modes than can be solved and put back. Use "
+                "fit.modes(count=...).calibrated(measured)."
+            )
+        return self.model.calibrated(measured)
+
     def modes(self, *, count: int | None = None) -> Modes:
         """Return the modes of the updated model on all DOFs of the structure.
 

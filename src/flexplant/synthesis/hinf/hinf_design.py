@@ -153,16 +153,18 @@ def tolerant(
     uncertain: UncertainPlant[Any],
     method: SynthesisMethod | None = None,
     progress: bool | None = None,
+    damped_below: float = 0.0,
 ) -> Controller:
     """Return the controller of a plant with channels for its modes, evened out in closed loop."""
     instance(uncertain, UncertainPlant, "uncertain", "Make it by plant.uncertain(frequency=0.005).")
-    channels = mode_channels(plant, uncertain)
+    channels = mode_channels(plant, uncertain, damped_below)
     open_plant = with_channels(plant, channels)
     first = _designed(open_plant, method, progress)
     channels = rebalanced(channels, open_plant, first.system)
-    open_plant = with_channels(plant, channels)
-    answer = _designed(open_plant, method, progress)
-    share = tolerated(channels, open_plant, answer.system)
+    answer = _designed(with_channels(plant, channels), method, progress)
+    scales = {one.mode: one.D for one in channels}
+    stated = [one.replace(D=scales[one.mode]) for one in mode_channels(plant, uncertain)]
+    share = tolerated(stated, with_channels(plant, stated), answer.system)
     return answer.replace(
         certificate=dict(answer.certificate or {}) | {TOLERATED: share},
         reached={},  # of the weights beside the channels of modes

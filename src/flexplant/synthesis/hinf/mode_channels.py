@@ -22,6 +22,9 @@ from ..robustness.uncertainty_blocks import FullBlock, osborne, places
 
 #: G over D of real mu, as a part of the response of a channel at its resonance
 _SHIFT = 0.7
+#: of modes that shall be damped: their least relative error, and the part of the largest modal
+#: force of the actuators from which on these push a mode
+_DAMPED, _PUSHED = 0.01, 0.1
 #: factor by which a scaling is changed at most in closed loop
 _REBALANCED = 4.0
 
@@ -43,6 +46,7 @@ class ModeChannel(Value):
     v: FloatArray
     c: float
     D: float
+    share: float
 
     def parts(self, dt: float) -> tuple[FloatArray, FloatArray, float, float, float, float]:
         """Return the input column (2,), output row (2,), and (a, b, c, d) of the all-pass."""
@@ -58,12 +62,14 @@ class ModeChannel(Value):
 
 
 def mode_channels(
-    weighted: StandardPlant, uncertain: UncertainPlant[Any]
+    weighted: StandardPlant, uncertain: UncertainPlant[Any], damped_below: float = 0.0
 ) -> tuple[ModeChannel, ...]:
     """Return a channel for each mode of uncertain frequency that the weighted plant moves.
 
     D is one over the modal force of the weighted disturbances: what a Delta feeds back then counts
-    as a disturbance does.
+    as a disturbance does. Modes below a frequency [Hz] that actuators push are to be damped, not
+    only tolerated: they are off by 1 % at least, and c = 0 (complex deltas), which also covers
+    errors of their shapes and damping.
     """
     own: Any = uncertain.plant
     g, dt = weighted.system, weighted.dt
@@ -99,8 +105,13 @@ def mode_channels(
             "u": np.hstack([g.B[states][:, columns["u"]], feeds]),
         }
         forces.append([la.norm(h @ rows[side]) / (h @ h) for side in "wu"])
-        found.append(ModeChannel(mode, states, theta, h, v, _SHIFT * share / zeta, 1.0))
+        found.append(ModeChannel(mode, states, theta, h, v, _SHIFT * share / zeta, 1.0, share))
     w, u = np.array(forces).T
+    low = [one.theta / (dt or 1.0) < 2.0 * np.pi * damped_below for one in found]
+    found = [
+        _damped(one) if below and force > _PUSHED * u.max() else one
+        for one, below, force in zip(found, low, u, strict=True)
+    ]
     if not np.any(w):
         raise AssumptionError(
             "no weighted disturbance moves the uncertain modes: nothing says how large their "
@@ -114,6 +125,11 @@ def mode_channels(
         for one, force, some in zip(found, size, moved, strict=True)
         if some
     )
+
+
+def _damped(one: ModeChannel) -> ModeChannel:
+    """Return a channel of a complex delta of 1 % or more."""
+    return one.replace(v=one.v * max(_DAMPED / one.share, 1.0), c=0.0)
 
 
 def _moved_by_force(pair: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:

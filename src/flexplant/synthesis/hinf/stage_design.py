@@ -24,6 +24,8 @@ _FIRST = 1.0 / 3.0
 _STEP, _MOST, _HALVINGS = 1.3, 8, 2
 #: modulus margin that is kept with any one mode off, as a part of that of the plant itself
 _KEPT = 0.875
+#: modes below so many times the bandwidth of the weights are damped, not only tolerated
+_DAMPED = 3.5
 #: most of the rate at which the weights can be sampled
 _OF_RATE = 0.1
 
@@ -142,7 +144,7 @@ class _StageTask:
         )
         weighted = self.through.weighted(z=weights.z, w=weights.w)
         try:
-            found = tolerant(weighted, self.uncertain)
+            found = tolerant(weighted, self.uncertain, damped_below=_DAMPED * bandwidth)
         except (AssumptionError, ModelError):
             raise
         except FlexplantError as error:

@@ -1,0 +1,218 @@
+"""The virtual machine that no drawing resembles, and models calibrated with what is measured."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+
+import flexplant as fx
+from flexplant.errors import LabelError, ModelError
+from flexplant.testbeds.ritz_plate import ritz_plate
+from stages import RATE, ports
+
+PLATE = {
+    "size": (0.6, 0.4),
+    "thickness": 0.0272,
+    "density": 2702.0,
+    "youngs_modulus": 70e9,
+    "poisson_ratio": 0.3,
+}
+
+
+@cache
+def machine(individual=1):
+    return fx.testbeds.wafer_stage(damping=0.001, individual=individual)
+
+
+def swing(M, K, count):
+    """Frequencies [Hz] of the elastic modes, densely."""
+    return np.sqrt(la.eigh(K, M, eigvals_only=True)[3 : 3 + count]) / (2 * np.pi)
+
+
+def test_thin_it_is_kirchhoffs_plate():
+    """Meshes of another formulation converge to it with the square of their size (Richardson)."""
+    thin = PLATE | {"thickness": 1e-4}
+    found = ritz_plate(**thin)
+    exact = swing(found.M, found.K, 12)
+    meshes = [
+        fx.solve_modes(fx.kirchhoff_plate(elements=(3 * n, 2 * n), **thin), count=15).freq[3:]
+        for n in (6, 12)
+    ]
+    limit = (4.0 * meshes[1] - meshes[0]) / 3.0
+    np.testing.assert_allclose(exact, limit, rtol=5e-4)
+    assert np.abs(meshes[1] / exact - 1.0).max() > 6e-4
+
+
+def test_rotary_inertia_is_that_of_its_slopes():
+    """First order: (rho h^3 / 12) times the integral of the squared slopes over that of rho h w^2.
+
+    The slopes are those of a meshed plate at its nodes.
+    """
+    thick, mesh = PLATE["thickness"], fx.kirchhoff_plate(elements=(36, 24), **PLATE)
+    modes = fx.solve_modes(mesh, count=9)
+    one = ritz_plate(**PLATE)
+    with_it = swing(one.M, one.K, 6)
+    none = ritz_plate(**(PLATE | {"thickness": thick / 1e3}))
+    without = 1e3 * swing(none.M, none.K, 6)
+    count = np.array([37, 25])
+    weight = np.outer(*(np.r_[0.5, np.ones(n - 2), 0.5] for n in count[::-1])).reshape(-1)
+    area = 0.6 * 0.4 / (36 * 24) * weight
+    slopes = modes.phi.reshape(-1, 3, 9)[:, 1:, 3:]
+    share = 2702.0 * thick**3 / 12.0 * np.einsum("n,nkm->m", area, slopes**2)
+    np.testing.assert_allclose(1.0 - with_it / without, 0.5 * share, rtol=0.05)
+
+
+def test_motions_between_nodes_are_those_of_one_polynomial():
+    plate = ritz_plate(**PLATE)
+    x, y = plate.dofs.xyz[:, 0], plate.dofs.xyz[:, 1]
+    w = 1.0 + 2.0 * x - 3.0 * y + 5.0 * x**2 * y - y**3
+    at = np.array([0.123, 0.321, 0.0])
+    assert plate.dofs.row(at, "z") @ w == pytest.approx(
+        1 + 2 * at[0] - 3 * at[1] + 5 * at[0] ** 2 * at[1] - at[1] ** 3
+    )
+    assert plate.dofs.row(at, "rx") @ w == pytest.approx(-3 + 5 * at[0] ** 2 - 3 * at[1] ** 2)
+    assert plate.dofs.row(at, "ry") @ w == pytest.approx(-2 - 10 * at[0] * at[1])
+    with pytest.raises(LabelError, match="off the plate"):
+        plate.dofs.row((0.7, 0.1, 0.0), "z")
+    with pytest.raises(LabelError, match="moves along"):
+        plate.dofs.row(at, "x")
+
+
+def test_no_mesh_of_the_drawing_has_its_frequencies():
+    found = machine().poles(range(4, 20)).freq
+    for n in (8, 16, 24):
+        drawing = fx.kirchhoff_plate(
+            size=(0.6, 0.6),
+            thickness=0.0272,
+            elements=(n, n),
+            density=2702.0,
+            youngs_modulus=70e9,
+            poisson_ratio=0.35,
+        )
+        loaded = drawing.with_parts(fx.PointMass(drawing.dofs.nearest((0.3, 0.15, 0), "z"), 0.5))
+        off = np.abs(fx.solve_modes(loaded, count=19).freq[3:] / found - 1.0)
+        assert np.median(off) > 0.005
+
+
+def test_machines_differ_and_each_is_itself():
+    first, again, other = machine(1), fx.testbeds.wafer_stage(damping=0.001), machine(2)
+    np.testing.assert_allclose(first.poles([9]).poles, again.poles([9]).poles, rtol=1e-9)
+    off = other.poles(range(4, 14)).freq / first.poles(range(4, 14)).freq - 1.0
+    assert 1e-4 < np.abs(off).max() < 0.02
+    zeta = machine().poles(range(4, 24)).zeta
+    assert 0.15 < np.log(zeta / 0.001).std() < 0.45
+    assert first.delay == 1.3
+
+
+def test_its_sensors_have_steps():
+    static = fx.design_static(fx.assemble_plant(drawing(), ports()).discretized(RATE, delay=1.3))
+    servo = fx.design_servo(
+        fx.assemble_plant(drawing(), ports()).discretized(RATE, delay=1.3),
+        bandwidth=8.0,
+        observer=static,
+    )
+    run = machine().run(ports(), static, servo, duration=0.05, rng=1)
+    counts = run["y1"] / 5e-11
+    assert np.abs(counts - counts.round()).max() < 1e-6
+
+
+@cache
+def drawing():
+    plate = fx.kirchhoff_plate(
+        size=(0.6, 0.6),
+        thickness=0.0272,
+        elements=(8, 8),
+        density=2702.0,
+        youngs_modulus=70e9,
+        poisson_ratio=0.35,
+    )
+    modes = fx.solve_modes(plate, count=24, damping=fx.ModalDamping(0.001))
+    spots = [(x, y, 0.0) for y in np.linspace(0, 0.6, 5) for x in np.linspace(0, 0.6, 5)]
+    del spots[12]
+    return fx.reduce(modes, fx.DesiredDofs([modes.dofs.nearest(p, "z") for p in spots]))
+
+
+def dense_poles(model):
+    """Poles of M, D, K in the upper half plane, by frequency."""
+    n = len(model.M)
+    inverse = np.linalg.inv(model.M)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ model.K, -inverse @ model.D]])
+    poles = np.linalg.eigvals(A)
+    poles = poles[poles.imag > 100.0]
+    return poles[np.argsort(np.abs(poles))]
+
+
+@pytest.mark.parametrize("damper", [0.0, 30.0])
+def test_a_calibrated_model_has_the_measured_poles_and_its_own_shapes(damper):
+    """With a damper that couples the modes too; what is not measured stays as it was."""
+    model = drawing()
+    row = np.eye(model.n_dof)[0] - np.eye(model.n_dof)[1]
+    model = model.replace(D=model.D + damper * np.outer(row, row))
+    measured = machine().poles([4, 6, 7, 9])
+    found = model.calibrated(measured)
+    poles = dense_poles(found)
+    nearest = np.abs(poles[:, None] - measured.poles).min(axis=0)
+    assert (nearest < 1e-8 * np.abs(measured.poles)).all()
+    assert np.array_equal(found.M, model.M)
+    before, after = (la.eigh(one.K, one.M)[0] for one in (model, found))
+    np.testing.assert_allclose(after[[4, 7, 9, 10, 15]], before[[4, 7, 9, 10, 15]], rtol=1e-9)
+    # rigid-body motions stay free of force
+    assert np.abs(found.K @ model.rigid_body).max() < 1e-6 * np.abs(model.K).max()
+
+
+def test_calibrated_modes_keep_their_shapes():
+    modes = fx.solve_modes(ritz_plate(**PLATE), count=12, damping=fx.ModalDamping(0.01))
+    measured = fx.MeasuredModes([-2 + 1000j, -3 + 1500j], modes=[4, 6])
+    found = modes.calibrated(measured)
+    assert found.poles[[3, 5]] == pytest.approx(measured.poles, rel=1e-12)
+    assert np.array_equal(found.phi, modes.phi)
+    assert np.array_equal(np.delete(found.omega, [3, 5]), np.delete(modes.omega, [3, 5]))
+
+
+def test_what_cannot_be_calibrated_is_refused():
+    poles = [-2 + 1000j]
+    with pytest.raises(ModelError, match="without numbers"):
+        drawing().calibrated(fx.MeasuredModes(poles))
+    with pytest.raises(ModelError, match="got float"):
+        drawing().calibrated(1.0)
+    with pytest.raises(LabelError, match="elastic mode"):
+        drawing().calibrated(fx.MeasuredModes(poles, modes=[2]))
+    with pytest.raises(LabelError, match="elastic mode"):
+        drawing().calibrated(fx.MeasuredModes(poles, modes=[40]))
+
+
+def test_fits_are_calibrated_too():
+    at = drawing().dofs.labels[0]
+    fit = fx.update(drawing(), [fx.AddedMass(at)], [fx.Eigenvalues(machine().poles([4]))])
+    measured = machine().poles([6, 7])
+    found = fit.calibrated(measured)
+    nearest = np.abs(dense_poles(found)[:, None] - measured.poles).min(axis=0)
+    assert (nearest < 1e-8 * np.abs(measured.poles)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*modes that the plant left out")
+def test_what_is_promised_on_a_calibrated_model_is_kept_by_other_machines():
+    """Each machine with its own poles; on these two a shape of 244 Hz is not the model's.
+
+    Tolerating errors of that mode's frequency alone gave 0.34 and 0.36 for 0.47.
+    """
+    known = [4, 6, 7, 8, 9, 10, 11, 13]
+    for individual in (3, 4):
+        one = machine(individual)
+        model = drawing()
+        plate_mass = fx.AddedMass(model.dofs.labels[7])
+        fit = fx.update(
+            model,
+            [plate_mass, fx.MatrixParameter("E", dK=model.K)],
+            [fx.Eigenvalues(one.poles([4, 6, 7, 8]))],
+        )
+        own = fx.assemble_plant(fit.calibrated(one.poles(known)), ports())
+        plant = own.discretized(RATE, delay=one.delay)
+        off = {m: 0.001 if m in known else 0.015 for m in range(4, 25)}
+        controller = fx.design_stage(plant.uncertain(frequency=off), bandwidth=50.0)
+        promised = fx.close_loop(plant, controller).modulus_margin
+        loop = one.loop(ports(), controller)
+        assert loop.is_stable
+        assert loop.modulus_margin > 0.9 * promised
