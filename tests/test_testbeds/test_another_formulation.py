@@ -18,6 +18,8 @@ PLATE = {
     "youngs_modulus": 70e9,
     "poisson_ratio": 0.3,
 }
+#: the paper's, of which the machines are made
+DRAWN = PLATE | {"size": (0.6, 0.6), "poisson_ratio": 0.35}
 
 
 @cache
@@ -82,14 +84,7 @@ def test_motions_between_nodes_are_those_of_one_polynomial():
 def test_no_mesh_of_the_drawing_has_its_frequencies():
     found = machine().poles(range(4, 20)).freq
     for n in (8, 16, 24):
-        drawing = fx.kirchhoff_plate(
-            size=(0.6, 0.6),
-            thickness=0.0272,
-            elements=(n, n),
-            density=2702.0,
-            youngs_modulus=70e9,
-            poisson_ratio=0.35,
-        )
+        drawing = fx.kirchhoff_plate(elements=(n, n), **DRAWN)
         loaded = drawing.with_parts(fx.PointMass(drawing.dofs.nearest((0.3, 0.15, 0), "z"), 0.5))
         off = np.abs(fx.solve_modes(loaded, count=19).freq[3:] / found - 1.0)
         assert np.median(off) > 0.005
@@ -119,14 +114,7 @@ def test_its_sensors_have_steps():
 
 @cache
 def drawing():
-    plate = fx.kirchhoff_plate(
-        size=(0.6, 0.6),
-        thickness=0.0272,
-        elements=(8, 8),
-        density=2702.0,
-        youngs_modulus=70e9,
-        poisson_ratio=0.35,
-    )
+    plate = fx.kirchhoff_plate(elements=(8, 8), **DRAWN)
     modes = fx.solve_modes(plate, count=24, damping=fx.ModalDamping(0.001))
     spots = [(x, y, 0.0) for y in np.linspace(0, 0.6, 5) for x in np.linspace(0, 0.6, 5)]
     del spots[12]
@@ -216,3 +204,33 @@ def test_what_is_promised_on_a_calibrated_model_is_kept_by_other_machines():
         loop = one.loop(ports(), controller)
         assert loop.is_stable
         assert loop.modulus_margin > 0.9 * promised
+
+
+def test_frequencies_are_uncertain_by_what_was_not_explained():
+    """Measured modes by their deviation, others by the misfit of those measured and by the mesh."""
+    model = drawing()
+    fit = fx.update(
+        model,
+        [fx.MatrixParameter("E", dK=model.K)],
+        [fx.Eigenvalues(machine().poles([4, 6, 7]))],
+    )
+    poles = machine().poles([4, 6, 7, 9, 13])
+    wide = poles.replace(covariance=np.diag((0.002 * np.abs(np.r_[poles.poles, poles.poles])) ** 2))
+    own = np.abs(fit.model.modes().poles)[[3, 5, 6, 8, 12]]
+    misfit = np.sqrt(np.mean((np.abs(poles.poles) / own - 1.0) ** 2))
+    found = fit.frequency_uncertainty(poles)
+    assert {found[m] for m in (4, 6, 7, 9, 13)} == {1e-3}
+    assert found[5] == found[20] == pytest.approx(2 * misfit)
+    assert fit.frequency_uncertainty(wide)[6] == pytest.approx(0.004)
+    coarse, fine = (
+        fx.solve_modes(fx.kirchhoff_plate(elements=(n, n), **DRAWN), count=24) for n in (8, 16)
+    )
+    mesh = coarse.mesh_error(fine)
+    beside = fit.frequency_uncertainty(poles, mesh=mesh)
+    assert beside[20] == pytest.approx(max(2 * misfit, 1.5 * abs(mesh.error[16])))
+    assert beside[4] == 1e-3
+    true = np.abs(machine().poles(range(4, 25)).freq / fit.model.modes().freq[3:24] - 1.0)
+    inside = [true[m - 4] < share for m, share in beside.items() if share > 1e-3]
+    assert np.mean(inside) > 0.7
+    with pytest.raises(ModelError, match="mesh"):
+        fit.frequency_uncertainty(poles, mesh=0.01)

@@ -14,6 +14,7 @@ from ..labels import DofSet, Place
 from ..structure.definite import signed_square
 from ..structure.placed import Placed, missed
 from .calibration import measured_poles
+from .mesh_error import MeshError, mesh_error
 
 #: relative: a frequency that rounding of K may change by more is one to know of
 _SOFT = 1e-4
@@ -283,6 +284,31 @@ class Modes(Placed, Value):
         omega, zeta = self.omega.copy(), self.zeta.copy()
         omega[places], zeta[places] = np.abs(poles), -poles.real / np.abs(poles)
         return self.replace(omega=omega, zeta=zeta, certificate={}, residual=(), rounding=())
+
+    def mesh_error(self, finer: Modes, *, order: float = 2.0) -> MeshError:
+        """Return what the mesh costs in frequency, by Richardson's rule.
+
+        Errors fall with the size of the elements to the power `order`; a frequency of the limit is
+        ``f_fine + (f_fine - f) / (r^order - 1)``. What both meshes leave out (shear, a mass, the
+        material) it cannot see.
+
+        Parameters
+        ----------
+        finer : Modes
+            Of the same structure with smaller elements: half as large, say.
+        order : float
+            2 for plates and for bricks of eight nodes.
+
+        Returns
+        -------
+        MeshError
+
+        Raises
+        ------
+        ModelError
+            When the meshes are too alike, have no shape in common, or the modes are complex.
+        """
+        return mesh_error(self, finer, order)
 
     @property
     def orthonormal_basis(self) -> FloatArray:

@@ -1,0 +1,63 @@
+"""What a mesh costs, by two meshes: the judge is a plate in polynomials, which has no mesh."""
+
+import numpy as np
+import pytest
+
+import flexplant as fx
+from flexplant.errors import ModelError
+from flexplant.testbeds.ritz_plate import elastic_modes, ritz_plate
+
+#: so thin that rotary inertia, which the meshes lack, is 1e-6
+THIN = {
+    "size": (0.6, 0.5),
+    "thickness": 5e-4,
+    "density": 2700.0,
+    "youngs_modulus": 70e9,
+    "poisson_ratio": 0.3,
+}
+
+
+def modes(n, count=20):
+    return fx.solve_modes(fx.kirchhoff_plate(elements=(n, n), **THIN), count=count)
+
+
+def test_the_error_is_that_from_the_converged_plate():
+    found = modes(8).mesh_error(modes(16, 24))
+    exact = elastic_modes(ritz_plate(**THIN))[0][: found.modes.size] / (2 * np.pi)
+    true = modes(8).freq[found.modes - 1] / exact - 1.0
+    assert np.abs(true).max() > 5e-3
+    np.testing.assert_allclose(found.error, true, atol=0.15 * np.abs(true).max())
+    assert np.median(np.abs(found.error / true - 1.0)) < 0.1
+    # what is left of the limit is far smaller than what the mesh costs
+    assert np.abs(found.limit / exact - 1.0).max() < 0.15 * np.abs(true).max()
+
+
+def test_beams_converge_by_their_own_order():
+    """A chain in one dimension has twice the nodes for elements half as large."""
+    coarse, fine, finest = (
+        fx.solve_modes(
+            fx.beam(
+                length=1.0, elements=n, area=1e-4, inertia=1e-9, density=7800.0,
+                youngs_modulus=210e9,
+            ),
+            count=5,
+        )
+        for n in (6, 12, 48)
+    )  # fmt: skip
+    found = coarse.mesh_error(fine, order=4.0)
+    assert found.ratio == pytest.approx(13 / 7)
+    true = coarse.freq[found.modes - 1] / finest.freq[found.modes - 1] - 1.0
+    np.testing.assert_allclose(found.error, true, rtol=0.35, atol=1e-7)
+
+
+def test_meshes_that_say_nothing_are_refused():
+    with pytest.raises(ModelError, match="Halve the elements"):
+        modes(8).mesh_error(modes(9))
+    with pytest.raises(ModelError, match="Halve the elements"):
+        modes(16).mesh_error(modes(8))
+    with pytest.raises(ModelError, match="order"):
+        modes(8).mesh_error(modes(16), order=0.0)
+
+
+def test_it_is_said_in_one_line():
+    assert repr(modes(8, 6).mesh_error(modes(16, 6))).startswith("<MeshError: 3 modes, ")
