@@ -78,6 +78,7 @@ def made():
     loop = close_loop(sampled, static, servo)
     yield fx.compare_loops({"servo": loop})
     yield from (loop.budget("die:error"), loop.mode_tolerances(known=1e-9))
+    yield fx.modes.MeshError(np.array([4]), np.array([10.0]), np.array([10.1]), 2.0)
     yield fx.loop.SpillOver(0.99, True, 0.5, 0.6, 100.0, 490)
     yield LeftOut(np.array([25]), np.eye(4), np.eye(3), np.zeros((3, 4)), plant)
     point = fx.setpoint(distance=1e-3, velocity=0.1, acceleration=1.0, jerk=100.0)
@@ -122,7 +123,7 @@ def made():
     yield synthesis.RobustStability(0.5, 0.4, 10.0, one, plant, zero, zero, {"machines": 1.0})
     yield synthesis.WorstCaseGain(2.0, 1.9, 1.0, 10.0, one, plant, zero, zero)
     yield from of_estimators(sampled, small)
-    yield from (fx.Riccati(), fx.testbeds.wafer_stage(elements=(8, 8)), sensors, solution)
+    yield from (fx.Riccati(), fx.testbeds.wafer_stage(), sensors, solution)
     more = a_system()
     yield from (lti.balanced(more, order=2), lti.modal_form(more), lti.norm_report(more))
     yield from (

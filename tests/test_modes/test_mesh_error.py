@@ -22,7 +22,7 @@ def modes(n, count=20):
 
 
 def test_the_error_is_that_from_the_converged_plate():
-    found = modes(8).mesh_error(modes(16, 24))
+    found = modes(8, 13).mesh_error(modes(16, 17))  # the order of later ones differs
     exact = elastic_modes(ritz_plate(**THIN))[0][: found.modes.size] / (2 * np.pi)
     true = modes(8).freq[found.modes - 1] / exact - 1.0
     assert np.abs(true).max() > 5e-3
