@@ -243,10 +243,10 @@ def test_the_readme_says_what_the_run_says(result):
     off = 100 * max(abs(row[0] / row[1] - 1) for row in rows)
     for said in (
         f"within {np.ceil(off):.0f} %",
-        f"{alone[0]:.2f} nm are predicted where the machine has {alone[1]:.2f} nm",
-        f"|S| < 1 up to {held.bandwidth:.0f} Hz",
+        f"{alone[0]:.1f} nm are predicted where the machine has {alone[1]:.1f} nm",
+        f"|S| < 1 up to {np.floor(held.bandwidth):.0f} Hz",
         f"modulus margin of {promised:.2f} is promised, {held.margin:.2f} is the machine's",
-        f"at most {ma[2]:.1f} nm, the best servo's {ma[1]:.1f} nm",
+        f"at most {ma[2]:.0f} nm, the best servo's {ma[1]:.0f} nm",
     ):
         assert said in text
 
