@@ -213,7 +213,7 @@ def test_the_papers_column(examples, paper):
 
 def test_the_table(stage, result):
     text = stage.table(result)
-    assert max(map(len, text.splitlines())) < 110
+    assert max(map(len, text.splitlines())) <= 110
     assert text.count("95% interval") == 6
     assert text.count("max |S| at u") == 2
     assert "NO (1.00" in text

@@ -40,7 +40,7 @@ class MeshError(Value):
     ...         density=2700, youngs_modulus=70e9, poisson_ratio=0.3)
     ...     return fx.solve_modes(plate, count=6)
     >>> modes(8).mesh_error(modes(16))
-    <MeshError: 3 modes, -0.019 % (mode 4) to +0.25 % (mode 6)>
+    <MeshError: 3 modes, +0.11 % (mode 5) to +0.19 % (mode 6)>
     """
 
     modes: IntArray
