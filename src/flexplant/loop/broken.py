@@ -88,21 +88,15 @@ class BrokenLoop:
         return bool(np.max(edge, initial=-1.0) >= 0)
 
     def mixed(self, at: Side = "u") -> tuple[str, ...]:
-        """Return the units of the channels where it is broken if they have several, else none.
-
-        A largest singular value then adds what cannot be added: an axis in other units has another.
-        """
+        """Return the units of the channels where it is broken if they have several, else none."""
+        # a largest singular value then adds what cannot be added
         names = self.u if at == "u" else self.y
         known = tuple(dict.fromkeys(self.units.get(name, "unknown") for name in names))
         return known if len(known) > 1 else ()
 
     @cached_property
     def worst(self) -> Callable[[Side, bool], tuple[float, float]]:
-        """The function of a side that gives the largest S there and its frequency [Hz].
-
-        Its size is that with scaled axes where it is required (True), else sigma_max; over a grid
-        refined at the peaks.
-        """
+        """Give the largest S of a side, axes scaled (True) or not, and its frequency [Hz]."""
         return cache(self._worst)
 
     def _worst(self, at: Side, scaled: bool) -> tuple[float, float]:
@@ -120,11 +114,8 @@ class BrokenLoop:
         return scaled_size(inverted(gain)) if scaled else sensitivity_size(gain)
 
     def margin(self, at: Side = "u", scaled: bool | None = None) -> float:
-        """Return ``1 / max_f |S|``; 0 when unstable.
-
-        |S| is the largest singular value; with scaled axes where channels have several units,
-        unless it is chosen.
-        """
+        """Return ``1 / max_f |S|``; 0 when unstable."""
+        # with scaled axes where channels have several units, unless it is chosen
         if self.is_unstable:
             return 0.0
         return 1.0 / self.worst(at, bool(self.mixed(at)) if scaled is None else scaled)[0]

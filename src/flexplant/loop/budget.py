@@ -128,11 +128,8 @@ class ErrorBudget(Value):
 def source_variances(
     monitored: StateSpace, row: int, noises: Sequence[Source]
 ) -> tuple[FloatArray, float]:
-    """Return the variance of an output by source, and its largest relative difference.
-
-    The observability Gramian Q of the output gives all sources at once, ``trace(G' Q G) + D D'``;
-    the covariance of the states under all of them gives the sum once more.
-    """
+    """Return the variance of an output by source, and its largest relative difference."""
+    # by the observability Gramian, trace(G' Q G) + D D', and by the states' covariance
     c = monitored.C[[row]]
     solve = solve_stein if monitored.dt else solve_lyapunov
     Q = solve(monitored.A.T, c.T @ c)
@@ -265,12 +262,8 @@ class Integral(NamedTuple):
 
 
 def densities(monitored: StateSpace, row: int, noises: Sequence[Source]) -> Densities:
-    """Return the function of frequency that gives each source's one-sided density in an output.
-
-    Sampled: ``2 h |C (z I - A)^-1 G + D|^2`` with ``z = exp(2 pi i f h)``; G is the exact
-    covariance of a sample, so the density holds all that folds back from above half the rate.
-    Continuous: ``2 |C (s I - A)^-1 G + D|^2``.
-    """
+    """Return the function of frequency that gives each source's one-sided density in an output."""
+    # 2 h |C (z I - A)^-1 G + D|^2, what folds back in it; continuous 2 |C (s I - A)^-1 G + D|^2
     n = monitored.n_states
     none = np.zeros((n, 1))
     # from the output back to the states: one column for any number of noises
@@ -292,11 +285,8 @@ def densities(monitored: StateSpace, row: int, noises: Sequence[Source]) -> Dens
 
 
 def integrated(find: Densities, monitored: StateSpace, variances: FloatArray) -> Integral:
-    """Return the running integrals of densities, by adaptive Gauss-Kronrod quadrature.
-
-    Intervals begin between the resonances and are halved where the rules of 7 and of 15 points
-    differ. A continuous loop is integrated to infinity, over ``t = f / (f + f_c)``.
-    """
+    """Return the running integrals of densities, by adaptive Gauss-Kronrod quadrature."""
+    # intervals are halved where 7 and 15 points differ; continuous: to infinity, t = f / (f + f_c)
     top = 0.5 / monitored.dt if monitored.dt else np.inf
     grid = _starts(monitored, top)
     centre = float(np.sqrt(grid[1] * grid[-2]))
@@ -348,11 +338,8 @@ def _starts(monitored: StateSpace, top: float) -> FloatArray:
 
 
 def _rule() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return nodes on (-1, 1) and the weights of Gauss (7 points) and Kronrod (15 points).
-
-    Kronrod's weights integrate polynomials exactly to degree 14 at least: they follow from the
-    nodes, which are those of QUADPACK [Piessens1983]_.
-    """
+    """Return nodes on (-1, 1) and the weights of Gauss (7 points) and Kronrod (15 points)."""
+    # the nodes are those of QUADPACK [Piessens1983]_, Kronrod's weights follow from them
     half = [
         0.991455371120812639206854697526329,
         0.949107912342758524526189684047851,
@@ -408,10 +395,8 @@ class Source(NamedTuple):
 
 
 def white_names(plant: StandardPlant) -> tuple[list[str], list[str]]:
-    """Return the channels of w that are white noise: disturbances, then noises per sample.
-
-    The latter are those of sensors, and disturbances that are held over each sample.
-    """
+    """Return the channels of w that are white noise: disturbances, then noises per sample."""
+    # per sample: those of sensors, and disturbances that are held over each sample
     loud = [name for name, level in plant.asd.items() if level > 0]
     held = plant.held if plant.dt else ()
     sensors = [name for name in loud if name.removesuffix(":noise") in plant.y or name in held]
@@ -428,11 +413,8 @@ def white_names(plant: StandardPlant) -> tuple[list[str], list[str]]:
 
 
 def white_noise(plant: StandardPlant) -> WhiteNoise:
-    """Return the noises of a sampled plant, all disturbances together.
-
-    The disturbances' covariance over a sample is exact, so what they excite above half the rate
-    is in the samples; a sensor's noise has the variance ``asd^2 rate / 2`` of a sample.
-    """
+    """Return the noises of a sampled plant, all disturbances together."""
+    # exact over a sample, what folds back included; a sensor's variance is asd^2 rate / 2
     white, sensors = white_names(plant)
     factor = continuous_factor(plant) if white else np.zeros((plant.system.n_states, 0))
     columns = np.array([plant.w.index(name) for name in sensors], dtype=np.int64)

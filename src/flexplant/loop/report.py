@@ -324,10 +324,8 @@ def loop_margins(
 def _roots(
     freq: FloatArray, values: FloatArray, function: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
-    """Return the zeros of a function of frequency between the lines where its sign changes.
-
-    All at once: a response at many frequencies costs little more than at one.
-    """
+    """Return the zeros of a function of frequency between the lines where its sign changes."""
+    # all at once: a response at many frequencies costs little more than at one
     from scipy.optimize.elementwise import find_root
 
     first = np.flatnonzero((values[1:] > 0) != (values[:-1] > 0))
@@ -436,11 +434,8 @@ def nyquist_count(
 def _continued(
     freq: FloatArray, plant: ComplexArray, controller: Responder, slope: int
 ) -> tuple[FloatArray, ComplexArray]:
-    """Return frequencies and K P (n_freq, nu, nu) of a measured plant, also below its lines.
-
-    There the controller is known, and the plant is that of the lowest line: its real part over
-    ``f^slope``, its imaginary part (delay) less by a factor of frequency.
-    """
+    """Return frequencies and K P (n_freq, nu, nu) of a measured plant, also below its lines."""
+    # the plant below its lines: its real part over f^slope, its imaginary part (delay) less by f
     low = np.geomspace(_BELOW, 1.0, 150)[:-1]
     first = plant[:, :, :1]
     below = (first.real + 1j * low * first.imag) / low**slope

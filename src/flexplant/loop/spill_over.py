@@ -153,12 +153,8 @@ def high(margin: float, without: float) -> bool:
 def growing_modes(
     loop: StateSpace, states: Sequence[str], near: float | None = None
 ) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """Return the numbers of the modes that take part in what grows, and its frequencies [Hz].
-
-    The part of state k in an eigenvalue is ``|left_k right_k|``, of its own left and right
-    eigenvectors (participation factors, [PerezArriaga1982]_); they do not depend on the
-    units of the states.
-    """
+    """Return the numbers of the modes that take part in what grows, and its frequencies [Hz]."""
+    # by participation factors |left_k right_k| [PerezArriaga1982]_, whatever the units of states
     numbers = _numbers(states, loop.n_states)
     if not np.any(numbers):
         return (), ()

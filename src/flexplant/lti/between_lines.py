@@ -22,12 +22,9 @@ AROUND = np.array([-6.0, -3.0, -1.5, -0.8, -0.4, 0.0, 0.4, 0.8, 1.5, 3.0, 6.0])
 def between_lines(
     lines: FloatArray, data: ComplexArray, freq: FloatArray
 ) -> tuple[ComplexArray, FloatArray]:
-    """Return responses between lines, and what two estimates of them differ by.
-
-    ``(a + b f) / (1 + c f)`` through three neighbours is exact for one mode on a constant, where
-    a straight line cuts its circle. Each frequency lies in two such triples: the result is their
-    mean.
-    """
+    """Return responses between lines, and what two estimates of them differ by."""
+    # the circle through three neighbours is exact for one mode on a constant; each frequency lies
+    # in two
     last = lines.size - 3
     i = np.searchsorted(lines, freq, side="right") - 1
     below = _through(lines, data, np.clip(i - 1, 0, last), freq)
@@ -64,11 +61,9 @@ def steps_between(lines: FloatArray, data: ComplexArray, places: IntArray) -> Fl
 def pole_between(
     lines: FloatArray, data: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-    """Return p and rho of ``g = a + b f + rho / (f - p)``, through `LINES` lines each.
-
-    Third divided differences of g over the lines f_j, in which a + b f is nothing, are
-    ``[g] = -rho / prod(f_j - p)`` and ``[f g] = p [g]``.
-    """
+    """Return p and rho of ``g = a + b f + rho / (f - p)``, through `LINES` lines each."""
+    # third divided differences, in which a + b f is nothing: [g] = -rho / prod(f_j - p), [f g] = p
+    # [g]
     apart = lines[:, None] - lines[None]
     apart[range(LINES), range(LINES)] = 1.0
     weighed = data / apart.prod(axis=1)

@@ -312,11 +312,8 @@ def image_freq(omega: Any, dt: float) -> Any:
 
 
 def bilinear(sys: System, rate: float) -> StateSpace:
-    """Return the continuous system that `tustin` would sample to this one.
-
-    ``z = (a + s) / (a - s)`` with a = 2 rate: stability, norms and (with w = a tan(theta / 2))
-    frequency responses are the same, so that continuous methods solve sampled problems exactly.
-    """
+    """Return the continuous system that `tustin` would sample to this one."""
+    # z = (a + s) / (a - s), a = 2 rate: stability and norms are kept; w = a tan(theta / 2)
     g = as_statespace(sys)
     a = 2.0 * positive(rate, "rate")
     plus = np.eye(g.n_states) + g.A
@@ -430,11 +427,7 @@ def accumulated_noise(
 
 
 def noise_factor(g: StateSpace, asd: FloatArray, h: float) -> FloatArray:
-    """Return G with ``G G' = Q_d``, the covariance that white noise adds to x in one sample.
-
-    ``Q_d = int_0^h e^(A s) B S B' e^(A' s) ds`` with S = diag(asd^2 / 2), the intensity of noise
-    with the one-sided amplitude spectral density asd (`accumulated_noise`).
-    """
+    """Return G with ``G G' = int_0^h e^(A s) B S B' e^(A' s) ds``, S = diag(asd^2 / 2)."""
     n = g.n_states
     active = np.flatnonzero(asd)
     if not n or not active.size:

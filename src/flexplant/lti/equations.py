@@ -160,11 +160,8 @@ class OnAxisError(Exception):
 def stabilising(
     A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return X and F of ``A'X + X A - (X B + S) R^-1 (B'X + S') + Q = 0``, A + B F stable.
-
-    R is indefinite. By the stable invariant subspace of the Hamiltonian: unlike doubling it does
-    not need X to be reached from zero, which an indefinite R does not guarantee.
-    """
+    """Return X and F of ``A'X + X A - (X B + S) R^-1 (B'X + S') + Q = 0``, A + B F stable."""
+    # R is indefinite: by the stable subspace of the Hamiltonian, X need not be reached from zero
     n = A.shape[0]
     inner = np.linalg.solve(R, np.hstack([B.T, S.T]))
     BR, SR = inner[:, :n], inner[:, n:]

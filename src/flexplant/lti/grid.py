@@ -203,11 +203,8 @@ def climbed(
 def highest(
     find: Callable[[FloatArray], FloatArray], grid: FloatArray, rounds: int
 ) -> tuple[float, float]:
-    """Return the largest value of a function of frequency, and its frequency [Hz].
-
-    The brackets around the highest local maxima of a grid are divided, until a parabola through
-    each says that it gains no more; those that can no longer be the highest are left.
-    """
+    """Return the largest value of a function of frequency, and its frequency [Hz]."""
+    # brackets around the highest maxima are divided, until a parabola gains no more
     values = find(grid)
     ends = np.clip(_tops(values)[:, None] + _ASIDE, 0, grid.size - 1)
     freq, size = grid[ends], values[ends]  # (k, 3): left, top and right of each

@@ -323,11 +323,8 @@ def connect(
 
 
 def _well_posed(loop: FloatArray) -> FloatArray:
-    """Return (I - loop)^-1, refusing an algebraic loop that has no solution.
-
-    Only channels that depend on themselves can be ill-posed, whatever their units: each strongly
-    connected part is judged after balancing.
-    """
+    """Return (I - loop)^-1, refusing an algebraic loop that has no solution."""
+    # only channels that depend on themselves can be ill-posed, whatever their units
     if not loop.any():
         return np.eye(loop.shape[0])
     count, part = csgraph.connected_components(loop != 0, connection="strong")

@@ -72,10 +72,7 @@ def in_parallel(g1: Any, g2: Any) -> dict[str, Any]:
 
 
 def common_fields(parts: Sequence[Any]) -> dict[str, Any]:
-    """Return what joined systems have in common, their states following each other.
-
-    Sampling time, names and blocks of states, and the units of all channels.
-    """
+    """Return dt, states, blocks and units of joined systems, their states following each other."""
     return {
         "dt": common_dt(parts),
         "states": state_names(parts),

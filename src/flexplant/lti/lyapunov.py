@@ -193,10 +193,8 @@ def _gramian(g: StateSpace, A: FloatArray, B: FloatArray) -> FloatArray:
 def _modal_gramian(
     A: FloatArray, B: FloatArray, blocks: tuple[int, ...] | object, discrete: bool
 ) -> FloatArray:
-    """Solve block by block: ``A_i X_ij + X_ij A_j' + B_i B_j' = 0``, all pairs (i, j) at once.
-
-    1 x 1 blocks are padded to 2 x 2 with a decoupled stable state that nothing drives.
-    """
+    """Solve block by block: ``A_i X_ij + X_ij A_j' + B_i B_j' = 0``, all pairs (i, j) at once."""
+    # 1 x 1 blocks are padded to 2 x 2 with a decoupled stable state that nothing drives
     sizes = np.asarray(blocks)
     starts = np.cumsum(sizes) - sizes
     b = sizes.size

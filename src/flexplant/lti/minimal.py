@@ -272,11 +272,9 @@ def _less(g: StateSpace, tol: float) -> StateSpace:
 
 
 def _stabilised(g: StateSpace) -> StateSpace:
-    """Return the system with its poles moved together until it is stable: the same subspaces.
-
-    They move by the speed of the system in even units of the states. Much farther out all of them
-    look alike: what zeros near them distinguish in a chain of integrators falls below `tol`.
-    """
+    """Return the system with its poles moved together until it is stable: the same subspaces."""
+    # by the speed of the system: much farther out all poles look alike, and chains of integrators
+    # lose what zeros near them distinguish
     poles = g.poles()
     eye = np.eye(g.n_states)
     if g.dt:

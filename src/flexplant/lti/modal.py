@@ -162,10 +162,8 @@ def _basis(A: FloatArray, centre: float) -> tuple[FloatArray, FloatArray, list[i
 def _parallel(
     k: int, values: ComplexArray, vectors: ComplexArray, done: np.typing.NDArray[np.bool_]
 ) -> int | None:
-    """Return the pole whose eigenvector is nearly parallel to that of pole k, or None.
-
-    The other of two real poles, or the conjugate of pole k: a double one that rounding split.
-    """
+    """Return the pole whose eigenvector is nearly parallel to that of pole k, or None."""
+    # the other of two real poles, or the conjugate: a double one that rounding split
     others = values == values[k].conj() if values[k].imag else (values.imag == 0.0) & ~done
     others &= np.abs(values - values[k]) < _PARALLEL * np.abs(values[k])
     others[k] = False
@@ -189,11 +187,8 @@ def _plane(A: FloatArray, values: ComplexArray, two: list[int]) -> FloatArray:
 
 
 def _chains(N: FloatArray, count: int) -> tuple[FloatArray, FloatArray] | None:
-    """Return (n, count) pairs with ``N v = w u, N u = 0``: rigid-body modes, or None.
-
-    The invariant subspace of the poles at the centre is that of the smallest singular values of
-    N^2, where N is a square of zero.
-    """
+    """Return (n, count) pairs with ``N v = w u, N u = 0``: rigid-body modes, or None."""
+    # of the smallest singular values of N^2: N is a square of zero there
     if count % 2:
         return None
     space = la.svd(N @ N)[2][-count:].T

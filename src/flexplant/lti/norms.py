@@ -316,11 +316,8 @@ def uncertain_poles(
 def eigenvalues_with_error(
     A: FloatArray, largest: float = DOUBLE
 ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-    """Return eigenvalues, eigenvectors and how far rounding may have moved each eigenvalue.
-
-    In the units that LAPACK takes for A itself, in which the blocks of unlike speed that do not act
-    on each other do not spoil each other. Conditions count up to `largest`.
-    """
+    """Return eigenvalues, eigenvectors and how far rounding may have moved each eigenvalue."""
+    # in LAPACK's own units of A, in which blocks of unlike speed do not spoil each other
     found: Any = la.eig(A, left=True, right=True)
     values, left, right = found
     d = even_scale(A)[:, None]
@@ -343,11 +340,9 @@ ACROSS, PARABOLAS, NARROWER = 9, 3, 8.0
 
 
 def level_set_peak(g: StateSpace, tolerance: float, bar: Progress) -> tuple[float, float]:
-    """Return the largest gain and its frequency [Hz] of a system without poles on the axis.
-
-    What a search finds is improved from the middles of the crossings of its level, until none is
-    left at (1 + tolerance) times it.
-    """
+    """Return the largest gain and its frequency [Hz] of a system without poles on the axis."""
+    # from the middles of the crossings of its level, until none is left at (1 + tolerance) times
+    # it
     top = 0.5 / g.dt if g.dt else np.inf
     find = _largest(responder(g))
     gain, freq = _searched(g, find, top)
@@ -417,10 +412,8 @@ def _searched(
 
 
 def _vertex(freq: FloatArray, gains: FloatArray, i: int) -> float:
-    """Return where 1 / gain^2, a parabola beside a resonance, is least; near point i.
-
-    The best of the three points where they are not on a parabola with a minimum.
-    """
+    """Return where 1 / gain^2, a parabola beside a resonance, is least; near point i."""
+    # the best of the three where they are not on a parabola with a minimum
     best = float(freq[int(np.argmax(gains[i - 1 : i + 2])) + i - 1])
     left, right = freq[i] - freq[i - 1], freq[i + 1] - freq[i]
     if not (left > 0.0 and right > 0.0 and gains[i - 1 : i + 2].min() > 0.0):

@@ -179,11 +179,9 @@ def exceeding(model: Residues, level: float, peaks: Peaks) -> FloatArray | None:
 
 
 def _outside(model: Residues, room: float, peaks: Peaks) -> tuple[FloatArray, FloatArray]:
-    """Return centres and radii of intervals outside the peaks' zones, from zero to an end.
-
-    Beyond the end ``|G - D| <= sum 2 |R_i| / (omega - |p_i|)`` is less than what the level leaves
-    room for.
-    """
+    """Return centres and radii of intervals outside the peaks' zones, from zero to an end."""
+    # beyond the end |G - D| <= sum 2 |R_i| / (omega - |p_i|) is less than what the level leaves
+    # room for
     speed = float(np.abs(model.poles).max())
     end = 1.001 * speed + 2.0 * float(model.sizes.sum()) / room
     beyond = 1.001 * speed * 4.0 ** np.arange(1 + int(np.log2(end / speed)) // 2)
@@ -198,10 +196,8 @@ def _outside(model: Residues, room: float, peaks: Peaks) -> tuple[FloatArray, Fl
 def _examined(
     model: Residues, centre: FloatArray, radius: FloatArray, level: float
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Return centres with gains above the level, and which intervals certainly stay below it.
-
-    ``|G| <= max |T_0 +- r T_1| + r^2 |T_2| + O(r^3)``: the norm of a line is convex.
-    """
+    """Return centres with gains above the level, and which intervals certainly stay below it."""
+    # |G| <= max |T_0 +- r T_1| + r^2 |T_2| + O(r^3): the norm of a line is convex
     if not centre.size:
         return centre, np.zeros(0, dtype=bool)
     T0, T1, T2 = model.series(centre, 2)

@@ -71,11 +71,8 @@ class Prepared(Value):
 
     @property
     def own_sizes(self) -> tuple[FloatArray, FloatArray]:
-        """What the plant does on each channel: sizes of u in z (nu,) and of w in y (ny,).
-
-        Feedthrough included, at the plant's own speed and away from its resonances. A channel that
-        does nothing has the size of the largest one.
-        """
+        """What the plant does on each channel: sizes of u in z (nu,) and of w in y (ny,)."""
+        # with feedthrough, away from resonances; a channel that does nothing has the largest size
         s = self._point
         u = np.hypot(_answers(self.A, self.B2, self.C1, s), np.linalg.norm(self.D12, axis=0))
         y = np.hypot(_answers(self.A.T, self.C2.T, self.B1.T, s), np.linalg.norm(self.D21, axis=1))
@@ -86,10 +83,8 @@ class Prepared(Value):
         return _DIRECT if self.direct else _POINT
 
     def measured_in(self, unit: float) -> Prepared:
-        """Return the problem with z in multiples of `unit`; u too, so that D12 is kept.
-
-        Its controller's C and D times `unit` are those of this problem.
-        """
+        """Return the problem with z in multiples of `unit`; u too, so that D12 is kept."""
+        # its controller's C and D times `unit` are those of this problem
         return self.replace(
             B2=unit * self.B2,
             C1=self.C1 / unit,
@@ -201,10 +196,8 @@ def normalised(D: FloatArray, own: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _answers(A: FloatArray, B: FloatArray, C: FloatArray, s: complex) -> FloatArray:
-    """Return the sizes (m,) of ``C (s I - A)^-1 B`` by column, at least a part of its terms'.
-
-    What u moves and z does not show has no size there but rounding.
-    """
+    """Return the sizes (m,) of ``C (s I - A)^-1 B`` by column, at least a part of its terms'."""
+    # what u moves and z does not show has no size there but rounding
     try:
         states = np.linalg.solve(s * np.eye(A.shape[0]) - A, B)
     except np.linalg.LinAlgError:  # a pole at s

@@ -19,11 +19,9 @@ ONE_VECTOR, CALL = 3.0, 3e4
 
 
 def cheapest(n: int, p: int, m: int, samples: int) -> tuple[int, float]:
-    """Return the size of a block that costs least, and the operations that a sample then takes.
+    """Return the size of a block that costs least, and the operations that a sample then takes."""
 
-    For n states, p outputs and m inputs; the preparation is shared by so many samples.
-    """
-
+    # n states, p outputs, m inputs; the preparation is shared by so many samples
     def cost(size: int) -> float:
         prepare = 2 * size * n * n * (m + p) + 4 * np.log2(size) * n**3
         step = (2 * ONE_VECTOR * n * n + CALL) / size
@@ -76,11 +74,9 @@ class Recursion(NamedTuple):
         return cheapest(self.F.shape[0], p, m, samples)[0]
 
     def in_blocks(self, size: int) -> Blocks:
-        """Return the matrices of a block of so many samples.
-
-        Over b samples ``out = O x + T v`` and ``x[k+b] = F^b x[k] + R v``, with the observability
-        matrix O, the reachability matrix R and the Toeplitz matrix T of Markov parameters.
-        """
+        """Return the matrices of a block of so many samples."""
+        # out = O x + T v and x[k+b] = F^b x[k] + R v: observability, reachability, Toeplitz of
+        # Markov
         b, n, (p, m) = size, self.F.shape[0], self.J.shape
         see, enter = np.empty((b, p, n)), np.empty((b, n, m))
         see[0], enter[b - 1] = self.H, self.G
@@ -106,10 +102,7 @@ class Recursion(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """``x[k+b] = step x[k] + v enter``, ``out = x see + v direct`` with rows v and out of a block.
-
-    A block has `size` samples b.
-    """
+    """``x[k+b] = step x[k] + v enter``, ``out = x see + v direct``, rows v and out of b samples."""
 
     step: FloatArray
     enter: FloatArray

@@ -32,11 +32,8 @@ def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
 def scaled_schur(
     A: FloatArray, B: FloatArray, C: FloatArray
 ) -> tuple[FloatArray, ComplexArray, ComplexArray]:
-    """Return units d of the states, and T, U of the Schur form ``A d / d[:, None] = U T U*``.
-
-    Units first: the orthogonal transformation mixes rounding with the norm of all of A, which plain
-    (q, dq/dt) states let grow with the square of the fastest mode.
-    """
+    """Return units d of the states, and T, U of the Schur form ``A d / d[:, None] = U T U*``."""
+    # units first: the transformation mixes rounding with the norm of all of A
     d = state_scale(A, B, C)
     T, U = la.schur(A * d / d[:, None], output="complex")
     return d, T, U

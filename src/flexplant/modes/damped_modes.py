@@ -156,10 +156,8 @@ _NONE = 1e-12
 
 
 def damper_forces(model: FEModel) -> FloatArray:
-    """Return orthonormal forces (n, m) that span those of dampers.
-
-    None, (n, 0), where D is a multiple of K and M, or at so many DOFs that it is a material's.
-    """
+    """Return orthonormal forces (n, m) that span those of dampers."""
+    # none where D is a multiple of K and M, or at so many DOFs that it is a material's
     none = np.zeros((model.n_dof, 0))
     if model.D is None or is_rayleigh(model):
         return none

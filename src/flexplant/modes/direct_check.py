@@ -63,11 +63,8 @@ def checked_response(
     tolerance: float,
     seen: Callable[[FloatArray, ComplexArray], ComplexArray] | None = None,
 ) -> tuple[DynamicBasis, ComplexArray, DirectCheck]:
-    """Return a basis that is good to a tolerance, its responses, and the check of them.
-
-    Where the error is larger, the direct solutions join the basis, which is checked again at other
-    frequencies.
-    """
+    """Return a basis that is good to a tolerance, its responses, and the check of them."""
+    # where the error is larger, direct solutions join the basis, checked again elsewhere
     view = seen or (lambda _, response: response)
 
     def find(at: FloatArray) -> ComplexArray:
@@ -92,11 +89,9 @@ def checked_response(
 def _direct(
     basis: DynamicBasis, at: FloatArray, rows: FloatArray, loads: FloatArray
 ) -> tuple[ComplexArray, Callable[[], DynamicBasis]]:
-    """Return responses by all of the matrices, and the basis that has the motions too.
-
-    By corrections with the factor of the stiffness that made the static shapes; a dynamic
-    stiffness is factored where they do not settle, or the model has no such factor.
-    """
+    """Return responses by all of the matrices, and the basis that has the motions too."""
+    # by corrections with the static factor; a dynamic stiffness is factored where they do not
+    # settle
     factor = held_factor(basis.model)
     corrected = None if factor is None else basis.corrected(at, loads, factor)
     if corrected is not None:

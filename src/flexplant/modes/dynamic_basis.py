@@ -42,10 +42,7 @@ _LEFT, _NOTHING = 0.2, 1e-9
 
 @dataclass(frozen=True)
 class DampingTerms:
-    """How a structure dissipates: ``K (1 + i eta) + i H + i omega (a M + b K + D + M V R V^T M)``.
-
-    R (diagonal, `own`) belongs to shapes V: those of the modes and vectors of a `DynamicBasis`.
-    """
+    """``K (1 + i eta) + i H + i omega (a M + b K + D + M V R V^T M)``, R diagonal, of shapes V."""
 
     own: FloatArray
     eta: float = 0.0
@@ -148,11 +145,8 @@ class DynamicBasis:
     def corrected(
         self, freq: FloatArray, loads: FloatArray, factor: StiffnessFactor
     ) -> DynamicBasis | None:
-        """Return the basis with what all of the matrices add at some frequencies.
-
-        The motions that a factor of the stiffness finds for what the basis leaves of the loads join
-        it, until next to nothing of that is left in energy; None where it does not settle.
-        """
+        """Return the basis with what all of the matrices add at some frequencies."""
+        # what a factor of the stiffness finds joins it, until next to nothing is left in energy
         n, count = self.n_modes, freq.size
         inner, basis, first = self._inertia[:, :n], self, np.zeros(0)
         forces = self.V[:, self.n_rigid :].T @ loads

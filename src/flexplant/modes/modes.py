@@ -367,10 +367,8 @@ class Modes(Placed, Value):
 
 
 def pole_pairs(omega: FloatArray, zeta: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return both poles (k,) of modes ``p'' + 2 zeta |omega| p' + omega |omega| p = 0``.
-
-    The first is that in the upper half plane, or the one that grows.
-    """
+    """Return both poles (k,) of modes ``p'' + 2 zeta |omega| p' + omega |omega| p = 0``."""
+    # the first is that in the upper half plane, or the one that grows
     size, unstable = np.abs(omega), omega < 0
     root = np.sqrt((zeta**2 - np.where(unstable, -1.0, 1.0)).astype(np.complex128))
     root = np.where(root.imag < 0, root.conj(), root)

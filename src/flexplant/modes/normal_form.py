@@ -369,11 +369,8 @@ def _unstable_pairs(grow: ComplexArray, decay: ComplexArray) -> ComplexArray:
 
 
 def _eigen(omega: FloatArray, C: FloatArray, *, low: bool) -> tuple[ComplexArray, ComplexArray]:
-    """Return all poles (2k,) and eigenvectors (2k, 2k) of the states ``(|Omega| p, p')``.
-
-    All entries are rates: nothing to balance. Low ones beside strong damping have digits when they
-    are the large eigenvalues of the inverse.
-    """
+    """Return all poles (2k,) and eigenvectors (2k, 2k) of the states ``(|Omega| p, p')``."""
+    # all entries are rates; low ones beside strong damping are large eigenvalues of the inverse
     none, size = np.zeros((omega.size, omega.size)), np.abs(omega)
     if low and np.all(omega > 0):
         soft = C / np.outer(omega, omega)
@@ -415,11 +412,8 @@ def _normalised(
 def _polished(
     poles: ComplexArray, mix: ComplexArray, C: FloatArray, scale: ComplexArray
 ) -> ComplexArray:
-    """Return shapes with ``x_i^T (lambda_i + lambda_j + C) x_j = 0``, by one Newton step.
-
-    Rounding mixes the shapes of slow modes that are close by far more than their own size: by that
-    of the fastest mode over their distance.
-    """
+    """Return shapes with ``x_i^T (lambda_i + lambda_j + C) x_j = 0``, by one Newton step."""
+    # rounding mixes slow close modes by that of the fastest over their distance
     root = np.sqrt(scale)
     unit = mix / root
     gram = (unit.T @ unit) * np.add.outer(poles, poles) + unit.T @ (C @ unit)

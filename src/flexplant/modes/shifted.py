@@ -184,10 +184,8 @@ def dissection_of(model: FEModel) -> Dissection:
 
 
 def modes_below(model: FEModel, square: float, *, single: bool = True) -> int:
-    """Return how many modes, rigid-body ones included, have an omega^2 below `square` (Sturm).
-
-    Without `single`, single precision is not tried: it was refused before.
-    """
+    """Return how many modes, rigid-body ones included, have an omega^2 below `square` (Sturm)."""
+    # without `single`, single precision is not tried: it was refused before
     shifted = _shifted(model.K, model.M, square)
     return multifrontal_inertia(shifted, dissection_of(model), single=single)
 

@@ -178,10 +178,8 @@ def solve_modes(
 
 
 def modes_reaching(model: FEModel, freq: float, *, least: int = 0) -> Modes:
-    """Return the undamped modes of a structure up to a frequency, and perhaps further.
-
-    Those that `solve_modes` found for this model are taken while they are in use and reach so far.
-    """
+    """Return the undamped modes of a structure up to a frequency, and perhaps further."""
+    # those that `solve_modes` found for this model are taken while they are in use
     known = _solved.get(model)
     modes = known() if known is not None else None
     least = min(least, model.n_dof)
@@ -370,11 +368,7 @@ def checked(
 
 
 def _measured(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple[FloatArray, ...]:
-    """Return what `checked` judges, from products of their own.
-
-    They are the lower triangle of ``phi^T M phi``, the weighted residuals and their limits, the
-    residuals relative to ``||K phi||``, and the relative errors of the frequencies by rounding.
-    """
+    """Return what `checked` judges, from products of their own."""
     M, K = by_rows(model.M), by_rows(model.K)
     size_of_K, stiff = Absolute(K), diagonal(model.K)
     # by stiffness: displacements and rotations compare, and DOFs without inertia weigh no more

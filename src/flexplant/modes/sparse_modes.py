@@ -50,11 +50,9 @@ _JUDGED = 8
 def counted_modes(
     model: FEModel, count: int, top: float = np.inf, method: Pardiso | None = None
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
-    """Return the lowest elastic modes with omega^2 up to `top`, and what was counted.
-
-    Block Lanczos finds them, a Sturm count in a gap above the last one says how many there are;
-    what is missing is looked for beside those found until the count agrees.
-    """
+    """Return the lowest elastic modes with omega^2 up to `top`, and what was counted."""
+    # Lanczos finds them, a Sturm count in a gap above says how many; missing ones are sought
+    # beside
     with one_thread():
         return _counted(model, count, top, method)
 
@@ -158,10 +156,8 @@ def _search(
     want: int,
     rng: Rng,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return omega^2 and shapes (n, want) beside the locked ones, residuals down to rounding.
-
-    Soft modes first: they are locked, and a new search finds those that their rounding hides.
-    """
+    """Return omega^2 and shapes (n, want) beside the locked ones, residuals down to rounding."""
+    # soft modes first: they are locked, and a new search finds those that their rounding hides
     held, block = model.body_motions, BLOCK
     start = None if locked.shape[1] >= held.shape[1] else held
     squares, found = _searched(model, factor, locked, want, rng, start)
@@ -256,10 +252,8 @@ def _apart(squares: FloatArray, count: int, top: float, rounding: FloatArray) ->
 
 
 def _gap(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[int, float]:
-    """Return how many modes lie below the widest gap after the last wanted one, and its middle.
-
-    Gaps narrower than some roundings of the modes beside them, or than 1e-8, are none.
-    """
+    """Return how many modes lie below the widest gap after the last wanted one, and its middle."""
+    # gaps narrower than some roundings of the modes beside them, or than 1e-8, are none
     above, least = squares[count - 1 :], _GAP_ROUNDINGS * rounding[count - 1 :]
     wide = np.diff(above)
     real = (wide > _GAP * above[1:]) & (wide > least[1:]) & (wide > least[:-1])
@@ -298,11 +292,7 @@ _EARLY, _FAR = 12, 0.1
 
 
 class BlockDavidson(BlockLanczos):
-    """The lowest modes by corrections ``P (K phi - omega^2 M phi)``, P near ``(K - sigma M)^-1``.
-
-    The basis of Lanczos, but extended by corrections of its Ritz vectors: P may be in error, since
-    the residuals are those of K and M [MorganScott1986]_.
-    """
+    """The lowest modes by corrections with ``P`` near ``(K - sigma M)^-1`` [MorganScott1986]_."""
 
     def __init__(
         self,
@@ -326,11 +316,8 @@ class BlockDavidson(BlockLanczos):
     def modes(
         self, count: int, extra: int, needed: Callable[[FloatArray], FloatArray]
     ) -> FloatArray:
-        """Return the lowest shapes (n, count), the last `extra` of them for their values only.
-
-        `needed` says of shapes (n, m) which residuals (m,), relative to ``||K phi||``, they may
-        leave.
-        """
+        """Return the lowest shapes (n, count), the last `extra` of them for their values only."""
+        # the last `extra` for their values only; `needed` gives the residuals shapes may leave
         found = np.zeros(count, dtype=bool)
         self._limit, self._left = np.zeros(count), np.full(count, np.inf)
         for _ in range(_STEPS + count):

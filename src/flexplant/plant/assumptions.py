@@ -130,11 +130,8 @@ _SHOWN = 3
 
 
 def aliased_modes(plant: Partition) -> str:
-    """Return, in words, which elastic modes of a sampled plant are not below half its rate.
-
-    A mode at f looks like one at ``|f - m rate|``, m whole, in its samples: a controller of that
-    rate cannot distinguish them. Empty when there are none.
-    """
+    """Return, in words, which elastic modes of a sampled plant are not below half its rate."""
+    # a mode at f looks like one at |f - m rate|: no controller of that rate distinguishes them
     if not plant.dt or not plant.is_assembled:
         return ""
     rate = 1.0 / plant.dt

@@ -152,10 +152,8 @@ def sampled_like(nominal: Any, plant: P) -> P:
 def rebuilt(
     plant: P, *, ports: Ports | None = None, realisation: ModalRealisation | None = None
 ) -> P:
-    """Return a plant with other ports or of other modes, sampled like the old one.
-
-    Ports that are among its own are rows and columns of it.
-    """
+    """Return a plant with other ports or of other modes, sampled like the old one."""
+    # ports that are among its own are rows and columns of it
     if plant.is_weighted:
         raise ModelError(
             f"other ports or modes are for a plant as it was made, this one is {plant.alteration}: "

@@ -135,11 +135,9 @@ class Parts(NamedTuple):
 
 
 def followed(one: Seen, order: int, push: FloatArray, ground: FloatArray) -> FloatArray:
-    """Return what a channel shows at once (m,) of loads `push` (m, n) and of `ground` (m, 6).
-
-    An accelerometer on a free body shows none of the ground's acceleration: the load -M r takes
-    back what the ground adds. So it does on springs, up to what the shapes miss of its motion.
-    """
+    """Return what a channel shows at once (m,) of loads `push` (m, n) and of `ground` (m, 6)."""
+    # an accelerometer on a free body shows none of the ground's: the load -M r takes back what it
+    # adds
     direct = push @ one.direct
     if order < 2:
         return direct

@@ -146,11 +146,8 @@ def _persistent(g: StateSpace) -> list[_Pole]:
 
 
 def _most(g: StateSpace, pole: complex, near: float) -> int:
-    """Return how many eigenvectors a pole has at most: one in each 2 x 2 block [[a, b], [c, d]].
-
-    A filter that reads accelerations has rows far larger than those of the modes, beside which
-    more than the motions that are free looks like rounding.
-    """
+    """Return how many eigenvectors a pole has at most: one in each 2 x 2 block [[a, b], [c, d]]."""
+    # rows of accelerations are so large that more than the free motions would look like rounding
     if g.blocks is None:
         return g.n_states
     most, start = 0, 0
@@ -163,11 +160,8 @@ def _most(g: StateSpace, pole: complex, near: float) -> int:
 
 
 def _alike(poles: list[_Pole], rate: float) -> list[list[_Pole]]:
-    """Return the poles, those together whose samples at a rate [Hz] are the same.
-
-    ``exp(lambda / rate)`` of poles that differ by a multiple of the rate is one pole of the sampled
-    plant: what channels have of one they must have apart from the others.
-    """
+    """Return the poles, those together whose samples at a rate [Hz] are the same."""
+    # exp(lambda / rate) of poles that differ by a multiple of the rate is one pole of the samples
     groups: list[tuple[complex, list[_Pole]]] = []
     for pole in poles:
         mirrored = _Pole(pole.value.conjugate(), pole.left.conj(), pole.right.conj())

@@ -69,10 +69,7 @@ class ModalRealisation(Value):
         return sum(name.startswith("mode") for name in self.names) // 2
 
     def once(self, key: Hashable, found: Callable[[], T]) -> T:
-        """Return what is known of the structure by a key, found at the first call only.
-
-        Every plant with these modes shares it, whatever its ports.
-        """
+        """Return what is known of the structure by a key, found at the first call only."""
         known: dict[Hashable, Any] = self.__dict__.setdefault("_known", {})
         if key not in known:
             known[key] = found()
@@ -106,10 +103,7 @@ class ModalRealisation(Value):
         return np.asarray(row @ self.inputs)
 
     def motion(self, row: FloatArray, derivative: int) -> FloatArray:
-        """Return the row (2 b,) of C for a displacement's 0th, 1st or 2nd derivative.
-
-        Rows (p, n) give rows (p, 2 b).
-        """
+        """Return the row (2 b,) of C for a displacement's derivative; rows (p, n) give (p, 2 b)."""
         C = np.asarray(row @ self.outputs).reshape(-1, self.pairs.shape[0], 1, 2)
         for _ in range(derivative):
             slowed = 0.0 if self.coupling is None else C[:, :, 0, 1] @ self.coupling
@@ -176,10 +170,8 @@ def _at_once(model: ReducedModel) -> ModalRealisation:
 
 
 def _of_matrices(model: FEModel | ReducedModel, real: RealForm) -> ModalRealisation:
-    """Modal blocks where they hold the damping to working precision, the dense form else.
-
-    A mode that D damps by itself is a block whatever its damping: critical and overdamped too.
-    """
+    """Modal blocks where they hold the damping to working precision, the dense form else."""
+    # a mode that D damps by itself is a block whatever its damping: critical and overdamped too
     omega, r = real.omega, real.n_rigid
     if real.drags:
         why = f"dampers to ground drag rigid-body motion at up to {real.drag:.3g} 1/s"
@@ -219,11 +211,8 @@ def _where(real: RealForm, *, overdamped: bool = False) -> str:
 
 
 def _dense(model: Structure, real: RealForm, why: str) -> ModalRealisation:
-    """Undamped modes, their velocities coupled by all of D.
-
-    Rigid-body motions that D does not touch stay double integrators by themselves, the others
-    have no stiffness and lose their speed: their position is an integrator still.
-    """
+    """Undamped modes, their velocities coupled by all of D."""
+    # rigid-body motions that D does not touch stay double integrators by themselves
     r, C, phi = real.n_rigid, real.C.copy(), real.phi.copy()
     if r:
         size = PROPORTIONAL * max(float(np.abs(C).max()), TINY)
@@ -250,10 +239,9 @@ def _turned(drag: FloatArray, size: float) -> tuple[int, FloatArray]:
 def _real(
     model: Structure, omega: FloatArray, zeta: FloatArray, phi: FloatArray, rigid: int, modes: int
 ) -> ModalRealisation:
-    """Equation (5): states (omega q, dq/dt) of each mode; residual vectors are fast modes.
-
-    An unstable mode has the block ``[[0, |omega|], [|omega|, -2 zeta |omega|]]``.
-    """
+    """Equation (5): states (omega q, dq/dt) of each mode; residual vectors are fast modes."""
+    # residual vectors are fast modes; an unstable one has [[0, |omega|], [|omega|, -2 zeta
+    # |omega|]]
     n, b = phi.shape
     size = np.abs(omega)
     scale = np.where(size > 0, size, size[rigid:].min(initial=np.inf) if size[rigid:].size else 1.0)

@@ -190,10 +190,8 @@ def _check_noise(g: StateSpace, asd: FloatArray, outputs: Late) -> None:
 def _noise(
     g: StateSpace, flow: Flow, asd: FloatArray, h: float, layout: _Layout, outputs: Late
 ) -> FloatArray:
-    """Return G (N, r), ``G G'`` the covariance that white inputs add in one sample.
-
-    Piece by piece between the instants at which late outputs are taken (`lti.noise`).
-    """
+    """Return G (N, r), ``G G'`` the covariance that white inputs add in one sample."""
+    # piece by piece between the instants at which late outputs are taken
     loud = np.flatnonzero(asd)
     if not loud.size or not g.n_states:
         return np.zeros((layout.size, 0))

@@ -16,12 +16,8 @@ from .sensors import Poi
 
 
 def selected(own: Assembled, ports: Ports) -> Assembled | None:
-    """Return a plant's origin with some of its sensors, actuators and POIs in their order.
-
-    Filters and delays of what is left out go with it. None where that does not give the plant of
-    these ports: others are among them, in another order, or an actuator left out has noise, which
-    the states of the sampled plant hold mixed with other noise.
-    """
+    """Return a plant's origin with some of its sensors, actuators and POIs in their order."""
+    # None for ports that are others or in another order, or whose noise the states hold mixed
     if not _among(ports, own.ports):
         return None
     kept = [poi.channel(axis) for poi in ports.z for axis in poi.axes]

@@ -151,12 +151,8 @@ def certified_norm(
 
 
 def reached_norms(P: StandardPlant, loop: StateSpace, respond: Responder) -> dict[str, float]:
-    """Return the largest gain of a loop from each group of w to each group of z, by a sweep.
-
-    The groups follow from the names that `assemble_plant` gives: of w `references` (die:ref),
-    `noises` (y1:noise) and `disturbances`, of z `efforts` (u1:effort) and `motions`. Empty for a
-    plant that was not assembled from a structure.
-    """
+    """Return the largest gain of a loop from each group of w to each group of z, by a sweep."""
+    # groups by the names that `assemble_plant` gives; empty for other plants
     if not P.is_assembled:
         return {}
     gain = respond(_sweep(loop))
@@ -215,11 +211,8 @@ def _sweep(loop: StateSpace) -> FloatArray:
 
 
 def _peak(H: ComplexArray) -> tuple[float, int]:
-    """Return the largest singular value of responses (p, m, n_freq), and at which frequency.
-
-    It lies between the Frobenius norm over the root of the rank and the Frobenius norm: where the
-    latter is too small there is nothing to compute.
-    """
+    """Return the largest singular value of responses (p, m, n_freq), and at which frequency."""
+    # between the Frobenius norm over the root of the rank and the Frobenius norm: few need an SVD
     size = np.sqrt(np.sum(H.real**2 + H.imag**2, axis=(0, 1)))
     near = np.flatnonzero(size >= size.max() * (1.0 - ROUNDING) / np.sqrt(min(H.shape[:2])))
     gains = np.linalg.norm(np.moveaxis(H[:, :, near], 2, 0), 2, axis=(1, 2))
@@ -253,10 +246,7 @@ def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Spil
 def with_left_out(
     answer: Controller, plant: StandardPlant, larger: Any, block: StateSpace | None = None
 ) -> Controller:
-    """Return an answer with its check on the modes left out, or the note that none are known.
-
-    The block is its part from the plant's y to u, unless all of its system is.
-    """
+    """Return an answer with its check on the modes left out; `block` is its part from y to u."""
     found = spill_over(plant, [answer.system if block is None else block], larger)
     if found is None:
         return answer.replace(notes=(*answer.notes, *unchecked(plant)))

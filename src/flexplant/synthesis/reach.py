@@ -62,10 +62,8 @@ def require_stabilisable(plant: StandardPlant, problem: Prepared, what: str) -> 
 
 
 def require_reach(problem: Prepared) -> None:
-    """Raise AssumptionError when u does not reach, or y does not see, a pole that is not stable.
-
-    Weights included. Hautus' rank test in the prepared coordinates, whatever the user's units.
-    """
+    """Raise AssumptionError when u does not reach, or y does not see, a pole that is not stable."""
+    # weights included; Hautus' rank test in the prepared coordinates, whatever the user's units
     A = problem.A
     poles = np.linalg.eigvals(A)
     size = max(float(np.linalg.norm(A, 2)) if A.size else 0.0, TINY)

@@ -98,10 +98,8 @@ def rigid_modes_of(plant: Partition) -> RigidModes:
 
 
 def require_weak(motions: RigidModes, bandwidth: float, what: str) -> None:
-    """Raise AssumptionError unless all suspension modes are well below a bandwidth [Hz].
-
-    Of an unstable pair the growth rate: a loop must cross 1 well above it to be stable.
-    """
+    """Raise AssumptionError unless all suspension modes are well below a bandwidth [Hz]."""
+    # of an unstable pair the growth rate: a loop must cross 1 well above it to be stable
     grows = -float(motions.freq.min(initial=0.0))
     if grows > bandwidth / _WEAK:
         raise AssumptionError(

@@ -133,11 +133,8 @@ def _missed_by_w(p: Prepared, found: OnAxisError) -> AssumptionError:
 
 
 def _require_full_columns(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> None:
-    """Raise OnAxisError when [A - s I, B; C, D] loses rank at an undamped pole s of A.
-
-    The Hamiltonian would show it, but four of its eigenvalues meet at a rigid-body mode that costs
-    nothing, and rounding spreads them over 1e-4.
-    """
+    """Raise OnAxisError when [A - s I, B; C, D] loses rank at an undamped pole s of A."""
+    # of the Hamiltonian four eigenvalues meet at a rigid-body mode, spread by rounding over 1e-4
     poles = np.linalg.eigvals(A)
     size = float(np.linalg.norm(A, 2)) if A.size else 0.0
     near = poles[np.abs(poles.real) <= SPLIT * size]

@@ -243,12 +243,9 @@ class _Attempt(NamedTuple):
 
 
 def _attempt(problem: Prepared, gamma: float) -> _Attempt:
-    """Return the central controller for gamma, or why there is none.
-
-    Refuted means proved, not that the numerics failed: at some frequency the part that u or y does
-    not reach exceeds gamma; or an accurate stabilising solution is not positive semi-definite,
-    or rho(X Y) > gamma^2.
-    """
+    """Return the central controller for gamma, or why there is none."""
+    # refuted means proved, not that the numerics failed: X or Y is indefinite, or rho(X Y) >
+    # gamma^2
     try:
         X, F, Y, H = riccati_solutions(problem, gamma)
     except OnAxisError as found:

@@ -29,10 +29,8 @@ _UNDAMPED = 1e-6
 
 
 def raised_bound(problem: Prepared, gamma: float, known: float) -> float:
-    """Return a known lower bound on what controllers reach, raised where it is far from gamma.
-
-    By the zeros on the imaginary axis, then by the Riccati equations (`relaxed_bound`).
-    """
+    """Return a known lower bound on what controllers reach, raised where it is far from gamma."""
+    # by the zeros on the imaginary axis, then by the Riccati equations
     if known * (1.0 + _CLOSE) < gamma:
         known = max(known, zero_bound(problem))
     if known * (1.0 + _CLOSE) < gamma:
@@ -79,10 +77,8 @@ def _bound_at_zeros(
     D11: FloatArray,
     D12: FloatArray,
 ) -> float:
-    """Return the largest ``|x' B1 + z' D11| / |z|`` with ``[x' z'] [A - s I, B2; C, D12] = 0``.
-
-    In any stable loop ``z' z(s) = (x' B1 + z' D11) w(s)``: x' times the equation of motion added.
-    """
+    """Return the largest ``|x' B1 + z' D11| / |z|`` with ``[x' z'] [A - s I, B2; C, D12] = 0``."""
+    # z' z(s) = (x' B1 + z' D11) w(s) in any stable loop: x' times the equation of motion added
     n, outputs = A.shape[0], C.shape[0]
     # the pencil of fewer outputs than inputs loses rank where its transpose does
     tall = outputs >= B2.shape[1]

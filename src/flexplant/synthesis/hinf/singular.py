@@ -71,12 +71,7 @@ def _cure(lacking: Sequence[str]) -> str:
 
 
 class Regularised:
-    """A problem with noise of size `level` on each y and effort of that size for each u.
-
-    ``[w; v] -> y + level v`` and ``[z; level u]``, in multiples of what the plant itself does on
-    the channel (`Prepared.own_sizes`). Any loop has at least the norm that it
-    has without them: a gamma that is reached here is reached by the problem itself.
-    """
+    """A problem with noise on each y and effort for each u, `level` of the channel's own size."""
 
     def __init__(self, problem: Prepared, level: float, states: bool = False) -> None:
         n, nu, ny = problem.A.shape[0], problem.B2.shape[1], problem.C2.shape[0]

@@ -57,11 +57,9 @@ class AxisLaw:
         return Law(factors, self._scale(numbers), self.axis.rate)
 
     def room(self, law: Law) -> FloatArray:
-        """Return what the distance to the critical point has to spare, at each point.
-
-        Where the plant is unknown above its lines, at the last one also what the loop gain has to
-        spare below a tenth of ``1 - 1 / peak``: a mode above it may rise tenfold then.
-        """
+        """Return what the distance to the critical point has to spare, at each point."""
+        # at the last line also what the gain has below a tenth of 1 - 1 / peak: a mode above may
+        # rise tenfold
         return self.room_of(law.response(self.axis.points[0]))
 
     def room_of(self, gain: ComplexArray, rows: IntArray | slice = slice(None)) -> FloatArray:
@@ -198,11 +196,8 @@ class MeasuredAxis:
 
     @cached_property
     def points(self) -> tuple[FloatArray, ComplexArray, FloatArray]:
-        """Frequencies [Hz], responses and bounds on their errors: the lines, and between them.
-
-        Where a response changes much between two lines, more than their errors, it follows the
-        circle through its neighbours; what two such circles differ by adds to the bound.
-        """
+        """Frequencies [Hz], responses and bounds on their errors: the lines, and between them."""
+        # where a response changes much, it follows the circles through its neighbours
         f, G, bound = self.freq, self.G, _DEVIATIONS * self.deviation
         if f.size < 4:
             return f, G, bound
@@ -223,10 +218,9 @@ class MeasuredAxis:
 
     @cached_property
     def inertia(self) -> float:
-        """The inertia, with its sign, of the rigid body: ``G = 1 / (inertia s^2)``.
-
-        The median over the lowest decade of lines, above the springs and well below the first mode.
-        """
+        """The inertia, with its sign, of the rigid body: ``G = 1 / (inertia s^2)``."""
+        # the median over the lowest decade of lines, above the springs and well below the first
+        # mode
         known = self.deviation <= _KNOWN * np.abs(self.G)
         first = float(self.resonances.min(initial=np.inf))
         above = self.freq >= 2.0 * self.suspension
@@ -276,12 +270,9 @@ class MeasuredAxis:
 
 
 def _scatter(freq: FloatArray, G: ComplexArray) -> FloatArray:
-    """Return the standard deviation of lines by how they scatter about a smooth curve.
-
-    Third differences of ``f^2 G`` have 20 times the variance of an error that differs from line to
-    line, and hardly anything of a smooth response; their median over neighbours leaves resonances
-    out.
-    """
+    """Return the standard deviation of lines by how they scatter about a smooth curve."""
+    # third differences of f^2 G have 20 times the variance of an error, hardly any of a smooth
+    # curve
     if freq.size < 2 * _NEAR:
         return np.zeros(freq.size)
     flat = G * freq**2

@@ -140,10 +140,7 @@ def _gains(laws: Sequence[Law], freq: FloatArray) -> ComplexArray:
 
 
 class Coupling(NamedTuple):
-    """Responses at some frequencies, frequency first.
-
-    With G the plant, `seen` is ``G before``, `felt` ``after G`` and `inner` ``after G before``.
-    """
+    """``seen = G before``, ``felt = after G``, ``inner = after G before``, frequency first."""
 
     freq: FloatArray
     seen: ComplexArray
@@ -166,10 +163,8 @@ class Coupling(NamedTuple):
         return np.concatenate([np.reshape(sides, (len(sides), len(C))), axes])
 
     def slopes(self, C: ComplexArray, place: int) -> ComplexArray:
-        """Return g (n, k) of one place: the distance changes by ``Re(g . dC)``.
-
-        With v, w the singular vectors of S and ``1 / S = I + M``, ``d sigma = Re(v' dM w)``.
-        """
+        """Return g (n, k) of one place: the distance changes by ``Re(g . dC)``."""
+        # v, w: singular vectors of S, and 1 / S = I + M: d sigma = Re(v' dM w)
         S = self._inverse(C)
         sides, of = self._sides(S, C), self.of
         if place >= len(sides):

@@ -60,10 +60,7 @@ class JointSearch:
         return JointLaws(numbers, max(plant.worst(laws) for plant in self.plants))
 
     def best(self) -> JointLaws | None:
-        """Return the best laws that were found; None where none are stable.
-
-        They hold the peak, or come as close to it as any that were found.
-        """
+        """Return laws that hold the peak, or come closest to it; None where none are stable."""
         held = self._held(self.given)
         if held is not None:
             return held
@@ -116,12 +113,9 @@ class JointSearch:
     def _raised(
         self, numbers: list[FloatArray], added: Sequence[FloatArray], least: float
     ) -> list[FloatArray]:
-        """Return what steps from stable laws lead to.
-
-        Each step is the best of the linearised problem within a radius, with an exact penalty on
-        what is violated ([Fletcher1987]_, chapter 14). ``det(I + P C)`` turns as often as before,
-        so that the loop stays stable.
-        """
+        """Return what steps from stable laws lead to."""
+        # an exact penalty on what is violated [Fletcher1987]_; det(I + P C) turns as often as
+        # before
         grids = [np.union1d(one.grid, more) for one, more in zip(self.plants, added, strict=True)]
         couplings = [one.coupling(grid) for one, grid in zip(self.plants, grids, strict=True)]
         x, radius = np.concatenate(numbers), _RADIUS

@@ -20,10 +20,7 @@ from ...lti.statespace import StateSpace
 
 
 class Section(NamedTuple):
-    """``(b2 p^2 + b1 p + b0) / (a2 p^2 + a1 p + a0)``, p = s / omega.
-
-    Of order 2; 1 where a2 is 0, and 0 where a1 is too.
-    """
+    """``(b2 p^2 + b1 p + b0) / (a2 p^2 + a1 p + a0)``, p = s / omega, of order 2, 1 or 0."""
 
     b: tuple[float, float, float]
     a: tuple[float, float, float]

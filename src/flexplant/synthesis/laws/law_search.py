@@ -70,11 +70,8 @@ class LawSearch:
         return self.raised(found.numbers) or found
 
     def raised(self, numbers: FloatArray, steps: int = _MANY) -> FoundLaw | None:
-        """Return what steps from some numbers lead to; None when that does not hold the peak.
-
-        Each step is the best of the linearised problem within a radius, with an exact penalty on
-        what is violated ([Fletcher1987]_, chapter 14).
-        """
+        """Return what steps from some numbers lead to; None when that does not hold the peak."""
+        # linear programs within a radius, with an exact penalty [Fletcher1987]_, chapter 14
         x, radius, best = numbers, _RADIUS, None
         if not self.of.axis.is_stable(self.of.law(x)):
             return None

@@ -47,11 +47,8 @@ def modelling() -> Any:
 
 
 def symmetric_blocks(rows: list[list[Any]]) -> Any:
-    """Return the symmetric block matrix (cvxpy) whose upper triangle of blocks is given.
-
-    cvxpy's ``M >> 0`` constrains only the symmetric part of M and says nothing: every LMI is
-    made here, where the lower triangle is a mirror and diagonal blocks are symmetrised.
-    """
+    """Return the symmetric block matrix (cvxpy) whose upper triangle of blocks is given."""
+    # cvxpy's ``M >> 0`` constrains only the symmetric part: every LMI is made here, mirrored
     cp = modelling()
     count = len(rows)
     full = [
@@ -96,11 +93,8 @@ def smallest_gamma(p: Plant, scale: float, settings: dict[str, float]) -> Optimu
 
 
 def moderate_controller(p: Plant, gamma: float, settings: dict[str, float]) -> Matrices:
-    """Return a controller for gamma, moderate X, Y and gains (Scherer, Gahinet, Chilali).
-
-    Their LMI holds for some Â exactly when its two diagonal parts do, which are linear in
-    (Y, Ĉ, D) and (X, B̂, D): Schur's complement about the columns of w and z.
-    """
+    """Return a controller for gamma, moderate X, Y and gains (Scherer, Gahinet, Chilali)."""
+    # holds for some A^ exactly when its two diagonal parts do, linear in (Y, C^, D), (X, B^, D)
     cp = modelling()
     n, nw, nz, nu, ny = *p.A.shape[:1], p.B1.shape[1], p.C1.shape[0], p.B2.shape[1], p.C2.shape[0]
     X, Y = (cp.Variable((n, n), symmetric=True) for _ in range(2))

@@ -26,11 +26,8 @@ Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def dual_bound(p: Plant, U: FloatArray, V: FloatArray, X: FloatArray, Y: FloatArray) -> float:
-    """Return a lower bound of gamma by weak duality, from the multipliers of the first two LMIs.
-
-    The third multiplier is chosen here, so that the dual equations hold exactly; what of it is
-    not positive semidefinite is paid for with the traces of X and Y.
-    """
+    """Return a lower bound of gamma by weak duality, from the multipliers of the first two LMIs."""
+    # the third is chosen so that the dual equations hold; what is indefinite is paid for by traces
     n, nw, nz = p.A.shape[0], p.B1.shape[1], p.C1.shape[0]
     U, V = _positive_part(U)[0], _positive_part(V)[0]
     total = np.trace(U[n:, n:]) + np.trace(V[n:, n:])
@@ -261,10 +258,8 @@ def same_states(p: Plant) -> Plant:
 
 
 def lqg_states(p: Plant) -> Plant:
-    """Return the plant in LQG-balanced states, in the unit of frequency of the LQG loop.
-
-    The Riccati solutions stand in for X and Y.
-    """
+    """Return the plant in LQG-balanced states, in the unit of frequency of the LQG loop."""
+    # the Riccati solutions stand in for X and Y
     n, nu, ny = p.A.shape[0], p.B2.shape[1], p.C2.shape[0]
     # a little of everything: no rank of D12, D21 or observability of z is assumed
     Q, W = p.C1.T @ p.C1, p.B1 @ p.B1.T

@@ -220,11 +220,8 @@ def _prepared(plant: StandardPlant) -> Plant:
 
 
 def _best_rate(problem: ObjectivePrograms) -> tuple[float, float]:
-    """Return the smallest optimum over the rate of decay of peak gains, and that rate.
-
-    A grid, then steps to both sides of the best rate, each the root of the one before: the two
-    LMIs of a peak gain are convex only for a given rate.
-    """
+    """Return the smallest optimum over the rate of decay of peak gains, and that rate."""
+    # the two LMIs of a peak gain are convex only for a given rate
     values: dict[float, float] = {}
     failures: list[Exception] = []
 
@@ -281,11 +278,8 @@ _CERTAIN = 0.5
 
 
 def require_reachable(plant: StandardPlant, subject_to: Sequence[Any]) -> None:
-    """Raise InfeasibleError when a bound is below what any controller reaches for it alone.
-
-    H2 by two Riccati equations, H-infinity by its lower bound; bounds on peaks and regions of
-    poles are not judged, nor what has no optimum.
-    """
+    """Raise InfeasibleError when a bound is below what any controller reaches for it alone."""
+    # bounds on peaks and regions of poles are not judged, nor what has no optimum
     for spec in subject_to:
         if not isinstance(spec, H2 | Hinf) or spec.below is None:
             continue

@@ -163,11 +163,8 @@ class PoleRegion(Value):
 
 
 def impulse_integral(closed: StateSpace, *, points: int = 4000) -> float:
-    """Return the largest of ``|D_ij| + int |h_ij(t)| dt`` of a stable continuous system.
-
-    By the trapezoidal rule until the slowest pole has decayed by e^-25, with a step that resolves
-    the fastest pole that matters; refined until it changes by less than 1e-4.
-    """
+    """Return the largest of ``|D_ij| + int |h_ij(t)| dt`` of a stable continuous system."""
+    # until the slowest pole has decayed by e^-25; refined until it changes by less than 1e-4
     from scipy.linalg import expm
 
     poles = closed.poles()
@@ -193,11 +190,8 @@ def impulse_integral(closed: StateSpace, *, points: int = 4000) -> float:
 
 
 def impulse_sum(closed: StateSpace) -> float:
-    """Return the largest of ``sum_k |h_ij[k]|`` of a stable sampled system.
-
-    Until the slowest pole has decayed by e^-25, many samples at a time; infinite where that takes
-    more than four million.
-    """
+    """Return the largest of ``sum_k |h_ij[k]|`` of a stable sampled system."""
+    # until e^-25 of the slowest pole; infinite where that takes more than four million samples
     radius = float(np.abs(closed.poles()).max(initial=0.0))
     # a loop of delays alone is over in a few samples
     speed = -np.log(max(radius, 1e-12))

@@ -319,11 +319,8 @@ class ServoTask:
         return [rigid_body(self.rate, self.plant.delay, float(f)) for f in free]
 
     def rigid_radius(self, axis: Axis) -> float:
-        """Return the spectral radius of the worst axis of the rigid body.
-
-        All axes have the same controller, so that the loop falls apart into those of the body's own
-        motions, whatever the axes: free ones (0 Hz) and suspension modes.
-        """
+        """Return the spectral radius of the worst axis of the rigid body."""
+        # all axes have one controller: the loop falls apart into the body's own motions
         radius = self._rigid_radius(axis)
         if not radius < 1.0:
             raise SolverError(

@@ -86,12 +86,8 @@ class ServoLoop:
         return np.asarray(self.modes[order][peaks[order] > _QUIET])
 
     def notched(self, axis: Axis, stable: Callable[[Axis], bool]) -> Axis:
-        """Return the axis with notches at the modes where they bring |S| at u down.
-
-        One after the other, while |S| is above 6 dB or the loop is unstable: of the modes of
-        largest gain the one whose notch lowers the peak most. In a stable loop a notch that gains
-        nothing is not placed.
-        """
+        """Return the axis with notches at the modes where they bring |S| at u down."""
+        # while |S| is above 6 dB or the loop unstable: the one of the largest that lowers it most
         peak = self.peak(axis)[0]
         for _ in range(_NOTCHES):
             if peak <= TARGET and stable(axis):
@@ -127,10 +123,8 @@ def decoupling(plant: StandardPlant, poi: Poi) -> FloatArray:
 def servo_loop(
     plant: StandardPlant, observer: StateSpace | None, poi: Poi, known: StandardPlant
 ) -> ServoLoop:
-    """Return the loop of a plant with an observer, or with the POI itself as its estimate.
-
-    It is decoupled, and has notches, by what is known to the design: a plant of fewer modes.
-    """
+    """Return the loop of a plant with an observer, or with the POI itself as its estimate."""
+    # decoupled, and with notches, by what is known to the design: a plant of fewer modes
     hats = tuple(poi.derived(axis, "hat") for axis in poi.axes)
     poles = plant.system.poles()
     if observer is not None:
@@ -280,11 +274,8 @@ class Axis:
 
 @lru_cache(maxsize=64)
 def rigid_body(rate: float, delay: float, suspension: float) -> StateSpace:
-    """Return one motion of the body, held and delayed: acceleration commanded to error.
-
-    Its frequency is that of a suspension [Hz], 0 when free; negative where magnets make poles
-    +-2 pi |f| of it.
-    """
+    """Return one motion of the body, held and delayed: acceleration commanded to error."""
+    # its suspension's frequency [Hz], 0 when free, negative where magnets make poles +-2 pi |f|
     body = StateSpace(
         [[0.0, 1.0], [-((2.0 * np.pi) ** 2) * suspension * abs(suspension), 0.0]],
         [[0.0], [1.0]],

@@ -81,11 +81,9 @@ def bfgs(
     steps: int,
     spent: Callable[[], bool] = lambda: False,
 ) -> tuple[FloatArray, float]:
-    """Return where BFGS with a weak Wolfe line search ends, and the value there.
-
-    It stops below the value `enough`, after so many steps, and when `spent` is true
-    [LewisOverton2013]_.
-    """
+    """Return where BFGS with a weak Wolfe line search ends, and the value there."""
+    # stops below the value `enough`, after so many steps, and when `spent` is true
+    # [LewisOverton2013]_
     value, gradient = function(x)
     H, values = np.eye(x.size), [value]
     for _ in range(steps):
@@ -209,12 +207,9 @@ class _Model:
 
 
 def downhill(gradients: FloatArray, beside: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the weights and the minimum y of ``max_i (c_i + g_i' y) + |y|^2 / 2``.
-
-    ``y = -G' w`` with weights w >= 0, sum(w) = 1. With t for the maximum this is the point of a
-    polyhedron next to the origin, but for a small share of t^2, which non-negative least squares
-    finds [LawsonHanson1995]_.
-    """
+    """Return the weights and the minimum y of ``max_i (c_i + g_i' y) + |y|^2 / 2``."""
+    # y = -G' w with w >= 0, sum(w) = 1: the point of a polyhedron next to the origin
+    # [LawsonHanson1995]_
     from scipy.optimize import nnls
 
     size = max(float(np.linalg.norm(gradients, axis=1).max()), np.finfo(float).tiny)
@@ -228,11 +223,8 @@ def downhill(gradients: FloatArray, beside: FloatArray) -> tuple[FloatArray, Flo
 
 
 def decrease_left(pieces: Pieces, radius: float) -> tuple[float, float]:
-    """Return the least slope of convex combinations of the gradients, and the decrease left.
-
-    ``-min_(|d| <= r) max_i (c_i + g_i' d)``, c_i below the largest: what a step of the radius
-    would still gain, to first order; found by bisection over the weight of |d|^2.
-    """
+    """Return the least slope of convex combinations of the gradients, and the decrease left."""
+    # -min_(|d| <= r) max_i (c_i + g_i' d), by bisection over the weight of |d|^2
     beside = pieces.value - pieces.value.max()
     top = pieces.gradient[np.argmax(beside)]
     low, high = 0.0, np.log(1e3 * (1.0 + float(np.linalg.norm(top)) / radius))

@@ -248,11 +248,8 @@ class _StructureSearch:
         return value, np.tensordot(self.family.jacobian(theta), by, axes=2)
 
     def value(self, theta: FloatArray) -> tuple[float, tuple[int, float]]:
-        """Return the logarithm of the largest norm of the loops, and which and where it is.
-
-        A little more for large parameters: some infima are only neared as gains grow without
-        bound, this ends them at finite ones.
-        """
+        """Return the logarithm of the largest norm of the loops, and which and where it is."""
+        # a little more for large parameters: ends infima that are only neared as gains grow
         self.evaluations += 1
         K = self.family.matrices(theta)
         if not np.all(np.isfinite(K.joined)):
