@@ -10,7 +10,7 @@ from flexplant.errors import InfeasibleError, ModelError
 from flexplant.modes import solve_modes
 from flexplant.structure import FEModel, ModalDamping
 from plates import make_plate
-from stages import ports, sampled, some_modes
+from stages import RATE, ports, sampled, some_modes
 
 #: modes 14 and 15 are a pair
 ZETA, COUNT, SHARE = 1e-3, 15, 0.005
@@ -108,3 +108,40 @@ def test_a_bandwidth_that_cannot_be_kept_is_refused_with_what_was_tried():
         fx.design_stage(plant().uncertain(frequency=0.03), bandwidth=400.0)
     with pytest.raises(ModelError, match="margin must be below 1"):
         fx.design_stage(plant(), margin=1.2)
+
+
+@pytest.mark.slow
+def test_an_uncertain_plant_is_designed_for_by_default():
+    """Weights and blocks keep what is uncertain: the same controller as with uncertain=."""
+    uncertain = plant().uncertain(frequency=SHARE)
+    P = uncertain.nominal
+    weights = fx.stage_weights(plant(), 100.0, uncertainty=SHARE)
+    again = fx.stage_weights(P, 100.0)
+    assert repr(weights) == repr(again)
+    assert "disturbance 20, effort 10" in repr(weights)
+    assert (
+        weights.uncertain.frequencies == uncertain.frequencies == dict.fromkeys(range(4, 16), SHARE)
+    )
+    problem = P.through(fx.reference_errors(P)).weighted(z=again.z, w=again.w)
+    found = fx.design_hinf(problem)
+    assert found.gamma == pytest.approx(design().gamma, rel=1e-9)
+    assert found.certificate["all frequencies at once"] < 1.0
+
+
+@pytest.mark.slow
+def test_modes_below_a_frequency_are_damped():
+    """The channel of a complex delta is small only where the loop damps the mode."""
+    plain = loop_on(plant(), design())
+    damped = loop_on(
+        plant(),
+        fx.design_hinf(
+            weighted(), uncertain=plant().uncertain(frequency=SHARE), damped_below=350.0
+        ),
+    )
+
+    def slowest(loop):
+        poles = np.log(loop.poles()) * RATE
+        near = (poles.imag > 2 * np.pi * 200.0) & (poles.imag < 2 * np.pi * 300.0)
+        return (-poles.real / np.abs(poles))[near].min()
+
+    assert slowest(damped) > 2.0 * slowest(plain)

@@ -453,8 +453,7 @@ def _known(given: Any, modes: IntArray) -> FloatArray | None:
     if given is None:
         return None
     if isinstance(given, UncertainPlant):
-        # stiffness is off by twice the relative error of the frequency
-        given = {d.mode: 0.5 * d.scale for d in given.deltas if d.kind == "freq"}
+        given = given.frequencies
     if isinstance(given, Mapping):
         return np.array([float(given.get(int(mode), 0.0)) for mode in modes])
     values = np.asarray(given, dtype=np.float64)

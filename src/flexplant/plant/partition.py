@@ -36,6 +36,7 @@ class Partition(Value):
     y: tuple[str, ...]
     asd: Mapping[str, float]
     origin: Origin = ELSEWHERE
+    uncertainty: Any = None
 
     def __post_init__(self) -> None:
         for side in "wuzy":
@@ -77,6 +78,8 @@ class Partition(Value):
     def of(cls, given: Any) -> Self:
         """Return a plant; of a system with labels when these name w, u, z and y.
 
+        Of an `UncertainPlant` its nominal plant, with what is uncertain in `uncertainty`.
+
         Raises
         ------
         LabelError
@@ -84,6 +87,7 @@ class Partition(Value):
         ModelError
             When it is neither.
         """
+        given = getattr(given, "nominal", given)
         if isinstance(given, cls):
             return given
         if is_system(given):

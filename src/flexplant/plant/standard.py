@@ -50,6 +50,8 @@ class StandardPlant(Partition):
     origin : Assembled, Weighted or Foreign
         Where it came from: `plant.assembled` holds ports, modes, noise and delay of a plant that
         was assembled from a structure, `plant.unweighted` is the plant before weights.
+    uncertainty : UncertainPlant, optional
+        By what its modes may be off: of ``plant.uncertain(...).nominal``, kept by weights.
 
     Raises
     ------
@@ -258,7 +260,8 @@ class StandardPlant(Partition):
         Returns
         -------
         UncertainPlant
-            `.system`, `.deltas`, `.lft(values)`, `.sample(rng, n)`.
+            `.system`, `.deltas`, `.lft(values)`, `.sample(rng, n)`. Functions that take a plant
+            take it too: designs and loops then say by what each mode may be off.
 
         Raises
         ------
@@ -269,7 +272,7 @@ class StandardPlant(Partition):
             negative stiffness or damping, or shapes are given that are not real.
         """
         return uncertain(
-            self,
+            self if self.uncertainty is None else self.replace(uncertainty=None),
             source,
             parameters,
             frequency=frequency,
@@ -314,8 +317,8 @@ def standard_plant(given: StandardPlant | System) -> StandardPlant:
 
     Parameters
     ----------
-    given : StandardPlant, StateSpace or control.StateSpace
-        The plant.
+    given : StandardPlant, UncertainPlant, StateSpace or control.StateSpace
+        The plant; of an uncertain one the nominal plant, with its `uncertainty`.
 
     Raises
     ------

@@ -191,6 +191,21 @@ class UncertainPlant(Value, Generic[P]):
     parameters: tuple[Parameter, ...] = ()
 
     @property
+    def nominal(self) -> P:
+        """The nominal plant with `uncertainty` this value, which weights and blocks keep.
+
+        What designs and loops take when they are given an uncertain plant; an H-infinity design
+        has ``uncertain.nominal.through(errors).weighted(z=..., w=...)``.
+        """
+        return self.plant.replace(uncertainty=self)
+
+    @property
+    def frequencies(self) -> dict[int, float]:
+        """By what share the frequency of each mode may be off, {mode: share} at delta = 1."""
+        # stiffness is off by twice the relative error of the frequency
+        return {d.mode: 0.5 * d.scale for d in self.deltas if d.kind == "freq"}
+
+    @property
     def channels(self) -> dict[str, str]:
         """The Delta of each of its channels: {`mode6:freq:rate`: `mode6:freq`, ...}, in order."""
         names = [delta.name for delta in self.deltas]

@@ -53,12 +53,13 @@ _SENSITIVE, _DRAWS = 2e-4, 3
 
 @one_thread()
 def design_hinf(
-    plant: StandardPlant | System,
+    plant: StandardPlant | UncertainPlant[Any] | System,
     method: SynthesisMethod | None = None,
     *,
     u: Sequence[str] | None = None,
     y: Sequence[str] | None = None,
     uncertain: UncertainPlant[Any] | None = None,
+    damped_below: float = 0.0,
     larger: Any = None,
     progress: bool | None = None,
 ) -> Controller:
@@ -70,7 +71,7 @@ def design_hinf(
 
     Parameters
     ----------
-    plant : StandardPlant
+    plant : StandardPlant or UncertainPlant
         Usually weighted; continuous or sampled. A labelled StateSpace (ours or python-control's)
         serves too: by the names of its channels, or with u and y named.
     method : Riccati or Lmi, optional
@@ -83,11 +84,15 @@ def design_hinf(
         Channels of the controller, for a StateSpace.
     uncertain : UncertainPlant, optional
         Of the plant that was weighted, ``plant.uncertain(frequency=0.005)``: its frequencies are
-        tolerated. Each mode gets a channel by which a change of its frequency acts, scaled by the
-        disturbances and with the shift of real mu, and the problem is solved twice, the scales
-        evened out in closed loop between. `gamma` is then with these channels (above 1 is no
-        failure), `certificate` has ``all frequencies at once``: below 1 no machine of the
-        uncertainty has a pole on the grid. ``ClosedLoop.mode_tolerances`` says what each may be.
+        tolerated; not needed where the plant is uncertain itself, or made of
+        ``uncertain.nominal`` by weights. Each mode gets a channel by which a change of its
+        frequency acts, scaled by the disturbances and with the shift of real mu, and the problem is
+        solved twice, the scales evened out in closed loop between. `gamma` is then with these
+        channels (above 1 is no failure), `certificate` has ``all frequencies at once``: below 1 no
+        machine of the uncertainty has a pole on the grid. ``ClosedLoop.mode_tolerances`` says what each may be.
+    damped_below : float [Hz]
+        Uncertain modes below it that actuators push are damped, not only tolerated: their channel
+        then covers errors of 1 % and of their shapes. `design_stage` has 3.5 times the bandwidth.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes that the plant left out, as for `larger_plant`: the loop is checked
         there too, sampled and delayed alike. Unless given, with those that the plant's reduced
@@ -143,8 +148,12 @@ def design_hinf(
             f"method must be Riccati(...) or Lmi(...), got {short(method)}. Pass one, or none."
         )
     plant = posed(plant, u, y, "H-infinity synthesis")
-    if uncertain is not None:
-        return with_left_out(tolerant(plant, uncertain, method, progress), plant, larger)
+    known = uncertain
+    if known is None and plant.uncertainty is not None and plant.uncertainty.frequencies:
+        known = plant.uncertainty
+    if known is not None:
+        found = tolerant(plant, known, method, progress, damped_below)
+        return with_left_out(found, plant, larger)
     return with_left_out(_designed(plant, method, progress), plant, larger)
 
 

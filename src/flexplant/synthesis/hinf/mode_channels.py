@@ -73,7 +73,7 @@ def mode_channels(
     """
     own: Any = uncertain.plant
     g, dt = weighted.system, weighted.dt
-    ranges = {d.mode: 0.5 * d.scale for d in uncertain.deltas if d.kind == "freq"}
+    ranges = uncertain.frequencies
     if not ranges or dt != own.dt:
         raise ModelError(
             "design_hinf(uncertain=) needs Deltas of frequencies on the plant that is weighted, "

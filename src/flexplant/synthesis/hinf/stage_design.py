@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import instance, positive
+from ...checks import positive
 from ...errors import AssumptionError, FlexplantError, InfeasibleError, ModelError
 from ...loop import ClosedLoop, close_loop
 from ...lti.interconnection import series
 from ...parallel import Progress
-from ...plant import StandardPlant, reference_errors, stage_weights
+from ...plant import StandardPlant, reference_errors, stage_weights, standard_plant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import Controller, with_left_out
 from .hinf_design import tolerant
@@ -36,8 +36,8 @@ def design_stage(
     bandwidth: float | None = None,
     margin: float = 0.4,
     poi: str | None = None,
-    disturbance: float = 20.0,
-    effort: float = 10.0,
+    disturbance: float | None = None,
+    effort: float | None = None,
     larger: Any = None,
     progress: bool | None = None,
 ) -> Controller:
@@ -62,7 +62,7 @@ def design_stage(
     poi : str, optional
         As for `stage_weights` and `reference_errors`.
     disturbance, effort : float
-        As for `stage_weights`; these let the modes be damped as much as they are pushed.
+        As for `stage_weights` of an uncertain plant.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes that the plant left out, as for `larger_plant`.
     progress : bool, optional
@@ -92,13 +92,9 @@ def design_stage(
     >>> fx.close_loop(plant, controller).modulus_margin > 0.4
     True
     """
-    uncertain: UncertainPlant[Any]
-    if isinstance(plant, UncertainPlant):
-        uncertain = plant
-    else:
-        given = instance(
-            plant, StandardPlant, "plant", "Assemble it, or pass plant.uncertain(...)."
-        )
+    given = standard_plant(plant)
+    uncertain = given.uncertainty
+    if uncertain is None:
         uncertain = given.uncertain(frequency=0.005)
     task = _StageTask(uncertain, positive(margin, "margin"), poi, disturbance, effort)
     with Progress(_MOST, "bandwidths", progress=progress) as bar:
@@ -117,14 +113,14 @@ class _StageTask:
         uncertain: UncertainPlant[Any],
         margin: float,
         poi: str | None,
-        disturbance: float,
-        effort: float,
+        disturbance: float | None,
+        effort: float | None,
     ) -> None:
         if margin >= 1.0:
             raise ModelError(f"margin must be below 1, got {margin}: no loop that acts keeps it.")
         self.uncertain, self.margin, self.poi = uncertain, margin, poi
         self.disturbance, self.effort = disturbance, effort
-        self.ranges = {d.mode: 0.5 * d.scale for d in uncertain.deltas if d.kind == "freq"}
+        self.ranges = uncertain.frequencies
         if not self.ranges:
             raise ModelError(
                 f"no frequency of {uncertain!r} is uncertain: nothing limits the bandwidth. Pass "
@@ -140,7 +136,11 @@ class _StageTask:
     def holds(self, bandwidth: float) -> bool:
         """Design for a bandwidth of the weights, and return whether the loop holds."""
         weights = stage_weights(
-            self.plant, bandwidth, poi=self.poi, disturbance=self.disturbance, effort=self.effort
+            self.uncertain.nominal,
+            bandwidth,
+            poi=self.poi,
+            disturbance=self.disturbance,
+            effort=self.effort,
         )
         weighted = self.through.weighted(z=weights.z, w=weights.w)
         try:

@@ -62,7 +62,8 @@ def design_mu(
     uncertain : UncertainPlant
         From `plant.uncertain(fit, neglected=larger)`, continuous or sampled.
     w, z : mapping {name: weight}, or sequence of str
-        Weights of performance, as for `StandardPlant.weighted`.
+        Weights of performance, as for `StandardPlant.weighted`, those of `stage_weights` too:
+        None leaves a channel out, as does not naming it.
     method : Riccati or Lmi, optional
         As for `design_hinf`.
     iterations : int

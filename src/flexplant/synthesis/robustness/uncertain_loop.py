@@ -20,6 +20,7 @@ from ...plant import StandardPlant
 from ...plant.uncertainty.delta_channels import DeltaChannels, delta_channels
 from ...plant.uncertainty.neglected import opened
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...plant.weighting import at_rate
 from .uncertainty_blocks import Block, FullBlock, Perturbation, RepeatedScalar, realised
 
 #: heights are taken this much above the weights at the frequencies that sample an interval
@@ -207,9 +208,10 @@ def _require_uncertain(given: object) -> None:
 
 
 def _weighted_names(given: Any, side: str) -> tuple[list[str], dict[str, Any]]:
-    """Return the names of channels and their weights."""
+    """Return the names of channels and their weights; None leaves a channel out."""
     if isinstance(given, Mapping):
-        return list(given), dict(given)
+        kept = {name: weight for name, weight in given.items() if weight is not None}
+        return list(kept), kept
     return list(name_list(given, side)), {}
 
 
@@ -218,12 +220,11 @@ def _checked_weights(given: Mapping[str, Any], dt: float) -> dict[str, StateSpac
     found = {}
     for name, weight in given.items():
         one = as_statespace(weight)
-        if one.D.shape != (1, 1) or (one.n_states and one.dt != dt):
+        if one.D.shape != (1, 1):
             raise ModelError(
-                f"the weight of {name!r} must have one input, one output and the sampling time "
-                f"{dt:g} s of the loop, got {one!r}."
+                f"the weight of {name!r} must have one input and one output, got {one!r}."
             )
-        found[name] = one
+        found[name] = at_rate(one, name, dt)
     return found
 
 
