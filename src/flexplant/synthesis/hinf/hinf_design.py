@@ -89,7 +89,8 @@ def design_hinf(
         frequency acts, scaled by the disturbances and with the shift of real mu, and the problem is
         solved twice, the scales evened out in closed loop between. `gamma` is then with these
         channels (above 1 is no failure), `certificate` has ``all frequencies at once``: below 1 no
-        machine of the uncertainty has a pole on the grid. ``ClosedLoop.mode_tolerances`` says what each may be.
+        machine of the uncertainty has a pole on the grid. ``ClosedLoop.mode_tolerances`` says what
+        each may be.
     damped_below : float [Hz]
         Uncertain modes below it that actuators push are damped, not only tolerated: their channel
         then covers errors of 1 % and of their shapes. `design_stage` has 3.5 times the bandwidth.
