@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks import ComplexArray, FloatArray, inner_names
 from ..errors import LabelError, ModelError, unknown_label
-from ..lti.interconnection import connect
+from ..lti.interconnection import among, connect
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
@@ -199,13 +199,7 @@ def with_known(plant: StandardPlant, systems: Sequence[StateSpace]) -> StandardP
     fresh = [n for n in dict.fromkeys(read) if n not in plant.y and is_known(n, refs, plant.u)]
     if not fresh:
         return plant
-    g, nw, nf = plant.system, len(plant.w), len(fresh)
-    B = np.hstack([g.B[:, :nw], np.zeros((g.n_states, nf)), g.B[:, nw:]])
-    C = np.vstack([g.C, np.zeros((nf, g.n_states))])
-    D = np.zeros((C.shape[0], B.shape[1]))
-    old = [*range(nw), *range(nw + nf, B.shape[1])]
-    D[np.ix_(np.arange(g.C.shape[0]), old)] = g.D
-    D[g.C.shape[0] :, nw : nw + nf] = np.eye(nf)
     w, y = (*plant.w, *fresh), (*plant.y, *fresh)
-    system = g.replace(B=B, C=C, D=D, inputs=[*w, *plant.u], outputs=[*plant.z, *y])
+    known = {(name, name): 1.0 for name in fresh}
+    system = among(plant.system, [*w, *plant.u], [*plant.z, *y], known)
     return plant.replace(system=system, w=w, y=y)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ..checks import ComplexArray, FloatArray, Value, inner_names, name_list
 from ..errors import ModelError, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
-from ..lti.interconnection import lft, loop_poles
+from ..lti.interconnection import among, lft, loop_poles
 from ..lti.norms import Obstacle, obstacle
 from ..lti.responses import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
@@ -447,30 +447,21 @@ def tapped(
     plant: StandardPlant, driven: Sequence[str], watched: Sequence[str], units: Mapping[str, str]
 ) -> StateSpace:
     """Return [w; driven; watched] -> [z; y; driven; watched; y of the loop], named `y1|loop`."""
-    g = plant.system
-    shown = [*plant.z, *plant.y, *driven, *watched]
-    rows = g.output_index([*plant.z, *plant.y])
-    taps = [*driven, *watched]  # inputs, and outputs unchanged
-    columns = g.input_index([*plant.w, *driven])
-    extra = np.zeros((g.n_states, len(watched)))
-    fed = g.output_index(plant.y)
-    D = np.zeros((len(shown) + fed.size, columns.size + len(watched)))
-    D[: rows.size, : columns.size] = g.D[np.ix_(rows, columns)]
-    D[rows.size : len(shown), len(plant.w) :] = np.eye(len(taps))
-    D[len(shown) :, : columns.size] = g.D[np.ix_(fed, columns)]
-    C = np.vstack([g.C[rows], np.zeros((len(taps), g.n_states)), g.C[fed]])
-    return StateSpace(
-        g.A,
-        np.hstack([g.B[:, columns], extra]),
-        C,
-        D,
-        g.dt,
-        inputs=[*plant.w, *taps],
-        outputs=[*shown, *inner_names((f"{name}|loop" for name in plant.y), shown)],
-        states=g.states,
-        name=g.name,
-        units=units,
+    shown, taps = [*plant.z, *plant.y, *driven, *watched], [*driven, *watched]
+    back = inner_names((f"{name}|loop" for name in plant.y), shown)
+    g, seen = plant.system, [*plant.z, *plant.y, *plant.y]
+    rows, columns = g.output_index(seen), g.input_index([*plant.w, *driven])
+    g = g.replace(
+        B=g.B[:, columns],
+        C=g.C[rows],
+        D=g.D[np.ix_(rows, columns)],
+        inputs=[*plant.w, *driven],
+        outputs=[*plant.z, *plant.y, *back],
+        units={},
+        blocks=None,
     )
+    whole = among(g, [*plant.w, *taps], [*shown, *back], {(name, name): 1.0 for name in taps})
+    return whole.replace(units=units)
 
 
 def close_loop(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import scipy.linalg as la
@@ -60,6 +60,23 @@ def side_by_side(systems: Iterable[System], names: Iterable[str], mark: str = "|
             for g, n in zip(map(as_statespace, systems), names, strict=True)
         )
     )
+
+
+def among(
+    g: StateSpace,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    through: Mapping[tuple[str, str], float] | None = None,
+) -> StateSpace:
+    """Return a system with its channels among others, and gains added, as {(output, input): k}."""
+    column, row = ({name: i for i, name in enumerate(names)} for names in (inputs, outputs))
+    driven, seen = [column[name] for name in g.inputs], [row[name] for name in g.outputs]
+    B, C = np.zeros((g.n_states, len(column))), np.zeros((len(row), g.n_states))
+    D = np.zeros((len(row), len(column)))
+    B[:, driven], C[seen], D[np.ix_(seen, driven)] = g.B, g.C, g.D
+    for (to, fro), gain in (through or {}).items():
+        D[row[to], column[fro]] += gain
+    return g.replace(B=B, C=C, D=D, inputs=inputs, outputs=outputs)
 
 
 def series(first: System, second: System) -> StateSpace:

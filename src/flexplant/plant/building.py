@@ -16,6 +16,7 @@ from ..lti.discretisation import (
     light_modes,
     noise_factor,
 )
+from ..lti.interconnection import among
 from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..reduction import ReducedModel
@@ -41,32 +42,24 @@ def wired(cls: type[P], origin: Assembled) -> P:
     tracked = [ports.poi(reference.poi) for reference in ports.references]
     refs = [poi.derived(poi.axes[0], "ref") for poi in tracked]
     w = [*(d.name for d in ports.w), *ports.input_noises, *noises, *refs]
-    z = [
-        *pois,
-        *(poi.derived(poi.axes[0], "error") for poi in tracked),
-        *(f"{name}:effort" for name in actuators),
-    ]
+    errors = [poi.derived(poi.axes[0], "error") for poi in tracked]
+    z = [*pois, *errors, *(f"{name}:effort" for name in actuators)]
     y = [*sensors, *refs]
     inputs, outputs = [*w, *actuators], [*z, *y]
-    column = {name: i for i, name in enumerate(inputs)}
-    row = {name: i for i, name in enumerate(outputs)}
-    B = np.zeros((physical.n_states, len(inputs)))
-    C = np.zeros((len(outputs), physical.n_states))
-    D = np.zeros((len(outputs), len(inputs)))
-    driven = [column[name] for name in physical.inputs]
-    seen = [row[name] for name in physical.outputs]
-    B[:, driven], C[seen] = physical.B, physical.C
-    D[np.ix_(seen, driven)] = physical.D
-    for name in noises:
-        D[row[name.removesuffix(":noise")], column[name]] = 1.0
-    for poi, ref in zip(tracked, refs, strict=True):
-        error, motion = row[poi.derived(poi.axes[0], "error")], row[poi.channel(poi.axes[0])]
-        C[error], D[error] = -C[motion], -D[motion]
-        D[error, column[ref]] += 1.0
-        D[row[ref], column[ref]] = 1.0
-    for name in actuators:
-        D[row[f"{name}:effort"], column[name]] = 1.0
-    system = physical.replace(B=B, C=C, D=D, inputs=inputs, outputs=outputs, units=ports.units)
+    motions = physical.output_index([poi.channel(poi.axes[0]) for poi in tracked])
+    through = {(name.removesuffix(":noise"), name): 1.0 for name in noises}
+    through |= {
+        pair: 1.0
+        for ref, error in zip(refs, errors, strict=True)
+        for pair in ((error, ref), (ref, ref))
+    }
+    through |= {(f"{name}:effort", name): 1.0 for name in actuators}
+    shown = physical.replace(
+        C=np.vstack([physical.C, -physical.C[motions]]),
+        D=np.vstack([physical.D, -physical.D[motions]]),
+        outputs=[*physical.outputs, *errors],
+    )
+    system = among(shown, inputs, outputs, through).replace(units=ports.units)
     asd = {d.name: d.asd for d in ports.w if d.asd > 0} | ports.input_noises
     asd |= {f"{s.name}:noise": s.asd for s in ports.y if s.asd > 0}
     return cls(system, tuple(w), tuple(actuators), tuple(z), tuple(y), asd, origin)

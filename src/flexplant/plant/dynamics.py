@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks import FloatArray
 from ..errors import ModelError, counted
-from ..lti.interconnection import append, series
+from ..lti.interconnection import among, append, series
 from ..lti.statespace import StateSpace, as_statespace
 from ..structure.placed import SPANNED
 from .port import QUANTITIES, Seen
@@ -175,15 +175,7 @@ def with_ground(parts: Parts, carried: Mapping[str, Carried]) -> Parts:
         before[name] = _with_integrals(before[name], name, sorted(lefts))
     inputs = [name for part in before.values() for name in part.outputs]
     outputs = [name for part in after.values() for name in part.inputs]
-    n = structure.n_states
-    column = [inputs.index(name) for name in structure.inputs]
-    row = [outputs.index(name) for name in structure.outputs]
-    B, C = np.zeros((n, len(inputs))), np.zeros((len(outputs), n))
-    D = np.zeros((len(outputs), len(inputs)))
-    B[:, column], C[row], D[np.ix_(row, column)] = structure.B, structure.C, structure.D
-    for (output, name), gain in entries.items():
-        D[outputs.index(output), inputs.index(name)] += gain
-    wider = structure.replace(B=B, C=C, D=D, inputs=inputs, outputs=outputs)
+    wider = among(structure, inputs, outputs, entries)
     return Parts(wider, before, after)
 
 

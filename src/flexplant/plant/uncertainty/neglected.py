@@ -13,7 +13,7 @@ from ...checks import ComplexArray, FloatArray, Value, whole
 from ...errors import CertificateError, ModelError, counted
 from ...lti.discretisation import image_freq
 from ...lti.frequency import frequency_response
-from ...lti.interconnection import side_by_side
+from ...lti.interconnection import among, side_by_side
 from ...lti.modal import part_of
 from ...lti.statespace import StateSpace, System
 from ...tolerances import TINY
@@ -199,35 +199,26 @@ def opened(system: StateSpace, neglected: NeglectedModes, deltas: int) -> StateS
     Inputs `y1:neglected:w` pass the weights and add to the outputs; outputs `u1:neglected:z` are
     the inputs over their scales.
     """
-    W, n = neglected.weights, system.n_states
-    total = n + W.n_states
-    A = np.zeros((total, total))
-    A[:n, :n], A[n:, n:] = system.A, W.A
+    W, mirrored = neglected.weights, neglected.mirrored
+    of = W.output_index(mirrored.values())
     ends = [f"{name}:neglected:w" for name in neglected.outputs]
     starts = [f"{name}:neglected:z" for name in neglected.inputs]
+    pairs = zip(starts, neglected.inputs, strict=True)
+    scales = dict(zip(pairs, 1.0 / neglected.scales, strict=True))
     inputs = [*system.inputs[:deltas], *ends, *system.inputs[deltas:]]
     outputs = [*system.outputs[:deltas], *starts, *system.outputs[deltas:]]
-    column, row = ({name: i for i, name in enumerate(names)} for names in (inputs, outputs))
-    B, C = np.zeros((total, len(inputs))), np.zeros((len(outputs), total))
-    D = np.zeros((len(outputs), len(inputs)))
-    own_in, own_out = [column[name] for name in system.inputs], [row[n] for n in system.outputs]
-    B[:n, own_in], C[own_out, :n], D[np.ix_(own_out, own_in)] = system.B, system.C, system.D
-    B[n:, [column[name] for name in ends]] = W.B
-    for i, name in enumerate(neglected.outputs):
-        C[row[name], n:] = W.C[i]
-        D[row[name], column[ends[i]]] = W.D[i, i]
-    for name, of in neglected.mirrored.items():
-        C[row[name], n:] = -C[row[of], n:]
-        D[row[name], column[f"{of}:neglected:w"]] = -D[row[of], column[f"{of}:neglected:w"]]
-    for name, start, scale in zip(neglected.inputs, starts, neglected.scales, strict=True):
-        D[row[start], column[name]] = 1.0 / scale
+    weights = W.replace(
+        C=np.vstack([W.C, -W.C[of]]),
+        D=np.vstack([W.D, -W.D[of]]),
+        inputs=ends,
+        outputs=[*neglected.outputs, *mirrored],
+        units={},
+    )
+    whole = among(system, inputs, outputs, scales) + among(weights, inputs, outputs)
     blocks = None
     if system.blocks is not None and W.blocks is not None:
         blocks = [*system.blocks, *W.blocks]
-    return StateSpace(
-        A, B, C, D, system.dt, inputs=inputs, outputs=outputs, states=[*system.states, *W.states],
-        name=system.name, blocks=blocks,
-    )  # fmt: skip
+    return whole.replace(name=system.name, units={}, blocks=blocks)
 
 
 def _elastic(small: Partition, big: Partition) -> Pair:

@@ -6,6 +6,7 @@ import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.linalg as la
 
 from ...certificates import stability, stability_name
 from ...checks import FloatArray, positive, whole
@@ -14,7 +15,7 @@ from ...loop import close_loop
 from ...lti.balancing import balanced
 from ...lti.frequency import frequency_response
 from ...lti.grid import resonance_grid
-from ...lti.interconnection import feedback, lft, series
+from ...lti.interconnection import connect, feedback, lft, series
 from ...lti.modal import split_stable
 from ...lti.norms import peak_gain
 from ...lti.riccati import control_care, control_dare
@@ -235,26 +236,22 @@ def _weight(
     P: StateSpace, K: StateSpace, rows: list[str], F: FloatArray, size: float
 ) -> StateSpace:
     """Return W: from errors of u = N v and of y = M v to v, the loop of P and K closed."""
-    own = K.select(rows)
-    n, k, m = P.n_states, K.n_states, len(K.inputs)
-    B2, D22 = size * P.B, size * P.D
-    back = np.linalg.inv(np.eye(m) - D22 @ own.D)  # y = back (C x + D22 (C_K x_K + a) - b)
-    y_x, y_k, y_a, y_b = back @ P.C, back @ D22 @ own.C, back @ D22, -back
-    u_x, u_k, u_a, u_b = own.D @ y_x, own.C + own.D @ y_k, own.D @ y_a, own.D @ y_b
-    A = np.block([
-        [P.A + B2 @ u_x, B2 @ u_k],
-        [K.B @ y_x, K.A + K.B @ y_k],
-    ])  # fmt: skip
-    B = np.block([[B2 @ (np.eye(len(rows)) + u_a), B2 @ u_b], [K.B @ y_a, K.B @ y_b]])
-    C = np.hstack([y_x, y_k - F])
-    D = np.hstack([y_a, y_b])
-    # monitored outputs of the controller do not act on the loop
-    into = np.zeros((B.shape[1], len(K.outputs) + m))
-    for i, name in enumerate(rows):
-        into[i, K.outputs.index(name)] = 1.0
-    into[len(rows) :, len(K.outputs) :] = np.eye(m)
-    assert A.shape == (n + k, n + k)  # noqa: S101 - the blocks were laid out so
-    return StateSpace(A, B @ into, C, D @ into, K.dt)
+    own, m = K.select(rows), len(K.inputs)
+    errors = [f"a:{name}" for name in K.outputs]  # monitored outputs do not act on the loop
+    pushed, v = [f"{name}|u" for name in rows], [f"v{i}" for i in range(m)]
+    y, read, missed = ([f"{kind}{i}" for i in range(m)] for kind in ("y", "in", "b"))
+    plant = P.replace(B=size * P.B, D=size * P.D, inputs=pushed, outputs=y, units={})
+    law = own.replace(
+        C=np.vstack([own.C, -F]),
+        D=np.vstack([own.D, np.eye(m)]),
+        inputs=read,
+        outputs=[*rows, *v],
+        units={},
+    )
+    gains = la.block_diag(np.tile(np.eye(len(rows)), 2), np.hstack([np.eye(m), -np.eye(m)]))
+    entering = [*rows, *(f"a:{name}" for name in rows), *y, *missed]
+    sums = StateSpace([], [], [], gains, K.dt, inputs=entering, outputs=[*pushed, *read])
+    return connect([plant, law, sums], [*errors, *missed], v)
 
 
 class LoopFacts(NamedTuple):
