@@ -42,6 +42,12 @@ def changed(mode, freq=0.0, damping=0.0):
     own = [g.states.index(f"mode{mode}:{part}") for part in "qv"]
     A[own[1], own[0]] *= (1.0 + freq) ** 2  # its stiffness: the damping force stays
     A[own[1], own[1]] *= 1.0 + damping
+    return closed_by_hand(A)
+
+
+def closed_by_hand(A):
+    """A of the closed loop with the plant's A given, and what S at u is made of."""
+    g = plant().continuous.system
     B = g.B[:, g.input_index(plant().u)]
     C = g.C[g.output_index(plant().y)]
     n, m = B.shape
@@ -57,6 +63,10 @@ def changed(mode, freq=0.0, damping=0.0):
 
 def radius(mode, **change):
     return np.abs(np.linalg.eigvals(changed(mode, **change)[0])).max()
+
+
+def closed_radius(A):
+    return np.abs(np.linalg.eigvals(closed_by_hand(A)[0])).max()
 
 
 def margin(mode, change, around):
@@ -144,3 +154,68 @@ def test_what_cannot_be_judged_is_refused():
         wild = fx.close_loop(plant(), block.replace(B=-block.B, D=-block.D))
     with pytest.raises(AssumptionError, match="unstable as it is"):
         wild.mode_tolerances()
+
+
+@cache
+def uncertain(share=0.001):
+    return plant().uncertain(frequency=share)
+
+
+def around(given):
+    with pytest.warns(FlexplantWarning, match="is known to") as said:
+        found = fx.close_loop(given, *loop().blocks)
+    return found, str(said[0].message)
+
+
+def test_a_loop_on_an_uncertain_plant_says_what_its_modes_hold_to():
+    found, said = around(uncertain())
+    fragile = tolerances()
+    worst = int(np.argmin(fragile.least))
+    assert found.tolerances.least[worst] == pytest.approx(fragile.least[worst], rel=1e-3)
+    mode, holds = fragile.modes[worst], 100 * fragile.least[worst]
+    assert f"mode {mode} ({fragile.freq[worst]:.4g} Hz) holds to {holds:.2g} %" in said
+    certificate = found.tolerances.certificate
+    assert certificate[f"mode {mode} holds to"] == pytest.approx(fragile.least[worst], rel=1e-3)
+    assert certificate[f"mode {mode} known to"] == 0.001
+    assert f"mode {mode} holds to" in repr(found)
+    assert loop().tolerances is None  # nothing was stated of that plant
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the loop hangs on")
+def test_draws_are_loops_around_machines_by_hand():
+    """Each machine's A is changed by hand: its poles and its least distance to -1 are the judge."""
+    found = loop().mode_tolerances(known=uncertain(0.002), draws=12, rng=3).draws
+    names = [delta.name for delta in uncertain(0.002).deltas]
+    seeds = np.random.default_rng(3).spawn(12)
+    drawn = [dict(zip(names, 0.5 * own.standard_normal(12), strict=True)) for own in seeds]
+    stable = []
+    for values in drawn:
+        g = plant().continuous.system
+        A = g.A.copy()
+        for name, value in values.items():
+            own = [g.states.index(f"{name.split(':')[0]}:{part}") for part in "qv"]
+            A[own[1], own[0]] *= 1.0 + 0.004 * value
+        stable.append(closed_radius(A) < 1.0)
+    assert np.array_equal(found.margins > 0, stable)
+    assert 0 < found.stable < 1
+    assert found.kept <= found.stable
+    again = loop().mode_tolerances(known=uncertain(0.002), draws=12, rng=3).draws
+    np.testing.assert_array_equal(found.margins, again.margins)
+    with pytest.raises(ModelError, match="UncertainPlant"):
+        loop().mode_tolerances(known=0.002, draws=3)
+
+
+@pytest.mark.slow
+def test_designs_say_what_their_modes_hold_to():
+    own = sampled(some_modes(ZETA, 6, attached=False), ports(asd=1e-2))
+    P = own.uncertain(frequency=1e-4)
+    observer = fx.design_static(P)
+    servo = fx.design_servo(P, bandwidth=40.0, observer=observer)
+    tuned = fx.design_loops(P, fx.Pid((2 * np.pi * 20.0) ** 2) * fx.Lead(20.0))
+    for found, blocks in ((servo, (observer, servo)), (tuned, (tuned,))):
+        alone = fx.close_loop(own, *blocks).mode_tolerances()
+        assert found.tolerances.least.min() == pytest.approx(alone.least.min(), rel=1e-2)
+        assert found.tolerances.summary in repr(found)
+        assert found.tolerances.draws.margins.size == 20
+    assert "stable of draws" in servo.certificate

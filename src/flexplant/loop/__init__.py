@@ -9,6 +9,7 @@ from .closed import close_loop as close_loop
 from .comparison import LoopComparison as LoopComparison
 from .comparison import LoopFigures as LoopFigures
 from .comparison import compare_loops as compare_loops
+from .machine_draws import MachineDraws as MachineDraws
 from .mode_tolerance import ModeTolerances as ModeTolerances
 from .report import LoopMargins as LoopMargins
 from .report import LoopReport as LoopReport

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -203,3 +203,24 @@ def with_known(plant: StandardPlant, systems: Sequence[StateSpace]) -> StandardP
     known = {(name, name): 1.0 for name in fresh}
     system = among(plant.system, [*w, *plant.u], [*plant.z, *y], known)
     return plant.replace(system=system, w=w, y=y)
+
+
+def tapped(
+    plant: StandardPlant, driven: Sequence[str], watched: Sequence[str], units: Mapping[str, str]
+) -> StateSpace:
+    """Return [w; driven; watched] -> [z; y; driven; watched; y of the loop], named `y1|loop`."""
+    shown, taps = [*plant.z, *plant.y, *driven, *watched], [*driven, *watched]
+    back = inner_names((f"{name}|loop" for name in plant.y), shown)
+    g, seen = plant.system, [*plant.z, *plant.y, *plant.y]
+    rows, columns = g.output_index(seen), g.input_index([*plant.w, *driven])
+    g = g.replace(
+        B=g.B[:, columns],
+        C=g.C[rows],
+        D=g.D[np.ix_(rows, columns)],
+        inputs=[*plant.w, *driven],
+        outputs=[*plant.z, *plant.y, *back],
+        units={},
+        blocks=None,
+    )
+    whole = among(g, [*plant.w, *taps], [*shown, *back], {(name, name): 1.0 for name in taps})
+    return whole.replace(units=units)

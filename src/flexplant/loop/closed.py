@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,15 +10,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import ComplexArray, FloatArray, Value, inner_names, name_list
+from ..certificates import in_words
+from ..checks import ComplexArray, FloatArray, Value, name_list
 from ..errors import ModelError, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
-from ..lti.interconnection import among, lft, loop_poles
+from ..lti.interconnection import lft, loop_poles
 from ..lti.norms import Obstacle, obstacle
 from ..lti.responses import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant, standard_plant
-from .blocks import as_block, check_inputs, commands, drives, joined, with_known
+from ..plant.uncertainty.uncertain_plant import UncertainPlant
+from .blocks import as_block, check_inputs, commands, drives, joined, tapped, with_known
 from .broken import BrokenLoop, Path, plant_path
 from .budget import (
     ErrorBudget,
@@ -31,7 +33,13 @@ from .budget import (
     sources,
     stationary_row,
 )
-from .mode_tolerance import ModeTolerances, mode_tolerances
+from .mode_tolerance import (
+    MARGIN,
+    ModeTolerances,
+    machine_draws,
+    mode_tolerances,
+    reported_tolerances,
+)
 from .spill_over import SpillOver, growing_modes, high
 
 
@@ -90,6 +98,8 @@ class ClosedLoop(Value):
             lines.append(f"  monitored: {shown}")
         if self.left_out is not None:
             lines.append(f"  with the modes left out: {self.left_out.summary}")
+        if self.tolerances is not None:
+            lines.append(f"  {in_words(self.tolerances.certificate)}")
         return "\n".join(lines)
 
     @property
@@ -271,7 +281,7 @@ class ClosedLoop(Value):
         """The same controller closed around the plant with the modes left out; None: not known."""
         if self.larger is None:
             return None
-        return ClosedLoop(self.larger, self.blocks, self.controller, self.idle)
+        return self.around(self.larger)
 
     @cached_property
     def left_out(self) -> SpillOver | None:
@@ -302,7 +312,32 @@ class ClosedLoop(Value):
         """
         return self.broken.margin()
 
-    def mode_tolerances(self, *, margin: float = 0.35, known: Any = None) -> ModeTolerances:
+    @cached_property
+    def tolerances(self) -> ModeTolerances | None:
+        """What modes of uncertain frequency hold to, and 20 machines drawn; None: nothing stated.
+
+        With the modes left out, where they are known. Frequencies are followed to 1 %, or to 2.5
+        times what is known.
+        """
+        return reported_tolerances(self)
+
+    def around(self, plant: StandardPlant) -> ClosedLoop:
+        """Return the loop of the same controller around another machine with the same channels.
+
+        Parameters
+        ----------
+        plant : StandardPlant
+            With this plant's u and y, sampled alike.
+
+        Returns
+        -------
+        ClosedLoop
+        """
+        return ClosedLoop(with_known(plant, self.blocks), self.blocks, self.controller, self.idle)
+
+    def mode_tolerances(
+        self, *, margin: float = MARGIN, known: Any = None, draws: int = 0, rng: Any = 0
+    ) -> ModeTolerances:
         """Return by how much each mode's frequency and damping may be off before the loop fails.
 
         One mode at a time, the others as they are, exactly: the change at which a pole crosses the
@@ -315,12 +350,17 @@ class ClosedLoop(Value):
         margin : float
             Modulus margin, broken at u, that shall be kept.
         known : UncertainPlant, float, (m,) array or {mode: float}, optional
-            By what share each elastic mode's frequency may be off.
+            By what share each elastic mode's frequency may be off; what the plant says itself when
+            not given.
+        draws : int
+            Machines drawn from that uncertain plant, everything off at once; none by default.
+        rng : int, SeedSequence, Generator or None
+            Of the draws.
 
         Returns
         -------
         ModeTolerances
-            Print it; `least`, `critical` for scripts.
+            Print it; `least`, `critical`, `draws` for scripts.
 
         Raises
         ------
@@ -335,7 +375,12 @@ class ClosedLoop(Value):
         FlexplantWarning
             When a mode holds to less than twice what is known of it.
         """
-        return mode_tolerances(self.plant, self.broken, margin=margin, known=known)
+        known = self.plant.uncertainty if known is None else known
+        found = mode_tolerances(self.plant, self.broken, margin=margin, known=known)
+        if draws:
+            found = found.replace(draws=machine_draws(self, known, margin, draws, rng))
+        found.warn_of_critical()
+        return found
 
     def rms(self, channel: str) -> float:
         """Return the stationary rms of a signal under all white noises, in closed form.
@@ -443,29 +488,11 @@ class ClosedLoop(Value):
         return row, self._white
 
 
-def tapped(
-    plant: StandardPlant, driven: Sequence[str], watched: Sequence[str], units: Mapping[str, str]
-) -> StateSpace:
-    """Return [w; driven; watched] -> [z; y; driven; watched; y of the loop], named `y1|loop`."""
-    shown, taps = [*plant.z, *plant.y, *driven, *watched], [*driven, *watched]
-    back = inner_names((f"{name}|loop" for name in plant.y), shown)
-    g, seen = plant.system, [*plant.z, *plant.y, *plant.y]
-    rows, columns = g.output_index(seen), g.input_index([*plant.w, *driven])
-    g = g.replace(
-        B=g.B[:, columns],
-        C=g.C[rows],
-        D=g.D[np.ix_(rows, columns)],
-        inputs=[*plant.w, *driven],
-        outputs=[*plant.z, *plant.y, *back],
-        units={},
-        blocks=None,
-    )
-    whole = among(g, [*plant.w, *taps], [*shown, *back], {(name, name): 1.0 for name in taps})
-    return whole.replace(units=units)
-
-
 def close_loop(
-    plant: StandardPlant | System, *blocks: Any, idle: Iterable[str] = (), larger: Any = None
+    plant: StandardPlant | UncertainPlant[Any] | System,
+    *blocks: Any,
+    idle: Iterable[str] = (),
+    larger: Any = None,
 ) -> ClosedLoop:
     """Return the closed loop of a plant with controller blocks, connected by name.
 
@@ -478,9 +505,10 @@ def close_loop(
 
     Parameters
     ----------
-    plant : StandardPlant, StateSpace or control.StateSpace
-        The plant; a system whose channels are named like those of an assembled plant (see
-        `StandardPlant.from_statespace`) is one.
+    plant : StandardPlant, UncertainPlant, StateSpace or control.StateSpace
+        The plant; of an uncertain one the nominal plant, and the repr says what its modes hold to
+        (`ClosedLoop.tolerances`). A system whose channels are named like those of an assembled
+        plant (see `StandardPlant.from_statespace`) is one.
     *blocks : StateSpace, or values with a `system` such as KalmanEstimator and Controller
         The controller in any number of parts. Sampled at the plant's rate, or static gains.
     idle : iterable of str
@@ -498,8 +526,9 @@ def close_loop(
     Warns
     -----
     FlexplantWarning
-        When the closed loop is unstable, or is with the modes that the plant left out; it is
-        returned all the same, for inspection. Marginal poles (a rigid-body mode that nothing
+        When the closed loop is unstable, or is with the modes that the plant left out, or a mode of
+        an uncertain plant holds to less than twice what is known of it; it is returned all the
+        same. Marginal poles (a rigid-body mode that nothing
         holds) are named by its repr alone.
 
     Raises
@@ -556,6 +585,8 @@ def close_loop(
             "The machine has these modes: lower the bandwidth, keep them in the plant, or let the "
             "controller roll off (or notch) before them."
         )
+    if loop.tolerances is not None:
+        loop.tolerances.warn_of_critical()
     return loop
 
 

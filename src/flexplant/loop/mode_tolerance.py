@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, positive
+from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, whole
 from ..errors import AssumptionError, ModelError, counted, warn
 from ..lti.responses import Responder, points, responder
 from ..lti.statespace import StateSpace
@@ -21,6 +21,7 @@ from ..plant.uncertainty.uncertain_plant import (
 )
 from ..tolerances import SETTLED, TINY
 from .broken import BrokenLoop, inverted
+from .machine_draws import MachineDraws
 
 #: relative change of frequency up to which a mode is followed
 LIMIT = 0.05
@@ -42,6 +43,11 @@ _LEAST = 1e-6
 _TRIED, _HALVINGS = 16, 8
 #: the tolerance is to be so many times what is known of a mode
 _SAFE = 2.0
+#: modulus margin to which tolerances are stated: |S| at u of 2.9, 9 dB
+MARGIN = 0.35
+#: relative change of a frequency to which a report follows a mode (a model that was updated is
+#: seldom further off), and machines that it draws: a second of work at most
+_FOLLOWED, _DRAWS = 0.01, 20
 #: rows of the table
 _SHOWN = 5
 
@@ -71,6 +77,8 @@ class ModeTolerances(Value):
         Largest relative change of frequency examined.
     known : (m,) array, optional
         Relative uncertainty of each frequency.
+    draws : MachineDraws, optional
+        Machines on which all that is uncertain is off at once.
 
     Examples
     --------
@@ -93,6 +101,7 @@ class ModeTolerances(Value):
     margin: float
     limit: FloatArray
     known: FloatArray | None = None
+    draws: MachineDraws | None = None
 
     @property
     def least(self) -> FloatArray:
@@ -125,6 +134,42 @@ class ModeTolerances(Value):
             f"leads to {to}"
         )
 
+    @property
+    def certificate(self) -> dict[str, float]:
+        """What the mode that is nearest to what is known of it holds to, and the draws."""
+        found: dict[str, float] = {}
+        if self.modes.size:
+            known = np.ones_like(self.least) if self.known is None else self.known
+            with np.errstate(divide="ignore"):
+                worst = int(np.argmin(self.least / known))
+            name = f"mode {self.modes[worst]}"
+            found[f"{name} holds to"] = float(self.least[worst])
+            if self.known is not None:
+                found[f"{name} known to"] = float(self.known[worst])
+        if self.draws is not None:
+            found |= {"stable of draws": self.draws.stable, "margin kept of draws": self.draws.kept}
+        return found
+
+    def warn_of_critical(self) -> None:
+        """Warn of modes that hold to less than twice what is known of them."""
+        if self.known is None or not self.critical:
+            return
+        said = [
+            f"mode {mode} ({freq:.4g} Hz) holds to {100 * least:.2g} %, is known to "
+            f"{100 * known:.2g} %"
+            for mode, freq, least, known in zip(
+                self.modes, self.freq, self.least, self.known, strict=True
+            )
+            if mode in self.critical
+        ]
+        more = f" and {len(said) - _SHOWN} more" if len(said) > _SHOWN else ""
+        drawn = "" if self.draws is None else f" Of machines drawn {self.draws.summary}."
+        warn(
+            "the loop hangs on frequencies that are not known well enough: "
+            f"{'; '.join(said[:_SHOWN])}{more}.{drawn} Measure these modes, or design for their "
+            "uncertainty: design_stage(plant.uncertain(...))."
+        )
+
     def __repr__(self) -> str:
         lines = [f"<ModeTolerances of {counted(self.modes.size, 'mode')}: {self.summary}"]
         known = "" if self.known is None else "     known to"
@@ -138,6 +183,8 @@ class ModeTolerances(Value):
             )
         if self.modes.size > _SHOWN:
             lines.append(f"  ... and {self.modes.size - _SHOWN} more")
+        if self.draws is not None:
+            lines.append(f"  all at once: {self.draws.summary}")
         return "\n".join(lines) + ">"
 
 
@@ -151,7 +198,12 @@ def _ends(ends: FloatArray, limit: float) -> str:
 
 
 def mode_tolerances(
-    plant: StandardPlant, broken: BrokenLoop, *, margin: float, known: Any = None
+    plant: StandardPlant,
+    broken: BrokenLoop,
+    *,
+    margin: float,
+    known: Any = None,
+    limit: float = LIMIT,
 ) -> ModeTolerances:
     r"""Return the smallest changes of each mode that harm a stable loop.
 
@@ -174,10 +226,10 @@ def mode_tolerances(
         raise AssumptionError(
             "the loop is unstable as it is: no mode has a tolerance. Stabilise it first."
         )
-    limit = np.minimum(LIMIT, _ASIDE / _TO_A_WIDTH * zeta)
+    limits = np.minimum(limit, _ASIDE / _TO_A_WIDTH * zeta)
     grids = [
         _around(f, z, end, broken.grid, plant.dt)
-        for f, z, end in zip(freq, zeta, limit, strict=True)
+        for f, z, end in zip(freq, zeta, limits, strict=True)
     ]
     channels = _LoopChannels.of(plant, broken)
     shape = (modes.size, 2)
@@ -185,31 +237,43 @@ def mode_tolerances(
     moved, damped = _changes(plant, modes, "freq"), _changes(plant, modes, "damping")
     for i, (grid, move, damp) in enumerate(zip(grids, moved, damped, strict=True)):
         sweep = channels.at(grid, move)
-        stable[i] = _crossings(channels, move, grid, sweep, (-limit[i], limit[i]))
-        within[i] = _margins(sweep, stable[i], limit[i], 1.0 / margin)
+        stable[i] = _crossings(channels, move, grid, sweep, (-limits[i], limits[i]))
+        within[i] = _margins(sweep, stable[i], limits[i], 1.0 / margin)
         sweep = channels.at(grid, damp)
         damping[i] = _crossings(channels, damp, grid, sweep, _DAMPINGS)
     own = _known(known, modes)
-    found = ModeTolerances(modes, freq, stable, within, damping, margin, limit, own)
-    _warn_of_critical(found)
-    return found
+    return ModeTolerances(modes, freq, stable, within, damping, margin, limits, own)
 
 
-def _warn_of_critical(found: ModeTolerances) -> None:
-    """Warn of modes that hold to less than twice what is known of them."""
-    if found.known is None or not found.critical:
-        return
-    said = [
-        f"mode {mode} ({freq:.4g} Hz) holds to {100 * least:.2g} %, known to {100 * known:.2g} %"
-        for mode, freq, least, known in zip(
-            found.modes, found.freq, found.least, found.known, strict=True
+def machine_draws(
+    loop: Any, uncertain: object, margin: float, count: int, rng: Any = 0
+) -> MachineDraws:
+    """Return the margins of a closed loop's controller on machines of an uncertain plant."""
+    if not isinstance(uncertain, UncertainPlant):
+        raise ModelError(
+            "machines are drawn from an UncertainPlant: close the loop on "
+            "plant.uncertain(frequency=...), or pass it as known=."
         )
-        if mode in found.critical
-    ]
-    warn(
-        f"the loop hangs on frequencies that are not known well enough: {'; '.join(said)}. "
-        "Measure these modes, or design for their uncertainty: design_stage(plant.uncertain(...))."
-    )
+    loops = map(loop.around, uncertain.sample(rng, whole(count, "draws")))
+    margins = [one.modulus_margin if one.is_stable else 0.0 for one in loops]
+    return MachineDraws(np.array(margins), margin)
+
+
+def reported_tolerances(loop: Any) -> ModeTolerances | None:
+    """Return what the modes of a closed loop hold to beside what its plant says of them."""
+    uncertain, whole_loop = loop.plant.uncertainty, loop.completed or loop
+    if uncertain is None or not uncertain.frequencies or not whole_loop.is_stable:
+        return None
+    known = uncertain.frequencies
+    limit = min(max(_FOLLOWED, 1.25 * _SAFE * max(known.values())), LIMIT)
+    try:
+        found = mode_tolerances(
+            whole_loop.plant, whole_loop.broken, margin=MARGIN, known=known, limit=limit
+        )
+    except ModelError as error:
+        warn(f"what the modes of the loop hold to is not computed: {error}")
+        return None
+    return found.replace(draws=machine_draws(loop, uncertain, MARGIN, _DRAWS))
 
 
 def _elastic(plant: StandardPlant) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -347,7 +411,11 @@ class _Sweep(NamedTuple):
     def sensitivity(self, delta: float) -> ComplexArray:
         """Return S at u with the mode changed."""
         H, rest = self.matrix(delta)
-        return np.asarray(self.S + self.Q @ np.linalg.solve(H, rest @ self.S))
+        turned = np.empty_like(H)  # H^-1 by its adjugate
+        turned[:, 0, 0], turned[:, 1, 1] = H[:, 1, 1], H[:, 0, 0]
+        turned[:, 0, 1], turned[:, 1, 0] = -H[:, 0, 1], -H[:, 1, 0]
+        turned /= _det(H)[:, None, None]
+        return np.asarray(self.S + self.Q @ (turned @ (rest @ self.S)))
 
     def roots(self) -> ComplexArray:
         """Return the complex change (n,) nearest to none at which there is a pole at each point."""
@@ -437,14 +505,18 @@ def _margins(sweep: _Sweep, stable: FloatArray, limit: float, size: float) -> Fl
 def _exceeds(sweep: _Sweep, delta: float, size: float) -> bool:
     """Return whether sigma_max of S(delta) reaches a size anywhere.
 
-    The Frobenius norm is between sigma_max and sigma_max times the root of the rank: it decides
-    at most points.
+    Between ``||(S* S)^2||_F^(1/4)`` and that over the eighth root of the size of S lies sigma_max:
+    it decides at most points.
     """
     S = sweep.sensitivity(delta)
-    norm = np.sqrt(np.sum(S.real**2 + S.imag**2, axis=(1, 2)))
-    if np.any(norm >= size * np.sqrt(S.shape[1])):
+    square = S.conj().swapaxes(1, 2) @ S
+    fourth = square @ square
+    norm = np.sum(fourth.real**2 + fourth.imag**2, axis=(1, 2)) ** 0.125
+    if np.any(norm >= size * S.shape[1] ** 0.125):
         return True
     open_points = norm >= size
+    if not np.any(open_points):
+        return False
     return bool(np.any(np.linalg.norm(S[open_points], 2, axis=(1, 2)) >= size))
 
 

@@ -310,7 +310,7 @@ class StandardPlant(Partition):
         return AssumptionReport(self)
 
 
-def standard_plant(given: StandardPlant | System) -> StandardPlant:
+def standard_plant(given: StandardPlant | UncertainPlant[StandardPlant] | System) -> StandardPlant:
     """Return a StandardPlant, also of a system whose labels distinguish w, u, z and y.
 
     Called by all functions that take a plant.

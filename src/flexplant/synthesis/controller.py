@@ -13,7 +13,7 @@ import numpy as np
 from ..certificates import in_words, stability, stability_name
 from ..checks import ComplexArray, FloatArray, Value
 from ..errors import CertificateError, FlexplantWarning, counted, warn
-from ..loop import SpillOver, close_loop
+from ..loop import ClosedLoop, ModeTolerances, SpillOver, close_loop
 from ..lti.norms import peak_gain
 from ..lti.preparation import Prepared
 from ..lti.responses import Responder, responder
@@ -44,6 +44,9 @@ class Controller(Value):
         is what the weights require. The largest is close to gamma.
     left_out : SpillOver, optional
         How the loop stands on the plant with the modes left out, where these are known.
+    tolerances : ModeTolerances, optional
+        Of an uncertain plant: by what each mode may be off before the loop fails, beside what is
+        known of it, and machines drawn.
     notes : sequence of str
         What the certificate does not cover, and what else is worth knowing.
     structure : FixedOrder, TunedLaws or ObserverGains, optional
@@ -69,6 +72,7 @@ class Controller(Value):
     notes: tuple[str, ...] = ()
     structure: Value | None = None
     tried: Mapping[str, float] | None = None
+    tolerances: ModeTolerances | None = None
 
     def __post_init__(self) -> None:
         self._set(
@@ -95,6 +99,8 @@ class Controller(Value):
             lines.append(f"  verified: {in_words(own)}")
         if self.left_out is not None:
             lines.append(f"  with the modes left out: {self.left_out.summary}")
+        if self.tolerances is not None:
+            lines.append(f"  {self.tolerances.summary}")
         lines += [f"  {note}" for note in self.notes]
         return "\n".join(lines)
 
@@ -224,34 +230,55 @@ def _peak(H: ComplexArray) -> tuple[float, int]:
 CLOSE = ", and one that differs a little from the model may be unstable"
 
 
-def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> SpillOver | None:
-    """Return the check of a design's loop with the modes left out; None: they are not known."""
-    whole = larger_plant(plant, larger)
-    if whole is None:
-        return None
+def checked_loop(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> ClosedLoop | None:
+    """Return a design's loop, with warnings of what modes do to it; None: nothing to check it by.
+
+    With the modes left out, where they are known, and with what its plant says of frequencies.
+    """
     plain, reading = plant.unweighted, plant.origin.reading
+    whole = larger_plant(plant, larger)
+    if whole is None and plain.uncertainty is None:
+        return None
     before = [] if reading is None else [reading]
     with warnings.catch_warnings():  # one warning is enough, where the user called from
         warnings.simplefilter("ignore", FlexplantWarning)
-        found = close_loop(plain, *before, *blocks, larger=whole).left_out
+        loop = close_loop(plain, *before, *blocks, larger=whole)
+    found = loop.left_out
     if found is not None and not found.is_fine:
         warn(
             f"with the modes that the plant left out the loop is {found.summary}. The machine has "
             f"these modes{CLOSE if found.is_high else ''}: choose less bandwidth, keep them in "
             "the plant, or weight the efforts (or roll the controller off) before them."
         )
-    return found
+    if loop.tolerances is not None:
+        loop.tolerances.warn_of_critical()
+    return loop
 
 
 def with_left_out(
     answer: Controller, plant: StandardPlant, larger: Any, block: StateSpace | None = None
 ) -> Controller:
-    """Return an answer with its check on the modes left out; `block` is its part from y to u."""
-    found = spill_over(plant, [answer.system if block is None else block], larger)
-    if found is None:
-        return answer.replace(notes=(*answer.notes, *unchecked(plant)))
-    certificate = dict(answer.certificate or {}) | found.certificate
-    return answer.replace(certificate=certificate, left_out=found)
+    """Return an answer with its check on the modes left out, or the note that none are known.
+
+    The block is its part from the plant's y to u, unless all of its system is.
+    """
+    loop = checked_loop(plant, [answer.system if block is None else block], larger)
+    return with_checks(answer, plant, loop)
+
+
+def with_checks(answer: Controller, plant: StandardPlant, loop: ClosedLoop | None) -> Controller:
+    """Return an answer with what its loop says of modes left out and of uncertain ones."""
+    left_out = None if loop is None else loop.left_out
+    tolerances = None if loop is None else loop.tolerances
+    certificate = dict(answer.certificate or {})
+    for found in (left_out, tolerances):
+        certificate |= {} if found is None else found.certificate
+    return answer.replace(
+        certificate=certificate,
+        left_out=left_out,
+        tolerances=tolerances,
+        notes=answer.notes if left_out is not None else (*answer.notes, *unchecked(plant)),
+    )
 
 
 def unchecked(plant: StandardPlant) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from ..errors import AssumptionError, ModelError
 from ..lti.preparation import Prepared
 from ..lti.statespace import System
 from ..plant import StandardPlant, standard_plant
+from ..plant.uncertainty.uncertain_plant import UncertainPlant
 from ..tolerances import TINY
 
 #: relative: poles so small are zero, real parts above this are not stable
@@ -30,7 +32,10 @@ _ROLES = {
 
 
 def posed(
-    given: StandardPlant | System, u: Sequence[str] | None, y: Sequence[str] | None, what: str
+    given: StandardPlant | UncertainPlant[Any] | System,
+    u: Sequence[str] | None,
+    y: Sequence[str] | None,
+    what: str,
 ) -> StandardPlant:
     """Return the plant of a synthesis: u and y named where it has no names of its own."""
     if u is None and y is None:

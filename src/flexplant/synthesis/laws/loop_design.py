@@ -10,7 +10,7 @@ import numpy as np
 
 from ...checks import FloatArray, Value, name_list, short
 from ...errors import LabelError, ModelError, counted, require_known, warn
-from ...loop import LoopReport, SpillOver, in_axes, report_loops
+from ...loop import LoopReport, ModeTolerances, SpillOver, in_axes, report_loops
 from ...loop.axes import static_map
 from ...loop.sensitivity import taken_apart
 from ...lti.frequency import Frf
@@ -18,7 +18,8 @@ from ...lti.interconnection import series, side_by_side
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import StandardPlant, decouple
-from ..controller import spill_over, unchecked
+from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ..controller import checked_loop, unchecked
 from .law import Element, Law
 
 
@@ -38,6 +39,8 @@ class LoopDesign(Value):
         How the loop stands on a model with the modes left out, where these are known.
     notes : sequence of str
         What is worth knowing.
+    tolerances : ModeTolerances, optional
+        Of an uncertain plant: by what each mode may be off before the loop fails.
 
     Examples
     --------
@@ -52,6 +55,7 @@ class LoopDesign(Value):
     report: LoopReport
     left_out: SpillOver | None = None
     notes: tuple[str, ...] = ()
+    tolerances: ModeTolerances | None = None
 
     def __repr__(self) -> str:
         axes = ", ".join(self.laws)
@@ -60,6 +64,8 @@ class LoopDesign(Value):
         lines += [f"  law of {axis}: {law!r}" for axis, law in list(self.laws.items())[:4]]
         if self.left_out is not None:
             lines.append(f"  with the modes left out: {self.left_out.summary}")
+        if self.tolerances is not None:
+            lines.append(f"  {self.tolerances.summary}")
         return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
 
 
@@ -88,6 +94,7 @@ def axes_of(
     hold: bool,
 ) -> Axes:
     """Return a plant in its decoupled axes; parameters as for `design_loops`."""
+    plant = getattr(plant, "nominal", plant)  # of an uncertain one
     given = plant if isinstance(plant, StandardPlant) else None
     if hasattr(plant, "frdata"):
         plant = Frf.from_control(plant)
@@ -131,7 +138,7 @@ def axes_controller(axes: Axes, laws: Mapping[str, Law]) -> StateSpace:
 
 @one_thread()
 def design_loops(
-    plant: StandardPlant | System | Frf,
+    plant: StandardPlant | UncertainPlant[Any] | System | Frf,
     laws: Element | Mapping[str, Element],
     *,
     before: System | FloatArray | None = None,
@@ -151,7 +158,7 @@ def design_loops(
 
     Parameters
     ----------
-    plant : StandardPlant, StateSpace or Frf
+    plant : StandardPlant, UncertainPlant, StateSpace or Frf
         Of an assembled StandardPlant the rigid-body axes are taken (`decouple`), unless `before`
         and `after` are given.
     laws : Law or mapping {axis: Law}
@@ -235,10 +242,16 @@ def made(
     report = report_loops((axes.plant, inner), at="y", rigid=rigid, unstable=unstable)
     system = connected(axes, inner, references or {}).replace(name="loops")
     feedback = system.select(inputs=axes.after.inputs)  # references take no part in the loop
-    left_out = None if axes.given is None else spill_over(axes.given, [feedback], larger)
+    loop = None if axes.given is None else checked_loop(axes.given, [feedback], larger)
+    left_out = None if loop is None else loop.left_out
     lacking = axes.given is not None and left_out is None
     return LoopDesign(
-        system, laws, report, left_out, unchecked(axes.given) if lacking and axes.given else ()
+        system,
+        laws,
+        report,
+        left_out,
+        unchecked(axes.given) if lacking and axes.given else (),
+        None if loop is None else loop.tolerances,
     )
 
 

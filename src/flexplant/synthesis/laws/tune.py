@@ -17,6 +17,7 @@ from ...lti.interconnection import series
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant, larger_plant
+from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..servo.servo_loop import TARGET
 from .axis_law import AxisLaw, MeasuredAxis
 from .joint_plant import JointPlant, Worst
@@ -30,7 +31,7 @@ _ZERO = 1e-6
 
 @one_thread()
 def tune_loops(
-    plant: StandardPlant | System | Frf,
+    plant: StandardPlant | UncertainPlant[Any] | System | Frf,
     *,
     before: System | FloatArray | None = None,
     after: System | FloatArray | None = None,

@@ -124,8 +124,7 @@ class UncertainLoop(OpenPlant):
 
     def around(self, plant: StandardPlant) -> ClosedLoop:
         """Return the controller's loop around another machine."""
-        nominal = self.loop
-        return ClosedLoop(plant, nominal.blocks, nominal.controller, nominal.idle)
+        return self.loop.around(plant)
 
 
 def open_plant(

@@ -20,6 +20,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import Poi, StandardPlant, larger_plant, standard_plant
 from ...plant.rigid.rigid_motion import RigidModes, require_weak
+from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import SAME
 from ..controller import CLOSE, Controller, unchecked
 from .servo_loop import (
@@ -38,7 +39,7 @@ from .servo_loop import (
 
 @one_thread()
 def design_servo(
-    plant: StandardPlant,
+    plant: StandardPlant | UncertainPlant[Any],
     *,
     bandwidth: float,
     poi: str | None = None,
@@ -160,11 +161,15 @@ def design_servo(
             f"{left_out.summary}. The machine has these modes{CLOSE if left_out.is_high else ''}. "
             f"{advice}"
         )
+    if closed.tolerances is not None:
+        closed.tolerances.warn_of_critical()
+        certificate |= closed.tolerances.certificate
     return Controller(
         task.controller(axis),
         f"servo {bandwidth:g} Hz on {task.poi.name!r}",
         certificate=certificate,
         left_out=left_out,
+        tolerances=closed.tolerances,
         notes=_notes(task, axis, left_out is not None),
     )
 
@@ -392,7 +397,7 @@ class ServoTask:
 
 
 def servo_task(
-    given: StandardPlant,
+    given: StandardPlant | UncertainPlant[Any],
     poi: str | None,
     rolloff: float | None,
     integrator: float | None,
