@@ -322,17 +322,7 @@ class ClosedLoop(Value):
         return reported_tolerances(self)
 
     def around(self, plant: StandardPlant) -> ClosedLoop:
-        """Return the loop of the same controller around another machine with the same channels.
-
-        Parameters
-        ----------
-        plant : StandardPlant
-            With this plant's u and y, sampled alike.
-
-        Returns
-        -------
-        ClosedLoop
-        """
+        """Return the loop of the same controller around a machine with the same u, y and rate."""
         return ClosedLoop(with_known(plant, self.blocks), self.blocks, self.controller, self.idle)
 
     def mode_tolerances(
