@@ -65,6 +65,12 @@ def test_draws_spread_as_stated():
         ({"frequency": [0.01, 0.02]}, fx.FlexplantError, "frequency of a mode"),
         ({"damping": 1.5}, ModelError, "damping of mode 4"),
         ({}, ModelError, "frequency=0.005"),
+        ({"gain": {"u9": 0.1}}, LabelError, "u9"),
+        ({"gain": {"u1": 1.5}}, ModelError, "sign is not known"),
+        ({"delay": 3.0}, ModelError, "cannot become negative"),
+        ({"parameters": {}}, ModelError, "empty"),
+        ({"parameters": {"mass": 0.1}}, ModelError, "AddedMass"),
+        ({"parameters": {fx.AddedMass("1:z"): 0.1}, "delay": 0.1}, ModelError, "alone"),
     ],
 )
 def test_what_cannot_be_stated_is_refused(arguments, error, said):
@@ -76,3 +82,96 @@ def test_a_fit_and_a_stated_share_exclude_each_other():
     measured = fx.MeasuredModes([-1 + 1500j], modes=[4], covariance=np.eye(2))
     with pytest.raises(ModelError, match="Pass one or the other"):
         plant().uncertain(measured, frequency=0.01)
+
+
+def response(system, freq):
+    """The responses (p, m) of a system at z or s of a frequency [Hz], by its matrices."""
+    s = np.exp(2j * np.pi * freq * system.dt) if system.dt else 2j * np.pi * freq
+    A, B, C, D = system.A, system.B, system.C, system.D
+    return C @ np.linalg.solve(s * np.eye(len(A)) - A, B) + D
+
+
+def closed_deltas(uncertain, values):
+    """The plant of some Deltas by the definition of the channels: w = delta z, by hand."""
+    g = uncertain.system
+    k = len(g.inputs) - len(uncertain.plant.w) - len(uncertain.plant.u)
+    H = response(g, 130.0)
+    owner = [uncertain.channels[name.removesuffix(":w")] for name in g.inputs[:k]]
+    delta = np.diag([values[name] for name in owner])
+    return H[k:, k:] + H[k:, :k] @ delta @ np.linalg.solve(np.eye(k) - H[:k, :k] @ delta, H[:k, k:])
+
+
+def test_gains_of_actuators_and_sensors():
+    uncertain = plant().uncertain(frequency={4: 0.01}, gain={"u1": 0.05, "y2": 0.02})
+    values = {"mode4:freq": 0.5, "u1:gain": 1.0, "y2:gain": -0.5}
+    machine = uncertain.lft(values)
+    only = uncertain.lft({"mode4:freq": 0.5})
+    scale = np.ones((len(plant().y), len(plant().u)))
+    scale[:, 0] *= 1.05
+    scale[1] *= 0.99
+    found, base = (response(one.Gyu, 130.0) for one in (machine, only))
+    np.testing.assert_allclose(found, scale * base, rtol=1e-9, atol=1e-20)
+    wanted = response(machine.continuous.system, 130.0)
+    made = closed_deltas(uncertain, values)
+    np.testing.assert_allclose(made, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+    # commands are not scaled, and neither is the noise
+    assert machine.system.D[machine.system.outputs.index("u1:effort")].max() == 1.0
+    noise = machine.system.outputs.index("y2"), machine.system.inputs.index("y2:noise")
+    assert machine.system.D[noise] == 1.0
+
+
+def test_the_delay():
+    uncertain = plant().uncertain(delay=0.2)
+    machine = uncertain.lft({"delay": -0.5})
+    wanted = plant().continuous.discretized(1.0 / plant().dt, delay=plant().delay - 0.1)
+    found = response(machine.system, 130.0)
+    np.testing.assert_allclose(found, response(wanted.system, 130.0), rtol=1e-9, atol=1e-20)
+    assert len({one.delay for one in uncertain.sample(1, 4)}) == 4
+
+
+def spring_of_masses(extra=0.0):
+    model = fx.chain(masses=[1.0, 1.0, 1.0 + extra], stiffnesses=[4e5, 4e5])
+    modes = fx.solve_modes(model, count=3, damping=fx.ModalDamping(0.01))
+    drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    ports = fx.testbeds.three_masses().assembled.ports
+    return fx.assemble_plant(drawing, ports).discretized(2e3, delay=1)
+
+
+def test_a_parameter_of_the_model():
+    """A mass known to 5 %: the machine is that of the heavier chain, shapes and all."""
+    uncertain = spring_of_masses().uncertain(parameters={fx.AddedMass("3:x"): 0.05})
+    assert "mass at 3:x" in repr(uncertain)
+    assert "+- 0.05 kg" in repr(uncertain)
+    found = uncertain.lft({"mass at 3:x": 1.0})
+    model = fx.chain(masses=[1.0, 1.0, 1.05], stiffnesses=[4e5, 4e5])
+    poles = np.linalg.eigvalsh(model.K.toarray() / np.sqrt(np.outer(*[model.M.diagonal()] * 2)))
+    np.testing.assert_allclose(swing(found)[0], np.sqrt(poles[1:]), rtol=1e-3)
+    wanted = response(found.continuous.system, 130.0)
+    made = closed_deltas(uncertain, {"mass at 3:x": 1.0})
+    np.testing.assert_allclose(made, wanted, rtol=1e-8, atol=1e-9 * np.abs(wanted).max())
+    masses = np.array([swing(one)[0][0] for one in uncertain.sample(1, 100)])
+    slope = (swing(found)[0][0] - swing(spring_of_masses())[0][0]) / 2.0
+    assert masses.std() == pytest.approx(abs(slope), rel=0.25)  # two deviations at delta = 1
+
+
+def test_a_gain_margin_is_what_mu_says():
+    """One uncertain gain: the loop is lost where its poles say so, of gains raised by hand."""
+    P = fx.testbeds.three_masses()
+    observer = fx.design_kalman(P)
+    servo = fx.design_servo(P, bandwidth=20.0, observer=observer)
+    uncertain = P.uncertain(gain={"u1": 0.5})
+    found = fx.synthesis.robust_stability(uncertain, observer, servo, machines=2)
+
+    def stable(delta):
+        machine = uncertain.lft({"u1:gain": delta})
+        return fx.loop.ClosedLoop(machine, *closed(P, observer, servo)).is_stable
+
+    edge = 1.0 / found.upper
+    assert found.lower == pytest.approx(found.upper, rel=0.02)
+    assert stable(0.97 * edge) and stable(-0.97 * edge)
+    assert not (stable(1.03 * edge) and stable(-1.03 * edge))
+
+
+def closed(P, *blocks):
+    loop = fx.close_loop(P, *blocks)
+    return loop.blocks, loop.controller, loop.idle

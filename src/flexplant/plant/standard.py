@@ -220,6 +220,8 @@ class StandardPlant(Partition):
         *,
         frequency: Any = None,
         damping: Any = None,
+        gain: Any = None,
+        delay: float | None = None,
         modes: Sequence[int] | None = None,
         deviations: float = 2.0,
         neglected: Any = None,
@@ -238,12 +240,19 @@ class StandardPlant(Partition):
         source : UpdateResult or MeasuredModes, optional
             A fit whose `model` this plant was assembled from, or measured poles with mode numbers
             and a covariance.
-        parameters : sequence of Parameter, optional
-            Those that were given to `update`, in its order; those the fit keeps when not given.
+        parameters : sequence of Parameter or {Parameter: float}, optional
+            Those that were given to `update`, in its order; those the fit keeps when not given. Or
+            in place of a source parameters with the amount by which each may be off at delta = 1,
+            in its own unit: ``{AddedMass("41:z"): 0.025}`` for 0.5 kg within 5 %.
         frequency, damping : float, (m,) array or {mode: float}, optional
             In place of a source: by what share frequencies and damping of modes may be off, at
             delta = 1; one for all, one for each of `modes`, or by mode. ``frequency=0.005`` is
             what an updated model of a structure seldom does better than where it was not measured.
+        gain : float or {name: float}, optional
+            By what share the gains of actuators and sensors may be off: `u1:gain`; one for all, or
+            by name.
+        delay : float [samples], optional
+            By how much the delay of a sampled plant may be off, more or less.
         modes : sequence of int, optional
             Numbers from 1, rigid-body modes included; all elastic (or all measured) ones when not
             given.
@@ -277,6 +286,8 @@ class StandardPlant(Partition):
             parameters,
             frequency=frequency,
             damping=damping,
+            gain=gain,
+            delay=delay,
             modes=modes,
             deviations=deviations,
             neglected=neglected,

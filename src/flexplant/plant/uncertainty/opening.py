@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ...checks import ComplexArray, FloatArray, positive, real_array
+from ...checks import ComplexArray, FloatArray, instance, positive, real_array
 from ...errors import LabelError, ModelError, require_known, unknown_label
 from ...identification import MeasuredModes
 from ...labels import Place
@@ -18,18 +18,18 @@ from ...lti.statespace import StateSpace
 from ...tolerances import SAME, TINY
 from ...updating import UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters.added import Parameter
-from ..building import P, continuous_plant, rebuilt
+from ..building import P, continuous_plant
 from ..partition import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
 from ..realisation import ModalRealisation
 from .delta_channels import require_exact, system_matrix, with_channels
 from .neglected import NeglectedModes, neglected_modes, opened
+from .shape_channels import shape_deltas, with_gain_channels, with_shape_channels
 from .uncertain_plant import (
     Delta,
     UncertainPlant,
     elastic_part,
     modal_realisation,
-    reshaped,
     with_changes,
 )
 
@@ -48,6 +48,8 @@ def uncertain(
     *,
     frequency: Any = None,
     damping: Any = None,
+    gain: Any = None,
+    delay: float | None = None,
     modes: Sequence[int] | None = None,
     deviations: float = 2.0,
     neglected: Any = None,
@@ -55,13 +57,24 @@ def uncertain(
 ) -> UncertainPlant[P]:
     """Return a plant with channels for Deltas; see `StandardPlant.uncertain`."""
     many = positive(deviations, "deviations")
-    if frequency is not None or damping is not None:
+    by_hand = [one is not None for one in (frequency, damping, gain, delay)]
+    if isinstance(parameters, Mapping):
+        if source is not None or shapes is not None or modes is not None or any(by_hand):
+            raise ModelError(
+                "parameters={parameter: amount} act on all modes at once: pass them alone, "
+                "without a fit, modes or other uncertainties."
+            )
+        return _by_parameters(plant, *_amounts(plant, parameters), many, neglected)
+    if any(by_hand):
         if source is not None or parameters is not None or shapes is not None:
             raise ModelError(
-                "frequency= and damping= state an uncertainty by hand; a fit or measured modes "
-                "bring their own. Pass one or the other."
+                "frequency=, damping=, gain= and delay= state an uncertainty by hand; a fit or "
+                "measured modes bring their own. Pass one or the other."
             )
-        deltas = _stated(modal_realisation(plant), frequency, damping, modes)
+        deltas: tuple[Delta, ...] = ()
+        if any(by_hand[:2]):
+            deltas = _stated(modal_realisation(plant), frequency, damping, modes)
+        deltas += _of_ports(plant, gain, delay)
         own = np.eye(len(deltas)) / many**2
         return _with_deltas(plant, deltas, own, many, neglected)
     if shapes is not None and not isinstance(source, MeasuredModes):
@@ -74,7 +87,16 @@ def uncertain(
         and not plant.is_weighted
         and plant.form.startswith("dense")
     ):
-        return _by_parameters(plant, source, parameters, modes, many, neglected)
+        unknowns = tuple(source.unknowns if parameters is None else parameters)
+        covariance = _checked_fit(source, unknowns)
+        if modes is not None:
+            raise ModelError(
+                f"the modes of this plant are coupled by damping ({plant.form}): its Deltas are "
+                "the parameters of the fit, which act on all modes. Leave modes out."
+            )
+        _check_model(plant, source.model)
+        about = about_fit(source, unknowns)
+        return _by_parameters(plant, about, covariance, many, neglected, source)
     realisation = modal_realisation(plant)
     if isinstance(source, UpdateResult):
         parameters = source.unknowns if parameters is None else parameters
@@ -137,6 +159,48 @@ def _stated(
     return tuple(deltas)
 
 
+def _of_ports(plant: Partition, gain: Any, delay: float | None) -> tuple[Delta, ...]:
+    """Return Deltas of stated gains of actuators and sensors, and of the delay."""
+    found: list[Delta] = []
+    if gain is not None:
+        ports = plant.assembled.ports
+        names = [*(port.name for port in ports.u), *(port.name for port in ports.y)]
+        if isinstance(gain, Mapping):
+            require_known("actuator or sensor", list(gain), names)
+        else:
+            gain = dict.fromkeys(names, gain)
+        sizes = {name: positive(size, f"gain of {name!r}") for name, size in gain.items()}
+        found += [Delta(f"{name}:gain", 0, "gain", size) for name, size in sizes.items()]
+    if delay is not None:
+        late = positive(delay, "delay")
+        if not plant.dt or late > plant.delay:
+            raise ModelError(
+                f"the delay is uncertain by {late:g} samples, and the plant has "
+                f"{plant.delay:g}: it is that of a sampled plant, and cannot become negative. "
+                "Pass plant.discretized(rate, delay=...) with the delay in the middle."
+            )
+        found.append(Delta("delay", 0, "delay", late))
+    return tuple(found)
+
+
+def _amounts(
+    plant: Partition, stated: Mapping[Parameter, Any]
+) -> tuple[tuple[Parameter, ...], FloatArray]:
+    """Return parameters and the covariance at which their amounts are one deviation each."""
+    if not stated:
+        raise ModelError("parameters= is empty: name at least one, {AddedMass('41:z'): 0.025}.")
+    for parameter in stated:
+        given: Any = parameter
+        instance(given, Parameter, "a key of parameters", "Such as AddedMass('41:z').")
+    if not hasattr(plant.model, "rigid_body") or not hasattr(plant.model, "replace"):
+        raise ModelError(
+            "parameters change the matrices of a model, and this plant was not assembled from "
+            "one: assemble it from a ReducedModel or an FEModel."
+        )
+    sizes = [positive(size, f"amount of {p.name}") for p, size in stated.items()]
+    return tuple(stated), np.diag(np.square(sizes))
+
+
 def _by_mode(given: Any, name: str, modes: Sequence[int]) -> FloatArray:
     """Return a number for each mode: of one for all, an array, or {mode: number}."""
     if given is None:
@@ -166,7 +230,11 @@ def _with_deltas(
 ) -> UncertainPlant[P]:
     """Return a plant with channels for Deltas of modes, of shapes and of neglected modes."""
     _check_range(deltas, deviations)
-    system = _opened(plant.continuous, deltas)
+    own = [delta for delta in deltas if delta.mode]
+    system = _opened(plant.continuous, own) if own else plant.continuous.system
+    gains = [delta for delta in deltas if delta.kind == "gain"]
+    if gains:
+        system = with_gain_channels(plant.continuous, system, own, gains)
     if shapes:
         system = with_shape_channels(plant.continuous, system, deltas, shapes)
         covariance = la.block_diag(covariance, np.eye(len(shapes)) / deviations**2)
@@ -182,37 +250,34 @@ def _with_deltas(
 
 def _by_parameters(
     plant: P,
-    fit: UpdateResult,
-    parameters: Sequence[Parameter] | None,
-    modes: Sequence[int] | None,
+    parameters: tuple[Parameter, ...],
+    covariance: FloatArray,
     deviations: float,
     neglected: Any,
+    fit: UpdateResult | None = None,
 ) -> UncertainPlant[P]:
-    """Return a plant whose modes damping couples, with Deltas on the parameters of its fit."""
-    unknowns = tuple(fit.unknowns if parameters is None else parameters)
-    covariance = _checked_fit(fit, unknowns)
-    if modes is not None:
-        raise ModelError(
-            f"the modes of this plant are coupled by damping ({plant.form}): its Deltas are the "
-            "parameters of the fit, which act on all modes. Leave modes out."
-        )
-    unknowns = about_fit(fit, unknowns)
-    system, deltas = by_parameters(plant.continuous, fit, unknowns, deviations)
+    """Return a plant with Deltas on parameters, stated or of a fit; stated ones at delta = 1."""
+    std = np.sqrt(np.diag(covariance))
+    scale = std if fit is None else deviations * std
+    system, deltas = by_parameters(plant.continuous, parameters, scale)
     weight = None
     if neglected is not None:
         weight = neglected_modes(plant, neglected)
         system = opened(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
-    scale = deviations * np.sqrt(np.diag(covariance))
-    return UncertainPlant(
-        plant,
-        system,
-        deltas,
-        covariance / np.outer(scale, scale),
-        deviations,
-        weight,
-        fit,
-        unknowns,
-    )
+    own = covariance / np.outer(std, std) / deviations**2
+    return UncertainPlant(plant, system, deltas, own, deviations, weight, fit, parameters)
+
+
+def _check_model(plant: Partition, other: Any) -> None:
+    """Refuse a fit of another model than the plant's."""
+    for name in "MDK":
+        own, others = getattr(plant.model, name, None), getattr(other, name)
+        if own is None or own.shape != others.shape or not np.allclose(
+            _dense(own), _dense(others), rtol=SAME, atol=0.0
+        ):  # fmt: skip
+            raise ModelError(
+                f"the plant has another {name} than the fit's model. Assemble it from fit.model."
+            )
 
 
 def _checked_fit(fit: UpdateResult, parameters: Sequence[Parameter]) -> FloatArray:
@@ -383,7 +448,12 @@ def _check_poles(
 def _check_range(deltas: Sequence[Delta], deviations: float) -> None:
     """Refuse Deltas that reach negative stiffness or damping."""
     for delta in deltas:
-        if delta.scale >= 1:
+        if delta.kind == "gain" and delta.scale >= 1:
+            raise ModelError(
+                f"{delta.name} is uncertain by {100 * delta.scale:.3g} %: its sign is not known, "
+                "and no controller is robust to that. Calibrate it."
+            )
+        if delta.mode and delta.scale >= 1:
             what = "stiffness" if delta.kind == "freq" else "damping"
             raise ModelError(
                 f"the {what} of mode {delta.mode} is uncertain by {100 * delta.scale:.3g} % at "
@@ -423,7 +493,7 @@ class _Felt(SensorPort):
 
 
 def by_parameters(
-    plant: Partition, fit: UpdateResult, parameters: Sequence[Parameter], deviations: float
+    plant: Partition, parameters: Sequence[Parameter], scales: FloatArray
 ) -> tuple[StateSpace, tuple[Delta, ...]]:
     """Return the continuous plant with channels for Deltas on the parameters, and these.
 
@@ -434,19 +504,10 @@ def by_parameters(
     """
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     model = realisation.model
-    for name in "MDK":
-        own, others = getattr(model, name, None), getattr(fit.model, name)
-        if own is None or own.shape != others.shape or not np.allclose(
-            _dense(own), _dense(others), rtol=SAME, atol=0.0
-        ):  # fmt: skip
-            raise ModelError(
-                f"the plant has another {name} than the fit's model. Assemble it from fit.model."
-            )
-    std = np.sqrt(np.diag(fit.covariance)) * deviations  # type: ignore[arg-type]
     deltas: list[Delta] = []
     loads: list[_Load] = []
     felt: list[_Felt] = []
-    for parameter, scale in zip(parameters, std.tolist(), strict=True):
+    for parameter, scale in zip(parameters, scales.tolist(), strict=True):
         deltas.append(Delta(parameter.name, 0, "parameter", scale))
         for order, part in zip((2, 1, 0), parameter.matrices(model), strict=True):
             if part is None:
@@ -473,119 +534,3 @@ def by_parameters(
 
 def _dense(matrix: object) -> FloatArray:
     return np.asarray(matrix.toarray() if sp.issparse(matrix) else matrix)  # type: ignore[attr-defined]
-
-
-#: relative: a dependence below this is rounding
-_ROUNDING = 1e-9
-
-
-class _Channel(NamedTuple):
-    """One channel of a Delta: what it moves, what it reads, of which mode's velocity."""
-
-    left: FloatArray
-    right: FloatArray
-    state: int
-    #: whether it reads the rate of that state
-    of_rate: bool = False
-    name: str = ""
-    #: factor of `right` that makes both sides of one size
-    even: float = 1.0
-
-
-def shape_deltas(
-    plant: Partition,
-    shapes: FloatArray,
-    measured: Sequence[int],
-    chosen: Sequence[int],
-    deviations: float,
-) -> list[Delta]:
-    """Return a Delta for each direction (n,) of `shapes` (m, n, r) of the chosen modes."""
-    realisation = modal_realisation(plant)
-    n = realisation.outputs.shape[0]
-    given = real_array(shapes, "shapes", (len(measured), n, None))
-    found = []
-    for number in chosen:
-        phi = realisation.inputs[:, 2 * number - 1]
-        for j, direction in enumerate(given[list(measured).index(number)].T, 1):
-            size = float(np.linalg.norm(direction) / np.linalg.norm(phi))
-            if size > 0:
-                along = direction / size
-                found.append(
-                    Delta(f"mode{number}:shape{j}", number, "shape", deviations * size, along)
-                )
-    return found
-
-
-def with_shape_channels(
-    plant: Partition, system: StateSpace, others: Sequence[Delta], deltas: Sequence[Delta]
-) -> StateSpace:
-    r"""Return a plant's system with channels for Deltas on shapes beside those it has.
-
-    ``phi + d v`` drives the mode by ``d v^T f`` more and shows ``d v q``, ``d v q'`` or
-    ``d v q''`` of its motion more: four channels at most, of which q'' feels what the first one
-    drives. Their columns are read off the plant assembled with forces or motions changed alone, so
-    that they hold for any port and filter.
-    """
-    base, g = system_matrix(plant.system), plant.system
-    n, m = g.n_states, len(g.inputs)
-    before = len(system.inputs) - m
-    first: list[_Channel] = []
-    further: list[_Channel] = []
-    for delta in deltas:
-        states = [int(plant.modal_states[2 * delta.mode - i]) for i in (2, 1)]
-        own = _factors(plant, delta, base, *states)
-        if not own:
-            raise ModelError(f"{delta.name} moves no port of the plant: leave that mode out.")
-        for i, one in enumerate(own):
-            row = np.concatenate([one.right[:n], np.zeros(before), one.right[n:]])
-            if one.of_rate:  # with what the other Deltas make of it
-                row = np.concatenate([system.A[one.state], system.B[one.state]])
-            even = np.sqrt(delta.scale * np.linalg.norm(one.left) / np.linalg.norm(one.right))
-            part = one._replace(
-                name=f"{delta.name}:{i + 1}" if i else delta.name,
-                left=one.left * (delta.scale / even),
-                right=row * even,
-                even=float(even),
-            )
-            (further if i else first).append(part)
-    parts = [*first, *further]
-    names = [one.name for one in parts]
-    left = np.array([one.left for one in parts]).T
-    right = np.array([one.right for one in parts])
-    feed = np.array([one.of_rate * one.even * left[one.state] for one in parts])
-    found = with_channels(system, before, names, left, right, feed)
-    require_exact(plant, found, [*others, *deltas], "the shapes of modes", "Leave shapes= out.")
-    return found
-
-
-def _factors(plant: Partition, delta: Delta, base: FloatArray, q: int, v: int) -> list[_Channel]:
-    """Return columns and rows of what a unit change of a shape does, of states q and v."""
-    realisation = modal_realisation(plant)
-    driven, seen = (
-        system_matrix(rebuilt(plant, realisation=one).system) - base
-        for one in (
-            reshaped(realisation, delta, 1.0, outputs=False),
-            reshaped(realisation, delta, 1.0, inputs=False),
-        )
-    )
-    found = []
-    row = driven[v]
-    if np.any(row):
-        found.append(_Channel(driven @ row / (row @ row), row, v))
-    # displacements and velocities read the states, accelerations what else their rate holds
-    size, rest, beyond = np.linalg.norm(seen, axis=1), seen.copy(), base[v].copy()
-    rest[:, [q, v]], beyond[[q, v]] = 0.0, 0.0
-    amount = rest @ beyond / max(float(beyond @ beyond), TINY)
-    amount[np.linalg.norm(rest, axis=1) <= _ROUNDING * size] = 0.0
-    plain = seen - np.outer(amount, base[v])
-    motion, speed = (np.eye(base.shape[1])[i] for i in (q, v))
-    for column, right, of_rate in (
-        (plain[:, q], motion, False),
-        (plain[:, v], speed, False),
-        (amount, base[v], True),
-    ):
-        small = np.abs(column) * np.linalg.norm(right) <= _ROUNDING * size
-        left = np.where(small, 0.0, column)
-        if np.any(left):
-            found.append(_Channel(left, right, v, of_rate))
-    return found

@@ -12,12 +12,12 @@ import scipy.sparse as sp
 
 from ...checks import FloatArray, Value, generator, real_array, whole
 from ...errors import FlexplantWarning, ModelError, counted, require_known
-from ...lti.statespace import StateSpace
+from ...lti.statespace import StateSpace, as_statespace
 from ...sparse.factor import dense
 from ...structure.rigid import orthonormalised
 from ...updating import UpdateResult
 from ...updating.parameters.added import Parameter
-from ..building import P, rebuilt
+from ..building import P, rebuilt, sampled
 from ..partition import Partition
 from ..realisation import MODAL, ModalRealisation
 from ..residual_form import modes_of
@@ -34,12 +34,12 @@ class Delta(Value):
         Of the channels: `mode6:freq` has the input `mode6:freq:w` and the output `mode6:freq:z`.
     mode : int
         Number of the mode, from 1, rigid-body modes included; 0 of a parameter.
-    kind : {"freq", "damping", "shape", "parameter"}
+    kind : {"freq", "damping", "shape", "parameter", "gain", "delay"}
         Stiffness ``omega^2 (1 + scale delta)``, damping ``2 zeta omega (1 + scale delta)`` or shape
-        ``phi + scale delta along`` of a mode; or a parameter of the fit, its value plus scale
-        delta.
+        ``phi + scale delta along`` of a mode; a parameter, its value plus scale delta; the gain
+        ``1 + scale delta`` of an actuator or sensor, or the delay of all actuators.
     scale : float
-        Change at delta = 1: relative, of a parameter in its own unit.
+        Change at delta = 1: relative, of a parameter in its own unit, of the delay in samples.
     along : (n,) array, optional
         Of a shape: as long as the shape, over the DOFs of the plant's modes.
 
@@ -58,7 +58,7 @@ class Delta(Value):
 
     name: str
     mode: int
-    kind: Literal["freq", "damping", "shape", "parameter"]
+    kind: Literal["freq", "damping", "shape", "parameter", "gain", "delay"]
     scale: float
     along: FloatArray | None = None
 
@@ -85,9 +85,13 @@ def with_changes(plant: P, changes: Sequence[tuple[Delta, float]]) -> P:
     Rows [1, 0] and [a00 / s, 1] of a block [[a00, s], [a10, a11]] are a mode's displacement and
     its rate over s; only the second row of the block changes, whatever its form.
     """
+    if all(delta.kind in ("gain", "delay") for delta, _ in changes):
+        return _with_ports(plant, plant.assembled.realisation, changes)
     realisation = modal_realisation(plant)
     pairs = np.array(realisation.pairs)
     for delta, amount in changes:
+        if delta.kind in ("gain", "delay"):
+            continue
         if delta.kind == "shape":
             realisation = reshaped(realisation, delta, amount)
             continue
@@ -103,7 +107,35 @@ def with_changes(plant: P, changes: Sequence[tuple[Delta, float]]) -> P:
         else:
             row = -np.trace(nominal) * np.array([nominal[0, 0] / s, 1.0])
         pairs[delta.mode - 1, 1] -= amount * row
-    return rebuilt(plant, realisation=realisation.replace(pairs=pairs))
+    return _with_ports(plant, realisation.replace(pairs=pairs), changes)
+
+
+def _with_ports(
+    plant: P, realisation: ModalRealisation, changes: Sequence[tuple[Delta, float]]
+) -> P:
+    """Return the plant of a realisation, gains of its ports and its delay changed."""
+    gains = {d.name.removesuffix(":gain"): 1.0 + x for d, x in changes if d.kind == "gain"}
+    late = sum(x for d, x in changes if d.kind == "delay")
+    ports = None
+    if gains:
+        own = plant.assembled.ports
+        sides = {
+            side: [_times(port, gains.get(port.name, 1.0)) for port in getattr(own, side)]
+            for side in "uy"
+        }
+        ports = own.replace(**sides)
+    if not late:
+        return rebuilt(plant, ports=ports, realisation=realisation)
+    fresh = rebuilt(plant.continuous, ports=ports, realisation=realisation)
+    return sampled(fresh, 1.0 / plant.dt, plant.delay + late)
+
+
+def _times(port: Any, gain: float) -> Any:
+    """Return an actuator or sensor with another gain."""
+    if gain == 1.0:
+        return port
+    static = as_statespace([[gain]])
+    return port.replace(dynamics=static if port.dynamics is None else gain * port.dynamics)
 
 
 def reshaped(
@@ -166,7 +198,7 @@ class UncertainPlant(Value, Generic[P]):
     fit : UpdateResult, optional
         Where the uncertainty comes from; `sample` draws its parameters.
     parameters : sequence of Parameter
-        Those of the fit.
+        Those of the fit, or those stated.
 
     Examples
     --------
@@ -229,6 +261,9 @@ class UncertainPlant(Value, Generic[P]):
             if delta.kind == "parameter":
                 unit = self.parameters[self.deltas.index(delta)].unit
                 lines.append(f"  {delta.name} +- {delta.scale:.3g} {unit}")
+                continue
+            if delta.kind == "delay":
+                lines.append(f"  {delta.name} +- {delta.scale:.3g} samples")
                 continue
             half = 0.5 if delta.kind == "freq" else 1.0
             lines.append(f"  {delta.name} +- {100 * half * delta.scale:.3g} %")
@@ -318,7 +353,8 @@ class UncertainPlant(Value, Generic[P]):
     def _moved(self, change: FloatArray) -> P:
         """Return the plant of the fit's model with its parameters changed by some amounts."""
         realisation = self.plant.assembled.realisation
-        model = _moved(realisation, self.fit.model, self.parameters, change)  # type: ignore[union-attr]
+        own = self.plant.model if self.fit is None else self.fit.model
+        model = _moved(realisation, own, self.parameters, change)
         with warnings.catch_warnings():  # the nominal plant has said in which form it is
             warnings.simplefilter("ignore", FlexplantWarning)
             return rebuilt(self.plant, realisation=modes_of(model))
