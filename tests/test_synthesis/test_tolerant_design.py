@@ -9,6 +9,7 @@ import flexplant as fx
 from flexplant.errors import InfeasibleError, ModelError
 from flexplant.modes import solve_modes
 from flexplant.structure import FEModel, ModalDamping
+from flexplant.synthesis.robustness.robust_stability import _quick
 from plates import make_plate
 from stages import RATE, ports, sampled, some_modes
 
@@ -145,3 +146,38 @@ def test_modes_below_a_frequency_are_damped():
         return (-poles.real / np.abs(poles))[near].min()
 
     assert slowest(damped) > 2.0 * slowest(plain)
+
+
+@pytest.mark.slow
+def test_the_quick_bound_shows_all_frequencies_at_once():
+    """12 modes of 0.1 % damping: what it allows, machines made by hand tolerate, and no more."""
+    errors = fx.reference_errors(plant())
+    found = fx.synthesis.robust_stability(
+        plant().uncertain(frequency=SHARE), errors, design(), quick=True, machines=8
+    )
+    assert found.is_robust
+    assert found.certificate["largest spectral radius of 8 machines"] < 1.0
+    assert found.certificate["modes, each by one channel"] == 12
+    assert max(radius(machine(seed), design()) for seed in range(1, 5)) < 1.0
+
+
+@pytest.mark.slow
+def test_the_quick_bound_of_one_mode_is_its_tolerance():
+    """The exact change at which a pole crosses: less is shown to be stable, more is not."""
+    loop = loop_on(plant(), design())
+    found = loop.mode_tolerances()
+    worst = int(np.argmin(np.abs(found.stable).min(axis=1)))
+    mode, edge = int(found.modes[worst]), np.abs(found.stable[worst]).min()
+    shown = [
+        _quick(
+            plant().uncertain(frequency=part * edge, modes=[mode]),
+            loop.blocks,
+            None,
+            2,
+            np.random.default_rng(0),
+        )
+        for part in (0.85, 1.1)
+    ]
+    assert shown[0].is_robust
+    assert 0.8 < shown[0].upper <= 1.0
+    assert shown[1] is None

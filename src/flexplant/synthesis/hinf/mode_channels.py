@@ -27,6 +27,8 @@ _SHIFT = 0.7
 _DAMPED, _PUSHED = 0.01, 0.1
 #: factor by which a scaling is changed at most in closed loop
 _REBALANCED = 4.0
+#: points at most on each side of a mode, two to a half-width of its resonance
+_SWEPT = 100
 
 
 @dataclass(frozen=True)
@@ -193,22 +195,26 @@ def rebalanced(
 
 
 def tolerated(
-    channels: Sequence[ModeChannel], plant: StandardPlant, controller: StateSpace
+    channels: Sequence[ModeChannel],
+    plant: StandardPlant,
+    controller: StateSpace,
+    times: float = 1.0,
 ) -> float:
     r"""Return an upper bound of real mu of the channels, the largest over a grid of frequencies.
 
-    Below 1 no Deltas of size 1, all at once, put a pole on the grid's frequencies: with M from all
-    d to all q without the shift, and any positive D and real G, both diagonal,
+    Below 1 no Deltas of a size (`times`), all at once, put a pole on the grid's frequencies: with M
+    from all d to all q without the shift, and any positive D and real G, both diagonal,
 
     .. math:: \bar\sigma\left((I + G^2)^{-1/4} (D M D^{-1} - j G) (I + G^2)^{-1/4}\right) \le 1
 
     excludes ``det(I - M \Delta) = 0`` [Young1990]_. D by Osborne's iteration, G the imaginary part
-    of the shift that the design counted on.
+    of the shift that the design counted on: a smooth function of the frequency, unlike the best G
+    of each, with which the frequency of a crossing could lie between those of the grid.
     """
     loop = lft(plant.system, controller)
     m = len(channels)
     part = loop.select(loop.outputs[:m], loop.inputs[:m])
-    freq = resonance_grid(loop.poles(), loop.dt)
+    freq = np.union1d(resonance_grid(loop.poles(), loop.dt), _swept(channels, times, loop.dt))
     z = points(loop, freq)
     seen: ComplexArray = np.moveaxis(responder(part)(freq), 2, 0)
     shift = np.array([_shift(one, z, loop.dt) for one in channels]).T
@@ -216,7 +222,7 @@ def tolerated(
     M = seen * size[:, None] - shift[:, :, None] * np.eye(m)
     where = places([FullBlock(1, 1) for _ in channels])
     most = 0.0
-    for each, G in zip(M, -shift.imag, strict=True):
+    for each, G in zip(times * M, -times * shift.imag, strict=True):
         bound = _scaled_size(each, G)  # D of the design first
         if bound > 1.0:
             d = np.sqrt(osborne(each, where))
@@ -224,6 +230,18 @@ def tolerated(
             bound = min(bound, _scaled_size(scaled, G), float(la.norm(scaled, 2)))
         most = max(most, bound)
     return most
+
+
+def _swept(channels: Sequence[ModeChannel], times: float, dt: float) -> FloatArray:
+    """Return frequencies [Hz] through the places that the modes may take, to half a half-width."""
+    found = []
+    for one in channels:
+        freq, width = one.theta / (2.0 * np.pi * (dt or 1.0)), one.share * _SHIFT / max(one.c, TINY)
+        reach = min(1.5 * times * one.share, 0.5)
+        count = int(np.clip(2.0 * reach / max(width, TINY), 4, _SWEPT))
+        found.append(freq * (1.0 + reach * np.linspace(-1.0, 1.0, 2 * count + 1)))
+    whole = np.concatenate(found)
+    return np.asarray(whole[whole < 0.5 / dt] if dt else whole)
 
 
 def _scaled_size(M: ComplexArray, G: FloatArray) -> float:

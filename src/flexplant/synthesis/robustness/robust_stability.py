@@ -11,10 +11,11 @@ import numpy as np
 from ...certificates import stability
 from ...checks import FloatArray, Value, generator, whole
 from ...errors import CertificateError, FlexplantError, counted
-from ...loop import ClosedLoop, SpillOver
+from ...loop import ClosedLoop, SpillOver, close_loop
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant, larger_plant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ..hinf.mode_channels import mode_channels, tolerated, with_channels
 from .lower import (
     Destabilising,
     destabilising,
@@ -32,6 +33,8 @@ _RESOLVED = 0.05
 _STARTS = 3
 #: the worst machine is shown this much beyond its edge of stability
 _BEYOND = 1e-3
+#: largest multiple of an uncertainty that the quick bound tries, and halvings: 3 % at 1
+_REACH, _HALVINGS = 2.0, 5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -108,6 +111,7 @@ class RobustStability(Value):
 def robust_stability(
     uncertain: UncertainPlant[Any],
     *blocks: Any,
+    quick: bool = False,
     larger: Any = None,
     machines: int = 20,
     rng: Any = 0,
@@ -125,6 +129,11 @@ def robust_stability(
         From `plant.uncertain(fit, neglected=larger)`.
     *blocks : StateSpace, or values with a `system`
         The controller, as for `close_loop`.
+    quick : bool
+        Where all Deltas are frequencies, first a bound with one channel a mode, the change of a
+        sampled mode to first order, on a grid through the resonances: a fraction of a second for
+        ten modes. Where it is below 1 it is the answer, without a lower bound; else the whole
+        search follows.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes that the plant left out, as for `larger_plant`: the nominal loop is
         checked there too.
@@ -177,12 +186,17 @@ def robust_stability(
     """
     count = whole(machines, "machines", minimum=0)
     chance = generator(rng)
+    if quick:
+        first = _quick(uncertain, blocks, larger, count, chance)
+        if first is not None:
+            return first
     loop = uncertain_loop(uncertain, blocks)
     with Progress(None, INTERVALS, progress=progress):
         found = covered(loop.system, loop.blocks, heights=loop.heights, least=_RESOLVED**2)
     upper = float(np.sqrt(found.level))
     worst = _worst(loop, found, upper, chance)
-    certificate = _tried(loop, upper, count, chance)
+    names = [block.name for block in loop.blocks if not isinstance(block, FullBlock)]
+    certificate = _tried(uncertain, loop.loop, names, upper, count, chance)
     # systems of many states are covered by sampling between the frequencies instead
     certificate["intervals by Hamiltonians"] = float(found.intervals * found.by_hamiltonian)
     if loop.dt:
@@ -208,9 +222,7 @@ def _left_out(loop: ClosedLoop, larger: Any) -> SpillOver | None:
     """Return the check of the nominal loop with the modes left out."""
     if larger is None:
         return loop.left_out
-    return ClosedLoop(
-        loop.plant, loop.blocks, loop.controller, loop.idle, larger_plant(loop.plant, larger)
-    ).left_out
+    return loop.replace(larger=larger_plant(loop.plant, larger)).left_out
 
 
 def _worst(
@@ -253,25 +265,67 @@ def _shown(
     return values, None, 0.0
 
 
+def _quick(
+    uncertain: UncertainPlant[Any],
+    blocks: tuple[Any, ...],
+    larger: Any,
+    count: int,
+    rng: np.random.Generator,
+) -> RobustStability | None:
+    """Return the answer of one channel a mode where it shows stability, None where it does not."""
+    names = [delta.name for delta in uncertain.deltas]
+    if uncertain.neglected is not None or any(d.kind != "freq" for d in uncertain.deltas):
+        return None
+    loop = close_loop(uncertain.plant, *blocks)
+    if loop.obstacle is not None:
+        return None  # the whole search says what is wrong
+    channels = mode_channels(uncertain.plant, uncertain)
+    opened = with_channels(uncertain.plant, channels)
+    controller = loop.controller.select(outputs=loop.driven)
+    low, high = 0.0, _REACH
+    for size in (1.0, *[0.0] * _HALVINGS):
+        tried = size or 0.5 * (low + high)
+        if tolerated(channels, opened, controller, tried) < 1.0:
+            low = tried
+        elif size:
+            return None
+        else:
+            high = tried
+    upper = 1.0 / low
+    certificate = _tried(uncertain, loop, names, upper, count, rng)
+    certificate["modes, each by one channel"] = float(len(channels))
+    left_out = _left_out(loop, larger)
+    if left_out is not None:
+        certificate |= left_out.certificate
+    none = np.zeros(0)
+    return RobustStability(
+        upper, 0.0, float("nan"), {}, None, none, none, certificate, left_out
+    )  # fmt: skip
+
+
 def _tried(
-    loop: UncertainLoop, upper: float, count: int, rng: np.random.Generator
+    uncertain: UncertainPlant[Any],
+    nominal: ClosedLoop,
+    names: list[str],
+    upper: float,
+    count: int,
+    rng: np.random.Generator,
 ) -> dict[str, float]:
     """Return how stable machines at corners are, each closed exactly."""
-    names = [block.name for block in loop.blocks if not isinstance(block, FullBlock)]
     size = min(1.0, 0.999 / upper)
     worst = -np.inf
     for _ in range(count):
         corner = dict(
             zip(names, (size * rng.choice([-1.0, 1.0], len(names))).tolist(), strict=True)
         )
-        made = loop.uncertain.lft(corner)
-        worst = max(worst, stability(loop.around(made).poles(), loop.dt))
-    if not worst < (1.0 if loop.dt else 0.0):
+        loop = nominal.around(uncertain.lft(corner))
+        worst = max(worst, stability(loop.poles(), loop.plant.dt))
+    if not worst < (1.0 if nominal.plant.dt else 0.0):
         raise CertificateError(
             f"a machine with Deltas of {size:.3g} is unstable ({worst:.9g}), but mu <= "
             f"{upper:.4g} was found: the loop is too badly conditioned. Report it."
         )
     if not count:
         return {}
-    kind = "largest spectral radius" if loop.dt else "largest real part"
+    kind = "largest spectral radius" if nominal.plant.dt else "largest real part"
     return {f"{kind} of {counted(count, 'machine')}": worst}

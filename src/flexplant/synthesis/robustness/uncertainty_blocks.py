@@ -187,6 +187,19 @@ class Scalings:
         """Where D and G of each block end in x."""
         return [own.start for own, _ in self.d_ranges[1:]] + [self.count]
 
+    def shifted(self, x: FloatArray, M: ComplexArray) -> FloatArray:
+        """Return x with G of real scalars that takes the imaginary part from the diagonal of M.
+
+        ``G = -D Im M``: of one real scalar alone F is then ``D (level - |M|^2 + 2 (Im M)^2)``.
+        """
+        x = x.copy()
+        for place, (own, _), end in zip(self.places, self.d_ranges, self.ends, strict=True):
+            size = place.block.w
+            if end - own.stop:  # its G; the diagonal comes first, in D as in G
+                turn = np.diagonal(M[place.z, place.w]).imag
+                x[own.stop : own.stop + size] = -x[own.start : own.start + size] * turn
+        return x
+
     def scaled(self, x: FloatArray, sizes: FloatArray) -> FloatArray:
         """Return x for D and G of each block times a number."""
         x = x.copy()

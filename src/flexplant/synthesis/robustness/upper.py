@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -48,12 +49,9 @@ def upper_level(
     size = float(np.linalg.norm(M)) ** 2
     if not size:
         return Certified(0.0, scalings.start)
-    x = scalings.scaled(scalings.start, osborne(M, scalings.places))
-    reached = reached_level(W, scalings, x)
-    if start is not None:
-        other = reached_level(W, scalings, start)
-        if other < reached:
-            x, reached = start, other
+    evened = scalings.scaled(scalings.start, osborne(M, scalings.places))
+    tried = [evened, scalings.shifted(evened, M), *([] if start is None else [start])]
+    reached, x = min(((reached_level(W, scalings, one), one) for one in tried), key=itemgetter(0))
     if not np.isfinite(reached):
         found = _admissible(M, scalings, x)
         if found is None:
