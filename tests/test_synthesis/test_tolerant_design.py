@@ -112,6 +112,7 @@ def test_a_bandwidth_that_cannot_be_kept_is_refused_with_what_was_tried():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the loop hangs on")
 def test_an_uncertain_plant_is_designed_for_by_default():
     """Weights and blocks keep what is uncertain: the same controller as with uncertain=."""
     uncertain = plant().uncertain(frequency=SHARE)
