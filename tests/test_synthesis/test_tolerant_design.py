@@ -182,3 +182,21 @@ def test_the_quick_bound_of_one_mode_is_its_tolerance():
     assert shown[0].is_robust
     assert 0.8 < shown[0].upper <= 1.0
     assert shown[1] is None
+
+
+@pytest.mark.slow
+def test_modes_above_half_the_rate_have_no_channel():
+    """Folded back, their all-pass would be unstable, and the problem without a solution."""
+    slow = plant().continuous.discretized(3e3, delay=1)
+    weights = fx.stage_weights(slow, 30.0)
+    problem = slow.through(fx.reference_errors(slow)).weighted(z=weights.z, w=weights.w)
+    found = fx.design_hinf(problem, uncertain=slow.uncertain(frequency=1e-3))
+    below = np.count_nonzero(swinging(slow) < 1500.0)
+    assert 0 < below < 12
+    assert any(f"a channel for each of {below} modes" in note for note in found.notes)
+
+
+def swinging(P):
+    """The frequencies [Hz] of the elastic modes, from the eigenvalues of A."""
+    poles = np.linalg.eigvals(P.continuous.system.A)
+    return np.abs(poles[poles.imag > 1.0]) / (2.0 * np.pi)

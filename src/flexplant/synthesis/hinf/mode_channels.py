@@ -71,7 +71,8 @@ def mode_channels(
     D is one over the modal force of the weighted disturbances: what a Delta feeds back then counts
     as a disturbance does. Modes below a frequency [Hz] that actuators push are to be damped, not
     only tolerated: they are off by 1 % at least, and c = 0 (complex deltas), which also covers
-    errors of their shapes and damping.
+    errors of their shapes and damping. Modes above half the rate are left out: samples show them
+    folded back, where no change of a force's response by one sample stands for their frequency's.
     """
     own: Any = uncertain.plant
     g, dt = weighted.system, weighted.dt
@@ -96,6 +97,8 @@ def mode_channels(
         A, h = _moved_by_force(pair, dt)
         omega, zeta = _pole(pair)
         theta = omega * np.sqrt(1.0 - zeta**2) * (dt or 1.0)
+        if dt and theta >= np.pi:
+            continue
         z = np.exp(1j * theta) if dt else 1j * theta
         at = np.linalg.solve(z * np.eye(2) - A, h)
         wanted = -1j * share / zeta
