@@ -372,16 +372,19 @@ def test_content_goes_before_the_suffix(tmp_path):
 
 
 def test_a_new_format_is_one_value(tmp_path, monkeypatch):
-    """A reader with options of its own, known by what the file begins with or by its suffix."""
+    """A reader with options of its own, known by its suffix or by what the file begins with.
+
+    The beginning comes as it is in the file, with its capital letters.
+    """
 
     def read_rows(path, *, mass=None, mesh=None):
         K = np.loadtxt(path, comments="!", ndmin=2)
         return fx.FEMatrices(K, None if mass is None else np.diag(np.loadtxt(mass)))
 
-    rows = Format((".rows",), read_rows, lambda head: head.startswith(b"!rows"), (".grid",), "mesh")
+    rows = Format((".rows",), read_rows, lambda head: head.startswith(b"!Rows"), (".grid",), "mesh")
     monkeypatch.setattr(models, "FORMATS", (*models.FORMATS, rows))
     (tmp_path / "K.rows").write_text("2 -1\n-1 2\n")
-    (tmp_path / "K.txt").write_text("!rows\n2 -1\n-1 2\n")
+    (tmp_path / "K.txt").write_text("!Rows\n2 -1\n-1 2\n")
     (tmp_path / "M.txt").write_text("3 4\n")
     for name in ("K.rows", "K.txt"):
         found = fx.read_matrices(tmp_path / name, mass=tmp_path / "M.txt")

@@ -18,6 +18,7 @@ from ..structure.matrices import FEMatrices
 from .assembled import from_triplets
 from .numbers import decimal, printed_digits, rows_of_numbers, wrong_line
 from .paths import (
+    FORMATS,
     Format,
     check_size,
     check_whole,
@@ -273,4 +274,4 @@ def _nodes(path: str | Path) -> dict[int, list[float]]:
 #: what to do with an input file that is not flat, or turns its nodes
 _FLAT = "Write the flattened input file (no parts and assemblies)."
 _PLACE = "Remove it, or name rows and places yourself: .with_dofs(DofSet(...))."
-ABAQUS = Format((".mtx",), read_abaqus, mesh=(".inp",), mesh_option="inp")
+FORMATS.append(Format((".mtx",), read_abaqus, mesh=(".inp",), mesh_option="inp"))

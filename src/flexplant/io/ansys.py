@@ -16,7 +16,7 @@ from ..structure import FEMatrices
 from .assembled import assembled, missing_extra
 from .child import in_child
 from .file_shapes import FileShapes, ModesFormat
-from .paths import Elsewhere, Format, file_path, is_text, no_motion, unread
+from .paths import ELSEWHERE, FORMATS, Elsewhere, Format, file_path, is_text, no_motion, unread
 from .tables import read_nodes_table
 
 #: a local coordinate system turned less than this [deg] is none
@@ -160,13 +160,15 @@ def _placed(nodes: Any, wanted: IntArray) -> tuple[FloatArray, dict[int, FloatAr
     return at_nodes(wanted, known, places, str(path)), turned
 
 
-FULL = Format((".full",), read_ansys, mesh=(".rst", ".cdb"), mesh_option="nodes")
-MARKUP = Elsewhere((".rst",), "text (reStructuredText?), no results of ANSYS", is_text)
-ELEMENTS = Elsewhere(
-    (".emat", ".esav", ".mode", ".db", ".dbb"),
-    "single elements, or data of ANSYS' own. Matrices: a modal analysis with WRFULL,1 writes the "
-    "assembled ones as .full, read_ansys",
-)
+FORMATS.append(Format((".full",), read_ansys, mesh=(".rst", ".cdb"), mesh_option="nodes"))
+ELSEWHERE += [
+    Elsewhere((".rst",), "text (reStructuredText?), no results of ANSYS", is_text),
+    Elsewhere(
+        (".emat", ".esav", ".mode", ".db", ".dbb"),
+        "single elements, or data of ANSYS' own. Matrices: a modal analysis with WRFULL,1 writes "
+        "the assembled ones as .full, read_ansys",
+    ),
+]
 
 
 _KINDS = dict(zip(("UX", "UY", "UZ", "ROTX", "ROTY", "ROTZ"), DIRECTIONS, strict=True))

@@ -15,7 +15,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from .nastran import Nodes, named_matrices, nastran_float, read_nodes
 from .numbers import fixed_numbers, printed_digits
-from .paths import USUAL, Format, check_whole, damaged, file_path, unread, wrong_line_of
+from .paths import FORMATS, USUAL, Format, check_whole, damaged, file_path, unread, wrong_line_of
 
 _ENDINGS = ("AAX", "AA", "GG", "2GG", "2PP", "")
 
@@ -363,7 +363,7 @@ def _wrong(path: str, at: int, line: bytes, due: str) -> FlexplantError:
 
 
 def _begins(head: bytes) -> bool:
-    return head.startswith((b"dmig", b"$")) and b"dmig" in head
+    return (head.startswith(b"$") and b"DMIG" in head.upper()) or head[:4].upper() == b"DMIG"
 
 
-DMIG = Format((".pch", ".dmig"), read_dmig, _begins, (".bdf", ".dat", ".nas"), "bdf")
+FORMATS.append(Format((".pch", ".dmig"), read_dmig, _begins, (".bdf", ".dat", ".nas"), "bdf"))

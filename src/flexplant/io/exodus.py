@@ -18,7 +18,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..modes import Modes
 from .assembled import missing_extra
 from .file_shapes import FileShapes, ModesFormat, check_mass, frequencies
-from .paths import Elsewhere, damaged, file_path, parsing
+from .paths import ELSEWHERE, Elsewhere, damaged, file_path, parsing
 
 _NAME = re.compile(r"(?:disp\w*?|displ\w*?|d|u|(rot\w*?|r))_?([xyz])", re.IGNORECASE)
 
@@ -234,8 +234,10 @@ class ExodusFile:
         return self.array(f"vals_nod_var{place + 1}")
 
 
-MODES = Elsewhere((".exo", ".e"), "modes: flexplant.io.read_modes reads them")
-MESH = Elsewhere((".g",), "a mesh: give it to read_sierra(..., exodus=...)")
+ELSEWHERE += [
+    Elsewhere((".exo", ".e"), "modes: flexplant.io.read_modes reads them"),
+    Elsewhere((".g",), "a mesh: give it to read_sierra(..., exodus=...)"),
+]
 
 
 def read_exodus_shapes(path: Path, nodes: Path | None) -> FileShapes:

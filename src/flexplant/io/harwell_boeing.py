@@ -15,7 +15,7 @@ from ..structure import FEMatrices
 from .assembled import one_matrix_each
 from .foreign_parsers import sound
 from .numbers import fixed_numbers, printed_digits, spaced_numbers
-from .paths import Format, check_size, check_whole, parsing, refused, unread
+from .paths import FORMATS, Format, check_size, check_whole, parsing, refused, unread
 
 #: lines whose digits are counted
 _SAMPLE = 4000
@@ -160,4 +160,4 @@ def _damage(lines: list[bytes], form: tuple[int, int], size: int, before: int) -
     return ""
 
 
-HARWELL_BOEING = Format((".rsa", ".rua", ".hb", ".rb"), read_harwell_boeing)
+FORMATS.append(Format((".rsa", ".rua", ".hb", ".rb"), read_harwell_boeing))

@@ -15,7 +15,7 @@ from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, chosen, missing_extra
 from .child import in_child
-from .paths import USUAL, Format, check_size, file_path, parsing
+from .paths import FORMATS, USUAL, Format, check_size, file_path, parsing
 
 #: a byte of a compressed file holds no more bytes than this
 _DEFLATED = 1100
@@ -215,8 +215,10 @@ def _hdf5(item: Any, path: Path, size: int) -> Any:
     )
 
 
-MATLAB = Format((".mat",), read_matlab, lambda head: head.startswith(b"matlab "))
-NUMPY = Format((".npz", ".npy"), read_npz)
+FORMATS += [
+    Format((".mat",), read_matlab, lambda head: head[:7].upper() == b"MATLAB "),
+    Format((".npz", ".npy"), read_npz),
+]
 
 
 def mat_variables(path: str | Path) -> dict[str, Any]:

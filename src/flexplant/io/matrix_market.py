@@ -19,7 +19,7 @@ from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import one_matrix_each
 from .numbers import printed_digits, rows_of_numbers, wrong_line
-from .paths import Format, check_size, check_whole, damaged, unread, wrong_line_of
+from .paths import FORMATS, Format, check_size, check_whole, damaged, unread, wrong_line_of
 
 #: lines whose digits are counted
 _SAMPLE = 4000
@@ -238,6 +238,6 @@ def _columns(values: FloatArray, head: _Header) -> FloatArray:
     return np.asarray(matrix + np.tril(matrix, -1).T)
 
 
-MATRIX_MARKET = Format(
-    (".mtx.gz",), read_matrix_market, lambda head: head.startswith(b"%%matrixmarket")
+FORMATS.append(
+    Format((".mtx.gz",), read_matrix_market, lambda head: head[:14].lower() == b"%%matrixmarket")
 )

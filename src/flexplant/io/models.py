@@ -12,42 +12,14 @@ from ..dof_columns import at_nodes
 from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices, FEModel
-from . import (
-    abaqus,
-    ansys,
-    dmig,
-    exodus,
-    harwell_boeing,
-    mat_matrices,
-    matrix_market,
-    op4,
-    sierra,
-    uff,
-)
-from .paths import HEAD, USUAL, Elsewhere, Format, ends, file_path, three_units
+from .paths import ELSEWHERE, FORMATS, HEAD, USUAL, Elsewhere, Format, ends, file_path, three_units
 from .tables import read_dofs, read_nodes_table
 
-FORMATS: tuple[Format, ...] = (
-    matrix_market.MATRIX_MARKET,
-    harwell_boeing.HARWELL_BOEING,
-    mat_matrices.MATLAB,
-    mat_matrices.NUMPY,
-    ansys.FULL,
-    op4.OUTPUT4,
-    dmig.DMIG,
-    abaqus.ABAQUS,
-    sierra.SIERRA,
-)
 _NASTRAN = (
     "Matrices: EXTSEOUT(ASMBULK,EXTID=1,MATOP4=31) in the case control and ASSIGN "
     "OUTPUT4='run.op4',UNIT=31 above it write them as .op4, read_op4"
 )
-ELSEWHERE: tuple[Elsewhere, ...] = (
-    exodus.MODES,
-    exodus.MESH,
-    uff.UNIVERSAL,
-    ansys.MARKUP,
-    ansys.ELEMENTS,
+ELSEWHERE += [
     Elsewhere(
         (".op2",),
         f"results, of which flexplant.io.read_modes reads the modes. {_NASTRAN}",
@@ -63,7 +35,7 @@ ELSEWHERE: tuple[Elsewhere, ...] = (
         "a model of COMSOL. Matrices: LiveLink's mphmatrix(model, 'sol1', 'out', {'Kc', 'Ec'}), "
         "of which Ec is M, saved as .mat: read_matlab",
     ),
-)
+]
 
 
 def read_matrices(
@@ -268,7 +240,7 @@ def _check_options(options: Iterable[str], form: Format, name: str) -> None:
 
 def _format(path: Path) -> Format:
     with path.open("rb") as file:
-        head = file.read(HEAD).lower()
+        head = file.read(HEAD)
     for form in FORMATS:
         if form.begins(head):
             return form

@@ -15,7 +15,7 @@ from ..labels import DofSet
 from ..structure.matrices import FEMatrices, completed
 from .nastran import named_matrices
 from .op4_binary import binary_matrices, text_matrices
-from .paths import USUAL, Format, file_path
+from .paths import FORMATS, USUAL, Format, file_path
 
 #: a matrix of the file: dense where the file holds it dense, real or complex
 Op4Matrix: TypeAlias = Any
@@ -191,4 +191,4 @@ def _read(
     return {name: found[name] for name in names}
 
 
-OUTPUT4 = Format((".op4",), read_op4)
+FORMATS.append(Format((".op4",), read_op4))

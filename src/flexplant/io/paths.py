@@ -159,6 +159,11 @@ class Elsewhere:
     begins: Callable[[bytes], bool] = lambda head: True
 
 
+#: what each reader's module registers: its files, and those without matrices beside them
+FORMATS: list[Format] = []
+ELSEWHERE: list[Elsewhere] = []
+
+
 def is_text(head: bytes) -> bool:
     """Return whether a file begins as text."""
     return bool(head) and not head.translate(None, delete=bytes(range(32, 256)) + b"\t\r\n\f")

@@ -15,7 +15,16 @@ from ..structure.matrices import FEMatrices
 from .assembled import from_triplets
 from .exodus import opened
 from .numbers import printed_digits, rows_of_numbers, wrong_line
-from .paths import Format, check_size, check_whole, damaged, file_path, no_motion, wrong_line_of
+from .paths import (
+    FORMATS,
+    Format,
+    check_size,
+    check_whole,
+    damaged,
+    file_path,
+    no_motion,
+    wrong_line_of,
+)
 
 _WORD = re.compile(rb"[^\s,;]+")
 #: a map has so many entries a node: x, y, z, rx, ry, rz and two or three that are no motion
@@ -214,4 +223,4 @@ def _per_node(path: str | Path, size: int, entry: IntArray, nodes: int | None) -
     )
 
 
-SIERRA = Format((".m",), read_sierra)
+FORMATS.append(Format((".m",), read_sierra))

@@ -15,7 +15,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..lti.frequency import ORDERS, Frf
 from ..structure.units import Units
 from .file_shapes import FileShapes, ModesFormat
-from .paths import GLOBAL, ONCE, Elsewhere, at_zero, damaged, file_path, refused, unread
+from .paths import ELSEWHERE, GLOBAL, ONCE, Elsewhere, at_zero, damaged, file_path, refused, unread
 from .tables import read_nodes_table
 from .uff_analysis import NORMAL_MODE, AnalysisData, mode_records, responses_of_model
 from .uff_records import (
@@ -301,10 +301,12 @@ def raw_nodes(path: str | Path) -> tuple[IntArray, FloatArray, tuple[float, floa
     return np.concatenate(nodes), np.concatenate(places), (length, force)
 
 
-UNIVERSAL = Elsewhere(
-    (".unv", ".uff"),
-    "results: read_frf_uff, read_modes_uff, read_nodes_uff of flexplant.io, and "
-    "read_modes for the modes of a model",
+ELSEWHERE.append(
+    Elsewhere(
+        (".unv", ".uff"),
+        "results: read_frf_uff, read_modes_uff, read_nodes_uff of flexplant.io, and "
+        "read_modes for the modes of a model",
+    )
 )
 
 
