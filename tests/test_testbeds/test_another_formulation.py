@@ -8,6 +8,7 @@ import scipy.linalg as la
 
 import flexplant as fx
 from flexplant.errors import LabelError, ModelError
+from flexplant.sparse.factor import dense
 from flexplant.testbeds.ritz_plate import ritz_plate
 from stages import RATE, ports
 
@@ -234,3 +235,47 @@ def test_frequencies_are_uncertain_by_what_was_not_explained():
     assert np.mean(inside) > 0.7
     with pytest.raises(ModelError, match="mesh"):
         fit.frequency_uncertainty(poles, mesh=0.01)
+
+
+@pytest.mark.slow
+def test_a_second_size_is_its_own_machine():
+    """A drawing of that size has its frequencies within 2 %, one of the paper's size none."""
+    size, thickness = (0.5, 0.35), 0.03
+    other = fx.testbeds.wafer_stage(size=size, thickness=thickness, damping=0.001)
+    mesh = fx.kirchhoff_plate(elements=(16, 12), **(DRAWN | {"size": size, "thickness": thickness}))
+    row, M = mesh.dofs.row((0.25, 0.0875, 0.0), "z"), mesh.M.toarray()
+    drawn = swing(M + 0.5 * np.outer(row, row), mesh.K.toarray(), 6)
+    found = other.poles(range(4, 10)).freq
+    np.testing.assert_allclose(found, drawn, rtol=0.02)
+    assert np.abs(found / drawn - 1.0).max() > 1e-3
+    assert np.all(found > 1.2 * machine().poles(range(4, 10)).freq)
+    with pytest.raises(ModelError, match="two lengths"):
+        fx.testbeds.wafer_stage(size=0.5)
+    with pytest.raises(ModelError, match="thickness"):
+        fx.testbeds.wafer_stage(thickness=0.0)
+
+
+@pytest.mark.slow
+def test_a_second_size_is_measured_at_its_own_places():
+    """The measured FRF is that of the hidden matrices; the paper's centre is off this plate."""
+    other = fx.testbeds.wafer_stage(size=(0.5, 0.28), thickness=0.03)
+    pushed = [(0.1, 0.07, 0.0), (0.4, 0.07, 0.0), (0.2, 0.24, 0.0)]
+    seen = [(0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.28, 0.0)]
+    own = fx.Ports(
+        w=[],
+        u=[fx.Actuator(f"u{i}", at=p) for i, p in enumerate(pushed)],
+        z=[],
+        y=[fx.Sensor(f"y{i}", at=p) for i, p in enumerate(seen)],
+    )
+    frf = other.measure_frf(own, period=1.0, periods=2, amplitude=10.0, rng=1)
+    M, D, K = (dense(part) for part in (other.truth.M, other.truth.D, other.truth.K))
+    B, C = (
+        np.array([other.truth.dofs.row(np.array(p), "z") for p in side]) for side in (pushed, seen)
+    )
+    for frequency in (50.0, 200.0, 300.0):
+        k = int(np.argmin(np.abs(frf.freq - frequency)))
+        s = 2j * np.pi * frf.freq[k]
+        hold = (1.0 - np.exp(-s / other.rate)) / (s / other.rate)
+        exact = hold * (C @ np.linalg.solve(s**2 * M + s * D + K, B.T))
+        # what is left of the transient of a servo of 8 Hz: 1e-3; with periods of 0.2 s it is 0.1
+        assert np.abs(frf.data[..., k] - exact).max() < 3e-3 * np.abs(exact).max()

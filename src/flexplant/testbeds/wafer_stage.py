@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -23,12 +23,9 @@ from ..structure import FEModel, ModalDamping, kirchhoff_plate
 from ..synthesis import design_servo
 from .ritz_plate import elastic_modes, ritz_plate
 
-SIZE = (0.6, 0.6)
-#: the paper's z_8
-Z8 = (SIZE[0] / 2, SIZE[1] / 4, 0.0)
 #: the plate of the paper's Table 1, as its drawing says
 DRAWING: Mapping[str, Any] = {
-    "size": SIZE,
+    "size": (0.6, 0.6),
     "thickness": 0.0272,
     "density": 2702.0,
     "youngs_modulus": 70e9,
@@ -44,6 +41,8 @@ STIFFNESS, SPREAD, LATENCY, STEP, SECOND = 0.003, 0.3, 1.3, 5e-11, 0.1
 def wafer_stage(
     *,
     elements: tuple[int, int] | None = None,
+    size: Sequence[float] = (0.6, 0.6),
+    thickness: float = 0.0272,
     damping: float = 0.01,
     added_mass: float = 0.5,
     rate: float = 10e3,
@@ -52,8 +51,8 @@ def wafer_stage(
 ) -> WaferStage:
     """Return the virtual machine: the paper's plate with an actuator's mass that no drawing shows.
 
-    A free plate of Table 1 with shear and rotary inertia, solved to convergence: no mesh of any
-    drawing has its frequencies (1 to 6 % below those of a plate without). A point mass is added at
+    A free plate of Table 1 with rotary inertia in polynomials, solved to convergence: no mesh of
+    any drawing has its frequencies. A point mass is added at
     (L/2, L/4), the paper's z_8, and up to 0.1 kg somewhere; stiffness is scattered over the plate
     by 0.3 %, damping over its modes by 30 %, sensors have steps of 0.05 nm, and the delay is no
     whole number of samples.
@@ -63,6 +62,10 @@ def wafer_stage(
     elements : (int, int), optional
         In its place the drawing's own plate on such a mesh, without scatter, second mass or steps,
         and a delay of 1: a machine of its models' family. (8, 8) is the paper's with 243 DOFs.
+    size : (float, float) [m]
+        Sides of the plate along x and y; the paper's when not given.
+    thickness : float [m]
+        Of the plate.
     damping : float
         Modal damping ratio of the bare plate's elastic modes; of a machine their mean.
     added_mass : float [kg]
@@ -89,15 +92,19 @@ def wafer_stage(
     >>> import flexplant as fx
     >>> fx.testbeds.wafer_stage().poles([6]).freq.round(1)
     array([455.1])
+    >>> fx.testbeds.wafer_stage(size=(0.5, 0.35), thickness=0.03).poles([6]).freq.round(1)
+    array([1260.7])
     >>> fx.testbeds.wafer_stage(elements=(4, 4)).poles([4]).freq.round(1)
     array([246.5])
     """
     mass = positive(added_mass, "added_mass", zero=True)
     fast = positive(rate, "rate")
+    drawing = _drawn(size, thickness)
+    mass_at: dict[tuple[float, ...], float] = {_spot(drawing): mass}
     if elements is None:
         late = positive(LATENCY if delay is None else delay, "delay", zero=True)
         seed = whole(individual, "individual", minimum=0)
-        return WaferStage(_individual(damping, mass, seed), fast, late, STEP)
+        return WaferStage(_individual(drawing, damping, mass_at, seed), fast, late, STEP, drawing)
     given = tuple(elements) if isinstance(elements, tuple | list) else ()
     if len(given) != 2:
         raise ModelError(
@@ -105,26 +112,48 @@ def wafer_stage(
         )
     elements = (whole(given[0], "elements along x"), whole(given[1], "elements along y"))
     late = positive(1.0 if delay is None else delay, "delay", zero=True)
-    bare = kirchhoff_plate(elements=elements, name="wafer stage", **DRAWING)
-    return WaferStage(_loaded(bare.with_damping(ModalDamping(damping)), {Z8: mass}), fast, late)
+    bare = kirchhoff_plate(elements=elements, name="wafer stage", **drawing)
+    truth = _loaded(bare.with_damping(ModalDamping(damping)), mass_at)
+    return WaferStage(truth, fast, late, drawing=drawing)
 
 
-def _individual(damping: float, mass: float, seed: int) -> FEModel:
+def _drawn(size: Any, thickness: Any) -> Mapping[str, Any]:
+    """Return the drawing of a plate of this size."""
+    sides = tuple(size) if isinstance(size, Sequence) and not isinstance(size, str) else ()
+    if len(sides) != 2:
+        raise ModelError(f"size is two lengths (x, y) in m, got {short(size)}. Try (0.6, 0.6).")
+    x, y = (positive(side, "size") for side in sides)
+    return {**DRAWING, "size": (x, y), "thickness": positive(thickness, "thickness")}
+
+
+def _spot(drawing: Mapping[str, Any]) -> tuple[float, float, float]:
+    """Return where the hidden mass is: the paper's z_8."""
+    x, y = drawing["size"]
+    return x / 2, y / 4, 0.0
+
+
+def _individual(
+    drawing: Mapping[str, Any], damping: float, known: Mapping[Any, float], seed: int
+) -> FEModel:
     """Return one machine: its stiffness, damping and masses."""
     random = np.random.default_rng([seed, 8])
     waves = random.normal(size=(3, 3))
+    sides = drawing["size"]
 
     def stiffer(x: FloatArray, y: FloatArray) -> FloatArray:
-        along = [np.cos(np.pi * np.arange(3)[:, None] * v / SIZE[0]) for v in (x[0], y[:, 0])]
+        along = [
+            np.cos(np.pi * np.arange(3)[:, None] * v / side)
+            for v, side in zip((x[0], y[:, 0]), sides, strict=True)
+        ]
         return np.asarray(1.0 + STIFFNESS * (along[1].T @ waves @ along[0]) / np.sqrt(9.0 / 4.0))
 
-    bare = ritz_plate(stiffer=stiffer, **DRAWING)
+    bare = ritz_plate(stiffer=stiffer, **drawing)
     omega, phi = elastic_modes(bare)
     zeta = positive(damping, "damping", zero=True) * np.exp(SPREAD * random.normal(size=omega.size))
     shapes = bare.M @ phi
     D = shapes * (2.0 * zeta * omega) @ shapes.T
-    spot = (SIZE[0] * random.random(), SIZE[1] * random.random(), 0.0)
-    masses: dict[tuple[float, ...], float] = {Z8: mass, spot: SECOND * random.random()}
+    spot = (sides[0] * random.random(), sides[1] * random.random(), 0.0)
+    masses = {**known, spot: SECOND * random.random()}
     return _loaded(bare.replace(D=0.5 * (D + D.T), name="wafer stage"), masses)
 
 
@@ -151,6 +180,8 @@ class WaferStage(Value):
         From measurement to actuation.
     step : float [m]
         Of its sensors; 0: none.
+    drawing : mapping
+        Size, thickness and material of its plate as drawn; the paper's when not given.
 
     Examples
     --------
@@ -164,6 +195,7 @@ class WaferStage(Value):
     rate: float
     delay: float
     step: float = 0.0
+    drawing: Mapping[str, Any] = field(default_factory=lambda: dict(DRAWING))
 
     def __repr__(self) -> str:
         late = f"{self.delay:g} sample" + ("" if self.delay == 1 else "s")
@@ -333,10 +365,16 @@ class WaferStage(Value):
                 ),
             ],
             u=ports.u,
-            z=[Poi("centre", at=(SIZE[0] / 2, SIZE[1] / 2, 0.0), axes=("z", "rx", "ry"))],
+            z=[
+                Poi(
+                    "centre",
+                    at=(*(side / 2 for side in self.drawing["size"]), 0.0),
+                    axes=("z", "rx", "ry"),
+                )
+            ],
             y=ports.y,
         )
-        loop = close_loop(self._plant(own), *_holding(own, self.rate, self.delay))
+        loop = close_loop(self._plant(own), *_holding(own, self))
         lines = np.arange(1, samples // 2)
         spectrum = np.exp(2j * np.pi * random.random(lines.size)) * np.sqrt(samples / 2.0)
         turns = np.exp(2j * np.pi * np.outer(np.arange(count), np.arange(count)) / count)
@@ -376,10 +414,10 @@ class WaferStage(Value):
         )
 
 
-def _holding(ports: Ports, rate: float, delay: float) -> tuple[Any, ...]:
+def _holding(ports: Ports, machine: WaferStage) -> tuple[Any, ...]:
     """Return the slow controller that keeps the machine in place, made from its drawing."""
-    drawing = kirchhoff_plate(elements=(4, 4), **DRAWING).with_damping(ModalDamping(0.01))
-    plant = assemble_plant(drawing, ports).discretized(rate, delay=delay)
+    drawing = kirchhoff_plate(elements=(4, 4), **machine.drawing).with_damping(ModalDamping(0.01))
+    plant = assemble_plant(drawing, ports).discretized(machine.rate, delay=machine.delay)
     return design_static(plant), design_servo(plant, bandwidth=8.0, rolloff=40.0)
 
 
