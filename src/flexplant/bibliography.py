@@ -131,6 +131,8 @@
    space structures, J. Guid. Control Dyn. 14, 1991.
 .. [Kaufman1975] Kaufman, A variable projection method for solving separable nonlinear least squares
    problems, BIT 15, 1975.
+.. [KennedyOHagan2001] Kennedy, O'Hagan, Bayesian calibration of computer models, J. Royal
+   Statistical Society B 63, 2001.
 .. [Kitanidis1987] Kitanidis, Unbiased minimum-variance linear state estimation, Automatica 23,
    1987.
 .. [KuczynskiWozniakowski1992] Kuczynski, Wozniakowski, Estimating the largest eigenvalue by the
@@ -174,6 +176,8 @@
 .. [PackardDoyle1993] Packard, Doyle, The complex structured singular value, Automatica 29, 1993.
 .. [Pascual1997] Pascual, Golinval, Razeto, A frequency domain correlation technique for model
    correlation and updating, IMAC 15, 1997.
+.. [PattersonThompson1971] Patterson, Thompson, Recovery of inter-block information when block sizes
+   are unequal, Biometrika 58, 1971.
 .. [Peeters2004] Peeters, Van der Auweraer, Guillaume, Leuridan, The PolyMAX frequency-domain
    method: a new standard for modal parameter estimation?, Shock and Vibration 11, 2004, 395-409.
 .. [PeetersDeRoeck1999] Peeters, De Roeck, Reference-based stochastic subspace identification for

@@ -253,6 +253,7 @@ def of_updates(rom, unknowns, residual, fit):
     yield fx.identifiability(rom, unknowns, [residual])
     yield fx.localise(rom, [residual], [fx.AddedMass(label) for label in rom.dofs.labels[:4]])
     yield fx.updating.correlate(fit.model, [residual])
+    yield from (fx.updating.Discrepancy("damping", 0.3, 6.0), fit.uncertainty())
     bounded = [fx.AddedMass(at, bounds=(0.0, 1.0)), fx.AddedDamping(at, bounds=(-1.0, 1.0))]
     yield fx.update(rom, bounded, [residual], method=fx.updating.TrustRegion(), starts=2)
     yield fx.sample_posterior(rom, unknowns, [residual], fit, steps=20)

@@ -217,22 +217,20 @@ def test_frequencies_are_uncertain_by_what_was_not_explained():
     )
     poles = machine().poles([4, 6, 7, 9, 13])
     wide = poles.replace(covariance=np.diag((0.002 * np.abs(np.r_[poles.poles, poles.poles])) ** 2))
-    own = np.abs(fit.model.modes().poles)[[3, 5, 6, 8, 12]]
-    misfit = np.sqrt(np.mean((np.abs(poles.poles) / own - 1.0) ** 2))
     found = fit.frequency_uncertainty(poles)
     assert {found[m] for m in (4, 6, 7, 9, 13)} == {1e-3}
-    assert found[5] == found[20] == pytest.approx(2 * misfit)
-    assert fit.frequency_uncertainty(wide)[6] == pytest.approx(0.004)
+    assert 0.005 < found[5] < found[20] < 0.1
+    assert fit.frequency_uncertainty(wide)[6] == pytest.approx(0.004, rel=0.05)
     coarse, fine = (
         fx.solve_modes(fx.kirchhoff_plate(elements=(n, n), **DRAWN), count=24) for n in (8, 16)
     )
     mesh = coarse.mesh_error(fine)
     beside = fit.frequency_uncertainty(poles, mesh=mesh)
-    assert beside[20] == pytest.approx(max(2 * misfit, 1.5 * abs(mesh.error[16])))
+    assert beside[20] == pytest.approx(max(found[20], 1.5 * abs(mesh.error[16])))
     assert beside[4] == 1e-3
     true = np.abs(machine().poles(range(4, 25)).freq / fit.model.modes().freq[3:24] - 1.0)
     inside = [true[m - 4] < share for m, share in beside.items() if share > 1e-3]
-    assert np.mean(inside) > 0.7
+    assert np.mean(inside) > 0.9
     with pytest.raises(ModelError, match="mesh"):
         fit.frequency_uncertainty(poles, mesh=0.01)
 

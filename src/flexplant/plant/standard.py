@@ -237,9 +237,11 @@ class StandardPlant(Partition):
 
         Parameters
         ----------
-        source : UpdateResult or MeasuredModes, optional
-            A fit whose `model` this plant was assembled from, or measured poles with mode numbers
-            and a covariance.
+        source : UpdateResult, ModalUncertainty or MeasuredModes, optional
+            A fit whose `model` this plant was assembled from (one with a discrepancy counts as its
+            `uncertainty()`: two deviations are what a mode may be off by), the uncertainty of a
+            calibrated model, ``fit.uncertainty(measured)``, or measured poles with mode numbers and
+            a covariance.
         parameters : sequence of Parameter or {Parameter: float}, optional
             Those that were given to `update`, in its order; those the fit keeps when not given. Or
             in place of a source parameters with the amount by which each may be off at delta = 1,

@@ -1,6 +1,7 @@
 """Model updating: parameters, residuals, sensitivities, searches and their judgement."""
 
 from ..rooms import public_names as _public_names
+from .discrepancy import Discrepancy as Discrepancy
 from .judgement.correlation import Correlation as Correlation
 from .judgement.correlation import correlate as correlate
 from .judgement.correlation import fdac as fdac
@@ -15,6 +16,7 @@ from .judgement.posterior import sample_posterior as sample_posterior
 from .judgement.validation import Validation as Validation
 from .judgement.validation import split as split
 from .judgement.validation import validate as validate
+from .modal_uncertainty import ModalUncertainty as ModalUncertainty
 from .parameters.added import AddedDamping as AddedDamping
 from .parameters.added import AddedMass as AddedMass
 from .parameters.added import AddedStiffness as AddedStiffness

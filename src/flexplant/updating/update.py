@@ -12,6 +12,7 @@ from ..errors import ModelError, SolverError, counted, warn
 from ..parallel import Progress
 from ..structure.model import FEModel
 from ..tolerances import TINY
+from .discrepancy import weighed
 from .full_basis import MOST_ROUNDS, FullBasis, is_large
 from .judgement.goodness import chi_square, covariance, is_bad, worst
 from .parameters.added import Parameter
@@ -118,9 +119,11 @@ def update(
     -----
     FlexplantWarning
         When the tolerance was not met; when the noise is known and the fit leaves more than noise
-        does in one of 10 000 cases (the covariance is then widened by chi-square over its degrees
-        of freedom); when the last round of defect correction still moved the estimate by more than
-        half a standard deviation.
+        does in one of 10 000 cases: parameters, and for each kind of residual the standard
+        deviation of what the model cannot explain, are then estimated together
+        (`UpdateResult.discrepancy`; with responses the covariance is widened instead, by chi-square
+        over its degrees of freedom); when the last round of defect correction still moved the
+        estimate by more than half a standard deviation.
 
     Raises
     ------
@@ -209,11 +212,19 @@ def update(
             "other mode numbers, start=, starts= or more iterations."
         )
     fit = _result(model, objective, method, best, begins[0])
-    fit = fit.replace(starts=summary(begins, ends), rounds=np.array(estimates))
-    if method.least_squares and is_bad(fit.p_value):
-        if fit.covariance is not None and fit.chi2 is not None:
-            fit = fit.replace(covariance=fit.covariance * (fit.chi2 / fit.dof))
-        warn(_complaint(fit, objective, best.p))
+    fit = fit.replace(starts=summary(begins, ends), rounds=np.array(estimates), residuals=given)
+    if not method.least_squares or not is_bad(fit.p_value):
+        return fit
+    named = worst(objective, objective.at(best.p))
+    end, found = weighed(objective, method, best, most=max_iterations, tolerance=enough)
+    if found:
+        again = _result(model, objective, method, end, begins[0])
+        kept = {"starts": fit.starts, "rounds": fit.rounds, "residuals": given}
+        # whether the model is right is judged by the noise alone, at the least chi-square
+        fit = again.replace(chi2=fit.chi2, dof=fit.dof, discrepancy=found, **kept)
+    elif fit.covariance is not None and fit.chi2 is not None:
+        fit = fit.replace(covariance=fit.covariance * (fit.chi2 / fit.dof))
+    warn(_complaint(fit, named))
     return fit
 
 
@@ -246,19 +257,27 @@ def _result(
     )
 
 
-def _complaint(fit: UpdateResult, objective: Objective, p: FloatArray) -> str:
-    """Return what is wrong with a fit that leaves more than noise."""
+def _complaint(fit: UpdateResult, named: str) -> str:
+    """Return what is wrong with a fit that leaves more than noise; `named`: its worst residuals."""
     negative = ""
     if fit.negative_masses:
         negative = f"{', '.join(fit.negative_masses)} came out negative. "
     tried = "" if fit.starts is None else f"{counted(len(fit.starts), 'start')} tried. "
+    kept = (
+        f"The covariance is widened by {(fit.chi2 or 0.0) / max(fit.dof, 1):.3g} and holds for "
+        "small errors of the model only."
+    )
+    if fit.discrepancy:
+        kept = (
+            f"A discrepancy of {fit.discrepancy_text} counts as noise, so that the parameters "
+            "weigh each value by what the model can explain; fit.uncertainty() says by how much "
+            "modes may be off."
+        )
     return (
         f"the updated model leaves more than noise: chi-square {fit.chi2:.4g} for {fit.dof} "
-        f"degrees of freedom. It fits worst {worst(objective, objective.at(p))}. {negative}"
+        f"degrees of freedom. It fits worst {named}. {negative}"
         "Something else differs between model and machine, or the noise is understated; "
-        f"localise(model, residuals, candidates) searches for the place. {tried}The covariance is "
-        f"widened by {(fit.chi2 or 0.0) / max(fit.dof, 1):.3g} and holds for small errors of the "
-        "model only."
+        f"localise(model, residuals, candidates) searches for the place. {tried}{kept}"
     )
 
 

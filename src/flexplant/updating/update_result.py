@@ -10,15 +10,19 @@ import numpy as np
 
 from ..checks import ComplexArray, FloatArray, Matrix, Rng, Value, between, generator, short, whole
 from ..errors import ModelError, counted, require_known, warn
+from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
 from ..modes.normal_form import RIGID_DRAG
 from ..structure.attachments import summed
 from ..structure.model import FEModel
 from ..structure.rigid import orthonormalised
+from .discrepancy import Discrepancy
 from .family import Family
-from .frequency_uncertainty import frequency_uncertainty
 from .judgement.goodness import chance
+from .modal_uncertainty import ModalUncertainty, modal_uncertainty
 from .parameters.added import AddedMass, Parameter
+from .residuals.eigenvalues import Eigenvalues
+from .residuals.residual import Residual
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -120,8 +124,8 @@ class UpdateResult(Value):
         ``G = (J^T W J)^-1 J^T W`` with J = [Re S; Im S], whatever the weights. Without:
         ``s^2 (J^T W J)^-1`` with the residual variance ``s^2 = e / (2 m - q)``, so weights are
         relative; it then holds the model's own error too. None when neither is known (no
-        covariance and 2 m = q). Widened by ``chi2 / dof`` where that is more than noise
-        (`p_value` below 1e-4).
+        covariance and 2 m = q). Where `chi2` is more than noise (`p_value` below 1e-4) C holds
+        the discrepancy too, or with responses is widened by ``chi2 / dof``.
     correlation : (q, q) array
         The correlation of the estimate for errors of covariance W^-1 (of `covariance` where
         there is one).
@@ -141,13 +145,19 @@ class UpdateResult(Value):
     unknowns : sequence of Parameter
         What was estimated, as it was given to `update`.
     chi2 : float or None
-        What is left of the residuals (and priors), squared and summed in units of their noise:
-        about `dof` when the model explains the measurement. None where the noise is not known.
+        What is left of the residuals (and priors), squared and summed in units of their noise, by
+        the parameters that leave least: about `dof` when the model explains the measurement. None
+        where the noise is not known.
     dof : int
         Degrees of freedom: residuals and priors less the parameters that were fitted and did not
         end at a bound.
     rounds : (r, q) array or None
         The estimate of the reduced model alone and after each round of defect correction.
+    residuals : sequence of Residual
+        What was fitted.
+    discrepancy : sequence of Discrepancy
+        What the model is off by in each kind of residual, beside noise; empty where noise explains
+        what is left.
 
     Examples
     --------
@@ -177,6 +187,8 @@ class UpdateResult(Value):
     chi2: float | None = None
     dof: int = 0
     rounds: FloatArray | None = None
+    residuals: tuple[Residual, ...] = ()
+    discrepancy: tuple[Discrepancy, ...] = ()
 
     def __getitem__(self, name: str) -> float:
         require_known("parameter", [name], self.parameters)
@@ -194,6 +206,17 @@ class UpdateResult(Value):
         Below 1e-4 the model is wrong somewhere else, or the noise was understated.
         """
         return chance(self.chi2, self.dof)
+
+    @property
+    def fitted_poles(self) -> MeasuredModes | None:
+        """The measured poles that were fitted, None where not one set of them was."""
+        found = [r.measured for r in self.residuals if isinstance(r, Eigenvalues)]
+        return found[0] if len(found) == 1 else None
+
+    @property
+    def discrepancy_text(self) -> str:
+        """The discrepancy in words."""
+        return ", ".join(f"{d.deviation:.2g} of {d.kind}" for d in self.discrepancy)
 
     @property
     def negative_masses(self) -> tuple[str, ...]:
@@ -223,6 +246,8 @@ class UpdateResult(Value):
             lines.append(f"  at a bound: {', '.join(self.at_bound[:5])}")
         if self.negative_masses:
             lines.append(f"  negative: {', '.join(self.negative_masses[:5])}")
+        if self.discrepancy:
+            lines.append(f"  off by, beside noise: {self.discrepancy_text} (relative)")
         said = "converged" if self.converged else "NOT CONVERGED"
         head = f"<UpdateResult: {said} in {counted(len(self.history), 'step')} ({self.reason})"
         if self.p_value is not None:
@@ -232,8 +257,8 @@ class UpdateResult(Value):
     def interval(self, level: float = 0.95) -> FloatArray:
         """Return confidence (credible) intervals (q, 2) of the parameters.
 
-        Of the normal distribution where the noise was given; of a normal distribution too (not
-        Student's t) where its size came from the residuals.
+        Of the normal distribution; of Student's, with the fewest degrees of freedom of a kind,
+        where the discrepancy was estimated.
 
         Parameters
         ----------
@@ -247,9 +272,11 @@ class UpdateResult(Value):
         """
         share = between(level, "level", 0.0, 1.0, "Choose 0.95, say.")
         std = self._known_std()
-        from scipy.special import ndtri
+        from scipy.special import ndtri, stdtrit
 
-        half = float(ndtri((1 + share) / 2)) * std
+        least = min((d.dof for d in self.discrepancy), default=None)
+        quantile = ndtri((1 + share) / 2) if least is None else stdtrit(least, (1 + share) / 2)
+        half = float(quantile) * std
         return np.column_stack([self.values - half, self.values + half])
 
     def sample(self, count: int, *, rng: Rng = 0) -> FloatArray:
@@ -337,31 +364,45 @@ class UpdateResult(Value):
     def frequency_uncertainty(
         self, measured: Any, *, mesh: MeshError | None = None
     ) -> dict[int, float]:
-        """Return by what share each frequency of the calibrated model may be off.
+        """Return the frequencies' part of `uncertainty`, {mode: share}."""
+        return self.uncertainty(measured, mesh=mesh).frequency
 
-        Of a measured mode two standard deviations, at least 0.1 %; of another twice the rms
-        difference of the measured modes from the update (what the parameters cannot explain of
-        those they cannot explain of the rest either), at least 0.5 %, and 1.5 times the error of
-        the mesh. ``plant.uncertain(frequency=...)`` takes it.
+    def uncertainty(
+        self, measured: Any = None, *, mesh: MeshError | None = None
+    ) -> ModalUncertainty:
+        """Return by what shares frequencies and damping of modes may be off, and their covariance.
+
+        The relative error of a mode is ``S dp + s (e + c)``: the parameters' error, one of each
+        mode and one of all together. Their deviation s, one for frequencies and one for damping,
+        follows from what the parameters leave of the measured modes by restricted likelihood; it is
+        near 0.25 % and 15 % where little was measured. Measured poles condition all of it, so that
+        the covariance of modes and parameters is joint.
 
         Parameters
         ----------
-        measured : MeasuredModes
-            With mode numbers, as for `calibrated`.
+        measured : MeasuredModes, optional
+            The modes with which the model is calibrated: the answer is that of
+            ``fit.calibrated(measured)``, where a measured mode is off by its two deviations, at
+            least by 0.1 % (damping by 2 %). None: of `model`, whose measured modes are off by what
+            the update left, with the poles that were fitted.
         mesh : MeshError, optional
-            Of ``modes.mesh_error(finer)``.
+            Of ``modes.mesh_error(finer)``; 1.5 times of it count for modes that were not measured.
 
         Returns
         -------
-        dict of {int: float}
-            For each elastic mode of the model.
+        ModalUncertainty
 
         Raises
         ------
         ModelError, LabelError
-            When `measured` has no numbers, or one is not of an elastic mode here.
+            When `measured` has no numbers, or one is not of an elastic mode here; without it, when
+            no poles were fitted.
+
+        References
+        ----------
+        [PattersonThompson1971]_, [KennedyOHagan2001]_.
         """
-        return frequency_uncertainty(self.model, measured, mesh)
+        return modal_uncertainty(self, measured, mesh)
 
     def modes(self, *, count: int | None = None) -> Modes:
         """Return the modes of the updated model on all DOFs of the structure.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -16,13 +16,14 @@ from ...identification import MeasuredModes
 from ...labels import Place
 from ...lti.statespace import StateSpace
 from ...tolerances import SAME, TINY
-from ...updating import UpdateResult, eigenvalue_sensitivities
+from ...updating import ModalUncertainty, UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters.added import Parameter
 from ..building import P, continuous_plant
 from ..partition import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
 from ..realisation import ModalRealisation
 from .delta_channels import require_exact, system_matrix, with_channels
+from .mode_deltas import KNOWN, SAME_MODEL, check_poles, judged, stated
 from .neglected import NeglectedModes, neglected_modes, opened
 from .shape_channels import shape_deltas, with_gain_channels, with_shape_channels
 from .uncertain_plant import (
@@ -33,8 +34,6 @@ from .uncertain_plant import (
     with_changes,
 )
 
-#: relative standard deviations below this open no channel
-_KNOWN = 1e-12
 #: relative: a dependence on the rates of the states below this is rounding
 _AFFINE = 1e-8
 #: relative change at which the plant's dependence on a Delta is read off
@@ -43,7 +42,7 @@ _PROBE = 0.25
 
 def uncertain(
     plant: P,
-    source: UpdateResult | MeasuredModes | None = None,
+    source: UpdateResult | ModalUncertainty | MeasuredModes | None = None,
     parameters: Sequence[Parameter] | None = None,
     *,
     frequency: Any = None,
@@ -73,7 +72,7 @@ def uncertain(
             )
         deltas: tuple[Delta, ...] = ()
         if any(by_hand[:2]):
-            deltas = _stated(modal_realisation(plant), frequency, damping, modes)
+            deltas = stated(modal_realisation(plant), frequency, damping, modes)
         deltas += _of_ports(plant, gain, delay)
         own = np.eye(len(deltas)) / many**2
         return _with_deltas(plant, deltas, own, many, neglected)
@@ -98,6 +97,11 @@ def uncertain(
         about = about_fit(source, unknowns)
         return _by_parameters(plant, about, covariance, many, neglected, source)
     realisation = modal_realisation(plant)
+    if isinstance(source, UpdateResult) and source.discrepancy and source.fitted_poles is not None:
+        source = source.uncertainty()
+    if isinstance(source, ModalUncertainty):
+        deltas, own = judged(realisation, source, modes, many)
+        return _with_deltas(plant, deltas, own, many, neglected)
     if isinstance(source, UpdateResult):
         parameters = source.unknowns if parameters is None else parameters
         numbers, poles, covariance = _fitted_poles(realisation, source, parameters, modes)
@@ -106,9 +110,13 @@ def uncertain(
     else:
         raise ModelError(
             "uncertainty comes from an UpdateResult or MeasuredModes, got "
-            f"{type(source).__name__}: pass one, or state it: frequency=0.005, damping=0.3."
+            f"{type(source).__name__}: pass one, fit.uncertainty(measured), or state it: "
+            "frequency=0.005, damping=0.3."
         )
-    _check_poles(realisation, numbers, poles, isinstance(source, UpdateResult))
+    fitted = isinstance(source, UpdateResult)
+    # measured: poles that were typed
+    limit, name = (SAME_MODEL, "fit") if fitted else (0.1, "measurement")
+    check_poles(realisation, numbers, poles, limit, name)
     G = _relative(poles)
     covariance = G @ covariance @ G.T
     scale = many * np.sqrt(np.diag(covariance))
@@ -119,7 +127,7 @@ def uncertain(
             ((kind, number) for kind in kinds for number in numbers), scale, strict=True
         )
     ]
-    keep = sorted(np.flatnonzero(scale > _KNOWN), key=lambda i: (every[i].mode, i))
+    keep = sorted(np.flatnonzero(scale > KNOWN), key=lambda i: (every[i].mode, i))
     if not keep:
         raise ModelError(f"modes {list(numbers)} have no variance: there is nothing uncertain.")
     deltas = tuple(every[i] for i in keep)
@@ -130,33 +138,6 @@ def uncertain(
         more = shape_deltas(plant, shapes, source.modes or (), numbers, many)
     about = about_fit(fit, parameters or ()) if fit else ()
     return _with_deltas(plant, deltas, own, many, neglected, more, fit, about)
-
-
-def _stated(
-    realisation: ModalRealisation, frequency: Any, damping: Any, modes: Sequence[int] | None
-) -> tuple[Delta, ...]:
-    """Return Deltas of stated relative uncertainties of frequency and damping, mode by mode."""
-    elastic = range(realisation.n_rigid + 1, realisation.n_modes + 1)
-    chosen = tuple(elastic if modes is None else modes)
-    for number in chosen:
-        if number not in elastic:
-            raise unknown_label("elastic mode of the plant", number, map(str, elastic))
-    sizes = {
-        kind: _by_mode(given, f"{name} of a mode", chosen)
-        for kind, name, given in (("freq", "frequency", frequency), ("damping", "damping", damping))
-    }
-    # stiffness is omega^2
-    scales = {"freq": 2.0 * sizes["freq"], "damping": sizes["damping"]}
-    kinds: tuple[Literal["freq", "damping"], ...] = ("freq", "damping")
-    deltas = [
-        Delta(f"mode{number}:{kind}", number, kind, float(scales[kind][i]))
-        for i, number in enumerate(chosen)
-        for kind in kinds
-        if scales[kind][i] > _KNOWN
-    ]
-    if not deltas:
-        raise ModelError("frequency= and damping= are zero: there is nothing uncertain.")
-    return tuple(deltas)
 
 
 def _of_ports(plant: Partition, gain: Any, delay: float | None) -> tuple[Delta, ...]:
@@ -199,23 +180,6 @@ def _amounts(
         )
     sizes = [positive(size, f"amount of {p.name}") for p, size in stated.items()]
     return tuple(stated), np.diag(np.square(sizes))
-
-
-def _by_mode(given: Any, name: str, modes: Sequence[int]) -> FloatArray:
-    """Return a number for each mode: of one for all, an array, or {mode: number}."""
-    if given is None:
-        return np.zeros(len(modes))
-    if isinstance(given, Mapping):
-        require_known("uncertain mode", map(str, given), map(str, modes))
-        given = [given.get(number, 0.0) for number in modes]
-    elif np.ndim(given) == 0:
-        given = [given] * len(modes)
-    values = real_array(given, name, (len(modes),))
-    if np.any(values < 0):
-        raise ModelError(
-            f"the {name} is uncertain by a share of it, 0 or more, got {values.min()}."
-        )
-    return values
 
 
 def _with_deltas(
@@ -423,26 +387,6 @@ def _relative(poles: ComplexArray) -> FloatArray:
             [np.diag(1 / damped), zero],
         ]
     )
-
-
-def _check_poles(
-    realisation: ModalRealisation, modes: Sequence[int], poles: ComplexArray, strict: bool
-) -> None:
-    """Refuse a plant without the modes that are uncertain."""
-    count = realisation.n_modes
-    for number, pole in zip(modes, poles, strict=True):
-        if not realisation.n_rigid < number <= count:
-            known = range(realisation.n_rigid + 1, count + 1)
-            raise unknown_label("elastic mode of the plant", number, map(str, known))
-        own = np.linalg.eigvals(realisation.pairs[number - 1])
-        off = np.min(np.abs(own - pole)) / abs(pole)
-        # strict: poles that were typed
-        if off > (1e-6 if strict else 0.1):
-            raise ModelError(
-                f"mode {number} has the pole {pole:.6g} in the "
-                f"{'fit' if strict else 'measurement'} and {own[0]:.6g} in the plant: they are "
-                "not of the same model. Assemble the plant from fit.model."
-            )
 
 
 def _check_range(deltas: Sequence[Delta], deviations: float) -> None:

@@ -18,7 +18,7 @@ from ...tolerances import divisor
 from ..family import Family
 from ..point_model import Point
 from .point_residuals import Held
-from .residual import Bound, Residual, channel_places, place_rows, split_parts
+from .residual import Bound, Kind, Residual, channel_places, place_rows, split_parts
 
 #: lines whose response is below so many standard deviations of the noise are left out
 SIGNAL = 3.0
@@ -185,6 +185,10 @@ class _BoundFrf(Bound):
         )
         self.name = f"{counted(lines.size, 'line')} of FRFs"
         self._last: tuple[Point, ComplexArray, Any] | None = None
+
+    def kinds(self) -> list[Kind]:
+        """Return none: what a model is off by at a line it is off by at the next one too."""
+        return []
 
     def row_name(self, row: int) -> str:
         line, channel = divmod(row % self.data.size, len(self._pairs))

@@ -152,6 +152,8 @@ class _Batch(NamedTuple):
 class BoundShapes(Bound):
     """Shapes at unit variance, each compared with the nearest multiple of the model's."""
 
+    kind, usual = "mode shape", 0.02
+
     def __init__(self, residual: ModeShapes, family: Family) -> None:
         measured = residual.measured
         own = measured.modes or ()

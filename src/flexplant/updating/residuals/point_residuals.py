@@ -106,6 +106,8 @@ class Antiresonances(Residual):
 
 
 class _BoundZeros(Bound):
+    kind, usual = "antiresonance", 5e-3
+
     def __init__(self, residual: Antiresonances, family: Family) -> None:
         places = [residual.output, residual.input]
         self.c, self.b = place_rows(family, places, residual.direction)
@@ -246,6 +248,8 @@ class StaticCompliance(Residual):
 
 
 class _BoundStatic(Bound):
+    kind, usual = "compliance", 0.02
+
     def __init__(self, residual: StaticCompliance, family: Family) -> None:
         places = [residual.output, residual.input]
         self.c, self.b = place_rows(family, places, residual.direction)

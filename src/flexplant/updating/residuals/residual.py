@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,6 +42,16 @@ class Residual(Value):
         """Return the residual tied to the rows of one family of models."""
 
 
+class Kind(NamedTuple):
+    """Errors of the model of one kind: independent, each of which moves the rows by a column."""
+
+    name: str
+    #: (m, k) what a relative error of one moves of the whitened rows
+    F: FloatArray
+    #: the relative standard deviation that is usual of a good model
+    usual: float
+
+
 class Bound(ABC):
     """Residuals of unit covariance (where the noise is known), and their exact gradients."""
 
@@ -54,6 +64,9 @@ class Bound(ABC):
     #: what the whole of a measured value is in each row: a part of it is a relative change
     size: FloatArray | float = 1.0
     name: str = ""
+    #: what a model is off by here, and by which share of the measured value it usually is
+    kind: str = "value"
+    usual: float = 0.01
 
     @abstractmethod
     def values(self, point: Point) -> FloatArray:
@@ -62,6 +75,13 @@ class Bound(ABC):
     @abstractmethod
     def slopes(self, point: Point) -> FloatArray:
         """Return their derivatives (m, q)."""
+
+    def kinds(self) -> list[Kind]:
+        """Return the kinds of errors of a model that show in the rows, empty where not described.
+
+        Here of each row, relative to the whole of its measured value.
+        """
+        return [Kind(self.kind, np.diag(np.atleast_1d(self.size)), self.usual)]
 
     def row_name(self, row: int) -> str:
         """Return what is measured in a row, for messages."""
