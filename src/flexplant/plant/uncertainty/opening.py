@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ...checks import ComplexArray, FloatArray, instance, positive, real_array
+from ...checks import ComplexArray, FloatArray, instance, positive
 from ...errors import LabelError, ModelError, require_known, unknown_label
 from ...identification import MeasuredModes
 from ...labels import Place
