@@ -80,8 +80,14 @@ def test_the_whole_chain_from_a_measured_frf(fleet, tmp_path):
     )  # fmt: skip
     report = chain.report(frf, 1)
     masses = [report.row[f"mass at {label}"] for label in fleet.LABELS]
-    np.testing.assert_allclose(masses, [0.6, 0.0, 0.0], atol=3e-3)
-    assert report.row["stiffness"] == pytest.approx(0.01, abs=1e-4)
+    # two short periods are off by more than their noise (the servo that holds the plate settles):
+    # chi-square is rejected, and the misfit counts as what the model cannot explain
+    np.testing.assert_allclose(masses, [0.6, 0.0, 0.0], atol=0.02)
+    assert report.row["stiffness"] == pytest.approx(0.01, abs=5e-4)
+    fit = report.fit
+    for name, true, wide in (("stiffness", 0.01, 0.02), (f"mass at {fleet.LABELS[0]}", 0.6, 0.25)):
+        low, high = fit.interval()[[q.name for q in fit.unknowns].index(name)]
+        assert low < true < high < low + wide
     assert report.places.chosen == (f"mass at {fleet.LABELS[0]}",)
     # the larger model has what decides on the machine, whose loop the chain never sees
     own = machine.loop(fleet.PORTS, *report.blocks)
