@@ -159,6 +159,16 @@ def with_unit(value: float, unit: str | None) -> str:
     return f"{value / factor:.3g} {shown}".rstrip()
 
 
+def with_deviation(value: float, deviation: float | None) -> str:
+    """Return a number in words, without the figures that its standard deviation leaves open."""
+    if deviation is None:
+        return f"{value:.7g}"
+    known = 7
+    if value and deviation > 0 and np.isfinite(deviation):
+        known = min(max(int(np.floor(np.log10(abs(value) / deviation))) + 2, 1), 7)
+    return f"{value:.{known}g} +- {deviation:.2g}"
+
+
 def sizes_of(sizes: Mapping[str, float], units: Mapping[str, str], most: int = 4) -> str:
     """Return sizes of channels in words, `die:z 0.527 nm, die:rx 3.1 nrad`, and how many more."""
     shown = [f"{name} {with_unit(size, units.get(name))}" for name, size in sizes.items()]

@@ -21,6 +21,7 @@ from .left_out import LeftOut as LeftOut
 from .machine_table import MachineTable as MachineTable
 from .machine_table import errors_on_machines as errors_on_machines
 from .minimax import design_minimax_filter as design_minimax_filter
+from .moved_modes import MovedModes as MovedModes
 from .multirate import PeriodicCertificate as PeriodicCertificate
 from .multirate import PeriodicEstimator as PeriodicEstimator
 from .multirate import design_multirate as design_multirate

@@ -9,10 +9,10 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, IntArray, with_unit
 from ..errors import counted
 from ..plant import StandardPlant
-from ..plant.uncertainty.uncertain_plant import Delta, with_changes
 from ..tolerances import SAME, TINY, divisor
 from .estimator import KalmanEstimator
-from .innovation_spectrum import InnovationLines, InnovationParts, impulse, parts_of, steady_gain
+from .innovation_spectrum import InnovationLines, InnovationParts, impulse, steady_gain
+from .moved_modes import ModeChange, explained_by_change, peak_band
 from .whiteness import ExcessPeak
 
 Cause = Literal[
@@ -21,16 +21,20 @@ Cause = Literal[
 #: a peak this close to a mode, relative, may belong to it: that of the innovations lies beyond the
 #: machine's mode, seen from the model's
 _NEAR = 0.12
+#: the same beside a higher peak of another cause: what a machine drifts by
+_DRIFTED = 0.03
 #: largest part of the samples that are outliers, and how many a short record may have
 _RARE, _FEW = 0.01, 20
 #: samples of one burst of motion that follow each other, and part of all that makes them one
 _APART, _BURST = 5, 0.5
 #: samples after an outlier that it is followed for at most
 _FOLLOWED = 2000
+#: a peak this close to one of another spectrum, relative, is the same
+_AGAIN = 2e-3
+#: peaks that are examined, at most
+_PEAKS = 12
 #: lines next to 0 that an offset is compared with
 _LOWEST = 8
-#: lines of a band at most, evaluations of the search for a mode's change, and widths of a new mode
-_BAND, _SEARCH, _WIDTHS = 400, 40, (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
 
 
 class LikelyCause(NamedTuple):
@@ -38,6 +42,8 @@ class LikelyCause(NamedTuple):
 
     cause: Cause
     text: str
+    #: the mode that is elsewhere, where this is the cause and it can be found
+    change: ModeChange | None = None
 
 
 class Outliers(NamedTuple):
@@ -190,32 +196,97 @@ def folded(freq: FloatArray, rate: float) -> FloatArray:
     return np.asarray(np.abs(freq - rate * np.round(freq / rate)))
 
 
-def peak_verdict(
+class Examined(NamedTuple):
+    """Peaks [cycles per sample] where no change was found before, and how far modes may be."""
+
+    tried: FloatArray
+    reach: float
+
+
+def examined(tried: list[float], whole: StandardPlant | None) -> Examined:
+    """Return the peaks examined; modes left out that are known may make others near kept modes."""
+    return Examined(np.array(tried), _NEAR if whole is None else _DRIFTED)
+
+
+def peak_verdicts(
     observer: KalmanEstimator,
     lines: InnovationLines,
+    U: ComplexArray,
     level: FloatArray,
     peaks: list[ExcessPeak],
     whole: tuple[StandardPlant, IntArray] | None,
-) -> LikelyCause:
-    """Return the verdict of peaks beyond the pooled `level` (m,).
+    before: Examined,
+) -> list[LikelyCause]:
+    """Return the verdicts of peaks beyond the pooled `level` (m,); U (m, nu) are the commands.
 
-    `whole` is the larger plant with the numbers of the modes left out, where it is known.
+    `whole` is the larger plant with the numbers of the modes left out, where it is known. Of the
+    highest peak any cause, of the others only whether a kept mode has changed.
     """
     plant, rate = observer.plant, 1.0 / observer.plant.dt
     kept = modes_of(plant)
     seen = folded(kept.freq, rate)
+    if not plant.is_assembled:  # its modes cannot be changed one by one
+        highest = max(peaks, key=lambda one: one.height)
+        near = _modes_near(seen, highest.freq * rate, _NEAR)
+        if near.size:
+            return [LikelyCause("frequency", _wrong(highest, rate, kept.named(int(near[0]))))]
+    causes: list[LikelyCause] = []
+    handled: set[int] = set()
+    for rank, peak in enumerate(sorted(peaks, key=lambda one: -one.height)[:_PEAKS]):
+        at = peak.freq * rate
+        near = _modes_near(seen, at, before.reach if rank or before.tried.size else _NEAR)
+        if whole is not None:  # a mode left out may be nearer
+            others = folded(left_modes(*whole).freq, rate)
+            near = near[np.abs(seen[near] - at) <= np.min(np.abs(others - at), initial=np.inf)]
+        if handled.intersection(near.tolist()):
+            continue  # explained already
+        if np.any(np.abs(before.tried - peak.freq) <= _AGAIN * peak.freq):
+            near = near[:0]
+        for i in near.tolist() if plant.is_assembled else ():
+            band = peak_band(lines, U, level, rate, at, float(seen[i]))
+            mode, number = float(kept.freq[i]), int(kept.numbers[i])
+            straight = abs(mode - rate * np.round(mode / rate) - seen[i]) <= SAME * rate
+            change = explained_by_change(observer, band, number, mode, 1.0 if straight else -1.0)
+            if change is not None:
+                text = _wrong(peak, rate, kept.named(i))
+                if any(one.change is not None for one in causes):
+                    text = (
+                        f"likewise {peak.height:.3g} times at {at:.4g} Hz, near {kept.named(i)})."
+                    )
+                causes.append(LikelyCause("frequency", text, change))
+                handled.add(i)
+                break
+        else:
+            if not rank:
+                causes.append(_beyond(observer, peaks, kept, near, whole))
+    return causes
+
+
+def _modes_near(seen: FloatArray, at: float, reach: float) -> IntArray:
+    """Return the modes that a peak may belong to, the nearest first."""
+    near = np.flatnonzero(np.abs(seen - at) <= reach * np.maximum(seen, TINY))
+    return near[np.argsort(np.abs(seen[near] - at))]
+
+
+def _wrong(peak: ExcessPeak, rate: float, mode: str) -> str:
+    return (
+        f"{_said(peak, rate)}, near {mode} in the plant): its frequency or damping is not the "
+        "machine's. Update the model."
+    )
+
+
+def _beyond(
+    observer: KalmanEstimator,
+    peaks: list[ExcessPeak],
+    kept: SampledModes,
+    near: IntArray,
+    whole: tuple[StandardPlant, IntArray] | None,
+) -> LikelyCause:
+    """Return the verdict of a highest peak that no change of a kept mode explains."""
+    rate = 1.0 / observer.plant.dt
     top = np.max(kept.freq[kept.freq < 0.5 * rate], initial=0.0)
     highest = max(peaks, key=lambda one: one.height)
     at = highest.freq * rate
-    near = np.flatnonzero(np.abs(seen - at) <= _NEAR * np.maximum(seen, TINY))
-    near = near[np.argsort(np.abs(seen[near] - at))]
-    i = next((int(j) for j in near if _changed(observer, lines, level, at, kept, int(j))), None)
-    if i is not None:
-        return LikelyCause(
-            "frequency",
-            f"{_said(highest, rate)}, near {kept.named(i)} in the plant): its frequency or damping "
-            "is not the machine's. Update the model.",
-        )
     found = None if whole is None else _named(observer, left_modes(*whole), at)
     if found is not None:
         return LikelyCause(found.cause, f"{_said(highest, rate)}: {found.text}")
@@ -289,89 +360,3 @@ def known_verdict(
         f"the {counted(left.freq.size, 'mode')} left out (most at {at:.4g} Hz, next to "
         f"{left.named(i)} in the larger model)). {end}",
     )
-
-
-def _changed(
-    observer: KalmanEstimator,
-    lines: InnovationLines,
-    level: FloatArray,
-    at: float,
-    kept: SampledModes,
-    i: int,
-) -> bool:
-    """Return whether another frequency or damping of a mode explains a peak better than a new mode.
-
-    Both are fitted to the lines around by Whittle's likelihood, the mode's change as the density
-    of the innovations on the changed plant, the new mode as ``h v v* g^2 / ((f - f_0)^2 + g^2)``
-    with any direction v; each parameter costs half the logarithm of the number of lines. A changed
-    mode is missing where the model has it, and shows itself in its own direction.
-    """
-    from scipy.optimize import minimize
-
-    plant = observer.plant
-    if not plant.is_assembled:
-        return True  # its modes cannot be changed one by one
-    rate, mode = 1.0 / plant.dt, float(kept.freq[i])
-    seen = float(folded(np.array([mode]), rate)[0])
-    sign = 1.0 if abs(mode - rate * np.round(mode / rate) - seen) <= SAME * rate else -1.0
-    reach = 3.0 * abs(at - seen) + 0.02 * at
-    freq = lines.freq * rate
-    band = np.flatnonzero(np.abs(freq - 0.5 * (at + seen)) <= reach)
-    band = band[:: -(-band.size // _BAND)]
-    X, base, p = lines.X[band], level[band], lines.X.shape[1]
-    number = int(kept.numbers[i])
-    own = np.eye(p)[None]
-    usual = parts_of(observer, plant, lines.freq[band]).both
-
-    def cost(change: FloatArray) -> float:
-        moved = mode + sign * (at - seen) * change[0]
-        amounts = [
-            (Delta("freq", number, "freq", 1.0), float((moved / mode) ** 2 - 1.0)),
-            (Delta("damping", number, "damping", 1.0), float(np.exp(change[1]) - 1.0)),
-        ]
-        machine = with_changes(plant, amounts)
-        S = parts_of(observer, machine, lines.freq[band]).both - usual + own
-        return _whittle(S * base[:, None, None], X)
-
-    starts = [np.array([share, factor]) for share in (0.0, 0.5, 1.0) for factor in (-1.4, 0.0, 1.4)]
-    with np.errstate(all="ignore"):
-        first = min(starts, key=cost)
-        best = minimize(
-            cost,
-            first,
-            method="Nelder-Mead",
-            options={
-                "maxfev": _SEARCH,
-                "initial_simplex": first + np.array([[0.0, 0.0], [0.2, 0.2], [0.2, -0.3]]),
-                "xatol": 1e-2,
-                "fatol": 0.5,
-            },
-        ).fun
-    new = min(_new_mode(X, base, freq[band], at, width * at) for width in _WIDTHS)
-    price = 0.5 * np.log(band.size)
-    return bool(best + 2 * price <= new + (2 * p + 1) * price)
-
-
-def _new_mode(
-    X: ComplexArray, base: FloatArray, freq: FloatArray, at: float, width: float
-) -> float:
-    """Return the cost of a mode of some width in any one direction."""
-    shape = width**2 / ((freq - at) ** 2 + width**2)
-    unit = X / np.sqrt(base)[:, None]
-    v = np.linalg.eigh(np.einsum("k,ki,kj->ij", shape, unit, unit.conj()))[1][:, -1]
-    seen = np.abs(unit @ v.conj()) ** 2
-    rest = np.sum(np.abs(unit) ** 2) - np.sum(seen) + X.shape[1] * np.sum(np.log(base))
-    heights = np.geomspace(0.1, 1e6, 60)[:, None]
-    m = 1.0 + heights * shape
-    return float(np.min(np.sum(np.log(m) + seen / m, axis=1)) + rest)
-
-
-def _whittle(S: ComplexArray, X: ComplexArray) -> float:
-    """Return ``sum log det S + X* S^-1 X``, infinite where S is no density."""
-    try:
-        root = np.linalg.cholesky(S)
-    except np.linalg.LinAlgError:
-        return np.inf
-    white = np.linalg.solve(root, X[:, :, None])
-    size = np.log(np.diagonal(root, axis1=1, axis2=2).real)
-    return float(2.0 * np.sum(size) + np.sum(np.abs(white) ** 2))

@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import FloatArray, Value, between, instance, real_array, short
+from ..checks import ComplexArray, FloatArray, Value, between, instance, real_array, short
 from ..errors import ModelError, ShapeError, counted
+from ..loop import ClosedLoop
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
 from .causes import (
     Cause,
+    Examined,
     LikelyCause,
+    Outliers,
+    examined,
+    folded,
     known_verdict,
     left_modes,
+    modes_of,
     offset,
     outlier_text,
     outliers,
-    peak_verdict,
+    peak_verdicts,
     settling,
 )
 from .estimate import Estimate
 from .estimator import KalmanEstimator
 from .estimator_channels import poi_channels, read_alike, row_of
 from .innovation_spectrum import InnovationLines, InnovationParts, expected, lines_of, parts_of
+from .kalman import design_kalman
 from .left_out import left_out
+from .moved_modes import ModeChange, MovedModes, moved_modes
 from .whiteness import ExcessPeak, Statistic, cumulative_periodogram, level_test, ljung_box, peaks
 
 #: fewest samples for a verdict
@@ -41,6 +49,10 @@ _COMPARED = 32768
 _AGREES = 1e-4
 #: steps of the fit of two noise levels, and what keeps it regular where one of them is not seen
 _SCORING, _RIDGE = 40, 1e-9
+#: modes that are fitted one after the other until no peak is left, at most
+_MOVED = 6
+#: the band of a mode, in half-widths and in lines to each side: nearly all of its power
+_HALF_WIDTHS, _BESIDE = 3.0, 2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -69,6 +81,12 @@ class Consistency(Value):
         The verdict in words.
     level : float
         Of all tests together.
+    spectra : mapping {mode: (float, float)}
+        Power of the innovations around each mode of the plant beside the predicted one, and the
+        probability of one as far off with a right model.
+    moved : MovedModes, optional
+        The modes that are elsewhere on the machine, by how much and with which deviation, where
+        this is a cause: ``model.calibrated(found.moved.measured)`` is the machine's model.
 
     Examples
     --------
@@ -91,14 +109,24 @@ class Consistency(Value):
     causes: tuple[Cause, ...]
     text: str
     level: float = field(default=0.95)
+    spectra: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+    moved: MovedModes | None = None
 
     def __repr__(self) -> str:
         nees = "".join(f", NEES {name} {m:.3g}" for name, (m, _, _) in self.nees.items())
         return (
             f"<Consistency at {100 * self.level:g} %: NIS {self.nis:.4g} (p {self.nis_p:.2g}), "
             f"Ljung-Box p {self.whiteness_p:.2g}, periodogram p {self.periodogram_p:.2g}{nees};\n"
-            f"  {self.text}>"
+            f"  {self.text}{self._off()}>"
         )
+
+    def _off(self) -> str:
+        """Return the modes around which the power is not the predicted one, in words."""
+        allowed = (1.0 - self.level) / max(len(self.spectra), 1)
+        off = [f"mode {n} {r:.3g}" for n, (r, p) in self.spectra.items() if p < allowed]
+        if not off or self.holds:
+            return ""
+        return f"\n  Power of the innovations around modes beside the predicted: {', '.join(off)}."
 
     @property
     def cause(self) -> Cause:
@@ -112,8 +140,8 @@ class Consistency(Value):
 
 
 def consistency(
-    observer: KalmanEstimator,
-    estimate: Estimate,
+    observer: KalmanEstimator | ClosedLoop,
+    estimate: Estimate | Any,
     *,
     larger: StandardPlant | Structure | None = None,
     truth: Any = None,
@@ -139,17 +167,20 @@ def consistency(
       fitted to the spectrum): the *noise ratio*;
     - a peak beyond that, which the change of a mode near it explains better than one more mode
       (the model's own mode is missing then, and the direction is its own): the *frequency* or
-      damping of that mode;
+      damping of that mode. Frequency and damping of all such modes are fitted to the record by
+      maximum likelihood, the commands counted, so that a closed loop does not bias them (`moved`);
     - any other peak: *truncation*, where it lies above all modes or a mode left out is known there;
       *folding*, where the plant has modes above it, or the mode left out lies above half the rate;
       or a disturbance that the plant lacks.
 
     Parameters
     ----------
-    observer : KalmanEstimator
-        That made the estimate.
-    estimate : Estimate
-        Of `observer.estimate(records)`; samples that its gate left out are missing ones.
+    observer : KalmanEstimator or ClosedLoop
+        That made the estimate; or a loop that ran on the machine: the record is judged by the
+        Kalman filter of its plant.
+    estimate : Estimate, Response or mapping {channel: (N,) array}
+        Of `observer.estimate(records)`; samples that its gate left out are missing ones. Or the
+        records themselves: all sensors and commands.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         With the modes left out, as in `design_kalman`. None: what the observer was designed with.
     truth : mapping {channel: (N,) array}, optional
@@ -185,11 +216,21 @@ def consistency(
     >>> fx.estimation.consistency(observer, observer.estimate(run)).holds
     True
     """
+    if isinstance(observer, ClosedLoop):
+        beyond = observer.larger if larger is None else larger
+        plant = observer.plant
+        observer = design_kalman(plant, larger=plant if beyond is None else beyond)
+    if (
+        isinstance(observer, KalmanEstimator)
+        and hasattr(estimate, "keys")
+        and not isinstance(estimate, Estimate)
+    ):
+        estimate = observer.estimate(estimate)
     if not isinstance(observer, KalmanEstimator) or not isinstance(estimate, Estimate):
         wrong = estimate if isinstance(observer, KalmanEstimator) else observer
         raise ModelError(
-            f"consistency needs a KalmanEstimator and its Estimate, got {short(wrong)}. Pass "
-            "observer and observer.estimate(records)."
+            "consistency needs a KalmanEstimator or a ClosedLoop, and an Estimate or a record, got "
+            f"{short(wrong)}. Pass observer and observer.estimate(records)."
         )
     share = between(level, "level", 0.5, 1.0, "Pass 0.95.", ends="[")
     alpha = 1 - share ** (1 / _TESTS)
@@ -202,26 +243,32 @@ def consistency(
             "a longer record."
         )
     normal = (estimate.innovations / estimate.innovation_deviations).T
-    raw = _tested(observer, white, normal, None, alpha)
+    known = bool(estimate.record.size)  # else the commands are not
+    u = estimate.record[:, len(estimate.sensors) :] if known else np.zeros((len(white), 0))
+    raw = _tested(observer, white, normal, None, alpha, u)
     said, rest = [], raw
     single = outliers(observer, white, normal, alpha)
     if single is not None:
         said.append(LikelyCause("outliers", outlier_text(single, observer, estimate.time)))
         white = single.white
-    settled = white.copy()
-    settled[: min(settling(observer), len(white) // 4)] = np.nan
+    settled, skip = white.copy(), min(settling(observer), len(white) // 4)
+    settled[:skip] = np.nan
     constant = offset(observer, settled, alpha)
     if constant is not None:
         said.append(LikelyCause("offset", constant.text))
         white = settled - constant.mean  # what an offset does at first is no constant
     whole = _whole(observer, larger)
     if said or whole is not None:
-        rest = _tested(observer, white, normal, whole, alpha)
-    verdict = _verdict(observer, rest, whole, estimate.sensors)
-    if not said or verdict.cause != "none":
-        said.append(verdict)
+        rest = _tested(observer, white, normal, whole, alpha, u)
+    verdicts = _verdicts(observer, rest, whole, estimate.sensors, examined([], whole))
+    said += [one for one in verdicts if not said or one.cause != "none"]
+    moved, changes = None, [one.change for one in verdicts if one.change is not None]
+    if changes and known:
+        before = examined([one.freq for one in rest.peaks], whole)
+        moved, left = _moved(observer, estimate, changes, single, alpha, before)
+        said += left
     gated = int(estimate.gated.sum())
-    left = f" {counted(gated, 'sample')} beyond the gate left out." if gated else ""
+    without = f" {counted(gated, 'sample')} beyond the gate left out." if gated else ""
     rate = 1.0 / observer.plant.dt
     return Consistency(
         raw.nis.statistic,
@@ -231,10 +278,81 @@ def consistency(
         dict(zip(estimate.sensors, raw.ratios.tolist(), strict=True)),
         _nees(observer, estimate, truth, share),
         tuple((one.freq * rate, one.height) for one in rest.peaks[:6]),
-        tuple(one.cause for one in said),
-        " ".join(one.text for one in said) + left,
+        tuple(dict.fromkeys(one.cause for one in said)),
+        " ".join(
+            one.text if not i else one.text[:1].upper() + one.text[1:] for i, one in enumerate(said)
+        )
+        + without,
         share,
+        _spectra(observer, raw),
+        moved,
     )
+
+
+def _moved(
+    observer: KalmanEstimator,
+    estimate: Estimate,
+    changes: Sequence[ModeChange],
+    single: Outliers | None,
+    alpha: float,
+    before: Examined,
+) -> tuple[MovedModes | None, list[LikelyCause]]:
+    """Return the modes that are elsewhere, more where these hid them, and what is left."""
+    record = np.array(estimate.record)
+    p = len(estimate.sensors)
+    missing = [] if single is None else single.places
+    for k, i in missing:
+        record[k, i] = np.nan
+    if estimate.gated.size:
+        record[:, :p][estimate.gated.T] = np.nan
+    clean, tried = estimate.replace(record=record), {one.mode for one in changes}
+    skip = min(settling(observer), len(record) // 4)
+    while changes:
+        found, machine, seen = moved_modes(observer, clean, changes, skip)
+        kept = [one for one, start in zip(found.changes, changes, strict=True) if one.near(start)]
+        if len(kept) < len(changes):  # it went on to another peak than the one found
+            changes = kept
+            continue
+        white = seen.whitened.T.copy()
+        white[:skip] = np.nan
+        normal = (seen.innovations / seen.innovation_deviations).T
+        facts = _tested(machine, white, normal, None, alpha, record[:, p:])
+        left = _verdicts(machine, facts, None, estimate.sensors, before)
+        peaks = np.append(before.tried, [one.freq for one in facts.peaks])
+        before = before._replace(tried=peaks)
+        more = [one.change for one in left if one.change is not None]
+        more = [one for one in more if one.mode not in {*found.modes, *tried}]
+        if not more or len(changes) >= _MOVED:
+            break
+        tried.update(one.mode for one in more)
+        changes = [*found.changes, *more]
+    else:
+        return None, []
+    text = f"{'; '.join(found.texts)}. Calibrate the model with these: moved.measured."
+    others = [one for one in left if one.cause not in ("none", "frequency")]
+    if left[0].cause == "none":
+        text += " The innovations are then white."
+    return found, [LikelyCause("frequency", text), *others]
+
+
+def _spectra(observer: KalmanEstimator, facts: _Facts) -> dict[int, tuple[float, float]]:
+    """Return the power of innovations around each mode beside the predicted one, and its p."""
+    plant, lines = observer.plant, facts.lines.freq
+    if not plant.is_assembled:
+        return {}
+    kept, found = modes_of(plant), {}
+    rate, step = 1.0 / float(plant.dt), float(lines[0])
+    blocks = plant.modal_blocks[plant.n_rigid :]
+    decay = -0.5 * np.trace(blocks, axis1=1, axis2=2) / (2.0 * np.pi)
+    expected = facts.parts.pooled.sum(axis=0)
+    for n, at, width in zip(kept.numbers.tolist(), folded(kept.freq, rate), decay, strict=True):
+        reach = _HALF_WIDTHS * width * plant.dt + _BESIDE * step
+        band = np.flatnonzero(np.abs(lines - at * plant.dt) <= reach)
+        if band.size:
+            ratio = float(np.mean(facts.lines.pooled.density[band] / expected[band]))
+            count = 2 * band.size * facts.lines.X.shape[1]
+            found[n] = ratio, level_test(count * ratio, count).p_value
+    return found
 
 
 class _Facts(NamedTuple):
@@ -250,6 +368,7 @@ class _Facts(NamedTuple):
     ratios: FloatArray
     samples: int
     alpha: float
+    U: ComplexArray
 
     @property
     def white(self) -> bool:
@@ -276,13 +395,18 @@ def _tested(
     normal: FloatArray,
     whole: StandardPlant | None,
     alpha: float,
+    u: FloatArray,
 ) -> _Facts:
-    """Return the tests of whitened innovations (N, p)."""
+    """Return the tests of whitened innovations (N, p) under commands u (N, nu)."""
     there = np.isfinite(white).all(axis=1)
     count = int(there.sum())
     nis = level_test(float(np.sum(white[there] ** 2)), count * white.shape[1])
     box = ljung_box(white, min(100, count // 20))
-    lines = lines_of(white if whole is None else white[-_COMPARED:])
+    last = white if whole is None else white[-_COMPARED:]
+    lines = lines_of(last)
+    # those of missing samples are as lost as their innovations
+    missing = np.isnan(last).any(axis=1, keepdims=True)
+    commands = np.where(missing, np.nan, u[-len(last) :])
     pooled = lines.pooled
     parts = (
         parts_of(observer, None, lines.freq)
@@ -293,8 +417,9 @@ def _tested(
     found = peaks(pooled._replace(density=pooled.density / (levels @ parts.pooled)), alpha)
     ratios = np.sqrt(np.mean(normal[there] ** 2, axis=0))
     return _Facts(
-        nis, box, cumulative_periodogram(pooled), found, lines, parts, levels, ratios, count, alpha
-    )
+        nis, box, cumulative_periodogram(pooled), found, lines, parts, levels, ratios, count, alpha,
+        lines_of(commands).X,
+    )  # fmt: skip
 
 
 def _whole(observer: KalmanEstimator, larger: Any) -> StandardPlant | None:
@@ -307,12 +432,16 @@ def _whole(observer: KalmanEstimator, larger: Any) -> StandardPlant | None:
     return None if found is None else read_alike(plant, found)
 
 
-def _verdict(
-    observer: KalmanEstimator, facts: _Facts, whole: StandardPlant | None, names: Any
-) -> LikelyCause:
-    """Return the likely cause and the verdict in words."""
+def _verdicts(
+    observer: KalmanEstimator,
+    facts: _Facts,
+    whole: StandardPlant | None,
+    names: Any,
+    before: Examined,
+) -> list[LikelyCause]:
+    """Return the likely causes and the verdicts in words."""
     if facts.white and facts.nis.p_value >= facts.alpha:
-        return LikelyCause("none", "the innovations are white and of the predicted size.")
+        return [LikelyCause("none", "the innovations are white and of the predicted size.")]
     numbers = None
     if whole is not None and whole.is_assembled:
         missed = observer.left_out if observer.left_out is not None else left_out(
@@ -321,19 +450,21 @@ def _verdict(
         numbers = None if missed is None else missed.modes
     if whole is not None and numbers is not None and facts.explained:
         left = left_modes(whole, numbers)
-        return known_verdict(observer, left, facts.parts, facts.lines.freq)
+        return [known_verdict(observer, left, facts.parts, facts.lines.freq)]
     if facts.white:
-        return LikelyCause("noise level", _level_text(facts, names))
+        return [LikelyCause("noise level", _level_text(facts, names))]
     if facts.peaks:
         known = None if whole is None or numbers is None else (whole, numbers)
-        return peak_verdict(observer, facts.lines, facts.expected, facts.peaks, known)
+        return peak_verdicts(
+            observer, facts.lines, facts.U, facts.expected, facts.peaks, known, before
+        )
     process, sensor = np.sqrt(facts.levels)
-    return LikelyCause(
-        "noise ratio",
+    text = (
         "the innovations are coloured as with other noises: the process noise is about "
         f"{process:.3g} times and that of the sensors {sensor:.3g} times the stated one. Estimate "
-        "both from the record.",
+        "both from the record."
     )
+    return [LikelyCause("noise ratio", text)]
 
 
 def _level_text(facts: _Facts, names: Any) -> str:

@@ -63,6 +63,8 @@ class Estimate(Value, Mapping[str, FloatArray]):
         gate.
     gated : (ny, N) array of bool
         Which samples these are; (ny, 0) without a gate.
+    record : (N, ny + nu) array
+        The measurements and the commands it was made from.
 
     Examples
     --------
@@ -87,6 +89,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
     units: Mapping[str, str] = field(default_factory=dict)
     gate: float = np.inf
     gated: BoolArray = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    record: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     # values are compared by identity; Mapping's == would compare arrays
     __eq__ = object.__eq__
@@ -239,6 +242,7 @@ def estimated(
         | {f"{name}:innovation": units[name] for name in model.sensors if name in units},
         gate,
         passage.gated.T,
+        record.both,
     )
 
 

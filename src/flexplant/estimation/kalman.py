@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -137,6 +138,25 @@ def design_kalman(
     )
     return KalmanEstimator(
         system, plant, design.gain, design.covariance, certificate, honest.values, found
+    )
+
+
+def redesigned(
+    observer: KalmanEstimator, change: Callable[[StandardPlant], StandardPlant]
+) -> KalmanEstimator:
+    """Return the observer of a changed plant, the modes left out and their noise as they are.
+
+    Its predicted errors are those of its own model.
+    """
+    plant, found = change(observer.plant), observer.left_out
+    if found is not None:
+        found = found.replace(plant=change(found.plant))
+    model = filter_model(plant, found)
+    design = _designed(model)
+    own = plant if found is None else found.plant
+    system = filter_system(own, model, design.predictor, design.poi_gain, "kalman")
+    return KalmanEstimator(
+        system, plant, design.gain, design.covariance, design.certificate, design.variances, found
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..checks import Value, generator, instance, positive, short, whole
 from ..errors import AssumptionError, ModelError, counted
-from ..estimation import KalmanEstimator, design_kalman
+from ..estimation import Consistency, KalmanEstimator, consistency, design_kalman
 from ..identification import MeasuredModes, identify_modes, numbered
 from ..loop import ClosedLoop, SpillOver, bandwidth, close_loop
 from ..lti.frequency import Frf
@@ -233,6 +233,7 @@ class MachinePipeline(Value):
                 loop=loop,
                 run=run,
                 verdict=None if check is None else check.check(loop, run),
+                agreement=consistency(observer, run),
             )
             row = self._row(report)
         row["warnings"] = len(said)
@@ -378,6 +379,8 @@ class MachineReport(Value):
         Which candidates joined the update.
     warned : tuple of str
         What was warned of on the way.
+    agreement : Consistency, optional
+        The run beside the model that was updated: which modes are elsewhere still.
     """
 
     row: Mapping[str, Any]
@@ -391,6 +394,7 @@ class MachineReport(Value):
     verdict: Verdict | None = None
     places: Localisation | None = None
     warned: tuple[str, ...] = ()
+    agreement: Consistency | None = None
 
     def __repr__(self) -> str:
         sections: dict[str, Sequence[Any]] = {
@@ -401,6 +405,7 @@ class MachineReport(Value):
             "Controller": self.blocks,
             "Loop on the larger model": [self.left_out and self.left_out.summary],
             "Loop that was run": [self.loop],
+            "Run beside the model": [self.agreement],
             "Specification": [self.verdict],
             "In numbers": [f"{name}: {_shown(value)}" for name, value in self.row.items()],
             "Warnings": self.warned,

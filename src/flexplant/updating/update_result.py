@@ -8,7 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, Matrix, Rng, Value, between, generator, short, whole
+from ..checks import (
+    ComplexArray,
+    FloatArray,
+    Matrix,
+    Rng,
+    Value,
+    between,
+    generator,
+    short,
+    whole,
+    with_deviation,
+)
 from ..errors import ModelError, counted, require_known, warn
 from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
@@ -235,7 +246,7 @@ class UpdateResult(Value):
         std = self.std
         deviations = [None] * len(self.parameters) if std is None else std.tolist()
         lines = [
-            f"  {name} = {_estimate(value, deviation)} {unit}".rstrip()
+            f"  {name} = {with_deviation(value, deviation)} {unit}".rstrip()
             for name, value, deviation, unit in zip(
                 self.parameters[:5], self.values.tolist(), deviations, self.units, strict=False
             )
@@ -433,16 +444,6 @@ class UpdateResult(Value):
         if not self.model.is_physical:
             return reduced  # generalised coordinates: the shapes are expanded already
         return reduced.replace(phi=self.model.T @ reduced.phi, dofs=self.model.full_dofs)
-
-
-def _estimate(value: float, deviation: float | None) -> str:
-    """Return a number in words, without the figures that its standard deviation leaves open."""
-    if deviation is None:
-        return f"{value:.7g}"
-    known = 7
-    if value and deviation > 0 and np.isfinite(deviation):
-        known = min(max(int(np.floor(np.log10(abs(value) / deviation))) + 2, 1), 7)
-    return f"{value:.{known}g} +- {deviation:.2g}"
 
 
 def changed_model(

@@ -1,0 +1,352 @@
+"""Modes of a plant that a record of the machine shows elsewhere: which, and by how much."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..checks import BoolArray, ComplexArray, FloatArray, Value, with_deviation
+from ..identification import MeasuredModes
+from ..lti.frequency import frequency_response
+from ..parallel import one_thread
+from ..plant import StandardPlant
+from ..plant.uncertainty.uncertain_plant import Delta, with_changes
+from .estimate import Estimate
+from .estimator import KalmanEstimator
+from .innovation_spectrum import InnovationLines, parts_of, whitening
+from .kalman import redesigned
+from .lag_report import Filter
+
+#: lines of a band and evaluations of the search for a mode's change, at most; widths of a new mode
+_BAND, _SEARCH, _WIDTHS = 400, 40, (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
+#: steps of the likelihood's maximisation; it ends at a step of so many deviations, which changes
+#: no figure that is printed
+_STEPS, _SETTLED = 12, 0.05
+#: part of the largest step within which the derivatives of the innovations are kept
+_LINEAR = 0.3
+#: differences: of a frequency in half-widths of the mode, of the logarithm of damping; both move
+#: the innovations far more than rounding and far less than linearity lasts
+_WIDTH, _LOG = 0.02, 0.02
+#: a fit ends this close to the peak where it began, relative: peaks are found within some lines
+_NEAR = 5e-3
+#: largest step of a search: widths of a mode, and logarithm of damping
+_FAR = 1.0
+
+
+class ModeChange(NamedTuple):
+    """A mode's number, and the logarithms of the ratios of its |pole| and of its decay rate."""
+
+    mode: int
+    frequency: float
+    decay: float
+
+    def near(self, start: ModeChange) -> bool:
+        """Whether a fit that began at a change ended at the same peak."""
+        return abs(self.frequency - start.frequency) <= max(_NEAR, 0.3 * abs(start.frequency))
+
+    @property
+    def amounts(self) -> list[tuple[Delta, float]]:
+        """The relative changes of stiffness and damping, for `with_changes`."""
+        n = self.mode
+        return [
+            (Delta(f"mode{n}:freq", n, "freq", 1.0), float(np.expm1(2.0 * self.frequency))),
+            (Delta(f"mode{n}:damping", n, "damping", 1.0), float(np.expm1(self.decay))),
+        ]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MovedModes(Value):
+    """Modes that a record shows elsewhere than the plant has them, by maximum likelihood.
+
+    Parameters
+    ----------
+    modes : sequence of m int
+        Their numbers in the plant, from 1, rigid-body modes included.
+    expected : (m,) complex array [rad/s]
+        Poles of the plant.
+    poles : (m,) complex array [rad/s]
+        Of the machine.
+    covariance : (2 m, 2 m) array
+        Of the logarithms of |pole|, then of the decay rates.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> stiffer = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4.2e5, 4.2e5])
+    >>> stiffer = stiffer.with_damping(fx.ModalDamping(0.01))
+    >>> machine = fx.assemble_plant(stiffer, plant.assembled.ports).discretized(2e3, delay=1)
+    >>> observer = fx.design_kalman(plant, larger=plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> run = fx.simulate(fx.close_loop(machine, observer, servo), duration=8.0, rng=1)
+    >>> fx.estimation.consistency(observer, run).moved.modes
+    (2, 3)
+    """
+
+    modes: tuple[int, ...]
+    expected: ComplexArray
+    poles: ComplexArray
+    covariance: FloatArray
+
+    def __repr__(self) -> str:
+        return "<MovedModes: " + "; ".join(self.texts) + ">"
+
+    @property
+    def frequency(self) -> dict[int, tuple[float, float]]:
+        """Relative change of each mode's frequency, and its standard deviation."""
+        change = np.abs(self.poles / self.expected) - 1.0
+        deviation = np.sqrt(np.diag(self.covariance))[: len(self.modes)]
+        return {
+            n: (float(c), float(d)) for n, c, d in zip(self.modes, change, deviation, strict=True)
+        }
+
+    @property
+    def damping(self) -> dict[int, tuple[float, float]]:
+        """Each mode's damping ratio on the machine, and its standard deviation."""
+        m = len(self.modes)
+        turned = np.hstack([-np.eye(m), np.eye(m)])
+        deviation = np.sqrt(np.diag(turned @ self.covariance @ turned.T))
+        zeta = -self.poles.real / np.abs(self.poles)
+        return {
+            n: (float(z), float(z * d)) for n, z, d in zip(self.modes, zeta, deviation, strict=True)
+        }
+
+    @property
+    def texts(self) -> list[str]:
+        """Each mode in words."""
+        found = []
+        for i, n in enumerate(self.modes):
+            (df, sf), (z, sz) = self.frequency[n], self.damping[n]
+            at, before = (abs(p[i]) / (2 * np.pi) for p in (self.poles, self.expected))
+            expected = -self.expected[i].real / abs(self.expected[i])
+            found.append(
+                f"mode {n} is at {at:.5g} Hz, not at {before:.5g} Hz (by "
+                f"{with_deviation(100 * df, 100 * sf)} %), its damping ratio is "
+                f"{with_deviation(100 * z, 100 * sz)} %, not {100 * expected:.2g} %"
+            )
+        return found
+
+    @property
+    def changes(self) -> tuple[ModeChange, ...]:
+        """The logarithms of the ratios of |pole| and of the decay rate, mode by mode."""
+        size = np.log(np.abs(self.poles / self.expected))
+        decay = np.log(self.poles.real / self.expected.real)
+        return tuple(
+            ModeChange(*one) for one in zip(self.modes, size.tolist(), decay.tolist(), strict=True)
+        )
+
+    @property
+    def measured(self) -> MeasuredModes:
+        """The poles with numbers and covariance: ``model.calibrated(moved.measured)``."""
+        m = len(self.modes)
+        real, imag = self.poles.real, self.poles.imag
+        # |p| and decay rate: d Re = Re d(log decay), d Im = (|p|^2 d(log |p|) - Re dRe) / Im
+        size = np.abs(self.poles) ** 2
+        G = np.block([
+            [np.zeros((m, m)), np.diag(real)],
+            [np.diag(size / imag), np.diag(-(real**2) / imag)],
+        ])  # fmt: skip
+        return MeasuredModes(self.poles, modes=self.modes, covariance=G @ self.covariance @ G.T)
+
+
+@one_thread()
+def moved_modes(
+    observer: KalmanEstimator, estimate: Estimate, starts: Sequence[ModeChange], skip: int
+) -> tuple[MovedModes, KalmanEstimator, Estimate]:
+    """Return where modes are on the machine, and observer and estimate of the changed plant.
+
+    Maximum likelihood of the record by the innovations of the filter of the changed plant, the
+    commands counted, so that feedback does not bias it; Gauss-Newton, the noises known but for one
+    common level: ``n/2 log(sum |W e|^2 / n) - n_k log det W``. The first samples are skipped.
+    """
+    task = _Likelihood(observer, estimate, [one.mode for one in starts], skip)
+    theta = np.array([[one.frequency for one in starts], [one.decay for one in starts]]).ravel()
+    information = np.eye(theta.size)
+    now = task.at(theta)
+    steps = np.r_[_WIDTH * task.widths, np.full(task.widths.size, _LOG)]
+    reach = np.r_[task.widths, np.ones(task.widths.size)] * _FAR
+    J, log_size = None, np.zeros(theta.size)
+    for _ in range(_STEPS):
+        if J is None:
+            near = [task.at(theta + row) for row in np.diag(steps)]
+            J = np.array([one.white - now.white for one in near]) / steps[:, None]
+            log_size = np.array([one.log_size - now.log_size for one in near]) / steps
+        information = J @ J.T / now.level
+        gradient = J @ now.white / now.level + now.samples * log_size
+        step = -np.linalg.solve(information, gradient)
+        part = float(np.max(np.abs(step) / reach))
+        step = step / max(part, 1.0)
+        trial = task.at(theta + step)
+        while trial.cost > now.cost and np.any(np.abs(step) > 0.1 * steps):
+            step = 0.5 * step
+            trial = task.at(theta + step)
+        if trial.cost > now.cost:
+            break
+        theta, now = theta + step, trial
+        if step @ information @ step <= _SETTLED**2 * step.size:
+            break
+        if part > _LINEAR:
+            J = None
+    p = task.poles(now.observer.plant)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    found = MovedModes(tuple(task.modes), task.poles(observer.plant), p, covariance)
+    return found, now.observer, now.estimate
+
+
+class _Trial(NamedTuple):
+    """Whitened innovations of a changed plant's filter, its log det, and what made them."""
+
+    white: FloatArray
+    log_size: float
+    samples: int
+    observer: KalmanEstimator
+    estimate: Estimate
+
+    @property
+    def level(self) -> float:
+        return float(np.mean(self.white**2))
+
+    @property
+    def cost(self) -> float:
+        return float(0.5 * self.white.size * np.log(self.level) + self.samples * self.log_size)
+
+
+class _Likelihood:
+    """The likelihood of a record over changes of some modes."""
+
+    def __init__(
+        self, observer: KalmanEstimator, estimate: Estimate, modes: list[int], skip: int
+    ) -> None:
+        self.observer, self.modes = observer, modes
+        names = [*observer.sensors, *observer.model.commands]
+        self.record = dict(zip(names, estimate.record.T, strict=True))
+        self.counted: BoolArray = np.isfinite(estimate.whitened)
+        self.counted[:, :skip] = False
+        poles = self.poles(observer.plant)
+        self.widths: FloatArray = np.asarray(-poles.real / np.abs(poles))
+
+    def poles(self, plant: StandardPlant) -> ComplexArray:
+        """Return the poles [rad/s] of the modes."""
+        blocks = plant.modal_blocks[np.array(self.modes) - 1]
+        found = np.linalg.eigvals(blocks).astype(np.complex128)
+        return np.asarray(found[np.arange(len(found)), np.argmax(found.imag, axis=1)])
+
+    def at(self, theta: FloatArray) -> _Trial:
+        """Return the innovations with the modes so changed."""
+        parts = zip(self.modes, *theta.reshape(2, -1).tolist(), strict=True)
+        changes = [amount for one in parts for amount in ModeChange(*one).amounts]
+        observer = redesigned(self.observer, lambda plant: with_changes(plant, changes))
+        estimate = observer.estimate(self.record, Filter())
+        S = observer.model.innovation(observer.predicted_covariance)
+        log_size = 0.5 * float(np.linalg.slogdet(S)[1])
+        white = estimate.whitened[self.counted]
+        return _Trial(white, log_size, int(self.counted.all(axis=0).sum()), observer, estimate)
+
+
+class PeakBand(NamedTuple):
+    """Lines [Hz] around a peak at which innovations (m, p) and commands (m, nu) are compared."""
+
+    freq: FloatArray
+    X: ComplexArray
+    U: ComplexArray
+    level: FloatArray
+    #: of the peak, and where the mode near it appears when sampled
+    at: float
+    seen: float
+
+
+def peak_band(
+    lines: InnovationLines, U: ComplexArray, level: FloatArray, rate: float, at: float, seen: float
+) -> PeakBand:
+    """Return the lines around a peak and the mode near it."""
+    reach = 3.0 * abs(at - seen) + 0.02 * at
+    freq = lines.freq * rate
+    band = np.flatnonzero(np.abs(freq - 0.5 * (at + seen)) <= reach)
+    band = band[:: -(-band.size // _BAND)]
+    return PeakBand(freq[band], lines.X[band], U[band], level[band], at, seen)
+
+
+def explained_by_change(
+    observer: KalmanEstimator, band: PeakBand, mode: int, freq: float, sign: float
+) -> ModeChange | None:
+    """Return the change of a mode [Hz] that explains a peak better than one more mode, or None.
+
+    Both are fitted to the lines around by Whittle's likelihood: the mode's change by what the
+    commands and the noises of the changed plant make of the innovations, ``V (G - G') U`` and the
+    density, the new mode as ``h v v* g^2 / ((f - f_0)^2 + g^2)`` with any direction v; each
+    parameter costs half the logarithm of the number of lines. A changed mode is missing where the
+    model has it, and shows itself in its own direction. `sign` is -1 where its frequency is folded.
+    """
+    from scipy.optimize import minimize
+
+    plant, p = observer.plant, band.X.shape[1]
+    lines = band.freq * plant.dt
+    usual = parts_of(observer, plant, lines).both
+    V, before = whitening(observer, lines), _commanded(observer, plant, band.freq)
+    driven = bool(np.any(band.U))
+
+    def change(x: FloatArray) -> ModeChange:
+        moved = freq + sign * (band.at - band.seen) * x[0]
+        return ModeChange(mode, float(np.log(max(moved, 1e-3 * freq) / freq)), float(x[1]))
+
+    def cost(x: FloatArray) -> float:
+        if not -0.5 <= x[0] <= 1.5:
+            return np.inf  # another peak than this one
+        machine = with_changes(plant, change(x).amounts)
+        S = parts_of(observer, machine, lines).both - usual + np.eye(p)[None]
+        left = band.X
+        if driven:
+            shown = V @ (before - _commanded(observer, machine, band.freq)) @ band.U[:, :, None]
+            left = left + shown[:, :, 0]
+        return _whittle(S * band.level[:, None, None], left)
+
+    starts = [np.array([share, factor]) for share in (0.0, 0.5, 1.0) for factor in (-1.4, 0.0, 1.4)]
+    with np.errstate(all="ignore"):
+        first = min(starts, key=cost)
+        best: Any = minimize(
+            cost,
+            first,
+            method="Nelder-Mead",
+            options={
+                "maxfev": _SEARCH,
+                "initial_simplex": first + np.array([[0.0, 0.0], [0.2, 0.2], [0.2, -0.3]]),
+                "xatol": 1e-2,
+                "fatol": 0.5,
+            },
+        )
+    new = min(_new_mode(band, width * band.at) for width in _WIDTHS)
+    price = 0.5 * np.log(band.freq.size)
+    return change(best.x) if best.fun + 2 * price <= new + (2 * p + 1) * price else None
+
+
+def _commanded(observer: KalmanEstimator, plant: StandardPlant, freq: FloatArray) -> ComplexArray:
+    """Return the responses (m, ny, nu) of the sensors to the commands."""
+    path = plant.system.select(observer.sensors, observer.model.commands)
+    return np.asarray(frequency_response(path, freq).data.transpose(2, 0, 1))
+
+
+def _new_mode(band: PeakBand, width: float) -> float:
+    """Return the cost of a mode of some width in any one direction."""
+    shape = width**2 / ((band.freq - band.at) ** 2 + width**2)
+    unit = band.X / np.sqrt(band.level)[:, None]
+    v = np.linalg.eigh(np.einsum("k,ki,kj->ij", shape, unit, unit.conj()))[1][:, -1]
+    seen = np.abs(unit @ v.conj()) ** 2
+    rest = np.sum(np.abs(unit) ** 2) - np.sum(seen)
+    rest += band.X.shape[1] * np.sum(np.log(band.level))
+    heights = np.geomspace(0.1, 1e6, 60)[:, None]
+    m = 1.0 + heights * shape
+    return float(np.min(np.sum(np.log(m) + seen / m, axis=1)) + rest)
+
+
+def _whittle(S: ComplexArray, X: ComplexArray) -> float:
+    """Return ``sum log det S + X* S^-1 X``, infinite where S is no density."""
+    try:
+        root = np.linalg.cholesky(S)
+    except np.linalg.LinAlgError:
+        return np.inf
+    white = np.linalg.solve(root, X[:, :, None])
+    size = np.log(np.diagonal(root, axis1=1, axis2=2).real)
+    return float(2.0 * np.sum(size) + np.sum(np.abs(white) ** 2))
