@@ -182,6 +182,8 @@ def of_estimators(plant, small):
     one = np.ones(1)
     yield estimation.NoiseLevels(small, ("y1:noise",), one, np.eye(1), one, 0.0, 1.0, 400)
     yield estimation.consistency(observer, observer.estimate(longer))
+    pole = np.array([-1.0 + 100.0j])
+    yield estimation.MovedModes((4,), pole, 1.01 * pole, np.eye(2))
     yield estimation.design_hinf_filter(small, accuracy=0.5)
     yield estimation.design_minimax_filter(small, [small], iterations=2)
     yield estimation.design_multirate(small, {"y1": 2})

@@ -6,30 +6,24 @@ import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..checks import Value, generator, instance, positive, short, whole
-from ..errors import AssumptionError, ModelError, counted
+from ..errors import AssumptionError, InfeasibleError, ModelError, counted
 from ..estimation import Consistency, KalmanEstimator, consistency, design_kalman
 from ..identification import MeasuredModes, identify_modes, numbered
 from ..loop import ClosedLoop, SpillOver, bandwidth, close_loop
 from ..lti.frequency import Frf
-from ..modes import Modes, solve_modes
-from ..plant import (
-    Ports,
-    StandardPlant,
-    assemble_plant,
-    larger_plant,
-    reference_errors,
-    stage_weights,
-)
+from ..modes import MeshError, Modes, solve_modes
+from ..plant import Ports, StandardPlant, UncertainPlant, assemble_plant, larger_plant
 from ..reduction import ModalTruncation, ReducedModel, reduce
 from ..store import written
 from ..structure import Damping, FEModel
-from ..synthesis import design_hinf
+from ..synthesis import design_stage
 from ..updating import Eigenvalues, Localisation, UpdateResult, localise, update
 from .response import Response
 from .simulate import simulate
@@ -37,14 +31,18 @@ from .specification import Specification, Verdict
 
 #: times that measured modes are paired with those of a model, at most
 _PAIRINGS = 5
+#: a mode of the full structure this far from the measured one, relative, is another one
+_SAME = 0.05
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MachinePipeline(Value):
     """The chain identify, localise, update, plant, observer, controller, verify, for `study`.
 
-    Called with a machine it returns a row: the parameters found, what the observer predicts, what
-    the controller reaches with the modes left out, and what it reaches *on the machine*, beside the
+    The updated model is calibrated with the measured poles, and the controller tolerates what
+    `UpdateResult.uncertainty` leaves open of its frequencies (`design_stage`). Called with a
+    machine it returns a row: the parameters found, what the observer predicts, what the controller
+    reaches with the modes left out, and what it reaches *on the machine*, beside the
     specification. A machine is
 
     - an `Frf` that was measured: its modes are identified, and paired by frequency and shape with
@@ -75,6 +73,8 @@ class MachinePipeline(Value):
         From measurement to actuation, any fraction.
     modes : sequence of int, optional
         Numbers of the modes whose poles are used; all that were identified when not given.
+    deviation : float
+        Of the errors of poles that a virtual machine is measured with, relative to their size.
     measurement : mapping, optional
         Options of `measure_frf` (period, amplitude, ...) of virtual machines, which are then
         identified from FRFs.
@@ -87,11 +87,13 @@ class MachinePipeline(Value):
         explained nearly as well by masses elsewhere.
     candidates : sequence
         Parameters of which `localise` chooses those that join the update.
-    bandwidth : float or sequence of float [Hz]
-        Of the H-infinity design on the updated model: the first of them, from the highest on,
-        whose loop has `margin` with the modes left out; the lowest where none has.
+    bandwidth : float or sequence of float [Hz], optional
+        Of the controller: the first of them, from the highest on, at which `design_stage` holds.
+        None: the highest that it finds, in some 20 s for 24 modes.
     margin : float
-        Modulus margin at u that a design must have there.
+        Modulus margin at u that a design must have.
+    mesh : MeshError, optional
+        Of the drawing's modes, ``modes.mesh_error(finer)``: part of what is not known.
     blocks : sequence, optional
         A controller for all machines (StateSpaces or Controllers), in place of a design for each.
     specification : Specification, optional
@@ -132,13 +134,15 @@ class MachinePipeline(Value):
     rate: float
     delay: float
     modes: Sequence[int] | None = None
+    deviation: float = 0.0
     measurement: Mapping[str, Any] | None = None
     band: tuple[float, float] | None = None
     hold: float | None = None
     starts: int | None = None
     candidates: Sequence[Any] = ()
-    bandwidth: float | Sequence[float] = 50.0
+    bandwidth: float | Sequence[float] | None = 50.0
     margin: float = 0.4
+    mesh: MeshError | None = None
     blocks: Sequence[Any] | None = None
     specification: Specification | None = None
     reference: Any = None
@@ -167,8 +171,11 @@ class MachinePipeline(Value):
             if self.modes is None
             else tuple(whole(n, "mode") for n in np.ravel(self.modes)),
             measurement=None if self.measurement is None else dict(self.measurement),
+            deviation=positive(self.deviation, "deviation", zero=True),
             candidates=tuple(self.candidates),
-            bandwidth=tuple(
+            bandwidth=None
+            if self.bandwidth is None
+            else tuple(
                 sorted(positive(f, "bandwidth") for f in np.atleast_1d(self.bandwidth))[::-1]
             ),
             margin=positive(self.margin, "margin"),
@@ -179,9 +186,13 @@ class MachinePipeline(Value):
         )
 
     def __repr__(self) -> str:
-        tried = ", ".join(f"{one:g}" for one in np.atleast_1d(self.bandwidth))
+        tried = ", ".join(f"{one:g}" for one in self._tried if one is not None) or "highest"
         control = "one controller for all" if self.blocks else f"H-infinity, {tried} Hz"
         return f"<MachinePipeline: {counted(len(self.parameters), 'parameter')} updated, {control}>"
+
+    @property
+    def _tried(self) -> tuple[float | None, ...]:
+        return (None,) if self.bandwidth is None else tuple(np.atleast_1d(self.bandwidth).tolist())
 
     @property
     def error(self) -> str:
@@ -211,11 +222,13 @@ class MachinePipeline(Value):
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             measured, places, fit = self._fitted(self._measured(machine, of_measurement))
-            many = self._larger(fit)
-            plant = assemble_plant(fit.model, self.ports).discretized(self.rate, delay=self.delay)
+            many = self._larger(fit, measured)
+            model = fit.calibrated(measured)
+            plant = assemble_plant(model, self.ports).discretized(self.rate, delay=self.delay)
             observer = design_kalman(plant, larger=many)
             if self.blocks is None:
-                blocks, left_out = self._designed(plant, many)
+                off = fit.uncertainty(measured, mesh=self.mesh)
+                blocks, left_out = self._designed(plant.uncertain(off), many)
             else:
                 blocks = tuple(self.blocks)
                 left_out = close_loop(plant, *blocks, larger=many).left_out
@@ -233,7 +246,6 @@ class MachinePipeline(Value):
                 loop=loop,
                 run=run,
                 verdict=None if check is None else check.check(loop, run),
-                agreement=consistency(observer, run),
             )
             row = self._row(report)
         row["warnings"] = len(said)
@@ -254,7 +266,8 @@ class MachinePipeline(Value):
                 "it. Give modes= (numbers, for its poles) or measurement= (options of its "
                 "measure_frf, or {})."
             )
-        poles: MeasuredModes = machine.poles(self.modes)
+        errors = {"deviation": self.deviation, "rng": rng} if self.deviation else {}
+        poles: MeasuredModes = machine.poles(self.modes, **errors)
         return poles
 
     def _fitted(
@@ -290,7 +303,19 @@ class MachinePipeline(Value):
             unknowns = [*unknowns, *chosen]
         return places, update(self.model, unknowns, residuals, starts=self.starts)
 
-    def _larger(self, fit: UpdateResult) -> Modes:
+    def _larger(self, fit: UpdateResult, measured: MeasuredModes) -> Modes:
+        """Return the modes of the updated full structure, calibrated unless damping couples them.
+
+        Its numbers are the reduced model's, or it is left as it is where its order differs.
+        """
+        many = self._updated_modes(fit)
+        numbers = np.array(measured.modes) - 1
+        if np.iscomplexobj(many.phi) or numbers.max() >= many.n_modes:
+            return many
+        near = np.abs(many.omega[numbers] / np.abs(measured.poles) - 1.0) < _SAME
+        return many.calibrated(measured) if near.all() else many
+
+    def _updated_modes(self, fit: UpdateResult) -> Modes:
         """Return the modes of the updated full structure."""
         if isinstance(self.full, FEModel):
             count = min(self.larger, self.full.n_dof)
@@ -302,17 +327,17 @@ class MachinePipeline(Value):
         return found
 
     def _designed(
-        self, plant: StandardPlant, many: Modes
+        self, plant: UncertainPlant[Any], many: Modes
     ) -> tuple[tuple[Any, ...], SpillOver | None]:
-        """Return the errors that an H-infinity controller reads, and it; and how both hold."""
-        errors = reference_errors(plant)
-        for wanted in np.atleast_1d(self.bandwidth):
-            weights = stage_weights(plant, float(wanted))
-            weighted = plant.through(errors).weighted(z=weights.z, w=weights.w)
-            found = design_hinf(weighted, larger=many)
-            if found.left_out is not None and found.left_out.modulus_margin >= self.margin:
+        """Return the fastest controller that tolerates what is not known, and how it holds."""
+        for wanted in self._tried:
+            try:
+                found = design_stage(plant, bandwidth=wanted, margin=self.margin, larger=many)
                 break
-        return (errors, found), found.left_out
+            except InfeasibleError:
+                if wanted == self._tried[-1]:
+                    raise
+        return (found,), found.left_out
 
     def _loop(
         self, machine: Any, plant: StandardPlant, blocks: Sequence[Any], many: Modes
@@ -379,8 +404,6 @@ class MachineReport(Value):
         Which candidates joined the update.
     warned : tuple of str
         What was warned of on the way.
-    agreement : Consistency, optional
-        The run beside the model that was updated: which modes are elsewhere still.
     """
 
     row: Mapping[str, Any]
@@ -394,7 +417,11 @@ class MachineReport(Value):
     verdict: Verdict | None = None
     places: Localisation | None = None
     warned: tuple[str, ...] = ()
-    agreement: Consistency | None = None
+
+    @cached_property
+    def agreement(self) -> Consistency:
+        """The run beside the model: which modes are elsewhere on the machine, by how much."""
+        return consistency(self.observer, self.run)
 
     def __repr__(self) -> str:
         sections: dict[str, Sequence[Any]] = {
@@ -405,7 +432,6 @@ class MachineReport(Value):
             "Controller": self.blocks,
             "Loop on the larger model": [self.left_out and self.left_out.summary],
             "Loop that was run": [self.loop],
-            "Run beside the model": [self.agreement],
             "Specification": [self.verdict],
             "In numbers": [f"{name}: {_shown(value)}" for name, value in self.row.items()],
             "Warnings": self.warned,

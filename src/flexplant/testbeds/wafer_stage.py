@@ -219,14 +219,20 @@ class WaferStage(Value):
     def _plant(self, ports: Ports) -> StandardPlant:
         return assemble_plant(self._realisation, ports).discretized(self.rate, delay=self.delay)
 
-    def poles(self, modes: Sequence[int]) -> MeasuredModes:
-        """Return the poles of some modes, as an ideal experimental modal analysis would.
+    def poles(
+        self, modes: Sequence[int], *, deviation: float = 0.0, rng: Any = None
+    ) -> MeasuredModes:
+        """Return the poles of some modes, as an experimental modal analysis would.
 
         Parameters
         ----------
         modes : sequence of int
             Numbers from 1, rigid-body modes included, as in the paper; elastic ones by frequency,
             those left out that damping keeps from swinging.
+        deviation : float
+            Of their errors, relative to their size; 0: ideal, without a covariance.
+        rng : int or Generator, optional
+            Of the errors.
 
         Raises
         ------
@@ -234,7 +240,7 @@ class WaferStage(Value):
             When a mode is not there, or is a rigid-body mode (a drift has no pole to measure).
         ModelError
             When a mode is no whole number, or lies above half the machine's rate, where no
-            sampled measurement shows it.
+            sampled measurement shows it, or the deviation is negative.
         """
         own = self._own_poles
         known = range(self._realisation.n_rigid + 1, self._realisation.n_rigid + own.size + 1)
@@ -252,7 +258,14 @@ class WaferStage(Value):
                     "the rate."
                 )
             found.append(pole)
-        return MeasuredModes(poles=np.array(found, dtype=np.complex128), modes=numbers)
+        exact = np.array(found, dtype=np.complex128)
+        if not positive(deviation, "deviation", zero=True):
+            return MeasuredModes(poles=exact, modes=numbers)
+        size = deviation * np.abs(exact)
+        error = generator(rng).normal(size=(2, exact.size)) * size / np.sqrt(2.0)
+        return MeasuredModes(
+            poles=exact + error[0] + 1j * error[1], modes=numbers, covariance=size**2
+        )
 
     def loop(self, ports: Ports, *blocks: Any) -> ClosedLoop:
         """Return the machine's own closed loop, for its margins.

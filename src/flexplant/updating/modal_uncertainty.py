@@ -103,7 +103,10 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
             )
     about = [q.about(v) for q, v in zip(fit.unknowns, fit.values.tolist(), strict=True)]
     found = eigenvalue_sensitivities(fit.model, about)
-    m, known = len(found.modes), range(found.modes[0], found.modes[-1] + 1)
+    # attachment vectors stand for modes left out: no machine has their frequencies
+    m = len(found.modes) - getattr(fit.model, "n_vectors", 0)
+    found = found.replace(modes=found.modes[:m], poles=found.poles[:m], S=found.S[:m])
+    known = range(found.modes[0], found.modes[-1] + 1)
     places, poles = measured_poles(measured, known)
     places = places + 1 - found.modes[0]
     own = found.poles[places]
