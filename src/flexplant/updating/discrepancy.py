@@ -16,7 +16,7 @@ from .search import Objective, SearchEnd, UpdateMethod
 
 #: degrees of freedom that the usual discrepancy of a kind counts: two measured modes outweigh it,
 #: and none measured leaves it
-_USUAL_DOF = 2.0
+USUAL_DOF = 2.0
 #: rounds of weights and parameters, and relative change of the deviations at which they end
 _ROUNDS, _SETTLED = 20, 0.01
 #: rows that are weighed against each other: matrices of the rows' number are factored
@@ -82,9 +82,9 @@ def restricted(
 
     def cost(log: FloatArray) -> tuple[float, FloatArray]:
         P, both = projected(covariance(log))
-        known = _USUAL_DOF * (log + 0.5 * np.exp(-2 * log))
+        known = USUAL_DOF * (log + 0.5 * np.exp(-2 * log))
         moved = P @ r
-        slope = _USUAL_DOF * (1 - np.exp(-2 * log))
+        slope = USUAL_DOF * (1 - np.exp(-2 * log))
         for k, (size, part) in enumerate(zip((usual * np.exp(log)) ** 2, parts, strict=True)):
             slope[k] += size * (np.sum(P * part) - moved @ part @ moved)
         return 0.5 * (both + r @ moved) + known.sum(), slope
@@ -96,7 +96,7 @@ def restricted(
     size = usual * np.exp(log)
     dof = [s**2 * float(np.sum(P * part)) for s, part in zip(size, parts, strict=True)]
     found = [
-        Discrepancy(name, float(s), _USUAL_DOF + d)
+        Discrepancy(name, float(s), USUAL_DOF + d)
         for name, s, d in zip(names, size, dof, strict=True)
     ]
     return found, V

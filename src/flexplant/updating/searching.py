@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
 from ..checks import FloatArray, Rng, generator, real_array, whole
-from ..errors import FlexplantError, ModelError, ShapeError, SolverError
-from ..tolerances import divisor
+from ..errors import FlexplantError, LabelError, ModelError, ShapeError, SolverError
+from ..tolerances import TINY, divisor
 from .judgement.goodness import chance, chi_square, is_bad
 from .parameters.added import PointParameter
+from .point_model import Point
 from .residuals.eigenvalues import Eigenvalues
 from .residuals.frf_residual import FrfResidual
 from .residuals.mode_shapes import ModeShapes
@@ -20,6 +21,9 @@ from .search import Objective, SearchEnd, TrustRegion, UpdateMethod
 from .search.update_method import Trail
 from .sensitivities import checked_values
 from .update_result import Starts
+
+#: the end of a search, or why there is none
+Reached: TypeAlias = SearchEnd | FlexplantError
 
 #: relative variance of each entry of a response in the first fit, beside its noise
 EVEN = 0.1
@@ -90,8 +94,22 @@ def _magnitude(residual: FrfResidual) -> FrfResidual:
 ABSURD = 0.1
 #: relative distance of a pole from the measured one, beyond noise, that a wrong pairing may leave
 FAR = 1e-3
-#: other starts that are tried after such an end, for models of up to so many DOFs and larger ones
-RETRIES, SMALL, RETRIES_LARGE = 20, 100, 4
+#: starts that are always tried beside the first, for models of up to so many DOFs and larger ones;
+#: near a second minimum about half of them end in the other one
+ALWAYS, ALWAYS_LARGE, SMALL = 4, 2, 100
+#: starts that are tried where the best end so far may be no answer, likewise
+RETRIES, RETRIES_LARGE = 20, 4
+#: steps from another start where the best is sound already, and how much larger the cost may then
+#: be for the search to go on
+GLANCE, WORTH = 10, 10.0
+#: relative difference of costs that is none: what the tolerance of a search leaves
+SAME_COST = 1e-6
+#: what is left of exact data, relatively to all that is fitted, when a search ends
+EXACT = 1e-8
+#: tolerance of a search that shows where it ends; the best is settled to the one that is given
+NEARLY = 1e-6
+#: relative change of all that is fitted between two ends that are one, the noise not known
+SAME_END = 1e-4
 
 
 def from_one_start(
@@ -101,35 +119,88 @@ def from_one_start(
     most: int | None,
     tolerance: float,
     rng: Rng,
-) -> tuple[SearchEnd, list[FloatArray], list[SearchEnd | None]]:
+    *,
+    led: bool,
+) -> tuple[SearchEnd, list[FloatArray], list[Reached]]:
     """Return the best end, the objective being there, all starts that were tried and their ends.
 
-    Where the end explains nothing of responses (a peak of the model lies on a wrong measured one),
-    or is far from poles alone (modes may have been paired wrongly), other starts are tried.
+    A few other starts are always tried: a minimum does not show that there is another. Where the
+    end explains nothing of responses (a peak of the model lies on a wrong measured one), or is far
+    from poles alone (modes may have been paired wrongly), there are more. `led`: through easier
+    problems first.
     """
-    begins = [begin]
-    best = _led(objective, begin, method, most, tolerance)
-    ends: list[SearchEnd | None] = [best]
-    if not _improvable(objective, best):
-        return best, begins, ends
+    begins, ends = [begin], [_attempt(objective, begin, method, most, tolerance, led=led)]
+    first = ends[0]
+    best = first if isinstance(first, SearchEnd) else None
+    size = 0.0 if best is None else float(np.linalg.norm(objective.size(objective.at(best.p))))
+    rounding = (EXACT * size) ** 2
     small = len(objective.family.V) <= SMALL
-    for other in scattered(objective, RETRIES if small else RETRIES_LARGE, rng):
-        begins.append(other)
-        try:
-            found = _led(objective, other, method, most, tolerance)
-        except (ModelError, SolverError):
-            ends.append(None)
-            continue
-        ends.append(found)
-        done = not _improvable(objective, found)
-        # poles are only paired anew where that explains them: an outlier is no wrong pairing
-        if done or (not objective.numbers and found.cost < best.cost):
-            best = found
-        if done:
+    always, retries = (ALWAYS, RETRIES) if small else (ALWAYS_LARGE, RETRIES_LARGE)
+    for count, other in enumerate(scattered(objective, begin, retries, rng)):
+        sound = best is not None and not (led and _improvable(objective, best))
+        if count >= always and (best is None or sound):
             break
+        limit = most if most is not None or not sound else GLANCE
+        found = _attempt(objective, other, method, limit, max(tolerance, NEARLY), led=led)
+        if sound and best is not None and isinstance(found, SearchEnd):
+            near = found.cost < WORTH * best.cost
+            if near and most is None and not found.converged:
+                found = _settled(objective, method, found, most, max(tolerance, NEARLY))
+        begins.append(other)
+        ends.append(found)
+        if not isinstance(found, SearchEnd):
+            continue
+        # poles are only paired anew where that explains them: an outlier is no wrong pairing
+        lower = best is None or found.cost < (1 - SAME_COST) * best.cost - rounding
+        if lower and not (objective.numbers and _improvable(objective, found)):
+            best = found
+    if best is None:
+        raise cast(FlexplantError, first)
     objective.path = []
+    if best is not first:
+        best = _settled(objective, method, best, most, tolerance)
+        objective.path = []
     objective.follow(best.trail.p)
     return best, begins, ends
+
+
+def _settled(
+    objective: Objective, method: UpdateMethod, end: SearchEnd, most: int | None, tolerance: float
+) -> SearchEnd:
+    """Return the end of a search that goes on from another's."""
+    objective.path = end.trail.p[:-1]
+    found = method.search(objective, end.p, most=most, tolerance=tolerance)
+    found.trail, found.tried = end.trail.joined(found.trail), end.tried or found.tried
+    return found
+
+
+def _attempt(
+    objective: Objective,
+    begin: FloatArray,
+    method: UpdateMethod,
+    most: int | None,
+    tolerance: float,
+    *,
+    led: bool,
+) -> Reached:
+    """Return the end of a search, or why there is none."""
+    search = _led if led else _direct
+    try:
+        return search(objective, begin, method, most, tolerance)
+    except FlexplantError as error:
+        return error
+
+
+def _direct(
+    objective: Objective,
+    begin: FloatArray,
+    method: UpdateMethod,
+    most: int | None,
+    tolerance: float,
+) -> SearchEnd:
+    """Return the end of a search for the answer itself."""
+    objective.path = []
+    return method.search(objective, begin, most=most, tolerance=tolerance)
 
 
 def _led(
@@ -180,27 +251,19 @@ def from_starts(
     method: UpdateMethod,
     most: int | None,
     tolerance: float,
-) -> tuple[SearchEnd, list[SearchEnd | None]]:
+) -> tuple[SearchEnd, list[Reached]]:
     """Return the best end, the objective being there, and what every start led to."""
-    ends: list[SearchEnd | None] = []
-    trouble: FlexplantError | None = None
-    for begin in begins:
-        try:
-            ends.append(method.search(objective, begin, most=most, tolerance=tolerance))
-        except (ModelError, SolverError) as error:
-            if len(begins) == 1:
-                raise
-            trouble = error
-            ends.append(None)
-    reached = [found for found in ends if found is not None]
+    ends = [_attempt(objective, one, method, most, tolerance, led=False) for one in begins]
+    reached = [found for found in ends if isinstance(found, SearchEnd)]
     if not reached:
-        raise SolverError(f"none of {len(begins)} starts leads anywhere; the last: {trouble}")
+        last = next(end for end in reversed(ends) if isinstance(end, FlexplantError))
+        if len(begins) == 1 or isinstance(last, LabelError):
+            raise last
+        raise SolverError(f"none of {len(begins)} starts leads anywhere; the last: {last}")
     best = min(reached, key=lambda found: found.cost)
     # the modes of the best end are numbered from its own start
     if len(begins) > 1:
-        objective.begin(begins[[f is best for f in ends].index(True)])
-        for p in best.trail.p[1:]:
-            objective.at(p, refer=True)
+        objective.follow(best.trail.p)
     return best, ends
 
 
@@ -218,7 +281,8 @@ def all_starts(objective: Objective, start: Any, starts: Any, rng: Rng) -> list[
     if starts is None:
         return [first]
     if np.ndim(starts) == 0:
-        return [first, *_drawn(objective, whole(starts, "starts") - 1, rng)]
+        others = whole(starts, "starts") - 1
+        return [first, *_drawn(objective, others, rng)] if others else [first]
     values = real_array(starts, "starts")
     if values.ndim != 2 or values.shape[1] != first.size or not values.shape[0]:
         raise ShapeError(f"starts must have shape (any, {first.size}), got {values.shape}.")
@@ -227,24 +291,64 @@ def all_starts(objective: Objective, start: Any, starts: Any, rng: Rng) -> list[
     return list(values)
 
 
-def summary(begins: list[FloatArray], ends: list[SearchEnd | None]) -> Starts | None:
-    """Return what several starts led to, None for one."""
-    if len(begins) == 1:
-        return None
-    nan = np.full(begins[0].size, np.nan)
+def summary(
+    objective: Objective, best: SearchEnd, begins: list[FloatArray], ends: list[Reached]
+) -> Starts:
+    """Return what every start led to, the objective being at the best end."""
+    point, nan = objective.at(best.p), np.full(best.p.size, np.nan)
+    found = [end for end in ends if isinstance(end, SearchEnd) and end.converged]
+    minima: list[SearchEnd] = []
+    for end in sorted(found, key=lambda one: one.cost):
+        if not any(same_minimum(objective, point, end, other) for other in (best, *minima)):
+            minima.append(end)
+    chi2, dof = chi_square(objective, point, np.ones(best.p.size, dtype=bool))
+    noise = chi2 is not None and not is_bad(chance(chi2, dof))
+    rows = objective.values(point).size
+    above = [_above(best.cost, end.cost, rows, noise=noise) for end in minima]
     return Starts(
         np.array(begins),
-        np.array([nan if found is None else found.p for found in ends]),
-        np.array([np.inf if found is None else found.cost for found in ends]),
+        np.array([end.p if isinstance(end, SearchEnd) else nan for end in ends]),
+        np.array([end.cost if isinstance(end, SearchEnd) else np.inf for end in ends]),
+        tuple(_said(end) for end in ends),
+        np.array([end.p for end in minima]).reshape(-1, best.p.size),
+        np.array(above),
     )
 
 
-def scattered(objective: Objective, count: int, rng: Rng) -> list[FloatArray]:
-    """Return starts around the default one, as far as each parameter moves eigenvalues by 10 %.
+def _said(end: Reached) -> str:
+    """Return how a search ended, in words."""
+    if not isinstance(end, SearchEnd):
+        return str(end)
+    return "; then ".join(end.tried) or end.reason
+
+
+def same_minimum(objective: Objective, point: Point, a: SearchEnd, b: SearchEnd) -> bool:
+    """Return whether two ends are one minimum: their difference changes what is fitted by nothing.
+
+    By less than a standard deviation where the noise is known, and relatively.
+    """
+    change = np.abs(objective.slopes(point) @ (a.p - b.p))
+    noise = objective.noise_known and float(np.linalg.norm(change)) < a.p.size**0.5
+    return noise or bool(np.max(change / objective.size(point)) < SAME_END)
+
+
+def _above(least: float, cost: float, rows: int, *, noise: bool) -> float:
+    """Return by how much -2 ln of the likelihood is larger at another minimum.
+
+    The difference of chi-square, or ``n ln(e/e_least)`` where the noise is not known or is not all
+    that is left.
+    """
+    if noise:
+        return 2 * (cost - least)
+    return float(rows * np.log(max(cost, TINY) / max(least, TINY)))
+
+
+def scattered(objective: Objective, middle: FloatArray, count: int, rng: Rng) -> list[FloatArray]:
+    """Return starts around one, as far as each parameter moves eigenvalues by 10 %.
 
     Sizes are drawn evenly over decades; masses, springs and dampers are added, not taken away.
     """
-    middle = objective.default_start
+    objective.path = []
     eigen = objective.begin(middle).eigen
     every = list(range(eigen.poles.size))
     moved = np.abs(objective.family.sensitivity(eigen, every)) / np.abs(eigen.poles)[:, None]

@@ -18,7 +18,7 @@ from .judgement.goodness import chi_square, covariance, is_bad, worst
 from .parameters.added import Parameter
 from .residuals.eigenvalues import Eigenvalues
 from .residuals.residual import Residual
-from .search import GaussNewton, Objective, SearchEnd, TrustRegion, UpdateMethod, checked_residuals
+from .search import Objective, SearchEnd, Secured, TrustRegion, UpdateMethod, checked_residuals
 from .search.objective import Defect
 from .search.update_method import ITERATIONS
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
@@ -165,7 +165,7 @@ def update(
     # the paper's problem: eigenvalues alone, nothing known beforehand
     plain = all(isinstance(r, Eigenvalues) and not r.clusters for r in given) and not known
     if method is None:
-        method = GaussNewton() if plain and not bounded and starts is None else TrustRegion()
+        method = Secured() if plain and not bounded and starts is None else TrustRegion()
     if bounded and not method.keeps_bounds:
         raise ModelError(
             f"{type(method).__name__} takes no bounds: use TrustRegion(), or drop bounds=."
@@ -180,12 +180,18 @@ def update(
         used = basis.at(checked_values(start, listed, "start"))
     objective = Objective(used, listed, given, prior=takes_part)
     begins = all_starts(objective, start, starts, rng)
-    cold = start is None and starts is None and not method.penalised
     with Progress(None, ITERATIONS, progress=progress):
         try:
-            if cold:
+            # where an answer that is drawn to its start ends is no minimum of the misfit
+            if starts is None and not method.penalised:
                 best, begins, ends = from_one_start(
-                    objective, begins[0], method, max_iterations, enough, rng
+                    objective,
+                    begins[0],
+                    method,
+                    max_iterations,
+                    enough,
+                    rng,
+                    led=start is None,
                 )
             else:
                 best, ends = from_starts(objective, begins, method, max_iterations, enough)
@@ -193,6 +199,7 @@ def update(
             check_units(objective, begins[0])
             raise
         check_units(objective, begins[0], best.trail.poles[0])
+        tried = summary(objective, best, begins, ends)
         estimates = [best.p]
         if basis is not None:
             best, estimates = corrected(
@@ -212,7 +219,7 @@ def update(
             "other mode numbers, start=, starts= or more iterations."
         )
     fit = _result(model, objective, method, best, begins[0])
-    fit = fit.replace(starts=summary(begins, ends), rounds=np.array(estimates), residuals=given)
+    fit = fit.replace(starts=tried, rounds=np.array(estimates), residuals=given)
     if not method.least_squares or not is_bad(fit.p_value):
         return fit
     named = worst(objective, objective.at(best.p))
@@ -262,7 +269,7 @@ def _complaint(fit: UpdateResult, named: str) -> str:
     negative = ""
     if fit.negative_masses:
         negative = f"{', '.join(fit.negative_masses)} came out negative. "
-    tried = "" if fit.starts is None else f"{counted(len(fit.starts), 'start')} tried. "
+    tried = f"{counted(len(fit.starts or ()), 'start')} tried. "
     kept = (
         f"The covariance is widened by {(fit.chi2 or 0.0) / max(fit.dof, 1):.3g} and holds for "
         "small errors of the model only."

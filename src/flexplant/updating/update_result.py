@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -27,13 +27,16 @@ from ..modes.normal_form import RIGID_DRAG
 from ..structure.attachments import summed
 from ..structure.model import FEModel
 from ..structure.rigid import orthonormalised
-from .discrepancy import Discrepancy
+from .discrepancy import USUAL_DOF, Discrepancy
 from .family import Family
-from .judgement.goodness import chance
+from .judgement.goodness import chance, is_bad
 from .modal_uncertainty import ModalUncertainty, modal_uncertainty
 from .parameters.added import AddedMass, Parameter
 from .residuals.eigenvalues import Eigenvalues
 from .residuals.residual import Residual
+
+#: share of machines that two printed deviations hold
+SHARE = 0.95
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,6 +93,13 @@ class Starts(Value):
         Parameters at the start and at the end, NaN where a search failed.
     cost : (s,) array
         Half the sum of squares at the end, infinite where a search failed.
+    reason : sequence of s str
+        Why each search ended, or failed; of all methods that were tried.
+    minima : (r, q) array
+        Other minima than the best, by rising cost.
+    above : (r,) array
+        By how much -2 ln of the likelihood is larger there than at the best: the difference of
+        chi-square where noise explains what is left, else ``n ln(cost / least cost)``.
 
     Examples
     --------
@@ -106,6 +116,21 @@ class Starts(Value):
     begin: FloatArray
     end: FloatArray
     cost: FloatArray
+    reason: tuple[str, ...] = ()
+    minima: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    above: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def rivals(self) -> list[tuple[FloatArray, float]]:
+        """Other minima that the data hardly distinguish from the best, and how far above they are.
+
+        A likelihood ratio that chance alone makes in one of 10 000 cases (`p_value`).
+        """
+        return [
+            (p, float(more))
+            for p, more in zip(self.minima, self.above, strict=True)
+            if not is_bad(chance(more, 1))
+        ]
 
     def __len__(self) -> int:
         return int(self.cost.size)
@@ -152,7 +177,7 @@ class UpdateResult(Value):
         Names of the parameters that ended at one of their bounds: the data pull beyond it, and
         the covariance does not include it.
     starts : Starts or None
-        What every start led to, when there were several.
+        What every start led to: all that was tried, and other minima.
     unknowns : sequence of Parameter
         What was estimated, as it was given to `update`.
     chi2 : float or None
@@ -243,8 +268,7 @@ class UpdateResult(Value):
         )
 
     def __repr__(self) -> str:
-        std = self.std
-        deviations = [None] * len(self.parameters) if std is None else std.tolist()
+        deviations = self._printed_deviations()
         lines = [
             f"  {name} = {with_deviation(value, deviation)} {unit}".rstrip()
             for name, value, deviation, unit in zip(
@@ -257,8 +281,20 @@ class UpdateResult(Value):
             lines.append(f"  at a bound: {', '.join(self.at_bound[:5])}")
         if self.negative_masses:
             lines.append(f"  negative: {', '.join(self.negative_masses[:5])}")
+        rivals = [] if self.starts is None else self.starts.rivals
+        for p, more in rivals[:2]:
+            other = ", ".join(
+                f"{name} = {value:.4g} {unit}".rstrip()
+                for name, value, unit in zip(
+                    self.parameters[:5], p.tolist(), self.units, strict=False
+                )
+            )
+            lines.append(f"  ANOTHER MINIMUM, chi2 + {more:.3g}: {other}")
         if self.discrepancy:
-            lines.append(f"  off by, beside noise: {self.discrepancy_text} (relative)")
+            off = f"{self.discrepancy_text} (relative)"
+            lines.append(f"  off by, beside noise: {off}; the +- count it")
+        elif is_bad(self.p_value):
+            lines.append("  no +-: what is left is no noise, and coherent")
         said = "converged" if self.converged else "NOT CONVERGED"
         head = f"<UpdateResult: {said} in {counted(len(self.history), 'step')} ({self.reason})"
         if self.p_value is not None:
@@ -268,8 +304,9 @@ class UpdateResult(Value):
     def interval(self, level: float = 0.95) -> FloatArray:
         """Return confidence (credible) intervals (q, 2) of the parameters.
 
-        Of the normal distribution; of Student's, with the fewest degrees of freedom of a kind,
-        where the discrepancy was estimated.
+        Of the normal distribution; of Student's where the discrepancy was estimated, with the
+        degrees of freedom that the data alone give the kind that has fewest of them: an error of
+        all modes together takes one, since no mode shows it.
 
         Parameters
         ----------
@@ -282,13 +319,30 @@ class UpdateResult(Value):
             When the covariance is not known, or the level is no probability.
         """
         share = between(level, "level", 0.0, 1.0, "Choose 0.95, say.")
-        std = self._known_std()
+        half = self._quantile(share) * self._known_std()
+        return np.column_stack([self.values - half, self.values + half])
+
+    def _quantile(self, share: float) -> float:
+        """Return how many standard deviations hold a share of a parameter's distribution."""
         from scipy.special import ndtri, stdtrit
 
-        least = min((d.dof for d in self.discrepancy), default=None)
-        quantile = ndtri((1 + share) / 2) if least is None else stdtrit(least, (1 + share) / 2)
-        half = float(quantile) * std
-        return np.column_stack([self.values - half, self.values + half])
+        if not self.discrepancy:
+            return float(ndtri((1 + share) / 2))
+        least = max(min(d.dof for d in self.discrepancy) - USUAL_DOF - 1, 1.0)
+        return float(stdtrit(least, (1 + share) / 2))
+
+    def _printed_deviations(self) -> list[float | None]:
+        """Return deviations of which two hold 95 % of machines, None where nothing says so.
+
+        Of responses that a model does not explain, the misfit is coherent from line to line.
+        """
+        from scipy.special import ndtri
+
+        std, rejected = self.std, is_bad(self.p_value)
+        if std is None or (rejected and not self.discrepancy):
+            return [None] * len(self.parameters)
+        wider = self._quantile(SHARE) / float(ndtri((1 + SHARE) / 2)) if rejected else 1.0
+        return [wider * deviation for deviation in std.tolist()]
 
     def sample(self, count: int, *, rng: Rng = 0) -> FloatArray:
         """Return draws (count, q) from Laplace's approximation of the posterior.

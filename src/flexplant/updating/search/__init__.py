@@ -4,6 +4,7 @@ from .gauss_newton import GaussNewton as GaussNewton
 from .lasso import Lasso as Lasso
 from .objective import Objective as Objective
 from .objective import checked_residuals as checked_residuals
+from .secured import Secured as Secured
 from .tikhonov import Tikhonov as Tikhonov
 from .trust_region import TrustRegion as TrustRegion
 from .update_method import SearchEnd as SearchEnd

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,8 +19,6 @@ ROUNDING = 1e-11
 UNSEEN = 1e-9
 #: singular values of S, its columns of length one, below which parameters cannot be distinguished
 SINGULAR = 1e-7
-#: how often a step that harms is halved
-HALVINGS = 30
 EXACT, STEP = "residual below the tolerance", "step below the tolerance"
 
 
@@ -53,6 +52,8 @@ class GaussNewton(UpdateMethod):
 
     truncate: float = field(default=0.0, kw_only=True)
 
+    #: how often a step that harms is halved
+    halvings: ClassVar[int] = 30
     steps = 20
     keeps_bounds = False
     weighs_poles = True
@@ -91,7 +92,7 @@ class GaussNewton(UpdateMethod):
             if converged:
                 break
             small = _is_small(change, size, tolerance)
-            advanced = _advanced(objective, p, step, r, size)
+            advanced = _advanced(objective, p, step, r, size, self.halvings)
             if advanced is None:
                 converged, reason = small, STEP if small else "no part of a step helps"
                 break
@@ -146,13 +147,18 @@ def _step(
 
 
 def _advanced(
-    objective: Objective, p: FloatArray, step: FloatArray, r: FloatArray, size: FloatArray
+    objective: Objective,
+    p: FloatArray,
+    step: FloatArray,
+    r: FloatArray,
+    size: FloatArray,
+    halvings: int,
 ) -> tuple[float, FloatArray] | None:
     """Return the part of a step taken and the residuals there, None when no part lowers (12)."""
     rounding = ROUNDING * float(np.linalg.norm(size))
     limit = float(np.linalg.norm(r)) * (1 + ROUNDING) + rounding
     fraction, trouble = 1.0, ""
-    for _ in range(HALVINGS):
+    for _ in range(halvings):
         try:
             found = objective.values(objective.at(p + fraction * step))
         except ModelError as error:

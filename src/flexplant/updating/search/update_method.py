@@ -50,6 +50,8 @@ class SearchEnd:
     trail: Trail
     converged: bool
     reason: str
+    #: methods that were tried and how each of them ended, where there were several
+    tried: tuple[str, ...] = ()
 
 
 class UpdateMethod(Value):
