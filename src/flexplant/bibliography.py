@@ -129,6 +129,7 @@
    Process. 57, 2009.
 .. [Kammer1991] Kammer, Sensor placement for on-orbit modal identification and correlation of large
    space structures, J. Guid. Control Dyn. 14, 1991.
+.. [KassRaftery1995] Kass, Raftery, Bayes factors, J. American Statistical Association 90, 1995.
 .. [Kaufman1975] Kaufman, A variable projection method for solving separable nonlinear least squares
    problems, BIT 15, 1975.
 .. [KennedyOHagan2001] Kennedy, O'Hagan, Bayesian calibration of computer models, J. Royal

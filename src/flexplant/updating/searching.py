@@ -301,17 +301,14 @@ def summary(
     for end in sorted(found, key=lambda one: one.cost):
         if not any(same_minimum(objective, point, end, other) for other in (best, *minima)):
             minima.append(end)
-    chi2, dof = chi_square(objective, point, np.ones(best.p.size, dtype=bool))
-    noise = chi2 is not None and not is_bad(chance(chi2, dof))
-    rows = objective.values(point).size
-    above = [_above(best.cost, end.cost, rows, noise=noise) for end in minima]
+    above = _above(objective, best, minima)
     return Starts(
         np.array(begins),
         np.array([end.p if isinstance(end, SearchEnd) else nan for end in ends]),
         np.array([end.cost if isinstance(end, SearchEnd) else np.inf for end in ends]),
         tuple(_said(end) for end in ends),
         np.array([end.p for end in minima]).reshape(-1, best.p.size),
-        np.array(above),
+        above,
     )
 
 
@@ -332,15 +329,23 @@ def same_minimum(objective: Objective, point: Point, a: SearchEnd, b: SearchEnd)
     return noise or bool(np.max(change / objective.size(point)) < SAME_END)
 
 
-def _above(least: float, cost: float, rows: int, *, noise: bool) -> float:
-    """Return by how much -2 ln of the likelihood is larger at another minimum.
+def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> FloatArray:
+    """Return by how much -2 ln of the likelihood is larger at other minima.
 
     The difference of chi-square, or ``n ln(e/e_least)`` where the noise is not known or is not all
     that is left.
     """
-    if noise:
-        return 2 * (cost - least)
-    return float(rows * np.log(max(cost, TINY) / max(least, TINY)))
+    point, free = objective.at(best.p), np.ones(best.p.size, dtype=bool)
+    rows, (least, dof) = objective.values(point).size, chi_square(objective, point, free)
+    if least is None or is_bad(chance(least, dof)):
+        costs = np.array([max(end.cost, TINY) for end in minima])
+        return np.asarray(rows * np.log(costs / max(best.cost, TINY)), dtype=np.float64)
+    found, objective.path = [], []
+    for end in minima:
+        chi2, _ = chi_square(objective, objective.follow(end.trail.p), free)
+        found.append((chi2 or 0.0) - least)
+    objective.follow(best.trail.p)
+    return np.array(found, dtype=np.float64)
 
 
 def scattered(objective: Objective, middle: FloatArray, count: int, rng: Rng) -> list[FloatArray]:

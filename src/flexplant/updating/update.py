@@ -76,17 +76,20 @@ def update(
         What to fit: `Eigenvalues`, `ModeShapes`, `FrfResidual`, `Antiresonances`,
         `StaticCompliance`, mixed freely.
     method : UpdateMethod, optional
-        `GaussNewton`, `TrustRegion`, `Tikhonov` or `Lasso`. None: as said above.
+        `GaussNewton`, `TrustRegion`, `Tikhonov` or `Lasso`. None: as said above, the trust region
+        going on where Gauss-Newton leads nowhere.
     start : (q,) array [kg, N s/m, N/m], optional
         Values to begin with. When not given zeros, or the means of priors, inside the bounds; then
         complex responses are fitted by the logarithm of their magnitude first, all entries about
-        equally weighted, and poles before shapes, since these converge from farther away. Where
-        responses alone are fitted and a tenth of their power is left, or several parameters to
-        poles alone and a pole is 0.1 % off, which noise does not explain, up to 20 other starts
-        are tried (`UpdateResult.starts`), 4 with a model of more than 100 DOFs.
+        equally weighted, and poles before shapes, since these converge from farther away. Four
+        other starts near it are always tried, two with a model of more than 100 DOFs, since a
+        minimum does not show that there is another; print(fit) names those of similar chi-square.
+        Where responses alone are fitted and a tenth of their power is left, or several parameters
+        to poles alone and a pole is 0.1 % off, which noise does not explain, up to 20 (or 4) are
+        tried (`UpdateResult.starts`).
     starts : int or (s, q) array, optional
-        Search from several starts, drawn between the bounds (or from the priors), and keep
-        the best; `start` is one of them.
+        Search from these starts alone, or from so many that are drawn between the bounds (or from
+        the priors), and keep the best; `start` is one of them. 1: from `start` alone.
     rng : int, SeedSequence or Generator
         For drawn starts.
     prior : bool
@@ -122,8 +125,8 @@ def update(
         does in one of 10 000 cases: parameters, and for each kind of residual the standard
         deviation of what the model cannot explain, are then estimated together
         (`UpdateResult.discrepancy`; with responses the covariance is widened instead, by chi-square
-        over its degrees of freedom); when the last round of defect correction still moved the
-        estimate by more than half a standard deviation.
+        over its degrees of freedom, and no +- is printed); when the last round of defect correction
+        still moved the estimate by more than half a standard deviation.
 
     Raises
     ------
@@ -165,7 +168,7 @@ def update(
     # the paper's problem: eigenvalues alone, nothing known beforehand
     plain = all(isinstance(r, Eigenvalues) and not r.clusters for r in given) and not known
     if method is None:
-        method = Secured() if plain and not bounded and starts is None else TrustRegion()
+        method = Secured() if plain and not bounded else TrustRegion()
     if bounded and not method.keeps_bounds:
         raise ModelError(
             f"{type(method).__name__} takes no bounds: use TrustRegion(), or drop bounds=."

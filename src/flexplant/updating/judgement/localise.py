@@ -95,7 +95,7 @@ def localise(
 
     References
     ----------
-    [ChenChen2008]_.
+    [ChenChen2008]_; [KassRaftery1995]_.
 
     Examples
     --------
@@ -132,6 +132,7 @@ def localise(
     best = fits.best(ranked, most)
     fits.polish(best)
     fit = fits.fit(best)
+    next_best, next_bic = fits.runner_up(best)
     p = np.zeros(0) if fit is None else fit.p
     chi2, dof = fits.chi2(best)
     found = Localisation(
@@ -148,6 +149,8 @@ def localise(
         chi2=chi2,
         dof=dof,
         units=tuple(q.unit for q in listed),
+        next_best=tuple(listed[i].name for i in next_best),
+        next_bic=next_bic,
     )
     if fit is not None and is_bad(found.p_value):
         full = len(best) >= most
@@ -192,6 +195,8 @@ def _singles(
 ALIKE = 2.0
 #: share of the residual by which rivals explain less than the best at most
 NEAR = 0.01
+#: difference of BIC that is very strong evidence ([KassRaftery1995]_: 10)
+CERTAIN = 10.0
 #: names in a line of a repr, lines in a table
 SHOWN, ROWS = 6, 12
 
@@ -227,6 +232,10 @@ class Localisation(Value):
         Residuals less the parameters that were fitted.
     units : sequence of c str, optional
         Of the candidates.
+    next_best : sequence of str
+        The best set that was fitted and lacks a place of the chosen one; empty for no change.
+    next_bic : float
+        Its criterion, infinite where no other set was fitted.
 
     Examples
     --------
@@ -254,6 +263,20 @@ class Localisation(Value):
     chi2: float | None = None
     dof: int = 0
     units: tuple[str, ...] = ()
+    next_best: tuple[str, ...] = ()
+    next_bic: float = np.inf
+
+    @property
+    def margin(self) -> float:
+        """By how much the criterion of the next set is above that of the chosen one.
+
+        A difference d is a likelihood ratio of ``exp(d/2)``: below 10 the next set is possible too.
+        Where more than noise is left (`p_value`), the ratio is that of errors of the model, and the
+        difference is divided by ``chi2 / dof``.
+        """
+        wrong = is_bad(self.p_value) and self.chi2 is not None
+        size = (self.chi2 or 0.0) / max(self.dof, 1) if wrong else 1.0
+        return (self.next_bic - self.chosen_bic) / size
 
     def __getitem__(self, name: str) -> float:
         """Return the score of a candidate."""
@@ -335,6 +358,11 @@ class Localisation(Value):
         rivals = [name for name in self.rivals if len(self.alike) < 2 or name not in self.alike]
         if rivals and self.chosen:
             text += f"\n  differs by less than {NEAR:.0%} of the data from: {_shown(rivals)}"
+        if self.chosen and np.isfinite(self.next_bic):
+            said = "NOT CERTAIN, next" if self.margin < CERTAIN else "next"
+            other = ", ".join(self.next_best) or "no change"
+            text += f"\n  {said}: {other}, worse by {self.margin:.3g}"
+            text += " (likelihood ratio exp(d/2))"
         if is_bad(self.p_value):
             text += f"\n  MORE THAN NOISE IS LEFT: chi2 {self.chi2:.4g} for {self.dof} dof"
         return text + ">"

@@ -129,6 +129,19 @@ class Subsets:
         dof = self.rows - len(subset) - len(self.beside)
         return (None if found is None else found.chi2), dof
 
+    def runner_up(self, best: Subset) -> tuple[Subset, float]:
+        """Return the fitted set of least criterion that names another place, and its criterion.
+
+        A set with more candidates beside those of the best names no other place.
+        """
+        other = [
+            (self._criterion(found, len(one)), one)
+            for one, found in self.done.items()
+            if found is not None and not set(best) <= set(one)
+        ]
+        score, found_best = min(other, default=(np.inf, ()))
+        return found_best, score
+
     def best(self, singles: Iterable[int], most: int) -> Subset:
         """Return the subset of up to `most` candidates with the least extended BIC."""
         best: Subset = ()
