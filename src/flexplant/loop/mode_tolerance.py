@@ -143,9 +143,10 @@ class ModeTolerances(Value):
             with np.errstate(divide="ignore"):
                 worst = int(np.argmin(self.least / known))
             name = f"mode {self.modes[worst]}"
-            found[f"{name} holds to"] = float(self.least[worst])
-            if self.known is not None:
-                found[f"{name} known to"] = float(self.known[worst])
+            if np.isfinite(self.least[worst]):  # else no change of a mode alone matters
+                found[f"{name} holds to"] = float(self.least[worst])
+                if self.known is not None:
+                    found[f"{name} known to"] = float(self.known[worst])
         if self.draws is not None:
             found |= {"stable of draws": self.draws.stable, "margin kept of draws": self.draws.kept}
         return found
