@@ -337,7 +337,8 @@ class Moments:
             R = self.R[o][toeplitz]
             # columns: coefficient r of A, channel i
             S = self.S[o][:, toeplitz].transpose(1, 2, 0).reshape(n, n * m)
-            solved = _solved(R, S)
+            # powers of z on most of the circle: well conditioned, whatever the data
+            solved = la.solve(R, S, assume_a="pos")
             big = big - S.conj().T @ solved
             numerators.append(-solved)
         free: Any = -_solved(big[m:, m:], big[m:, :m])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -10,20 +10,32 @@ from typing import Any
 import numpy as np
 
 from ..checks import ComplexArray, FloatArray, between, instance, positive, real_array, short, whole
-from ..errors import LabelError, ModelError, ShapeError, SolverError, counted, require_known
+from ..errors import (
+    LabelError,
+    ModelError,
+    ShapeError,
+    SolverError,
+    counted,
+    require_known,
+    warn,
+)
 from ..lti.frequency import Frf
 from ..parallel import Progress, one_thread
 from ..tolerances import ROUNDING, TINY
 from .diagram import Moments, OrderPoles, PoleSelection, StabilisationDiagram, built_diagram
+from .gate import gated
 from .line_weights import PreparedLines, prepared
+from .model_error import disagreement
 from .pole_test import (
     UPPER,
     dropped,
     fewer_terms,
     freedom,
     improved,
+    merged,
     missed,
     more_terms,
+    own_price,
     relocated,
     split,
     supported,
@@ -31,13 +43,19 @@ from .pole_test import (
     unwindowed,
     warned,
 )
-from .refine import Lines, refined
+from .refine import Fit, Lines, refined
 from .result import IdentifiedModes, answer, hann_segment, leakage_warned, of_segments
 
 #: of an identification, for its bar: the diagram, twice fit and growth, the answer
 STAGES = 6
-#: changes of one kind that are accepted
-MOST = 6
+#: changes of one kind that are accepted, and poles that a fit may have
+MOST, MOST_POLES = 6, 60
+#: lines apart that poles at peaks have: a peak that is no resonance of a linear machine is
+#: explained badly, and what is left of it is no other pole
+REGION = 20
+#: values of the FRF times (poles times references) squared, the products of a step of the fit, up
+#: to which it is made without a request: some seconds altogether
+CHEAP = 5e7
 
 
 def stabilisation_diagram(
@@ -61,7 +79,8 @@ def stabilisation_diagram(
     band : (low, high) [Hz], optional
         The frequencies used; all by default.
     orders : iterable of int, optional
-        Model orders; each has order * min(n_in, n_out) poles. 2 to 40 by default.
+        Model orders; each has order * min(n_in, n_out) poles. By default 2 to 40, or to a quarter
+        of the lines; every other one where many references make each of them costly.
     tolerances : (float, float, float)
         Relative change of frequency and of damping from one order to the next, and the MAC,
         for a pole to be called stable.
@@ -100,7 +119,7 @@ def stabilisation_diagram(
             f"{tolerances!r}."
         )
     top = between(max_zeta, "max_zeta", 0.0, 1.0, "From 1 on nothing oscillates: pass 0.2, say.")
-    ready, listed = prepared(frf, band), checked_orders(orders)
+    ready, listed = prepared(frf, band), None if orders is None else checked_orders(orders)
     if not ready.known:
         ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])
     with one_thread():
@@ -117,12 +136,15 @@ def identify_modes(
     upper: int | None = None,
     hold: float | None = None,
     dofs: Mapping[str, str] | None = None,
+    refine: bool | None = None,
+    most: int = MOST_POLES,
     max_iterations: int = 150,
     progress: bool | None = None,
 ) -> IdentifiedModes:
     r"""Return poles, mode shapes and their covariance from measured FRFs.
 
-    Poles that stay over the orders of a stabilisation diagram start a maximum likelihood fit of
+    The poles that stay over the orders of a stabilisation diagram are the first answer, with the
+    shapes and residual terms of least squares. They start a maximum likelihood fit (`refine`) of
 
     .. math:: H(s) = \sum_k \frac{\psi_k l_k^T}{s - \lambda_k} +
         \frac{\bar\psi_k \bar l_k^T}{s - \bar\lambda_k}
@@ -135,6 +157,14 @@ def identify_modes(
     still not explained is warned of, with its frequency. A pole with another at the same place
     (repeated, or too close for the diagram) is taken apart where that lowers chi-square by more
     than noise does.
+
+    Measurements that no linear machine explains: a pole is added only for what the outputs share,
+    beyond poles of their own at each of them, and misfit that is correlated over neighbouring lines
+    counts as so much less. Of two poles within a bandwidth with the same shape and participation
+    one remains. Where outputs disagree on the poles (a roving sensor), they are warned of, and the
+    covariance is that of leaving out each output in turn. Poles whose deviation of frequency or
+    damping exceeds it, mains multiples narrower than half a line and poles at the edge of the band
+    are not reported, but listed with the reason in `rejected`.
 
     Lines of Hann-windowed segments show a resonance widened by the window: where that explains them
     better (H1 of random excitation), each term ``1/(s - lambda)`` is fitted as such lines show it,
@@ -149,7 +179,7 @@ def identify_modes(
     band : (low, high) [Hz], optional
         What to fit and report; all by default.
     orders : iterable of int, optional
-        Of the stabilisation diagram; 2 to 40 by default.
+        Of the stabilisation diagram, whose default it is.
     start : PoleSelection, optional
         Poles chosen by hand, `stabilisation_diagram(frf).select(freq=[...])`.
     lower : int
@@ -164,10 +194,16 @@ def identify_modes(
     dofs : mapping {channel: DOF label}, optional
         Where outputs and inputs are; shapes are labelled by it, and mass-normalised where an
         input and an output share a DOF.
+    refine : bool, optional
+        Whether to fit by maximum likelihood; when not given, where that is cheap: values of the FRF
+        times (poles times references) squared up to 5e7. False takes about a second.
+    most : int
+        Poles that the fit may have.
     max_iterations : int
         Of the fit.
     progress : bool, optional
-        A bar of the stages: None shows one on a terminal for work of more than two seconds.
+        A bar of the stages: None shows one on a terminal for work of more than two seconds, and
+        anywhere when a costly refinement is requested, with its cost.
 
     Returns
     -------
@@ -205,15 +241,16 @@ def identify_modes(
     >>> found.freq.round(2), modes.freq.round(2)
     (array([ 34.46, 147.  ]), array([ 34.46, 147.  ]))
     """
-    with one_thread(), Progress(STAGES, "modes", progress=progress) as bar:
+    most, steps = whole(most, "most"), whole(max_iterations, "max_iterations")
+    if refine is not None and not isinstance(refine, bool):
+        raise ModelError(f"refine is True, False or None, got {short(refine)}.")
+    with one_thread():
         try:
-            found = _identified(
-                frf, band, orders, start, lower, upper, hold, dofs, max_iterations, bar
+            return _identified(
+                frf, band, orders, start, lower, upper, hold, dofs, (refine, most, steps), progress
             )
         except SolverError as error:
             raise of_segments(frf, error) from None
-        bar.advance(STAGES - bar.done)
-        return found
 
 
 def _identified(
@@ -225,27 +262,49 @@ def _identified(
     upper: int | None,
     hold: float | None,
     dofs: Mapping[str, str] | None,
-    max_iterations: int,
-    bar: Progress,
+    limits: tuple[bool | None, int, int],
+    progress: bool | None,
 ) -> IdentifiedModes:
     ready = prepared(frf, band)
-    low, high = float(ready.freq[0]), float(ready.freq[-1])
+    high = float(ready.freq[-1])
     lower = whole(lower, "lower", minimum=0)
-    most = UPPER[-1] if upper is None else whole(upper, "upper", minimum=0)
-    max_iterations = whole(max_iterations, "max_iterations")
+    terms = UPPER[-1] if upper is None else whole(upper, "upper", minimum=0)
     rate = None if hold is None else positive(hold, "hold")
     if rate is not None and high > rate / 2 * (1 + ROUNDING):
         raise ModelError(f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together.")
     labels = checked_channels(dofs, frf)
-    listed = checked_orders(orders)
+    listed = None if orders is None else checked_orders(orders)
     if start is not None:
         instance(start, PoleSelection, "start", "Pass diagram.select(freq=[...]).")
     if not ready.known:
         ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])
-    diagram = None
+    refine, most, steps = limits
+
+    def lines_of(ready: PreparedLines) -> Lines:
+        # with all residual terms, so that no pole is kept or moved to stand in for one
+        return Lines(
+            *(ready.freq, ready.data, ready.weight, lower, terms, rate, ready.known),
+            inflation=ready.inflation,
+            variance_freedom=frf.freedom,
+            segment=hann_segment(frf),
+            most=most,
+        )
+
+    diagram, at_peaks = None, False
     if start is None:
         diagram = diagram_of(ready, _affordable(listed, ready), (0.01, 0.05, 0.95), 0.2)
-        chosen = diagram.automatic()
+        try:
+            chosen = diagram.automatic()
+        except SolverError:
+            found = None if frf.window is not None or refine else _at_peaks(lines_of(ready))
+            if found is None:
+                raise
+            chosen, refine, at_peaks = found, False, True
+            warn(
+                "no pole stays over the orders of the stabilisation diagram: the poles are those "
+                "of the highest peaks, their damping is no more than its order of magnitude. A "
+                "transient that has not decayed or a single run looks so: average over more runs."
+            )
     elif start.participation.shape[0] != ready.data.shape[1]:
         raise ShapeError(
             f"start was chosen with {counted(start.participation.shape[0], 'reference')}, this FRF "
@@ -253,44 +312,126 @@ def _identified(
         )
     else:
         chosen = start
+    alone, free = start is None and not at_peaks, upper is None
+    work = ready.data.size * (len(chosen) * ready.data.shape[1]) ** 2
+    costly = work > CHEAP
+    if refine is None:
+        refine = not costly
+    shown = True if refine and costly and progress is None else progress
+    name = f"modes, {work:.1e} operations a step" if costly else "modes"
+    with Progress(STAGES, name, progress=shown) as bar:
+        bar.advance()
+        made = _refined if refine else _first
+        ready, lines, fit = made(ready, lines_of, chosen, alone, free, steps, bar)
+
+        def again(poles: ComplexArray, part: ComplexArray) -> Fit:
+            if not refine:
+                return Fit(lines, poles, part)
+            return refined(lines, poles, part, steps=steps, strict=False)
+
+        fit, reported, rejected = gated(lines, fit, again, alone=alone, refine=refine)
+        apart = None
+        if refine:
+            fit = refined(lines, fit.poles, fit.participation, steps=steps, fine=True)
+            excess = fit.cost - freedom(lines, fit.poles.size)
+            apart = disagreement(lines, fit, own_price(lines, fit), excess)
+            warned(unexplained(lines, fit), None if apart is None else apart.size)
+        answered = answer(
+            frf, ready, lines, fit, reported, labels, diagram, rejected, refine, apart
+        )
+        bar.advance(STAGES - bar.done)
+    leakage_warned(frf, answered)
+    return answered
+
+
+def _at_peaks(lines: Lines) -> PoleSelection | None:
+    """Return poles at the peaks of a response that no stable poles explain, as a grid finds them.
+
+    A response whose phase rises through a resonance (a transient that is not decayed, a record of
+    one run) has no pole that is stable there, and its peak is one all the same.
+    """
+    spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
+    none = np.zeros((lines.data.shape[1], 0), dtype=np.complex128)
+    fit = Fit(lines, none[0], none)
+    for _ in range(MOST):
+        trials = [one for rivals in missed(lines, fit) for one in rivals]
+        trials = [
+            one for one in trials if np.all(np.abs(one.poles[-1] - fit.poles) > REGION * spacing)
+        ]
+        best = max(trials, key=lambda trial: trial.gain - trial.least, default=None)
+        if best is None or best.gain < best.least:
+            break
+        fit = Fit(lines, best.poles, best.participation)
+    return PoleSelection(fit.poles, fit.participation) if fit.poles.size else None
+
+
+def _first(
+    ready: PreparedLines,
+    lines_of: Callable[[PreparedLines], Lines],
+    chosen: PoleSelection,
+    alone: bool,
+    free: bool,
+    steps: int,
+    bar: Progress,
+) -> tuple[PreparedLines, Lines, Fit]:
+    """Return the fit of least squares at the poles chosen, with as few residual terms as do."""
+    lines, poles, part = lines_of(ready), chosen.poles, chosen.participation
+    if alone:
+        poles, part = supported(lines, poles, part)
+    return ready, lines, Fit(lines, poles, part)
+
+
+def _refined(
+    ready: PreparedLines,
+    lines_of: Callable[[PreparedLines], Lines],
+    chosen: PoleSelection,
+    alone: bool,
+    free: bool,
+    steps: int,
+    bar: Progress,
+) -> tuple[PreparedLines, Lines, Fit]:
+    """Return the maximum likelihood fit, with the poles and terms that the data support."""
     poles, part = chosen.poles, chosen.participation
-    bar.advance()
-    alone, free = start is None, upper is None
-    reducing = [(unwindowed, 1), (dropped, int(alone)), (fewer_terms, int(free))]
+    reducing = [(unwindowed, 1), (dropped, int(alone))]
+    reducing += [(merged, MOST * int(alone)), (fewer_terms, int(free))]
     growing = [
         *((missed, MOST), (more_terms, int(free))),
         *((split, MOST), (relocated, MOST), (missed, MOST)),
     ]
     for _ in range(1 if ready.known else 2):
-        # with all residual terms, so that no pole is kept or moved to stand in for one
-        lines = Lines(
-            *(ready.freq, ready.data, ready.weight, lower, most, rate, ready.known),
-            inflation=ready.inflation,
-            variance_freedom=frf.freedom,
-            segment=hann_segment(frf),
-        )
+        lines = lines_of(ready)
         if alone:
             poles, part = supported(lines, poles, part)
         # poles that turn out to be none may keep it from settling: judged at the end
-        fit = refined(lines, poles, part, steps=max_iterations, strict=not alone)
-        lines, fit = improved(lines, fit, reducing, steps=max_iterations)
+        fit = refined(lines, poles, part, steps=steps, strict=not alone)
+        lines, fit = improved(lines, fit, reducing, steps=steps)
         bar.advance()
         if alone:
-            lines, fit = improved(lines, fit, growing, steps=max_iterations, rough=True)
+            lines, fit = improved(lines, fit, growing, steps=steps, rough=True)
             bar.advance()
         poles, part = fit.poles, fit.participation
         if not ready.known:
             share = 1.0 - freedom(lines, poles.size) / (2 * fit.model.size)
             ready = ready.from_residuals(ready.data - fit.model, share)
-    fit = refined(lines, fit.poles, fit.participation, steps=max_iterations, fine=True)
-    warned(unexplained(lines, fit))
-    found = answer(frf, ready, lines, fit, (low, high), labels, diagram)
-    leakage_warned(frf, found)
-    return found
+    return ready, lines, fit
 
 
-def _affordable(orders: list[int], ready: PreparedLines) -> list[int]:
-    fewest = min(window.seen.stop - window.seen.start for window in windows(ready))
+#: the highest model order by default, and the lines that each order is to have then
+HIGHEST, LINES_OF_ORDER = 40, 4
+#: references times parts of the band from which every other order is enough: each is a large
+#: eigenvalue problem
+MANY = 4
+
+
+def _affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
+    """Return the orders, by default as many as the lines afford; ModelError for too high ones."""
+    parts = windows(ready)
+    fewest = min(window.seen.stop - window.seen.start for window in parts)
+    if orders is None:
+        # four orders at least are compared, which twenty lines afford
+        top = max(6, min(HIGHEST, fewest // LINES_OF_ORDER - 1))
+        many = len(parts) * ready.data.shape[1] >= MANY and top == HIGHEST
+        return list(range(2, top + 1, 2 if many else 1))
     if 2 * (orders[-1] + 1) > fewest:
         raise ModelError(
             f"order {orders[-1]} needs more lines than the {ready.freq.size} of the band: lower "
@@ -308,14 +449,13 @@ def checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
     return {str(name): str(label) for name, label in dofs.items()}
 
 
-def checked_orders(orders: Iterable[int] | None) -> list[int]:
-    """Return rising model orders, 2 to 40 where none are given."""
-    given = range(2, 41) if orders is None else orders
-    if isinstance(given, str) or not isinstance(given, Iterable):
+def checked_orders(orders: Iterable[int]) -> list[int]:
+    """Return rising model orders."""
+    if isinstance(orders, str) or not isinstance(orders, Iterable):
         raise ModelError(
             f"orders are whole numbers to compare, got {short(orders)}. Try range(2, 41)."
         )
-    listed = sorted({whole(n, "each of orders") for n in given})
+    listed = sorted({whole(n, "each of orders") for n in orders})
     if len(listed) < 4:
         raise ModelError(
             f"orders must be at least four whole numbers from 1 to compare, got {listed!r:.60}."

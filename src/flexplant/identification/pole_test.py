@@ -12,6 +12,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray
 from ..errors import SolverError, warn
 from ..tolerances import RANK
+from .model_error import coherence, own_cost, twin
 from .refine import Fit, Lines, refined
 
 #: probability that noise anywhere in the band passes for a pole
@@ -181,6 +182,8 @@ def _accepted(lines: Lines, fit: Fit, trial: Trial, steps: int) -> tuple[Lines, 
     if trial.gain < min(trial.least, BEFORE * trial.least):
         return None
     more_poles = trial.poles.size > fit.poles.size
+    if more_poles and trial.poles.size > lines.most:
+        return None
     below = fit.cost - trial.least
     start = trial.poles, trial.participation
     try:
@@ -188,14 +191,42 @@ def _accepted(lines: Lines, fit: Fit, trial: Trial, steps: int) -> tuple[Lines, 
     except SolverError:
         return None
     zeta, before = (-each.poles.real / np.abs(each.poles) for each in (more, fit))
-    if more.cost >= below or zeta.max() >= max(BROADEST, BROADER * before.max()):
+    if more.cost >= below or zeta.max() >= max(BROADEST, BROADER * before.max(initial=0.0)):
         return None
-    if more_poles and not corroborated(lines, fit.model, more.model):
+    if more_poles and not (
+        corroborated(lines, fit.model, more.model)
+        and twin(more) is None
+        and shared(lines, fit, more, trial.least)
+    ):
         return None
     return trial.lines, more
 
 
-def _unit(lines: Lines, fit: Fit) -> float:
+def shared(lines: Lines, fit: Fit, more: Fit, least: float) -> bool:
+    """Return whether the outputs share what a pole more explains, beyond what else they are off by.
+
+    The pole is to lower the cost by what it must, times the `coherence` of what is left near it;
+    and where outputs do not agree on the poles, also that of fits with poles of their own at each
+    output, which have no need of a pole for the sake of these differences.
+    """
+    new = int(np.argmax([np.min(np.abs(pole - fit.poles), initial=np.inf) for pole in more.poles]))
+    least = least * coherence(lines, more.model, more.poles[new])
+    if fit.cost - more.cost < least:
+        return False
+    if len(fit.shapes) == 1:
+        return True
+    apart = own_cost(lines, fit)
+    agreed = fit.cost - apart < own_price(lines, fit)
+    return agreed or apart - own_cost(lines, more) > least
+
+
+def own_price(lines: Lines, fit: Fit) -> float:
+    """Return by how much poles of their own at each output must lower the cost."""
+    count = 2 * fit.poles.size * (len(fit.shapes) - 1)
+    return unit(lines, fit) * price(lines, max(1, count), CHANCE)
+
+
+def unit(lines: Lines, fit: Fit) -> float:
     """Return the misfit, 1 at least, by which an estimated variance is off everywhere."""
     return max(1.0, fit.cost / freedom(lines, fit.poles.size))
 
@@ -219,12 +250,20 @@ def dropped(lines: Lines, fit: Fit) -> Proposals:
         yield [Trial(lines, poles, part, np.inf, -np.inf)]
 
 
+def merged(lines: Lines, fit: Fit) -> Proposals:
+    """Propose the fit without the weaker one of two poles of one resonance."""
+    pair = twin(fit)
+    if pair is not None:
+        rest = np.delete(np.arange(fit.poles.size), pair[1])
+        yield [Trial(lines, fit.poles[rest], fit.participation[:, rest], np.inf, -np.inf)]
+
+
 def _terms(lines: Lines, fit: Fit, upper: int, chance: float) -> Trial:
     """Return the fit with another number of residual terms of modes above the band."""
     other, count = replace(lines, upper=upper), upper - lines.upper
     channels = lines.data.shape[0] * lines.data.shape[1]
     gain = fit.cost - Fit(other, fit.poles, fit.participation).cost
-    least = np.sign(count) * _unit(lines, fit) * price(lines, channels * abs(count), chance)
+    least = np.sign(count) * unit(lines, fit) * price(lines, channels * abs(count), chance)
     return Trial(other, fit.poles, fit.participation, gain, least)
 
 
@@ -256,7 +295,7 @@ def split(lines: Lines, fit: Fit) -> Proposals:
     .. math:: \frac{\psi l^T}{s-\lambda} \to \frac{\psi l^T + \psi' l_\perp^T}{s-\lambda}
         \quad\text{or}\quad \frac{\psi l^T}{s-\lambda-\delta} + \frac{\psi' l^T}{s-\lambda+\delta}
     """
-    least = pole_price(lines) * _unit(lines, fit)
+    least = pole_price(lines) * unit(lines, fit)
     pairs = [pair for k in range(fit.poles.size) for pair in _pairs(fit, k)]
     trials = [Trial(lines, *one, fit.cost - Fit(lines, *one).cost, least) for one in pairs]
     yield sorted(trials, key=lambda trial: -trial.gain)
@@ -306,15 +345,17 @@ def relocated(lines: Lines, fit: Fit) -> Proposals:
 
 
 def missed(lines: Lines, fit: Fit) -> Proposals:
-    """Propose a pole at the two highest peaks of what is left, single lines apart."""
-    least = pole_price(lines) * _unit(lines, fit)
-    for peak in [peak for peak in unexplained(lines, fit) if not peak.isolated][:2]:
+    """Propose a pole at the highest peaks of what is left, single lines apart."""
+    least = pole_price(lines) * unit(lines, fit)
+    for peak in [peak for peak in unexplained(lines, fit) if not peak.isolated][:TRIED]:
         poles, part, cost = candidate(lines, fit.model, fit.poles, fit.participation, peak)
         yield [Trial(lines, poles, part, fit.cost - cost, least)]
 
 
 #: lengths [lines] of the stretches that are examined
 STRETCHES = (3, 9, 27, 81)
+#: of each length the highest so many, and the peaks at which a pole is tried
+PLACES, TRIED = 4, 6
 #: standard deviations of a stretch's chi-square above which it is not explained
 LIMIT = 6.0
 #: damping ratios tried for a missed pole, beside the widths that its stretch suggests
@@ -365,8 +406,12 @@ def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
         if noiseless:
             share = total / np.convolve(measured, np.ones(length), mode="valid")
             height = np.where(share > SHARE**2, height, 0.0)
-        best = int(np.argmax(height))
-        if height[best] > LIMIT:
+        for _ in range(PLACES):
+            best = int(np.argmax(height))
+            highest = float(height[best])
+            if highest <= LIMIT:
+                break
+            height[max(0, best - 2 * length) : best + 2 * length + 1] = 0.0
             seen = lines.freq[best : best + length]
             weight = power[best : best + length]
             step = float(lines.freq[1] - lines.freq[0])
@@ -376,7 +421,7 @@ def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
                 if not _surpassing(lines, model, slice(best, best + length)):
                     continue
                 middle_freq = float(seen[np.argmax(weight)])
-            found.append(Peak(middle_freq, step * length, float(height[best]), alone))
+            found.append(Peak(middle_freq, step * length, highest, alone))
     return sorted(found, key=lambda peak: -peak.height)
 
 
@@ -462,10 +507,17 @@ def unexplained(lines: Lines, fit: Fit) -> list[Peak]:
     return kept
 
 
-def warned(left: list[Peak]) -> None:
-    """Warn of stretches that no pole explains, and of single lines."""
+def warned(left: list[Peak], apart: float | None) -> None:
+    """Warn of stretches that no pole explains, of single lines, or of outputs that disagree."""
     stretches = [peak for peak in left if not peak.isolated]
-    if stretches:
+    if apart is not None:
+        warn(
+            f"outputs disagree on the frequencies by {apart:.2%} (standard deviation), which "
+            "explains most of what is more than noise: a sensor that moves and has mass, an "
+            "amplitude or a temperature that changed between measurements. Poles are means over "
+            "the outputs, their deviations come from leaving out each output in turn."
+        )
+    elif stretches:
         warn(
             f"more than noise is left near {_listed(stretches)}: a mode may be missed or merged "
             "there, and its neighbours be off by more than their stated deviation. Look at "
@@ -473,7 +525,7 @@ def warned(left: list[Peak]) -> None:
             "band."
         )
     single = [peak for peak in left if peak.isolated]
-    if single:
+    if single and apart is None:
         warn(
             f"single lines hold more than noise, with noise alone around them: {_listed(single)}. "
             "No pole was fitted to them: a disturbance of one frequency (mains, a pump) or a "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -42,6 +42,16 @@ class Lines:
     variance_freedom: float | None = None
     #: length [s] of the Hann-windowed segments that the fit takes account of
     segment: float | None = None
+    #: poles that a fit may have
+    most: int = 1000
+
+    def of_output(self, o: int) -> Lines:
+        """Return the lines of one output."""
+        one = replace(self, data=self.data[[o]], weight=self.weight[[o]])
+        # what the residual terms take is known
+        one.__dict__["smooth_bases"] = [self.smooth_bases[o]]
+        one.__dict__["goals"] = [self.goals[o]]
+        return one
 
     @cached_property
     def smooth(self) -> ComplexArray:
@@ -78,6 +88,7 @@ def refined(
     strict: bool = True,
     fine: bool = False,
     below: float = np.inf,
+    poles_only: bool = False,
 ) -> Fit:
     r"""Return the weighted least-squares fit of poles and residual terms.
 
@@ -89,7 +100,8 @@ def refined(
     the Jacobian of [Kaufman1975]_); poles and participation l, one entry of each
     column held at 1, are found by Levenberg-Marquardt: to a tenth of a standard deviation, or
     to 3e-3 of one where the fit is to be `fine`. A fit that will not come `below` a cost is given
-    up: as soon as twenty times what a full step would gain is not enough.
+    up: as soon as twenty times what a full step would gain is not enough. `poles_only`: the
+    participation stays as it is.
     """
     pivots = np.argmax(np.abs(participation), axis=0)
     columns = np.arange(poles.size)
@@ -105,6 +117,8 @@ def refined(
         scaled, slope = N / np.outer(size, size), g / size
         # a pole outside the band may come to the axis: it stays there, the others go on
         held = np.flatnonzero((poles.real >= -1.01 * LEAST * poles.imag) & (g[: poles.size] > 0))
+        if poles_only:
+            held = np.concatenate([held, np.arange(2 * poles.size, g.size)])
         scaled[held], scaled[:, held], slope[held] = 0.0, 0.0, 0.0
         scaled[held, held] = 1.0
         # what a full step would gain: a damped one is short, and says nothing of being there

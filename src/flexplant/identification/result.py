@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray
+from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError, SolverError, warn
 from ..lti.frequency import Frf, checked_freq
 from ..tolerances import TINY
 from .diagram import StabilisationDiagram
+from .gate import Rejected
 from .line_weights import PreparedLines
 from .measured import MeasuredModes
+from .model_error import Disagreement
 from .pole_test import freedom
 from .refine import Fit, Lines, axis, free_inputs, residual_terms, seen_terms
 
@@ -25,13 +27,19 @@ def answer(
     ready: PreparedLines,
     lines: Lines,
     fit: Fit,
-    band: tuple[float, float],
+    reported: IntArray,
     labels: Mapping[str, str],
     diagram: StabilisationDiagram | None,
+    rejected: tuple[Rejected, ...],
+    refine: bool,
+    apart: Disagreement | None,
 ) -> IdentifiedModes:
-    """Return the identified modes of a fit, sorted, those inside the band."""
+    """Return the identified modes of a fit, sorted, those that are reported."""
     misfit = fit.cost / freedom(lines, fit.poles.size)
-    covariance, spread = (part * max(1.0, misfit) for part in _covariances(fit, ready))
+    formal, spread = _covariances(fit, ready)
+    covariance, spread = formal * max(1.0, misfit), spread * max(1.0, misfit)
+    if apart is not None:
+        covariance = formal + apart.covariance
     shapes, part, terms = fit.shapes, fit.participation, fit.terms
     if ready.swapped:
         shapes, part, terms = part, shapes, terms.transpose(1, 0, 2)
@@ -45,14 +53,9 @@ def answer(
         spread = spread[:, turned][:, :, turned]
     T = _scale_errors((raw, unscaled), (shapes, part), shared if normalised else [])
     spread = T @ spread @ T.conj().transpose(0, 2, 1)
-    freq = np.abs(fit.poles) / (2 * np.pi)
-    order = np.argsort(freq, kind="stable")
-    inside = np.array([k for k in order if band[0] <= freq[k] <= band[1]], dtype=np.int64)
-    outside = np.array([k for k in order if not band[0] <= freq[k] <= band[1]], dtype=np.int64)
-    if not inside.size:
-        raise SolverError(
-            f"the fit moved every pole out of the band {band[0]:.4g} to {band[1]:.4g} Hz. Widen it."
-        )
+    order = np.argsort(np.abs(fit.poles), kind="stable")
+    seen = np.isin(order, reported)
+    inside, outside = order[seen], order[~seen]
     both = np.concatenate([inside, inside + fit.poles.size])
     return IdentifiedModes(
         fit.poles[inside],
@@ -73,6 +76,9 @@ def answer(
         misfit=misfit,
         diagram=diagram,
         channel_covariance=spread[inside],
+        rejected=rejected,
+        refined=refine,
+        inconsistency=None if apart is None else apart.size,
     )
 
 
@@ -311,6 +317,9 @@ class IdentifiedModes(MeasuredModes):
     misfit: float = field(kw_only=True)
     diagram: StabilisationDiagram | None = field(default=None, kw_only=True)
     channel_covariance: ComplexArray | None = field(default=None, kw_only=True)
+    rejected: tuple[tuple[float, float, str], ...] = field(default=(), kw_only=True)
+    refined: bool = field(default=True, kw_only=True)
+    inconsistency: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -322,6 +331,17 @@ class IdentifiedModes(MeasuredModes):
             terms=self.terms,
             channel_covariance=self.channel_covariance,
         )
+
+    def __repr__(self) -> str:
+        notes = ["refined" if self.refined else "from the diagram, refine=True for the fit"]
+        if self.inconsistency is not None:
+            notes.append(
+                f"outputs disagree by {self.inconsistency:.1e}, deviations by leaving them out"
+            )
+        elif self.misfit > 1.0:
+            notes.append(f"deviations enlarged by the misfit {self.misfit:.3g}")
+        notes += [f"rejected {freq:.5g} Hz: {why}" for freq, _, why in self.rejected[:4]]
+        return "; ".join([super().__repr__()[:-1].replace("Measured", "Identified"), *notes]) + ">"
 
     @property
     def shape_covariance(self) -> ComplexArray | None:

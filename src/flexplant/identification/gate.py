@@ -1,0 +1,137 @@
+"""Which poles of a fit are reported: those with a reason against them are listed instead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.linalg as la
+
+from ..checks import ComplexArray, FloatArray, IntArray
+from ..errors import SolverError
+from ..tolerances import RANK, TINY
+from .model_error import strength, twin
+from .pole_test import pole_price, shared, unit
+from .refine import Fit, Lines
+
+#: frequencies [Hz] of mains
+MAINS = (50.0, 60.0)
+#: width of a resonance in lines below which a disturbance of one frequency looks the same
+NARROW = 0.5
+#: half-widths beside a pole within which another one may stand for the same resonance
+BESIDE = 3.0
+
+#: frequency [Hz], damping ratio and the reason why a pole is not reported
+Rejected = tuple[float, float, str]
+
+
+def gated(
+    lines: Lines,
+    fit: Fit,
+    fitted: Callable[[ComplexArray, ComplexArray], Fit],
+    *,
+    alone: bool,
+    refine: bool,
+) -> tuple[Fit, IntArray, tuple[Rejected, ...]]:
+    """Return the fit without poles that are none, the places of those reported, and the others.
+
+    Twins, and poles that nothing is known of, are left out of the fit, one by one; what lies at the
+    edge of the band or is mains remains in the fit, which explains it, and is not reported. Poles
+    chosen by hand are not merged (`alone`: none were).
+    """
+    listed: list[Rejected] = []
+    while True:
+        found = _needless(lines, fit, fitted, alone, refine)
+        if found is None:
+            break
+        place, reason = found
+        listed.append(_entry(fit, place, reason))
+        if fit.poles.size == 1:
+            raise SolverError(
+                f"no pole is left: {listed[-1][0]:.5g} Hz is {reason}. Widen the band, measure "
+                "longer, or average more."
+            )
+        rest = np.delete(np.arange(fit.poles.size), place)
+        fit = fitted(fit.poles[rest], fit.participation[:, rest])
+    reasons = [_outside(lines, pole) for pole in fit.poles]
+    listed += [_entry(fit, k, why) for k, why in enumerate(reasons) if why]
+    kept = np.array([k for k, why in enumerate(reasons) if why is None], dtype=np.int64)
+    if not kept.size:
+        raise SolverError(
+            "no pole is left within the band: "
+            + "; ".join(f"{f:.5g} Hz is {why}" for f, _, why in listed[:3])
+            + ". Widen it."
+        )
+    return fit, kept, tuple(sorted(listed))
+
+
+def _entry(fit: Fit, k: int, reason: str) -> Rejected:
+    pole = complex(fit.poles[k])
+    return abs(pole) / (2 * np.pi), -pole.real / abs(pole), reason
+
+
+def _needless(
+    lines: Lines,
+    fit: Fit,
+    fitted: Callable[[ComplexArray, ComplexArray], Fit],
+    alone: bool,
+    refine: bool,
+) -> tuple[int, str] | None:
+    """Return a pole that is to be left out, and why."""
+    size, std = np.abs(fit.poles), _deviations(lines, fit)
+    unknown = np.maximum(std[1] / size, std[0] / np.maximum(-fit.poles.real, TINY))
+    inside = [k for k in range(size.size) if _outside(lines, fit.poles[k]) is None]
+    worst = max(inside, key=lambda k: float(unknown[k]), default=None)
+    if worst is not None and unknown[worst] >= 1.0:
+        return worst, "without information: its deviation of frequency or damping exceeds it"
+    if not alone:
+        return None
+    found = twin(fit)
+    if found is not None:
+        other, place = found
+        return place, f"a twin of the pole at {size[other] / (2 * np.pi):.5g} Hz"
+    for place in _beside(fit) if refine else []:
+        rest = np.delete(np.arange(size.size), place)
+        try:
+            less = fitted(fit.poles[rest], fit.participation[:, rest])
+        except SolverError:
+            continue
+        if not shared(lines, less, fit, pole_price(lines) * unit(lines, fit)):
+            return place, "not shared by the outputs: it stands for what they differ by"
+    return None
+
+
+def _deviations(lines: Lines, fit: Fit) -> FloatArray:
+    """Return the deviations (2, m) of Re and Im of the poles, misfit included."""
+    N, _ = fit.gradient()
+    size = np.sqrt(np.maximum(np.diag(N), TINY))
+    inverse = la.pinvh(N / np.outer(size, size), rtol=RANK)
+    variance = np.diag(inverse) / size**2 * unit(lines, fit) * lines.inflation
+    return np.asarray(np.sqrt(variance[: 2 * fit.poles.size]).reshape(2, -1))
+
+
+def _beside(fit: Fit) -> list[int]:
+    """Return the weaker poles beside others, the weakest first."""
+    height, found = strength(fit), []
+    for k in np.argsort(height):
+        reach = BESIDE * (-fit.poles.real - fit.poles.real[k])
+        if np.any((np.abs(fit.poles - fit.poles[k]) < reach) & (height > height[k])):
+            found.append(int(k))
+    return found
+
+
+def _outside(lines: Lines, pole: complex) -> str | None:
+    """Return why a pole of the fit is not reported, None where it is."""
+    freq, width = abs(pole) / (2 * np.pi), -2.0 * pole.real / (2 * np.pi)
+    low, high = float(lines.freq[0]), float(lines.freq[-1])
+    spacing = float(np.median(np.diff(lines.freq)))
+    if not low <= freq <= high:
+        return "outside the band"
+    if min(freq - low, high - freq) < max(spacing, width / 4):
+        return "at the edge of the band"
+    if width < NARROW * spacing:
+        for mains in MAINS:
+            number = round(freq / mains)
+            if number and abs(freq - number * mains) < spacing / 2:
+                return f"a mains multiple, {number} x {mains:g} Hz, narrower than half a line"
+    return None
