@@ -67,6 +67,7 @@
    CERFACS, 1992.
 .. [DuffReid1983] Duff, Reid, The multifrontal solution of indefinite sparse symmetric linear
    equations, ACM Trans. Math. Softw. 9, 1983.
+.. [EfronTibshirani1993] Efron, Tibshirani, An Introduction to the Bootstrap, Chapman & Hall, 1993.
 .. [EmamiNaeiniVanDooren1982] Emami-Naeini, Van Dooren, Computation of zeros of linear multivariable
    systems, Automatica 18, 1982.
 .. [Enns1984] Enns, Model reduction with balanced realizations, IEEE CDC, 1984.

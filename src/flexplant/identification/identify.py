@@ -374,10 +374,12 @@ def _first(
     steps: int,
     bar: Progress,
 ) -> tuple[PreparedLines, Lines, Fit]:
-    """Return the fit of least squares at the poles chosen, with as few residual terms as do."""
+    """Return the fit near the poles chosen, with all residual terms and no search for others."""
     lines, poles, part = lines_of(ready), chosen.poles, chosen.participation
     if alone:
         poles, part = supported(lines, poles, part)
+        # the diagram's poles are off by more than noise makes them; steps converge quadratically
+        return ready, lines, refined(lines, poles, part, steps=2, strict=False)
     return ready, lines, Fit(lines, poles, part)
 
 
@@ -395,8 +397,8 @@ def _refined(
     reducing = [(unwindowed, 1), (dropped, int(alone))]
     reducing += [(merged, MOST * int(alone)), (fewer_terms, int(free))]
     growing = [
-        *((missed, MOST), (more_terms, int(free))),
-        *((split, MOST), (relocated, MOST), (missed, MOST)),
+        *((missed, MOST), (merged, MOST), (more_terms, int(free))),
+        *((split, MOST), (relocated, MOST), (merged, MOST), (missed, MOST)),
     ]
     for _ in range(1 if ready.known else 2):
         lines = lines_of(ready)

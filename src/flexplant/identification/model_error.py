@@ -13,8 +13,10 @@ from .refine import Fit, Lines, refined
 
 #: MAC from which two shapes are one: they differ by less than what a neighbour's tail makes
 ALIKE = 0.9
-#: part of a misfit that is most of it
-MOSTLY = 0.5
+#: half-widths (mean of two poles) within which poles of different shapes may be one resonance
+WITHIN = 1.5
+#: part of a misfit that is most of it: a missed mode leaves about half, a shift less than 1e-3
+MOSTLY = 0.9
 #: misfit near a pole, with its correlation over lines, up to which it is noise
 NOISE = 1.5
 #: steps of a fit of one output: its poles begin near
@@ -73,18 +75,20 @@ def twin(fit: Fit) -> tuple[int, int] | None:
 
     One resonance that is no straight circle (leakage, an amplitude that matters) becomes such a
     pair. With one input any two shapes pass for it: two modes are proven there by several inputs,
-    or by leaving nothing but noise.
+    or by leaving nothing but noise of a known variance.
     """
     height = strength(fit)
     for k in np.argsort(height):
         for j in np.argsort(-height):
-            apart = abs(fit.poles[j] - fit.poles[k])
-            if height[j] <= height[k] or apart > -fit.poles[j].real - fit.poles[k].real:
+            if height[j] <= height[k]:
                 continue
+            apart, widths = abs(fit.poles[j].imag - fit.poles[k].imag), -fit.poles.real[[j, k]]
             same = min(_mac(fit.shapes, j, k), _mac(fit.participation, j, k)) > ALIKE
-            if same or (
-                fit.participation.shape[0] == 1
-                and coherence(fit.lines, fit.model, fit.poles[k]) > NOISE
+            if apart > (widths.sum() if same else WITHIN * np.sqrt(widths.prod())):
+                continue
+            single = fit.participation.shape[0] == 1
+            if (single and (same or not fit.lines.known)) or (
+                (same or single) and coherence(fit.lines, fit.model, fit.poles[k]) > NOISE
             ):
                 return int(j), int(k)
     return None
@@ -116,8 +120,8 @@ def disagreement(lines: Lines, fit: Fit, least: float, excess: float) -> Disagre
     ([EfronTibshirani1993]_, ch. 11). The covariance :math:`(n-1)/n \sum_o d_o d_o^T` needs nothing
     of the noise; it is made larger by Student's factor of n - 1 degrees, so that 1.96 deviations
     hold 95 %.
-    None where poles of their own lower the cost by less than `least`, or explain less than half of
-    the cost's `excess` over that of noise: something else is wrong then.
+    None where poles of their own lower the cost by less than `least`, or do not explain nearly all
+    of the cost's `excess` over that of noise: something else is wrong then.
     """
     from scipy.special import stdtrit
 
@@ -139,5 +143,9 @@ def disagreement(lines: Lines, fit: Fit, least: float, excess: float) -> Disagre
     moved = np.array([-la.lstsq(total - N[kept, kept], g[kept])[0] for N, g in parts])
     moved = moved - moved.mean(axis=0)
     factor = float(stdtrit(count - 1.0, 0.975)) / 1.96
-    covariance = factor**2 * (count - 1.0) / count * moved.T @ moved
+    # shifts of a half-width and more are beyond the first order: what the middle of the outputs'
+    # own poles is off by counts too
+    middle = np.median(places.real, axis=0) + 1j * np.median(places.imag, axis=0) - fit.poles
+    off = np.concatenate([middle.real, middle.imag])
+    covariance = factor**2 * (count - 1.0) / count * moved.T @ moved + np.outer(off, off)
     return Disagreement(size, covariance)

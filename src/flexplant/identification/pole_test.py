@@ -17,6 +17,8 @@ from .refine import Fit, Lines, refined
 
 #: probability that noise anywhere in the band passes for a pole
 CHANCE = 1e-3
+#: probability that noise passes for outputs that disagree: real ones do by far more
+ALARM = 1e-9
 
 
 def supported(
@@ -195,7 +197,7 @@ def _accepted(lines: Lines, fit: Fit, trial: Trial, steps: int) -> tuple[Lines, 
         return None
     if more_poles and not (
         corroborated(lines, fit.model, more.model)
-        and twin(more) is None
+        and added(fit, more) not in (twin(more) or ())
         and shared(lines, fit, more, trial.least)
     ):
         return None
@@ -205,12 +207,12 @@ def _accepted(lines: Lines, fit: Fit, trial: Trial, steps: int) -> tuple[Lines, 
 def shared(lines: Lines, fit: Fit, more: Fit, least: float) -> bool:
     """Return whether the outputs share what a pole more explains, beyond what else they are off by.
 
-    The pole is to lower the cost by what it must, times the `coherence` of what is left near it;
+    The pole is to lower the cost by what it must, or by the `coherence` of what is left near it;
     and where outputs do not agree on the poles, also that of fits with poles of their own at each
     output, which have no need of a pole for the sake of these differences.
     """
-    new = int(np.argmax([np.min(np.abs(pole - fit.poles), initial=np.inf) for pole in more.poles]))
-    least = least * coherence(lines, more.model, more.poles[new])
+    new = added(fit, more)
+    least = max(least, pole_price(lines) * coherence(lines, more.model, more.poles[new]))
     if fit.cost - more.cost < least:
         return False
     if len(fit.shapes) == 1:
@@ -220,10 +222,16 @@ def shared(lines: Lines, fit: Fit, more: Fit, least: float) -> bool:
     return agreed or apart - own_cost(lines, more) > least
 
 
+def added(fit: Fit, more: Fit) -> int:
+    """Return which pole of a fit of more poles is farthest from those before."""
+    away = [np.min(np.abs(pole - fit.poles), initial=np.inf) for pole in more.poles]
+    return int(np.argmax(away))
+
+
 def own_price(lines: Lines, fit: Fit) -> float:
     """Return by how much poles of their own at each output must lower the cost."""
     count = 2 * fit.poles.size * (len(fit.shapes) - 1)
-    return unit(lines, fit) * price(lines, max(1, count), CHANCE)
+    return unit(lines, fit) * price(lines, max(1, count), ALARM)
 
 
 def unit(lines: Lines, fit: Fit) -> float:

@@ -291,6 +291,13 @@ class IdentifiedModes(MeasuredModes):
         E[n n^H] of the error n of each mode's [shape; participation], that of their scale
         included, from the FRF's variance and the correlation of its outputs' errors (where not
         known, they are taken for independent).
+    rejected : sequence of (frequency [Hz], damping ratio, reason)
+        Poles that are not reported.
+    refined : bool
+        Whether poles are those of the maximum likelihood fit to its end, else the first answer.
+    inconsistency : float, optional
+        Relative deviation of the frequencies between outputs, where they disagree: the covariance
+        of the poles is then that of leaving out each output in turn.
 
     Examples
     --------
@@ -333,7 +340,7 @@ class IdentifiedModes(MeasuredModes):
         )
 
     def __repr__(self) -> str:
-        notes = ["refined" if self.refined else "from the diagram, refine=True for the fit"]
+        notes = ["refined" if self.refined else "the first answer (refine=True for more)"]
         if self.inconsistency is not None:
             notes.append(
                 f"outputs disagree by {self.inconsistency:.1e}, deviations by leaving them out"

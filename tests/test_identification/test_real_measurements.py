@@ -1,0 +1,146 @@
+"""Measurements that no linear machine explains: real ones, and outputs that do not agree."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from flexplant.errors import FlexplantWarning, ModelError
+from flexplant.identification import identify_modes
+from flexplant.lti import Frf
+from flexplant.store import load
+from oracles_identification import modal_frf, noisy, pole
+
+MEASURED = Path(__file__).parents[3] / "shared" / "data" / "measured"
+
+
+def content(name):
+    for place in (MEASURED, Path("/work/shared/data/measured")):
+        if (place / name).exists():
+            return scipy.io.loadmat(place / name)
+    return pytest.skip(f"{name} is not there")
+
+
+def ruler(low, high):
+    """Ten outputs of a ruler hit by hand (torebutlin/pydvma, BSD-3), mains of 50 Hz on them."""
+    data = content("ruler.mat")
+    freq = np.arange(len(data["yspec"])) * data["freq"].item() / data["npts"].item()
+    band = (freq >= low) & (freq <= high)
+    return Frf(freq[band], data["yspec"][band].T[:, None, :], quantity="acceleration")
+
+
+def vibration_toolbox(name):
+    data = content(name)
+    freq, H = data["Freq_domain"].ravel().astype(float), data["Hf_chan_2"].ravel()
+    return Frf(freq[1:], H[None, None, 1:], quantity="acceleration")
+
+
+@pytest.mark.slow
+def test_a_ruler_has_the_modes_picked_by_hand_and_mains_are_named():
+    """20 modes in 24 s, mains among them, before outputs had to share what a pole explains."""
+    with pytest.warns(FlexplantWarning, match="outputs disagree"):
+        found = identify_modes(ruler(20.0, 400.0))
+    assert np.abs(found.freq / [39.5, 108.5, 212.5, 269.7, 352.3] - 1).max() < 5e-3
+    assert any("3 x 50 Hz" in reason for _, _, reason in found.rejected)
+    assert "3 x 50 Hz" in repr(found)
+    assert found.inconsistency == pytest.approx(5e-4, rel=0.5)
+
+
+def test_a_ruler_in_a_wide_band_is_answered_from_the_diagram():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FlexplantWarning)
+        found = identify_modes(ruler(400.0, 1500.0), refine=False)
+    assert not found.refined
+    for peak in (517.5, 729.3, 1111.9, 1305.2):  # of the sum of the responses' magnitudes
+        assert np.abs(found.freq / peak - 1).min() < 5e-3
+    assert len(found) < 14
+    assert np.all(found.std.real < -found.poles.real)
+
+
+@pytest.mark.parametrize("band", [(150, 300), (100, 300), (50, 400), (180, 250), (200, 225)])
+def test_one_published_mode_has_no_twin(band):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FlexplantWarning)
+        found = identify_modes(vibration_toolbox("vt_case1.mat"), band=band)
+    near = found.freq[np.abs(found.freq - 212.09) < 5.0]
+    assert near.tolist() == pytest.approx([212.09], abs=0.05)
+
+
+BANDS = [(150, 250), (100, 300), (50, 400), (5, 500), (180, 210), (185, 200)]
+
+
+@pytest.mark.parametrize("band", BANDS)
+def test_a_peak_whose_phase_rises_is_found_all_the_same(band):
+    """No stable pole has this phase: the diagram is empty, and was refused in all six bands."""
+    with pytest.warns(FlexplantWarning, match="no pole stays"):
+        found = identify_modes(vibration_toolbox("vt_case2.mat"), band=band)
+    assert np.abs(found.freq - 192.59).min() < 0.2
+    assert len(found) <= 2
+
+
+def roving(shift, seed, zeta=0.004, n_in=1, step=0.1, truth=(40.0, 75.0, 110.0, 160.0)):
+    """Six outputs, each of a machine whose frequencies are off by a relative draw of its own."""
+    rng, freq = np.random.default_rng(seed), np.arange(20.0, 200.0, step)
+    phi, drive = rng.normal(size=(6, 4)), rng.normal(size=(n_in, 4)) + 1.0
+    draws = 1.0 + shift * rng.normal(size=6)
+    H = np.array([
+        modal_frf(freq, pole(np.array(truth) * own, zeta), phi[[o]], drive)[0]
+        for o, own in enumerate(draws)
+    ])  # fmt: skip
+    deviation = 1e-3 * np.sqrt(np.mean(np.abs(H) ** 2))
+    variance = np.full(H.shape, deviation**2)
+    return Frf(freq, noisy(H, deviation, rng), variance=variance), pole(truth, zeta)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shift", [1e-4, 1e-3])
+def test_outputs_of_a_roving_sensor_share_four_modes(shift, tmp_path):
+    """7 to 13 modes before, in silence; deviations of chi-square held 5 % of the poles."""
+    inside, count = 0, 3
+    for seed in range(count):
+        frf, truth = roving(shift, seed, step=0.3)
+        with pytest.warns(FlexplantWarning, match=r"outputs disagree .* by 0\.\d+%"):
+            found = identify_modes(frf)
+        assert len(found) == 4
+        assert found.inconsistency == pytest.approx(shift, rel=0.9)
+        inside += np.sum(np.abs((found.poles - truth).imag) < 1.96 * found.std.imag)
+    assert inside >= 4 * count - 3  # of 95 % three are outside once in a hundred such tests
+    found.save(tmp_path / "found.npz")
+    assert repr(load(tmp_path / "found.npz")) == repr(found)
+    assert "by leaving them out" in repr(found)
+
+
+def test_default_orders_are_those_that_the_lines_afford():
+    freq = np.arange(180.0, 200.0, 0.42)
+    H = modal_frf(freq, pole([190.0], [0.005]), np.ones((1, 1)), np.ones((1, 1)))
+    found = identify_modes(Frf(freq, H))
+    assert freq.size < 50
+    assert found.freq.tolist() == pytest.approx([190.0], rel=1e-6)
+
+
+def test_a_costly_refinement_is_said_and_the_first_answer_is_near_it(monkeypatch, capsys):
+    monkeypatch.setattr("flexplant.identification.identify.CHEAP", 10.0)
+    frf, truth = roving(0.0, 1)
+    first = identify_modes(frf)
+    assert not first.refined
+    assert "first answer" in repr(first)
+    score = np.abs((first.poles - truth).imag) / first.std.imag
+    assert score.max() < 4.0
+    assert capsys.readouterr().err == ""
+    best = identify_modes(frf, refine=True)
+    assert "operations a step" in capsys.readouterr().err
+    assert best.refined
+    assert np.abs((first.poles - best.poles).imag / best.std.imag).max() < 1.0
+
+
+def test_poles_at_the_edge_are_listed_and_the_limit_of_poles_holds():
+    frf, _ = roving(0.0, 1)
+    edge = identify_modes(frf, band=(20.0, 110.15))
+    assert edge.freq.round().tolist() == [40.0, 75.0]
+    assert [reason for _, _, reason in edge.rejected] == ["at the edge of the band"]
+    with pytest.raises(ModelError, match="most"):
+        identify_modes(frf, most=0)
+    with pytest.raises(ModelError, match="refine"):
+        identify_modes(frf, refine="yes")
