@@ -79,7 +79,7 @@ def test_the_whole_chain_from_a_measured_frf(fleet, tmp_path):
     low, high = report.fit.interval()[
         [q.name for q in report.fit.unknowns].index(f"mass at {labels[0]}")
     ]
-    assert low < 0.6 < high < low + 1.0
+    assert low < 0.6 < high < low + 2.0
     # the larger model has what decides on the machine, whose loop the chain never sees
     own = machine.loop(fleet.PORTS, *report.blocks)
     assert report.row["stable"] and own.is_stable
