@@ -69,7 +69,7 @@ def test_the_whole_chain_from_a_measured_frf(fleet, tmp_path):
     shaken = {"period": 0.5, "periods": 2, "discard": 1, "amplitude": 5.0}
     frf = machine.measure_frf(fleet.PORTS, **shaken, rng=1)
     chain = fleet.pipeline().replace(
-        modes=None, band=(200.0, 1300.0), hold=fleet.RATE, starts=None, bandwidth=20.0,
+        modes=None, band=(200.0, 1300.0), hold=fleet.RATE, starts=1, bandwidth=20.0,
         parameters=fleet.pipeline().parameters[1:], duration=0.4,
         candidates=[fx.AddedMass(label) for label in labels], folder=tmp_path,
     )  # fmt: skip
@@ -91,7 +91,7 @@ def test_the_whole_chain_from_a_measured_frf(fleet, tmp_path):
     headings = [line for line in text.splitlines() if line and not line.startswith(" ")]
     assert headings[:6] == ["Measured", "Localised", "Updated", "Observer", "Controller",
                             "Loop on the larger model"]  # fmt: skip
-    assert "plant 164 states" in text and "specification: " in text
+    assert "plant 168 states" in text and "specification: " in text
     poles = report.measured  # numbered by now: measuring again is not needed
     assert chain.replace(candidates=()).report(poles, 1).measured.modes == poles.modes
 

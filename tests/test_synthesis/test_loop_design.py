@@ -95,21 +95,6 @@ def test_modes_left_out_are_checked():
     assert min(known.left_out.modulus_margin, known.left_out.without) >= 0.5
 
 
-@pytest.mark.slow
-def test_tuned_on_lines_verified_on_the_model():
-    """Each loop uses its 6 dB up; dense eigenvalues and a sweep of the model agree."""
-    frf, axes = measured()
-    found = tune_loops(frf, **axes, rate=RATE, delay=1, notches=1)
-    loop = fx.close_loop(sampled(reduced(0.001), ports(references=[])), found)
-    poles = np.abs(la.eigvals(loop.system.A))
-    assert poles.max() < 1.0
-    on_model = design_loops(plant(), found.laws).report
-    for name, one in found.report.items():
-        assert 0.5 <= one.modulus_margin < 0.52
-        assert on_model[name].modulus_margin == pytest.approx(one.modulus_margin, rel=0.05)
-        assert one.crossovers[0] > 1.5 * fx.servo_bandwidth(plant())
-
-
 def body(late, spring=0.0):
     """2 kg with a mode at 600 Hz of 0.1 %, sampled with some delay; free, or on a spring [Hz]."""
     w, s = 2 * np.pi * 600.0, 2 * np.pi * spring
