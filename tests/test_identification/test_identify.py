@@ -304,7 +304,7 @@ def test_fewer_outputs_than_inputs():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("quantity", ["velocity", "acceleration"])
+@pytest.mark.parametrize("quantity", ["acceleration"])
 def test_the_quantity_and_the_unit_do_not_matter(quantity):
     frf, base = measured(), identified()
     other = frf.replace(data=frf.data * 1e-9, variance=frf.variance * 1e-18).converted(quantity)
