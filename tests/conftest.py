@@ -3,12 +3,14 @@
 import os
 import re
 import sys
+from collections import Counter
 from pathlib import Path
 
 # before NumPy is loaded: the matrices here are small, and BLAS threads would wait for each other
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -40,6 +42,13 @@ def pytest_configure(config):
     """Hand out files in their order: by the number of tests, the long single ones would be last."""
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items):
+    """Put files that hold slow tests first, the most of them ahead: none is left for the end."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])  # stable: a file stays in one piece
 
 
 def pytest_ignore_collect(collection_path, config):
