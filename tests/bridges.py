@@ -79,7 +79,7 @@ def noisy_fits(bridge, trials, seed=4, **known):
     rng = np.random.default_rng(seed)
     errors, scores = [], []
     for _ in range(trials):
-        fit = update(bridge.model, bridge.parameters(**known), bridge.residuals(rng))
+        fit = update(bridge.model, bridge.parameters(**known), bridge.residuals(rng), starts=1)
         errors.append(fit.values - TRUTH)
         scores.append(errors[-1] / fit.std)
     return np.sqrt(np.mean(np.square(errors))), np.sqrt(np.mean(np.square(scores)))

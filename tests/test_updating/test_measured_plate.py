@@ -14,7 +14,7 @@ TRIALS = 200
 @pytest.mark.slow
 def test_a_few_noisy_responses_find_the_mass():
     campaign, rng = Campaign(), np.random.default_rng(1)
-    fits = [campaign.fit(rng) for _ in range(8)]
+    fits = [campaign.fit(rng) for _ in range(4)]
     assert judged(fits)[1] < 0.01
     assert fits[0].std[0] < 0.01
 

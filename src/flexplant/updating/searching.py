@@ -335,6 +335,8 @@ def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> Fl
     The difference of chi-square, or ``n ln(e/e_least)`` where the noise is not known or is not all
     that is left.
     """
+    if not minima:
+        return np.zeros(0)
     point, free = objective.at(best.p), np.ones(best.p.size, dtype=bool)
     rows, (least, dof) = objective.values(point).size, chi_square(objective, point, free)
     if least is None or is_bad(chance(least, dof)):
@@ -404,16 +406,15 @@ def _check_inside(objective: Objective, start: FloatArray) -> None:
 NEAR = 0.15
 
 
-def check_units(objective: Objective, begin: FloatArray, start: Any = None) -> None:
+def check_units(objective: Objective, begin: FloatArray) -> None:
     """Raise ModelError where all measured poles are 2 pi below or above those of the model."""
     data = objective.poles_measured
     if data is None:
         return
-    if start is None:
-        try:
-            start = objective.poles(objective.begin(begin))
-        except ModelError:
-            return  # the search raises what is wrong at the start
+    try:
+        start = objective.poles(objective.begin(begin))
+    except FlexplantError:
+        return  # the search raises what is wrong at the start
     known = dict(zip(objective.numbers, np.abs(start), strict=True))
     ratio = np.abs(data.target) / np.array([known[n] for n in data.numbers])
     below = bool(np.all(np.abs(2 * np.pi * ratio - 1) < NEAR))

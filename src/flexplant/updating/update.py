@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray, Rng, flag, generator, instance, positive, whole
-from ..errors import ModelError, SolverError, counted, warn
+from ..errors import ModelError, counted, warn
 from ..parallel import Progress
 from ..structure.model import FEModel
 from ..tolerances import TINY
@@ -184,24 +184,14 @@ def update(
     objective = Objective(used, listed, given, prior=takes_part)
     begins = all_starts(objective, start, starts, rng)
     with Progress(None, ITERATIONS, progress=progress):
-        try:
-            # where an answer that is drawn to its start ends is no minimum of the misfit
-            if starts is None and not method.penalised:
-                best, begins, ends = from_one_start(
-                    objective,
-                    begins[0],
-                    method,
-                    max_iterations,
-                    enough,
-                    rng,
-                    led=start is None,
-                )
-            else:
-                best, ends = from_starts(objective, begins, method, max_iterations, enough)
-        except (ModelError, SolverError):
-            check_units(objective, begins[0])
-            raise
-        check_units(objective, begins[0], best.trail.poles[0])
+        check_units(objective, begins[0])
+        # where an answer that is drawn to its start ends is no minimum of the misfit
+        if starts is None and not method.penalised:
+            best, begins, ends = from_one_start(
+                objective, begins[0], method, max_iterations, enough, rng, led=start is None
+            )
+        else:
+            best, ends = from_starts(objective, begins, method, max_iterations, enough)
         tried = summary(objective, best, begins, ends)
         estimates = [best.p]
         if basis is not None:

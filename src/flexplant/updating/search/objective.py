@@ -64,6 +64,7 @@ class Objective:
         self.poles_measured = PoleRows(poles) if poles else None
         self.reference: Point | None = None
         self._point: Point | None = None
+        self._first: Point | None = None
         #: points through which modes are followed to where a search begins, numbered at the first
         self.path: list[FloatArray] = []
         #: what is added to the residuals, to first order about the parameters it was found at
@@ -78,10 +79,12 @@ class Objective:
     def begin(self, p: FloatArray) -> Point:
         """Return the model at a start, its modes numbered there or where `path` begins."""
         path = [*self.path, p]
-        point = first_point(self.family, path[0])
-        if self.numbers:
-            mode_columns(self.numbers, point.eigen)
-        point = self.place(point)
+        if self._first is None or not np.array_equal(self._first.p, path[0]):
+            point = first_point(self.family, path[0])
+            if self.numbers:
+                mode_columns(self.numbers, point.eigen)
+            self._first = self._assigned(self._turned(point))
+        point = self._set(self._first, refer=True)
         for step in path[1:]:
             point = self.at(step, refer=True)
         return point
