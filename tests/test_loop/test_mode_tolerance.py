@@ -178,7 +178,10 @@ def test_a_loop_on_an_uncertain_plant_says_what_its_modes_hold_to():
     assert certificate[f"mode {mode} holds to"] == pytest.approx(fragile.least[worst], rel=1e-3)
     assert certificate[f"mode {mode} known to"] == 0.001
     assert f"mode {mode} holds to" in repr(found)
-    assert loop().tolerances is None  # nothing was stated of that plant
+    sure = loop().tolerances  # nothing was stated of that plant
+    assert sure.known is None and sure.draws is None
+    assert sure.least[worst] == pytest.approx(fragile.least[worst], rel=1e-3)
+    assert f"mode {mode} holds to" in repr(loop())
 
 
 @pytest.mark.slow

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, whole
+from ..checks import BoolArray, ComplexArray, FloatArray, IntArray, Value, positive, whole
 from ..errors import AssumptionError, ModelError, counted, warn
 from ..lti.responses import Responder, points, responder
 from ..lti.statespace import StateSpace
@@ -34,6 +34,11 @@ _NODES: Mapping[str, tuple[float, ...]] = {
     "freq": (-LIMIT, -0.5 * LIMIT, 0.5 * LIMIT, LIMIT),
     "damping": (-0.9, -0.45, 1.0, 2.0),
 }
+#: times the largest change about a mode where its resonance passes, with its skirts
+_PASSED = 1.2
+#: part of the size looked for that |S| has, with the mode where it is or at an end, at all points
+#: which the resonance does not pass and which are looked at in between
+_NEAR = 0.7
 #: range of relative changes of damping that is searched: without any, a mode that the loop does
 #: not see is marginal
 _DAMPINGS = (-0.999, 2.0)
@@ -205,6 +210,7 @@ def mode_tolerances(
     margin: float,
     known: Any = None,
     limit: float = LIMIT,
+    most: int | None = None,
 ) -> ModeTolerances:
     r"""Return the smallest changes of each mode that harm a stable loop.
 
@@ -222,7 +228,7 @@ def mode_tolerances(
     margin = positive(margin, "margin")
     if margin >= 1.0:
         raise ModelError(f"margin must be below 1, the largest that a loop can keep, got {margin}.")
-    modes, freq, zeta = _elastic(plant)
+    modes, freq, zeta = _elastic(plant, most)
     if broken.is_unstable:
         raise AssumptionError(
             "the loop is unstable as it is: no mode has a tolerance. Stabilise it first."
@@ -235,13 +241,15 @@ def mode_tolerances(
     channels = _LoopChannels.of(plant, broken)
     shape = (modes.size, 2)
     stable, within, damping = np.full(shape, np.inf), np.full(shape, np.inf), np.full(shape, np.inf)
-    moved, damped = _changes(plant, modes, "freq"), _changes(plant, modes, "damping")
+    moved, damped = (_changes(plant, broken, modes, kind) for kind in ("freq", "damping"))
+    shared = channels.responses(np.unique(np.concatenate([*grids, np.zeros(0)])))
     for i, (grid, move, damp) in enumerate(zip(grids, moved, damped, strict=True)):
-        sweep = channels.at(grid, move)
+        around = shared.among(grid)
+        sweep = around.sweep(move)
         stable[i] = _crossings(channels, move, grid, sweep, (-limits[i], limits[i]))
-        within[i] = _margins(sweep, stable[i], limits[i], 1.0 / margin)
-        sweep = channels.at(grid, damp)
-        damping[i] = _crossings(channels, damp, grid, sweep, _DAMPINGS)
+        passed = np.abs(grid / freq[i] - 1.0) <= _PASSED * limits[i]
+        within[i] = _margins(sweep, passed, stable[i], limits[i], 1.0 / margin)
+        damping[i] = _crossings(channels, damp, grid, around.sweep(damp), _DAMPINGS)
     own = _known(known, modes)
     return ModeTolerances(modes, freq, stable, within, damping, margin, limits, own)
 
@@ -261,24 +269,42 @@ def machine_draws(
 
 
 def reported_tolerances(loop: Any) -> ModeTolerances | None:
-    """Return what the modes of a closed loop hold to beside what its plant says of them."""
-    uncertain, whole_loop = loop.plant.uncertainty, loop.completed or loop
-    if uncertain is None or not uncertain.frequencies or not whole_loop.is_stable:
+    """Return what the modes of a closed loop hold to, beside what its plant says of them.
+
+    With the modes left out, where they are known; of those only the plant's own are changed.
+    """
+    plant, uncertain, whole_loop = loop.plant, loop.plant.uncertainty, loop.completed or loop
+    known = {} if uncertain is None else uncertain.frequencies
+    if not known and (uncertain is not None or not plant.has_own_modes):
         return None
-    known = uncertain.frequencies
-    limit = min(max(_FOLLOWED, 1.25 * _SAFE * max(known.values())), LIMIT)
+    if not whole_loop.is_stable:
+        return None
+    limit = min(max(_FOLLOWED, 1.25 * _SAFE * max(known.values(), default=0.0)), LIMIT)
     try:
         found = mode_tolerances(
-            whole_loop.plant, whole_loop.broken, margin=MARGIN, known=known, limit=limit
+            whole_loop.plant,
+            whole_loop.broken,
+            margin=MARGIN,
+            known=known or None,
+            limit=limit,
+            most=plant.assembled.realisation.n_modes,
         )
     except ModelError as error:
-        warn(f"what the modes of the loop hold to is not computed: {error}")
+        if known:
+            warn(f"what the modes of the loop hold to is not computed: {error}")
         return None
+    if uncertain is None:
+        return found
     return found.replace(draws=machine_draws(loop, uncertain, MARGIN, _DRAWS))
 
 
-def _elastic(plant: StandardPlant) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return numbers, frequencies [Hz] and damping ratios of the modes that swing below Nyquist."""
+def _elastic(
+    plant: StandardPlant, most: int | None = None
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return numbers, frequencies [Hz] and damping ratios of the modes that swing below Nyquist.
+
+    Of the first `most` modes.
+    """
     realisation = plant.assembled.realisation
     trace = np.trace(realisation.pairs, axis1=1, axis2=2)
     square = np.linalg.det(realisation.pairs)
@@ -286,7 +312,7 @@ def _elastic(plant: StandardPlant) -> tuple[IntArray, FloatArray, FloatArray]:
     zeta = -0.5 * trace / np.maximum(omega, TINY)
     top = np.pi / plant.dt if plant.dt else np.inf
     swings = (np.arange(omega.size) >= realisation.n_rigid) & (zeta < 1.0) & (omega < top)
-    keep = np.flatnonzero(swings & (omega > 0))
+    keep = np.flatnonzero((swings & (omega > 0))[:most])
     return keep + 1, omega[keep] / (2.0 * np.pi), zeta[keep]
 
 
@@ -294,18 +320,16 @@ def _around(freq: float, zeta: float, limit: float, grid: FloatArray, dt: float)
     """Return frequencies [Hz] through the places that a mode may take, and about it."""
     count = int(np.ceil(limit * _TO_A_WIDTH / max(zeta, TINY)))
     count = min(max(count, 2 * _TO_A_WIDTH), _ASIDE)
-    fine = freq * (1.0 + 1.2 * limit * np.linspace(-1.0, 1.0, 2 * count + 1))
+    fine = freq * (1.0 + _PASSED * limit * np.linspace(-1.0, 1.0, 2 * count + 1))
     near = np.union1d(fine, grid[(grid > 0.5 * freq) & (grid < 2.0 * freq)])
     return np.asarray(near[near < 0.5 / dt] if dt else near)
-
-
-_Kind: TypeAlias = Literal["freq", "damping"]
 
 
 class _ModeChange(NamedTuple):
     """A mode of the sampled plant as polynomials in a relative change: coefficients of each power.
 
-    A (k, 2, 2), what feeds it from other states (k, 2, n) and from u (k, 2, m), and C (p, 2).
+    A (k, 2, 2), what feeds it from other states (k, 2, n) and from the loop's u (k, 2, m), and the
+    rows C (p, 2) of its y.
     """
 
     states: IntArray
@@ -315,23 +339,23 @@ class _ModeChange(NamedTuple):
     C: FloatArray
 
 
-def _changes(plant: StandardPlant, modes: IntArray, kind: _Kind) -> list[_ModeChange]:
+def _changes(
+    plant: StandardPlant, broken: BrokenLoop, modes: IntArray, kind: Any
+) -> list[_ModeChange]:
     """Return each mode's part of the plant; all are changed at once, for they are uncoupled."""
-    driven = plant.system.input_index(plant.u)
     nodes = np.array([0.0, *_NODES[kind]])
     found = []
     for node in nodes:
         amount = (1.0 + node) ** 2 - 1.0 if kind == "freq" else node
         every = [(Delta("", int(mode), kind, 1.0), float(amount)) for mode in modes]
         found.append(with_changes(plant, every).system if node else plant.system)
-    rows = plant.system.output_index(plant.y)
     powers = np.linalg.inv(np.vander(nodes, increasing=True))
     where = plant.modal_states.reshape(-1, 2)
     changes = []
     for mode in modes:
         own = where[mode - 1]
         other = np.setdiff1d(np.arange(plant.system.n_states), own)
-        seen = [g.C[np.ix_(rows, own)] for g in found]
+        seen = [g.C[np.ix_(g.output_index(broken.y), own)] for g in found]
         if any(not np.array_equal(one, seen[0]) for one in seen):
             raise ModelError(
                 "a sensor of y sees accelerations, in which frequency and damping of a mode "
@@ -342,7 +366,7 @@ def _changes(plant: StandardPlant, modes: IntArray, kind: _Kind) -> list[_ModeCh
         parts = (
             np.array([g.A[np.ix_(own, own)] for g in found]),
             fed,
-            np.array([g.B[np.ix_(own, driven)] for g in found]),
+            np.array([g.B[np.ix_(own, g.input_index(broken.u))] for g in found]),
         )
         A, F, B = (np.tensordot(powers, part, 1) for part in parts)
         changes.append(_ModeChange(own, A, F, B, seen[0]))
@@ -356,8 +380,6 @@ class _LoopChannels:
     plant: StandardPlant
     broken: BrokenLoop
     states: Responder
-    driven: IntArray
-    read: IntArray
 
     @classmethod
     def of(cls, plant: StandardPlant, broken: BrokenLoop) -> _LoopChannels:
@@ -367,66 +389,87 @@ class _LoopChannels:
         to_states = StateSpace(
             g.A, g.B[:, columns], np.eye(n), np.zeros((n, len(columns))), g.dt, blocks=g.blocks
         )
-        driven = np.array([plant.u.index(name) for name in broken.u])
-        read = np.array([plant.y.index(name) for name in broken.y])
-        return cls(plant, broken, responder(to_states), driven, read)
+        return cls(plant, broken, responder(to_states))
 
-    def at(self, freq: FloatArray, change: _ModeChange) -> _Sweep:
-        """Return what a mode's equation is made of at frequencies [Hz]."""
+    def responses(self, freq: FloatArray) -> _Responses:
+        """Return the loop's responses at frequencies [Hz]."""
         K, P = self.broken.respond(freq)
         S = inverted(K @ P)
         x = np.moveaxis(self.states(freq), 2, 0)
-        Q = S @ K @ change.C[self.read]
-        X = x[:, change.states]
-        F = [fed @ x + B[:, self.driven] for fed, B in zip(change.fed, change.B, strict=True)]
-        return _Sweep(points(self.plant.system, freq), S, Q, X, np.array(F), change.A)
+        return _Responses(freq, points(self.plant.system, freq), S, S @ K, x)
+
+    def at(self, freq: FloatArray, change: _ModeChange) -> _Sweep:
+        """Return what a mode's equation is made of at frequencies [Hz]."""
+        return self.responses(freq).sweep(change)
+
+
+class _Responses(NamedTuple):
+    """S, S K and the states' responses x (n, states, m) at points z of frequencies [Hz]."""
+
+    freq: FloatArray
+    z: ComplexArray
+    S: ComplexArray
+    SK: ComplexArray
+    x: ComplexArray
+
+    def among(self, freq: FloatArray) -> _Responses:
+        """Return those at some of the frequencies."""
+        at = np.searchsorted(self.freq, freq)
+        return _Responses(freq, self.z[at], self.S[at], self.SK[at], self.x[at])
+
+    def sweep(self, change: _ModeChange) -> _Sweep:
+        """Return what a mode's equation is made of."""
+        Q = self.SK @ change.C
+        fed = np.any(change.fed != 0.0, axis=(0, 1))
+        from_others = np.einsum("kij,njm->knim", change.fed[:, :, fed], self.x[:, fed])
+        F = from_others + change.B[:, None]
+        X = self.x[:, change.states]
+        own = np.tile(-change.A[:, None].astype(complex), (1, self.z.size, 1, 1))
+        own[0] += self.z[:, None, None] * np.eye(2)
+        rest = F - own @ X
+        return _Sweep(self.S, Q, rest, own - rest @ Q)
 
 
 class _Sweep(NamedTuple):
-    """S, Q, X, F (k, n, 2, m) and A (k, 2, 2) of a mode at points z (n,)."""
+    """S (n, m, m), Q (n, m, 2) of a mode, and as polynomials in its change two more.
 
-    z: ComplexArray
+    ``F - (z I - A) X`` (k, n, 2, m) and H (k, n, 2, 2), coefficients of each power.
+    """
+
     S: ComplexArray
     Q: ComplexArray
-    X: ComplexArray
-    F: ComplexArray
-    A: FloatArray
+    rest: ComplexArray
+    H: ComplexArray
 
-    def parts(self, delta: Any) -> tuple[ComplexArray, ComplexArray]:
-        """Return ``z I - A(delta)`` and F(delta) at changes: one, or one for each point."""
-        powers = np.power.outer(np.asarray(delta), np.arange(len(self.A)))
-        A = np.tensordot(powers, self.A, 1)
-        F = (
-            np.tensordot(powers, self.F, 1)
-            if powers.ndim == 1
-            else np.einsum("nk,knij->nij", powers, self.F)
-        )
-        return self.z[:, None, None] * np.eye(2) - A, F
+    def at(self, where: IntArray) -> _Sweep:
+        """Return the sweep at some of the points."""
+        return _Sweep(self.S[where], self.Q[where], self.rest[:, where], self.H[:, where])
 
-    def matrix(self, delta: Any) -> tuple[ComplexArray, ComplexArray]:
-        """Return H (n, 2, 2), and ``F - (z I - A) X``."""
-        own, F = self.parts(delta)
-        rest = F - own @ self.X
-        return own - rest @ self.Q, rest
-
-    def sensitivity(self, delta: float) -> ComplexArray:
-        """Return S at u with the mode changed."""
-        H, rest = self.matrix(delta)
+    def sensitivity(self, delta: Any) -> ComplexArray:
+        """Return S at u with the mode changed, alike or for each point (n,)."""
+        each = np.reshape(delta, (-1, 1, 1))
+        H, rest = _value(self.H, each), _value(self.rest, each)
         turned = np.empty_like(H)  # H^-1 by its adjugate
         turned[:, 0, 0], turned[:, 1, 1] = H[:, 1, 1], H[:, 0, 0]
         turned[:, 0, 1], turned[:, 1, 0] = -H[:, 0, 1], -H[:, 1, 0]
-        turned /= _det(H)[:, None, None]
+        turned /= (H[:, 0, 0] * H[:, 1, 1] - H[:, 0, 1] * H[:, 1, 0])[:, None, None]
         return np.asarray(self.S + self.Q @ (turned @ (rest @ self.S)))
 
     def roots(self) -> ComplexArray:
-        """Return the complex change (n,) nearest to none at which there is a pole at each point."""
-        delta = np.zeros(self.z.size, dtype=np.complex128)
-        aside = 1e-6  # the root of rounding, and some more: the slope is good to as much
+        """Return the complex change (n,) nearest to none at which there is a pole at each point.
+
+        By Newton's method: det H is a polynomial of twice the degree of H.
+        """
+        powers = np.arange(2 * len(self.H) - 1)
+        det = np.zeros((powers.size, self.S.shape[0]), dtype=np.complex128)
+        for i, a in enumerate(self.H):
+            for j, b in enumerate(self.H):
+                det[i + j] += a[:, 0, 0] * b[:, 1, 1] - a[:, 0, 1] * b[:, 1, 0]
+        slope = powers[1:, None] * det[1:]
+        delta = np.zeros(det.shape[1], dtype=np.complex128)
         for _ in range(12):
-            here = _det(self.matrix(delta)[0])
-            slope = (_det(self.matrix(delta + aside)[0]) - here) / aside
             with np.errstate(divide="ignore", invalid="ignore"):
-                moved = here / slope
+                moved = _value(det, delta) / _value(slope, delta)
             moved = np.where(np.isfinite(moved), moved, 0.0)
             delta = delta - moved
             if np.all(np.abs(moved) <= SETTLED * np.abs(delta)):
@@ -436,8 +479,12 @@ class _Sweep(NamedTuple):
         return delta
 
 
-def _det(H: ComplexArray) -> ComplexArray:
-    return np.asarray(H[:, 0, 0] * H[:, 1, 1] - H[:, 0, 1] * H[:, 1, 0])
+def _value(polynomial: ComplexArray, at: Any) -> ComplexArray:
+    """Return a polynomial's value by Horner's rule, its coefficients along the first axis."""
+    found = polynomial[-1]
+    for coefficient in polynomial[-2::-1]:
+        found = found * at + coefficient
+    return np.asarray(found)
 
 
 def _crossings(
@@ -477,48 +524,55 @@ def _sign_changes(delta: ComplexArray, ends: tuple[float, float]) -> list[tuple[
     return [(int(k), int(k) + 1) for k in where]
 
 
-def _margins(sweep: _Sweep, stable: FloatArray, limit: float, size: float) -> FloatArray:
-    """Return the changes, downwards and upwards, at which |S| at u reaches a size."""
+def _margins(
+    sweep: _Sweep, passed: BoolArray, stable: FloatArray, limit: float, size: float
+) -> FloatArray:
+    """Return the changes, downwards and upwards, at which |S| at u reaches a size.
+
+    Where the resonance does not pass, |S| changes little and one way: only points are looked at
+    that come near the size at an end.
+    """
     found = np.array([-np.inf, np.inf])
-    if _exceeds(sweep, 0.0, size):
+    if _exceeds(sweep, np.zeros(1), size)[0]:
         return np.zeros(2)
+    ends = [min(abs(end), limit) for end in stable]
+    near = passed.copy()
+    for change in (0.0, -ends[0], ends[1]):
+        near |= _size(sweep.sensitivity(change)) >= _NEAR * size
+    sweep = sweep.at(np.flatnonzero(near))
     for side, sign in enumerate((-1.0, 1.0)):
-        end = min(abs(stable[side]), limit)
-        below = 0.0
-        for step in np.geomspace(min(_LEAST, 0.5 * end), end, _TRIED):
-            if _exceeds(sweep, sign * step, size):
-                above = step
-                for _ in range(_HALVINGS):
-                    middle = 0.5 * (below + above)
-                    if _exceeds(sweep, sign * middle, size):
-                        above = middle
-                    else:
-                        below = middle
-                found[side] = sign * above
-                break
-            below = float(step)
-        else:
-            if np.isfinite(stable[side]):  # the peak is narrower than the grid shows
-                found[side] = stable[side]
+        steps = np.geomspace(min(_LEAST, 0.5 * ends[side]), ends[side], _TRIED)
+        high = np.flatnonzero(_exceeds(sweep, sign * steps, size))
+        if high.size:
+            below, above = np.concatenate([[0.0], steps])[[high[0], high[0] + 1]]
+            for _ in range(_HALVINGS):
+                middle = 0.5 * (below + above)
+                if _exceeds(sweep, np.array([sign * middle]), size)[0]:
+                    above = middle
+                else:
+                    below = middle
+            found[side] = sign * above
+        elif np.isfinite(stable[side]):  # the peak is narrower than the grid shows
+            found[side] = stable[side]
     return found
 
 
-def _exceeds(sweep: _Sweep, delta: float, size: float) -> bool:
-    """Return whether sigma_max of S(delta) reaches a size anywhere.
+def _exceeds(sweep: _Sweep, deltas: FloatArray, size: float) -> BoolArray:
+    """Return whether sigma_max of S reaches a size anywhere, for each of some changes (k,)."""
+    n = len(sweep.S)
+    S = sweep.at(np.tile(np.arange(n), deltas.size)).sensitivity(np.repeat(deltas, n))
+    norm = _size(S)
+    reached = norm >= size * S.shape[1] ** 0.125
+    open_ = np.flatnonzero((norm >= size) & ~reached)
+    reached[open_] = np.linalg.norm(S[open_], 2, axis=(1, 2)) >= size
+    return np.asarray(np.any(reached.reshape(deltas.size, n), axis=1))
 
-    Between ``||(S* S)^2||_F^(1/4)`` and that over the eighth root of the size of S lies sigma_max:
-    it decides at most points.
-    """
-    S = sweep.sensitivity(delta)
+
+def _size(S: ComplexArray) -> FloatArray:
+    """Return ``||(S* S)^2||_F^(1/4)``: at least sigma_max, at most its eighth root of m times."""
     square = S.conj().swapaxes(1, 2) @ S
     fourth = square @ square
-    norm = np.sum(fourth.real**2 + fourth.imag**2, axis=(1, 2)) ** 0.125
-    if np.any(norm >= size * S.shape[1] ** 0.125):
-        return True
-    open_points = norm >= size
-    if not np.any(open_points):
-        return False
-    return bool(np.any(np.linalg.norm(S[open_points], 2, axis=(1, 2)) >= size))
+    return np.asarray(np.sum(fourth.real**2 + fourth.imag**2, axis=(1, 2)) ** 0.125)
 
 
 def _known(given: Any, modes: IntArray) -> FloatArray | None:

@@ -245,6 +245,11 @@ class Partition(Value):
         return self.assembled.realisation.n_rigid if self.is_assembled else 0
 
     @property
+    def has_own_modes(self) -> bool:
+        """Whether it has modes, not weighted, each with its own frequency and damping."""
+        return self.is_assembled and not self.is_weighted and self.form == "modal blocks"
+
+    @property
     def form(self) -> str:
         """`modal blocks`, `dense: ` and why modes are coupled, or `as given` without a structure.
 

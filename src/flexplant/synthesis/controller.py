@@ -233,11 +233,11 @@ CLOSE = ", and one that differs a little from the model may be unstable"
 def checked_loop(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> ClosedLoop | None:
     """Return a design's loop, with warnings of what modes do to it; None: nothing to check it by.
 
-    With the modes left out, where they are known, and with what its plant says of frequencies.
+    With the modes left out, where they are known, and with what the plant's own modes hold to.
     """
     plain, reading = plant.unweighted, plant.origin.reading
     whole = larger_plant(plant, larger)
-    if whole is None and plain.uncertainty is None:
+    if whole is None and plain.uncertainty is None and not plain.has_own_modes:
         return None
     before = [] if reading is None else [reading]
     with warnings.catch_warnings():  # one warning is enough, where the user called from
