@@ -164,3 +164,22 @@ def test_dk_iteration_makes_every_machine_keep_the_weights(sampled):
         weighted = machine.weighted(w=w, z={name: z.get(name) for name in machine.z})
         assert fx.hinf_norm(lft(weighted.system, found.system)) <= found.gamma * 1.001
     assert robust_stability(deltas, found).upper < found.gamma
+
+
+def test_one_channel_a_mode_makes_every_machine_keep_the_weights():
+    """Only frequencies are uncertain: mu is that of the machines, and of the general search."""
+    deltas = plant(True).uncertain(frequency=0.03)
+    z = {"tip:x": tustin(fx.lowpass(0.5) * 40.0, RATE), "f:effort": 0.03}
+    w = {"d": 1.0, "s:noise": 0.01}
+    found = design_mu(deltas, w=w, z=z)
+    assert "one channel a mode" in found.method
+    assert found.gamma == found.certificate["mu"] < 0.8
+    names = [delta.name for delta in deltas.deltas]
+    gains = []
+    for corner in itertools.product([-1.0, 0.0, 1.0], repeat=len(names)):
+        machine = deltas.lft(dict(zip(names, corner, strict=True)))
+        weighted = machine.weighted(w=w, z={name: z.get(name) for name in machine.z})
+        gains.append(fx.hinf_norm(lft(weighted.system, found.system)))
+    assert 0.9 * found.gamma < max(gains) < 1.01 * found.gamma
+    worst = worst_case_gain(deltas, found, w=w, z=z)
+    assert worst.lower <= found.gamma * 1.02

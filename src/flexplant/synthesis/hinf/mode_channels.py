@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import RANK, TINY
-from ..robustness.uncertainty_blocks import FullBlock, osborne, places
+from ..robustness.uncertainty_blocks import FullBlock, Place, osborne, places
 
 #: G over D of real mu, as a part of the response of a channel at its resonance
 _SHIFT = 0.7
@@ -49,6 +50,10 @@ class ModeChannel(Value):
     c: float
     D: float
     share: float
+
+    def of_size(self, times: float) -> ModeChannel:
+        """Return the channel of a larger or smaller uncertainty."""
+        return self.replace(share=times * self.share, v=times * self.v, c=times * self.c)
 
     def parts(self, dt: float) -> tuple[FloatArray, FloatArray, float, float, float, float]:
         """Return the input column (2,), output row (2,), and (a, b, c, d) of the all-pass."""
@@ -203,10 +208,18 @@ def tolerated(
     controller: StateSpace,
     times: float = 1.0,
 ) -> float:
-    r"""Return an upper bound of real mu of the channels, the largest over a grid of frequencies.
+    """Return an upper bound of real mu of the channels, the largest over a grid of frequencies.
 
-    Below 1 no Deltas of a size (`times`), all at once, put a pole on the grid's frequencies: with M
-    from all d to all q without the shift, and any positive D and real G, both diagonal,
+    Below 1 no Deltas of a size (`times`), all at once, put a pole on the grid's frequencies.
+    """
+    return ModeLoop.of(channels, plant, controller, times).bound(times)
+
+
+@dataclass(frozen=True)
+class ModeLoop:
+    r"""A loop from all d to all q without their shift, after these the weighted w and z.
+
+    With any positive D and real G, both diagonal, and G zero at the weighted w and z,
 
     .. math:: \bar\sigma\left((I + G^2)^{-1/4} (D M D^{-1} - j G) (I + G^2)^{-1/4}\right) \le 1
 
@@ -214,25 +227,97 @@ def tolerated(
     of the shift that the design counted on: a smooth function of the frequency, unlike the best G
     of each, with which the frequency of a crossing could lie between those of the grid.
     """
-    loop = lft(plant.system, controller)
-    m = len(channels)
-    part = loop.select(loop.outputs[:m], loop.inputs[:m])
-    freq = np.union1d(resonance_grid(loop.poles(), loop.dt), _swept(channels, times, loop.dt))
-    z = points(loop, freq)
-    seen: ComplexArray = np.moveaxis(responder(part)(freq), 2, 0)
-    shift = np.array([_shift(one, z, loop.dt) for one in channels]).T
-    size = np.hypot(1.0, [one.c for one in channels])
-    M = seen * size[:, None] - shift[:, :, None] * np.eye(m)
-    where = places([FullBlock(1, 1) for _ in channels])
-    most = 0.0
-    for each, G in zip(times * M, -times * shift.imag, strict=True):
-        bound = _scaled_size(each, G)  # D of the design first
-        if bound > 1.0:
-            d = np.sqrt(osborne(each, where))
-            scaled = each * d[:, None] / d
-            bound = min(bound, _scaled_size(scaled, G), float(la.norm(scaled, 2)))
-        most = max(most, bound)
-    return most
+
+    M: ComplexArray
+    shift: FloatArray
+    where: list[Place]
+
+    @classmethod
+    def of(
+        cls,
+        channels: Sequence[ModeChannel],
+        plant: StandardPlant,
+        controller: StateSpace,
+        times: float,
+        *,
+        weighted: bool = False,
+    ) -> ModeLoop:
+        """Return the loop over a grid; with the weighted w and z after the channels, or without."""
+        loop = lft(plant.system, controller)
+        m = len(channels)
+        q, p = (len(side) if weighted else m for side in (loop.outputs, loop.inputs))
+        part = loop.select(loop.outputs[:q], loop.inputs[:p])
+        freq = np.union1d(resonance_grid(loop.poles(), loop.dt), _swept(channels, times, loop.dt))
+        z = points(loop, freq)
+        M: ComplexArray = np.moveaxis(responder(part)(freq), 2, 0).copy()
+        shift = np.array([_shift(one, z, loop.dt) for one in channels]).T
+        M[:, :m] *= np.hypot(1.0, [one.c for one in channels])[:, None]
+        M[:, range(m), range(m)] -= shift
+        blocks = [FullBlock(1, 1) for _ in channels]
+        if weighted:
+            blocks.append(FullBlock(p - m, q - m))
+        return cls(M, np.asarray(shift.imag), places(blocks))
+
+    def bound(self, times: float) -> float:
+        """Return the bound for Deltas, and a performance block, of a size: the design's D first."""
+        bounds = self._sizes(times * self.M, -times * self.shift)
+        high = np.flatnonzero(bounds > 1.0)
+        if high.size:
+            rows, columns = (side[high] for side in self.even)
+            scaled = times * self.M[high] * rows[:, :, None] / columns[:, None]
+            own = self._sizes(scaled, -times * self.shift[high])
+            plain = np.linalg.norm(scaled, 2, axis=(1, 2))
+            bounds[high] = np.minimum(bounds[high], np.minimum(own, plain))
+        return float(bounds.max())
+
+    @cached_property
+    def even(self) -> tuple[FloatArray, FloatArray]:
+        """D that evens out the rows and columns at each frequency: of all rows, of all columns."""
+        d = np.sqrt(osborne(self.M, self.where))
+        rows, columns = (
+            np.repeat(d, [getattr(one, side).stop - getattr(one, side).start for one in self.where],
+                      axis=1)
+            for side in ("z", "w")
+        )  # fmt: skip
+        return rows, columns
+
+    def _sizes(self, M: ComplexArray, G: FloatArray) -> FloatArray:
+        """Return sigma_max of ``(I + G^2)^-1/4 (M - j G) (I + G^2)^-1/4`` of each, or above it.
+
+        ``||(M* M)^2||_F^(1/4)`` is at most its eighth root of the size too large: singular values
+        are computed where that leaves open whether they are below 1 or the largest of all.
+        """
+        m, shifted = G.shape[1], M.copy()
+        shifted[:, range(m), range(m)] -= 1j * G
+        root = (1.0 + G**2) ** -0.25
+        shifted[:, :m] *= root[:, :, None]
+        shifted[:, :, :m] *= root[:, None]
+        square = shifted.conj().swapaxes(1, 2) @ shifted
+        sizes = np.linalg.norm(square @ square, axis=(1, 2)) ** 0.25
+        near = sizes > min(1.0, sizes.max() / min(shifted.shape[1:]) ** 0.125)
+        sizes[near] = np.linalg.norm(shifted[near], 2, axis=(1, 2))
+        return np.asarray(sizes)
+
+    def smallest(self, near: float, most: float, accuracy: float) -> float:
+        """Return the smallest level at which all Deltas and gains over it are shown; else inf.
+
+        The mu of robust performance from above: the bound is 1 for Deltas of one over the level.
+        Sought from a level that is `near`, up to `most`, and down to `most` times less.
+        """
+        low, high = near, near
+        while self.bound(1.0 / high) > 1.0:
+            low, high = high, 1.5 * high
+            if high > most:
+                return np.inf
+        while low == high or (low > near / most and self.bound(1.0 / low) <= 1.0):
+            high, low = low, low / 1.5
+        while high > (1.0 + accuracy) * low:
+            middle = float(np.sqrt(low * high))
+            if self.bound(1.0 / middle) <= 1.0:
+                high = middle
+            else:
+                low = middle
+        return high
 
 
 def _swept(channels: Sequence[ModeChannel], times: float, dt: float) -> FloatArray:
@@ -245,12 +330,6 @@ def _swept(channels: Sequence[ModeChannel], times: float, dt: float) -> FloatArr
         found.append(freq * (1.0 + reach * np.linspace(-1.0, 1.0, 2 * count + 1)))
     whole = np.concatenate(found)
     return np.asarray(whole[whole < 0.5 / dt] if dt else whole)
-
-
-def _scaled_size(M: ComplexArray, G: FloatArray) -> float:
-    """Return sigma_max of ``(I + G^2)^-1/4 (M - j G) (I + G^2)^-1/4``."""
-    root = (1.0 + G**2) ** -0.25
-    return float(la.norm((M - 1j * np.diag(G)) * root[:, None] * root, 2))
 
 
 def _shift(one: ModeChannel, z: ComplexArray, dt: float) -> ComplexArray:

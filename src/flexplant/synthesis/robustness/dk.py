@@ -18,8 +18,9 @@ from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import ROUNDING
 from ..controller import Controller, SynthesisMethod, with_left_out
 from ..hinf.hinf_design import design_hinf
+from .mode_dk import by_mode_channels
 from .sweep import covered
-from .uncertain_loop import OpenPlant, UncertainLoop, open_plant, uncertain_loop
+from .uncertain_loop import OpenPlant, UncertainLoop, open_plant, require_uncertain, uncertain_loop
 from .uncertainty_blocks import FullBlock, Scalings, osborne, places
 from .upper import upper_level
 
@@ -56,6 +57,11 @@ def design_mu(
     for its loop, a filter of few states per Delta, and so on. In the design real Deltas count as
     complex, which is cautious; what is judged, and kept, is the controller of the smallest mixed
     mu, real Deltas real, between all frequencies. The first candidate is that without uncertainty.
+
+    Where all Deltas are frequencies, each mode has one channel, as in `design_hinf` of an uncertain
+    plant, with the shift of real mu and a constant D, evened out in closed loop; the bound is that
+    of a grid through the places of the modes, to first order in their changes. Machines at corners
+    of the uncertainty are closed exactly. Where that shows no controller, the general way follows.
 
     Parameters
     ----------
@@ -99,9 +105,14 @@ def design_mu(
     """
     if not w or not z:
         raise ModelError("name the channels of performance: w={'d': 1.0}, z={'tip:x': weight}.")
-    plant = open_plant(uncertain, w=w, z=z)
+    require_uncertain(uncertain)
     most = whole(iterations, "iterations")
     states = whole(order, "order", minimum=0)
+    if uncertain.neglected is None and all(one.kind == "freq" for one in uncertain.deltas):
+        answer = by_mode_channels(uncertain, w, z, most, method, progress)
+        if answer is not None:
+            return with_left_out(answer, uncertain.plant, larger)
+    plant = open_plant(uncertain, w=w, z=z)
     scales = _DFilters.none(plant)
     best: _DkStep | None = None
     found: list[float] = []

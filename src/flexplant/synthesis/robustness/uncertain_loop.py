@@ -136,10 +136,10 @@ def open_plant(
     driven: Sequence[str] | None = None,
 ) -> OpenPlant:
     """Return an uncertain plant with its channels, weighted w and z, and all y and u."""
-    _require_uncertain(uncertain)
+    require_uncertain(uncertain)
     channels = delta_channels(uncertain)
-    into, weights_in = _weighted_names(w, "w")
-    out, weights_out = _weighted_names(z, "z")
+    into, weights_in = weighted_names(w, "w")
+    out, weights_out = weighted_names(z, "z")
     g, plant = channels.system, uncertain.plant
     n_real = sum(size for _, size in channels.deltas)
     neglected = channels.neglected
@@ -177,7 +177,7 @@ def uncertain_loop(
     z: Any = (),
 ) -> UncertainLoop:
     """Return the loop of an uncertain plant with its channels, and some of w and z."""
-    _require_uncertain(uncertain)
+    require_uncertain(uncertain)
     loop = close_loop(uncertain.plant, *blocks)
     if loop.obstacle is not None:
         raise AssumptionError(
@@ -199,14 +199,15 @@ def uncertain_loop(
     })  # fmt: skip
 
 
-def _require_uncertain(given: object) -> None:
+def require_uncertain(given: object) -> None:
+    """Raise ModelError when a value is no uncertain plant."""
     if not isinstance(given, UncertainPlant):
         raise ModelError(
             f"need an UncertainPlant, got {short(given)}. Make it by plant.uncertain(fit)."
         )
 
 
-def _weighted_names(given: Any, side: str) -> tuple[list[str], dict[str, Any]]:
+def weighted_names(given: Any, side: str) -> tuple[list[str], dict[str, Any]]:
     """Return the names of channels and their weights; None leaves a channel out."""
     if isinstance(given, Mapping):
         kept = {name: weight for name, weight in given.items() if weight is not None}

@@ -223,19 +223,22 @@ def _hermitian(size: int) -> ComplexArray:
 def osborne(M: ComplexArray, where: Sequence[Place]) -> FloatArray:
     """Return the squares d of a number for each block that even out ``d_i^(1/2) M_ij d_j^(-1/2)``.
 
-    Frobenius norms of the blocks stand for their largest singular values [Osborne1960]_.
+    Of one matrix or of each (n, z, w). Frobenius norms of the blocks stand for their largest
+    singular values [Osborne1960]_.
     """
-    k = len(where)
-    size = np.array([[la.norm(M[a.z, b.w]) for b in where] for a in where])
-    np.fill_diagonal(size, 0.0)
-    tiny = ROUNDING * max(float(size.max(initial=0.0)), TINY)
-    d = np.ones(k)
+    k = np.arange(len(where))
+    square = np.add.reduceat(np.abs(M) ** 2, [one.z.start for one in where], axis=-2)
+    square = np.add.reduceat(square, [one.w.start for one in where], axis=-1)
+    square[..., k, k] = 0.0
+    tiny = ROUNDING * np.maximum(np.sqrt(square.max(axis=(-2, -1), initial=0.0)), TINY)
+    d = np.ones(square.shape[:-1])
     for _ in range(20):
-        for i in range(k):
-            row = np.sqrt(np.sum((size[i] / d) ** 2)) * d[i] + tiny
-            column = np.sqrt(np.sum((size[:, i] * d) ** 2)) / d[i] + tiny
-            d[i] *= np.sqrt(column / row)
-    return np.asarray((d / np.exp(np.mean(np.log(d)))) ** 2)
+        for i in k:
+            own = np.sqrt(d[..., i])
+            row = np.sqrt(np.sum(square[..., i, :] / d, axis=-1)) * own + tiny
+            column = np.sqrt(np.sum(square[..., i] * d, axis=-1)) / own + tiny
+            d[..., i] *= column / row
+    return np.asarray(d / np.exp(np.mean(np.log(d), axis=-1, keepdims=True)))
 
 
 class Perturbation(NamedTuple):

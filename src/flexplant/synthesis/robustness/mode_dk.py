@@ -1,0 +1,152 @@
+"""D-K iteration with one channel a mode: robust performance under uncertain frequencies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...checks import FloatArray
+from ...errors import AssumptionError, CertificateError, FlexplantError, counted
+from ...lti.grid import resonance_grid
+from ...lti.interconnection import lft
+from ...lti.responses import responder
+from ...lti.statespace import StateSpace
+from ...parallel import Progress
+from ...plant import StandardPlant
+from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ..controller import Controller, SynthesisMethod
+from ..hinf.hinf_design import design_hinf
+from ..hinf.mode_channels import (
+    ModeChannel,
+    ModeLoop,
+    mode_channels,
+    rebalanced,
+    with_channels,
+)
+from .uncertain_loop import weighted_names
+
+#: relative accuracy of mu, and its largest value that is looked for
+_ACCURACY, _LARGEST = 0.02, 100.0
+#: relative decrease of mu below which the iteration ends: that of its accuracy
+_SETTLED = 0.02
+#: machines at corners of the uncertainty that are closed exactly, and by how much their gain may
+#: exceed the bound: the first order of the channels, and the accuracy of mu
+_MACHINES, _BEYOND = 8, 0.05
+
+
+class _Step(NamedTuple):
+    """A controller and its mu."""
+
+    mu: float
+    controller: StateSpace
+    channels: Sequence[ModeChannel]
+
+
+def by_mode_channels(
+    uncertain: UncertainPlant[Any],
+    w: Any,
+    z: Any,
+    most: int,
+    method: SynthesisMethod | None,
+    progress: bool | None,
+) -> Controller | None:
+    """Return the controller of the smallest mu over the steps; None where no step shows any.
+
+    Step k solves the H-infinity problem of Deltas and weights divided by the mu of the step before:
+    at a fixed point the norm is 1 and mu what it was divided by.
+    """
+    plant = uncertain.plant
+    weighted = plant.weighted(**{
+        side: {name: found.get(name) for name in getattr(plant, side)}
+        for side, found in (("z", _weights(z, "z")), ("w", _weights(w, "w")))
+    })  # fmt: skip
+    try:
+        stated = mode_channels(weighted, uncertain)
+    except AssumptionError:  # no disturbance moves them: nothing says how D begins
+        return None
+    best: _Step | None = None
+    found: list[float] = []
+    level = 1.0
+    channels: Sequence[ModeChannel] = stated
+    with Progress(most, "steps of D-K", progress=progress) as bar:
+        for number in range(most):
+            bar.advance(int(number > 0))
+            try:
+                step = _step(weighted, channels, level, method)
+            except FlexplantError:
+                break
+            found.append(step.mu)
+            settled = best is not None and step.mu > (1.0 - _SETTLED) * best.mu
+            if best is None or step.mu < best.mu:
+                best = step
+            if settled:
+                break
+            level = min(step.mu, 2.0 * level)
+            channels = step.channels
+    if best is None or not np.isfinite(best.mu):
+        return None
+    certificate = {"mu": best.mu} | {f"mu of step {i}": mu for i, mu in enumerate(found, 1)}
+    certificate["largest gain of machines over mu"] = _tried(uncertain, best, w, z)
+    return Controller(
+        best.controller,
+        f"D-K iteration with one channel a mode, {counted(len(found), 'step')}",
+        gamma=best.mu,
+        certificate=certificate,
+    )
+
+
+def _step(
+    weighted: StandardPlant,
+    channels: Sequence[ModeChannel],
+    level: float,
+    method: SynthesisMethod | None,
+) -> _Step:
+    """Return the controller for Deltas and weights over a level, its mu, and channels for it."""
+    sized = [one.of_size(1.0 / level) for one in channels]
+    plant = with_channels(weighted, sized)
+    own = plant.system.output_index(weighted.z)
+    scale = np.ones(len(plant.system.outputs))
+    scale[own] = 1.0 / level
+    g = plant.system
+    system = g.replace(C=g.C * scale[:, None], D=g.D * scale[:, None])
+    K = design_hinf(plant.replace(system=system), method).system
+    again = rebalanced(channels, with_channels(weighted, channels), K)
+    loop = ModeLoop.of(again, with_channels(weighted, again), K, 2.0, weighted=True)
+    return _Step(loop.smallest(level, _LARGEST, _ACCURACY), K, again)
+
+
+def _weights(given: Any, side: str) -> dict[str, Any]:
+    """Return the weight of each channel of performance that is named."""
+    names, weights = weighted_names(given, side)
+    return {name: weights.get(name, 1.0) for name in names}
+
+
+def _tried(uncertain: UncertainPlant[Any], best: _Step, w: Any, z: Any) -> float:
+    """Return the largest weighted gain of machines at corners, each closed exactly, over mu."""
+    chance, size = np.random.default_rng(0), min(1.0, 1.0 / best.mu)
+    names = [delta.name for delta in uncertain.deltas]
+    most = 0.0
+    for _ in range(_MACHINES):
+        ends = size * chance.choice([-1.0, 1.0], len(names))
+        machine = uncertain.lft(dict(zip(names, ends.tolist(), strict=True)))
+        own = machine.weighted(
+            z={name: _weights(z, "z").get(name) for name in machine.z},
+            w={name: _weights(w, "w").get(name) for name in machine.w},
+        )
+        loop = lft(own.system, best.controller)
+        if not loop.is_stable:
+            raise CertificateError(
+                f"a machine within {size:.3g} of the uncertainty is unstable, but mu <= "
+                f"{best.mu:.4g} was found: the changes are too large for the first order of one "
+                "channel a mode. Report it."
+            )
+        most = max(most, _gain(loop))
+    return most / best.mu
+
+
+def _gain(loop: StateSpace) -> float:
+    """Return the largest singular value over a grid through the resonances."""
+    freq: FloatArray = resonance_grid(loop.poles(), loop.dt)
+    return float(np.linalg.norm(np.moveaxis(responder(loop)(freq), 2, 0), 2, axis=(1, 2)).max())
