@@ -39,7 +39,10 @@ def estimate_frf(
     A machine that floats is measured under feedback, where noise finds its way back to the
     inputs and H1 is biased towards ``-1/K``. References r that are not correlated with the noise
     give the process sensitivity PS = S_yr S_rr^-1 and the sensitivity S = S_ur S_rr^-1, and the
-    plant is their quotient. The estimate of periodic signals averages the noise away first.
+    plant is their quotient (the three-point method): r is an excitation added to the commands, or
+    set-points, one for each input. The estimate of periodic signals averages the noise away first,
+    and with as many experiments as inputs it is that quotient with and without r. Take as inputs
+    what acts on the machine: the commands and the excitation added to them.
 
     Parameters
     ----------
@@ -67,7 +70,10 @@ def estimate_frf(
     Warns
     -----
     FlexplantWarning
-        When an output keeps one value for longer than quantisation explains: a drop-out. With
+        When an output keeps one value for longer than quantisation explains: a drop-out. When,
+        without a reference, the machine seems to respond before its inputs act: noise returns
+        through a controller, and the estimate is biased (set-points as the only excitation bias
+        it without that sign: pass reference= in closed loop always). With
         `Periodic`: when the inputs do not repeat after the stated period (it or the rate is
         wrong), or when a transient has not died away, with the periods to discard.
 
@@ -89,6 +95,15 @@ def estimate_frf(
     >>> frf = estimate_frf({"force": u[:, 0]}, y, 100.0, method=Periodic(period=1.0))
     >>> print(frf, f"{abs(frf['y1', 'force'][0]):.3f}")
     <Frf: force -> y1, 49 frequencies 1 .. 49 Hz> 2.000
+
+    In closed loop, u = r - 0.3 y with y = 2 u + noise, the direct estimate is too small:
+
+    >>> import numpy as np
+    >>> r, v = np.random.default_rng(1).normal(size=(2, 1, 20_000))
+    >>> y = (2.0 * r + v) / 1.6
+    >>> frfs = [estimate_frf(r - 0.3 * y, y, 100.0, reference=ref) for ref in (None, r)]
+    >>> [f"{np.mean(frf.data.real):.1f}" for frf in frfs]
+    ['1.6', '2.0']
     """
     data = records(inputs, outputs, reference, positive(rate, "rate"))
     if quantity not in (None, "displacement", "velocity", "acceleration"):

@@ -13,6 +13,7 @@ from ..errors import ModelError, ShapeError, warn
 from ..lti.frequency import Frf
 from ..lti.line_correlation import checked_overlap, checked_window
 from ..tolerances import ROUNDING, TINY
+from .feedback import feedback, feedback_warned
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -207,7 +208,7 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
     left = _left_over(found, G, with_reference=data.r is not None)
     left = left * (found.count / (found.count - n_ref))
     variance, correlation = error_statistics(left, inverse / found.count)
-    return Frf(
+    frf = Frf(
         found.freq,
         G.transpose(1, 2, 0),
         inputs=data.inputs,
@@ -220,6 +221,9 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
         window=method.window,
         overlap=method.overlap,
     )
+    if data.r is None:
+        feedback_warned(feedback(frf))
+    return frf
 
 
 def error_statistics(left: ComplexArray, inverse: ComplexArray) -> tuple[FloatArray, ComplexArray]:
