@@ -142,6 +142,9 @@ def test_refusals():
         worst_case_gain(uncertain(std=0.3), lead(gain=60.0), w=["d"], z=["tip:x"])
     with pytest.raises(ModelError, match=r"plant\.uncertain"):
         robust_stability(plant(), lead())
+    late = plant(True).uncertain(delay=0.2)
+    with pytest.raises(ModelError, match=r"1 \+- 0.2 samples passes a whole number"):
+        robust_stability(late, lead(True))
     with pytest.raises(LabelError, match="no output 'x'"):
         worst_case_gain(uncertain(), lead(gain=15.0), w=["d"], z=["x"])
     with pytest.raises(ModelError, match="name them"):
@@ -183,3 +186,14 @@ def test_one_channel_a_mode_makes_every_machine_keep_the_weights():
     assert 0.9 * found.gamma < max(gains) < 1.01 * found.gamma
     worst = worst_case_gain(deltas, found, w=w, z=z)
     assert worst.lower <= found.gamma * 1.02
+
+
+def test_a_delay_within_a_sample_is_a_delta():
+    """Some 0.5 samples of 400 Hz at a crossover of 1.5 Hz are little, 3 samples are not."""
+    later = plant().discretized(RATE, delay=1.3)
+    found = robust_stability(later.uncertain(delay=0.25), lead(True))
+    machines = [later.uncertain(delay=0.25).lft({"delay": one}) for one in (-1.0, 1.0)]
+    assert found.is_robust == all(stable(one, lead(True)) for one in machines)
+    assert found.lower <= found.upper < 1.0
+    both = robust_stability(later.uncertain(delay=0.25, frequency=0.02), lead(True))
+    assert both.upper >= 0.99 * found.upper

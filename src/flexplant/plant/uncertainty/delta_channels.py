@@ -165,6 +165,14 @@ def _sampled_channels(
         for end in (1.0, -1.0)
     }
     base = sampled_machine(uncertain, {})
+    for delta in deltas:
+        if any(machines[delta.name, end].states != base.states for end in (1.0, -1.0)):
+            raise ModelError(
+                f"the delay of {uncertain.plant.delay:g} +- {delta.scale:g} samples passes a whole "
+                "number of samples, where what it does is not affine in it, so that no Delta "
+                "expresses it. Bound it on each side (1.1 +- 0.1 beside 0.9 +- 0.1), or draw "
+                "machines: uncertain.sample(rng, n)."
+            )
     slow = bilinear(base, rate)
     direct, mapped = _EvenUnits.of(base), _EvenUnits.of(slow)
     found: dict[str, tuple[_Change, _Change]] = {}
