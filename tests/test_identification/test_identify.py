@@ -25,7 +25,7 @@ from flexplant.lti import Frf
 from flexplant.store import load
 from oracles_identification import held_mode, mac, modal_frf, noisy, pole
 
-FREQ = np.arange(20.0, 200.0, 0.1)
+FREQ = np.arange(42.0, 170.0, 0.1)
 #: a pair that a peer merged, one 0.1 % apart, one repeated, at 0.1 % damping
 CLOSE = pole([47.5, 48.2, 90.0, 90.09, 120.0, 120.0, 160.0], 1e-3)
 RNG = np.random.default_rng(0)
@@ -202,7 +202,7 @@ def test_a_pair_is_taken_apart_with_one_input():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("known", "seeds"),
-    [(True, range(1000, 1012)), (False, range(2000, 2004))],
+    [(True, range(1000, 1005)), (False, range(2000, 2002))],
     ids=["variance", "no variance"],
 )
 def test_no_pole_is_lost_in_silence_and_the_doubt_is_honest(known, seeds):
@@ -285,10 +285,15 @@ def test_without_noise_to_machine_precision():
 
 @pytest.mark.slow
 def test_without_variance_doubt_comes_from_what_is_left():
-    found = identify_modes(measured(known=False), orders=ORDERS)
-    known = identified()
-    assert len(found) == 7
-    assert np.all(np.abs(found.std.real / known.std.real - 1)[[2, 3, 6]] < 0.5)
+    found, known = (
+        identify_modes(
+            measured(CLOSE[2:6], PHI[:, 2:6], freq=np.arange(80.0, 130.0, 0.1), known=stated),
+            orders=ORDERS,
+        )
+        for stated in (False, True)
+    )
+    assert len(found) == 4
+    assert np.all(np.abs(found.std.real / known.std.real - 1)[:2] < 0.5)
     assert np.abs(z_scores(found, known.poles)).max() < 4.0
 
 
@@ -306,7 +311,8 @@ def test_fewer_outputs_than_inputs():
 @pytest.mark.slow
 @pytest.mark.parametrize("quantity", ["acceleration"])
 def test_the_quantity_and_the_unit_do_not_matter(quantity):
-    frf, base = measured(), identified()
+    frf = measured(CLOSE[[0, 1, 6]], PHI[:, :3], n_in=2, freq=np.arange(42.0, 170.0, 0.2))
+    base = identify_modes(frf, orders=ORDERS)
     other = frf.replace(data=frf.data * 1e-9, variance=frf.variance * 1e-18).converted(quantity)
     found = identify_modes(other, orders=ORDERS)
     assert np.abs(found.poles / base.poles - 1).max() < 1e-8
@@ -344,21 +350,22 @@ def test_flags_say_what_stays():
 
 
 def test_a_held_machine_needs_its_hold():
+    freq = np.arange(20.0, 200.0, 0.1)
     rate, truth = 500.0, pole([60.0, 130.0], [0.01, 0.005])
     phi = PHI[:3, :2]
     H = sum(
-        np.outer(phi[:, k], phi[:2, k])[:, :, None] * held_mode(FREQ, truth[k], rate)
+        np.outer(phi[:, k], phi[:2, k])[:, :, None] * held_mode(freq, truth[k], rate)
         for k in (0, 1)
     )
     dofs = {"u1": "1:z", "y1": "1:z"}
-    frf = Frf(FREQ, H)
+    frf = Frf(freq, H)
     found = identify_modes(frf, orders=range(2, 16), lower=0, upper=0, hold=rate, dofs=dofs)
     assert np.abs(found.poles / truth - 1).max() < 1e-10
     assert np.abs(np.abs(found.shapes) / np.abs(phi) - 1).max() < 1e-8
-    assert np.abs(found.frf(FREQ).data - H).max() < 1e-10 * np.abs(H).max()
+    assert np.abs(found.frf(freq).data - H).max() < 1e-10 * np.abs(H).max()
     start = PoleSelection(truth, phi[:2])
     # a stated variance: weights drawn from the rounding of exact data differ between processors
-    stated = Frf(FREQ, H, variance=(1e-3 * np.abs(H)) ** 2)
+    stated = Frf(freq, H, variance=(1e-3 * np.abs(H)) ** 2)
     with pytest.warns(FlexplantWarning, match="missed or merged"):
         without = identify_modes(stated, start=start, lower=0, upper=3, dofs=dofs)
     assert np.abs(np.abs(without.shapes) / np.abs(phi) - 1).max() > 1e-2
@@ -388,12 +395,12 @@ def test_slopes_against_central_differences():
         assert slope == pytest.approx(-2 * g[k], rel=1e-5, abs=1e-6 * np.abs(g).max())
 
 
-COARSE = np.arange(40.0, 60.0, 0.05)
+COARSE = np.arange(42.0, 60.0, 0.1)
 TRIAL = pole([47.5, 48.2, 53.0], [0.004, 0.005, 0.003])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("common", "trials"), [(0.0, 60), (0.9, 120)])
+@pytest.mark.parametrize(("common", "trials"), [(0.0, 40), (0.9, 80)])
 def test_confidence_covers_the_truth(common, trials):
     """Many trials: chi-square of all poles together, 95 % regions within a binomial interval.
 
@@ -412,7 +419,7 @@ def test_confidence_covers_the_truth(common, trials):
         e = np.einsum("ab,bif->aif", root, noisy(np.zeros(H.shape), deviation, rng))
         frf = Frf(COARSE, H + e, variance=variance, correlation=correlation)
         for F, scores in ((frf, distance), (frf.replace(correlation=None), blind)):
-            if F is not frf and not (common and trial < 100):
+            if F is not frf and not (common and trial < 30):
                 continue
             found = identify_modes(F, start=start, lower=0, upper=2)
             error = found.poles - TRIAL
@@ -435,7 +442,7 @@ def test_covariance_of_shapes_is_that_of_many_measurements():
     deviation = 1e-3 * np.sqrt(np.mean(np.abs(H) ** 2))
     rng, distance = np.random.default_rng(17), []
     start = PoleSelection(TRIAL * (1 + 1e-5), PHI[:2, :3])
-    for _ in range(90):
+    for _ in range(45):
         frf = Frf(COARSE, noisy(H, deviation, rng), variance=np.full(H.shape, deviation**2))
         found = identify_modes(frf, start=start, lower=0, upper=2)
         for k in range(3):

@@ -48,15 +48,22 @@ def test_a_ruler_has_the_modes_picked_by_hand_and_mains_are_named():
     assert found.inconsistency == pytest.approx(5e-4, rel=0.5)
 
 
-def test_a_ruler_in_a_wide_band_is_answered_from_the_diagram():
+@pytest.mark.slow
+@pytest.mark.parametrize("refine", [None, False])
+def test_a_ruler_in_a_wide_band_is_answered_from_the_diagram(refine):
+    """11 modes in 114 s, 1305 Hz not among them, when it was refined by default."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FlexplantWarning)
-        found = identify_modes(ruler(400.0, 1500.0), refine=False)
+        found = identify_modes(ruler(400.0, 1500.0), refine=refine)
     assert not found.refined
-    for peak in (517.5, 729.3, 1111.9, 1305.2):  # of the sum of the responses' magnitudes
+    for peak in (517.5, 551.4, 729.3, 1111.9, 1305.2):  # of the sum of the responses' magnitudes
         assert np.abs(found.freq / peak - 1).min() < 5e-3
     assert len(found) < 14
     assert np.all(found.std.real < -found.poles.real)
+    if refine is None:
+        assert "outputs do not share" in repr(found)
+        assert found.zeta.max() < 0.05  # what is broader lies under others, or over the edge
+        assert found.inconsistency == pytest.approx(3e-3, rel=0.5)
 
 
 @pytest.mark.parametrize("band", [(150, 300), (100, 300), (50, 400), (180, 250), (200, 225)])
@@ -80,6 +87,16 @@ def test_a_peak_whose_phase_rises_is_found_all_the_same(band):
     assert len(found) <= 2
 
 
+def test_a_refinement_that_takes_too_much_leaves_the_first_answer(monkeypatch):
+    frf, _ = roving(0.0, 1, step=0.3)
+    first = identify_modes(frf, refine=False)
+    monkeypatch.setattr("flexplant.identification.identify.BUDGET", 1e6)
+    found = identify_modes(frf)
+    assert "after 1e+06 operations" in repr(found)
+    assert np.array_equal(found.poles, first.poles)
+    assert identify_modes(frf, refine=True).refined
+
+
 def roving(shift, seed, zeta=0.004, n_in=1, step=0.1, truth=(40.0, 75.0, 110.0, 160.0)):
     """Six outputs, each of a machine whose frequencies are off by a relative draw of its own."""
     rng, freq = np.random.default_rng(seed), np.arange(20.0, 200.0, step)
@@ -98,7 +115,7 @@ def roving(shift, seed, zeta=0.004, n_in=1, step=0.1, truth=(40.0, 75.0, 110.0, 
 @pytest.mark.parametrize("shift", [1e-4, 1e-3])
 def test_outputs_of_a_roving_sensor_share_four_modes(shift, tmp_path):
     """7 to 13 modes before, in silence; deviations of chi-square held 5 % of the poles."""
-    inside, count = 0, 3
+    inside, count = 0, 2
     for seed in range(count):
         frf, truth = roving(shift, seed, step=0.3)
         with pytest.warns(FlexplantWarning, match=r"outputs disagree .* by 0\.\d+%"):
@@ -106,7 +123,7 @@ def test_outputs_of_a_roving_sensor_share_four_modes(shift, tmp_path):
         assert len(found) == 4
         assert found.inconsistency == pytest.approx(shift, rel=0.9)
         inside += np.sum(np.abs((found.poles - truth).imag) < 1.96 * found.std.imag)
-    assert inside >= 4 * count - 3  # of 95 % three are outside once in a hundred such tests
+    assert inside >= 4 * count - 2  # of 95 % three are outside once in two hundred such tests
     found.save(tmp_path / "found.npz")
     assert repr(load(tmp_path / "found.npz")) == repr(found)
     assert "by leaving them out" in repr(found)

@@ -10,7 +10,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError
 from ..tolerances import RANK, TINY
-from .model_error import strength, twin
+from .model_error import ALIKE, mac, strength, twin
 from .pole_test import pole_price, shared, unit
 from .refine import Fit, Lines
 
@@ -31,7 +31,7 @@ def gated(
     fitted: Callable[[ComplexArray, ComplexArray], Fit],
     *,
     alone: bool,
-    refine: bool,
+    compare: bool,
 ) -> tuple[Fit, IntArray, tuple[Rejected, ...]]:
     """Return the fit without poles that are none, the places of those reported, and the others.
 
@@ -41,7 +41,7 @@ def gated(
     """
     listed: list[Rejected] = []
     while True:
-        found = _needless(lines, fit, fitted, alone, refine)
+        found = _needless(lines, fit, fitted, alone, compare)
         if found is None:
             break
         place, reason = found
@@ -65,6 +65,24 @@ def gated(
     return fit, kept, tuple(sorted(listed))
 
 
+def steady(
+    fit: Fit, reported: IntArray, deviation: FloatArray
+) -> tuple[IntArray, tuple[Rejected, ...]]:
+    """Return which poles outputs that disagree share, and the others.
+
+    One beside another, whose damping is not known from zero (95 %) by the `deviation` (m,) of
+    leaving out outputs, stands for what the outputs differ by.
+    """
+    beside = np.array([
+        np.any(np.abs(np.delete(fit.poles.imag, k) - pole.imag) < -pole.real)
+        for k, pole in enumerate(fit.poles)
+    ])  # fmt: skip
+    vague = beside & (1.96 * deviation > -fit.poles.real)
+    reason = "not shared by the outputs: leaving one out changes its damping by as much as it is"
+    out = tuple(_entry(fit, int(k), reason) for k in reported[vague[reported]])
+    return reported[~vague[reported]], out
+
+
 def _entry(fit: Fit, k: int, reason: str) -> Rejected:
     pole = complex(fit.poles[k])
     return abs(pole) / (2 * np.pi), -pole.real / abs(pole), reason
@@ -75,7 +93,7 @@ def _needless(
     fit: Fit,
     fitted: Callable[[ComplexArray, ComplexArray], Fit],
     alone: bool,
-    refine: bool,
+    compare: bool,
 ) -> tuple[int, str] | None:
     """Return a pole that is to be left out, and why."""
     size, std = np.abs(fit.poles), _deviations(lines, fit)
@@ -89,16 +107,25 @@ def _needless(
     found = twin(fit)
     if found is not None:
         other, place = found
-        return place, f"a twin of the pole at {size[other] / (2 * np.pi):.5g} Hz"
-    for place in _beside(fit) if refine else []:
-        rest = np.delete(np.arange(size.size), place)
-        try:
-            less = fitted(fit.poles[rest], fit.participation[:, rest])
-        except SolverError:
-            continue
-        if not shared(lines, less, fit, pole_price(lines) * unit(lines, fit)):
+        alike = mac(fit.shapes, other, place) > ALIKE
+        if not compare or alike or not _shared(lines, fit, fitted, place):
+            return place, f"a twin of the pole at {size[other] / (2 * np.pi):.5g} Hz"
+    for place in _beside(fit) if compare else []:
+        if not _shared(lines, fit, fitted, place):
             return place, "not shared by the outputs: it stands for what they differ by"
     return None
+
+
+def _shared(
+    lines: Lines, fit: Fit, fitted: Callable[[ComplexArray, ComplexArray], Fit], place: int
+) -> bool:
+    """Return whether the outputs share a pole of the fit, true where there is no fit without it."""
+    rest = np.delete(np.arange(fit.poles.size), place)
+    try:
+        less = fitted(fit.poles[rest], fit.participation[:, rest])
+    except SolverError:
+        return True
+    return shared(lines, less, fit, pole_price(lines) * unit(lines, fit))
 
 
 def _deviations(lines: Lines, fit: Fit) -> FloatArray:
@@ -127,7 +154,7 @@ def _outside(lines: Lines, pole: complex) -> str | None:
     spacing = float(np.median(np.diff(lines.freq)))
     if not low <= freq <= high:
         return "outside the band"
-    if min(freq - low, high - freq) < max(spacing, width / 4):
+    if min(freq - low, high - freq) < max(spacing, width / 2):
         return "at the edge of the band"
     if width < NARROW * spacing:
         for mains in MAINS:

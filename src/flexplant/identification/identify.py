@@ -23,9 +23,9 @@ from ..lti.frequency import Frf
 from ..parallel import Progress, one_thread
 from ..tolerances import ROUNDING, TINY
 from .diagram import Moments, OrderPoles, PoleSelection, StabilisationDiagram, built_diagram
-from .gate import gated
+from .gate import gated, steady
 from .line_weights import PreparedLines, prepared
-from .model_error import disagreement
+from .model_error import disagreement, outputs_disagree
 from .pole_test import (
     UPPER,
     dropped,
@@ -43,7 +43,7 @@ from .pole_test import (
     unwindowed,
     warned,
 )
-from .refine import Fit, Lines, refined
+from .refine import Exhausted, Fit, Lines, Products, refined
 from .result import IdentifiedModes, answer, hann_segment, leakage_warned, of_segments
 
 #: of an identification, for its bar: the diagram, twice fit and growth, the answer
@@ -56,6 +56,10 @@ REGION = 20
 #: values of the FRF times (poles times references) squared, the products of a step of the fit, up
 #: to which it is made without a request: some seconds altogether
 CHEAP = 5e7
+#: products that a refinement without a request may take in all, some twenty seconds
+BUDGET = 5e9
+#: steps of the first answer: the diagram's poles are off by more than noise makes them
+QUICK = 2
 
 
 def stabilisation_diagram(
@@ -195,8 +199,10 @@ def identify_modes(
         Where outputs and inputs are; shapes are labelled by it, and mass-normalised where an
         input and an output share a DOF.
     refine : bool, optional
-        Whether to fit by maximum likelihood; when not given, where that is cheap: values of the FRF
-        times (poles times references) squared up to 5e7. False takes about a second.
+        Whether to fit by maximum likelihood; when not given, where that is cheap (values of the FRF
+        times (poles times references) squared up to 5e7 at each step, 5e9 in all) and worth it: not
+        where poles of each output's own leave noise alone and shared ones far more, as outputs
+        that disagree do. False takes about a second.
     most : int
         Poles that the fit may have.
     max_iterations : int
@@ -279,6 +285,7 @@ def _identified(
     if not ready.known:
         ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])
     refine, most, steps = limits
+    budget = Products()
 
     def lines_of(ready: PreparedLines) -> Lines:
         # with all residual terms, so that no pole is kept or moved to stand in for one
@@ -288,6 +295,7 @@ def _identified(
             variance_freedom=frf.freedom,
             segment=hann_segment(frf),
             most=most,
+            work=budget,
         )
 
     diagram, at_peaks = None, False
@@ -315,29 +323,48 @@ def _identified(
     alone, free = start is None and not at_peaks, upper is None
     work = ready.data.size * (len(chosen) * ready.data.shape[1]) ** 2
     costly = work > CHEAP
-    if refine is None:
-        refine = not costly
     shown = True if refine and costly and progress is None else progress
     name = f"modes, {work:.1e} operations a step" if costly else "modes"
     with Progress(STAGES, name, progress=shown) as bar:
         bar.advance()
-        made = _refined if refine else _first
-        ready, lines, fit = made(ready, lines_of, chosen, alone, free, steps, bar)
+        lines = lines_of(ready)
+        fit, reason = _first(lines, chosen, alone), ""
+        differ = refine is None and alone and outputs_disagree(fit)
+        if refine is False:
+            reason = "refine=True for more"
+        elif refine is None and costly:
+            reason = f"refine=True for more, {work:.1e} operations a step"
+        elif differ:
+            reason = "a refinement comes no nearer to poles that outputs do not share"
+        else:
+            budget.most = np.inf if refine else budget.done + BUDGET
+            try:
+                ready, lines, fit = _refined(ready, lines_of, fit, alone, free, steps, bar)
+            except Exhausted:
+                reason = f"more is left than shared poles explain after {BUDGET:.0e} operations"
+        budget.most, settled = np.inf, not reason
+
+        # poles that outputs are to share are known where a refinement, or own fits, were made
+        compare = settled or differ
 
         def again(poles: ComplexArray, part: ComplexArray) -> Fit:
-            if not refine:
-                return Fit(lines, poles, part)
-            return refined(lines, poles, part, steps=steps, strict=False)
+            count = steps if settled else QUICK * int(compare)
+            return refined(lines, poles, part, steps=count, strict=False)
 
-        fit, reported, rejected = gated(lines, fit, again, alone=alone, refine=refine)
+        fit, reported, rejected = gated(lines, fit, again, alone=alone, compare=compare)
         apart = None
-        if refine:
+        if settled:
             fit = refined(lines, fit.poles, fit.participation, steps=steps, fine=True)
+        if compare:
             excess = fit.cost - freedom(lines, fit.poles.size)
             apart = disagreement(lines, fit, own_price(lines, fit), excess)
+            if apart is not None:
+                deviation = np.sqrt(np.diag(apart.covariance)[: fit.poles.size])
+                reported, others = steady(fit, reported, deviation)
+                rejected = tuple(sorted(rejected + others))
             warned(unexplained(lines, fit), None if apart is None else apart.size)
         answered = answer(
-            frf, ready, lines, fit, reported, labels, diagram, rejected, refine, apart
+            frf, ready, lines, fit, reported, labels, diagram, rejected, reason, apart
         )
         bar.advance(STAGES - bar.done)
     leakage_warned(frf, answered)
@@ -365,35 +392,25 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
     return PoleSelection(fit.poles, fit.participation) if fit.poles.size else None
 
 
-def _first(
-    ready: PreparedLines,
-    lines_of: Callable[[PreparedLines], Lines],
-    chosen: PoleSelection,
-    alone: bool,
-    free: bool,
-    steps: int,
-    bar: Progress,
-) -> tuple[PreparedLines, Lines, Fit]:
+def _first(lines: Lines, chosen: PoleSelection, alone: bool) -> Fit:
     """Return the fit near the poles chosen, with all residual terms and no search for others."""
-    lines, poles, part = lines_of(ready), chosen.poles, chosen.participation
-    if alone:
-        poles, part = supported(lines, poles, part)
-        # the diagram's poles are off by more than noise makes them; steps converge quadratically
-        return ready, lines, refined(lines, poles, part, steps=2, strict=False)
-    return ready, lines, Fit(lines, poles, part)
+    if not alone:
+        return Fit(lines, chosen.poles, chosen.participation)
+    poles, part = supported(lines, chosen.poles, chosen.participation)
+    return refined(lines, poles, part, steps=QUICK, strict=False)
 
 
 def _refined(
     ready: PreparedLines,
     lines_of: Callable[[PreparedLines], Lines],
-    chosen: PoleSelection,
+    first: Fit,
     alone: bool,
     free: bool,
     steps: int,
     bar: Progress,
 ) -> tuple[PreparedLines, Lines, Fit]:
     """Return the maximum likelihood fit, with the poles and terms that the data support."""
-    poles, part = chosen.poles, chosen.participation
+    poles, part = first.poles, first.participation
     reducing = [(unwindowed, 1), (dropped, int(alone))]
     reducing += [(merged, MOST * int(alone)), (fewer_terms, int(free))]
     growing = [

@@ -9,7 +9,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray
 from ..tolerances import TINY
-from .refine import Fit, Lines, refined
+from .refine import Fit, Lines
 
 #: MAC from which two shapes are one: they differ by less than what a neighbour's tail makes
 ALIKE = 0.9
@@ -19,24 +19,30 @@ WITHIN = 1.5
 MOSTLY = 0.9
 #: misfit near a pole, with its correlation over lines, up to which it is noise
 NOISE = 1.5
-#: steps of a fit of one output: its poles begin near
-OWN_STEPS = 20
+#: standard deviations by which chi-square may exceed its degrees of freedom by chance
+LIMIT = 3.0
 #: lines, or half-widths, beside a pole over which misfit is compared
 NEAR, WIDE = 20.0, 3.0
 
 
-def own_cost(lines: Lines, fit: Fit) -> float:
+def own_cost(fit: Fit) -> float:
     """Return the cost of fits of each output alone, with poles of its own."""
-    return sum(one.cost for one in own_fits(lines, fit))
+    return sum(one.cost for one in fit.own)
 
 
-def own_fits(lines: Lines, fit: Fit) -> list[Fit]:
-    """Return the fits of each output alone: poles of its own, the participation of all."""
-    start = fit.poles, fit.participation
-    return [
-        refined(lines.of_output(o), *start, steps=OWN_STEPS, strict=False, poles_only=True)
-        for o in range(len(fit.shapes))
-    ]
+def outputs_disagree(fit: Fit) -> bool:
+    """Return whether poles of each output's own leave noise alone, shared ones far more.
+
+    No pole that outputs share explains what is left then, and where the shared poles are is known
+    by how the outputs differ, not by the misfit that a refinement lowers.
+    """
+    lines, (n_out, m) = fit.lines, fit.shapes.shape
+    count = n_out * lines.data.shape[1] * (lines.lower + lines.upper) + 4 * m * n_out
+    free = max(1.0, 2 * lines.data.size - lines.inflation * count)
+    if n_out == 1 or fit.cost < NOISE * free:
+        return False
+    alone = own_cost(fit)
+    return alone < free + LIMIT * np.sqrt(2 * free * lines.inflation) and alone * NOISE < fit.cost
 
 
 def coherence(lines: Lines, model: ComplexArray, pole: complex) -> float:
@@ -83,7 +89,7 @@ def twin(fit: Fit) -> tuple[int, int] | None:
             if height[j] <= height[k]:
                 continue
             apart, widths = abs(fit.poles[j].imag - fit.poles[k].imag), -fit.poles.real[[j, k]]
-            same = min(_mac(fit.shapes, j, k), _mac(fit.participation, j, k)) > ALIKE
+            same = min(mac(fit.shapes, j, k), mac(fit.participation, j, k)) > ALIKE
             if apart > (widths.sum() if same else WITHIN * np.sqrt(widths.prod())):
                 continue
             single = fit.participation.shape[0] == 1
@@ -94,7 +100,8 @@ def twin(fit: Fit) -> tuple[int, int] | None:
     return None
 
 
-def _mac(vectors: ComplexArray, j: int, k: int) -> float:
+def mac(vectors: ComplexArray, j: int, k: int) -> float:
+    """Return the MAC of two columns."""
     a, b = vectors[:, j], vectors[:, k]
     return float(
         abs(np.vdot(a, b)) ** 2 / max(TINY, float(np.vdot(a, a).real * np.vdot(b, b).real))
@@ -127,7 +134,7 @@ def disagreement(lines: Lines, fit: Fit, least: float, excess: float) -> Disagre
 
     if len(fit.shapes) == 1:
         return None
-    own = own_fits(lines, fit)
+    own = fit.own
     if fit.cost - sum(one.cost for one in own) < max(least, MOSTLY * excess):
         return None
     count, m = len(own), fit.poles.size

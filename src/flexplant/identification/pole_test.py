@@ -217,9 +217,26 @@ def shared(lines: Lines, fit: Fit, more: Fit, least: float) -> bool:
         return False
     if len(fit.shapes) == 1:
         return True
-    apart = own_cost(lines, fit)
+    if "own" not in vars(fit) and _proven(fit, more, least):
+        return True
+    apart = own_cost(fit)
     agreed = fit.cost - apart < own_price(lines, fit)
-    return agreed or apart - own_cost(lines, more) > least
+    return agreed or apart - own_cost(more) > least
+
+
+def _proven(fit: Fit, more: Fit, least: float) -> bool:
+    """Return whether a few outputs, with poles of their own, prove the pole more already."""
+    found, gain = [], 0.0
+    for o, own in enumerate(more.own):
+        try:
+            found.append(fit.of_output(o, below=own.cost + least - gain))
+        except SolverError:
+            return True
+        gain += found[-1].cost - own.cost
+        if gain > least:
+            return True
+    vars(fit)["own"] = found
+    return False
 
 
 def added(fit: Fit, more: Fit) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,11 +18,31 @@ from ..tolerances import RANK, TINY
 #: largest entry of a participation vector beside the one held at 1
 RUNAWAY = 5.0
 #: squares of the standard deviations by which a full step may still move a fit that has settled
-FINE, COARSE = 1e-5, 1e-2
+FINE, COARSE, ROUGH = 1e-5, 1e-2, 0.3
 #: steps after which a fit may be given up, and how often the gain of a full step is waited for
 PATIENCE, HOPE = 4, 20.0
+#: steps of a fit of one output: its poles begin near
+OWN = 20
 #: least damping ratio of a pole
 LEAST = 1e-7
+
+
+class Exhausted(Exception):  # noqa: N818 - no error: the first answer stands
+    """A refinement takes more products than it may."""
+
+
+@dataclass
+class Products:
+    """Products that fits took so far, and how many they may take."""
+
+    most: float = np.inf
+    done: float = 0.0
+
+    def add(self, count: float) -> None:
+        """Count some more; Exhausted where these are too many."""
+        self.done += count
+        if self.done > self.most:
+            raise Exhausted
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +64,7 @@ class Lines:
     segment: float | None = None
     #: poles that a fit may have
     most: int = 1000
+    work: Products = field(default_factory=Products)
 
     def of_output(self, o: int) -> Lines:
         """Return the lines of one output."""
@@ -101,7 +122,7 @@ def refined(
     column held at 1, are found by Levenberg-Marquardt: to a tenth of a standard deviation, or
     to 3e-3 of one where the fit is to be `fine`. A fit that will not come `below` a cost is given
     up: as soon as twenty times what a full step would gain is not enough. `poles_only`: the
-    participation stays as it is.
+    participation stays as it is, and poles are found to half a standard deviation.
     """
     pivots = np.argmax(np.abs(participation), axis=0)
     columns = np.arange(poles.size)
@@ -110,7 +131,7 @@ def refined(
     # nearly Gauss-Newton from the start, whose poles are good
     damping, idle = 1e-6, 0
     power = float(np.sum(np.abs(lines.data * lines.weight) ** 2))
-    enough = FINE if fine else COARSE
+    enough = ROUGH if poles_only else FINE if fine else COARSE
     for number in range(steps):
         N, g = now.gradient()
         size = np.sqrt(np.maximum(np.diag(N), TINY))
@@ -179,6 +200,7 @@ class Fit:
         s = axis(lines.freq)
         n_out = lines.data.shape[0]
         m = poles.size
+        lines.work.add(lines.data.size * (2 * m) ** 2)
         self.lines, self.poles, self.participation, self.m = lines, poles, participation, m
         self.pivots: IntArray = np.zeros(m, dtype=int) if pivots is None else pivots
         self.plus, self.slope = seen_terms(poles, s, lines.hold, lines.segment)
@@ -214,6 +236,21 @@ class Fit:
             (stacked.T @ stacked, stacked.T @ right, float(right @ right))
             for right, stacked in zip(self.lines.goals, self._stacked(), strict=True)
         ]
+
+    @cached_property
+    def own(self) -> list[Fit]:
+        """The fits of each output alone."""
+        return [self.of_output(o) for o in range(len(self.shapes))]
+
+    def of_output(self, o: int, below: float = np.inf) -> Fit:
+        """Return the fit of one output alone: poles of its own, the participation of all."""
+        return refined(
+            *(self.lines.of_output(o), self.poles, self.participation),
+            steps=OWN,
+            strict=False,
+            below=below,
+            poles_only=True,
+        )
 
     @cached_property
     def modal(self) -> ComplexArray:
@@ -287,6 +324,7 @@ class Fit:
     def gradient(self) -> tuple[FloatArray, FloatArray]:
         """Return J^T J and J^T e of the nonlinear parameters, all outputs together."""
         count = 2 * self.participation.size
+        self.lines.work.add(self.lines.data.size * count**2)
         N, g = np.zeros((count, count)), np.zeros(count)
         for o, (_, error) in enumerate(self.bases):
             J, _ = self._jacobian(o)

@@ -31,7 +31,7 @@ def answer(
     labels: Mapping[str, str],
     diagram: StabilisationDiagram | None,
     rejected: tuple[Rejected, ...],
-    refine: bool,
+    reason: str,
     apart: Disagreement | None,
 ) -> IdentifiedModes:
     """Return the identified modes of a fit, sorted, those that are reported."""
@@ -77,7 +77,7 @@ def answer(
         diagram=diagram,
         channel_covariance=spread[inside],
         rejected=rejected,
-        refined=refine,
+        first_answer=reason,
         inconsistency=None if apart is None else apart.size,
     )
 
@@ -293,8 +293,9 @@ class IdentifiedModes(MeasuredModes):
         known, they are taken for independent).
     rejected : sequence of (frequency [Hz], damping ratio, reason)
         Poles that are not reported.
-    refined : bool
-        Whether poles are those of the maximum likelihood fit to its end, else the first answer.
+    first_answer : str
+        Why poles are those of the first answer, empty where they are those of the maximum
+        likelihood fit to its end (`refined`).
     inconsistency : float, optional
         Relative deviation of the frequencies between outputs, where they disagree: the covariance
         of the poles is then that of leaving out each output in turn.
@@ -325,7 +326,7 @@ class IdentifiedModes(MeasuredModes):
     diagram: StabilisationDiagram | None = field(default=None, kw_only=True)
     channel_covariance: ComplexArray | None = field(default=None, kw_only=True)
     rejected: tuple[tuple[float, float, str], ...] = field(default=(), kw_only=True)
-    refined: bool = field(default=True, kw_only=True)
+    first_answer: str = field(default="", kw_only=True)
     inconsistency: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -339,8 +340,13 @@ class IdentifiedModes(MeasuredModes):
             channel_covariance=self.channel_covariance,
         )
 
+    @property
+    def refined(self) -> bool:
+        """Whether poles are those of the maximum likelihood fit to its end."""
+        return not self.first_answer
+
     def __repr__(self) -> str:
-        notes = ["refined" if self.refined else "the first answer (refine=True for more)"]
+        notes = ["refined" if self.refined else f"the first answer ({self.first_answer})"]
         if self.inconsistency is not None:
             notes.append(
                 f"outputs disagree by {self.inconsistency:.1e}, deviations by leaving them out"
