@@ -99,7 +99,8 @@ class ClosedLoop(Value):
         if self.left_out is not None:
             lines.append(f"  with the modes left out: {self.left_out.summary}")
         if self.tolerances is not None:
-            lines.append(f"  {in_words(self.tolerances.certificate)}")
+            found = self.tolerances.certificate
+            lines.append(f"  {in_words(found) if found else self.tolerances.summary}")
         return "\n".join(lines)
 
     @property
@@ -314,10 +315,10 @@ class ClosedLoop(Value):
 
     @cached_property
     def tolerances(self) -> ModeTolerances | None:
-        """What modes of uncertain frequency hold to, and 20 machines drawn; None: nothing stated.
+        """What modes hold to; None where these are not each its own, or the loop is unstable.
 
-        With the modes left out, where they are known. Frequencies are followed to 1 %, or to 2.5
-        times what is known.
+        Where frequencies are stated as uncertain with 20 machines drawn, and with the modes left
+        out, where they are known. Frequencies are followed to 1 %, or to 2.5 times what is known.
         """
         return reported_tolerances(self)
 
@@ -575,7 +576,7 @@ def close_loop(
             "The machine has these modes: lower the bandwidth, keep them in the plant, or let the "
             "controller roll off (or notch) before them."
         )
-    if loop.tolerances is not None:
+    if plant.uncertainty is not None and loop.tolerances is not None:
         loop.tolerances.warn_of_critical()
     return loop
 

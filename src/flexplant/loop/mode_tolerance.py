@@ -37,7 +37,7 @@ _NODES: Mapping[str, tuple[float, ...]] = {
 #: times the largest change about a mode where its resonance passes, with its skirts
 _PASSED = 1.2
 #: part of the size looked for that |S| has, with the mode where it is or at an end, at all points
-#: which the resonance does not pass and which are looked at in between
+#: which the resonance does not pass and which are examined in between
 _NEAR = 0.7
 #: range of relative changes of damping that is searched: without any, a mode that the loop does
 #: not see is marginal
@@ -210,7 +210,6 @@ def mode_tolerances(
     margin: float,
     known: Any = None,
     limit: float = LIMIT,
-    most: int | None = None,
 ) -> ModeTolerances:
     r"""Return the smallest changes of each mode that harm a stable loop.
 
@@ -228,7 +227,7 @@ def mode_tolerances(
     margin = positive(margin, "margin")
     if margin >= 1.0:
         raise ModelError(f"margin must be below 1, the largest that a loop can keep, got {margin}.")
-    modes, freq, zeta = _elastic(plant, most)
+    modes, freq, zeta = _elastic(plant)
     if broken.is_unstable:
         raise AssumptionError(
             "the loop is unstable as it is: no mode has a tolerance. Stabilise it first."
@@ -244,12 +243,11 @@ def mode_tolerances(
     moved, damped = (_changes(plant, broken, modes, kind) for kind in ("freq", "damping"))
     shared = channels.responses(np.unique(np.concatenate([*grids, np.zeros(0)])))
     for i, (grid, move, damp) in enumerate(zip(grids, moved, damped, strict=True)):
-        around = shared.among(grid)
-        sweep = around.sweep(move)
+        sweep = shared.sweep(move, grid)
         stable[i] = _crossings(channels, move, grid, sweep, (-limits[i], limits[i]))
         passed = np.abs(grid / freq[i] - 1.0) <= _PASSED * limits[i]
         within[i] = _margins(sweep, passed, stable[i], limits[i], 1.0 / margin)
-        damping[i] = _crossings(channels, damp, grid, around.sweep(damp), _DAMPINGS)
+        damping[i] = _crossings(channels, damp, grid, shared.sweep(damp, grid), _DAMPINGS)
     own = _known(known, modes)
     return ModeTolerances(modes, freq, stable, within, damping, margin, limits, own)
 
@@ -271,40 +269,35 @@ def machine_draws(
 def reported_tolerances(loop: Any) -> ModeTolerances | None:
     """Return what the modes of a closed loop hold to, beside what its plant says of them.
 
-    With the modes left out, where they are known; of those only the plant's own are changed.
+    With the modes left out, where these are known and frequencies are uncertain; of a sure plant
+    without: its models are large, and what they add to the answer is little.
     """
-    plant, uncertain, whole_loop = loop.plant, loop.plant.uncertainty, loop.completed or loop
-    known = {} if uncertain is None else uncertain.frequencies
-    if not known and (uncertain is not None or not plant.has_own_modes):
+    uncertain = loop.plant.uncertainty
+    if uncertain is None:
+        sure = loop.plant.has_own_modes and loop.is_stable
+        return _within(loop, {}) if sure else None
+    whole_loop = loop.completed or loop
+    if not uncertain.frequencies or not whole_loop.is_stable:
         return None
-    if not whole_loop.is_stable:
-        return None
+    found = _within(whole_loop, uncertain.frequencies)
+    return found and found.replace(draws=machine_draws(loop, uncertain, MARGIN, _DRAWS))
+
+
+def _within(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:
+    """Return the tolerances of a stable loop to the changes that a report follows."""
     limit = min(max(_FOLLOWED, 1.25 * _SAFE * max(known.values(), default=0.0)), LIMIT)
     try:
-        found = mode_tolerances(
-            whole_loop.plant,
-            whole_loop.broken,
-            margin=MARGIN,
-            known=known or None,
-            limit=limit,
-            most=plant.assembled.realisation.n_modes,
+        return mode_tolerances(
+            loop.plant, loop.broken, margin=MARGIN, known=known or None, limit=limit
         )
     except ModelError as error:
         if known:
             warn(f"what the modes of the loop hold to is not computed: {error}")
         return None
-    if uncertain is None:
-        return found
-    return found.replace(draws=machine_draws(loop, uncertain, MARGIN, _DRAWS))
 
 
-def _elastic(
-    plant: StandardPlant, most: int | None = None
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return numbers, frequencies [Hz] and damping ratios of the modes that swing below Nyquist.
-
-    Of the first `most` modes.
-    """
+def _elastic(plant: StandardPlant) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return numbers, frequencies [Hz] and damping ratios of the modes that swing below Nyquist."""
     realisation = plant.assembled.realisation
     trace = np.trace(realisation.pairs, axis1=1, axis2=2)
     square = np.linalg.det(realisation.pairs)
@@ -312,7 +305,7 @@ def _elastic(
     zeta = -0.5 * trace / np.maximum(omega, TINY)
     top = np.pi / plant.dt if plant.dt else np.inf
     swings = (np.arange(omega.size) >= realisation.n_rigid) & (zeta < 1.0) & (omega < top)
-    keep = np.flatnonzero((swings & (omega > 0))[:most])
+    keep = np.flatnonzero(swings & (omega > 0))
     return keep + 1, omega[keep] / (2.0 * np.pi), zeta[keep]
 
 
@@ -412,22 +405,18 @@ class _Responses(NamedTuple):
     SK: ComplexArray
     x: ComplexArray
 
-    def among(self, freq: FloatArray) -> _Responses:
-        """Return those at some of the frequencies."""
-        at = np.searchsorted(self.freq, freq)
-        return _Responses(freq, self.z[at], self.S[at], self.SK[at], self.x[at])
-
-    def sweep(self, change: _ModeChange) -> _Sweep:
-        """Return what a mode's equation is made of."""
-        Q = self.SK @ change.C
-        fed = np.any(change.fed != 0.0, axis=(0, 1))
-        from_others = np.einsum("kij,njm->knim", change.fed[:, :, fed], self.x[:, fed])
+    def sweep(self, change: _ModeChange, freq: FloatArray | None = None) -> _Sweep:
+        """Return what a mode's equation is made of, at some of the frequencies or all."""
+        at = slice(None) if freq is None else np.searchsorted(self.freq, freq)
+        z, Q = self.z[at], self.SK[at] @ change.C
+        fed = np.flatnonzero(np.any(change.fed != 0.0, axis=(0, 1)))
+        others, X = self.x[:, fed][at], self.x[:, change.states][at]
+        from_others = np.einsum("kij,njm->knim", change.fed[:, :, fed], others)
         F = from_others + change.B[:, None]
-        X = self.x[:, change.states]
-        own = np.tile(-change.A[:, None].astype(complex), (1, self.z.size, 1, 1))
-        own[0] += self.z[:, None, None] * np.eye(2)
+        own = np.tile(-change.A[:, None].astype(complex), (1, z.size, 1, 1))
+        own[0] += z[:, None, None] * np.eye(2)
         rest = F - own @ X
-        return _Sweep(self.S, Q, rest, own - rest @ Q)
+        return _Sweep(self.S[at], Q, rest, own - rest @ Q)
 
 
 class _Sweep(NamedTuple):
@@ -529,7 +518,7 @@ def _margins(
 ) -> FloatArray:
     """Return the changes, downwards and upwards, at which |S| at u reaches a size.
 
-    Where the resonance does not pass, |S| changes little and one way: only points are looked at
+    Where the resonance does not pass, |S| changes little and one way: only points are examined
     that come near the size at an end.
     """
     found = np.array([-np.inf, np.inf])
