@@ -7,6 +7,9 @@ from .frf_estimation import average_frfs as average_frfs
 from .frf_estimation import estimate_frf as estimate_frf
 from .identify import identify_modes as identify_modes
 from .identify import stabilisation_diagram as stabilisation_diagram
+from .impact import Blow as Blow
+from .impact import ImpactTest as ImpactTest
+from .impact import impact_frf as impact_frf
 from .measured import MeasuredModes as MeasuredModes
 from .measured import numbered as numbered
 from .output_only import identify_output_only as identify_output_only

@@ -47,10 +47,11 @@ def feedback(frf: Frf) -> Feedback | None:
     Noise that returns through a set-point's controller alone, ``u = K (r - y)``, biases by 1/K,
     which is causal: no record of u and y shows that. The response is taken from lines with s^2
     and a taper, so that neither rigid-body modes nor the end of the band spread over all lags,
-    and compared with what the variance makes there.
+    and compared with what the variance makes there. Hann-windowed segments only: others fold
+    what rings on at the end of a segment to these times.
     """
     n = frf.freq.size
-    if frf.variance is None or frf.resolution is None or n < 4 * STRETCH:
+    if frf.window != "hann" or frf.variance is None or frf.resolution is None or n < 4 * STRETCH:
         return None
     lines = np.arange(1, n + 1)
     if not np.allclose(frf.freq, lines * frf.resolution):

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ..checks import ComplexArray, FloatArray, members, positive
 from ..errors import ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf
-from .periodic import Periodic, periodic_frf
+from .periodic import Periodic, averages_advised, periodic_frf
 from .spectra import H1Estimator, SpectralMethod, dropouts_warned, records, spectral_frf
 
 Signals: TypeAlias = npt.ArrayLike | Mapping[str, Any]
@@ -34,6 +34,7 @@ def estimate_frf(
     ``HvEstimator(...)``  total least squares: noise on both
     ``Periodic(...)``     Y U^-1 of mean periods: no leakage, noise on both
     with ``reference=r``  S_yr S_ur^-1: under feedback (joint input-output)
+    `impact_frf`          blows of a hammer, found in the record
     ====================  ==========================================================
 
     A machine that floats is measured under feedback, where noise finds its way back to the
@@ -73,7 +74,8 @@ def estimate_frf(
         When an output keeps one value for longer than quantisation explains: a drop-out. When,
         without a reference, the machine seems to respond before its inputs act: noise returns
         through a controller, and the estimate is biased (set-points as the only excitation bias
-        it without that sign: pass reference= in closed loop always). With
+        it without that sign: pass reference= in closed loop always). When averages of segments
+        are taken of inputs that repeat (`Periodic`) or are pulses (`impact_frf`). With
         `Periodic`: when the inputs do not repeat after the stated period (it or the rate is
         wrong), or when a transient has not died away, with the periods to discard.
 
@@ -113,6 +115,7 @@ def estimate_frf(
     if isinstance(method, Periodic):
         return periodic_frf(data, method, quantity)
     if isinstance(method, SpectralMethod):
+        averages_advised(data.u if data.r is None else data.r, data.rate, method.window)
         return spectral_frf(data, method, quantity)
     raise ModelError(
         "method is H1Estimator(...), H2Estimator(...), HvEstimator(...) or Periodic(...), got "

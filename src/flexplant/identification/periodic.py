@@ -344,11 +344,50 @@ def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: flo
             f"the inputs are not periodic: at half of the lines or more their power is "
             f"{10 * np.log10(ratio):.1f} dB of what lies between the lines, where periodic "
             "signals have nothing. Check period= and rate; random excitation needs "
-            "H1Estimator(...), noise that comes back through a controller reference= or more "
-            "periods."
+            "H1Estimator(...), blows of a hammer impact_frf(...), noise that comes back through a "
+            "controller reference= or more periods."
         )
         return False
     return True
+
+
+#: share of the inputs' power by which periodic ones change from period to period, at most
+REPEATED = 1e-3
+#: mean fourth power over squared power of pulses that fill 1/60 of a record; noise has 3
+PULSES = 60.0
+
+
+def averages_advised(x: FloatArray, rate: float, window: Any) -> None:
+    """Warn where the averages of segments suit the inputs worse than another method does."""
+    power = np.mean(x**2, axis=2)
+    peaked = np.mean(x**4, axis=2)[power > 0] / power[power > 0] ** 2
+    if peaked.size and peaked.min() > PULSES:
+        warn(
+            "the inputs are pulses: segments of a fixed length cut the responses to blows "
+            "anywhere, which adds to their damping. Use impact_frf(force, response, rate, "
+            "segment=...), which finds the blows."
+        )
+        return
+    period = _period(x)
+    if period and window != "boxcar":
+        warn(
+            f"the inputs repeat after {period / rate:.6g} s: windowed segments leak and smear "
+            f"resonances where whole periods do not. Use Periodic(period={period / rate:.6g})."
+        )
+
+
+def _period(x: FloatArray) -> int:
+    """Return the shortest period of at most half the record [samples], 0 where there is none."""
+    change = _change(x)[: x.shape[2] // 2 + 1]
+    # neighbouring samples of slow signals are alike too
+    apart = np.flatnonzero(change > 0.5)
+    if not apart.size:
+        return 0
+    alike = np.flatnonzero(change[apart[0] :] < REPEATED) + apart[0]
+    if not alike.size:
+        return 0
+    run = alike[: int(np.argmax(np.diff(alike, append=alike[-1] + 2) > 1)) + 1]
+    return int(run[np.argmin(change[run])])
 
 
 def _change(x: FloatArray) -> FloatArray:

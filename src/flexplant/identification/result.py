@@ -195,11 +195,11 @@ def _scaled(
     return shapes * factor, part / factor, bool(shared)
 
 
-#: width 2 zeta f of a resonance in lines below which leakage is more than a few per cent of it
+#: width 2 zeta f of a resonance in lines below which leakage may keep poles from being stable
 FEWEST = 4.0
-#: leakage widens what is seen of such a resonance: by this much at most where it has that width
-WIDENED = 1.2
-#: the same in lines where the window is fitted through: then little but its main lobe is seen
+#: what leakage adds to the damping, relative, at a width of one line: no window, and tapered ones
+BOXCAR, TAPERED = 1.0 / np.pi, 0.1
+#: width in lines where the window is fitted through: below, little but its main lobe is seen
 FEWEST_THROUGH = 0.5
 
 
@@ -210,32 +210,51 @@ def hann_segment(frf: Frf) -> float | None:
 
 
 def leakage_warned(frf: Frf, found: IdentifiedModes) -> None:
-    r"""Warn of resonances narrower than about four lines of windowed segments.
+    r"""Warn of resonances that windowed segments widen by more than their deviation.
 
-    A Hann window smears the response over its main lobe: damping is overestimated by 1 % at 10
-    lines, by some 10 % at 4, and one resonance becomes two poles below ([BendatPiersol2010]_,
-    section 11.6). Where the window is fitted through: half a line.
+    Segments without a taper see responses to inputs t before with the share 1 - t/T of their
+    length T, which shifts a pole by about -1/T: of its width of n lines, ``1/(pi n)``. Tapered
+    ones leave about 0.1/n ([BendatPiersol2010]_, section 11.6, of random excitation). What leaks
+    is not coherent: no more than ``1 - gamma^2`` at the resonance, nothing where all of a response
+    lies within its segment. Where the window is fitted through, nothing is left but below half a
+    line.
     """
     if frf.window is None or frf.resolution is None:
         return
     poles = found.poles
     width = -2.0 * poles.real / (2 * np.pi)
-    fewest, widened = (FEWEST, WIDENED) if found.segment is None else (FEWEST_THROUGH, 1.0)
-    lines = width / (frf.resolution * widened)
-    narrow = np.flatnonzero(lines < fewest)
+    lines = width / frf.resolution
+    if found.segment is not None:
+        added = np.where(lines < FEWEST_THROUGH, 1.0, 0.0)
+    else:
+        added = (BOXCAR if frf.window == "boxcar" else TAPERED) / lines
+        if frf.coherence is not None:
+            at = np.argmin(np.abs(frf.freq[:, None] - np.abs(poles) / (2 * np.pi)), axis=0)
+            added = np.minimum(added, 1.0 - np.max(frf.coherence[:, :, at], axis=(0, 1)))
+    std = found.std
+    known = np.zeros(poles.size) if std is None else std.real / -poles.real
+    narrow = np.flatnonzero(added > known)
     if not narrow.size:
         return
-    worst = int(narrow[np.argmin(lines[narrow])])
+    worst = int(narrow[np.argmax(added[narrow])])
     freq = np.abs(poles) / (2 * np.pi)
     listed = ", ".join(f"{freq[k]:.4g} Hz (2 zeta f = {width[k]:.2g} Hz)" for k in narrow[:4])
     more = f" and {narrow.size - 4} more" if narrow.size > 4 else ""
+    size = (
+        f"by up to {added[worst]:.1%} where its deviation is {known[worst]:.1%}"
+        if found.segment is None
+        else "and splits it into several poles where it is narrower than half a line"
+    )
+    longer = (
+        FEWEST_THROUGH / width[worst]
+        if found.segment
+        else added[worst] / (max(known[worst], TINY) * frf.resolution)
+    )
     warn(
         f"segments of {1 / frf.resolution:.3g} s are too short for the damping near "
-        f"{listed}{more}: below about {fewest:g}/segment = {fewest * frf.resolution:.2g} Hz "
-        "leakage widens a resonance and splits it into several poles, so that damping and the "
-        "number of modes are wrong by more than their stated deviation. Take segment= of at least "
-        f"{fewest * widened / width[worst]:.2g} s (the true damping is less than what is seen), "
-        "or excite with whole periods, Periodic(...)."
+        f"{listed}{more}: leakage widens a resonance {size}. Take segment= of at least "
+        f"{longer:.2g} s, a Hann window, excite with whole periods, Periodic(...), or strike, "
+        "impact_frf(...)."
     )
 
 

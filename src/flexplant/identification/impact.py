@@ -1,0 +1,456 @@
+"""Impact tests: blows of a hammer found in records, and the damping of their window taken out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..checks import ComplexArray, FloatArray, IntArray, Value, between, positive
+from ..errors import ModelError, ShapeError, SolverError, counted, unknown_label
+from ..lti.frequency import Frf
+from ..tolerances import TINY
+from .identify import identify_modes
+from .result import IdentifiedModes
+from .spectra import Records, dropouts_warned, error_statistics, records
+
+#: a pulse is this many deviations of the force's noise high: one of 10^8 samples of noise is
+NOISE = 6.0
+#: median of |x| of normal noise times this is its deviation
+NORMAL = 1.4826
+#: equal samples at a channel's extreme value that are a limit, after a step of so many quanta
+FLAT, STEEP = 3, 4.0
+#: the window ends at exp(-4), 2 %, by default: resonances are 1.3 lines wide at least
+WINDOWS = 4.0
+#: complex degrees of freedom of a variance, averaged over lines where there are few blows
+FREEDOM = 8
+
+
+@dataclass(frozen=True)
+class Blow:
+    """One blow: on which input, when [s], how hard, in which experiment; and why it is refused."""
+
+    input: str
+    time: float
+    peak: float
+    experiment: int = 0
+    reason: str = ""
+
+    def __str__(self) -> str:
+        why = f": {self.reason}" if self.reason else ""
+        return f"{self.input} at {self.time:.4g} s, {self.peak:.3g}{why}"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ImpactTest(Value):
+    """FRFs of blows, made by `impact_frf`: as their window damps them.
+
+    Parameters
+    ----------
+    frf : Frf
+        ``H(s + 1/decay)`` at ``s = i omega``: every pole has moved by ``-1/decay``. The window
+        makes errors of neighbouring lines depend on each other, of which fits know nothing: its
+        variance is enlarged by `dependence`, so that a mean over lines has that of its errors.
+    used, refused : sequences of Blow
+        The blows averaged, and those that were not, with their reasons.
+    segment : float [s]
+        Length of record after each blow.
+    decay : float [s]
+        Time constant of the window; infinite: none.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> time = np.arange(6000) / 1e3
+    >>> force = np.isin(time, [0.1, 3.0]) * 1.0
+    >>> ring = np.exp(-2.0 * time) * np.sin(2 * np.pi * 40.0 * time)
+    >>> response = np.convolve(force, ring)[:6000]
+    >>> response += 1e-4 * np.random.default_rng(1).normal(size=6000)
+    >>> test = fx.identification.impact_frf(force, response, 1e3, segment=2.0)
+    >>> print(test)
+    <ImpactTest: 2 blows used, 0 refused, segments of 2 s, window of 0.5 s>
+    >>> -test.identify(band=(20.0, 60.0)).poles.real.round(1)  # the window alone damps by 2
+    array([2.])
+    """
+
+    frf: Frf
+    used: tuple[Blow, ...] = field(kw_only=True)
+    refused: tuple[Blow, ...] = field(default=(), kw_only=True)
+    segment: float = field(kw_only=True)
+    decay: float = field(kw_only=True)
+
+    @property
+    def dependence(self) -> float:
+        r"""Sum of the correlations of a line's error with all others', T/tau coth(T/tau)."""
+        return _dependence(self.segment / self.decay)
+
+    def __repr__(self) -> str:
+        window = f"window of {self.decay:.4g} s" if np.isfinite(self.decay) else "no window"
+        head = (
+            f"<ImpactTest: {counted(len(self.used), 'blow')} used, {len(self.refused)} refused, "
+            f"segments of {self.segment:.4g} s, {window}>"
+        )
+        return "\n".join([head, *(f"  refused {blow}" for blow in self.refused)])
+
+    def identify(self, **options: Any) -> IdentifiedModes:
+        """Return the machine's modes: those of the FRF without the window's damping.
+
+        Parameters
+        ----------
+        **options
+            As for `identify_modes`: band, orders, dofs, ...
+
+        Raises
+        ------
+        ModelError, SolverError
+            As `identify_modes`.
+        """
+        return self.corrected(identify_modes(self.frf, **options))
+
+    def corrected(self, found: IdentifiedModes) -> IdentifiedModes:
+        r"""Return modes identified from `frf` without the window's damping.
+
+        Force and responses times ``exp(-t/tau)`` are those of ``H(s + 1/tau)``: poles move by
+        -1/tau exactly, residues not at all. Of noise white in time, a fit of
+        ``g = t exp(-(a + 1/tau) t)``, a pole's derivative, has the variance
+
+        .. math:: \frac{\int g^2 w^2 dt}{\overline{w^2} \int g^2 dt} = \frac{2T}{\tau}
+            \left(\frac{a + 1/\tau}{a + 2/\tau}\right)^3
+
+        times that of independent lines, without the enlarged variance of `frf`; residues the same
+        without the cube.
+
+        Parameters
+        ----------
+        found : IdentifiedModes
+            From `identify_modes` of `frf`.
+
+        Raises
+        ------
+        SolverError
+            When no pole has damping beyond that of the window.
+        """
+        if not np.isfinite(self.decay):
+            return found
+        shift = 1.0 / self.decay
+        damped = np.flatnonzero(found.poles.real + shift < 0)
+        listed = [(f, z - shift / (2 * np.pi * f), why) for f, z, why in found.rejected]
+        for k in np.setdiff1d(np.arange(len(found)), damped):
+            left = -float(found.poles[k].real) - shift
+            zeta = left / abs(found.poles[k])
+            listed.append((float(found.freq[k]), float(zeta), "without damping beyond the window"))
+        if not damped.size:
+            raise SolverError(
+                f"no pole has damping beyond the window's {shift:.3g} rad/s: they are disturbances "
+                "of one frequency, or the segments are too short. Take longer ones, segment=."
+            )
+        kept = found.select(damped.tolist())
+        rate = -(kept.poles.real + shift)
+        share = (rate + shift) / (rate + 2 * shift)
+        whole = 2 * self.segment * shift / -np.expm1(-2 * self.segment * shift)
+        whole = whole / self.dependence
+        size = np.tile(np.sqrt(whole * share**3), 2)
+        spread, residues = kept.covariance, kept.channel_covariance
+        poles, shapes, participation = kept.unreported
+        return kept.replace(
+            poles=kept.poles + shift,
+            covariance=None if spread is None else spread * np.outer(size, size),
+            channel_covariance=(
+                None if residues is None else residues * (whole * share)[:, None, None]
+            ),
+            unreported=(poles + shift, shapes, participation),
+            rejected=tuple(sorted(listed)),
+        )
+
+
+def impact_frf(
+    force: npt.ArrayLike | Mapping[str, Any],
+    response: npt.ArrayLike | Mapping[str, Any],
+    rate: float,
+    *,
+    segment: float,
+    decay: float | None = None,
+    level: float = 0.05,
+    limits: Mapping[str, float] | None = None,
+    quantity: str | None = None,
+) -> ImpactTest:
+    r"""Return the FRFs of an impact test, ``G = sum(Y F^*) / sum(F F^*)`` over its blows.
+
+    Blows are the pulses of the force in long records. Each has a segment of its own, in which the
+    force beside the pulse is set to zero (the force window) and force and responses are multiplied
+    by ``exp(-t/decay)``, which moves all poles by -1/decay (`ImpactTest.identify` takes it out).
+    What rings on at the end of a segment, and into the next one, changes residues and no pole.
+    Left out are blows with another one in their segment, clipped ones, and those cut off by the
+    end of the record.
+
+    Parameters
+    ----------
+    force : (n_time,), (n_in, n_time) or (n_exp, n_in, n_time) array, or mapping by name
+        The hammer's force, a channel for each point that is struck; those that are not are zero.
+    response : array or mapping
+        What was measured, as for `estimate_frf`.
+    rate : float [Hz]
+        Sampling rate.
+    segment : float [s]
+        Length of record for each blow; its inverse is the resolution.
+    decay : float [s], optional
+        Time constant of the exponential window: a quarter of the segment by default, infinite
+        for none.
+    level : float
+        Share of the largest force of a record above which a pulse begins, between 0 and 1.
+    limits : mapping {channel: value}, optional
+        Full scale of channels: a blow that reaches it is refused. Channels that stay at their
+        extreme value after a steep rise are found without.
+    quantity : {"displacement", "velocity", "acceleration"}, optional
+        What the responses are.
+
+    Returns
+    -------
+    ImpactTest
+        With the FRF, its coherence, variance and correlation, and the blows used and refused.
+
+    Warns
+    -----
+    FlexplantWarning
+        When an output keeps one value for long.
+
+    Raises
+    ------
+    ModelError, ShapeError, LabelError
+        When records do not belong together, or an input has no blow that can be used.
+
+    References
+    ----------
+    [BendatPiersol2010]_, ch. 6 and 9 (H1, its variance); [PintelonSchoukens2012]_, ch. 6.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> force = np.zeros(3000)
+    >>> force[[100, 1000, 2000, 2040]] = 1.0  # the last one rebounds
+    >>> response = np.convolve(force, [0.0, 2.0, 1.0])[:3000]
+    >>> response += 0.01 * np.random.default_rng(1).normal(size=3000)
+    >>> test = impact_frf({"1:z": force}, {"1:z": response}, 1e3, segment=0.5, limits={"1:z": 9.0})
+    >>> [blow.time for blow in test.used], [blow.reason for blow in test.refused]
+    ([0.1, 1.0], ['another blow follows after 0.04 s', 'a blow came 0.04 s before'])
+    """
+    data = records(force, response, None, positive(rate, "rate"))
+    if quantity not in (None, "displacement", "velocity", "acceleration"):
+        raise unknown_label("quantity", quantity, ["displacement", "velocity", "acceleration"])
+    between(level, "level", 0.0, 1.0, "A twentieth is usual: 0.05.")
+    length = round(positive(segment, "segment") * data.rate)
+    tau = segment / WINDOWS if decay is None else _time_constant(decay)
+    n_time = data.u.shape[2]
+    if not 8 <= length <= n_time:
+        raise ModelError(
+            f"a segment of {length} samples in a record of {n_time}: choose segment= between "
+            f"{8 / data.rate:g} and {n_time / data.rate:g} s."
+        )
+    full = _full_scale(limits, data.inputs, data.outputs)
+    dropouts_warned(data)
+    f = data.u - np.median(data.u, axis=2, keepdims=True)
+    y = data.y - np.mean(data.y, axis=2, keepdims=True)
+    window = np.exp(-np.arange(length) / (tau * data.rate))
+    used: list[Blow] = []
+    refused: list[Blow] = []
+    forces: list[list[ComplexArray]] = [[] for _ in data.inputs]
+    motions: list[list[ComplexArray]] = [[] for _ in data.inputs]
+    for e in range(f.shape[0]):
+        for blow, i, start, at in _blows(data, f, e, level, length, full):
+            if blow.reason:
+                refused.append(blow)
+                continue
+            used.append(blow)
+            part = slice(start, start + length)
+            own = f[e, i, part] * _force_window(length, *at) * window
+            forces[i].append(np.fft.rfft(own))
+            motions[i].append(np.fft.rfft(y[e, :, part] * window, axis=1))
+    _require_blows(data.inputs, forces, refused)
+    inner = slice(1, (length + 1) // 2)
+    F = [np.array(part)[:, inner] for part in forces]
+    Y = [np.array(part)[:, :, inner] for part in motions]
+    freq = np.asarray(np.arange(length // 2 + 1)[inner] / length * data.rate, dtype=np.float64)
+    names = {"inputs": data.inputs, "outputs": data.outputs, "quantity": quantity}
+    frf = _averaged(freq, F, Y, data.rate / length, names)
+    if frf.variance is not None:
+        frf = frf.replace(variance=frf.variance * _dependence(length / (tau * data.rate)))
+    return ImpactTest(
+        frf, used=tuple(used), refused=tuple(refused), segment=length / data.rate, decay=tau
+    )
+
+
+def _averaged(
+    freq: FloatArray,
+    F: list[ComplexArray],
+    Y: list[ComplexArray],
+    resolution: float,
+    names: dict[str, Any],
+) -> Frf:
+    """Return H1 over the blows (n_blow, ...) of each input; noise is what they leave together."""
+    import scipy.ndimage as ndi
+
+    power = np.array([np.sum(np.abs(one) ** 2, axis=0) for one in F])
+    if not np.all(power > 0):
+        raise ModelError("a force has no power at some lines: check the channel of the hammer.")
+    cross = [np.einsum("hof,hf->of", y, f.conj()) for y, f in zip(Y, F, strict=True)]
+    G = np.stack([c / p for c, p in zip(cross, power, strict=True)], axis=1)
+    spare = sum(len(one) - 1 for one in F)
+    variance = correlation = coherence = freedom = None
+    if spare:
+        error = np.concatenate(
+            [y - G[None, :, i] * f[:, None] for i, (y, f) in enumerate(zip(Y, F, strict=True))]
+        )
+        left = np.einsum("haf,hbf->fab", error, error.conj()) / spare
+        lines = -(-FREEDOM // spare) | 1
+        left = ndi.uniform_filter1d(left, lines, axis=0, mode="nearest")
+        inverse = np.einsum("if,ij->fij", 1.0 / power, np.eye(len(F)))
+        variance, correlation = error_statistics(left, inverse)
+        if not np.all(variance > 0):
+            variance = correlation = None  # no noise at all: nothing to weight by
+        seen = np.stack([np.sum(np.abs(y) ** 2, axis=0) for y in Y], axis=1)
+        coherent = np.abs(np.stack(cross, axis=1)) ** 2
+        coherence = np.clip(coherent / np.maximum(power[None] * seen, TINY), 0.0, 1.0)
+        freedom = None if variance is None else float(spare * lines)
+    return Frf(
+        freq,
+        G,
+        **names,
+        coherence=coherence,
+        variance=variance,
+        correlation=correlation,
+        freedom=freedom,
+        resolution=resolution,
+    )
+
+
+def _blows(
+    data: Records,
+    f: FloatArray,
+    e: int,
+    level: float,
+    length: int,
+    full: Mapping[str, float],
+) -> Iterator[tuple[Blow, int, int, tuple[int, int]]]:
+    """Yield the blows of experiment e: input, where the segment begins, samples before, width."""
+    largest = float(np.abs(f).max())
+    pulses = sorted(
+        (begin, end, i)
+        for i, force in enumerate(f[e])
+        for begin, end in _pulses(force, level, largest)
+    )
+    before = 2 + max((end - begin for begin, end, _ in pulses), default=0)
+    limited = _limited(data.u[e], data.inputs, full) | _limited(data.y[e], data.outputs, full)
+    begins = [pulse[0] for pulse in pulses]
+    for k, (begin, end, i) in enumerate(pulses):
+        start = begin - before
+        reason = _reason(begins, k, start, length, f.shape[2], data.rate)
+        over = [name for name, at in limited.items() if at[max(start, 0) : start + length].any()]
+        if not reason and over:
+            reason = f"{over[0]} is at the limit of its range"
+        pulse = f[e, i, begin:end]
+        peak = float(pulse[np.argmax(np.abs(pulse))])
+        blow = Blow(data.inputs[i], begin / data.rate, peak, e, reason)
+        yield blow, i, start, (before, end - begin)
+
+
+def _require_blows(inputs: tuple[str, ...], forces: list[Any], refused: list[Blow]) -> None:
+    for name, found in zip(inputs, forces, strict=True):
+        if not found:
+            why = "; ".join(str(blow) for blow in refused if blow.input == name)
+            raise ModelError(
+                f"{name} has no blow that can be used ({why or 'no pulse in its record'}): "
+                "shorten segment= where blows follow too soon, check level= and the ranges, or "
+                "measure again."
+            )
+
+
+def _pulses(force: FloatArray, level: float, largest: float) -> list[tuple[int, int]]:
+    """Return where pulses begin and end; those nearer than the width of one are one pulse."""
+    size = float(np.abs(force).max())
+    noise = NORMAL * float(np.median(np.abs(force)))
+    high = np.flatnonzero(np.abs(force) > max(level * size, NOISE * noise))
+    if size < level * largest or not high.size:
+        return []
+    found = [(int(high[0]), int(high[0]) + 1)]
+    for at in high[1:].tolist():
+        begin, end = found[-1]
+        if at - end <= end - begin:
+            found[-1] = (begin, at + 1)
+        else:
+            found.append((at, at + 1))
+    return found
+
+
+def _reason(begins: list[int], k: int, start: int, length: int, n_time: int, rate: float) -> str:
+    """Return why a blow cannot be used, nothing where it can."""
+    if k and begins[k] < begins[k - 1] + length - (begins[k] - start):
+        return f"a blow came {(begins[k] - begins[k - 1]) / rate:.3g} s before"
+    if k + 1 < len(begins) and begins[k + 1] < start + length:
+        return f"another blow follows after {(begins[k + 1] - begins[k]) / rate:.3g} s"
+    if start < 0:
+        return "the record begins with it"
+    if start + length > n_time:
+        return f"the record ends {(n_time - begins[k]) / rate:.3g} s after it"
+    return ""
+
+
+def _force_window(length: int, before: int, width: int) -> FloatArray:
+    """Return 1 until a pulse's width after it, then half a cosine to zero over another width."""
+    time = np.arange(length) - (before + 2 * width)
+    fall = np.clip(time / max(width, 1), 0.0, 1.0)
+    return np.asarray(0.5 + 0.5 * np.cos(np.pi * fall))
+
+
+def _limited(
+    signals: FloatArray, names: tuple[str, ...], full: Mapping[str, float]
+) -> dict[str, Any]:
+    """Return {channel: samples at the limit of its range}, of those that ever are."""
+    found = {}
+    for name, signal in zip(names, signals, strict=True):
+        at = np.zeros(signal.size, dtype=np.bool_)
+        if name in full:
+            at |= np.abs(signal) >= full[name]
+        steps = np.abs(np.diff(signal))
+        moving = steps[steps > 0]
+        if moving.size:
+            for extreme in (signal.max(), signal.min()):
+                at |= _flat(signal == extreme, steps, STEEP * float(moving.min()))
+        if at.any():
+            found[name] = at
+    return found
+
+
+def _flat(extreme: Any, steps: FloatArray, steep: float) -> Any:
+    """Return runs of `extreme` that begin after a step larger than `steep`, of FLAT samples."""
+    edges = np.diff(np.concatenate([[0], extreme.astype(np.int8), [0]]))
+    at = np.zeros(extreme.size, dtype=np.bool_)
+    begins: IntArray = np.flatnonzero(edges == 1)
+    for begin, end in zip(begins, np.flatnonzero(edges == -1), strict=True):
+        if end - begin >= FLAT and begin and steps[begin - 1] > steep:
+            at[begin:end] = True
+    return at
+
+
+def _dependence(damped: float) -> float:
+    """Return x coth(x) of T/tau; 1 without a window."""
+    return damped / float(np.tanh(damped)) if damped else 1.0
+
+
+def _time_constant(decay: Any) -> float:
+    return float("inf") if decay == float("inf") else positive(decay, "decay")
+
+
+def _full_scale(limits: Any, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> dict[str, float]:
+    """Return limits of known channels."""
+    if limits is None:
+        return {}
+    if not isinstance(limits, Mapping):
+        raise ShapeError("limits is a mapping {channel: full scale}, such as {'force': 500.0}.")
+    for name in limits:
+        if name not in (*inputs, *outputs):
+            raise unknown_label("channel", name, [*inputs, *outputs])
+    return {name: positive(value, f"limits[{name!r}]") for name, value in limits.items()}

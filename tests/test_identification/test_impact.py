@@ -1,0 +1,193 @@
+"""Blows on a plate in polynomials, whose modes are its own and no mesh's; its poles are known."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy.signal as ss
+
+from flexplant.errors import LabelError, ModelError, ShapeError, SolverError
+from flexplant.identification import identify_modes, impact_frf
+from flexplant.testbeds.ritz_plate import elastic_modes, ritz_plate
+from flexplant.testbeds.wafer_stage import DRAWING
+from oracles_identification import pole
+
+RATE = 4000.0
+PLACES = [(0.0, 0.0), (0.6, 0.0), (0.31, 0.6), (0.13, 0.26), (0.42, 0.33)]
+STRUCK = {"1:z": 0, "4:z": 3}
+ZETA = np.array([0.003, 0.002, 0.004, 0.0025, 0.003])
+
+
+@cache
+def plate():
+    bare = ritz_plate(**DRAWING)
+    omega, phi = elastic_modes(bare)
+    rows = np.array([bare.dofs.row(np.array([x, y, 0.0]), "z") for x, y in PLACES])
+    return pole(omega[:5] / 2 / np.pi, ZETA), (rows @ phi)[:, :5]
+
+
+def ringing(force, struck, noise, rng):
+    """Displacements (5, n_time), the force held; modes beyond the fifth are not excited."""
+    poles, phi = plate()
+    y = np.zeros((5, force.size))
+    for k, p in enumerate(poles):
+        mode = ss.cont2discrete(([1.0], [1.0, -2 * p.real, abs(p) ** 2]), 1 / RATE)
+        y += np.outer(phi[:, k] * phi[struck, k], ss.lfilter(mode[0][0], mode[1], force))
+    return y + noise * np.std(y) * rng.normal(size=y.shape)
+
+
+def blows(times, n, *, peaks=None, width=4):
+    """Half sines of `width` samples."""
+    force = np.zeros(n)
+    pulse = np.sin(np.pi * (np.arange(width) + 0.5) / width)
+    for time, peak in zip(times, peaks or np.full(len(times), 200.0), strict=True):
+        at = round(time * RATE)
+        force[at : at + width] += peak * pulse
+    return force
+
+
+def hammered(times, *, seed, noise=0.02, **options):
+    """Force and responses of both points, struck one after the other in two experiments."""
+    rng = np.random.default_rng(seed)
+    n = round((max(times) + 1.3) * RATE)
+    forces = np.zeros((2, 2, n))
+    y = np.zeros((2, 5, n))
+    for e, struck in enumerate(STRUCK.values()):
+        forces[e, e] = blows(times, n, **options)
+        y[e] = ringing(forces[e, e], struck, noise, rng)
+    forces += 0.2 * rng.normal(size=forces.shape)
+    return dict(zip(STRUCK, forces.transpose(1, 0, 2), strict=True)), {
+        f"{i}:z": y[:, i - 1] for i in range(1, 6)
+    }
+
+
+def off(found):
+    """Errors of real and imaginary parts in deviations; repeated pairs by the nearer one."""
+    poles = plate()[0]
+    assert len(found) == len(poles)
+    rest = list(poles)
+    near = [rest.pop(int(np.argmin(np.abs(np.array(rest) - p)))) for p in found.poles]
+    error = found.poles - near
+    return np.concatenate([error.real / found.std.real, error.imag / found.std.imag])
+
+
+@pytest.mark.slow
+def test_poles_are_the_machines_without_the_windows_damping():
+    """A pair 3e-5 apart struck at two points; ringing 0.4 to 5 % into the next blow."""
+    force, y = hammered([0.2, 1.4, 2.5, 3.9, 5.2], seed=1)
+    test = impact_frf(force, y, RATE, segment=1.0)
+    assert (len(test.used), len(test.refused), test.decay) == (10, 0, 0.25)
+    seen = identify_modes(test.frf, band=(150.0, 700.0), hold=RATE)
+    found = test.corrected(seen)
+    np.testing.assert_allclose(found.poles - seen.poles, 4.0, rtol=1e-9)
+    assert np.abs(off(found)).max() < 3.5
+    assert np.sort(found.zeta) == pytest.approx(np.sort(ZETA), rel=0.02)
+    phi = plate()[1]
+    for k in range(3):
+        shape = found.shapes[:, k] / np.sqrt(np.vdot(found.shapes[:, k], found.shapes[:, k]).real)
+        assert abs(np.vdot(shape, phi[:, k])) ** 2 / np.sum(phi[:, k] ** 2) > 0.9999
+
+
+@pytest.mark.slow
+def test_deviations_of_few_blows_are_those_of_the_errors():
+    """Three blows that ring to 1 % and less, and noise: two modes, 12 records, 48 scores."""
+    rng = np.random.default_rng(6)
+    force = blows([0.2, 2.4, 4.5], 28_000)
+    clean = ringing(force, 3, 0.0, rng)[[1, 3, 4]]
+    scores = []
+    for _ in range(12):
+        y = clean + 0.3 * np.std(clean) * rng.normal(size=clean.shape)
+        test = impact_frf(force, y, RATE, segment=2.0, decay=0.5)
+        found = test.identify(band=(215.0, 390.0), hold=RATE)
+        error = found.poles[:2] - plate()[0][:2]
+        scores.append([error.real / found.std.real[:2], error.imag / found.std.imag[:2]])
+    # the rms of 48 independent scores is known to 10 %
+    assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=0.3)
+
+
+def test_doubles_overloads_and_cut_blows_are_left_out_with_their_reasons():
+    rng = np.random.default_rng(3)
+    times = [0.1, 1.4, 1.43, 2.7, 4.0, 5.3, 6.6]
+    force = blows(times, 28_000, peaks=[200.0, 150.0, 80.0, 200.0, 900.0, 180.0, 190.0])
+    y = ringing(force, 0, 0.01, rng)
+    force += 0.1 * rng.normal(size=force.size)
+    y = np.clip(y, -0.4 * np.abs(y).max(), 0.4 * np.abs(y).max())  # the fifth blow overloads
+    test = impact_frf({"1:z": force}, y, RATE, segment=1.0)
+    assert [round(blow.time, 1) for blow in test.used] == [0.1, 2.7, 5.3]
+    reasons = {round(blow.time, 2): blow.reason for blow in test.refused}
+    assert reasons[1.4] == "another blow follows after 0.0302 s"
+    assert reasons[1.43] == "a blow came 0.0302 s before"
+    assert "limit of its range" in reasons[4.0]
+    assert reasons[6.6] == "the record ends 0.4 s after it"
+    assert "refused 1:z at 6.6 s" in repr(test)
+    with pytest.raises(ModelError, match=r"1:z has no blow.*range"):
+        impact_frf({"1:z": force}, y, RATE, segment=1.0, limits={"1:z": 100.0})
+
+
+def test_coherence_is_the_share_of_what_the_blows_have_in_common():
+    rng = np.random.default_rng(4)
+    force = blows(np.arange(40) * 0.3 + 0.1, 50_000)
+    clean = ss.lfilter([0.0, 1.0], [1.0], force)
+    options = {"segment": 0.25, "decay": np.inf}
+    part = impact_frf(force, clean + 1e-3 * rng.normal(size=force.size), RATE, **options)
+    assert part.frf.coherence[0, 0, :100].min() > 0.999
+    noisy = impact_frf(force, clean + 15.0 * rng.normal(size=force.size), RATE, **options)
+    error = np.abs(noisy.frf.data - part.frf.data)[0, 0, :100] ** 2
+    assert np.mean(error / noisy.frf.variance[0, 0, :100]) == pytest.approx(1.0, abs=0.3)
+    assert 0.3 < np.mean(noisy.frf.coherence[0, 0, :100]) < 0.95
+
+
+@pytest.mark.parametrize("noise", [1e-2, 1e-3])
+def test_five_blows_that_ring_at_the_records_end_give_three_poles(noise):
+    """Ringing 2.8 % at the end of each record, the first mode: not one pole more."""
+    rng = np.random.default_rng(2)
+    rate, count = 1000.0, 2000
+    freq, zeta = np.array([41.3, 102.6, 163.9]), np.array([0.00689, 0.008, 0.006])
+    phi = rng.normal(size=(3, 3))
+    force = np.zeros(5 * count + 50)
+    for k in range(5):
+        force[50 + k * count : 53 + k * count] = 100.0 * np.array([0.5, 1.0, 0.5])
+    y = np.zeros((3, force.size))
+    for k, p in enumerate(pole(freq, zeta)):
+        mode = ss.cont2discrete(([abs(p) ** 2], [1.0, -2 * p.real, abs(p) ** 2]), 1 / rate)
+        y += np.outer(phi[:, k] * phi[0, k], ss.lfilter(mode[0][0], mode[1], force))
+    y += noise * np.std(y) * rng.normal(size=y.shape)
+    found = impact_frf(force, y, rate, segment=1.9).identify(band=(20.0, 250.0), hold=rate)
+    assert found.freq == pytest.approx(freq, rel=1e-3)
+    assert found.zeta == pytest.approx(zeta, rel=0.03)
+    assert np.abs((found.poles - pole(freq, zeta)).real / found.std.real).max() < 3.5
+
+
+def test_a_line_without_damping_is_no_pole():
+    """Mains in the response: after the window is taken out nothing damps it."""
+    rng = np.random.default_rng(5)
+    force = blows([0.1, 1.4, 2.6], 16_000)
+    time = np.arange(force.size) / RATE
+    y = 1e-3 * np.sin(2 * np.pi * 333.3 * time + 0.3) + 1e-6 * rng.normal(size=force.size)
+    test = impact_frf(force, y, RATE, segment=1.0)
+    found = identify_modes(test.frf.replace(variance=None, correlation=None), band=(300.0, 360.0))
+    undamped = found.replace(poles=found.poles.imag * 1j - 4.0 - 1e-6 * (found.poles.real < -4.1))
+    with pytest.raises(SolverError, match="beyond the window"):
+        test.corrected(undamped.replace(poles=undamped.poles.imag * 1j - 3.9))
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "text"),
+    [
+        ({"segment": 9.0}, ModelError, "segment"),
+        ({"segment": -1.0}, ModelError, "segment"),
+        ({"decay": 0.0}, ModelError, "decay"),
+        ({"level": 1.5}, ModelError, "level"),
+        ({"quantity": "position"}, LabelError, "quantity"),
+        ({"limits": 5.0}, ShapeError, "limits"),
+        ({"limits": {"x": 5.0}}, LabelError, "channel"),
+        ({"force": np.zeros((2, 4000))}, ModelError, "no blow"),
+        ({"response": np.zeros(300)}, ShapeError, "same experiments"),
+    ],
+)
+def test_bad_impact_tests_are_refused(changes, error, text):
+    force = blows([0.1, 0.5], 4000)
+    noise = np.random.default_rng(0).normal(size=force.size)
+    arguments = {"force": force, "response": force + noise, "rate": RATE, "segment": 0.2} | changes
+    with pytest.raises(error, match=text):
+        impact_frf(**arguments)
