@@ -13,7 +13,6 @@ from ..checks import ComplexArray, FloatArray, IntArray, Value, between, positiv
 from ..errors import ModelError, ShapeError, SolverError, counted, unknown_label
 from ..lti.frequency import Frf
 from ..tolerances import TINY
-from .identify import identify_modes
 from .result import IdentifiedModes
 from .spectra import Records, dropouts_warned, error_statistics, records
 
@@ -31,7 +30,26 @@ FREEDOM = 8
 
 @dataclass(frozen=True)
 class Blow:
-    """One blow: on which input, when [s], how hard, in which experiment; and why it is refused."""
+    """One blow of an impact test.
+
+    Parameters
+    ----------
+    input : str
+        The channel of its force.
+    time : float [s]
+        When its pulse begins.
+    peak : float
+        Largest force, in the unit of the record.
+    experiment : int
+        In which record, from 0.
+    reason : str
+        Why it is refused, empty where it is not.
+
+    Examples
+    --------
+    >>> print(Blow("1:z", 2.0, 180.0, reason="another blow follows after 0.04 s"))
+    1:z at 2 s, 180: another blow follows after 0.04 s
+    """
 
     input: str
     time: float
@@ -73,8 +91,9 @@ class ImpactTest(Value):
     >>> test = fx.identification.impact_frf(force, response, 1e3, segment=2.0)
     >>> print(test)
     <ImpactTest: 2 blows used, 0 refused, segments of 2 s, window of 0.5 s>
-    >>> -test.identify(band=(20.0, 60.0)).poles.real.round(1)  # the window alone damps by 2
-    array([2.])
+    >>> seen = fx.identify_modes(test.frf, band=(20.0, 60.0))
+    >>> -seen.poles.real.round(1), -test.corrected(seen).poles.real.round(1)
+    (array([4.]), array([2.]))
     """
 
     frf: Frf
@@ -95,21 +114,6 @@ class ImpactTest(Value):
             f"segments of {self.segment:.4g} s, {window}>"
         )
         return "\n".join([head, *(f"  refused {blow}" for blow in self.refused)])
-
-    def identify(self, **options: Any) -> IdentifiedModes:
-        """Return the machine's modes: those of the FRF without the window's damping.
-
-        Parameters
-        ----------
-        **options
-            As for `identify_modes`: band, orders, dofs, ...
-
-        Raises
-        ------
-        ModelError, SolverError
-            As `identify_modes`.
-        """
-        return self.corrected(identify_modes(self.frf, **options))
 
     def corrected(self, found: IdentifiedModes) -> IdentifiedModes:
         r"""Return modes identified from `frf` without the window's damping.
@@ -182,7 +186,7 @@ def impact_frf(
 
     Blows are the pulses of the force in long records. Each has a segment of its own, in which the
     force beside the pulse is set to zero (the force window) and force and responses are multiplied
-    by ``exp(-t/decay)``, which moves all poles by -1/decay (`ImpactTest.identify` takes it out).
+    by ``exp(-t/decay)``, which moves all poles by -1/decay (`ImpactTest.corrected` takes it out).
     What rings on at the end of a segment, and into the next one, changes residues and no pole.
     Left out are blows with another one in their segment, clipped ones, and those cut off by the
     end of the record.
