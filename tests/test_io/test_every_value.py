@@ -253,6 +253,9 @@ def of_updates(rom, unknowns, residual, fit):
         fx.updating.Tikhonov(),
         fx.updating.Lasso(),
     )
+    blow, answer = np.zeros(90), np.arange(90.0) % 7
+    blow[[10, 50]] = 1.0
+    yield fx.identification.impact_frf(blow, answer, 100.0, segment=0.3)
     yield fx.identifiability(rom, unknowns, [residual])
     yield fx.localise(rom, [residual], [fx.AddedMass(label) for label in rom.dofs.labels[:4]])
     yield fx.updating.correlate(fit.model, [residual])

@@ -28,8 +28,8 @@ WINDOWS = 4.0
 FREEDOM = 8
 
 
-@dataclass(frozen=True)
-class Blow:
+@dataclass(frozen=True, eq=False, repr=False)
+class Blow(Value):
     """One blow of an impact test.
 
     Parameters
@@ -47,8 +47,8 @@ class Blow:
 
     Examples
     --------
-    >>> print(Blow("1:z", 2.0, 180.0, reason="another blow follows after 0.04 s"))
-    1:z at 2 s, 180: another blow follows after 0.04 s
+    >>> Blow("1:z", 2.0, 180.0, reason="another blow follows after 0.04 s")
+    <Blow: 1:z at 2 s, 180: another blow follows after 0.04 s>
     """
 
     input: str
@@ -57,9 +57,9 @@ class Blow:
     experiment: int = 0
     reason: str = ""
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         why = f": {self.reason}" if self.reason else ""
-        return f"{self.input} at {self.time:.4g} s, {self.peak:.3g}{why}"
+        return f"<Blow: {self.input} at {self.time:.4g} s, {self.peak:.3g}{why}>"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -113,7 +113,7 @@ class ImpactTest(Value):
             f"<ImpactTest: {counted(len(self.used), 'blow')} used, {len(self.refused)} refused, "
             f"segments of {self.segment:.4g} s, {window}>"
         )
-        return "\n".join([head, *(f"  refused {blow}" for blow in self.refused)])
+        return "\n".join([head, *(f"  refused {blow!r}" for blow in self.refused)])
 
     def corrected(self, found: IdentifiedModes) -> IdentifiedModes:
         r"""Return modes identified from `frf` without the window's damping.
@@ -364,7 +364,7 @@ def _blows(
 def _require_blows(inputs: tuple[str, ...], forces: list[Any], refused: list[Blow]) -> None:
     for name, found in zip(inputs, forces, strict=True):
         if not found:
-            why = "; ".join(str(blow) for blow in refused if blow.input == name)
+            why = "; ".join(repr(blow) for blow in refused if blow.input == name)
             raise ModelError(
                 f"{name} has no blow that can be used ({why or 'no pulse in its record'}): "
                 "shorten segment= where blows follow too soon, check level= and the ranges, or "
