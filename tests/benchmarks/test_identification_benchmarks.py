@@ -1,10 +1,12 @@
-"""Identification beside its peers on a pair at 47.5 and 48.2 Hz; run with ``-m benchmark -s``."""
+"""Identification beside its peers: a close pair, real sets, 56 FRFs; ``-m benchmark -s``."""
 
 import time
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 
 from flexplant.identification import identify_modes
 from flexplant.lti import Frf
@@ -13,6 +15,7 @@ from oracles_identification import modal_frf, noisy, pole
 pytestmark = pytest.mark.benchmark
 FREQ = np.arange(10.0, 150.0, 0.05)
 TRUTH = pole([47.5, 48.2, 112.0], [0.004, 0.004, 0.01])
+MEASURED = Path(__file__).parents[3] / "shared" / "data" / "measured"
 PHI = np.random.default_rng(0).normal(size=(5, 3))
 
 
@@ -78,3 +81,82 @@ def test_the_close_pair_beside_peers(level):
     assert ours[0].max() < 0.1 * level
     for error, _, _ in rows.values():
         assert ours[0].max() < 1.5 * error.max()
+
+
+def ruler_lines():
+    """Real: ten places of a ruler, of examples/ruler.py; picked by hand by those who measured."""
+    stored = np.load(Path(__file__).parents[2] / "examples" / "data" / "ruler.npz")
+    truth = np.array([39.5, 108.5, 212.5, 269.7, 352.3])
+    frf = Frf(stored["freq"], stored["accelerance"][:, None].astype(complex))
+    return frf.replace(quantity="acceleration"), truth, None
+
+
+def one_published_mode():
+    content = scipy.io.loadmat(MEASURED / "vt_case1.mat")
+    freq, H = content["Freq_domain"].ravel().astype(float), content["Hf_chan_2"].ravel()
+    inside = (freq >= 100.0) & (freq <= 300.0)
+    frf = Frf(freq[inside], H[None, None, inside], quantity="acceleration")
+    return frf, np.array([212.09]), None
+
+
+def stage_of_56():
+    rng, freq = np.random.default_rng(3), np.linspace(20.0, 400.0, 950)
+    truth = np.array([41.0, 66.0, 93.0, 118.0, 152.0, 187.0, 224.0, 268.0, 311.0, 359.0])
+    phi = rng.normal(size=(14, 10))
+    H = modal_frf(freq, pole(truth, np.full(10, 0.01)), phi, phi[:4])
+    return Frf(freq, noisy(H, 1e-3 * np.sqrt(np.mean(np.abs(H) ** 2)), rng)), truth, 0.01
+
+
+@pytest.mark.parametrize("case", [ruler_lines, one_published_mode, stage_of_56])
+def test_poles_damping_and_time_beside_a_quick_peer(case):
+    """Poles of the peer are picked at the true frequencies, ours by nobody."""
+    EMA = pytest.importorskip("sdypy.EMA")
+    if case is one_published_mode and not MEASURED.exists():
+        pytest.skip(f"{MEASURED} is not there")
+    frf, truth, zeta = case()
+
+    def of_peer():
+        flat = frf.data.reshape(-1, frf.freq.size)
+        low, high = float(frf.freq[0]), float(frf.freq[-1])
+        form = "accelerance" if frf.quantity == "acceleration" else "receptance"
+        model = EMA.Model(
+            flat, frf.freq, lower=low, upper=high, pol_order_high=40, frf_form=form
+        )  # fmt: skip
+        model.get_poles(show_progress=False)
+        model.select_closest_poles(list(truth), f_window=3)
+        return np.array(model.nat_freq), np.array(model.nat_xi)
+
+    def ours(refine):
+        found = identify_modes(frf, refine=refine)
+        return found.freq, found.zeta
+
+    rows = {}
+    methods = {
+        "sdypy-EMA": of_peer,
+        "first answer": lambda: ours(False),
+        "default": lambda: ours(None),
+    }
+    for name, method in methods.items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            method()  # modules are loaded
+            start = time.process_time()
+            freq, damping = method()
+            spent = time.process_time() - start
+        near = np.abs(freq[:, None] - truth).argmin(axis=0)
+        off = np.abs(freq[near] / truth - 1)
+        worst = np.nan if zeta is None else np.abs(damping[near] / zeta - 1).max()
+        rows[name] = off, worst, freq.size, spent
+    print(f"\n{case.__name__}: {frf.data[..., 0].size} FRFs, {frf.freq.size} lines")
+    for name, (off, worst, count, spent) in rows.items():
+        ratio = spent / rows["sdypy-EMA"][3]
+        print(
+            f"{name:14s} {np.sum(off < 5e-3)} of {truth.size} within 0.5 %, worst {off.max():.1e},"
+            f" damping off by {worst:.1e}, {count} poles, {spent:.2f} s, ratio {ratio:.1f}"
+        )
+    default, peer = rows["default"], rows["sdypy-EMA"]
+    assert np.all(default[0] < 5e-3)
+    if zeta is not None:
+        assert default[1] < 0.03
+        assert default[2] == truth.size
+        assert default[0].max() < 1.1 * peer[0].max()
