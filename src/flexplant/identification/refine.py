@@ -323,34 +323,43 @@ class Fit:
 
     def gradient(self) -> tuple[FloatArray, FloatArray]:
         """Return J^T J and J^T e of the nonlinear parameters, all outputs together."""
-        count = 2 * self.participation.size
-        self.lines.work.add(self.lines.data.size * count**2)
-        N, g = np.zeros((count, count)), np.zeros(count)
-        for o, (_, error) in enumerate(self.bases):
-            J, _ = self._jacobian(o)
-            N += J.T @ J
-            g += J.T @ error
+        N, g, _ = self._equations
         return N, g
 
-    def normal(self) -> tuple[FloatArray, list[ComplexArray], tuple[Any, ...]]:
-        """Return J^T J, J and the maps of the shapes, of the nonlinear parameters.
+    @cached_property
+    def _equations(self) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
+        """J^T J and J^T e, and per output what the shapes take of J."""
+        count = 2 * self.participation.size
+        self.lines.work.add(self.lines.data.size * count**2)
+        N, g, taken = np.zeros((count, count)), np.zeros(count), []
+        for o, (_, error) in enumerate(self.bases):
+            J, common = self._jacobian(o)
+            N += J.T @ J
+            g += J.T @ error
+            taken.append(common)
+        return N, g, taken
 
-        J per output (n_in, n_freq, n_parameters); the maps per output are d[Re psi; Im psi] /
-        d(poles, participation) and, these held, its rows by the weighted data (n_in, n_freq, 2 m).
+    def jacobians(self) -> Iterator[ComplexArray]:
+        """Yield J (n_in, n_freq, n_parameters) per output."""
+        n_in, n_freq = self.lines.data.shape[1:]
+        for o in range(len(self.bases)):
+            split = self._jacobian(o)[0].reshape(n_in, 2, n_freq, -1)
+            yield split[:, 0] + 1j * split[:, 1]
+
+    def maps(self) -> list[tuple[FloatArray, ComplexArray]]:
+        """Return per output how its shapes follow.
+
+        d[Re psi; Im psi] / d(poles, participation) and, these held, its rows by the weighted data
+        (n_in, n_freq, 2 m).
         """
         n_in, n_freq = self.lines.data.shape[1:]
-        count = 2 * self.m * n_in
-        N, kept, maps = np.zeros((count, count)), [], []
-        for o, (Q, _) in enumerate(self.bases):
-            J, common = self._jacobian(o)
+        found = []
+        for o, ((Q, _), common) in enumerate(zip(self.bases, self._equations[2], strict=True)):
             R, size = self.triangles[o]
             inverse = la.pinv(R, rtol=RANK) / size[:, None]
             rows = (Q @ inverse.T).reshape(n_in, 2, n_freq, 2 * self.m)
-            maps.append((-inverse @ common, rows[:, 0] + 1j * rows[:, 1]))
-            N += J.T @ J
-            split = J.reshape(n_in, 2, n_freq, count)
-            kept.append(split[:, 0] + 1j * split[:, 1])
-        return N, kept, tuple(maps)
+            found.append((-inverse @ common, rows[:, 0] + 1j * rows[:, 1]))
+        return found
 
 
 def free_inputs(pivots: Any, n_in: int) -> IntArray:

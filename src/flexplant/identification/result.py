@@ -91,7 +91,7 @@ def _covariances(fit: Fit, ready: PreparedLines) -> tuple[FloatArray, ComplexArr
     independent unless outputs share errors. Noise that acts on the machine is shared: near a
     resonance it moves all outputs along the shape, which is scale.
     """
-    N, jacobian, maps = fit.normal()
+    N, maps = fit.gradient()[0], fit.maps()
     m, n_out, n_in = fit.poles.size, len(maps), fit.participation.shape[0]
     size = np.sqrt(np.maximum(np.diag(N), TINY))
     # participation of repeated poles is known up to a rotation only: it gets no variance
@@ -104,7 +104,7 @@ def _covariances(fit: Fit, ready: PreparedLines) -> tuple[FloatArray, ComplexArr
         for a, own in enumerate(direct):
             held[a, a] = _inner(own, own)
     else:
-        gains = [np.einsum("ifp,qp->ifq", J, inverse) for J in jacobian]
+        gains = [np.einsum("ifp,qp->ifq", J, inverse) for J in fit.jacobians()]
         common = np.zeros_like(inverse)
         for a in range(n_out):
             for b in range(n_out):
