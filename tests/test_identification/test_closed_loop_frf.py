@@ -131,7 +131,8 @@ def test_the_direct_way_is_biased_towards_the_controller_and_the_joint_one_is_no
     r = 3e-6 * rng.normal(size=(1, 3, 50_000))
     u, y = measured(50.0, rng, setpoint=r, sensor=2e-6)
     method = H1Estimator(segment=0.5)
-    joint = estimate_frf(u, y, RATE, method=method, reference=r)
+    with pytest.warns(FlexplantWarning, match=r"at 1 of 1249 lines, 2 .. 2 Hz, the references"):
+        joint = estimate_frf(u, y, RATE, method=method, reference=r)
     direct = estimate_frf(u, y, RATE, method=method)
     freq, G = transfer(2500)
     inner = (freq > 20) & (freq < 200)
@@ -157,10 +158,14 @@ def test_noise_that_returns_through_the_controller_is_warned_of():
     method = H1Estimator(segment=1.0)
     with pytest.warns(FlexplantWarning, match="made in closed loop.*reference="):
         direct = estimate_frf(u, y, RATE, method=method, quantity="displacement")
+    with pytest.warns(FlexplantWarning, match=r"lines, 1 .. \d+ Hz, the references are too weak"):
+        joint = estimate_frf(u, y, RATE, method=method, reference=r, quantity="displacement")
+    freq, G = transfer(5000)
+    off = np.mean(np.abs(joint.data - G) ** 2 / joint.variance, axis=(0, 1))
+    assert off[0] > 10.0  # the loop leaves the input to noise
+    assert np.mean(off[freq > 40.0]) < 1.2
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        joint = estimate_frf(u, y, RATE, method=method, reference=r, quantity="displacement")
-        freq, G = transfer(5000)
         _, own = transfer(50_000)
         Y = np.einsum("ijf,ejf->eif", own, np.fft.rfft(r)[:, :, 1:25_000])
         y = np.fft.irfft(np.pad(Y, [(0, 0), (0, 0), (1, 1)]), 50_000, axis=2)

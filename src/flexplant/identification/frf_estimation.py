@@ -74,7 +74,8 @@ def estimate_frf(
         When an output keeps one value for longer than quantisation explains: a drop-out. When,
         without a reference, the machine seems to respond before its inputs act: noise returns
         through a controller, and the estimate is biased (set-points as the only excitation bias
-        it without that sign: pass reference= in closed loop always). When averages of segments
+        it without that sign: pass reference= in closed loop always); with one, at lines where the
+        inputs are mostly noise. When averages of segments
         are taken of inputs that repeat (`Periodic`) or are pulses (`impact_frf`). With
         `Periodic`: when the inputs do not repeat after the stated period (it or the rate is
         wrong), or when a transient has not died away, with the periods to discard.

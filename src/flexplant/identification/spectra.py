@@ -199,6 +199,7 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
                 "method=H1Estimator(...) or Periodic(...)."
             )
         back = found.block("u", "r")
+        weak_references_warned(found)
         G = _right_divided(found.block("y", "r"), back)
         explained = _solved(found.block("r", "r"), found.block("r", "y"))
         inverse = _inverse(back @ _solved(found.block("r", "r"), back.conj().transpose(0, 2, 1)))
@@ -224,6 +225,27 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
     if data.r is None:
         feedback_warned(feedback(frf))
     return frf
+
+
+#: averages times power of the inputs that references explain over the rest: below, the errors of
+#: the quotient are a hundred times what its variance says in the mean, above 6 they are as it says
+STRONG = 8.0
+
+
+def weak_references_warned(found: Averages) -> None:
+    """Warn of lines at which references hardly move the inputs: the quotient is not known there."""
+    back, power = found.block("u", "r"), np.einsum("fuu->fu", found.block("u", "u")).real
+    moved = _solved(found.block("r", "r"), back.conj().transpose(0, 2, 1))
+    explained = np.einsum("fur,fru->fu", back, moved).real
+    strength = found.count * explained / np.maximum(power - explained, TINY * power)
+    weak = found.freq[np.min(strength, axis=1) < STRONG]
+    if weak.size:
+        warn(
+            f"at {weak.size} of {found.freq.size} lines, {weak[0]:.4g} .. {weak[-1]:.4g} Hz, the "
+            "references are too weak in the inputs: noise and the controller make most of them, "
+            "and S_yr S_ur^-1 divides by little. The variance is too small there. Leave these "
+            "lines out, band=, or excite more there, measure longer, or take Periodic(...)."
+        )
 
 
 def error_statistics(left: ComplexArray, inverse: ComplexArray) -> tuple[FloatArray, ComplexArray]:
