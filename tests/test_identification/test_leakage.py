@@ -106,7 +106,6 @@ PHI = np.array([[1.0, 0.8], [0.6, -1.0], [-0.7, 0.5]])
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:segments of 4 s are too short")  # it is 0.5 %, see below
 def test_fits_over_hann_lines_claim_what_they_are_off_by():
     """60 records, four poles parts each: the rms of z is 1 within 15 %; it was 1.4."""
     truth, rate, scores, misfits = pole(FREQS, ZETA), 400.0, [], []
