@@ -56,8 +56,8 @@ REGION = 20
 #: values of the FRF times (poles times references) squared, the products of a step of the fit, up
 #: to which it is made without a request: some seconds altogether
 CHEAP = 5e7
-#: products that a refinement without a request may take in all, some twenty seconds
-BUDGET = 5e9
+#: products that a refinement without a request may take in all, a minute or two
+BUDGET = 2e10
 #: steps of the first answer: the diagram's poles are off by more than noise makes them
 QUICK = 2
 
@@ -200,8 +200,8 @@ def identify_modes(
         input and an output share a DOF.
     refine : bool, optional
         Whether to fit by maximum likelihood; when not given, where that is cheap (values of the FRF
-        times (poles times references) squared up to 5e7 at each step, 5e9 in all) and worth it: not
-        where poles of each output's own leave noise alone and shared ones far more, as outputs
+        times (poles times references) squared up to 5e7 at each step, 2e10 in all) and worth it:
+        not where poles of each output's own leave noise alone and shared ones far more, as outputs
         that disagree do. False takes about a second.
     most : int
         Poles that the fit may have.
@@ -362,6 +362,7 @@ def _identified(
                 deviation = np.sqrt(np.diag(apart.covariance)[: fit.poles.size])
                 reported, others = steady(fit, reported, deviation)
                 rejected = tuple(sorted(rejected + others))
+        if compare or budget.done > BUDGET:
             warned(unexplained(lines, fit), None if apart is None else apart.size)
         answered = answer(
             frf, ready, lines, fit, reported, labels, diagram, rejected, reason, apart
