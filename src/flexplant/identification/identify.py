@@ -57,7 +57,7 @@ REGION = 20
 #: to which it is made without a request: some seconds altogether
 CHEAP = 5e7
 #: products that a refinement without a request may take in all, a minute or two
-BUDGET = 2e10
+BUDGET = 5e10
 #: steps of the first answer: the diagram's poles are off by more than noise makes them
 QUICK = 2
 
@@ -200,7 +200,7 @@ def identify_modes(
         input and an output share a DOF.
     refine : bool, optional
         Whether to fit by maximum likelihood; when not given, where that is cheap (values of the FRF
-        times (poles times references) squared up to 5e7 at each step, 2e10 in all) and worth it:
+        times (poles times references) squared up to 5e7 at each step, 5e10 in all) and worth it:
         not where poles of each output's own leave noise alone and shared ones far more, as outputs
         that disagree do. False takes about a second.
     most : int

@@ -23,8 +23,9 @@ FINE, COARSE, ROUGH = 1e-5, 1e-2, 0.3
 PATIENCE, HOPE = 4, 20.0
 #: steps of a fit of one output: its poles begin near
 OWN = 20
-#: least damping ratio of a pole
-LEAST = 1e-7
+#: least damping ratio of a pole, and how many times farther from zero than the highest line it may
+#: be: there it is a constant to a hundredth, and with a hold its exponential still a number
+LEAST, FARTHEST = 1e-7, 100.0
 
 
 class Exhausted(Exception):  # noqa: N818 - no error: the first answer stands
@@ -132,6 +133,7 @@ def refined(
     damping, idle = 1e-6, 0
     power = float(np.sum(np.abs(lines.data * lines.weight) ** 2))
     enough = ROUGH if poles_only else FINE if fine else COARSE
+    farthest = FARTHEST * 2 * np.pi * float(lines.freq[-1])
     for number in range(steps):
         N, g = now.gradient()
         size = np.sqrt(np.maximum(np.diag(N), TINY))
@@ -148,7 +150,8 @@ def refined(
         for _ in range(12):
             step = _step(scaled, slope, damping) / size
             trial = _moved(poles, participation, pivots, step)
-            if np.abs(trial[1]).max() < 1e6 and np.all(trial[0].imag > 0):
+            near = np.abs(trial[0]).max() < farthest and np.abs(trial[1]).max() < 1e6
+            if near and np.all(trial[0].imag > 0):
                 better = Fit(lines, *trial, pivots)
                 gained = now.cost - better.cost
                 if gained >= 0:
