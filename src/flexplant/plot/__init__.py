@@ -31,6 +31,7 @@ from .nyquist import pole_map as pole_map
 from .placement import pareto_curve as pareto_curve
 from .placement import placed as placed
 from .placement import sensor_map as sensor_map
+from .pole_picker import PolePicker as PolePicker
 from .report import report as report
 from .response import response as response
 from .response import step as step
