@@ -70,7 +70,7 @@ def test_draws_spread_as_stated():
         ({"delay": 3.0}, ModelError, "cannot become negative"),
         ({"parameters": {}}, ModelError, "empty"),
         ({"parameters": {"mass": 0.1}}, ModelError, "AddedMass"),
-        ({"parameters": {fx.AddedMass("1:z"): 0.1}, "delay": 0.1}, ModelError, "alone"),
+        ({"parameters": {fx.AddedMass("1:z"): 0.1}}, ModelError, "ReducedModel or an FEModel"),
     ],
 )
 def test_what_cannot_be_stated_is_refused(arguments, error, said):
@@ -82,6 +82,16 @@ def test_a_fit_and_a_stated_share_exclude_each_other():
     measured = fx.MeasuredModes([-1 + 1500j], modes=[4], covariance=np.eye(2))
     with pytest.raises(ModelError, match="Pass one or the other"):
         plant().uncertain(measured, frequency=0.01)
+
+
+def test_gains_and_delay_go_beside_a_source():
+    omega = swing(plant())[0][:2]
+    poles, covariance = (-1e-3 + 1j) * omega, np.diag([0.1, 0.1, 4.0, 4.0])
+    measured = fx.MeasuredModes(poles, modes=[4, 5], covariance=covariance)
+    uncertain = plant().uncertain(measured, gain={"u1": 0.1}, delay=0.2)
+    names = [delta.name for delta in uncertain.deltas]
+    assert names[-2:] == ["u1:gain", "delay"] and "mode4:freq" in names
+    assert len({one.delay for one in uncertain.sample(2, 3)}) == 3
 
 
 def response(system, freq):
@@ -134,7 +144,7 @@ def spring_of_masses(extra=0.0):
     modes = fx.solve_modes(model, count=3, damping=fx.ModalDamping(0.01))
     drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
     ports = fx.testbeds.three_masses().assembled.ports
-    return fx.assemble_plant(drawing, ports).discretized(2e3, delay=1)
+    return fx.assemble_plant(drawing, ports).discretized(2e3, delay=1.3)
 
 
 def test_a_parameter_of_the_model():
@@ -152,6 +162,67 @@ def test_a_parameter_of_the_model():
     masses = np.array([swing(one)[0][0] for one in uncertain.sample(1, 100)])
     slope = (swing(found)[0][0] - swing(spring_of_masses())[0][0]) / 2.0
     assert masses.std() == pytest.approx(abs(slope), rel=0.25)  # two deviations at delta = 1
+
+
+BESIDE = {"mass at 3:x": 1.0, "mode2:freq": -1.0, "mode3:damping": 1.0, "u1:gain": -0.5}
+
+
+def every_kind(**more):
+    stated = {"frequency": {2: 0.02}, "damping": {3: 0.3}, "gain": {"u1": 0.1}} | more
+    return spring_of_masses().uncertain(parameters={fx.AddedMass("3:x"): 0.05}, **stated)
+
+
+def test_a_parameter_beside_modes_and_gains():
+    """The matrices by hand: a heavier mass, and K and D changed along two modes."""
+    M, K = np.eye(3), np.array([[4e5, -4e5, 0.0], [-4e5, 8e5, -4e5], [0.0, -4e5, 4e5]])
+    values, phi = np.linalg.eigh(K)
+    omega = np.sqrt(np.maximum(values, 0.0))
+    zeta = np.array([0.0, 0.01, 0.01 * 1.3])
+    K = K - 0.04 * values[1] * np.outer(phi[:, 1], phi[:, 1])
+    D = phi @ np.diag(2.0 * zeta * omega) @ phi.T
+    M[2, 2] += 0.05
+    A = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.linalg.solve(M, K), -np.linalg.solve(M, D)]])
+    poles = np.linalg.eigvals(A)
+    poles = poles[poles.imag > 1.0]
+    uncertain = every_kind()
+    found = uncertain.lft(BESIDE)
+    np.testing.assert_allclose(swing(found)[0], np.sort(np.abs(poles)), rtol=1e-6)
+    s = 2j * np.pi * 130.0
+    drive = np.linalg.solve(M * s**2 + D * s + K, np.array([1.0, 0.0, 0.0]))
+    assert np.abs(response(found.continuous.Gyu, 130.0)).max() == pytest.approx(
+        0.95 * np.abs(drive).max(), rel=1e-6
+    )
+    made, wanted = closed_deltas(uncertain, BESIDE), response(found.continuous.system, 130.0)
+    np.testing.assert_allclose(made, wanted, rtol=1e-8, atol=1e-9 * np.abs(wanted).max())
+    draws = every_kind(delay=0.1).sample(1, 20)
+    assert len({one.delay for one in draws}) == 20
+    assert len({swing(one)[0][0] for one in draws}) == 20
+    for wrong, said in (
+        ({"delay": 9.0}, "become negative"),
+        ({"gain": 1.0}, "sign is not known"),
+        ({"frequency": None, "damping": None, "modes": [2]}, "nothing uncertain"),
+    ):
+        with pytest.raises(ModelError, match=said):
+            every_kind(**wrong)
+
+
+@pytest.mark.slow
+def test_a_loop_under_all_kinds_at_once():
+    """What mu calls stable is stable on machines at corners, which are solved anew."""
+    plant = spring_of_masses()
+    observer = fx.design_kalman(plant)
+    servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    shares = {"frequency": {2: 0.005}, "damping": {3: 0.1}}
+    uncertain = every_kind(**shares, delay=0.1)
+    found = fx.synthesis.robust_stability(uncertain, observer, servo, machines=2)
+    size = 0.98 / found.upper
+    random = np.random.default_rng(1)
+    loop = fx.close_loop(plant, observer, servo)
+    for _ in range(16):
+        corner = random.choice([-size, size], len(uncertain.deltas))
+        values = {d.name: float(x) for d, x in zip(uncertain.deltas, corner, strict=True)}
+        assert loop.around(uncertain.lft(values)).is_stable
+    assert found.lower > 0.9 * found.upper
 
 
 def test_a_gain_margin_is_what_mu_says():

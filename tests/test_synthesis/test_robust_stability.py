@@ -184,8 +184,11 @@ def test_one_channel_a_mode_makes_every_machine_keep_the_weights():
         weighted = machine.weighted(w=w, z={name: z.get(name) for name in machine.z})
         gains.append(fx.hinf_norm(lft(weighted.system, found.system)))
     assert 0.9 * found.gamma < max(gains) < 1.01 * found.gamma
+    assert 0.9 < found.certificate["largest gain of machines over mu"] < 1.01
     worst = worst_case_gain(deltas, found, w=w, z=z)
     assert worst.lower <= found.gamma * 1.02
+    with pytest.raises(LabelError, match="'push'"):
+        design_mu(deltas, w={"push": 1.0}, z=z)
 
 
 def test_a_delay_within_a_sample_is_a_delta():

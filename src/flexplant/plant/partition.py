@@ -13,6 +13,7 @@ from ..errors import LabelError, ModelError, counted, require_known, unknown_lab
 from ..labels import DIRECTIONS
 from ..lti.statespace import StateSpace, System, as_statespace
 from .origin import ELSEWHERE, Assembled, Foreign, Origin
+from .realisation import MODAL
 
 
 def is_system(given: object) -> TypeGuard[System]:
@@ -247,7 +248,7 @@ class Partition(Value):
     @property
     def has_own_modes(self) -> bool:
         """Whether it has modes, not weighted, each with its own frequency and damping."""
-        return self.is_assembled and not self.is_weighted and self.form == "modal blocks"
+        return self.is_assembled and not self.is_weighted and self.form == MODAL
 
     @property
     def form(self) -> str:

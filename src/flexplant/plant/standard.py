@@ -245,16 +245,18 @@ class StandardPlant(Partition):
         parameters : sequence of Parameter or {Parameter: float}, optional
             Those that were given to `update`, in its order; those the fit keeps when not given. Or
             in place of a source parameters with the amount by which each may be off at delta = 1,
-            in its own unit: ``{AddedMass("41:z"): 0.025}`` for 0.5 kg within 5 %.
+            in its own unit: ``{AddedMass("41:z"): 0.025}`` for 0.5 kg within 5 %. All that follows
+            may be stated beside these; a mode is then that of the nominal plant, whose K changes
+            by a share of ``omega^2 (M phi)(M phi)'``.
         frequency, damping : float, (m,) array or {mode: float}, optional
             In place of a source: by what share frequencies and damping of modes may be off, at
             delta = 1; one for all, one for each of `modes`, or by mode. ``frequency=0.005`` is
             what an updated model of a structure seldom does better than where it was not measured.
         gain : float or {name: float}, optional
             By what share the gains of actuators and sensors may be off: `u1:gain`; one for all, or
-            by name.
+            by name. Beside a source too.
         delay : float [samples], optional
-            By how much the delay of a sampled plant may be off, more or less.
+            By how much the delay of a sampled plant may be off, more or less. Beside a source too.
         modes : sequence of int, optional
             Numbers from 1, rigid-body modes included; all elastic (or all measured) ones when not
             given.

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..certificates import in_words, stability, stability_name
 from ..checks import ComplexArray, FloatArray, Value
-from ..errors import CertificateError, FlexplantWarning, LabelError, counted, warn
+from ..errors import CertificateError, FlexplantWarning, counted, warn
 from ..loop import ClosedLoop, ModeTolerances, SpillOver, close_loop
 from ..lti.norms import peak_gain
 from ..lti.preparation import Prepared
@@ -237,18 +237,14 @@ def checked_loop(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Cl
     """
     plain, reading = plant.unweighted, plant.origin.reading
     whole = larger_plant(plant, larger)
-    sure = whole is None and plain.uncertainty is None
-    if sure and not plain.has_own_modes:
-        return None
     before = [] if reading is None else [reading]
+    # a block that is read in the place of what is measured, under its names: no loop by names
+    renamed = any(set(block.outputs) & set(plain.y) for block in before)
+    if whole is None and plain.uncertainty is None and (renamed or not plain.has_own_modes):
+        return None
     with warnings.catch_warnings():  # one warning is enough, where the user called from
         warnings.simplefilter("ignore", FlexplantWarning)
-        try:
-            loop = close_loop(plain, *before, *blocks, larger=whole)
-        except LabelError:
-            if not sure:
-                raise
-            return None  # what the design reads has names of what is measured: none to close by
+        loop = close_loop(plain, *before, *blocks, larger=whole)
     found = loop.left_out
     if found is not None and not found.is_fine:
         warn(

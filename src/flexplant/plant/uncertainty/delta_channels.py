@@ -23,6 +23,11 @@ from .uncertain_plant import Delta, UncertainPlant, with_changes
 _RANK = 1e-5
 #: relative curvature over a Delta above which another mapping is tried
 _CURVED = 0.01
+#: relative curvature over a Delta that is taken as that of a fraction, as masses have: affine
+#: channels miss the machine by twice this, and are widened by as much
+_BENT = 1e-3
+#: largest norm of a fraction's feedback: its pole lies well beyond the ends of the Delta
+_FEEDBACK = 0.5
 #: largest relative distance of the channels from machines at the corners of the uncertainty
 _LARGEST = 0.05
 
@@ -49,7 +54,7 @@ def delta_channels(uncertain: UncertainPlant[Any]) -> DeltaChannels:
     one, mapped to continuous time (``s = 2 / dt (z - 1) / (z + 1)``, which keeps an undamped mode
     undamped), are nearly affine in the Deltas: each Delta's channels are the difference of the
     machines at its ends, widened by what is curved, and the whole is compared with machines at
-    corners of the uncertainty.
+    corners of the uncertainty. A gain is exact: it is a channel of what all others act on.
     """
     plant = uncertain.plant
     if not plant.dt:
@@ -127,7 +132,7 @@ def _with_neglected(
 def sampled_machine(uncertain: UncertainPlant[Any], values: Mapping[str, float]) -> StateSpace:
     """Return the sampled [w; u] -> [z; y] at some values of the Deltas, its states comparable."""
     plant = uncertain.plant
-    if uncertain.deltas[0].kind != "parameter":
+    if not uncertain.of_matrices:
         exact: StateSpace = uncertain.lft(values).system
         return exact
     if plant.assembled.ports.latencies:
@@ -137,7 +142,12 @@ def sampled_machine(uncertain: UncertainPlant[Any], values: Mapping[str, float])
         )
     g, sizes = _grouped(uncertain)
     amounts = np.concatenate([[values.get(name, 0.0)] * size for name, size in sizes])
-    return discretized(_closed(g, amounts), 1.0 / plant.dt, delay=plant.delay, delayed=plant.u)
+    late = plant.delay + sum(
+        delta.scale * values.get(delta.name, 0.0)
+        for delta in uncertain.deltas
+        if delta.kind == "delay"
+    )
+    return discretized(_closed(g, amounts), 1.0 / plant.dt, delay=late, delayed=plant.u)
 
 
 def _closed(g: StateSpace, amounts: FloatArray) -> StateSpace:
@@ -148,17 +158,33 @@ def _closed(g: StateSpace, amounts: FloatArray) -> StateSpace:
 
 
 class _Change(NamedTuple):
-    """Half the difference of the machines at both ends of a Delta, relative to the base."""
+    """Half the difference of the machines at both ends of a Delta, and of it what is curved."""
 
     matrix: FloatArray
-    curved: float
+    bend: FloatArray
+
+    @property
+    def curved(self) -> float:
+        """Size of what is curved, relative to the difference of the ends."""
+        return float(0.5 * la.norm(self.bend) / la.norm(self.matrix))
+
+
+class _Part(NamedTuple):
+    """Channels of a Delta: ``delta L (1 - delta F)^-1 R`` is its change of [A B; C D]."""
+
+    name: str
+    left: FloatArray
+    right: FloatArray
+    feed: FloatArray
 
 
 def _sampled_channels(
     uncertain: UncertainPlant[Any],
 ) -> tuple[StateSpace, list[tuple[str, int]]]:
     """Return the bilinear image with channels, and the number of each Delta's."""
-    rate, deltas = 1.0 / uncertain.plant.dt, uncertain.deltas
+    rate = 1.0 / uncertain.plant.dt
+    gains = [delta for delta in uncertain.deltas if delta.kind == "gain"]
+    deltas = [delta for delta in uncertain.deltas if delta.kind != "gain"]
     machines = {
         (delta.name, end): sampled_machine(uncertain, {delta.name: end})
         for delta in deltas
@@ -186,13 +212,15 @@ def _sampled_channels(
         for delta in deltas
         if found[delta.name][1].curved > max(_CURVED, found[delta.name][0].curved)
     }
-    sides: tuple[list[Any], list[Any]] = ([], [])
+    sides: tuple[list[_Part], list[_Part]] = ([], [])
     for delta in deltas:
         side = 0 if delta.mode in far else 1
-        sides[side].append((delta.name, *(direct, mapped)[side].factors(found[delta.name][side])))
+        sides[side].append((direct, mapped)[side].part(delta.name, found[delta.name][side]))
     opened_z = bilinear(_with_channels(base, sides[0]), rate)
-    sizes = [(name, right.shape[0]) for part in sides for name, _, right in part]
-    return _with_channels(slow, sides[1], opened_z), sizes
+    sizes = [(part.name, len(part.right)) for side in sides for part in side]
+    system = _with_channels(slow, sides[1], opened_z)
+    system, first = with_gain_channels(uncertain.plant, system, gains)
+    return system, [*first, *sizes]
 
 
 class _EvenUnits(NamedTuple):
@@ -215,31 +243,42 @@ class _EvenUnits(NamedTuple):
 
     def change(self, base: StateSpace, plus: StateSpace, minus: StateSpace) -> _Change:
         up, down = self.scaled(plus) - self.scaled(base), self.scaled(minus) - self.scaled(base)
-        return _Change(0.5 * (up - down), float(la.norm(0.5 * (up + down)) / la.norm(up - down)))
+        return _Change(0.5 * (up - down), 0.5 * (up + down))
 
-    def factors(self, change: _Change) -> tuple[FloatArray, FloatArray]:
-        """Return L, R with ``L R`` the change, widened by what is curved."""
+    def part(self, name: str, change: _Change) -> _Part:
+        """Return the channels of a Delta, widened by what is curved and no fraction.
+
+        Half the difference of the ends is ``L (1 - F^2)^-1 R``, half their sum, which is zero of
+        what is affine, ``L F (1 - F^2)^-1 R``.
+        """
         left, values, right = la.svd(change.matrix, full_matrices=False)
         rank = int(np.count_nonzero(values > _RANK * values[0]))
-        root = np.sqrt((1.0 + 2.0 * change.curved) * values[:rank])
-        return (left[:, :rank] * root) / self.row[:, None], root[:, None] * right[
-            :rank
-        ] / self.column
+        left, right, root = left[:, :rank], right[:rank], np.sqrt(values[:rank])
+        feed = np.zeros((rank, rank))
+        bend = change.bend
+        if change.curved > _BENT:
+            core = left.T @ bend @ right.T
+            fraction = core / np.outer(root, root)
+            if la.norm(fraction, 2) < _FEEDBACK:
+                feed, bend = fraction, bend - left @ core @ right
+        width = np.sqrt(1.0 + 2.0 * change._replace(bend=bend).curved)
+        seen = (np.eye(rank) - feed @ feed) @ (root[:, None] * right)
+        left, right = left * root / self.row[:, None], seen / self.column
+        return _Part(name, width * left, width * right, feed)
 
 
 def _with_channels(
-    g: StateSpace,
-    parts: list[tuple[str, FloatArray, FloatArray]],
-    opened: StateSpace | None = None,
+    g: StateSpace, parts: Sequence[_Part], opened: StateSpace | None = None
 ) -> StateSpace:
     """Return g with channels of Deltas before its own, after those that `opened` has already."""
     other = g if opened is None else opened
     n, before = g.n_states, len(other.inputs) - len(g.inputs)
-    names = [f"{name}:{i}" for name, _, right in parts for i in range(1, right.shape[0] + 1)]
-    left = np.hstack([np.zeros((n + len(g.outputs), 0)), *(one for _, one, _ in parts)])
-    right = np.vstack([np.zeros((0, n + len(g.inputs))), *(one for _, _, one in parts)])
+    names = [f"{part.name}:{i}" for part in parts for i in range(1, len(part.right) + 1)]
+    left = np.hstack([np.zeros((n + len(g.outputs), 0)), *(part.left for part in parts)])
+    right = np.vstack([np.zeros((0, n + len(g.inputs))), *(part.right for part in parts)])
     right = np.insert(right, [n] * before, 0.0, axis=1)
-    return with_channels(other, before, names, left, right)
+    feed = la.block_diag(np.zeros((0, 0)), *(part.feed for part in parts))
+    return with_channels(other, before, names, left, right, feed)
 
 
 def _distance(
@@ -247,12 +286,17 @@ def _distance(
 ) -> float:
     """Return how far sampled machines at corners are from the channels, relative to their change.
 
-    In z, where no frequency counts more than another.
+    In z, where no frequency counts more than another. Gains are exact, and left at 0 here: their
+    channels act on commands, those of a machine behind the delay, so that states differ.
     """
+    gains = {delta.name for delta in uncertain.deltas if delta.kind == "gain"}
+    if len(gains) == len(sizes):
+        return 0.0
     base = sampled_machine(uncertain, {})
     units = _EvenUnits.of(base)
     found = 0.0
-    for corner in np.random.default_rng(0).choice([-1.0, 1.0], (4, len(sizes))):
+    even = np.array([0.0 if name in gains else 1.0 for name, _ in sizes])
+    for corner in even * np.random.default_rng(0).choice([-1.0, 1.0], (4, len(sizes))):
         values = dict(zip([name for name, _ in sizes], corner.tolist(), strict=True))
         exact = units.scaled(sampled_machine(uncertain, values))
         amounts = np.repeat(corner, [size for _, size in sizes])
@@ -302,6 +346,34 @@ def with_channels(
         name=g.name,
         blocks=g.blocks,
     )
+
+
+def with_gain_channels(
+    plant: Partition, system: StateSpace, deltas: Sequence[Delta]
+) -> tuple[StateSpace, list[tuple[str, int]]]:
+    """Return a system with a first channel for each Delta on a gain, and their names, in order.
+
+    ``(1 + d) u`` acts by d times the command's column more, all but its own effort; ``(1 + d) y``
+    adds d times what the sensor shows of the motion, with what the actuators' Deltas do.
+    """
+    order = sorted(deltas, key=lambda one: one.name.removesuffix(":gain") in plant.y)
+    for delta in order:
+        name = delta.name.removesuffix(":gain")
+        n, (k, m) = system.n_states, (len(system.outputs), len(system.inputs))
+        left, right = np.zeros((n + k, 1)), np.zeros((1, n + m))
+        if name in plant.u:
+            column = system.inputs.index(name)
+            left[:, 0] = np.concatenate([system.B[:, column], system.D[:, column]])
+            left[n + system.outputs.index(f"{name}:effort")] = 0.0
+            right[0, n + column] = delta.scale
+        else:
+            row = system.outputs.index(name)
+            left[n + row] = 1.0
+            right[0] = delta.scale * np.concatenate([system.C[row], system.D[row]])
+            if f"{name}:noise" in system.inputs:
+                right[0, n + system.inputs.index(f"{name}:noise")] = 0.0
+        system = with_channels(system, 0, [delta.name], left, right)  # first: all others see it
+    return system, [(delta.name, 1) for delta in reversed(order)]
 
 
 def require_exact(

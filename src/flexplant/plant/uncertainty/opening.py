@@ -18,14 +18,15 @@ from ...lti.statespace import StateSpace
 from ...tolerances import SAME, TINY
 from ...updating import ModalUncertainty, UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters.added import Parameter
+from ...updating.parameters.matrix_parameters import MatrixParameter
 from ..building import P, continuous_plant
 from ..partition import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
 from ..realisation import ModalRealisation
-from .delta_channels import require_exact, system_matrix, with_channels
+from .delta_channels import require_exact, system_matrix, with_channels, with_gain_channels
 from .mode_deltas import KNOWN, SAME_MODEL, check_poles, judged, stated
 from .neglected import NeglectedModes, neglected_modes, opened
-from .shape_channels import shape_deltas, with_gain_channels, with_shape_channels
+from .shape_channels import shape_deltas, with_shape_channels
 from .uncertain_plant import (
     Delta,
     UncertainPlant,
@@ -56,26 +57,23 @@ def uncertain(
 ) -> UncertainPlant[P]:
     """Return a plant with channels for Deltas; see `StandardPlant.uncertain`."""
     many = positive(deviations, "deviations")
-    by_hand = [one is not None for one in (frequency, damping, gain, delay)]
-    if isinstance(parameters, Mapping):
-        if source is not None or shapes is not None or modes is not None or any(by_hand):
+    by_mode = frequency is not None or damping is not None
+    alone = source is None and shapes is None
+    beside = _of_ports(plant, gain, delay)
+    if by_mode or isinstance(parameters, Mapping):
+        if not alone or not (parameters is None or isinstance(parameters, Mapping)):
             raise ModelError(
-                "parameters={parameter: amount} act on all modes at once: pass them alone, "
-                "without a fit, modes or other uncertainties."
+                "frequency=, damping= and parameters={parameter: amount} state an uncertainty by "
+                "hand; a fit or measured modes bring their own. Pass one or the other; gain= and "
+                "delay= go beside both."
             )
-        return _by_parameters(plant, *_amounts(plant, parameters), many, neglected)
-    if any(by_hand):
-        if source is not None or parameters is not None or shapes is not None:
-            raise ModelError(
-                "frequency=, damping=, gain= and delay= state an uncertainty by hand; a fit or "
-                "measured modes bring their own. Pass one or the other."
-            )
-        deltas: tuple[Delta, ...] = ()
-        if any(by_hand[:2]):
-            deltas = stated(modal_realisation(plant), frequency, damping, modes)
-        deltas += _of_ports(plant, gain, delay)
-        own = np.eye(len(deltas)) / many**2
-        return _with_deltas(plant, deltas, own, many, neglected)
+        if by_mode or modes is not None:
+            beside = stated(modal_realisation(plant), frequency, damping, modes) + beside
+        if parameters is not None:
+            known, amounts = _amounts(plant, parameters)
+            return _by_parameters(plant, known, amounts, many, neglected, beside=beside)
+    if beside and alone and parameters is None:
+        return _with_deltas(plant, beside, np.eye(len(beside)) / many**2, many, neglected)
     if shapes is not None and not isinstance(source, MeasuredModes):
         raise ModelError(
             "deviations of shapes go with measured modes; those of a fit follow from its "
@@ -95,13 +93,14 @@ def uncertain(
             )
         _check_model(plant, source.model)
         about = about_fit(source, unknowns)
-        return _by_parameters(plant, about, covariance, many, neglected, source)
+        return _by_parameters(plant, about, covariance, many, neglected, source, beside)
     realisation = modal_realisation(plant)
     if isinstance(source, UpdateResult) and source.discrepancy and source.fitted_poles is not None:
         source = source.uncertainty()
     if isinstance(source, ModalUncertainty):
         deltas, own = judged(realisation, source, modes, many)
-        return _with_deltas(plant, deltas, own, many, neglected)
+        own = la.block_diag(own, np.eye(len(beside)) / many**2)
+        return _with_deltas(plant, (*deltas, *beside), own, many, neglected)
     if isinstance(source, UpdateResult):
         parameters = source.unknowns if parameters is None else parameters
         numbers, poles, covariance = _fitted_poles(realisation, source, parameters, modes)
@@ -130,8 +129,9 @@ def uncertain(
     keep = sorted(np.flatnonzero(scale > KNOWN), key=lambda i: (every[i].mode, i))
     if not keep:
         raise ModelError(f"modes {list(numbers)} have no variance: there is nothing uncertain.")
-    deltas = tuple(every[i] for i in keep)
+    deltas = (*(every[i] for i in keep), *beside)
     own = covariance[np.ix_(keep, keep)] / np.outer(scale[keep], scale[keep])
+    own = la.block_diag(own, np.eye(len(beside)) / many**2)
     fit = source if isinstance(source, UpdateResult) else None
     more: Sequence[Delta] = ()
     if shapes is not None and isinstance(source, MeasuredModes):
@@ -198,7 +198,8 @@ def _with_deltas(
     system = _opened(plant.continuous, own) if own else plant.continuous.system
     gains = [delta for delta in deltas if delta.kind == "gain"]
     if gains:
-        system = with_gain_channels(plant.continuous, system, own, gains)
+        system, _ = with_gain_channels(plant.continuous, system, gains)
+        require_exact(plant.continuous, system, [*own, *gains], "the gains", "Leave gain= out.")
     if shapes:
         system = with_shape_channels(plant.continuous, system, deltas, shapes)
         covariance = la.block_diag(covariance, np.eye(len(shapes)) / deviations**2)
@@ -219,17 +220,37 @@ def _by_parameters(
     deviations: float,
     neglected: Any,
     fit: UpdateResult | None = None,
+    beside: tuple[Delta, ...] = (),
 ) -> UncertainPlant[P]:
-    """Return a plant with Deltas on parameters, stated or of a fit; stated ones at delta = 1."""
+    """Return a plant with Deltas on parameters, stated or of a fit, and others beside them."""
+    _check_range(beside, deviations)
     std = np.sqrt(np.diag(covariance))
-    scale = std if fit is None else deviations * std
-    system, deltas = by_parameters(plant.continuous, parameters, scale)
+    modes = tuple(delta for delta in beside if delta.mode)
+    scale = np.array([*(std if fit is None else deviations * std), *(d.scale for d in modes)])
+    every = (*parameters, *(_as_parameter(plant, delta) for delta in modes))
+    system, deltas = by_parameters(plant.continuous, every, scale)
+    if gains := [delta for delta in beside if delta.kind == "gain"]:
+        base = plant.continuous
+        alone, _ = with_gain_channels(base, base.system, gains)
+        require_exact(base, alone, gains, "the gains", "Leave gain= out.")
+        system, _ = with_gain_channels(base, system, gains)
     weight = None
     if neglected is not None:
         weight = neglected_modes(plant, neglected)
         system = opened(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
-    own = covariance / np.outer(std, std) / deviations**2
-    return UncertainPlant(plant, system, deltas, own, deviations, weight, fit, parameters)
+    own = la.block_diag(covariance / np.outer(std, std), np.eye(len(beside))) / deviations**2
+    deltas = (*deltas[: len(parameters)], *modes, *(one for one in beside if not one.mode))
+    return UncertainPlant(plant, system, deltas, own, deviations, weight, fit, every)
+
+
+def _as_parameter(plant: Partition, delta: Delta) -> MatrixParameter:
+    """Return a Delta on a mode as a change of K, omega^2 (M phi)(M phi)', or of D."""
+    realisation = plant.assembled.realisation
+    push = np.asarray(plant.model.M @ realisation.inputs[:, 2 * delta.mode - 1])
+    pair = realisation.pairs[delta.mode - 1]
+    if delta.kind == "freq":
+        return MatrixParameter(delta.name, dK=float(np.linalg.det(pair)) * np.outer(push, push))
+    return MatrixParameter(delta.name, dD=-float(np.trace(pair)) * np.outer(push, push))
 
 
 def _check_model(plant: Partition, other: Any) -> None:

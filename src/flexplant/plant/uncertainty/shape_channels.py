@@ -16,35 +16,6 @@ from ..partition import Partition
 from .delta_channels import require_exact, system_matrix, with_channels
 from .uncertain_plant import Delta, modal_realisation, reshaped
 
-
-def with_gain_channels(
-    plant: Partition, system: StateSpace, others: Sequence[Delta], deltas: Sequence[Delta]
-) -> StateSpace:
-    """Return a plant's system with channels for Deltas on gains of actuators and sensors.
-
-    ``(1 + d) u`` acts by d times the command's column more, all but its own effort; ``(1 + d) y``
-    adds d times what the sensor shows of the motion, with what the actuators' Deltas do.
-    """
-    for delta in sorted(deltas, key=lambda one: one.name.removesuffix(":gain") in plant.y):
-        name = delta.name.removesuffix(":gain")
-        n, (k, m) = system.n_states, (len(system.outputs), len(system.inputs))
-        left, right = np.zeros((n + k, 1)), np.zeros((1, n + m))
-        if name in plant.u:
-            column = system.inputs.index(name)
-            left[:, 0] = np.concatenate([system.B[:, column], system.D[:, column]])
-            left[n + system.outputs.index(f"{name}:effort")] = 0.0
-            right[0, n + column] = delta.scale
-        else:
-            row = system.outputs.index(name)
-            left[n + row] = 1.0
-            right[0] = delta.scale * np.concatenate([system.C[row], system.D[row]])
-            if f"{name}:noise" in system.inputs:
-                right[0, n + system.inputs.index(f"{name}:noise")] = 0.0
-        system = with_channels(system, 0, [delta.name], left, right)  # first: all others see it
-    require_exact(plant, system, [*others, *deltas], "the gains", "Leave gain= out.")
-    return system
-
-
 #: relative: a dependence below this is rounding
 _ROUNDING = 1e-9
 

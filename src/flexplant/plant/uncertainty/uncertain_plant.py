@@ -238,6 +238,11 @@ class UncertainPlant(Value, Generic[P]):
         return {d.mode: 0.5 * d.scale for d in self.deltas if d.kind == "freq"}
 
     @property
+    def of_matrices(self) -> bool:
+        """Whether Deltas are changes of M, D and K: of parameters, and of modes beside these."""
+        return any(delta.kind == "parameter" for delta in self.deltas)
+
+    @property
     def channels(self) -> dict[str, str]:
         """The Delta of each of its channels: {`mode6:freq:rate`: `mode6:freq`, ...}, in order."""
         names = [delta.name for delta in self.deltas]
@@ -303,10 +308,11 @@ class UncertainPlant(Value, Generic[P]):
             require_known("Delta", [name], known)
             amount = float(real_array(value, f"the value of {name!r}", ()))
             changes.append((known[name], known[name].scale * amount))
-        if self.deltas[0].kind != "parameter":
+        if not self.of_matrices:
             return with_changes(self.plant, changes)
         amounts = {delta.name: amount for delta, amount in changes}
-        return self._moved(np.array([amounts.get(delta.name, 0.0) for delta in self.deltas]))
+        moved = np.array([amounts.get(parameter.name, 0.0) for parameter in self.parameters])
+        return self._moved(moved, changes)
 
     def sample(self, rng: Any, n: int = 1) -> list[P]:
         """Return machines within the uncertainty, ports and sampling those of the nominal plant.
@@ -348,16 +354,19 @@ class UncertainPlant(Value, Generic[P]):
             drawn = _normal(rng, self.covariance)
             names = (delta.name for delta in self.deltas)
             return self.lft(dict(zip(names, drawn.tolist(), strict=True)))
-        return self._moved(_normal(rng, self.fit.covariance))
+        moved = _normal(rng, self.fit.covariance)
+        beside = [delta for delta in self.deltas if delta.kind in ("gain", "delay")]
+        amounts = (rng.standard_normal(len(beside)) / self.deviations).tolist()
+        return self._moved(moved, [(d, d.scale * x) for d, x in zip(beside, amounts, strict=True)])
 
-    def _moved(self, change: FloatArray) -> P:
-        """Return the plant of the fit's model with its parameters changed by some amounts."""
+    def _moved(self, change: FloatArray, changes: Sequence[tuple[Delta, float]] = ()) -> P:
+        """Return the plant of the model with its parameters, gains and delay changed."""
         realisation = self.plant.assembled.realisation
         own = self.plant.model if self.fit is None else self.fit.model
         model = _moved(realisation, own, self.parameters, change)
         with warnings.catch_warnings():  # the nominal plant has said in which form it is
             warnings.simplefilter("ignore", FlexplantWarning)
-            return rebuilt(self.plant, realisation=modes_of(model))
+            return _with_ports(self.plant, modes_of(model), changes)
 
 
 def _normal(rng: np.random.Generator, covariance: FloatArray) -> FloatArray:

@@ -58,10 +58,7 @@ def by_mode_channels(
     at a fixed point the norm is 1 and mu what it was divided by.
     """
     plant = uncertain.plant
-    weighted = plant.weighted(**{
-        side: {name: found.get(name) for name in getattr(plant, side)}
-        for side, found in (("z", _weights(z, "z")), ("w", _weights(w, "w")))
-    })  # fmt: skip
+    weighted = _weighted(plant, w, z)
     try:
         stated = mode_channels(weighted, uncertain)
     except AssumptionError:  # no disturbance moves them: nothing says how D begins
@@ -117,10 +114,14 @@ def _step(
     return _Step(loop.smallest(level, _LARGEST, _ACCURACY), K, again)
 
 
-def _weights(given: Any, side: str) -> dict[str, Any]:
-    """Return the weight of each channel of performance that is named."""
-    names, weights = weighted_names(given, side)
-    return {name: weights.get(name, 1.0) for name in names}
+def _weighted(plant: StandardPlant, w: Any, z: Any) -> StandardPlant:
+    """Return a plant with the channels of performance alone, weighted."""
+    sides = {}
+    for side, given in (("z", z), ("w", w)):
+        names, weights = weighted_names(given, side)
+        own = {name: weights.get(name, 1.0) for name in names}
+        sides[side] = dict.fromkeys(getattr(plant, side)) | own  # None leaves one out
+    return plant.weighted(**sides)
 
 
 def _tried(uncertain: UncertainPlant[Any], best: _Step, w: Any, z: Any) -> float:
@@ -131,19 +132,15 @@ def _tried(uncertain: UncertainPlant[Any], best: _Step, w: Any, z: Any) -> float
     for _ in range(_MACHINES):
         ends = size * chance.choice([-1.0, 1.0], len(names))
         machine = uncertain.lft(dict(zip(names, ends.tolist(), strict=True)))
-        own = machine.weighted(
-            z={name: _weights(z, "z").get(name) for name in machine.z},
-            w={name: _weights(w, "w").get(name) for name in machine.w},
+        loop = lft(_weighted(machine, w, z).system, best.controller)
+        most = max(most, _gain(loop) / best.mu if loop.is_stable else np.inf)
+    if most > 1.0 + _BEYOND:
+        raise CertificateError(
+            f"of machines within {size:.3g} of the uncertainty one has {most:.4g} times the gain "
+            f"of mu <= {best.mu:.4g} (inf: it is unstable): the changes are too large for the "
+            "first order of one channel a mode. State less uncertainty, or raise the rate."
         )
-        loop = lft(own.system, best.controller)
-        if not loop.is_stable:
-            raise CertificateError(
-                f"a machine within {size:.3g} of the uncertainty is unstable, but mu <= "
-                f"{best.mu:.4g} was found: the changes are too large for the first order of one "
-                "channel a mode. Report it."
-            )
-        most = max(most, _gain(loop))
-    return most / best.mu
+    return most
 
 
 def _gain(loop: StateSpace) -> float:
