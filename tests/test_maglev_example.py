@@ -46,6 +46,17 @@ def test_the_magnets_make_six_unstable_pairs(maglev, found):
     assert "6 unstable rigid-body pairs" in found["report"]["detectable"].finding
 
 
+def test_the_machine_keeps_what_the_loop_promises(maglev, found):
+    """Of another formulation than the bricks, with another mass and other magnets."""
+    promised, kept = found["path"][0]["loop"], found["machine"]
+    assert kept.is_stable
+    assert kept.modulus_margin == pytest.approx(promised.modulus_margin, rel=0.05)
+    for axis in maglev.AXES:
+        assert kept.rms(f"die:{axis}") == pytest.approx(promised.rms(f"die:{axis}"), rel=0.03)
+        assert kept.rms(f"die:{axis}") != pytest.approx(promised.rms(f"die:{axis}"), rel=1e-4)
+    assert f"{kept.modulus_margin:.3f}" in maglev.table(found)
+
+
 def test_the_budget_is_that_of_the_spectra(maglev, found):
     """One source of each kind against |H|^2 asd^2 over frequency; all add up to the rms."""
     loop = found["path"][0]["loop"]

@@ -20,7 +20,7 @@ from flexplant.errors import (
 from flexplant.loop import close_loop
 from flexplant.lti import StateSpace
 from flexplant.plant import Foreign, StandardPlant, Weighted
-from flexplant.simulation import setpoint, simulate
+from flexplant.simulation import Quantiser, setpoint, simulate
 from flexplant.simulation import simulate as simulate_function
 from flexplant.store import load
 from machines import RATE, block, matrices, observer, servo, stage
@@ -129,6 +129,19 @@ def test_runs_do_not_depend_on_their_company(loop):
     assert np.abs(all_runs["die:z"][0] - all_runs["die:z"][1]).max() > 0
     longer = simulate(loop, runs=2, **(options | {"duration": 0.35}))
     np.testing.assert_array_equal(longer.data[:, :, :400], all_runs.data[:2])
+
+
+def test_every_run_may_have_a_signal_of_its_own(loop):
+    options = {"duration": 0.05, "rng": 7}
+    each = 1e-6 * np.linspace(0.0, 1.0, 100) * np.array([[1.0], [-2.0], [0.0]])
+    together = simulate(loop, reference=each, disturbance={"amp": 1e-3}, runs=3, **options)
+    for i, signal in enumerate(each):
+        alone = simulate(loop, reference=signal, disturbance={"amp": 1e-3}, runs=[i], **options)
+        np.testing.assert_array_equal(alone.data[0], together.data[i])
+    steps = {"elements": {"y1": Quantiser(1e-9)}}  # sample by sample, all runs at once
+    together = simulate(loop, reference=each, runs=3, **options, **steps)
+    alone = simulate(loop, reference=each[1], runs=[1], **options, **steps)
+    np.testing.assert_array_equal(alone.data[0], together.data[1])
 
 
 def test_seeds(loop):
@@ -309,6 +322,8 @@ def test_assumptions_are_checked(loop):
         ({"reference": {"amp": 1.0}}, LabelError, "no reference 'amp'"),
         ({"disturbance": {"die:ref": 1.0}}, LabelError, "no disturbance 'die:ref'"),
         ({"reference": np.zeros(7)}, ShapeError, "reference 'die:ref' must have shape \\(20,\\)"),
+        ({"reference": np.zeros((2, 20)), "runs": 3}, ShapeError, r"shape \(3, 20\)"),
+        ({"reference": np.zeros((1, 20))}, ShapeError, r"shape \(20,\)"),
         ({"reference": lambda t: t[:3]}, ShapeError, "shape"),
         ({"reference": np.nan}, ModelError, "NaN"),
         ({"runs": 0}, ModelError, "runs must be a whole number at least 1, got 0"),

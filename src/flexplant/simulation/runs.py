@@ -41,7 +41,7 @@ class Runner(Protocol):
         """Put all runs at a state of plant and controller; each draws from its generator."""
 
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
-        """Run one stretch: w as `given` (k, nw) plus noise; return whether the state is finite.
+        """Run one stretch: w as `given` (k, nw) or (runs, k, nw) plus noise; return if finite.
 
         The channels z, y, driven u and monitored go into `data` (runs, channels, k).
         """
@@ -142,7 +142,7 @@ class SampleBySample:
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
         """Run one stretch."""
         states, y, _ = self.buffers
-        k = given.shape[0]
+        k = given.shape[-2]
         self.w[:, :k], self.w[:, k:] = given, 0.0
         for r, generator in enumerate(self.generators):
             white, single = self.noise.draw(generator, self.stretch, self.hold)
@@ -224,9 +224,9 @@ class InBlocks:
 
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
         """Run one stretch."""
-        k, known = given.shape[0], self.columns.size
+        k, known = given.shape[-2], self.columns.size
         white, single = self.noise.draw(self.generator, self.stretch, self.hold)
-        self.w[:k], self.w[k:] = given, 0.0
+        self.w[:k], self.w[k:] = given.reshape(k, -1), 0.0
         self.w[:, self.noise.columns] += single
         self.v[:, :known], self.v[:, known:] = self.w[:, self.columns], white
         out, self.x = self._run(self.v, self.x)

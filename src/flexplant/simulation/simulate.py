@@ -67,7 +67,8 @@ def simulate(
         Of the run; round(duration * rate) samples, the first at 0.
     reference : signal or mapping {name: signal}, optional
         For references such as `die:ref`; one signal where the plant has one reference. A signal is
-        a SetPoint, an array of one value per sample, a number, or a function of the times [s].
+        a SetPoint, an array of one value per sample, a number, or a function of the times [s]; an
+        array (runs, samples) has one row for each run.
         Derivatives of a SetPoint that blocks read are taken from it.
     disturbance : mapping {name: signal}, optional
         For other channels of w, held over each sample, in addition to their noise.
@@ -138,10 +139,10 @@ def simulate(
         )
     time: FloatArray = np.arange(steps, dtype=np.float64) * plant.dt
     met = conditions(loop, elements, anti_windup, finer, moving, time)
-    given = _given(plant, reference, disturbance, time)
+    numbers = _run_numbers(runs)
+    given = _given(plant, reference, disturbance, time, 0 if runs is None else len(numbers))
     silent = plant if flag(noise, "noise") else plant.replace(asd={})
     white = white_noise(silent)
-    numbers = _run_numbers(runs)
     state = _start(loop, start)
     seed = seed_sequence(rng)
     generators = _generators(seed, numbers)
@@ -151,15 +152,16 @@ def simulate(
     # products this small run slower on two threads than on one (5 times, on a busy machine)
     overflow = np.errstate(over="ignore", invalid="ignore")
     with one_thread(), overflow:
-        runner = make_runner(loop, white, given, grows=grows, met=met)
+        runner = make_runner(loop, white, given.reshape(-1, len(plant.w)), grows=grows, met=met)
         groups = [slice(i, i + runner.abreast) for i in range(0, len(numbers), runner.abreast)]
         total = len(groups) * -(-steps // runner.stretch)
         with Progress(total, "simulate", progress=progress) as bar:
             for group in groups:
                 runner.begin(state, generators[group])
+                own = given[group if len(given) > 1 else slice(None)]
                 for first in range(0, steps, runner.stretch):
                     stretch = slice(first, min(first + runner.stretch, steps))
-                    if not runner.fill(given[stretch], data[group, :, stretch]):
+                    if not runner.fill(own[:, stretch], data[group, :, stretch]):
                         raise ModelError(
                             f"the loop diverged beyond all numbers before {time[stretch][-1]:g} s: "
                             f"it is unstable (spectral radius {closed.spectral_radius:.6g}). Look "
@@ -216,8 +218,9 @@ def _given(
     reference: Signal | Mapping[str, Signal] | None,
     disturbance: Mapping[str, Signal] | None,
     time: FloatArray,
+    runs: int,
 ) -> FloatArray:
-    """Return the known part of w (n_time, nw)."""
+    """Return the known part of w (runs, n_time, nw); (1, n_time, nw) where runs share it."""
     both = [name for name in plant.w if name in plant.y]
     own, others = references(plant), [name for name in plant.w if name not in both]
     if reference is None:
@@ -234,14 +237,17 @@ def _given(
             f"disturbance must be a mapping, got {short(disturbance)}: say which channel of w is "
             "meant, disturbance={name: signal}."
         )
-    given = np.zeros((time.size, len(plant.w)))
+    given = np.zeros((1, time.size, len(plant.w)))
     for kind, known, signals in (
         ("reference", both, {**reference, **_derivatives(reference, both, own)}),
         ("disturbance", others, disturbance or {}),
     ):
         for name, signal in signals.items():
             require_known(kind, [name], known, "the plant's w")
-            given[:, plant.w.index(name)] = _sampled(signal, f"{kind} {name!r}", time)
+            values = _sampled(signal, f"{kind} {name!r}", time, runs)
+            if values.ndim == 2 and len(given) < len(values):
+                given = np.tile(given, (len(values), 1, 1))
+            given[:, :, plant.w.index(name)] = values
     return given
 
 
@@ -274,13 +280,16 @@ def _of(move: SetPoint, kind: str) -> Callable[[FloatArray], FloatArray]:
     return lambda time: np.asarray(getattr(move.at(time), kind))
 
 
-def _sampled(signal: Any, name: str, time: FloatArray) -> FloatArray:
-    """Return a signal at the sampling instants."""
+def _sampled(signal: Any, name: str, time: FloatArray, runs: int) -> FloatArray:
+    """Return a signal at the sampling instants: a number, (n_time,) or (runs, n_time)."""
     if isinstance(signal, SetPoint):
         _check_setpoint(signal, name, time)
         return signal.at(time).position
     values = real_array(signal(time) if callable(signal) else signal, name)
-    return values if values.ndim == 0 else real_array(values, name, time.shape)
+    if values.ndim == 0:
+        return values
+    each = (runs,) if runs and values.ndim == 2 else ()
+    return real_array(values, name, (*each, *time.shape))
 
 
 def _check_setpoint(move: SetPoint, name: str, time: FloatArray) -> None:

@@ -20,7 +20,7 @@ from ..structure import FEModel
 #: order in each direction: the first twenty frequencies of the paper's plate to 1e-6
 ORDER = 15
 #: relative: a point so far outside still lies on the edge
-_EDGE = 1e-9
+EDGE = 1e-9
 #: derivatives in (x, y) of the deflection and their sign: rx = dz/dy, ry = -dz/dx
 _MOTIONS = {"z": (0, 0, 1.0), "rx": (0, 1, 1.0), "ry": (1, 0, -1.0)}
 
@@ -40,20 +40,26 @@ class PolynomialShape(Interpolation):
                 "plane does not stretch. Choose one of them."
             )
         place = np.asarray(xyz[:2]) / self.size
-        if np.any(place < -_EDGE) or np.any(place > 1.0 + _EDGE):
+        if np.any(place < -EDGE) or np.any(place > 1.0 + EDGE):
             raise LabelError(
                 f"the point {tuple(np.asarray(xyz).tolist())} is off the plate of {self.size} m. "
                 "Choose one on it."
             )
         *orders, sign = _MOTIONS[direction]
         x, y = (
-            _lagrange(self.nodes, np.array([2.0 * p - 1.0]), int(k))[0] * (2.0 / length) ** int(k)
+            lagrange(self.nodes, np.array([2.0 * p - 1.0]), int(k))[0] * (2.0 / length) ** int(k)
             for p, k, length in zip(place, orders, self.size, strict=True)
         )
         return np.asarray(sign * np.outer(y, x).reshape(-1))
 
 
-def _lagrange(nodes: FloatArray, points: FloatArray, order: int = 0) -> FloatArray:
+def nodes_of(order: int) -> FloatArray:
+    """Return Lobatto's points in [-1, 1], through which Lagrange's polynomials stay small."""
+    inner = legendre.legroots(legendre.legder(np.eye(order + 1)[order]))
+    return np.concatenate([[-1.0], np.sort(inner.real), [1.0]])
+
+
+def lagrange(nodes: FloatArray, points: FloatArray, order: int = 0) -> FloatArray:
     """Return derivatives of Lagrange's polynomials through nodes, at points (p, n)."""
     size = nodes.size - 1  # by Legendre's polynomials, which stay well conditioned
     given = legendre.legvander(nodes, size)
@@ -78,11 +84,10 @@ def ritz_plate(
     polynomials that meet each boundary condition in the limit; integrals exact. `stiffer` is a
     function of (x, y): a factor of E there.
     """
-    inner = legendre.legroots(legendre.legder(np.eye(order + 1)[order]))
-    nodes = np.concatenate([[-1.0], np.sort(inner.real), [1.0]])
+    nodes = nodes_of(order)
     points, weights = legendre.leggauss(order + 3)
     a, b = (0.5 * float(length) for length in size)
-    N = [_lagrange(nodes, points, k) for k in range(3)]
+    N = [lagrange(nodes, points, k) for k in range(3)]
 
     def derived(x_order: int, y_order: int) -> FloatArray:
         both = np.einsum("pj,qi->pqji", N[y_order], N[x_order]).reshape(points.size**2, -1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -16,10 +16,11 @@ from ..identification import MeasuredModes
 from ..identification.periodic import frf_of_periods, line_spectra, offsets
 from ..loop import ClosedLoop, close_loop
 from ..lti.frequency import Frf
-from ..plant import Disturbance, Poi, Ports, StandardPlant, assemble_plant
+from ..plant import Disturbance, GroundSpring, Poi, Ports, StandardPlant, assemble_plant, suspend
 from ..plant.realisation import ModalRealisation, realised
+from ..reduction import ReducedModel
 from ..simulation import Quantiser, Response, simulate
-from ..structure import FEModel, ModalDamping, kirchhoff_plate
+from ..structure import FEModel, ModalDamping, kirchhoff_plate, solid_block
 from ..synthesis import design_servo
 from .ritz_plate import elastic_modes, ritz_plate
 
@@ -36,6 +37,8 @@ DRAWING: Mapping[str, Any] = {
 #: of a machine: relative scatter of stiffness over the plate and of damping over its modes [-],
 #: delay [samples], step of its sensors [m], and a second mass [kg], at most
 STIFFNESS, SPREAD, LATENCY, STEP, SECOND = 0.003, 0.3, 1.3, 5e-11, 0.1
+#: Hz, of the servo that holds a stage on magnets while it is measured
+HELD = 50.0
 
 
 def wafer_stage(
@@ -132,22 +135,28 @@ def _spot(drawing: Mapping[str, Any]) -> tuple[float, float, float]:
     return x / 2, y / 4, 0.0
 
 
+def waves(random: np.random.Generator, sides: Sequence[float]) -> Callable[..., FloatArray]:
+    """Return a factor of stiffness over x and y (...): cosines of random heights."""
+    height = random.normal(size=(3, 3))
+
+    def factor(x: FloatArray, y: FloatArray) -> FloatArray:
+        over_x, over_y = (
+            np.cos(np.pi * np.arange(3) * at[..., None] / side)
+            for at, side in zip((x, y), sides[:2], strict=True)
+        )
+        seen = np.einsum("...i,ji,...j->...", over_x, height, over_y)
+        return np.asarray(1.0 + STIFFNESS * seen / np.sqrt(9.0 / 4.0))
+
+    return factor
+
+
 def _individual(
     drawing: Mapping[str, Any], damping: float, known: Mapping[Any, float], seed: int
 ) -> FEModel:
     """Return one machine: its stiffness, damping and masses."""
     random = np.random.default_rng([seed, 8])
-    waves = random.normal(size=(3, 3))
     sides = drawing["size"]
-
-    def stiffer(x: FloatArray, y: FloatArray) -> FloatArray:
-        along = [
-            np.cos(np.pi * np.arange(3)[:, None] * v / side)
-            for v, side in zip((x[0], y[:, 0]), sides, strict=True)
-        ]
-        return np.asarray(1.0 + STIFFNESS * (along[1].T @ waves @ along[0]) / np.sqrt(9.0 / 4.0))
-
-    bare = ritz_plate(stiffer=stiffer, **drawing)
+    bare = ritz_plate(stiffer=waves(random, sides), **drawing)
     omega, phi = elastic_modes(bare)
     zeta = positive(damping, "damping", zero=True) * np.exp(SPREAD * random.normal(size=omega.size))
     shapes = bare.M @ phi
@@ -181,7 +190,9 @@ class WaferStage(Value):
     step : float [m]
         Of its sensors; 0: none.
     drawing : mapping
-        Size, thickness and material of its plate as drawn; the paper's when not given.
+        Size, thickness and material of its plate (or block) as drawn; the paper's when not given.
+    magnets : tuple of GroundSpring
+        Those that a block floats on, as drawn; none: it is free.
 
     Examples
     --------
@@ -191,11 +202,12 @@ class WaferStage(Value):
     (10000.0, 1.3)
     """
 
-    truth: FEModel
+    truth: FEModel | ReducedModel
     rate: float
     delay: float
     step: float = 0.0
     drawing: Mapping[str, Any] = field(default_factory=lambda: dict(DRAWING))
+    magnets: tuple[GroundSpring, ...] = ()
 
     def __repr__(self) -> str:
         late = f"{self.delay:g} sample" + ("" if self.delay == 1 else "s")
@@ -215,6 +227,11 @@ class WaferStage(Value):
         slowest = 1e-6 * float(np.abs(found.pairs[found.n_rigid :]).max(axis=(1, 2)).min())
         poles = poles[poles.imag > slowest]
         return np.asarray(poles[np.argsort(np.abs(poles))], dtype=np.complex128)
+
+    @property
+    def _n_rigid(self) -> int:
+        """How many modes are motions of a rigid body, free or on magnets."""
+        return 6 if self.magnets else self._realisation.n_rigid
 
     def _plant(self, ports: Ports) -> StandardPlant:
         return assemble_plant(self._realisation, ports).discretized(self.rate, delay=self.delay)
@@ -243,14 +260,14 @@ class WaferStage(Value):
             sampled measurement shows it, or the deviation is negative.
         """
         own = self._own_poles
-        known = range(self._realisation.n_rigid + 1, self._realisation.n_rigid + own.size + 1)
+        known = range(self._n_rigid + 1, self._n_rigid + own.size + 1)
         found = []
         listed = [modes] if not isinstance(modes, Iterable) or isinstance(modes, str) else modes
         numbers = tuple(whole(mode, "mode") for mode in listed)
         for mode in numbers:
             if mode not in known:
                 raise unknown_label("elastic mode", mode, map(str, known))
-            pole = own[mode - 1 - self._realisation.n_rigid]
+            pole = own[mode - 1 - self._n_rigid]
             if (freq := abs(pole) / (2.0 * np.pi)) >= 0.5 * self.rate:
                 raise ModelError(
                     f"mode {mode} at {freq:.4g} Hz is not below half the rate, {0.5 * self.rate:g} "
@@ -315,6 +332,13 @@ class WaferStage(Value):
             elements=self._steps(ports),
         )
 
+    @property
+    def _middle(self) -> Poi:
+        """The middle of the top, which the servo holds."""
+        x, y, z = (*self.drawing["size"], 0.0)[:3]
+        axes = ("x", "y", "z", "rx", "ry", "rz") if z else ("z", "rx", "ry")
+        return Poi("centre", at=(x / 2, y / 2, z), axes=axes)
+
     def _steps(self, ports: Ports) -> dict[str, Quantiser] | None:
         """Return the steps of its sensors."""
         if not self.step:
@@ -333,8 +357,9 @@ class WaferStage(Value):
     ) -> Frf:
         """Return the FRFs from actuator forces to sensors, measured under feedback.
 
-        A free plate drifts, so a slow servo from the drawing holds it. Random-phase multisines are
-        added to all actuators at once, orthogonal over as many experiments as there are actuators;
+        A free plate drifts, a stage on magnets falls, so a servo from the drawing holds it.
+        Random-phase multisines are added to all actuators at once, orthogonal over as many
+        experiments as there are actuators;
         total forces F and outputs Y then give ``G = Y F^-1`` (joint input-output: dividing Y by
         the excitation alone would be biased by the feedback).
 
@@ -378,13 +403,7 @@ class WaferStage(Value):
                 ),
             ],
             u=ports.u,
-            z=[
-                Poi(
-                    "centre",
-                    at=(*(side / 2 for side in self.drawing["size"]), 0.0),
-                    axes=("z", "rx", "ry"),
-                )
-            ],
+            z=[self._middle],
             y=ports.y,
         )
         loop = close_loop(self._plant(own), *_holding(own, self))
@@ -393,26 +412,24 @@ class WaferStage(Value):
         turns = np.exp(2j * np.pi * np.outer(np.arange(count), np.arange(count)) / count)
         near = offsets(periods)[0][:, None] / periods
         lag = np.exp(-2j * np.pi * (lines + near) * self.delay / samples)
-        shaken = np.zeros((count, count, *lag.shape), dtype=np.complex128)
-        forces = np.zeros_like(shaken)
-        motions = np.zeros((count, len(ports.y), *lag.shape), dtype=np.complex128)
-        for experiment in range(count):
-            waves = _multisine(spectrum[None, :] * turns[:, experiment, None], lines, samples)
-            waves = positive(amplitude, "amplitude") * waves
-            signal = np.tile(waves, periods + discard)
-            run = simulate(
-                loop,
-                disturbance=dict(zip(shakers, signal, strict=True)),
-                duration=(periods + discard) * samples / self.rate,
-                elements=self._steps(own),
-                rng=int(random.integers(2**63)),
-            )
-            sent, seen = ([run[port.name] for port in side] for side in (ports.u, ports.y))
-            commands, motions[experiment], shaken[experiment] = (
-                line_spectra(np.array(part), samples, periods)[..., : lines.size]
-                for part in (sent, seen, signal)
-            )
-            forces[experiment] = shaken[experiment] + lag * commands
+        waves = np.stack(
+            [_multisine(spectrum * turn[:, None], lines, samples) for turn in turns.T], axis=1
+        )
+        signal = np.tile(positive(amplitude, "amplitude") * waves, periods + discard)
+        run = simulate(
+            loop,
+            disturbance=dict(zip(shakers, signal, strict=True)),
+            duration=(periods + discard) * samples / self.rate,
+            elements=self._steps(own),
+            rng=random,
+            runs=count,
+        )
+        sent, seen = ([run[port.name] for port in side] for side in (ports.u, ports.y))
+        commands, motions, shaken = (
+            line_spectra(of.swapaxes(0, 1), samples, periods)[..., : lines.size]
+            for of in (np.array(sent), np.array(seen), signal)
+        )
+        forces = shaken + lag * commands
         kinds = {sensor.quantity for sensor in ports.y}
         return frf_of_periods(
             lines / period,
@@ -429,9 +446,17 @@ class WaferStage(Value):
 
 def _holding(ports: Ports, machine: WaferStage) -> tuple[Any, ...]:
     """Return the slow controller that keeps the machine in place, made from its drawing."""
-    drawing = kirchhoff_plate(elements=(4, 4), **machine.drawing).with_damping(ModalDamping(0.01))
-    plant = assemble_plant(drawing, ports).discretized(machine.rate, delay=machine.delay)
-    return design_static(plant), design_servo(plant, bandwidth=8.0, rolloff=40.0)
+    model: FEModel
+    if machine.magnets:
+        model = solid_block(elements=(4, 3, 1), **machine.drawing)
+        model = suspend(model.with_damping(ModalDamping(0.01)), machine.magnets)
+    else:
+        model = kirchhoff_plate(elements=(4, 4), **machine.drawing)
+        model = model.with_damping(ModalDamping(0.01))
+    plant = assemble_plant(model, ports).discretized(machine.rate, delay=machine.delay)
+    # against magnets a loop must be several times as fast as what they make grow
+    slow = HELD if machine.magnets else 8.0
+    return design_static(plant), design_servo(plant, bandwidth=slow, rolloff=5.0 * slow)
 
 
 def _check_multisine(samples: int, periods: int, discard: int) -> None:
