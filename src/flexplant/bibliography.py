@@ -67,7 +67,6 @@
    CERFACS, 1992.
 .. [DuffReid1983] Duff, Reid, The multifrontal solution of indefinite sparse symmetric linear
    equations, ACM Trans. Math. Softw. 9, 1983.
-.. [EfronTibshirani1993] Efron, Tibshirani, An Introduction to the Bootstrap, Chapman & Hall, 1993.
 .. [EmamiNaeiniVanDooren1982] Emami-Naeini, Van Dooren, Computation of zeros of linear multivariable
    systems, Automatica 18, 1982.
 .. [Enns1984] Enns, Model reduction with balanced realizations, IEEE CDC, 1984.
@@ -180,6 +179,8 @@
    correlation and updating, IMAC 15, 1997.
 .. [PattersonThompson1971] Patterson, Thompson, Recovery of inter-block information when block sizes
    are unequal, Biometrika 58, 1971.
+.. [PauleMandel1982] Paule, Mandel, Consensus values and weighting factors, J. Res. Natl. Bur.
+   Stand. 87, 1982, 377-385.
 .. [Peeters2004] Peeters, Van der Auweraer, Guillaume, Leuridan, The PolyMAX frequency-domain
    method: a new standard for modal parameter estimation?, Shock and Vibration 11, 2004, 395-409.
 .. [PeetersDeRoeck1999] Peeters, De Roeck, Reference-based stochastic subspace identification for

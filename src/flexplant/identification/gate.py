@@ -66,19 +66,19 @@ def gated(
 
 
 def steady(
-    fit: Fit, reported: IntArray, deviation: FloatArray
+    fit: Fit, reported: IntArray, spread: FloatArray
 ) -> tuple[IntArray, tuple[Rejected, ...]]:
     """Return which poles outputs that disagree share, and the others.
 
-    One beside another, whose damping is not known from zero (95 %) by the `deviation` (m,) of
-    leaving out outputs, stands for what the outputs differ by.
+    One beside another, whose damping at an output is not known from zero (95 %) by its `spread`
+    (m,) over them, stands for what the outputs differ by.
     """
     beside = np.array([
         np.any(np.abs(np.delete(fit.poles.imag, k) - pole.imag) < -pole.real)
         for k, pole in enumerate(fit.poles)
     ])  # fmt: skip
-    vague = beside & (1.96 * deviation > -fit.poles.real)
-    reason = "not shared by the outputs: leaving one out changes its damping by as much as it is"
+    vague = beside & (1.96 * spread > -fit.poles.real)
+    reason = "not shared by the outputs: its damping differs between them by as much as it is"
     out = tuple(_entry(fit, int(k), reason) for k in reported[vague[reported]])
     return reported[~vague[reported]], out
 

@@ -165,10 +165,10 @@ def identify_modes(
     Measurements that no linear machine explains: a pole is added only for what the outputs share,
     beyond poles of their own at each of them, and misfit that is correlated over neighbouring lines
     counts as so much less. Of two poles within a bandwidth with the same shape and participation
-    one remains. Where outputs disagree on the poles (a roving sensor), they are warned of, and the
-    covariance is that of leaving out each output in turn. Poles whose deviation of frequency or
-    damping exceeds it, mains multiples narrower than half a line and poles at the edge of the band
-    are not reported, but listed with the reason in `rejected`.
+    one remains. Where outputs disagree on the poles (a roving sensor), they are warned of: poles
+    are then means of each output's own, with the deviations of random effects. Poles whose
+    deviation of frequency or damping exceeds it, mains multiples narrower than half a line and
+    poles at the edge of the band are not reported, but listed with the reason in `rejected`.
 
     Lines of Hann-windowed segments show a resonance widened by the window: where that explains them
     better (H1 of random excitation), each term ``1/(s - lambda)`` is fitted as such lines show it,
@@ -359,8 +359,8 @@ def _identified(
             excess = fit.cost - freedom(lines, fit.poles.size)
             apart = disagreement(lines, fit, own_price(lines, fit), excess)
             if apart is not None:
-                deviation = np.sqrt(np.diag(apart.covariance)[: fit.poles.size])
-                reported, others = steady(fit, reported, deviation)
+                reported, others = steady(fit, reported, apart.spread[: fit.m])
+                fit = Fit(lines, apart.poles, fit.participation, fit.pivots)
                 rejected = tuple(sorted(rejected + others))
         if compare or budget.done > BUDGET:
             warned(unexplained(lines, fit), None if apart is None else apart.size)

@@ -23,7 +23,6 @@ from ..checks import (
     whole,
 )
 from ..errors import LabelError, ModelError, ShapeError, counted
-from ..labels import Place
 from ..modes import Modes
 from ..modes.matching import assigned, in_span
 from ..tolerances import SAME
@@ -323,7 +322,7 @@ def numbered(
     measured: MeasuredModes,
     model: Any,
     *,
-    at: Mapping[str, Place] | None = None,
+    at: Any = None,
     tolerance: float = 0.15,
     least_mac: float = 0.7,
     partial: bool = False,
@@ -344,8 +343,9 @@ def numbered(
         With shapes, or paired by frequency alone.
     model : Modes, or a model with `.modes()`
         Its modes are numbered from 1, rigid-body modes included.
-    at : mapping {label of a shape's row: place}, optional
-        Where the rows of the shapes are; by default their labels are DOFs of the model.
+    at : Ports, or mapping {label of a shape's row: place or sensor}, optional
+        Where the rows of the shapes are, along z at a point unless a sensor says otherwise; the
+        sensors of ports; by default their labels are DOFs of the model.
     tolerance : float
         Largest relative difference of frequencies in a pair.
     least_mac : float
@@ -436,12 +436,17 @@ def _lowest(numbers: list[int], omega: FloatArray, taken: set[int]) -> list[int]
 def _likeness(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -> FloatArray:
     if measured.shapes is None or measured.dofs is None:
         return np.ones((len(measured), elastic.size))
-    if at is not None and not isinstance(at, Mapping):
-        raise LabelError(f"at is a mapping from the labels of shapes to places, got {at!r:.60}.")
-    places = [(at or {}).get(label, label) for label in measured.dofs]
-    phi: ComplexArray = np.array(
-        [modes.at(place)[elastic] for place in places], dtype=np.complex128
-    )
+    given = {port.name: port for port in at.y} if hasattr(at, "y") else at or {}
+    if not isinstance(given, Mapping):
+        raise LabelError(
+            f"at is Ports, or a mapping from the labels of shapes to places, got {at!r:.60}."
+        )
+    places = [given.get(label, label) for label in measured.dofs]
+    rows = [
+        modes.at(place.at, place.direction) if hasattr(place, "direction") else modes.at(place)
+        for place in places
+    ]
+    phi: ComplexArray = np.array(rows, dtype=np.complex128)[:, elastic]
     alike = np.zeros((len(measured), elastic.size))
     omega = modes.omega[elastic]
     for j in range(elastic.size):

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray
-from ..tolerances import TINY
+from ..tolerances import RANK, TINY
 from .refine import Fit, Lines
 
 #: MAC from which two shapes are one: they differ by less than what a neighbour's tail makes
@@ -21,6 +21,8 @@ MOSTLY = 0.9
 NOISE = 1.5
 #: standard deviations by which chi-square may exceed its degrees of freedom by chance
 LIMIT = 3.0
+#: halvings of the interval of a variance: to nine digits
+BISECTIONS = 30
 #: lines, or half-widths, beside a pole over which misfit is compared
 NEAR, WIDE = 20.0, 3.0
 
@@ -110,49 +112,102 @@ def mac(vectors: ComplexArray, j: int, k: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Disagreement:
-    """By how much outputs differ in the frequencies (relative), and what leaving each out shows.
+    """By how much outputs differ in the frequencies (relative), and their mean poles (m,).
 
-    `covariance` (2 m, 2 m) is that of [Re lambda; Im lambda].
+    `spread` (2 m,) of [Re lambda; Im lambda] is the deviation of an output from them, `deviation`
+    their own, `correlation` over the outputs.
     """
 
     size: float
-    covariance: FloatArray
+    poles: ComplexArray
+    spread: FloatArray
+    deviation: FloatArray
+    correlation: FloatArray
+
+    def covariance(self, formal: FloatArray) -> FloatArray:
+        """Return the covariance of the poles, with that of the noise alone (2 m, 2 m) in it."""
+        rest = np.sqrt(np.maximum(0.0, self.deviation**2 - np.diag(formal)))
+        return np.asarray(formal + self.correlation * np.outer(rest, rest))
 
 
 def disagreement(lines: Lines, fit: Fit, least: float, excess: float) -> Disagreement | None:
-    r"""Return by how much the outputs of a fit differ, and the jackknife covariance of its poles.
+    """Return by how much the outputs of a fit differ, and the mean of their own poles.
 
-    Without output o the optimum moves by :math:`d_o = -(N - N_o)^{-1} g_o` to first order, with
-    the normal equations :math:`N = \sum_o N_o` and the gradients of the poles, whose sum is zero
-    ([EfronTibshirani1993]_, ch. 11). The covariance :math:`(n-1)/n \sum_o d_o d_o^T` needs nothing
-    of the noise; it is made larger by Student's factor of n - 1 degrees, so that 1.96 deviations
-    hold 95 %.
     None where poles of their own lower the cost by less than `least`, or do not explain nearly all
     of the cost's `excess` over that of noise: something else is wrong then.
     """
-    from scipy.special import stdtrit
-
     if len(fit.shapes) == 1:
         return None
     own = fit.own
-    if fit.cost - sum(one.cost for one in own) < max(least, MOSTLY * excess):
+    if fit.cost - own_cost(fit) < max(least, MOSTLY * excess):
         return None
-    count, m = len(own), fit.poles.size
-    places = np.array([one.poles for one in own])
-    away = (places - np.median(places.imag, axis=0) * 1j).imag / np.abs(fit.poles)
+    places = np.array([np.concatenate([one.poles.real, one.poles.imag]) for one in own])
+    # an output that hardly sees a mode may have its own pole anywhere: known no better than there
+    seen, alone = (np.array([_variance(one) for one in fits]) for fits in (_parted(fit), own))
+    variance = np.maximum(seen, alone) + np.tile(np.array([_strayed(fit, one) for one in own]), 2)
+    mean, spread, deviation, weighted = random_effects(places, variance)
+    power = np.sqrt(np.sum(weighted**2, axis=0))
+    weighted = weighted / np.maximum(power, TINY)
+    m, count = fit.poles.size, len(own)
+    poles = mean[:m] + 1j * mean[m:]
+    away = (places[:, m:] - np.median(places[:, m:], axis=0)) / np.abs(poles)
     size = 1.4826 * float(np.median(np.abs(away))) * np.sqrt(count / (count - 1.0))
-    parts = [
-        Fit(lines.of_output(o), fit.poles, fit.participation, fit.pivots).gradient()
-        for o in range(count)
-    ]
-    kept = slice(0, 2 * m)
-    total = sum(N[kept, kept] for N, _ in parts)
-    moved = np.array([-la.lstsq(total - N[kept, kept], g[kept])[0] for N, g in parts])
-    moved = moved - moved.mean(axis=0)
-    factor = float(stdtrit(count - 1.0, 0.975)) / 1.96
-    # shifts of a half-width and more are beyond the first order: what the middle of the outputs'
-    # own poles is off by counts too
-    middle = np.median(places.real, axis=0) + 1j * np.median(places.imag, axis=0) - fit.poles
-    off = np.concatenate([middle.real, middle.imag])
-    covariance = factor**2 * (count - 1.0) / count * moved.T @ moved + np.outer(off, off)
-    return Disagreement(size, covariance)
+    return Disagreement(size, poles, spread, deviation, weighted.T @ weighted)
+
+
+def _parted(fit: Fit) -> list[Fit]:
+    """Return the fit of each output at the shared poles."""
+    count = range(len(fit.shapes))
+    return [Fit(fit.lines.of_output(o), fit.poles, fit.participation, fit.pivots) for o in count]
+
+
+def _variance(one: Fit) -> FloatArray:
+    """Return the variances (2 m,) of a fit's poles, its participation held."""
+    N = one.gradient()[0][: 2 * one.m, : 2 * one.m]
+    size = np.sqrt(np.maximum(np.diag(N), TINY))
+    inverse = la.pinvh(N / np.outer(size, size), rtol=RANK)
+    return np.asarray(one.lines.inflation * np.diag(inverse) / size**2)
+
+
+def _strayed(fit: Fit, one: Fit) -> FloatArray:
+    """Return the squares of how far own poles (m,) are that came nearer to another shared pole."""
+    away = np.abs(one.poles[:, None] - fit.poles)
+    near = np.argmin(away, axis=1) == np.arange(fit.m)
+    return np.where(near, 0.0, np.diag(away) ** 2)
+
+
+def random_effects(
+    places: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    r"""Return means over the first axis, sqrt(t), the means' deviations and weighted differences.
+
+    Each of n values x has a variance v of its own about a place of its own, and places have the
+    variance t about the mean sought: with :math:`w = 1/(v + t)` it is
+    :math:`\mu = \sum w x / \sum w`, of variance :math:`1/\sum w`. t is the one at which
+    :math:`\sum w (x - \mu)^2` is the median of chi-square with n - 1 degrees of freedom
+    ([PauleMandel1982]_ take its mean, which is too small a t more often than not), zero where it is
+    less at zero already. Where t is not zero it is known from :math:`(\sum w)^2/\sum w^2` outputs,
+    as the mean is: deviations are enlarged by Student's factor, so that 1.96 of them hold 95 %.
+    """
+    from scipy.special import chdtri, stdtrit
+
+    def at(extra: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        weight: FloatArray = 1.0 / (variance + extra)
+        mean: FloatArray = np.sum(weight * places, axis=0) / np.sum(weight, axis=0)
+        root: FloatArray = np.sqrt(weight)
+        return weight, mean, root * (places - mean)
+
+    goal = float(chdtri(len(places) - 1.0, 0.5))
+    low = np.zeros(places.shape[1])
+    # sum (x - mean)^2 / t is below the goal there
+    high = np.sum((places - places.mean(axis=0)) ** 2, axis=0) / goal
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        above = np.sum(at(middle)[2] ** 2, axis=0) > goal
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    extra = np.where(np.sum(at(np.zeros_like(low))[2] ** 2, axis=0) > goal, high, 0.0)
+    weight, mean, weighted = at(extra)
+    total = np.sum(weight, axis=0)
+    degrees = np.maximum(1.0, total**2 / np.sum(weight**2, axis=0) - 1.0)
+    factor = np.where(extra > 0, stdtrit(degrees, 0.975) / 1.96, 1.0)
+    return mean, np.sqrt(extra), factor / np.sqrt(total), weighted

@@ -540,7 +540,7 @@ def warned(left: list[Peak], apart: float | None) -> None:
             f"outputs disagree on the frequencies by {apart:.2%} (standard deviation), which "
             "explains most of what is more than noise: a sensor that moves and has mass, an "
             "amplitude or a temperature that changed between measurements. Poles are means over "
-            "the outputs, their deviations come from leaving out each output in turn."
+            "the outputs, their deviations come from how these differ."
         )
     elif stretches:
         warn(

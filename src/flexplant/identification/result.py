@@ -39,7 +39,7 @@ def answer(
     formal, spread = _covariances(fit, ready)
     covariance, spread = formal * max(1.0, misfit), spread * max(1.0, misfit)
     if apart is not None:
-        covariance = formal + apart.covariance
+        covariance = apart.covariance(formal)
     shapes, part, terms = fit.shapes, fit.participation, fit.terms
     if ready.swapped:
         shapes, part, terms = part, shapes, terms.transpose(1, 0, 2)
@@ -318,8 +318,8 @@ class IdentifiedModes(MeasuredModes):
         Why poles are those of the first answer, empty where they are those of the maximum
         likelihood fit to its end (`refined`).
     inconsistency : float, optional
-        Relative deviation of the frequencies between outputs, where they disagree: the covariance
-        of the poles is then that of leaving out each output in turn.
+        Relative deviation of the frequencies between outputs, where they disagree: poles are then
+        means over the outputs, and their covariance comes from how these differ.
 
     Examples
     --------
@@ -370,7 +370,7 @@ class IdentifiedModes(MeasuredModes):
         notes = ["refined" if self.refined else f"the first answer ({self.first_answer})"]
         if self.inconsistency is not None:
             notes.append(
-                f"outputs disagree by {self.inconsistency:.1e}, deviations by leaving them out"
+                f"outputs disagree by {self.inconsistency:.1e}, poles are means of their own"
             )
         elif self.misfit > 1.0:
             notes.append(f"deviations enlarged by the misfit {self.misfit:.3g}")
