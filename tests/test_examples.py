@@ -114,11 +114,11 @@ def test_the_measured_poles_stand_in_the_models(result):
 
 
 def test_predicted_errors_are_those_of_the_machine(result):
-    """Within 10 % where modes left out are counted; far off where they are not."""
+    """Within 5 % in z, rx, ry where modes left out are counted; far off where they are not."""
     for case in result["cases"].values():
-        for errors in case["errors"].values():
+        for errors in case["axes"]:
             predicted, measured, low, high = errors["measured, all modes"]
-            assert abs(predicted / measured - 1) < 0.1
+            assert abs(predicted / measured - 1) < 0.05
             assert low < measured < high
     light = result["cases"][0.001]["errors"][1e-3]
     assert light["measured, 24 modes"][1] > 4 * light["measured, 24 modes"][0]
@@ -239,7 +239,7 @@ def test_the_readme_says_what_the_run_says(result):
     promised = case["loops"]["tolerant, measured"]["model"].modulus_margin
     ma = [1e9 * case["loops"][name]["exposure"][0] for name in case["loops"]]
     cases = result["cases"].values()
-    rows = [e["measured, all modes"] for c in cases for e in c["errors"].values()]
+    rows = [one["measured, all modes"] for c in cases for one in c["axes"]]
     off = 100 * max(abs(row[0] / row[1] - 1) for row in rows)
     for said in (
         f"within {np.ceil(off):.0f} %",
