@@ -132,12 +132,17 @@ def test_runs_do_not_depend_on_their_company(loop):
 
 
 def test_every_run_may_have_a_signal_of_its_own(loop):
+    """Many runs multiply matrices where one run multiplies vectors: last digits may differ."""
     options = {"duration": 0.05, "rng": 7}
+
+    def close(alone, together):
+        np.testing.assert_allclose(alone, together, rtol=0, atol=1e-11 * np.abs(together).max())
+
     each = 1e-6 * np.linspace(0.0, 1.0, 100) * np.array([[1.0], [-2.0], [0.0]])
     together = simulate(loop, reference=each, disturbance={"amp": 1e-3}, runs=3, **options)
     for i, signal in enumerate(each):
         alone = simulate(loop, reference=signal, disturbance={"amp": 1e-3}, runs=[i], **options)
-        np.testing.assert_array_equal(alone.data[0], together.data[i])
+        close(alone.data[0], together.data[i])
     steps = {"elements": {"y1": Quantiser(1e-9)}}  # sample by sample, all runs at once
     together = simulate(loop, reference=each, runs=3, **options, **steps)
     alone = simulate(loop, reference=each[1], runs=[1], **options, **steps)

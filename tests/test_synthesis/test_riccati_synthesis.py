@@ -330,7 +330,7 @@ def test_a_gamma_that_hangs_on_the_last_digits_of_the_plant_is_refused():
     found = design_hinf(turned(P, 1e4), u=u, y=y)
     assert found.gamma == pytest.approx(best, rel=1e-3, abs=0)
     hidden = turned(P, 1e5)
-    with pytest.raises(SolverError, match=r"badly conditioned: A is .*(one rounding|hang on)"):
+    with pytest.raises(SolverError, match=r"badly conditioned: A is "):
         design_hinf(hidden, Riccati(), u=u, y=y)
     with pytest.warns(FlexplantWarning, match=r"^no feedback .*badly conditioned: A is "):
         assert not design_hinf(hidden, u=u, y=y).system.n_states

@@ -10,6 +10,9 @@ from flexplant.modes import solve_modes
 from flexplant.reduction import DesiredDofs, reduce
 from flexplant.structure import ModalDamping, PointMass
 from flexplant.updating import AddedMass, Eigenvalues, localise
+from flexplant.updating.family import repeated_groups
+from flexplant.updating.point_model import Point
+from flexplant.updating.search import Objective
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +89,21 @@ def test_long_work_shows_a_bar(uneven, capsys):
     assert "candidates: 100%" in capsys.readouterr().err
     localise(uneven, data, [AddedMass(uneven.dofs.labels[3])], most=1)
     assert capsys.readouterr().err == ""
+
+
+def test_the_order_in_which_rounding_leaves_repeated_modes_decides_nothing(plate):
+    """On other kernels equal modes change places: slopes and places found are the same."""
+    model = plate.reduced(0.001, attached=True)
+    data = measured(model, {str(plate.z8): 0.5}, seed=3)
+    objective = Objective(model, [AddedMass(plate.z8)], data, prior=False)
+    point = objective.begin(np.zeros(1))
+    groups = repeated_groups(point.eigen.poles)
+    assert [point.labels[group].tolist() for group in groups][:2] == [[7, 8], [9, 10]]
+    slopes = objective.slopes(point)
+    labels = point.labels.copy()
+    for group in groups:
+        labels[group] = labels[group[::-1]]
+    again = objective.place(Point(objective.family, point.p, point.eigen, labels))
+    np.testing.assert_allclose(
+        objective.slopes(again), slopes, rtol=0, atol=1e-6 * np.abs(slopes).max()
+    )

@@ -242,10 +242,17 @@ def turned(point: Point, data: PoleRows) -> Point:
 
     How repeated modes split depends on the step, and the step on how they split: try both
     directions of every parameter, and keep the step that fits best by the split it causes itself.
+    Their numbers rise with the frequencies they move to: which of equal modes came first is a
+    matter of rounding.
     """
-    repeated = {i for group in repeated_groups(point.eigen.poles) for i in group}
-    if not repeated:
+    groups = repeated_groups(point.eigen.poles)
+    if not groups:
         return point
+    repeated = {i for group in groups for i in group}
+    labels = point.labels.copy()
+    for group in groups:
+        labels[group] = np.sort(labels[group])
+    point = Point(point.family, point.p, point.eigen, labels)
     try:
         columns = point.columns(data.numbers)
     except ModelError:
