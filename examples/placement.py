@@ -3,7 +3,8 @@
 Run it: ``python examples/placement.py``. The stage of ``wafer_stage.py`` carries 0.5 kg that no
 drawing shows; its model is updated from a measurement, with the uncertainty of what was found. The
 error at the die, which no sensor sees, decides where four sensors go: on a grid of 48 places
-without the die itself, in picometres, with a bound below which no choice can be.
+without the die itself, in picometres, with a bound below which no choice can be. What is chosen
+then measures on the machine, beside sensors at the corners.
 """
 
 # %% Names and numbers
@@ -31,8 +32,7 @@ from flexplant.placement import (
     device_worth,
     pareto_curve,
 )
-from paper_plate import DELAY, updated
-from wafer_stage import RATE, L, ports, reduced
+from wafer_stage import L, models, plant_of, ports
 
 OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 ENCODER = 5e-12  # m/sqrt(Hz)
@@ -48,17 +48,27 @@ CABLE = fx.Rectangle((-0.01, 0.15), (0.25, 0.45))
 AXES = {"z": 1.0, "rx": 0.013, "ry": 0.013}
 
 
-# %% The machine: updated, and as uncertain as its measurement
-def machine(rng: int = 1) -> tuple[fx.StandardPlant, list[fx.StandardPlant]]:
-    """Return the sampled plant of the updated model, and three machines that it could be too."""
-    hidden = fx.testbeds.wafer_stage(elements=(8, 8), rate=RATE, delay=DELAY)
-    exact = hidden.poles([6, 7])
-    measured = fx.MeasuredModes(
-        poles=exact.poles, modes=[6, 7], covariance=np.diag(np.repeat((2.0, 0.5), 2) ** 2)
-    )
-    fit = updated(reduced(0.01), measured)
-    small = fx.assemble_plant(fit.model, ports()).discretized(RATE, delay=DELAY)
-    return small, small.uncertain(fit).sample(rng, 3)
+# %% The machine: measured, and what is not known of its modes
+def plants(case: dict[str, Any], rng: int = 1) -> tuple[fx.StandardPlant, list[fx.StandardPlant]]:
+    """Return the sampled plant of the measured model, and three machines that it could be too."""
+    small = plant_of(case, "measured")
+    return small, small.uncertain(frequency=case["off"]).sample(rng, 3)
+
+
+def on_machine(case: dict[str, Any], plant: fx.StandardPlant) -> tuple[float, float]:
+    """Return the die's error [m rms] over `AXES` by a plant's sensors: predicted, and measured."""
+    full = case["full"]["measured"]
+    design = {"estimate": fx.design_kalman(plant, larger=full)}
+    static = fx.design_static(plant, larger=full)
+    servo = fx.design_servo(plant, bandwidth=10.0, observer=static)
+    blocks = static, servo, *fx.reading_along(design)
+    run = case["machine"].run(plant.assembled.ports, *blocks, duration=3.0, rng=1, runs=5)
+    both = [
+        weight * np.array(fx.compare_estimators(design, run, f"die:{axis}", start=1.0)["estimate"])
+        for axis, weight in AXES.items()
+    ]
+    predicted, measured, *_ = np.linalg.norm(both, axis=0)
+    return float(predicted), float(measured)
 
 
 # %% Sensors
@@ -105,8 +115,14 @@ def both(plant: fx.StandardPlant) -> dict[str, Any]:
 
 def main() -> dict[str, Any]:
     """Return everything that was found."""
-    plant, machines = machine()
+    case = models(0.01)
+    plant, machines = plants(case)
     result = {"plant": plant, "machines": machines, "sensors": sensors(plant, machines)}
+    corners = plant.assembled.ports.replace(y=[y.replace(asd=ENCODER) for y in ports().y])
+    result["machine"] = {
+        "at the corners": on_machine(case, plant.with_ports(corners)),
+        "the die's error": on_machine(case, result["sensors"]["the die's error"].on(plant)),
+    }
     grid = [place for place in GRID if not DIE.holds(np.array([place[:2]]))[0]]
     corners = plant.assembled.ports.y[:3]
     three = plant.with_ports(plant.assembled.ports.replace(y=corners))
@@ -128,6 +144,9 @@ def table(result: dict[str, Any]) -> str:
             for number in (found.value, max(found.bound, 0.0))
         )
         lines.append(f"{name:24s}{error:>12s}{value:>12s}{low:>12s}   {' '.join(found.chosen):.24}")
+    lines += ["", "error at the die, modes left out included: predicted, and on the machine"]
+    for name, both in result["machine"].items():
+        lines.append(f"{name:24s}" + "".join(f"{1e12 * error:9.1f} pm" for error in both))
     pair = result["pair"]
     lines += ["", f"the closed loop: {pair!r}", f"{result['worth']!r}", "", f"{result['curve']!r}"]
     return "\n".join(lines)

@@ -31,6 +31,9 @@ def test_the_story_of_placement(tmp_path):
         for found in result["sensors"].values()
         for port in found.ports
     )
+    corners, chosen = (np.array(both) for both in result["machine"].values())
+    assert chosen[1] < 0.6 * corners[1]  # m rms on a machine that no model here resembles
+    np.testing.assert_allclose([corners[0], chosen[0]], [corners[1], chosen[1]], rtol=0.05)
     assert np.all(np.diff(result["curve"].values) < 0)
     assert np.all(result["worth"].without > result["worth"].value)
     text = example.table(result)
