@@ -1,114 +1,87 @@
-"""The table in the docstring of stage_weights, measured again on the machine."""
+"""The table of stage_weights, measured again on a machine of another formulation."""
 
+import importlib
 import re
 import warnings
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from flexplant.errors import FlexplantWarning
-from flexplant.loop import close_loop
-from flexplant.plant import reference_errors, stage_weights
-from flexplant.synthesis import design_hinf
-from flexplant.testbeds import wafer_stage
-from stages import RATE, fitted, ports, reduced, sampled
+import flexplant as fx
 
-KNOBS = ("peak", "disturbance", "effort", "noise")
+EXAMPLES = Path(__file__).parents[2] / "examples"
+KNOBS = {"peak", "disturbance", "effort", "noise"}
 
 
 def rows():
-    """Return (bandwidth, changed knobs, numbers) of each line of the table."""
+    """Return (bandwidth, changed knobs, numbers) of each line of the table; unstable is 0."""
     found = []
-    for line in (stage_weights.__doc__ or "").splitlines():
-        cells = re.split(r"\s{2,}", line.strip())
+    for line in (fx.stage_weights.__doc__ or "").splitlines():
+        cells = re.split(r"\s{2,}", line.strip().replace("unstable", "0"))
         if re.fullmatch(r"\d+", cells[0]) and len(cells) in (6, 7):
-            words = " ".join(cells[1:-5]).replace(",", "").split()
+            words = " ".join(cells[1:-5]).split()
             knobs = dict(zip(words[::2], map(float, words[1::2]), strict=True))
             found.append((float(cells[0]), knobs, [float(cell) for cell in cells[-5:]]))
     return found
 
 
 @cache
-def machine(damping=0.001):
-    return wafer_stage(elements=(8, 8), damping=damping, rate=RATE, delay=1)
+def stage(damping=0.001):
+    """The example, and its machine and models."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(EXAMPLES))
+        example = importlib.import_module("wafer_stage")
+    return example, example.models(damping)
 
 
-@cache
-def model(damping=0.001):
-    return fitted(reduced(damping), machine(damping).poles([6, 7]).poles).model
-
-
-def judged(bandwidth, knobs, damping=0.001):
-    """Design on the updated model; |S| of the machine over a grid through the loop's resonances."""
-    plant = sampled(model(damping))
-    errors, weights = reference_errors(plant), stage_weights(plant, bandwidth, **knobs)
-    found = design_hinf(plant.through(errors).weighted(z=weights.z, w=weights.w))
-    loop = machine(damping).loop(ports(), errors, found)
-    swing = np.log(loop.monitored.poles())
-    swing = swing[(swing.imag > 0) & (np.abs(swing) < 3.1)] * RATE / (2 * np.pi)
-    near = swing.imag + swing.real * np.linspace(-3, 3, 13)[:, None]
-    freq = np.unique(
-        np.append(np.geomspace(0.5, 0.499 * RATE, 1500), near[(near > 0.5) & (near < 0.499 * RATE)])
-    )
+def judged(bandwidth, knobs, damping=0.001, *, kind="measured", sure=False):
+    """Design on a model; |S| of the machine over a grid, and the margin, 0 when unstable."""
+    example, case = stage(damping)
+    plant = example.plant_of(case, kind)
+    known = None if sure else plant.uncertain(frequency=case["off"])
+    errors = fx.reference_errors(plant)
+    weights = fx.stage_weights(plant, bandwidth, uncertainty=known, **knobs)
+    weighted = plant.through(errors).weighted(z=weights.z, w=weights.w)
+    with warnings.catch_warnings(action="ignore"):  # one is unstable
+        found = fx.design_hinf(weighted, uncertain=known)
+        loop = case["machine"].loop(example.ports(), errors, found)
+    freq = np.geomspace(0.5, 0.499 * example.RATE, 6000)
     S = np.abs(loop.frequency_response(freq)["die:error", "die:ref"])
-    assert loop.spectral_radius < 1
-    numbers = [
-        found.gamma,
-        freq[np.argmax(S >= 1)],
-        20 * np.log10(S.max()),
-        -20 * np.log10(loop.modulus_margin),
-        np.interp(5.0, freq, S),
-    ]
-    return found, numbers
+    margin = loop.modulus_margin if loop.is_stable else 0.0
+    numbers = found.gamma, freq[np.argmax(S >= 1)], 20 * np.log10(S.max()), margin
+    return found, [*numbers, np.interp(5.0, freq, S)]
 
 
 def test_the_table_names_every_knob():
     named = [knobs for _, knobs, _ in rows()]
-    assert len(named) == 14
-    assert {name for knobs in named for name in knobs} == set(KNOBS)
+    assert len(named) == 10
+    assert {name for knobs in named for name in knobs} == KNOBS
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("bandwidth", "knobs", "numbers"), rows())
+@pytest.mark.parametrize(("bandwidth", "knobs", "numbers"), rows()[1::2])  # 4 s each
 def test_a_line_of_the_table(bandwidth, knobs, numbers):
-    found, measured = judged(bandwidth, knobs)
-    steps = np.array([0.02 * numbers[0], 0.02 * numbers[1], 0.25, 0.25, 0.00006])
+    _, measured = judged(bandwidth, knobs)
+    steps = np.array([0.02 * numbers[0], 0.03 * numbers[1], 0.4, 0.015, 0.00006])
     np.testing.assert_array_less(np.abs(np.array(measured) - numbers), steps)
-    # gamma is the size of the largest block, beside 1 that is asked
-    assert 0.5 * found.gamma < max(found.reached.values()) <= found.gamma * (1 + 1e-3)
+
+
+@pytest.mark.slow
+def test_what_is_said_of_other_designs():
+    assert judged(80.0, {}, sure=True)[1][3] == 0.0
+    usual = {"kind": "measured", "sure": True}, {"kind": "drawing", "sure": True}, {}
+    margins = [judged(80.0, {}, 0.01, **options)[1][3] for options in usual]
+    np.testing.assert_allclose(margins, [0.35, 0.24, 0.48], atol=0.01)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("bandwidth", "damping"), [(30.0, 0.01), (50.0, 0.001), (80.0, 0.001)])
-def test_the_defaults_keep_margins_on_the_machine(bandwidth, damping):
-    found, (gamma, reached, at_poi, at_u, _) = judged(bandwidth, {}, damping)
+def test_sure_of_its_modes_the_loop_is_within_its_blocks(bandwidth, damping):
+    """Gamma is the size of the largest block, beside 1 that is asked; effort decides."""
+    found, (gamma, reached, *_) = judged(bandwidth, {}, damping, sure=True)
     assert reached > bandwidth
-    assert max(at_poi, at_u) < 8.0
     assert gamma < 1.15
     assert found.reached["efforts from disturbances"] == pytest.approx(gamma, rel=0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("bandwidth", "size", "to", "at_u"), [(80.0, 3.0, 88.7, 7.6), (100.0, 2.0, 102.0, 10.4)]
-)
-def test_nominal_unstable_and_updated_stable_on_the_machine(bandwidth, size, to, at_u):
-    """The hidden 0.5 kg at 0.1 % damping; noise as small as 0.005."""
-    radii = []
-    for source in (reduced(0.001), model()):
-        plant = sampled(source)
-        errors = reference_errors(plant)
-        weights = stage_weights(plant, bandwidth, disturbance=size, effort=size, noise=0.005)
-        found = design_hinf(plant.through(errors).weighted(z=weights.z, w=weights.w))
-        assert close_loop(plant, errors, found).spectral_radius < 1
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FlexplantWarning)
-            loop = machine().loop(ports(), errors, found)
-        radii.append(loop.spectral_radius)
-    assert radii[0] > 1.0005
-    assert radii[1] < 1.0
-    freq = np.geomspace(0.5, 300.0, 1500)
-    S = np.abs(loop.frequency_response(freq)["die:error", "die:ref"])
-    assert freq[np.argmax(S >= 1)] == pytest.approx(to, rel=0.02)
-    assert -20 * np.log10(loop.modulus_margin) == pytest.approx(at_u, abs=0.6)
+    assert 0.5 * found.gamma < max(found.reached.values()) <= found.gamma * (1 + 1e-3)
