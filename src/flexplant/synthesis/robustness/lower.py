@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -31,6 +32,8 @@ _FINE = 1e-4
 _PHASES = 25
 #: random starts at each frequency
 _RESTARTS = 4
+#: real Deltas of which all signs are tried, and the loops that are closed for it
+_FEW, _LOOPS = 5, 256
 #: steps towards worse signs of the real Deltas
 _ASCENTS = 6
 
@@ -329,6 +332,32 @@ def destabilising(
             best = _ascended(M, blocks, start, least, best)
             if best is not None and best.size < 1.001 * least:
                 return best
+    return _at_corners(M, blocks, least, best)
+
+
+def _at_corners(
+    M: StateSpace, blocks: Sequence[Block], least: float, best: Destabilising | None
+) -> Destabilising | None:
+    """Return the best so far, after every choice of signs of a few Deltas that are all real.
+
+    At many sizes: those that destabilise may be a narrow range, stable on both sides.
+    """
+    real = all(isinstance(block, RepeatedScalar) and block.real for block in blocks)
+    if not real or len(blocks) > _FEW:
+        return best
+    corners = [
+        Perturbation(signs, (), 0.0)
+        for signs in itertools.product([-1.0 + 0j, 1.0 + 0j], repeat=len(blocks))
+    ]
+    for corner in corners:
+        most = 100.0 * least if best is None else best.size * (1 - 1e-6)
+        delta = realised(corner, blocks)
+        for t in np.geomspace(least, most, _LOOPS // len(corners) + 1)[1:].tolist():
+            if _growth(M, delta, t)[0] >= 0:
+                found = smallest_multiple(M, blocks, corner, least, t)
+                if found is not None and (best is None or found.size < best.size):
+                    best = found
+                break
     return best
 
 

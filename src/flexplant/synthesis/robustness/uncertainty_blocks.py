@@ -158,6 +158,10 @@ class Scalings:
                         entries.append((p, w, z, 1j * B[i, k], False))
                         entries.append((p, z, w, -1j * np.conj(B[i, k]), False))
         self.count = len(start)
+        #: which x are of G
+        self.of_G = np.ones(self.count, dtype=bool)
+        for own, _ in self.d_ranges:
+            self.of_G[own] = False
         #: D = I, G = 0
         self.start: FloatArray = np.array(start)
         self.owner: IntArray = np.array([e[0] for e in entries])

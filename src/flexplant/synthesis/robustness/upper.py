@@ -21,6 +21,9 @@ _GROWTH = 10.0
 _BACK = 0.15
 #: levels; relative distance of a level to what its centre reaches, at which it is the smallest
 _LEVELS, _SETTLED = 200, 2e-3
+#: G beside the trace of D times the size of M, from which on it is too large: all that G takes
+#: from M is Im M, where D of the blocks are alike
+_WIDEST = 1.0
 #: a level this far below the size of M is zero
 _ZERO = 1e-10
 
@@ -132,10 +135,17 @@ def reached_level(W: ComplexArray, scalings: Scalings, x: FloatArray) -> float:
 def centred(
     W: ComplexArray, scalings: Scalings, x: FloatArray, level: float, *, steps: int = _STEPS
 ) -> FloatArray:
-    """Return scalings after Newton steps to the analytic centre of ``F > 0, D > 0`` at a level."""
+    """Return scalings after Newton steps to the analytic centre of ``F > 0, D > 0`` at a level.
+
+    Where no real Delta at all closes the loop (M is complex beside a resonance) F grows with G
+    without end, and scalings that hold at one frequency hold nowhere else: a square of G counts
+    from `_WIDEST` times the trace of D and the size of M on.
+    """
     coefficients = scalings.coefficients(level)
     trace = scalings.start
-    value = _barrier(W, scalings, x, level)
+    size = float(np.linalg.norm(W[scalings.w :])) * float(trace @ x)
+    wide = np.where(scalings.of_G, 1.0 / max(_WIDEST * size, TINY) ** 2, 0.0)
+    value = _barrier(W, scalings, x, level) + float(wide @ x**2)
     if not np.isfinite(value):
         return x
     for _ in range(steps):
@@ -146,6 +156,8 @@ def centred(
             P, scalings.row, scalings.column, coefficients, scalings.first
         )
         _add_of_D(scalings, x, gradient, hessian)
+        gradient += 2.0 * wide * x
+        hessian[np.diag_indices_from(hessian)] += 2.0 * wide
         step, decrement = _newton(hessian, gradient, trace)
         # the value is off by the square of it
         if not decrement > 1e-6:
@@ -154,7 +166,7 @@ def centred(
         # shorter steps are rounding of x
         while t > 1e-8:
             moved = x + t * step
-            new = _barrier(W, scalings, moved, level)
+            new = _barrier(W, scalings, moved, level) + float(wide @ moved**2)
             if new < value:
                 x, value = moved, new
                 break
