@@ -1,7 +1,6 @@
 """From an update's covariance to a guarantee: the story runs, and its numbers are true."""
 
 import importlib
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -21,32 +20,26 @@ def test_the_guarantee_holds_on_machines_drawn_anew(tmp_path):
     found = example.main(tmp_path)
     assert all(found["claims"].values())
     robust, worst = found["robust"], found["worst"]
-    assert robust.upper < 0.1
+    assert 0.3 < robust.lower <= robust.upper < 1.05 * robust.lower
     assert robust.left_out.is_stable
-    assert worst.upper == pytest.approx(1.713, rel=0.01, abs=0)
-    assert worst.nominal == pytest.approx(1.691, rel=2e-3, abs=0)
-    # the bound covers the machine with all of its modes, which is in the weight
-    whole = fx.assemble_plant(found["whole"], example.ports())
-    blocks = found["loop"].blocks
-    loop = fx.close_loop(whole.discretized(example.RATE, delay=example.DELAY), *blocks)
+    assert worst.upper == pytest.approx(1.868, rel=0.02, abs=0)
+    assert worst.nominal == pytest.approx(1.717, rel=5e-3, abs=0)
+    # the bound covers the machine that no model here resembles, over a grid of its own
+    loop = found["machine"]
     assert loop.is_stable
-    gain = np.abs(loop.frequency_response(np.linspace(60.0, 140.0, 300))["die:error", "die:ref"])
+    gain = np.abs(loop.frequency_response(np.geomspace(10.0, 4e3, 20_000))["die:error", "die:ref"])
     assert gain.max() <= worst.upper
     # and the corners of the Deltas
-    gains = []
+    gains, blocks = [], found["loop"].blocks
     for sign in (-1.0, 1.0):
         values = {delta.name: sign for delta in found["uncertain"].deltas}
         corner = fx.close_loop(found["uncertain"].lft(values), *blocks)
         gains.append(fx.peak_gain(corner.system["die:error", "die:ref"])[0])
     assert max(gains) <= worst.upper
-    # H-infinity is not robust to so bad a measurement, and is to one better by mu
-    sharp = found["sharp"]
-    assert 5.0 < sharp.lower <= sharp.upper < 1.02 * sharp.lower
-    for part, stable in ((0.98, True), (1.02, False)):
-        values = {name: part * value for name, value in sharp.values.items()}
-        with pytest.warns(fx.FlexplantWarning) if not stable else nullcontext():
-            loop = fx.close_loop(found["uncertain"].lft(values), found["errors"], found["hinf"])
-        assert loop.is_stable is stable
+    # without the modes above, mu of H-infinity says nothing of the machine
+    few, sharp = found["few"], found["sharp"]
+    assert few.upper < 1.0 < 50.0 < sharp.lower <= sharp.upper < 1.05 * sharp.lower
+    assert not found["broken"].is_stable
     text = example.table(found)
     assert "every machine is stable" in text
     assert "stage_hinf.c" in text
