@@ -4,7 +4,9 @@ Run it: ``python examples/measured_frf.py``. The virtual machine floats under a 
 shaken by multisines; its frequency responses (FRFs) give poles, the poles say what its drawing has
 wrong, and responses that were not used say whether that is true. The machine differs from the
 drawing in three things: 0.5 kg at z8 that no drawing shows, Young's modulus 70 instead of 69 GPa,
-and 1 % modal damping instead of 0.7 %. Pictures go to ``examples/out``.
+and 1 % modal damping instead of 0.7 %. It has the drawing's mesh, so that a truth exists for each
+parameter and deviations can be judged by it; what an update is worth on a machine of another
+formulation is in ``wafer_stage.py``. Pictures go to ``examples/out``.
 """
 
 # %% Names and numbers

@@ -2,7 +2,8 @@
 
 Run it: ``python examples/paper_plate.py``. It prints one table and writes the counterparts of the
 paper's figures 3 to 11 to ``examples/out``. The paper says 0.1 % modal damping, but its printed
-eigenvalues have 1 %, so 1 % it is here; ``wafer_stage.py`` goes on from here to closed loops.
+eigenvalues have 1 %, so 1 % it is here. As in the paper, machine and drawing share their mesh;
+``wafer_stage.py`` goes on from here to closed loops and a machine of another formulation.
 """
 
 # %% Names
