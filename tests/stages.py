@@ -67,6 +67,13 @@ def fitted(model, poles):
     return update(model, [AddedMass(at), AddedDamping(at)], [Eigenvalues(measured)])
 
 
+def calibrated(model, machine, modes=range(4, 16)):
+    """The mass at z8 from two poles; then the frequencies and dampings are the machine's own."""
+    low, poles = machine.poles([6, 7]), machine.poles(list(modes))
+    at = model.full_dofs.nearest(Z8, "z")
+    return update(model, [AddedMass(at)], [Eigenvalues(low)]).calibrated(poles)
+
+
 def sampled(model, channels=None, *, delay=1):
     """The plant at the machine's rate."""
     return assemble_plant(model, channels or ports()).discretized(RATE, delay=delay)

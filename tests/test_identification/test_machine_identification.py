@@ -20,7 +20,7 @@ def test_true_poles_lie_within_three_sigma():
     The variance is that of the periods of one run; several runs, at more damping: the example.
     """
     zeta = 0.003
-    machine, channels = wafer_stage(elements=(8, 8), damping=zeta), ports()
+    machine, channels = wafer_stage(damping=zeta), ports()
     frf = machine.measure_frf(channels, period=0.6, periods=2, discard=3, rng=3)
     found = identify_modes(frf, band=(150.0, 1250.0), hold=1e4)
     modes = solve_modes(make_plate(), count=18, damping=ModalDamping(zeta))

@@ -29,19 +29,20 @@ from flexplant.synthesis import Riccati, design_hinf
 from flexplant.synthesis.controller import certified_norm
 from flexplant.testbeds import wafer_stage
 from oracles_synthesis import brute_norm, closed_loop, gains, split, stability
-from stages import CORNERS, NOISE, RATE, fitted, ports, reduced, sampled
+from stages import CORNERS, NOISE, RATE, calibrated, ports, reduced, sampled
 
 BANDWIDTH = 30.0
 
 
 @cache
 def machine():
-    return wafer_stage(elements=(8, 8), damping=0.01, rate=RATE, delay=1)
+    """Of another formulation than the model's mesh."""
+    return wafer_stage(damping=0.01, rate=RATE, delay=1)
 
 
 @cache
 def updated():
-    return fitted(reduced(), machine().poles([6, 7]).poles).model
+    return calibrated(reduced(), machine())
 
 
 def weighted(plant, bandwidth=BANDWIDTH):

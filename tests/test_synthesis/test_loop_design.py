@@ -144,7 +144,7 @@ def test_on_springs_within_the_lines():
 @pytest.mark.slow
 def test_tuned_on_the_measured_machine_stable_on_the_truth():
     """Noise, lines of 1 Hz, a hidden mass: no model but the rigid-body axes of the drawing."""
-    machine = wafer_stage(elements=(8, 8))
+    machine = wafer_stage()
     channels = ports(asd=1e-4, references=[])
     frf = machine.measure_frf(channels, period=1.0, periods=2, amplitude=30.0, rng=3)
     found = tune_loops(frf, **measured()[1], rate=RATE, delay=1, hold=False, notches=1)
