@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,8 @@ _SHIFT = 0.7
 _DAMPED, _PUSHED = 0.01, 0.1
 #: factor by which a scaling is changed at most in closed loop
 _REBALANCED = 4.0
+#: frequencies whose D is found at once, those of the largest bounds first
+_AT_ONCE = 64
 #: points at most on each side of a mode, two to a half-width of its resonance
 _SWEPT = 100
 
@@ -212,7 +213,7 @@ def tolerated(
 
     Below 1 no Deltas of a size (`times`), all at once, put a pole on the grid's frequencies.
     """
-    return ModeLoop.of(channels, plant, controller, times).bound(times)
+    return times * ModeLoop.of(channels, plant, controller, times).level(1.0 / times)
 
 
 @dataclass(frozen=True)
@@ -221,11 +222,12 @@ class ModeLoop:
 
     With any positive D and real G, both diagonal, and G zero at the weighted w and z,
 
-    .. math:: \bar\sigma\left((I + G^2)^{-1/4} (D M D^{-1} - j G) (I + G^2)^{-1/4}\right) \le 1
+    .. math:: M^* D M + j (G M - M^* G) \le \beta^2 D
 
-    excludes ``det(I - M \Delta) = 0`` [Young1990]_. D by Osborne's iteration, G the imaginary part
-    of the shift that the design counted on: a smooth function of the frequency, unlike the best G
-    of each, with which the frequency of a crossing could lie between those of the grid.
+    excludes ``det(I - M \Delta) = 0`` for Deltas up to ``1 / beta`` [Young1990]_. D by Osborne's
+    iteration, G the imaginary part of the shift that the design counted on: a smooth function of
+    the frequency, unlike the best G of each, with which the frequency of a crossing could lie
+    between those of the grid.
     """
 
     M: ComplexArray
@@ -258,22 +260,27 @@ class ModeLoop:
             blocks.append(FullBlock(p - m, q - m))
         return cls(M, np.asarray(shift.imag), places(blocks))
 
-    def bound(self, times: float) -> float:
-        """Return the bound for Deltas, and a performance block, of a size: the design's D first."""
-        bounds = self._sizes(times * self.M, -times * self.shift)
-        high = np.flatnonzero(bounds > 1.0)
-        if high.size:
-            rows, columns = (side[high] for side in self.even)
-            scaled = times * self.M[high] * rows[:, :, None] / columns[:, None]
-            own = self._sizes(scaled, -times * self.shift[high])
-            plain = np.linalg.norm(scaled, 2, axis=(1, 2))
-            bounds[high] = np.minimum(bounds[high], np.minimum(own, plain))
-        return float(bounds.max())
+    def level(self, near: float) -> float:
+        """Return beta, the largest over the grid: the Deltas and gains over it are all shown.
 
-    @cached_property
-    def even(self) -> tuple[FloatArray, FloatArray]:
-        """D that evens out the rows and columns at each frequency: of all rows, of all columns."""
-        d = np.sqrt(osborne(self.M, self.where))
+        The design's D and G first, D for a beta that is `near`; where that is the largest, D that
+        evens out the loop, with G and without, and the best of the three.
+        """
+        plain = self._levels(self.M, self.shift, near)
+        most = 0.0
+        for part in np.array_split(np.argsort(-plain), -(-plain.size // _AT_ONCE)):
+            if plain[part[0]] <= most:
+                break
+            rows, columns = self._even(self.M[part])
+            M = self.M[part] * rows[:, :, None] / columns[:, None]
+            ways = [plain[part], self._levels(M, self.shift[part], near)]
+            ways.append(self._levels(M, np.zeros_like(self.shift[part]), near))
+            most = max(most, float(np.min(ways, axis=0).max()))
+        return most
+
+    def _even(self, M: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """Return the D of all rows and of all columns that even out each matrix."""
+        d = np.sqrt(osborne(M, self.where))
         rows, columns = (
             np.repeat(d, [getattr(one, side).stop - getattr(one, side).start for one in self.where],
                       axis=1)
@@ -281,43 +288,18 @@ class ModeLoop:
         )  # fmt: skip
         return rows, columns
 
-    def _sizes(self, M: ComplexArray, G: FloatArray) -> FloatArray:
-        """Return sigma_max of ``(I + G^2)^-1/4 (M - j G) (I + G^2)^-1/4`` of each, or above it.
-
-        ``||(M* M)^2||_F^(1/4)`` is at most its eighth root of the size too large: singular values
-        are computed where that leaves open whether they are below 1 or the largest of all.
-        """
-        m, shifted = G.shape[1], M.copy()
-        shifted[:, range(m), range(m)] -= 1j * G
-        root = (1.0 + G**2) ** -0.25
-        shifted[:, :m] *= root[:, :, None]
-        shifted[:, :, :m] *= root[:, None]
-        square = shifted.conj().swapaxes(1, 2) @ shifted
-        sizes = np.linalg.norm(square @ square, axis=(1, 2)) ** 0.25
-        near = sizes > min(1.0, sizes.max() / min(shifted.shape[1:]) ** 0.125)
-        sizes[near] = np.linalg.norm(shifted[near], 2, axis=(1, 2))
-        return np.asarray(sizes)
-
-    def smallest(self, near: float, most: float, accuracy: float) -> float:
-        """Return the smallest level at which all Deltas and gains over it are shown; else inf.
-
-        The mu of robust performance from above: the bound is 1 for Deltas of one over the level.
-        Sought from a level that is `near`, up to `most`, and down to `most` times less.
-        """
-        low, high = near, near
-        while self.bound(1.0 / high) > 1.0:
-            low, high = high, 1.5 * high
-            if high > most:
-                return np.inf
-        while low == high or (low > near / most and self.bound(1.0 / low) <= 1.0):
-            high, low = low, low / 1.5
-        while high > (1.0 + accuracy) * low:
-            middle = float(np.sqrt(low * high))
-            if self.bound(1.0 / middle) <= 1.0:
-                high = middle
-            else:
-                low = middle
-        return high
+    def _levels(self, M: ComplexArray, shift: FloatArray, near: float) -> FloatArray:
+        """Return beta of each matrix, with ``D = (1 + shift^2 / beta^2)^-1/2`` at a beta near."""
+        m = shift.shape[1]
+        root = (1.0 + (shift / near) ** 2) ** -0.25
+        scaled = M.copy()
+        scaled[:, :m] *= root[:, :, None]
+        scaled[:, :, :m] /= root[:, None]
+        with_G = -1j * shift[:, :, None] * scaled[:, :m]
+        form = scaled.conj().swapaxes(1, 2) @ scaled
+        form[:, :m] += with_G
+        form[:, :, :m] += with_G.conj().swapaxes(1, 2)
+        return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(form)[:, -1], 0.0)))
 
 
 def _swept(channels: Sequence[ModeChannel], times: float, dt: float) -> FloatArray:

@@ -8,16 +8,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...checks import FloatArray
-from ...errors import AssumptionError, CertificateError, FlexplantError, counted
+from ...errors import AssumptionError, CertificateError, FlexplantError, SolverError, counted
 from ...lti.grid import resonance_grid
 from ...lti.interconnection import lft
+from ...lti.preparation import prepared
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import Controller, SynthesisMethod
-from ..hinf.hinf_design import design_hinf
+from ..hinf.hinf_riccati import Riccati
 from ..hinf.mode_channels import (
     ModeChannel,
     ModeLoop,
@@ -27,12 +28,10 @@ from ..hinf.mode_channels import (
 )
 from .uncertain_loop import weighted_names
 
-#: relative accuracy of mu, and its largest value that is looked for
-_ACCURACY, _LARGEST = 0.02, 100.0
-#: relative decrease of mu below which the iteration ends: that of its accuracy
+#: relative decrease of mu below which the iteration ends
 _SETTLED = 0.02
 #: machines at corners of the uncertainty that are closed exactly, and by how much their gain may
-#: exceed the bound: the first order of the channels, and the accuracy of mu
+#: exceed the bound: the first order of the channels
 _MACHINES, _BEYOND = 8, 0.05
 
 
@@ -108,10 +107,15 @@ def _step(
     scale[own] = 1.0 / level
     g = plant.system
     system = g.replace(C=g.C * scale[:, None], D=g.D * scale[:, None])
-    K = design_hinf(plant.replace(system=system), method).system
+    problem = prepared(system, plant.u, plant.y)
+    found = (method or Riccati()).solve(problem)
+    K = problem.restored(found.A, found.B, found.C, found.D)
+    if not lft(system, K).is_stable:
+        raise SolverError("the controller does not stabilise in rounding.")
     again = rebalanced(channels, with_channels(weighted, channels), K)
     loop = ModeLoop.of(again, with_channels(weighted, again), K, 2.0, weighted=True)
-    return _Step(loop.smallest(level, _LARGEST, _ACCURACY), K, again)
+    first = loop.level(level)
+    return _Step(min(first, loop.level(first)), K, again)  # D is found for a level
 
 
 def _weighted(plant: StandardPlant, w: Any, z: Any) -> StandardPlant:
