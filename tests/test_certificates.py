@@ -1,0 +1,266 @@
+"""Each certificate is handed a wrong answer and refuses it: one of its two routes is made wrong."""
+
+from functools import cache
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+import flexplant as fx
+from flexplant.errors import CertificateError
+from flexplant.synthesis import FixedOrder, PoleRegion
+
+
+@cache
+def masses():
+    """Sampled: three masses on springs with w, u, z and y."""
+    return fx.testbeds.three_masses()
+
+
+@cache
+def problem():
+    """Continuous: a first-order plant with weights on S and K S."""
+    return fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+
+
+@cache
+def two_masses(count=2):
+    """Continuous: two masses, and a third that few modes leave out."""
+    model = fx.chain(masses=[1.0, 1.0, 0.1], stiffnesses=[4e5, 4e5])
+    modes = fx.solve_modes(model, count=count, damping=fx.ModalDamping(0.02))
+    ports = fx.Ports(
+        w=[fx.Disturbance("d", at="2:x")],
+        u=[fx.Actuator("u1", at="1:x")],
+        z=[fx.Poi("tip", at="2:x", axes=("x",))],
+        y=[fx.Sensor("y1", at="1:x", asd=1e-9)],
+    )
+    return fx.assemble_plant(modes, ports)
+
+
+def off_by(share):
+    """The two masses, the frequency of their mode uncertain."""
+    return two_masses().uncertain(frequency=share)
+
+
+def lead(rate=None):
+    """A controller of the two masses, sampled or not."""
+    law = -1e3 * fx.lti.tf([0.05, 1.0], [0.002, 1.0]).replace(inputs=["y1"], outputs=["u1"])
+    return law if rate is None else fx.lti.tustin(law, rate)
+
+
+def estimate():
+    return fx.design_kalman(masses())
+
+
+@cache
+def servo():
+    observer = fx.design_kalman(masses())
+    return fx.close_loop(masses(), observer, fx.design_servo(masses(), bandwidth=5.0))
+
+
+def reducer(**options):
+    return fx.synthesis.reduce_controller(masses(), fx.design_h2(masses()), **options)
+
+
+def frfs():
+    freq = np.array([10.0, 20.0])
+    return {
+        name: fx.Frf(freq, -1 / (m * (2 * np.pi * freq) ** 2)[None, None], ["1:x"], ["1:x"])
+        for name, m in (("stage", 2.0), ("frame", 3.0))
+    }
+
+
+def chains():
+    return {name: fx.chain(masses=[1.0, 2.0], stiffnesses=[5e5]) for name in ("stage", "frame")}
+
+
+JOINT = fx.Joint("stage/1:x", "frame/1:x")
+
+
+def larger(by, place=None):
+    """The right answer too large by a factor; of several numbers, the one at a place."""
+
+    def wrong(function):
+        def called(*args, **options):
+            found = function(*args, **options)
+            if place is None or found is None:
+                return None if found is None else by * found
+            parts = list(found)
+            parts[place] = by * parts[place]
+            return type(found)(*parts) if hasattr(found, "_fields") else tuple(parts)
+
+        return called
+
+    return wrong
+
+
+def given(by, place):
+    """An argument too large by a factor."""
+
+    def wrong(function):
+        def called(*args):
+            return function(*(by * x if i == place else x for i, x in enumerate(args)))
+
+        return called
+
+    return wrong
+
+
+def second(function):
+    """Right at the first call, too large by 1 % afterwards."""
+    calls = []
+
+    def called(*args):
+        calls.append(args)
+        return (1.0 if len(calls) == 1 else 1.01) * function(*args)
+
+    return called
+
+
+def half_open(function):
+    """Coupled responses with a part of those that nothing couples."""
+
+    def called(B, lines, load, found, *others):
+        return function(B, lines, load, found + 0.01 * lines, *others)
+
+    return called
+
+
+def opposite(function):
+    """A controller of the wrong sign."""
+
+    def called(*args):
+        found = function(*args)
+        return found._replace(C=-found.C, D=-found.D)
+
+    return called
+
+
+#: what is made wrong, how, what is called then, and what is said
+WRONG = {
+    "error of an observer, its dual": (
+        "estimation.error._dual", larger(1.1),
+        lambda: estimate().rms("die", on=masses()), "its dual differ",
+    ),
+    "minimax filter": (
+        "estimation.minimax._means", larger(1.01),
+        lambda: fx.estimation.design_minimax_filter(masses(), [masses()], iterations=3),
+        "those of the filter in closed form differ",
+    ),
+    "filter of several rates": (
+        "estimation.multirate._step", larger(1.01, 3),
+        lambda: fx.estimation.design_multirate(masses(), {"y2": 2}), "one period",
+    ),
+    "H-infinity filter": (
+        "estimation.robust_filter._at", larger(1.5, 1),
+        lambda: fx.estimation.design_hinf_filter(masses()), "more than the level",
+    ),
+    "unknown inputs": (
+        "estimation.unknown_inputs._judged", given(1.1, 2),
+        lambda: fx.estimation.design_input_estimator(
+            masses(), ["amp"], fx.estimation.Augmented(drift=1.0)
+        ), "variances differ",
+    ),
+    "coupled responses": (
+        "joining.frf_coupling._check_gap", half_open, lambda: fx.joined(frfs(), JOINT),
+        "leave a gap",
+    ),
+    "rigid-body motions of joined parts": (
+        "joining.join.certified", given(2, 6), lambda: fx.joined(chains(), JOINT),
+        "stretch no joint",
+    ),
+    "budget by the other Gramian": (
+        "loop.budget.solve_stein", second, lambda: servo().budget("die:error"),
+        "observability Gramian",
+    ),
+    "budget by its spectrum": (
+        "loop.budget.integrated", larger(1.01, 1), lambda: servo().budget("die:error"),
+        "integral of the spectrum",
+    ),
+    "H2 norm by the other Gramian": (
+        "lti.norms.observability_gramian", larger(1.01),
+        lambda: fx.h2_norm(fx.StateSpace([[-2.0]], [[1.0]], [[1.0]], [[0.0]])),
+        "by the observability",
+    ),
+    "cost of a layout": (
+        "placement.poi_lqr.AGREEMENT", lambda allowed: -allowed,
+        lambda: import_module("flexplant.placement.poi_lqr").confirmed(1.0, 1.0), "loop costs",
+    ),
+    "affine channels of a sampled plant": (
+        "plant.uncertainty.delta_channels._distance", lambda _: lambda *_: 1.0,
+        lambda: fx.synthesis.robust_stability(
+            two_masses().discretized(2e3).uncertain(frequency=0.01, damping=0.1), lead(2e3)
+        ), "lie 100 % off",
+    ),
+    "bound of neglected modes": (
+        "plant.uncertainty.neglected._MARGIN", lambda margin: 0.5 * margin,
+        lambda: two_masses().uncertain(frequency=0.01, neglected=two_masses(3)),
+        "times the weights",
+    ),
+    "reduced controller": (
+        "synthesis.aftercare.order.kept", lambda _: lambda *_: "too much",
+        lambda: reducer(loss=0.1), "no controller of fewer states",
+    ),
+    "H2 claim": (
+        "synthesis.h2._solved", larger(1.01, 4), lambda: fx.design_h2(masses()), "by the synthesis",
+    ),
+    "H2 stability": (
+        "synthesis.h2._solved", opposite, lambda: fx.design_h2(masses()), "is not stable",
+    ),
+    "normalised coprime factors": (
+        "synthesis.hinf.ncf._least_by_factors", larger(1.01),
+        lambda: fx.synthesis.shape_loop(fx.lti.tf([1.0], [1.0, 1.0, 0.0]), bandwidth=10.0),
+        "by the Hankel norm",
+    ),
+    "two degrees of freedom": (
+        "synthesis.hinf.shaping.following", larger(0.5, 1),
+        lambda: fx.synthesis.shape_loop(
+            fx.lti.tf([1.0], [1.0, 1.0, 0.0]), bandwidth=10.0, model=20.0
+        ), "was claimed",
+    ),
+    "largest gain": (
+        "synthesis.robustness.gain._reached", larger(100.0, 0),
+        lambda: fx.synthesis.worst_case_gain(off_by(0.01), lead(), w=["d"], z=["tip:x"]),
+        "was proven as largest",
+    ),
+    "mu of one channel a mode": (
+        "synthesis.robustness.mode_dk._gain", larger(100.0),
+        lambda: fx.synthesis.design_mu(
+            off_by(0.01), w=["d", "y1:noise"], z=["tip:x", "u1:effort"], iterations=1
+        ), "times the gain",
+    ),
+    "robust stability by machines": (
+        "synthesis.robustness.robust_stability.stability", lambda _: lambda *_: 1.5,
+        lambda: fx.synthesis.robust_stability(off_by(0.01), lead(), machines=8), "is unstable",
+    ),
+    "structured claim": (
+        "synthesis.structured.structured_design._norm", larger(1.01),
+        lambda: fx.synthesis.design_structured(problem(), FixedOrder(0), starts=1),
+        "in the scaled problem",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_wrong_answer_is_refused(what, monkeypatch):
+    target, wrong, call, said = WRONG[what]
+    module, name = target.rsplit(".", 1)
+    place = import_module(f"flexplant.{module}")
+    monkeypatch.setattr(place, name, wrong(getattr(place, name)))
+    with pytest.raises(CertificateError, match=said):
+        call()
+
+
+def test_a_loop_is_held_to_each_objective():
+    """`design_lmi` computes what it reached from the loop: a norm and a region not kept."""
+    design = import_module("flexplant.synthesis.objectives.design")
+    plant, found = problem(), fx.design_hinf(problem())
+    norm = fx.synthesis.Hinf(below=0.9 * found.gamma)
+    with pytest.raises(CertificateError, match="in the closed loop"):
+        design._verified(plant, found.system, norm, ())
+    region = PoleRegion(decay=1e6)
+    with pytest.raises(CertificateError, match="outside its region"):
+        design._verified(plant, found.system, fx.synthesis.Hinf(), (region,))
+    with pytest.raises(CertificateError, match="not stable"):
+        wrong = found.system.replace(C=-1e3 * found.system.C, D=-1e3 * found.system.D)
+        design._verified(plant, wrong, fx.synthesis.Hinf(), ())
