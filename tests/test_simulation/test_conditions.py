@@ -20,10 +20,10 @@ from stages import L, ports, some_modes
 RATE, FINER = 2000.0, 4
 
 
-def made(delay):
+def made(delay, **options):
     """A plate of six modes and its loop at 2 kHz."""
     modes = some_modes(count=6, attached=False)
-    plant = assemble_plant(modes, ports()).discretized(RATE, delay=delay)
+    plant = assemble_plant(modes, ports(**options)).discretized(RATE, delay=delay)
     return close_loop(plant, design_kalman(plant), design_servo(plant, bandwidth=20.0))
 
 
@@ -64,8 +64,11 @@ def test_between_samples_is_the_matrix_exponential(delay):
     np.testing.assert_allclose(run["die:z"], z, rtol=0, atol=1e-8 * np.abs(z).max())
 
 
-def test_noise_is_that_of_the_samples_of_the_controller(loop):
+def test_noise_is_that_of_the_samples_of_the_controller():
     """Commands, in which the noise of the sensors prevails, have the rms in closed form."""
+    loop = made(1.0, asd=1e-6, sensor_asd=1e-9)
+    budget = loop.budget("u1")
+    assert sum(budget.variances[["noise" in name for name in budget.names]]) > 0.9 * budget.rms**2
     fine = simulate(loop, duration=0.5, rng=1, runs=4, finer=2)
     u = fine["u1"][:, ::2]
     np.testing.assert_array_equal(fine["u1"][:, 1::2], u)

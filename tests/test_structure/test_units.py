@@ -45,12 +45,16 @@ def test_the_force_of_a_consistent_system(names, force):
 
 
 def test_frequencies_change_with_the_unit_of_time_only():
+    """And so do the rates at which motions decay, the eigenvalues of M^-1 D."""
     K, M = np.array([[12.0, 6000.0], [6000.0, 4.0e6]]), np.diag([2e-3, 300.0])
     square = np.linalg.eigvals(np.linalg.solve(M, K)).real
     for names, time in ((("mm", "t", "s"), 1.0), (("in", "lb", "ms"), 1e-3)):
         system = units(*names)
-        si = np.linalg.solve(system.mass_matrix(M, DOFS), system.stiffness_matrix(K, DOFS))
-        np.testing.assert_allclose(np.linalg.eigvals(si).real * time**2, square, rtol=1e-12)
+        mass = system.mass_matrix(M, DOFS)
+        stiff = np.linalg.solve(mass, system.stiffness_matrix(K, DOFS))
+        np.testing.assert_allclose(np.linalg.eigvals(stiff).real * time**2, square, rtol=1e-12)
+        decay = np.linalg.solve(mass, system.damping_matrix(K, DOFS))
+        np.testing.assert_allclose(np.linalg.eigvals(decay).real * time, square, rtol=1e-12)
 
 
 def test_a_sparse_matrix_stays_sparse_and_symmetric_to_the_bit():
