@@ -1,6 +1,7 @@
 """Branch and bound: proven optima are those of every subset, bounds are never above them."""
 
 from functools import cache
+from itertools import combinations
 from math import comb
 
 import numpy as np
@@ -158,6 +159,24 @@ def test_branches_find_what_every_subset_shows(make, monkeypatch, side):
     best = place(plant, candidates, 4, criterion).value
     assert 0.8 * rough.value <= rough.bound <= best <= rough.value
     assert rough.gap <= 0.2
+
+
+def test_from_the_worst_start_the_optimum_is_found_all_the_same(make, monkeypatch):
+    """A bound too high by a little cuts off the optimum; a start that is best would hide it."""
+    room = "flexplant.placement.branch_and_bound"
+    for seed in (3, 11, 12):
+        plant, sensors, _ = make(seed, count=9)
+        for one in (f"{room}._SCREENED", f"{room}._SCORED"):
+            monkeypatch.setattr(one, 1)
+        layouts = layouts_of(plant, "y", sensors, PoiVariance("die"))
+        sets = list(combinations(range(9), 4))
+        values = [float(layouts.score([one])[0]) for one in sets]
+        worst = sets[int(np.argmax(values))]
+        start = (worst, ((max(values),),), 1)
+        monkeypatch.setattr(f"{room}.best_start", lambda *_, start=start: start)
+        found = place_sensors(plant, sensors, 4, method=BranchAndBound())
+        assert found.value == pytest.approx(min(values), rel=1e-12, abs=0.0)
+        assert found.bound == found.value
 
 
 def test_a_limit_of_branches_says_that_it_was_hit(make):
