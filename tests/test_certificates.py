@@ -136,6 +136,28 @@ def opposite(function):
     return called
 
 
+def unproven(function):
+    """A loop whose norm is not finite."""
+
+    def called(*args):
+        found = function(*args)
+        return found._replace(certificate=dict(found.certificate, norm=np.inf))
+
+    return called
+
+
+class Unstable:
+    """The report of a loop that is not stable."""
+
+    is_stable = False
+
+    def __init__(self, report):
+        self.report = report
+
+    def __getattr__(self, name):
+        return getattr(self.report, name)
+
+
 #: what is made wrong, how, what is called then, and what is said
 WRONG = {
     "error of an observer, its dual": (
@@ -211,6 +233,18 @@ WRONG = {
         "synthesis.hinf.ncf._least_by_factors", larger(1.01),
         lambda: fx.synthesis.shape_loop(fx.lti.tf([1.0], [1.0, 1.0, 0.0]), bandwidth=10.0),
         "by the Hankel norm",
+    ),
+    "shaped loop": (
+        "synthesis.hinf.shaping.report_loops",
+        lambda function: lambda *args, **options: Unstable(function(*args, **options)),
+        lambda: fx.synthesis.shape_loop(fx.lti.tf([1.0], [1.0, 1.0, 0.0]), bandwidth=10.0),
+        "a mode was hidden",
+    ),
+    "no feedback": (
+        "synthesis.hinf.hinf_design._of_loop", unproven,
+        lambda: import_module("flexplant.synthesis.hinf.hinf_design").idle_answer(
+            problem(), None, ""
+        ), "cannot be verified",
     ),
     "two degrees of freedom": (
         "synthesis.hinf.shaping.following", larger(0.5, 1),
