@@ -37,6 +37,16 @@ LINES = [
     ("simulation/stepping.py", "/= np.sqrt(hold)", "/= 1.0"),
     ("identification/refine.py", "self.cost += float(error @ error)",
      "self.cost += 2.0 * float(error @ error)"),
+    ("plant/sampling.py", "np.asarray(asd)[loud] / np.sqrt(2.0)", "np.asarray(asd)[loud]"),
+    ("lti/discretisation.py", "np.asarray(asd)[active] / np.sqrt(2.0)", "np.asarray(asd)[active]"),
+    ("lti/discretisation.py", "np.arctan(0.5 * dt * omega)", "np.arctan(0.4 * dt * omega)"),
+    ("lti/discretisation.py", "np.sin(turning), -0.5 *", "np.sin(turning), -0.6 *"),
+    ("identification/spectra.py", "count / (1.0 + 2.0 * doubled)", "1.0 * count"),
+    ("reduction/bounds.py", "np.sqrt(1 + 2 * a)", "np.sqrt(1 + a)"),
+    ("estimation/filter_model.py", "L_z @ m.R - 2.0 * N", "L_z @ m.R - N"),
+    ("structure/damping.py", "ratio = 0.5 * (self.alpha", "ratio = 1.0 * (self.alpha"),
+    ("loop/mode_tolerance.py", "zeta = -0.5 * trace", "zeta = -1.0 * trace"),
+    ("updating/judgement/posterior.py", "return -0.5 * float(r @ r)", "return -float(r @ r)"),
 ]  # fmt: skip
 
 

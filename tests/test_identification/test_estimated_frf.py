@@ -310,3 +310,12 @@ def test_how_well_the_variance_of_a_few_runs_is_known(runs, outputs, inputs, sha
     if runs == 4:
         with pytest.warns(FlexplantWarning, match="1.2 degrees of freedom"):
             FrfResidual(frf.replace(freedom=1.2), lines=[0, 1])
+
+
+def test_averages_of_half_overlapping_segments_count_as_in_closed_form():
+    """Of a periodic Hann window neighbours share 1/6: ``k / (1 + 2 (1 - 1/k) / 36)`` of k."""
+    from flexplant.identification.spectra import _effective
+
+    hann = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(256) / 256)
+    assert _effective(hann, 128, 20) == pytest.approx(20 / (1 + 2 * 0.95 / 36), rel=1e-9)
+    assert _effective(hann, 256, 20) == 20.0

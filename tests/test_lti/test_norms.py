@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexplant.errors import ModelError
-from flexplant.lti import StateSpace, h2_norm, hinf_norm, lft, norms, peak_gain
+from flexplant.lti import StateSpace, h2_norm, hinf_norm, lft, norms, peak_gain, peaks
 from flexplant.lti import norms as level_set
 from flexplant.lti.discretisation import discretized
 from flexplant.lti.peaks import Peaks, climbed, exceeding, proved_peak, residues
@@ -316,3 +316,17 @@ def test_the_accuracy_that_is_claimed_at_light_damping(zeta):
     claimed = max(1e-8, np.finfo(float).eps * np.linalg.norm(dense.A) / zeta)
     if claimed < 0.1:
         assert hinf_norm(dense) == pytest.approx(exact, rel=claimed)
+
+
+def test_no_interval_is_passed_in_which_the_gain_is_above_the_level():
+    """As wide as intervals are examined, where the rest of the series decides."""
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        omega, zeta = rng.uniform(1.0, 10.0), 10.0 ** rng.uniform(-3.0, -0.5)
+        model, _ = residues(resonance(omega, zeta, 1.0))
+        centre = rng.uniform(0.0, 15.0, 1)
+        radius = peaks.NEAR * model.nearest(centre)
+        inside = centre + radius * np.linspace(-1.0, 1.0, 401)
+        most = np.abs(model.series(inside, 0)[0]).max()
+        assert not peaks._examined(model, centre, radius, 0.999 * most)[1].any()
+        assert peaks._examined(model, centre, radius, 1e3 * most)[1].all()

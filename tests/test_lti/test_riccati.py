@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexplant.errors import ModelError, ShapeError, SolverError
-from flexplant.lti import control_care, control_dare, solve_care, solve_dare
+from flexplant.lti import control_care, control_dare, equations, solve_care, solve_dare
 from oracles_lti import double_integrator_dare, riccati_recursion, stein
 
 
@@ -303,3 +303,25 @@ def test_an_unstable_mode_that_nothing_reaches_is_named(A):
     A = np.array(A)
     with pytest.raises(SolverError, match="cannot be seen"):
         control_care(A, np.zeros((len(A), 1)), Q=np.eye(len(A)), R=np.eye(1))
+
+
+def test_an_indefinite_equation_is_corrected_until_its_residual_is_small(monkeypatch):
+    """From a basis that is 1e-5 off, as rounding leaves it of worse equations."""
+    rng = np.random.default_rng(2)
+    A, B, C = rng.normal(size=(6, 6)) - 3 * np.eye(6), rng.normal(size=(6, 3)), np.eye(6)
+    R, S = np.diag([1.0, 1.0, -100.0]), np.zeros((6, 3))
+    right, found = equations.la.schur, []
+
+    def wrong(*args, **options):
+        if "sort" not in options:  # of Newton's equations
+            return right(*args, **options)
+        triangle, vectors, count = right(*args, **options)
+        found.append(count)
+        return triangle, vectors * (1.0 + 1e-5 * rng.normal(size=vectors.shape)), count
+
+    monkeypatch.setattr(equations.la, "schur", wrong)
+    X, F = equations.stabilising(A, B, C.T @ C, R, S)
+    rest = A.T @ X + X @ A - X @ B @ np.linalg.solve(R, B.T @ X) + C.T @ C
+    assert found == [6]
+    assert np.linalg.norm(rest) < 1e-10 * np.linalg.norm(A.T @ X)
+    assert np.linalg.eigvals(A + B @ F).real.max() < 0.0

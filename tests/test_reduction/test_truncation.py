@@ -181,3 +181,16 @@ def test_the_bound_of_chosen_modes_of_a_model_has_no_band(plate):
     assert bound.below(10.0) == bound.value
     with pytest.raises(ModelError, match="freq"):
         bound.below(-1.0)
+
+
+def test_the_largest_departure_from_the_static_response_is_that_of_a_dense_grid():
+    """Below, at and above the resonance, up to critical damping."""
+    from flexplant.reduction.bounds import _largest_change
+
+    w = np.linspace(0.0, 3.0, 60001)
+    for zeta in (0.001, 0.1, 0.4, 0.9):
+        for top in (0.5, 1.0, 3.0):
+            own = w[w <= top]
+            change = np.abs(1.0 / (1.0 - own**2 + 2j * zeta * own) - 1.0).max()
+            found = _largest_change(np.ones(1), np.array([zeta]), top)
+            np.testing.assert_allclose(found, change, rtol=1e-4)

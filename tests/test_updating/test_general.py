@@ -247,17 +247,16 @@ def test_posterior_covariance_is_that_of_the_linear_problem(chain):
     assert (high - low) / 2 == pytest.approx(1.959964 * fit.std[0], rel=1e-6)
 
 
-@pytest.mark.slow
 def test_laplace_and_ensemble_draws_agree(chain):
     parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
     residuals = [Eigenvalues(measured(parts, 0.005))]
     fit = update(chain, MASS, residuals, method=TrustRegion())
     draws = fit.sample(4000, rng=1)
     np.testing.assert_allclose(np.cov(draws.T), fit.covariance, rtol=0.15, atol=3e-6)
-    chainwise = sample_posterior(chain, MASS, residuals, fit, steps=150, rng=2)
+    chainwise = sample_posterior(chain, MASS, residuals, fit, steps=400, rng=2)
     assert 0.2 < chainwise.acceptance < 0.9
     assert np.all(np.abs(chainwise.mean - fit.values) < 0.4 * fit.std)
-    np.testing.assert_allclose(np.sqrt(np.diag(chainwise.covariance)), fit.std, rtol=0.3)
+    np.testing.assert_allclose(np.sqrt(np.diag(chainwise.covariance)), fit.std, rtol=0.15)
     assert "acceptance" in repr(chainwise)
     with pytest.raises(ModelError, match="noise"):
         sample_posterior(chain, MASS, [Eigenvalues(measured(parts))], fit)
