@@ -153,7 +153,7 @@ def test_real_deltas_against_brute_force():
         first += [t for t, one in zip(sizes, growth, strict=True) if one > 0][:1]
     brute = 1.0 / min(first)
     assert brute * 0.99 <= found.lower <= found.upper
-    assert found.upper <= 1.12 * brute
+    assert found.upper <= 1.11 * brute  # 1.08 to 1.10, where G too small gave 1.11 to 1.18
     # taken as complex, light damping alone would be lost by them
     assert mu(g, [RepeatedScalar(real=False)] * 3).lower > 100 * found.upper
 

@@ -211,7 +211,7 @@ def _scales_of(plant: OpenPlant, loop: UncertainLoop, order: int) -> _DFilters:
             continue
         start = scalings.scaled(scalings.start, osborne(M, where))
         x = upper_level(M, scalings, start).x
-        rows.append(np.sqrt(np.array([D[0, 0].real for D in scalings.D(x)])))
+        rows.append(np.sqrt(scalings.stacks(x)[0][:, 0, 0].real))  # all are numbers
     d = np.array(rows)
     d = d / d[:, -1:]  # performance is not scaled
     tall = np.array([plant.heights(one, one) for one in omega])

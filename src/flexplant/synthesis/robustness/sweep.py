@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import tick
 from ...tolerances import ROUNDING, TINY
 from .uncertainty_blocks import Block, Scalings, places
-from .upper import centred, reached_level, simple_bound, upper_level
+from .upper import WIDE, centred, reached_level, simple_bound, upper_level
 
 #: relative distance of the level to the largest upper bound found at a frequency
 _ABOVE = 5e-3
@@ -140,7 +141,12 @@ class _Cover:
     def _raise(self, M: ComplexArray, omega: float) -> FloatArray:
         """Return scalings that hold at a frequency; the level is raised where it is too low."""
         near = min(self.last, key=lambda one: abs(one[0] - omega))[1] if self.last else None
-        found = upper_level(M, self.scalings, near, enough=0.97 * self.level)
+        enough = 0.97 * self.level
+        found = upper_level(M, self.scalings, near, enough=enough, widest=WIDE)
+        has_G = np.any(self.scalings.of_G) and not self.scalings.skewed
+        if found.level > enough and has_G:  # the level is raised only by what no G lowers
+            freer = upper_level(M, self.scalings, found.x, enough=enough)
+            found = min(found, freer, key=itemgetter(0))
         self.found.append((omega, found.level))
         if not found.level * (1 + self.accuracy) ** 2 <= self.level:
             self.level = max(self.level, found.level * (1 + self.accuracy) ** 2)

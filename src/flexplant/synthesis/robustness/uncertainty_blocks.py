@@ -158,6 +158,16 @@ class Scalings:
                         entries.append((p, w, z, 1j * B[i, k], False))
                         entries.append((p, z, w, -1j * np.conj(B[i, k]), False))
         self.count = len(start)
+        sizes = [basis.shape[1] for _, basis in self.d_ranges]
+        #: blocks of one size together: x of their D (n_blocks, size^2), and the basis of each
+        self.alike: list[tuple[IntArray, ComplexArray]] = [
+            (
+                np.array([np.arange(own.start, own.stop) for own, b in self.d_ranges
+                          if b.shape[1] == size]),
+                _hermitian(size),
+            )
+            for size in sorted(set(sizes))
+        ]  # fmt: skip
         #: which x are of G
         self.of_G = np.ones(self.count, dtype=bool)
         for own, _ in self.d_ranges:
@@ -169,8 +179,6 @@ class Scalings:
         self.column: IntArray = np.array([e[2] for e in entries])
         self.value: ComplexArray = np.array([e[3] for e in entries], dtype=np.complex128)
         self.leveled = np.array([e[4] for e in entries])
-        #: the first entry of each parameter, whose entries follow each other
-        self.first = np.searchsorted(self.owner, np.arange(self.count))
 
     def coefficients(self, level: float) -> ComplexArray:
         """Return the entries of S for x = 1, at a level."""
@@ -182,9 +190,9 @@ class Scalings:
         np.add.at(S, (self.row, self.column), self.coefficients(level) * x[self.owner])
         return S
 
-    def D(self, x: FloatArray) -> list[ComplexArray]:
-        """Return D of each block."""
-        return [np.einsum("p,pij->ij", x[own], basis) for own, basis in self.d_ranges]
+    def stacks(self, x: FloatArray) -> list[ComplexArray]:
+        """Return D of the blocks of each size (n_blocks, size, size)."""
+        return [np.einsum("bp,pij->bij", x[own], basis) for own, basis in self.alike]
 
     @property
     def ends(self) -> list[int]:
