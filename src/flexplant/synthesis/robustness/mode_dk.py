@@ -109,7 +109,7 @@ def _step(
     system = g.replace(C=g.C * scale[:, None], D=g.D * scale[:, None])
     problem = prepared(system, plant.u, plant.y)
     found = (method or Riccati()).solve(problem)
-    K = problem.restored(found.A, found.B, found.C, found.D)
+    K = problem.restored(found.A, found.B, found.C, found.D).replace(name="mu", units=plant.units)
     if not lft(system, K).is_stable:
         raise SolverError("the controller does not stabilise in rounding.")
     again = rebalanced(channels, with_channels(weighted, channels), K)

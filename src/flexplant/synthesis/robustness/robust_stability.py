@@ -33,8 +33,8 @@ _RESOLVED = 0.05
 _STARTS = 3
 #: the worst machine is shown this much beyond its edge of stability
 _BEYOND = 1e-3
-#: largest multiple of an uncertainty that the quick bound tries, and halvings: 3 % at 1
-_REACH, _HALVINGS = 2.0, 5
+#: largest multiple of an uncertainty that the quick bound tries
+_REACH = 2.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -282,16 +282,12 @@ def _quick(
     channels = mode_channels(uncertain.plant, uncertain)
     opened = with_channels(uncertain.plant, channels)
     controller = loop.controller.select(outputs=loop.driven)
-    low, high = 0.0, _REACH
-    for size in (1.0, *[0.0] * _HALVINGS):
-        tried = size or 0.5 * (low + high)
-        if tolerated(channels, opened, controller, tried) < 1.0:
-            low = tried
-        elif size:
-            return None
-        else:
-            high = tried
-    upper = 1.0 / low
+    upper = tolerated(channels, opened, controller)
+    if not upper < 1.0:
+        return None
+    # the grid goes through the places of the modes at Deltas of a size, not beyond
+    size = 1.0 / max(upper, 1.0 / _REACH)
+    upper = max(1.0 / size, tolerated(channels, opened, controller, size) / size)
     certificate = _tried(uncertain, loop, names, upper, count, rng)
     certificate["modes, each by one channel"] = float(len(channels))
     left_out = _left_out(loop, larger)
