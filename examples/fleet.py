@@ -1,6 +1,6 @@
 """A fleet of wafer stages: one robust controller for all against one for each machine.
 
-Run it: ``python examples/fleet.py`` for ten machines (some 3 minutes of one core) or, as below,
+Run it: ``python examples/fleet.py`` for ten machines (50 s of two cores) or, as below,
 with their number: ``python examples/fleet.py 50``. No machine is of the drawing's family: each is a
 plate in polynomials with rotary inertia, an unknown mass at z8 and another somewhere, scattered
 stiffness and damping, sensors with steps. All are measured (poles of twelve modes, errors of 1e-5),
