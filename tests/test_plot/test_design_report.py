@@ -89,7 +89,14 @@ def test_it_begins_with_the_result_and_ends_with_versions(text, design):
     assert f"modulus margin {loop.modulus_margin:.3g}" in tiles[3]
     said = words(tree)
     seeds = "seed of run7", "seed of test8"
-    for part in (fx.__version__, np.__version__, *seeds, "u4:effort", "no choice is below"):
+    for part in (
+        fx.__version__,
+        np.__version__,
+        *seeds,
+        "u4:effort",
+        "Beside the model of the loop",
+        "no choice is below",
+    ):
         assert part in said
     drawn = [one for one in tree.iter("figure") if one.get("class") == "picture"]
     assert len(drawn) >= 8 and all(one.find(".//path") is not None for one in drawn)

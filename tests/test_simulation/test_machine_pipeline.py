@@ -58,6 +58,15 @@ def test_modes_and_reduced_models_are_updated_as_the_drawing_is():
     assert near.modulus_margin == pytest.approx(expected["margin expected"], rel=1e-2)
 
 
+def test_the_report_holds_the_run_against_the_model():
+    """Power around each mode beside the predicted; a run that is too short says so."""
+    short, longer = (pipeline(duration=t).report(machine(0.1), 1) for t in (0.05, 1.0))
+    assert "The run beside the model\n  not judged: " in repr(short)
+    assert longer.agreement.holds
+    assert set(longer.agreement.spectra) == {2, 3}
+    assert "The run beside the model\n  <Consistency at 95 %" in repr(longer)
+
+
 def test_damping_in_place_of_a_matrix():
     same = pipeline(full=bare(), damping=LAW)
     close(same(machine(0.0), 1), pipeline()(machine(0.0), 1))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import Value, generator, instance, positive, short, whole
-from ..errors import AssumptionError, InfeasibleError, ModelError, counted
+from ..errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, counted
 from ..estimation import Consistency, KalmanEstimator, consistency, design_kalman
 from ..identification import MeasuredModes, identify_modes, numbered
 from ..loop import ClosedLoop, SpillOver, bandwidth, close_loop
@@ -432,6 +432,7 @@ class MachineReport(Value):
             "Controller": self.blocks,
             "Loop on the larger model": [self.left_out and self.left_out.summary],
             "Loop that was run": [self.loop],
+            "The run beside the model": [self._judged()],
             "Specification": [self.verdict],
             "In numbers": [f"{name}: {_shown(value)}" for name, value in self.row.items()],
             "Warnings": self.warned,
@@ -442,6 +443,13 @@ class MachineReport(Value):
             if shown:
                 lines += [heading, *(f"  {line}" for line in shown.splitlines()), ""]
         return "\n".join(lines[:-1])
+
+    def _judged(self) -> Consistency | str:
+        """Return how the run agrees with the model, or why that cannot be said."""
+        try:
+            return self.agreement
+        except FlexplantError as error:
+            return f"not judged: {error}"
 
     def write(self, path: str | Path) -> None:
         """Write the text to a file, at once or not at all; `save` keeps the values themselves.

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...certificates import Certificate, figure
 from ...checks import FloatArray, IntArray, with_unit
-from ...estimation import LagReport
+from ...estimation import LagReport, consistency
 from ...identification import StabilisationDiagram
 from ...loop import ClosedLoop, ErrorBudget
 from ...lti.frequency import Frf
@@ -86,6 +86,10 @@ def sections(design: Design, gallery: Gallery) -> Iterator[Chapter]:
 def _shown(name: str, value: Any, design: Design, gallery: Gallery) -> str:
     """Return a value: its name, what it says of itself, tables and pictures."""
     parts = [f"<h3>{escape(name)}</h3>", value._repr_html_()]
+    loop = next(iter(design.of(ClosedLoop).values()), None)
+    if isinstance(value, Response) and value.seed is not None and loop is not None:
+        parts.append("<h4>Beside the model of the loop</h4>")
+        parts.append(attempted(lambda: consistency(loop, value)._repr_html_()))
     modes = _modes_of(value)
     if modes is not None:
         parts.append(
