@@ -94,10 +94,30 @@ def test_fill_is_that_of_nested_dissection():
     _, K, nodes, xyz, _ = meshes.plate(60)
     known = dissect(K, nodes, xyz)
     assert known.n_factor < 31 * K.shape[0] * np.log2(61**2)
-    assert dissect(K, nodes).n_factor < 1.6 * known.n_factor
+    for without in (dissect(K, nodes), dissect(K)):
+        assert without.n_factor < 1.1 * known.n_factor
     # coordinates that say nothing about the graph are not followed
     wrong = np.random.default_rng(0).permutation(xyz)
-    assert dissect(K, nodes, wrong).n_factor < 1.6 * known.n_factor
+    assert dissect(K, nodes, wrong).n_factor < 1.1 * known.n_factor
+
+
+def test_a_shell_rolled_up_is_cut_along_itself():
+    _, K, nodes, xyz, _ = meshes.plate(60)
+    turn = 12 * np.pi * xyz[:, 0] / np.ptp(xyz[:, 0])
+    radius = 0.1 + 0.01 * turn
+    rolled = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), xyz[:, 1]])
+    assert dissect(K, nodes, rolled).n_factor < 1.1 * dissect(K, nodes, xyz).n_factor
+
+
+def test_a_solid_without_coordinates_and_bodies_that_do_not_touch():
+    _, K, nodes, xyz, _ = meshes.solid(12, 9, 8)
+    known = dissect(K, nodes, xyz).n_factor
+    assert dissect(K, nodes).n_factor < 1.1 * known
+    three = sp.csc_array(sp.block_diag([K, K, K]))
+    apart = dissect(three, np.concatenate([nodes + k * (nodes.max() + 1) for k in range(3)]))
+    assert apart.n_factor < 1.35 * 3 * known  # the middle one is cut twice
+    mixed = np.random.default_rng(2).permutation(K.shape[0])
+    assert dissect(sp.csc_array(K[mixed][:, mixed]), nodes[mixed]).n_factor < 1.1 * known
 
 
 def test_a_hub_does_not_spoil_the_order():
@@ -164,7 +184,9 @@ def test_a_complex_symmetric_factor_between_resonances():
         factor = ComplexSymmetricFactor(B, dissect(B, leaf=20))
         wanted = la.solve(B.toarray(), b)
         np.testing.assert_allclose(factor.solve(b), wanted, rtol=0, atol=1e-10 * abs(wanted).max())
-        np.testing.assert_allclose(factor.solve(b[:, 0]), factor.solve(b)[:, 0], rtol=1e-12)
+        # one column is another kernel's product: alike to what the solution is good to
+        single = factor.solve(b[:, 0]) - factor.solve(b)[:, 0]
+        assert abs(single).max() < 1e-11 * abs(wanted).max()
     with pytest.raises(SolverError, match="singular"):
         ComplexSymmetricFactor(sp.csc_array((3, 3), dtype=complex))
 

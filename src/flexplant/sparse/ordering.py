@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,18 +10,25 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..checks import FloatArray, IntArray
+from ..checks import BoolArray, FloatArray, IntArray
 
 #: a part of fewer DOFs is eliminated as one dense block
 LEAF = 96
 #: a node with this many times the mean number of neighbours (a spider, a constraint) goes last
 _HUB = 20
-#: a first separator with more than this part of the nodes: the coordinates do not fit the graph
-_USELESS = 0.25
+#: coordinates whose first separator has more than this times the nodes of the graph's own do not
+#: fit the graph (a rolled-up shell, where they meet through air: 2.5); boxes have 1.0 to 1.1
+_USELESS = 1.3
 #: multiplications of a factorisation for each entry of the factor from which on it is costly
 _COSTLY = 350.0
-#: points from which distances through the graph stand in for missing coordinates
-_LANDMARKS = 8
+#: averages over neighbours of a distance through the graph: 10 to 40 give the same fill within 1 %
+_AVERAGES = 20
+#: part of the nodes on either side of the middle in which the smallest separator is looked for
+_BAND = 0.05
+#: a side with less than this part of the DOFs: cut in the middle instead
+_LEAST_SIDE = 0.15
+#: capacity of what no cut goes through: above any flow, below the limit of 32-bit integers
+_UNCUT = 2**30
 
 
 @dataclass(frozen=True)
@@ -68,27 +75,43 @@ def dissect(
     *,
     leaf: int = LEAF,
 ) -> Dissection:
-    """Return the nested dissection of a symmetric matrix.
+    """Return the nested dissection of a symmetric matrix [George1973]_.
 
-    Parts are cut in two across their longest side, through the median; the nodes on one side that
-    touch the other come after both [George1973]_.
+    Where coordinates fit the graph, parts are cut across their longest side; else along the
+    graph itself (`_graph_cut`), which costs eight times the time.
     """
-    n = matrix.shape[0]
     if nodes is None:
-        nodes = np.arange(n)
+        nodes = _alike(matrix)
     _, first, member = np.unique(nodes, return_index=True, return_inverse=True)
     width = np.bincount(member)
     graph = _node_graph(matrix, member, width.size)
     degree = np.diff(graph.indptr)
     hubs = degree > _HUB * max(8.0, float(degree.mean()))
-    parts = None
+    cut: _Cut = _graph_cut
+    place = np.arange(width.size)
     if xyz is not None:
-        parts = _bisect(graph, xyz[first], width, hubs, leaf)
-    if parts is None or parts.worst > _USELESS * width.size:
-        other = _bisect(graph, graph_coordinates(graph), width, hubs, leaf)
-        if parts is None or other.worst < parts.worst:
-            parts = other
-    return _fronts(graph, parts, member, width)
+        where = _unit_box(xyz[first])
+        across = _coordinate_cut(where)
+        sizes = [
+            _bisect(graph, width, hubs, leaf, way, levels=1).separator for way in (across, cut)
+        ]
+        if sizes[0] <= _USELESS * sizes[1]:
+            cut, place = across, _morton(where)
+    return _fronts(graph, _bisect(graph, width, hubs, leaf, cut), place, member, width)
+
+
+def _alike(matrix: sp.csc_array) -> IntArray:
+    """Return a number for each DOF, the same where DOFs touch each other and the same others.
+
+    So are the DOFs of a node; sums of a random integer for each DOF touched tell them apart.
+    Where few are alike (elements whose axes do not couple), groups of unlike sizes cost fill.
+    """
+    n = matrix.shape[0]
+    lower: Any = sp.tril(matrix, -1, format="csc")
+    lower = sp.csc_array((np.ones(lower.nnz, np.int64), lower.indices, lower.indptr), shape=(n, n))
+    key = np.random.default_rng(0).integers(2**62, size=n)
+    names, alike = np.unique(key + lower @ key + lower.T @ key, return_inverse=True)
+    return np.asarray(alike) if names.size < 0.6 * n else np.arange(n)
 
 
 def _node_graph(matrix: sp.csc_array, member: IntArray, count: int) -> sp.csr_array:
@@ -106,112 +129,198 @@ def _node_graph(matrix: sp.csc_array, member: IntArray, count: int) -> sp.csr_ar
     return sp.csr_array(edges + edges.T)
 
 
-def graph_coordinates(graph: sp.csr_array) -> FloatArray:
-    """Return coordinates (n, 3) of a graph's nodes from distances to a few far-apart ones.
+@dataclass(frozen=True)
+class _Level:
+    """What one level cuts: nodes, the part (0, 1, ...) and width of each, edges inside parts.
 
-    Classical scaling of the distances to landmarks [deSilvaTenenbaum2004]_;
-    components that do not touch lie beside each other.
+    `heads` and `tails` are positions in `nodes`, each edge once.
     """
-    n = graph.shape[0]
-    count, component = csgraph.connected_components(graph, directed=False)
-    found = np.zeros((n, 3))
-    for c in range(min(count, 64)):  # beyond, many small pieces: any order is good
-        inside = np.flatnonzero(component == c)
-        part: Any = graph[inside][:, inside] if count > 1 else graph
-        found[inside] = _scaled_distances(sp.csr_array(part))
-    return found + np.outer(component, [2.0 * n, 0.0, 0.0])
+
+    nodes: IntArray
+    part: IntArray
+    width: IntArray
+    heads: IntArray
+    tails: IntArray
+
+    def dofs(self, chosen: BoolArray) -> FloatArray:
+        """Return the number of DOFs of the chosen nodes in each part."""
+        count = int(self.part.max()) + 1
+        found: Any = np.bincount(self.part[chosen], self.width[chosen], minlength=count)
+        return np.asarray(found, dtype=np.float64)
 
 
-def _scaled_distances(graph: sp.csr_array) -> FloatArray:
-    n = graph.shape[0]
-    if n < 4:
-        return np.column_stack([np.arange(n, dtype=np.float64), np.zeros(n), np.zeros(n)])
-    unit = sp.csr_array((np.ones(graph.indices.size), graph.indices, graph.indptr), shape=(n, n))
-    distance = np.zeros((n, 0))
-    start = int(np.argmax(_distances(unit, 0)))
-    for _ in range(min(_LANDMARKS, n)):
-        distance = np.column_stack([distance, _distances(unit, start)])
-        start = int(np.argmax(distance.min(axis=1)))
-    square = distance**2
-    centred = square - square.mean(axis=0)
-    _, _, right = np.linalg.svd(centred[:: max(1, n // 4000)], full_matrices=False)
-    coordinates = centred @ right[:3].T
-    return np.pad(coordinates, ((0, 0), (0, 3 - coordinates.shape[1])))
-
-
-def _distances(graph: sp.csr_array, start: int) -> FloatArray:
-    """Return the number of steps from a node to each other, breadth first."""
-    order, before = csgraph.breadth_first_order(graph, start, directed=False)
-    steps = np.zeros(graph.shape[0])
-    # predecessors come first in the order: levels follow by doubling of the jumps
-    jump = np.where(before < 0, start, before).astype(np.int64)
-    length = np.where(before < 0, 0, 1).astype(np.int64)
-    length[start] = 0
-    jump[start] = start
-    while np.any(jump[order] != start):
-        length = length + length[jump]
-        jump = jump[jump]
-    length = length + length[jump]
-    steps[order] = length[order]
-    return steps
+#: what cuts the parts of a level: masks over its nodes, the upper sides and the separators
+_Cut = Callable[[_Level], tuple[BoolArray, BoolArray]]
 
 
 @dataclass(frozen=True)
 class _Parts:
-    """Each node's part (heap numbers: part p is cut into 2p and 2p + 1), and its place in it."""
+    """Each node's part (part p is cut into 2p and 2p + 1), and the nodes of the first separator."""
 
     part: IntArray
-    place: IntArray
-    worst: int
+    separator: int
 
 
-def _bisect(graph: sp.csr_array, xyz: FloatArray, width: IntArray, hubs: Any, leaf: int) -> _Parts:
+def _bisect(
+    graph: sp.csr_array, width: IntArray, hubs: BoolArray, leaf: int, cut: _Cut, levels: int = 62
+) -> _Parts:
     """Cut all parts of a level at once, until each is a leaf."""
     n = width.size
-    where = _unit_box(xyz)
     part = np.ones(n, dtype=np.int64)
     live = ~hubs
-    place = _morton(where)
     heads = np.repeat(np.arange(n), np.diff(graph.indptr))
     tails = graph.indices.astype(np.int64)
-    once = (heads < tails) & live[heads] & live[tails]
+    once = heads < tails
     heads, tails = heads[once], tails[once]
-    worst = int(np.count_nonzero(hubs))
-    while True:
-        inside = np.flatnonzero(live)
-        if not inside.size:
+    local = np.zeros(n, dtype=np.int64)
+    separator = 0
+    for depth in range(levels):
+        nodes = np.flatnonzero(live)
+        _, number = np.unique(part[nodes], return_inverse=True)
+        large = np.bincount(number, weights=width[nodes]) > leaf
+        large &= np.bincount(number) > 1
+        live[nodes[~large[number]]] = False
+        nodes = nodes[large[number]]
+        if not nodes.size:
             break
-        # parts left, numbered 0, 1, ...
-        names, number = np.unique(part[inside], return_inverse=True)
-        size = np.bincount(number, weights=width[inside])
-        cut = (size > leaf) & (np.bincount(number) > 1)
-        live[inside[~cut[number]]] = False
-        inside, number = inside[cut[number]], number[cut[number]]
-        if not inside.size:
-            break
-        upper = np.zeros(n, dtype=bool)
-        upper[inside[_upper_half(where[inside], number, names.size)]] = True
-        keep = live[heads] & live[tails]
-        heads, tails = heads[keep], tails[keep]
-        across = upper[heads] != upper[tails]
-        a, b = heads[across], tails[across]
-        low, high = np.where(upper[a], b, a), np.where(upper[a], a, b)
-        slot = np.zeros(n, dtype=np.int64)
-        slot[inside] = number
-        low, high = np.unique(low), np.unique(high)
-        # of the two shores of the cut the one with fewer DOFs
-        few = np.bincount(slot[high], weights=width[high], minlength=names.size) < np.bincount(
-            slot[low], weights=width[low], minlength=names.size
-        )
-        between = np.concatenate([low[~few[slot[low]]], high[few[slot[high]]]])
-        if part[inside[0]] == 1 and between.size:
-            worst = max(worst, between.size)
-        live[between] = False
-        rest = inside[live[inside]]
-        part[rest] = 2 * part[rest] + upper[rest]
-        keep = live[heads] & live[tails] & ~across
-        heads, tails = heads[keep], tails[keep]
-    return _Parts(part, place, worst)
+        local[nodes] = np.arange(nodes.size)
+        inside = live[heads] & live[tails]
+        heads, tails = heads[inside], tails[inside]
+        _, number = np.unique(part[nodes], return_inverse=True)
+        level = _Level(nodes, number, width[nodes], local[heads], local[tails])
+        upper, between = cut(level)
+        if depth == 0:
+            separator = int(np.count_nonzero(between))
+        live[nodes[between]] = False
+        part[nodes[~between]] = 2 * part[nodes[~between]] + upper[~between]
+    return _Parts(part, separator)
+
+
+def _smaller_shore(level: _Level, upper: BoolArray) -> BoolArray:
+    """Return the nodes on one side that touch the other, of the side with fewer such DOFs."""
+    across = upper[level.heads] != upper[level.tails]
+    heads, tails = level.heads[across], level.tails[across]
+    shore = np.zeros(upper.size, dtype=bool)
+    shore[heads] = shore[tails] = True
+    few = level.dofs(shore & upper) < level.dofs(shore & ~upper)
+    chosen: BoolArray = shore & (upper == few[level.part])
+    return chosen
+
+
+def _coordinate_cut(where: FloatArray) -> _Cut:
+    """Return the cut through the median of the longest side."""
+
+    def cut(level: _Level) -> tuple[BoolArray, BoolArray]:
+        upper = _upper_half(where[level.nodes], level.part)
+        return upper, _smaller_shore(level, upper)
+
+    return cut
+
+
+def _graph_cut(level: _Level) -> tuple[BoolArray, BoolArray]:
+    """Return the smallest separator near the middle of the longest way through each part.
+
+    Its nodes are the minimum cut of the flow through a band of nodes, each of which passes as
+    much as it has DOFs (Menger's theorem), for all parts in one network.
+    """
+    piece, along = _along(level)
+    order = np.lexsort((along, piece, level.part))
+    begin = np.searchsorted(level.part[order], np.arange(int(level.part.max()) + 2))
+    rank = np.empty(order.size)
+    rank[order] = np.arange(order.size)
+    rank = (rank + 0.5 - begin[level.part]) / np.diff(begin)[level.part]
+    half = rank >= 0.5
+    low, high = rank < 0.5 - _BAND, rank > 0.5 + _BAND
+    touching = (low[level.heads] & high[level.tails]) | (high[level.heads] & low[level.tails])
+    band = ~(low | high)
+    band[level.heads[touching]] = band[level.tails[touching]] = True
+    upper, between = _minimum_cut(level, low & ~band, high & ~band, band)
+    whole = level.dofs(np.ones_like(upper))
+    sides = np.minimum(level.dofs(upper), level.dofs(~upper & ~between))
+    lopsided = (sides < _LEAST_SIDE * whole)[level.part]
+    upper = np.where(lopsided, half, upper)
+    return upper, np.where(lopsided, _smaller_shore(level, half), between)
+
+
+def _along(level: _Level) -> tuple[IntArray, FloatArray]:
+    """Return each node's connected piece, and a coordinate along the longest way through it.
+
+    The difference of the distances to two far ends, averaged over neighbours: steps towards the
+    vector of Fiedler, whose level sets are smaller than those of distances.
+    """
+    n = level.nodes.size
+    ends = (np.r_[level.heads, level.tails], np.r_[level.tails, level.heads])
+    graph = sp.csr_array((np.ones(ends[0].size), ends), shape=(n, n))
+    count, piece = csgraph.connected_components(graph, directed=False)
+
+    def farthest(distance: FloatArray) -> IntArray:
+        order = np.lexsort((distance, piece))
+        return order[np.searchsorted(piece[order], np.arange(count), side="right") - 1]
+
+    def distance(starts: IntArray) -> FloatArray:
+        return _steps(graph, starts)
+
+    one = farthest(distance(farthest(np.zeros(n))))
+    from_one = distance(one)
+    along = from_one - distance(farthest(from_one))
+    neighbours = graph.sum(axis=1) + 1.0
+    for _ in range(_AVERAGES):
+        along = (graph @ along + along) / neighbours
+    return piece.astype(np.int64), along
+
+
+def _steps(graph: sp.csr_array, starts: IntArray) -> FloatArray:
+    """Return the number of steps from each node to the nearest of some, breadth first."""
+    n = graph.shape[0]
+    pointer = np.r_[graph.indptr, graph.indptr[-1] + starts.size]
+    indices = np.r_[graph.indices, starts].astype(graph.indices.dtype)
+    source = sp.csr_array((np.ones(indices.size), indices, pointer), shape=(n + 1, n + 1))
+    order, jump = csgraph.breadth_first_order(source, n)
+    jump[n] = n
+    steps = np.ones(n + 1)
+    steps[n] = 0.0
+    while np.any(jump[order] != n):  # each jump passes twice as many steps as the one before
+        steps, jump = steps + steps[jump], jump[jump]
+    return steps[:n] - 1.0
+
+
+def _minimum_cut(
+    level: _Level, low: BoolArray, high: BoolArray, band: BoolArray
+) -> tuple[BoolArray, BoolArray]:
+    """Return the upper sides and the fewest DOFs in the band that part `low` from `high`.
+
+    Node k of the band is an edge from k to m + k; of the cuts nearest to `low` and nearest to
+    `high` the one of the more equal sides is taken, part by part.
+    """
+    nodes = np.flatnonzero(band)
+    m = nodes.size
+    local = np.zeros(band.size, dtype=np.int64)
+    local[nodes] = np.arange(m)
+    heads, tails = np.r_[level.heads, level.tails], np.r_[level.tails, level.heads]
+    within = band[heads] & band[tails]
+    first = local[np.unique(tails[low[heads] & band[tails]])]
+    last = local[np.unique(heads[high[tails] & band[heads]])]
+    source, sink = 2 * m, 2 * m + 1
+    begin = np.r_[local[heads[within]] + m, np.arange(m), np.full(first.size, source), last + m]
+    end = np.r_[local[tails[within]], np.arange(m) + m, first, np.full(last.size, sink)]
+    capacity = np.full(begin.size, _UNCUT, dtype=np.int32)
+    capacity[np.count_nonzero(within) :][:m] = level.width[nodes]
+    network = sp.csr_array((capacity, (begin, end)), shape=(2 * m + 2, 2 * m + 2))
+    left: Any = network - csgraph.maximum_flow(network, source, sink).flow
+    left.data = (left.data > 0).astype(np.int8)
+    left.eliminate_zeros()
+    found = []
+    for graph, start in ((left, source), (sp.csr_array(left.T), sink)):
+        reached = np.zeros(2 * m + 2, dtype=bool)
+        reached[csgraph.breadth_first_order(graph, start, return_predecessors=False)] = True
+        below = reached if start == source else ~reached
+        upper, between = high.copy(), np.zeros_like(high)
+        between[nodes] = below[:m] & ~below[m : 2 * m]
+        upper[nodes] = ~below[:m]
+        found.append((upper, between))
+    unequal = [abs(level.dofs(up) - level.dofs(~up & ~cut)) for up, cut in found]
+    later = (unequal[1] < unequal[0])[level.part]
+    return np.where(later, found[1][0], found[0][0]), np.where(later, found[1][1], found[0][1])
 
 
 def _unit_box(xyz: FloatArray) -> FloatArray:
@@ -221,27 +330,24 @@ def _unit_box(xyz: FloatArray) -> FloatArray:
     return np.asarray(np.round(box, 9), dtype=np.float64)
 
 
-def _upper_half(where: FloatArray, number: IntArray, count: int) -> Any:
+def _upper_half(where: FloatArray, number: IntArray) -> BoolArray:
     """Return a mask of the nodes beyond the median of their part, along its longest side."""
+    count = int(number.max()) + 1
     by_part = np.argsort(number, kind="stable")
     begin = np.searchsorted(number[by_part], np.arange(count + 1))
-    filled = np.flatnonzero(np.diff(begin) > 0)
-    starts = begin[filled]
+    starts = begin[:-1]
     ordered = where[by_part]
     side = np.maximum.reduceat(ordered, starts) - np.minimum.reduceat(ordered, starts)
-    axis = np.zeros(count, dtype=np.int64)
-    axis[filled] = np.argmax(side, axis=1)
+    axis = np.argmax(side, axis=1)
     along = where[np.arange(number.size), axis[number]]
     rank = np.lexsort((along, number))
     middle = (begin[:-1] + begin[1:]) // 2
-    level = np.zeros(count)
-    level[filled] = along[rank[middle[filled]]]
-    lowest = np.zeros(count)
-    lowest[filled] = along[rank[starts]]
+    level, lowest = along[rank[middle]], along[rank[starts]]
     # a whole row of equal coordinates goes to one side, unless one side would be empty
-    upper = np.where(level[number] > lowest[number], along >= level[number], along > level[number])
-    flat = np.zeros(count, dtype=bool)
-    flat[filled] = side.max(axis=1) <= 0
+    upper: BoolArray = np.where(
+        level[number] > lowest[number], along >= level[number], along > level[number]
+    )
+    flat = side.max(axis=1) <= 0
     if np.any(flat):
         position = np.empty(number.size, dtype=np.int64)
         position[rank] = np.arange(number.size)
@@ -261,14 +367,16 @@ def _morton(where: FloatArray) -> IntArray:
     return rank
 
 
-def _fronts(graph: sp.csr_array, parts: _Parts, member: IntArray, width: IntArray) -> Dissection:
+def _fronts(
+    graph: sp.csr_array, parts: _Parts, place: IntArray, member: IntArray, width: IntArray
+) -> Dissection:
     """Order the nodes part by part, children first, and find what each part touches."""
     names = np.unique(parts.part)
     names = names[np.argsort(_postorder_key(names), kind="stable")]
     rank = np.empty(names.size, dtype=np.int64)
     by_name = np.argsort(names)
     number = by_name[np.searchsorted(names[by_name], parts.part)]
-    sequence = np.lexsort((parts.place, number))
+    sequence = np.lexsort((place, number))
     position = np.empty(width.size, dtype=np.int64)
     position[sequence] = np.arange(width.size)
     starts = np.searchsorted(number[sequence], np.arange(names.size + 1))
