@@ -13,7 +13,7 @@ import numpy as np
 from ...checks import FloatArray, Value, positive, real_array, short, whole
 from ...errors import ModelError, ShapeError
 from ...labels import DofSet, Interpolation
-from .grid_matrices import Grid
+from .element_matrices import Grid
 
 #: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre
 Field: TypeAlias = "float | Sequence[Any] | FloatArray | Callable[..., float]"

@@ -11,8 +11,7 @@ import scipy.sparse as sp
 
 from ...checks import FloatArray, IntArray, Value, positive, real_array
 from ...errors import ModelError
-from .element_matrices import beam_mass, beam_rotary, beam_stiffness
-from .grid_matrices import Grid
+from .element_matrices import Grid, beam_mass, beam_rotary, beam_stiffness
 
 #: of an element: a rib's ends are this close to nodes
 _ON_NODE = 1e-6

@@ -14,8 +14,14 @@ from ...checks import FloatArray, real_array
 from ...errors import LabelError, counted
 from ...labels import Interpolation
 from ...tolerances import SAME
-from .element_matrices import brick_shape, brick_slopes, hermite, plate_coefficients, plate_terms
-from .grid_matrices import Grid
+from .element_matrices import (
+    Grid,
+    brick_shape,
+    brick_slopes,
+    hermite,
+    plate_coefficients,
+    plate_terms,
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -8,19 +8,18 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...checks import FloatArray, IntArray
-from ...errors import ModelError, SolverError
-from ...sparse.factor import by_rows, diagonal, is_positive_definite, unit_diagonal
-from ...sparse.lowest import PRECISION, ROUNDING, Lowest, lowest_modes
-from ...tolerances import SAME, divisor
-from ..definite import are_rigid, are_swapped, unstable_stiffness
-from ..matrices import FEMatrices
-from ..model import FEModel
-from ..precision import loss, shown_digits
-from ..rigid import RigidMass, farness, orthonormalised, rigid_mass, rigid_motions
-from ..singular_mass import empty_rows, left_out, null_motions
-from ..soft_springs import pieces, unheld
-from ..zero_energy import ZeroEnergy, beyond, own_motions, zero_energy
+from ..checks import FloatArray, IntArray
+from ..errors import ModelError, SolverError
+from ..sparse.factor import by_rows, diagonal, is_positive_definite, unit_diagonal
+from ..sparse.lowest import PRECISION, ROUNDING, Lowest, lowest_modes
+from ..tolerances import SAME, divisor
+from .definite import are_rigid, are_swapped, unstable_stiffness
+from .matrices import FEMatrices
+from .model import FEModel
+from .precision import loss, shown_digits
+from .rigid import RigidMass, farness, orthonormalised, pieces, rigid_mass, rigid_motions, unheld
+from .singular_mass import empty_rows, left_out, null_motions
+from .zero_energy import ZeroEnergy, beyond, own_motions, zero_energy
 
 #: requested from the solver: six rigid-body motions and some elastic modes, a few beside more
 _MODES, _FEW = 10, 4
