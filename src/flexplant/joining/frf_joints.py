@@ -15,8 +15,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
 from ..lti.frequency import ORDERS
 from ..structure.rigid import rigid_motions
-from .ends import JointEnd, joint_axes
-from .joint import Joint, Patch
+from .joint import Joint, JointEnd, Patch, joint_axes
 
 #: a joint that adds less than this part to the others repeats them
 _RANK = 1e-9

@@ -23,10 +23,9 @@ from ..structure.placed import SPANNED
 from ..structure.rigid import orthonormalised, rigid_body_basis
 from ..tolerances import TINY, divisor
 from .component import Component, JoinedShape, Model, Pose, components_of
-from .ends import split_end
 from .frf_coupling import joined_frfs
 from .joining_certificate import certified
-from .joint import Joint, Patch
+from .joint import Joint, Patch, split_end
 from .links import (
     Elimination,
     Link,

@@ -18,8 +18,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..structure.rigid import rigid_motions
 from ..tolerances import TYPED
 from .component import Component, Model, Pose, components_of
-from .ends import JointEnd, joint_axes
-from .joint import Joint
+from .joint import Joint, JointEnd, joint_axes
 
 #: relative: what a joint feels of a motion of the whole machine below this is rounding
 BALANCED = 1e-9

@@ -14,9 +14,8 @@ from ..errors import ModelError, SolverError, warn
 from ..labels import Place
 from ..parallel import Progress
 from ..sparse.factor import DENSE_LIMIT, by_rows, dense, diagonal
-from ..sparse.lanczos import STEPS
+from ..sparse.lanczos import STEPS, Absolute, column_groups, rounding_of
 from ..sparse.pardiso import Pardiso
-from ..sparse.rayleigh_ritz import Absolute, column_groups, rounding_of
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping
 from ..structure.definite import signed_root, signed_square
 from ..structure.eigen import elastic_modes, signed

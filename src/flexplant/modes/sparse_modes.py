@@ -13,9 +13,21 @@ from ..checks import FloatArray, IntArray, Matrix, Rng
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread, tick
 from ..sparse.factor import by_rows
-from ..sparse.lanczos import BLOCK, REACHED, SAME, STEPS, BlockLanczos, along_basis, iterated
+from ..sparse.lanczos import (
+    BLOCK,
+    REACHED,
+    SAME,
+    SPREAD,
+    STEPS,
+    Absolute,
+    BlockLanczos,
+    along_basis,
+    column_groups,
+    iterated,
+    rayleigh_ritz,
+    rounding_of,
+)
 from ..sparse.pardiso import Pardiso
-from ..sparse.rayleigh_ritz import SPREAD, Absolute, column_groups, rayleigh_ritz, rounding_of
 from ..structure.definite import are_rigid
 from ..structure.eigen import check_stiffness
 from ..structure.model import FEModel

@@ -17,8 +17,8 @@ from ..sparse.factor import dense, unit_diagonal
 from ..structure import Damping, FEModel, ModalDamping
 from ..tolerances import RANK, TINY
 from .condensation import DofPartition
-from .methods import ReductionMethod
-from .projection import (
+from .methods import (
+    ReductionMethod,
     block,
     fe_model,
     inner,

@@ -16,14 +16,15 @@ from ..modes.solve import solve_modes
 from ..sparse.factor import unit_diagonal
 from ..structure import FEModel, ModalDamping
 from ..tolerances import ROUNDING, SAME
-from .methods import ReductionMethod, refused_partition
-from .projection import (
+from .methods import (
+    ReductionMethod,
     Solver,
     block,
     fe_model,
     inner,
     labels_given,
     projected,
+    refused_partition,
 )
 from .reduced import ReducedModel
 

@@ -13,15 +13,14 @@ from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..lti.grid import climbed
 from ..modes.attachment_vectors import labels_of, places, static_response
-from ..modes.direct_check import DirectCheck, antiresonances, checked_response
-from ..modes.dynamic_basis import DynamicBasis
+from ..modes.dynamic_basis import DirectCheck, DynamicBasis, antiresonances, checked_response
 from ..modes.matching import paired
 from ..modes.modes import Modes
 from ..modes.shifted import held_factor
 from ..modes.solve import modes_reaching
 from ..structure import FEModel, Hysteretic
 from ..tolerances import SAME, divisor
-from .bounds import ErrorBound
+from .ranking import ErrorBound
 
 #: refinements of the frequencies at which the error is largest
 _ROUNDS = 3

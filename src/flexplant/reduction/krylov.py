@@ -20,8 +20,7 @@ from ..modes.shifted import stiffness_factor
 from ..sparse.factor import DENSE_LIMIT, dense, dynamic_lu
 from ..structure import FEModel
 from ..tolerances import RANK, TINY
-from .methods import ReductionMethod
-from .projection import fe_model, projected
+from .methods import ReductionMethod, fe_model, projected
 from .reduced import ReducedModel
 
 #: M-norm of what is new in a vector, of the whole vector, below which it adds nothing

@@ -17,11 +17,9 @@ from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..structure import FEModel, ModalDamping
 from ..tolerances import SAME
-from .bounds import ErrorBound
 from .condensation import kept_columns, mode_numbers
-from .methods import ReductionMethod
-from .projection import inner
-from .ranking import channels, peak_gains, rank_modes
+from .methods import ReductionMethod, inner
+from .ranking import ErrorBound, channels, peak_gains, rank_modes
 from .reduced import STATIC, ReducedModel
 
 _SUM = "sum of the peaks of the neglected modes"

@@ -20,7 +20,7 @@ from ..sparse.factor import (
     is_positive_definite,
     unit_diagonal,
 )
-from ..sparse.rayleigh_ritz import rounding_of
+from ..sparse.lanczos import rounding_of
 
 #: what becomes a matrix of a structure
 MatrixLike: TypeAlias = "npt.ArrayLike | sp.sparray | sp.spmatrix"

@@ -1,4 +1,4 @@
-"""Rigid-body motions from the geometry of the degrees of freedom, the mass in them, and soft springs."""
+"""Rigid-body motions from the geometry, the mass in them, and the soft springs on them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from ..checks import FloatArray, IntArray, Matrix
 from ..errors import ModelError, SolverError
 from ..labels import DIRECTIONS, DofSet, Place
 from ..sparse.factor import by_rows, diagonal
+from ..sparse.lanczos import Absolute
 from ..sparse.lowest import PRECISION, ROUNDING, definite_solver
-from ..sparse.rayleigh_ritz import Absolute
 from ..tolerances import SAME, divisor
 
 #: times the usual rounding of a row: a force larger than this is of a spring
