@@ -17,17 +17,20 @@ from ..structure.units import Units
 from .file_shapes import FileShapes, ModesFormat
 from .paths import ELSEWHERE, GLOBAL, ONCE, Elsewhere, at_zero, damaged, file_path, refused, unread
 from .tables import read_nodes_table
-from .uff_analysis import NORMAL_MODE, AnalysisData, mode_records, responses_of_model
 from .uff_records import (
     KINDS,
+    NORMAL_MODE,
+    AnalysisData,
     check_complete,
     check_systems,
     coherence_of,
     common_frequencies,
     datasets,
+    mode_records,
     paired_records,
     record_scale,
     record_sides,
+    responses_of_model,
     whole_entry,
 )
 

@@ -13,9 +13,9 @@ from ..plant import StandardPlant
 from ..reduction import EffectiveIndependence
 from ..reduction.criteria import SelectionCriterion
 from ..work import Work
-from .candidate_shapes import ByShapes, Shapes
+from .convex import SummedMatrices
+from .gramian import ByShapes, Shapes
 from .problem import Found, Problem, Search
-from .summed import SummedMatrices
 
 
 @dataclass(frozen=True, eq=False)

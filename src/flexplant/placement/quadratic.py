@@ -13,8 +13,8 @@ from ..errors import SolverError
 from ..lti.equations import doubled, doubled_riccati, relative
 from ..lti.riccati import control_dare
 from ..tolerances import divisor
+from .convex import Convex, Tangent
 from .criterion import Scorer
-from .tangent import Convex, Tangent
 
 #: largest residual of the Riccati equation, relative, that is taken without another solver
 RESIDUAL = 1e-10

@@ -13,8 +13,19 @@ from matplotlib.ticker import MultipleLocator
 from ..checks import FloatArray, name_list, real_array, short
 from ..errors import ModelError, unknown_label
 from ..lti.frequency import Frf
-from ._axes import STYLES, axes, finish, legend, role_of
-from .gains import Curve, curves, decibel, gain_label, readable, shared_reference
+from ._axes import (
+    STYLES,
+    Curve,
+    axes,
+    curves,
+    decibel,
+    finish,
+    gain_label,
+    legend,
+    readable,
+    role_of,
+    shared_reference,
+)
 
 #: channels for which a grid of diagrams can still be read
 _MOST = 36

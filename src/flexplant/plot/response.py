@@ -20,8 +20,7 @@ from ..lti.responses import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
 from ..simulation import Response
 from ..tolerances import SPLIT
-from ._axes import GREY, finish, legend, named, panel_axes, quantity_of, shown_in, styles
-from .gains import labelled
+from ._axes import GREY, finish, labelled, legend, named, panel_axes, quantity_of, shown_in, styles
 
 
 def response(

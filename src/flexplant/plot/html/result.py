@@ -14,9 +14,8 @@ from ...errors import FlexplantError, ModelError, counted
 from ...loop import ClosedLoop, ErrorBudget, LoopFigures, compare_loops, report_loops
 from ...plant import StandardPlant
 from ...simulation import ExposureErrors, Verdict
-from ..budget import budget
-from ..nyquist import nyquist
-from ..sensitivity import sensitivity
+from ..errors import budget
+from ..loops import nyquist, sensitivity
 from .page import Chapter, Gallery, note, table, tiles
 
 Tile = tuple[str, str, str, str]
