@@ -53,11 +53,6 @@ class Joint(Value):
         the first end. DOFs have no lever arm; a node without rotations turns with its neighbours,
         for arms up to 1e-4 of the machine's size, such as few digits of coordinates leave.
 
-    Raises
-    ------
-    LabelError, ModelError
-        When an end, an axis or a number is none; when a rigid joint has no second end.
-
     Examples
     --------
     >>> Joint("stage/41:z", "frame/7:z")
@@ -190,11 +185,6 @@ class Patch(Value):
         nodes.
     weights : (m,) array, optional
         Of the nodes, in the order of `nodes`: the area that each stands for, say. None: equal.
-
-    Raises
-    ------
-    LabelError, ModelError, ShapeError
-        When neither nodes nor a box are given, or weights are not positive.
 
     Examples
     --------

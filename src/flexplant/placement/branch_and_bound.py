@@ -39,11 +39,6 @@ class Exchange(Search):
         The greedy one and `starts - 1` random ones. Where the criterion has a relaxation the choice
         of the largest relaxed weights is one more.
 
-    Raises
-    ------
-    ModelError
-        When starts is not at least 1.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -201,11 +196,6 @@ class Screened(Search):
     starts : int
         Of the exchanges.
 
-    Raises
-    ------
-    ModelError
-        When `by` is not callable, or a number is not at least 1.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -276,11 +266,6 @@ class BranchAndBound(Search):
         exchanges at the start and the bound of the relaxation.
     starts : int
         Starts of the exchanges, as in `Exchange`.
-
-    Raises
-    ------
-    ModelError
-        When the gap is not in [0, 1), branches are negative or starts not at least 1.
 
     Notes
     -----

@@ -33,12 +33,6 @@ class ByRows(Search):
         Whether E_i is weighted by the driving-point residue ``sum_j phi_ij^2 / omega_j^2``, so
         that places that move little are left out first (EfI-DPR).
 
-    Raises
-    ------
-    ModelError
-        When the method is no SelectionCriterion, or driving_point is given without
-        EffectiveIndependence.
-
     References
     ----------
     [Kammer1991]_; [Imamovic1998]_; [Manohar2018]_.
@@ -138,11 +132,6 @@ class ModeInformation(ByShapes):
     ----------
     elastic : bool
         Whether rigid-body modes are left out.
-
-    Raises
-    ------
-    ModelError
-        When elastic is neither True nor False; when called, for a plant made elsewhere.
 
     References
     ----------

@@ -93,13 +93,6 @@ class PoiLqr(MotionAndEffort):
         The motion of the POI that one newton of one actuator is worth. Small: the disturbance is
         rejected as well as the structure and the delay allow.
 
-    Raises
-    ------
-    LabelError
-        When an axis appears twice; when called, for a POI or an axis that the plant lacks.
-    ModelError
-        When a factor or the effort is not positive.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -219,13 +212,6 @@ class ClosedLoopH2(MotionAndEffort):
         As for `PoiLqr`.
     effort : float [m/N]
         The motion of the POI that one newton of one actuator is worth.
-
-    Raises
-    ------
-    LabelError
-        When a name appears twice; when called, for a POI or an axis that the plant lacks.
-    ModelError
-        When a factor or the effort is not positive.
 
     Examples
     --------
@@ -438,11 +424,6 @@ class HinfLevel(Criterion):
         Weight of the effort of each actuator, whichever is chosen.
     noise : float
         Weight of the noise of each sensor.
-
-    Raises
-    ------
-    ModelError
-        When weights are no mappings, effort or noise not positive.
 
     Examples
     --------

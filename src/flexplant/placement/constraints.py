@@ -63,11 +63,6 @@ class Together(Constraint):
     groups : sequence of sequences of str
         Names, two or more in each group.
 
-    Raises
-    ------
-    LabelError
-        When a group has fewer than two names; when used, for an unknown name.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -113,11 +108,6 @@ class Mirrored(Constraint):
     at : float [m]
         Where the plane is.
 
-    Raises
-    ------
-    ModelError
-        When the axis is none of these or the place no number.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -157,13 +147,6 @@ class Among(Constraint):
         Candidates.
     at_least, at_most : int, optional
         How many of them.
-
-    Raises
-    ------
-    ModelError
-        When a count is no whole number, or at_least is above at_most.
-    LabelError
-        When these are no names; when used, for an unknown name.
 
     Examples
     --------
@@ -210,13 +193,6 @@ class Budget(Constraint):
         Cost of candidates by name.
     default : float
         Cost of the others.
-
-    Raises
-    ------
-    ModelError
-        When a number is negative.
-    LabelError
-        When used, for an unknown name.
 
     Examples
     --------
@@ -268,11 +244,6 @@ class Excluded(Constraint):
     zones : Rectangle, Disc or sequence of them
         At least one.
 
-    Raises
-    ------
-    ModelError
-        When a zone is something else, or there is none.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -305,11 +276,6 @@ class OffPoi(Constraint):
     ----------
     radius : float [m]
         Candidates with a point no farther from any POI are excluded.
-
-    Raises
-    ------
-    ModelError
-        When the radius is no finite number.
 
     Examples
     --------
@@ -347,11 +313,6 @@ class Within(Constraint):
         At least one; their union counts.
     at_least, at_most : int, optional
         How many. A candidate is inside when any of its points is.
-
-    Raises
-    ------
-    ModelError
-        When a zone or a count is not of its kind, or at_least is above at_most.
 
     Examples
     --------
@@ -391,11 +352,6 @@ class MinimumDistance(Constraint):
     ----------
     distance : float [m]
         Between the nearest points of the two.
-
-    Raises
-    ------
-    ModelError
-        When it is not positive.
 
     Examples
     --------

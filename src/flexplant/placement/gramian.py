@@ -154,12 +154,6 @@ class KineticEnergy(ByShapes):
         Of the mass matrix; not needed where the plant was assembled from matrices or a reduced
         model.
 
-    Raises
-    ------
-    ModelError
-        When the model is no structure; when called, where no mass matrix is known or it is of
-        another structure.
-
     References
     ----------
     [Kammer1991]_.
@@ -211,11 +205,6 @@ class ModalGramian(Criterion):
     ----------
     measure : {"trace", "log det", "least"}
         Sum of the eigenvalues, sum of their logarithms, or the least one.
-
-    Raises
-    ------
-    ModelError
-        When the measure is none of these; when called, for a plant without elastic modes.
     """
 
     scale: ClassVar[float] = 1.0
@@ -265,11 +254,6 @@ class ModalObservability(ModalGramian):
     measure : {"trace", "log det", "least"}
         Sum of the eigenvalues, sum of their logarithms, or the least one.
 
-    Raises
-    ------
-    ModelError
-        When the measure is none of these; when called, for a plant without elastic modes.
-
     References
     ----------
     [Gawronski2004]_, chapter 4.
@@ -299,11 +283,6 @@ class ModalControllability(ModalGramian):
     ----------
     measure : {"trace", "log det", "least"}
         Sum of the eigenvalues, sum of their logarithms, or the least one.
-
-    Raises
-    ------
-    ModelError
-        When the measure is none of these; when called, for a plant without elastic modes.
 
     References
     ----------
@@ -340,11 +319,6 @@ class SensorIndices(ByShapes):
     ----------
     norm : {"h2", "hinf", "hankel"}
         By which modes are weighted.
-
-    Raises
-    ------
-    ModelError
-        When the norm is none of these; when called, for a plant made elsewhere.
 
     References
     ----------
@@ -393,11 +367,6 @@ class ActuatorIndices(SensorIndices):
     ----------
     norm : {"h2", "hinf", "hankel"}
         By which modes are weighted.
-
-    Raises
-    ------
-    ModelError
-        When the norm is none of these; when called, for a plant made elsewhere.
 
     Examples
     --------

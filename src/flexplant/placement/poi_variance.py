@@ -205,14 +205,6 @@ class PoiVariance(Criterion):
     own_modes : bool
         Whether modes left out do not count, whatever the reduced model has kept of them.
 
-    Raises
-    ------
-    LabelError
-        When a name appears twice; when called, for a POI or an axis that the plant lacks.
-    ModelError
-        When a factor is not positive, the measure or the lag is none of these, larger is no
-        structure, or is given with own_modes or a lag.
-
     References
     ----------
     [AndersonMoore1979]_, chapter 4.

@@ -281,11 +281,6 @@ class Exhaustive(Search):
     limit : int
         More subsets than this are refused.
 
-    Raises
-    ------
-    ModelError
-        When limit is no whole number of at least 1.
-
     Examples
     --------
     >>> import flexplant as fx

@@ -131,11 +131,6 @@ class Penalised(Wrapping):
     weight : float
         Of the penalty.
 
-    Raises
-    ------
-    ModelError
-        When one of them is not callable, or the weight not positive.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -228,12 +223,6 @@ class OverMachines(Wrapping):
     measure : {"worst", "mean"}
         Over the machines.
 
-    Raises
-    ------
-    ModelError
-        When there are no machines, one of them is no sampled plant, the measure is none of these,
-        or the criterion is not callable.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -306,11 +295,6 @@ class AfterLoss(Wrapping):
         Which devices may be lost.
     measure : {"worst", "mean"}
         Over the devices.
-
-    Raises
-    ------
-    ModelError
-        When `of` or the measure is none of these, or the criterion not callable.
 
     Examples
     --------

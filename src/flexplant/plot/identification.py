@@ -177,11 +177,6 @@ class PolePicker:
     **options
         For `identify_modes`, by which picked modes are fitted: ``hold=``, ``lower=``, ...
 
-    Raises
-    ------
-    ModelError
-        When the values are of other types.
-
     Examples
     --------
     >>> import flexplant as fx

@@ -48,11 +48,6 @@ class CraigBampton(ReductionMethod):
     damping : ModalDamping or Rayleigh, optional
         Of the reduced model's own modes; None: ``T^T D T``.
 
-    Raises
-    ------
-    LabelError, ModelError
-        For bad labels or numbers.
-
     References
     ----------
     [CraigBampton1968]_.
@@ -229,11 +224,6 @@ class Rubin(_FreeInterface):
     damping : ModalDamping or Rayleigh, optional
         Of modes and attachment vectors; None: ``T^T D T``.
 
-    Raises
-    ------
-    LabelError, ModelError
-        For bad labels or numbers.
-
     References
     ----------
     [Rubin1975]_.
@@ -265,11 +255,6 @@ class MacNeal(_FreeInterface):
         As for `Rubin`.
     damping : ModalDamping or Rayleigh, optional
         Of the modes; None: their part of D.
-
-    Raises
-    ------
-    LabelError, ModelError
-        For bad labels or numbers.
 
     References
     ----------

@@ -114,11 +114,6 @@ class Guyan(ReductionMethod):
     damping : ModalDamping or Rayleigh, optional
         Of the reduced model's own modes; None: ``T^T D T``.
 
-    Raises
-    ------
-    LabelError
-        When a label appears twice, or none is given.
-
     References
     ----------
     [Guyan1965]_.
@@ -166,11 +161,6 @@ class Irs(ReductionMethod):
         Stop when no omega^2 changes by more than this part of itself.
     damping : ModalDamping or Rayleigh, optional
         Of the reduced model's own modes; None: ``T^T D T``.
-
-    Raises
-    ------
-    LabelError, ModelError
-        For bad labels, or options that are not positive.
 
     Notes
     -----
@@ -262,11 +252,6 @@ class Serep(ReductionMethod):
         As many mode numbers (from 1, rigid-body modes included and all there); None: the lowest.
     damping : ModalDamping or Rayleigh, optional
         Of the reduced model's own modes; None: ``T^T D T``.
-
-    Raises
-    ------
-    LabelError, ModelError
-        For bad labels or mode numbers.
 
     Notes
     -----

@@ -53,11 +53,6 @@ class Krylov(ReductionMethod):
         Of the reduced model's own modes, beside a basis of the undamped structure; None: the
         model's D, in the basis too.
 
-    Raises
-    ------
-    LabelError, ModelError
-        For bad places, frequencies or numbers.
-
     References
     ----------
     [BaiSu2005]_; [SalimbahramiLohmann2006]_.

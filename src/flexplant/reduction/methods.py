@@ -240,11 +240,6 @@ class DesiredDofs(ReductionMethod):
     damping : ModalDamping or Rayleigh, optional
         With an FEModel: of modes and vectors, in place of its D.
 
-    Raises
-    ------
-    LabelError, ModelError
-        When a label appears twice, or none is given; when `damping` is no law.
-
     References
     ----------
     [paper]_, equations (6)-(8).

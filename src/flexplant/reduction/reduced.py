@@ -163,11 +163,6 @@ class ReducedModel(Spanned, Value):
     joining : Value, optional
         Of a joined machine: how it was joined, with the checks that were made; not after an update.
 
-    Raises
-    ------
-    ShapeError, ModelError
-        When sizes do not match or entries are not finite.
-
     References
     ----------
     [paper]_, equations (6)-(8).

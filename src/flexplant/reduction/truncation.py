@@ -46,11 +46,6 @@ class ModalTruncation(ReductionMethod):
     damping : ModalDamping or Rayleigh, optional
         With an FEModel: of modes and vectors, in place of its D.
 
-    Raises
-    ------
-    ModelError
-        When neither or both of `count` and `modes` are given.
-
     Notes
     -----
     From `Modes`, what is truncated is what is left of them (their attachment vectors included),
@@ -182,11 +177,6 @@ class ModalBalanced(ReductionMethod):
         Where the static compliance of what was left out is kept.
     damping : ModalDamping or Rayleigh, optional
         With an FEModel: of its modes.
-
-    Raises
-    ------
-    ModelError
-        When numbers do not fit or no input is given.
 
     Notes
     -----

@@ -79,11 +79,6 @@ class ModalDamping(Damping):
         this rate. `assemble_plant` takes such a model as it is, in dense form; `solve_modes`, whose
         rigid-body modes are at 0, refuses it.
 
-    Raises
-    ------
-    ModelError
-        When a ratio is negative, or 1 and more.
-
     Examples
     --------
     >>> ModalDamping(0.01).zeta([0.0, 1500.0])
@@ -221,11 +216,6 @@ class Rayleigh(Damping):
         Let alpha slow rigid-body motions down too, in ``FEModel.with_damping``: D is then
         ``alpha M + beta K`` as it stands. `assemble_plant` takes such a model as it is, in dense
         form; `solve_modes`, whose rigid-body modes are at 0, refuses it.
-
-    Raises
-    ------
-    ModelError
-        When alpha or beta is negative.
 
     References
     ----------

@@ -28,11 +28,6 @@ class Rectangle(Value):
     lower, upper : (2,) array [m]
         Its corners of smallest and largest x, y.
 
-    Raises
-    ------
-    ModelError
-        When upper is not above lower.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -70,11 +65,6 @@ class Disc(Value):
         Its middle.
     radius : float [m]
         Above 0.
-
-    Raises
-    ------
-    ModelError
-        When the radius is not positive.
 
     Examples
     --------

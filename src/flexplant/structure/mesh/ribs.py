@@ -62,11 +62,6 @@ class Rib(Value):
     density, youngs_modulus, poisson_ratio : float, optional
         Of its material; that of the plate under it when not given.
 
-    Raises
-    ------
-    ModelError
-        When it is not along x or y, has no section or two, or a number is not positive.
-
     References
     ----------
     Torsion of a rectangle: [TimoshenkoGoodier1970]_, sec. 109 (a fit within 0.5 %): ``J = w^3 h
