@@ -1,4 +1,4 @@
-"""The two stories of the paper's plate run, their claims are true, and can become untrue."""
+"""The stories of the paper's plate and its stage run, their claims are true, or they stop."""
 
 import importlib
 import json
@@ -36,6 +36,24 @@ def stage(examples):
 @pytest.fixture(scope="module")
 def result(stage):
     return stage.main()
+
+
+@pytest.fixture
+def later(examples, result, monkeypatch):
+    """Return examples that begin where the stage's own run ended: with its models and designs."""
+    stage, loops = examples[0], result["cases"][0.001]["loops"]
+    cases = result["cases"]
+    monkeypatch.setattr(stage, "models", cases.__getitem__)
+    monkeypatch.setattr(stage, "servo", lambda *_: loops["best servo"]["model"].blocks)
+    monkeypatch.setattr(stage, "tolerant", lambda *_: loops["tolerant, measured"]["model"].blocks)
+
+    def found(name):
+        module = importlib.import_module(name)
+        if hasattr(module, "models"):
+            monkeypatch.setattr(module, "models", cases.__getitem__)
+        return module
+
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -255,6 +273,82 @@ def test_the_readme_says_what_the_run_says(result):
         assert said == pytest.approx(found, abs=tolerance), sentence
     (within,) = re.search(r"hold on the machine within (\d+) %", text).groups()
     assert int(within) - 1.5 < off < int(within) + 0.1
+
+
+def test_the_guarantee_holds_on_machines_drawn_anew(later, tmp_path):
+    """From what a measurement leaves open to a bound, kept by a machine of no model's kind."""
+    example = later("robust_control")
+    found = example.main(tmp_path)
+    assert all(found["claims"].values())
+    robust, worst = found["robust"], found["worst"]
+    assert 0.3 < robust.lower <= robust.upper < 1.05 * robust.lower
+    assert robust.left_out.is_stable
+    assert worst.upper == pytest.approx(1.868, rel=0.02, abs=0)
+    assert worst.nominal == pytest.approx(1.717, rel=5e-3, abs=0)
+    # the bound covers the machine that no model here resembles, over a grid of its own
+    loop = found["machine"]
+    assert loop.is_stable
+    gain = np.abs(loop.frequency_response(np.geomspace(10.0, 4e3, 20_000))["die:error", "die:ref"])
+    assert gain.max() <= worst.upper
+    # and the corners of the Deltas
+    gains, blocks = [], found["loop"].blocks
+    for sign in (-1.0, 1.0):
+        values = {delta.name: sign for delta in found["uncertain"].deltas}
+        corner = fx.close_loop(found["uncertain"].lft(values), *blocks)
+        gains.append(fx.peak_gain(corner.system["die:error", "die:ref"])[0])
+    assert max(gains) <= worst.upper
+    # without the modes above, mu of H-infinity says nothing of the machine
+    few, sharp = found["few"], found["sharp"]
+    assert few.upper < 1.0 < 50.0 < sharp.lower <= sharp.upper < 1.05 * sharp.lower
+    assert not found["broken"].is_stable
+    text = example.table(found)
+    assert "every machine is stable" in text
+    assert "stage_hinf.c" in text
+    assert example.picture(found, tmp_path).stat().st_size > 20_000
+
+
+def test_each_order_buys_what_the_example_says(later, tmp_path):
+    """Feedforward on the virtual machine, in both loops of the stage."""
+    example = later("feedforward")
+    result = example.main()
+    for runs in result["runs"].values():
+        peak, late = ({name: example.figures(run)[i] for name, run in runs.items()} for i in (0, 1))
+        assert peak["acceleration"] < 0.03 * peak["none"]
+        assert peak["jerk"] < 0.5 * peak["acceleration"]
+        assert peak["snap"] < 0.9 * peak["jerk"] and peak["inverse"] < 0.8 * peak["snap"]
+        assert late["snap"] < 0.02 * late["none"]
+    errors = result["learnt"].errors
+    assert errors[1] < 0.5 * errors[0] and errors[2] < 1.1 * errors[1]
+    text = example.table(result)
+    assert "best servo, feedforward" in text and "move 2: rms" in text
+    assert example.picture(result, tmp_path).stat().st_size > 20_000
+
+
+def test_the_story_of_placement(later, tmp_path):
+    """Choices are what their criteria say, and their bounds hold."""
+    example = later("placement")
+    result = example.main()
+    goal = fx.PoiVariance("die", example.AXES, own_modes=True)
+    value = {k: goal(found.on(result["plant"])) for k, found in result["sensors"].items()}
+    best = value["the die's error"]
+    proven = result["sensors"]["variance within 12 %, proven"]
+    assert proven.gap <= 0.12 or proven.stopped
+    assert proven.bound <= min(v for k, v in value.items() if not k.startswith("25"))
+    for name in ("0.25 m apart", "none at the cable", "worst machine of three", "one may fail"):
+        assert value[name] >= best * (1 - 1e-9)
+    assert not any(
+        example.DIE.holds(np.array([port.at[:2]]))[0]
+        for found in result["sensors"].values()
+        for port in found.ports
+    )
+    corners, chosen = (np.array(both) for both in result["machine"].values())
+    assert chosen[1] < 0.6 * corners[1]  # m rms on a machine that no model here resembles
+    np.testing.assert_allclose([corners[0], chosen[0]], [corners[1], chosen[1]], rtol=0.05)
+    assert np.all(np.diff(result["curve"].values) < 0)
+    assert np.all(result["worth"].without > result["worth"].value)
+    text = example.table(result)
+    assert "at the die" in text and "pm" in text and "e-2" not in text
+    assert all(path.stat().st_size > 15_000 for path in example.pictures(result, tmp_path))
 
 
 def check_the_readmes_picture(drawn):

@@ -74,8 +74,6 @@ def read_abaqus(
         When a node has no coordinates in `inp`.
     ShapeError
         When `dofs` has another number of rows.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----

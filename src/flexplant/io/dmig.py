@@ -62,8 +62,6 @@ def read_dmig(
         When there is no matrix of such a name, or a node has no coordinates in `bdf`.
     ModelError
         When a matrix is complex, not square, gives an entry twice, or scalar points are there.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----

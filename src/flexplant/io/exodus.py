@@ -65,8 +65,6 @@ def read_exodus_modes(
         not mass-normalised with `M`.
     LabelError
         When `times` or `variables` name what is not known.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----

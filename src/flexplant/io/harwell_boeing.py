@@ -43,10 +43,6 @@ def read_harwell_boeing(
     dofs : DofSet, or path of a table for `read_dofs`, optional
         What the rows stand for: the files do not say.
 
-    Returns
-    -------
-    FEMatrices
-
     Raises
     ------
     FlexplantError
@@ -55,8 +51,6 @@ def read_harwell_boeing(
         When a matrix is complex, skew-symmetric, a pattern, or not assembled.
     ShapeError
         When sizes differ.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----

@@ -103,8 +103,6 @@ def read_mat(path: str | Path, name: str | None = None) -> MatValue:
         When it is no MATLAB file (version 7.3 is HDF5: save with '-v7').
     ModelError, ShapeError, LabelError
         When matrices are missing, what they hold is no system, or which of several is not said.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------
@@ -150,8 +148,6 @@ def read_mat_values(path: str | Path) -> dict[str, MatValue]:
         When it is no MATLAB file (version 7.3 is HDF5: save with '-v7').
     ModelError, ShapeError, LabelError
         When there is no such structure, or what one holds does not belong together.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------

@@ -49,10 +49,6 @@ def read_matrix_market(
     dofs : DofSet, or path of a table for `read_dofs`, optional
         What the rows stand for: the files do not say.
 
-    Returns
-    -------
-    FEMatrices
-
     Raises
     ------
     FlexplantError
@@ -62,8 +58,6 @@ def read_matrix_market(
         When a matrix is complex, skew-symmetric or a pattern without numbers.
     ShapeError
         When sizes differ.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----

@@ -464,8 +464,6 @@ def read_op4(
         When there is no matrix of such a name.
     ModelError
         When which matrix is meant is not clear, or it is complex.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----
@@ -520,8 +518,6 @@ def read_op4_matrices(
         When the file is cut off, damaged, or no OUTPUT4 file; the byte or line is named.
     LabelError
         When there is no matrix of such a name.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------

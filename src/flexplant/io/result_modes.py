@@ -147,8 +147,6 @@ def read_modes(
         several sets of modes are there, or the shapes are not mass-normalised with `matrices`.
     LabelError
         When a node has no place or its coordinate system is not there.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------

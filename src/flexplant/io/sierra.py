@@ -74,8 +74,6 @@ def read_sierra(
         When the map, the mesh and the matrices do not belong together.
     ModelError
         When rows are no motion of a node, or a map and `dofs` are both given.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------

@@ -68,18 +68,12 @@ def read_dofs(
     length : str or float
         The unit of the coordinates, "mm" for instance, or its size in metres.
 
-    Returns
-    -------
-    DofSet
-
     Raises
     ------
     FlexplantError
         When a line has another number of columns, or holds no number where one is needed.
     LabelError
         When a column is missing, a direction is unknown, or a node has no coordinates.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------

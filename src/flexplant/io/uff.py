@@ -79,8 +79,6 @@ def read_frf_uff(
         When units or quantities are not clear, or zero frequency would be integrated.
     LabelError
         When `quantity` is another word.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----
@@ -183,8 +181,6 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
         When a mode that is named is not there.
     ModelError
         When a mode has zero frequency (a rigid-body mode), or a pole is not stable.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------
@@ -253,8 +249,6 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
         When nodes are given, or move, in a coordinate system of their own (dataset 2420).
     LabelError
         When a direction is unknown or a node appears twice.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------

@@ -192,10 +192,6 @@ def coincident_joints(
     tolerance : float [m], optional
         How far apart nodes may be; None: 1e-6 of the machine's size.
 
-    Returns
-    -------
-    list of Joint
-
     Raises
     ------
     ModelError

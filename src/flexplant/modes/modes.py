@@ -465,10 +465,6 @@ class Modes(Placed, Value):
         order : float
             2 for plates and for bricks of eight nodes.
 
-        Returns
-        -------
-        MeshError
-
         Raises
         ------
         ModelError

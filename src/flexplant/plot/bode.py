@@ -175,10 +175,6 @@ def singular_values(
     ax : Axes, optional
         Where to draw.
 
-    Returns
-    -------
-    Axes
-
     Raises
     ------
     ModelError
@@ -246,10 +242,6 @@ def frf(
         Where systems are evaluated; a grid of each, refined at resonances, when not given.
     ax : Axes, optional
         Where to draw.
-
-    Returns
-    -------
-    Axes
 
     Raises
     ------

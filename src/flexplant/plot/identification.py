@@ -52,10 +52,6 @@ def stabilisation(
     ax : Axes, optional
         Where to draw.
 
-    Returns
-    -------
-    Axes
-
     Examples
     --------
     >>> import flexplant as fx

@@ -72,10 +72,6 @@ def nyquist(
     ax : Axes, optional
         Where to draw.
 
-    Returns
-    -------
-    Axes
-
     Raises
     ------
     ModelError
@@ -289,10 +285,6 @@ def sensitivity(
         Where pairs of plant and controller are evaluated; a grid of each when not given.
     ax : Axes, optional
         Where to draw.
-
-    Returns
-    -------
-    Axes
 
     Raises
     ------

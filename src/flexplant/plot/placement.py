@@ -149,10 +149,6 @@ def placed(
     ax : Axes, optional
         Where to draw.
 
-    Returns
-    -------
-    Axes
-
     Raises
     ------
     ModelError

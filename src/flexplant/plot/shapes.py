@@ -54,10 +54,6 @@ def mode_shape(
     ax : Axes3D, optional
         Where to draw.
 
-    Returns
-    -------
-    Axes3D
-
     Raises
     ------
     ModelError
@@ -369,10 +365,6 @@ def layout(
         Further places to name.
     ax : Axes, optional
         Where to draw.
-
-    Returns
-    -------
-    Axes, of a solid Axes3D
 
     Raises
     ------

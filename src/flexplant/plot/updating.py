@@ -461,10 +461,6 @@ def parameters(
     axs : list of Axes, optional
         Where to draw, one for each parameter.
 
-    Returns
-    -------
-    list of Axes
-
     Examples
     --------
     >>> import flexplant as fx

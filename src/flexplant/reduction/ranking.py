@@ -119,10 +119,6 @@ def rank_modes(
     inputs, outputs : place or sequence of places
         Forces and displacements: DOF labels, points (z) or mappings; no outputs: the inputs.
 
-    Returns
-    -------
-    ModeRanking
-
     Raises
     ------
     ModelError

@@ -35,10 +35,6 @@ class Damping(Value):
         ----------
         omega : (k,) array [rad/s]
             Undamped frequencies.
-
-        Returns
-        -------
-        (k,) array [-]
         """
 
     def ratios(self, omega: FloatArray, shapes: FloatArray, K: Matrix, dofs: DofSet) -> FloatArray:
@@ -54,10 +50,6 @@ class Damping(Value):
             The stiffness of the structure.
         dofs : DofSet
             Its DOFs.
-
-        Returns
-        -------
-        (k,) array [-]
         """
         return self.zeta(omega)
 

@@ -116,10 +116,6 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
     model : FEModel or FEMatrices
         What is checked; matrices as a file holds them may be wrong in any way.
 
-    Returns
-    -------
-    ModelCheck
-
     Raises
     ------
     ModelError
