@@ -87,7 +87,7 @@ def binary_matrices(content: bytes, path: str) -> Iterable[tuple[str, Any, int, 
             due = f"a matrix begins with a record of {6 * size} bytes, got {stop - start}"
             raise damaged(path, f"byte {at}: {due}")
         columns, rows, form, kind = words.integers(start, 4)
-        name = _name(content[start + 4 * size : stop].decode("latin-1"))
+        name = _header_name(content[start + 4 * size : stop].decode("latin-1"))
         if columns < 1 or not rows or kind not in (1, 2, 3, 4) or not name.isprintable():
             got = f"{columns} columns, {rows} rows, type {kind}, name {name!r}"
             raise damaged(path, f"byte {start}: no header of a matrix: {got}")
@@ -112,7 +112,7 @@ def binary_matrices(content: bytes, path: str) -> Iterable[tuple[str, Any, int, 
         yield name, matrix, form, digits_of(np.zeros(0, dtype=words.real[kind % 2 == 0]))
 
 
-def _name(text: str) -> str:
+def _header_name(text: str) -> str:
     """Return the name in a header; words of 8 bytes may hold 4 letters each."""
     clean = text.replace("\0", " ")
     if len(clean) == 16 and clean[8:].strip() and not clean[4:8].strip():
@@ -151,7 +151,7 @@ def _matrix(
         for start, stop, (column, row, _) in zip(starts, stops, heads, strict=True):
             count = (stop - start - 3 * size) // per
             if row - 1 + count > shape[0]:
-                raise _outside(words.path, start, name, row - 1 + count, shape)
+                raise _outside_error(words.path, start, name, row - 1 + count, shape)
             part = np.frombuffer(words.content, value, count, start + 3 * size)
             if thin:
                 parts.append(
@@ -171,7 +171,9 @@ def _matrix(
     outside = (row < 1) | (row > shape[0] + 1 - length)
     if np.any(outside):
         bad = int(np.argmax(outside))
-        raise _outside(words.path, int(place[bad]), name, int(row[bad] - 1 + length[bad]), shape)
+        raise _outside_error(
+            words.path, int(place[bad]), name, int(row[bad] - 1 + length[bad]), shape
+        )
     # strings in the order of columns, as they are in the file
     order = np.argsort(column, kind="stable")
     place, length, row, column = place[order], length[order], row[order], column[order]
@@ -229,7 +231,9 @@ def _gather(content: bytes, at: Any, width: int) -> Any:
     return np.ascontiguousarray(raw[index]).reshape(-1)
 
 
-def _outside(path: str, at: int, name: str, row: int, shape: tuple[int, int]) -> FlexplantError:
+def _outside_error(
+    path: str, at: int, name: str, row: int, shape: tuple[int, int]
+) -> FlexplantError:
     return damaged(path, f"byte {at}: a string of {name} reaches row {row} of {shape[0]}")
 
 
@@ -487,7 +491,7 @@ def read_op4(
     found = _read(path, None)
     given = {"stiffness": stiffness, "mass": mass, "damping": damping}
     chosen = named_matrices(found, given, _ENDINGS, str(path))
-    K, M, D = (_real(found, name, path) for name in chosen)
+    K, M, D = (_real_matrix(found, name, path) for name in chosen)
     assert K is not None  # noqa: S101 - its name is known
     M, D = (None if _is_absent(part, K.shape[0]) else part for part in (M, D))
     digits = found[str(chosen[0])][2]
@@ -542,7 +546,7 @@ def _is_absent(matrix: sp.csc_array | None, n: int) -> bool:
     return matrix is None or (n > 1 and matrix.shape == (1, 1) and not matrix.count_nonzero())
 
 
-def _real(found: dict[str, Any], name: str | None, path: str | Path) -> sp.csc_array | None:
+def _real_matrix(found: dict[str, Any], name: str | None, path: str | Path) -> sp.csc_array | None:
     if name is None:
         return None
     matrix, form, _ = found[name]

@@ -127,7 +127,7 @@ def whole_entry(part: dict[str, Any], name: str) -> int:
         ) from None
 
 
-def _channel(part: dict[str, Any], side: str) -> tuple[str, int]:
+def _channel_of(part: dict[str, Any], side: str) -> tuple[str, int]:
     """Return the name of a channel and the sign of its direction."""
     node, code = whole_entry(part, f"{side}_node"), whole_entry(part, f"{side}_dir")
     if 1 <= abs(code) <= 6:
@@ -143,7 +143,7 @@ def paired_records(
     pairs: dict[tuple[str, str], tuple[int, dict[str, Any]]] = {}
     doubled = []
     for part in records:
-        (output, up), (name, down) = _channel(part, "rsp"), _channel(part, "ref")
+        (output, up), (name, down) = _channel_of(part, "rsp"), _channel_of(part, "ref")
         pair = (output, f"u {name}")
         if pair in pairs:
             doubled.append(" <- ".join(pair))
@@ -198,7 +198,7 @@ def common_frequencies(records: list[dict[str, Any]], path: str) -> FloatArray:
         step = float(np.ptp(first)) / max(first.size - 1, 1)
         if own.size != first.size or np.max(np.abs(own - first)) > 1e-3 * step:
             two = [
-                f"{_channel(one, 'rsp')[0]} <- u {_channel(one, 'ref')[0]} ({x.size} from "
+                f"{_channel_of(one, 'rsp')[0]} <- u {_channel_of(one, 'ref')[0]} ({x.size} from "
                 f"{x[0]:g} to {x[-1]:g} Hz)"
                 for one, x in ((part, own), (records[0], first))
             ]
@@ -375,11 +375,11 @@ def _of_55(part: dict[str, Any], path: Path) -> AnalysisData:
 
 def read_analysis(path: Path) -> list[AnalysisData]:
     """Return all motions at nodes in the datasets 2414 of a file; other results are passed over."""
-    found = [_parsed(lines, place, path) for place, lines in _blocks(path)]
+    found = [_parsed(lines, place, path) for place, lines in _response_blocks(path)]
     return [part for part in found if part is not None]
 
 
-def _blocks(path: Path) -> Iterator[tuple[int, list[bytes]]]:
+def _response_blocks(path: Path) -> Iterator[tuple[int, list[bytes]]]:
     """Yield the place, from 1, and the lines of each dataset 2414."""
     place = 0
     lines: list[bytes] | None = None
@@ -399,7 +399,7 @@ def _blocks(path: Path) -> Iterator[tuple[int, list[bytes]]]:
 
 def _parsed(lines: list[bytes], place: int, path: Path) -> AnalysisData | None:
     what = f"dataset {place} (type 2414)"
-    head = [_numbers(line, path, what) for line in (lines[2:3] + lines[8:_HEAD])]
+    head = [_line_numbers(line, path, what) for line in (lines[2:3] + lines[8:_HEAD])]
     if len(head) < 6 or not head[0].size or head[1].size < 6 or head[2].size < 8:
         raise damaged(path, f"{what} is cut off", "Export it again.")
     location, (_, analysis, kind, result, data, count) = head[0][0], head[1][:6].astype(int)
@@ -436,7 +436,7 @@ def _parsed(lines: list[bytes], place: int, path: Path) -> AnalysisData | None:
     )
 
 
-def _numbers(line: bytes, path: Path, what: str) -> FloatArray:
+def _line_numbers(line: bytes, path: Path, what: str) -> FloatArray:
     found = spaced_numbers(line)
     if found is None or not np.all(np.isfinite(found)) or np.any(np.abs(found) > 1e15):
         raise damaged(path, f"{what}: {line[:60]!r} holds other things than numbers")

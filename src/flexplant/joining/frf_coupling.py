@@ -133,7 +133,7 @@ def joined_frfs(
     [deKlerk2008]_, [vanderSeijs2013]_.
     """
     _same_lines(frfs)
-    parts, listed = parts_of(frfs, dofs), _listed(joints)
+    parts, listed = parts_of(frfs, dofs), _joint_list(joints)
     links = frf_links(listed, parts)
     warn_of_bending(listed, parts, frfs)
     first = next(iter(frfs.values()))
@@ -226,7 +226,7 @@ def uncoupled(
     whose = None if isinstance(known, Frf) else known
     mapping(whose, "known", "Pass responses by component: {'frame': frf}.", least=1)
     _same_lines({"the machine": machine, **known})
-    links = _taken_out(machine, known, _listed(joints), dofs)
+    links = _taken_out(machine, known, _joint_list(joints), dofs)
     kept_out = [i for i, name in enumerate(machine.outputs) if name.partition("/")[0] not in known]
     kept_in = [i for i, name in enumerate(machine.inputs) if name.partition("/")[0] not in known]
     if not kept_out or not kept_in:
@@ -399,7 +399,7 @@ def _shared(Y: MeasuredParts, known: Mapping[str, Frf]) -> tuple[FloatArray, Flo
     return found[0], found[1]
 
 
-def _listed(joints: Any) -> list[Any]:
+def _joint_list(joints: Any) -> list[Any]:
     if isinstance(joints, Joint):
         return [joints]
     return list(instance(joints, Iterable, "joints", "Pass Joint(...) in [...]."))

@@ -74,23 +74,24 @@ class Joint(Value):
         if axes is not None and (not axes or len(set(axes)) < len(axes)):
             raise LabelError(f"axes of a joint must be different ones, got {axes!r}: name each.")
         self._set(
-            first=_checked(self.first),
-            second=None if self.second is None else _checked(self.second),
+            first=_check_end(self.first),
+            second=None if self.second is None else _check_end(self.second),
             axes=axes,
-            stiffness=_numbers(self.stiffness, "stiffness of a joint"),
-            rate=_numbers(self.rate, "rate of a joint"),
+            stiffness=_axis_numbers(self.stiffness, "stiffness of a joint"),
+            rate=_axis_numbers(self.rate, "rate of a joint"),
             point=None if self.point is None else real_array(self.point, "point", (3,)),
         )
         if self.is_rigid and self.second is None:
             raise ModelError(
-                f"a rigid joint of {_shown(self.first)} needs a second end. Hold DOFs to the "
+                f"a rigid joint of {_end_text(self.first)} needs a second end. Hold DOFs to the "
                 "ground by model.fixed([...]) before they are joined, or give stiffness=."
             )
         if self.rate is not None and np.any(np.asarray(self.rate) < 0):
             raise ModelError(f"the rate of a damper must not be negative, got {self.rate}.")
 
     def __repr__(self) -> str:
-        ends = f"{_shown(self.first)} - {'ground' if self.second is None else _shown(self.second)}"
+        second = "ground" if self.second is None else _end_text(self.second)
+        ends = f"{_end_text(self.first)} - {second}"
         along = "" if self.axes is None else f" along {', '.join(self.axes)}"
         if self.is_rigid:
             return f"<Joint {ends}{along}, rigid>"
@@ -132,7 +133,7 @@ class Joint(Value):
         return found[0], found[1]
 
 
-def _checked(end: Any) -> Any:
+def _check_end(end: Any) -> Any:
     if isinstance(end, Patch):
         return end
     if isinstance(end, str) and all(end.partition("/")):
@@ -145,14 +146,14 @@ def _checked(end: Any) -> Any:
     )
 
 
-def _numbers(value: Any, name: str) -> Any:
+def _axis_numbers(value: Any, name: str) -> Any:
     if value is None:
         return None
     array = real_array(value, name)
     return float(array) if array.ndim == 0 else real_array(array, name, (None,))
 
 
-def _shown(end: Any) -> str:
+def _end_text(end: Any) -> str:
     if isinstance(end, tuple):
         return f"{end[0]}/({', '.join(f'{x:g}' for x in end[1])})"
     return repr(end) if isinstance(end, Patch) else str(end)
@@ -342,7 +343,7 @@ class JointEnd:
         dofs, self._rows = self._dofs, {}
         if dofs.component_of is None and node.lstrip("-").isdigit():
             for row in np.flatnonzero(dofs.nodes == int(node)):
-                self._rows[dofs.directions[row]] = _unit(len(dofs), row)
+                self._rows[dofs.directions[row]] = _unit_rows(len(dofs), row)
                 self.point = np.asarray(dofs.xyz[row])
         else:  # of a machine: "frame/41", of which DOFs may follow others
             for axis in DIRECTIONS:
@@ -457,7 +458,7 @@ def split_end(text: str, names: Sequence[str]) -> tuple[str, str]:
     return text.partition("/")[0], text.partition("/")[2]
 
 
-def _unit(n: int, row: Any) -> FloatArray:
+def _unit_rows(n: int, row: Any) -> FloatArray:
     found = np.zeros(n)
     found[row] = 1.0
     return found

@@ -70,7 +70,7 @@ class DynamicBasis:
         phi = np.real(modes.phi)
         dampers = damper_forces(model) if damping is None else None
         static = static_shapes(model, loads, dampers)
-        shapes, squares = _diagonal(model, beyond(model.M, phi, static))
+        shapes, squares = _diagonalise_shapes(model, beyond(model.M, phi, static))
         self.V = np.hstack([phi, shapes])
         self.squares = np.concatenate([modes.basis_squares[: modes.n_modes], squares])
         #: shapes that a damping law by modes is of
@@ -102,7 +102,7 @@ class DynamicBasis:
         found.__dict__.update(self.__dict__)
         model, phi = self.model, self.V[:, : self.n_modes]
         more = np.hstack([self.V[:, self.n_modes :], beyond(model.M, self.V, shapes)])
-        more, squares = _diagonal(model, more)
+        more, squares = _diagonalise_shapes(model, more)
         found.V = np.hstack([phi, more])
         found.squares = np.concatenate([self.squares[: self.n_modes], squares])
         found._damped()
@@ -203,7 +203,7 @@ class DynamicBasis:
             order = dissection_of(model) if law.D is None and law.H is None else None
             solve = _with_rank(ComplexSymmetricFactor(matrix, order).solve, U, size)
         else:
-            full = _dense(matrix) + (U * size) @ U.T
+            full = _dense_complex(matrix) + (U * size) @ U.T
             scale = 1.0 / np.sqrt(np.abs(np.diag(full)))[:, None]
             lu = la.lu_factor(full * scale * scale.T)
             matrix, U, size = full, U[:, :0], size[:0]
@@ -301,7 +301,7 @@ def static_shapes(
     return np.hstack(shapes)
 
 
-def _diagonal(model: FEModel, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _diagonalise_shapes(model: FEModel, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return M-orthonormal shapes that are orthogonal in K too, and their omega^2."""
     if not shapes.shape[1]:
         return shapes, np.zeros(0)
@@ -328,7 +328,7 @@ def _as_like(D: Any, matrix: Any) -> Any:
     return D if sp.issparse(matrix) == sp.issparse(D) else dense(D)
 
 
-def _dense(matrix: Any) -> ComplexArray:
+def _dense_complex(matrix: Any) -> ComplexArray:
     full: Any = matrix.toarray() if hasattr(matrix, "toarray") else matrix
     return np.asarray(full, dtype=np.complex128)
 
@@ -398,7 +398,7 @@ def checked_response(
     points = _points(basis, find, float(freq[0]), float(freq[-1]))
     for last in range(_ROUNDS - 1, -1, -1):
         at = np.array(sorted({next(points) for _ in range(checks)}))
-        wanted, better = _direct(basis, at, rows, loads)
+        wanted, better = _direct_responses(basis, at, rows, loads)
         check = _compared(at, find(at), view(at, wanted), found)
         if check.holds(tolerance) or not last:
             return basis, found, check
@@ -407,7 +407,7 @@ def checked_response(
     raise AssertionError
 
 
-def _direct(
+def _direct_responses(
     basis: DynamicBasis, at: FloatArray, rows: FloatArray, loads: FloatArray
 ) -> tuple[ComplexArray, Callable[[], DynamicBasis]]:
     """Return responses by all of the matrices, and the basis that has the motions too."""

@@ -439,7 +439,7 @@ def _open(problem: Problem, scorer: Convex, cutoff: float, node: _Node) -> _Open
         if tangent is not None:
             bounds = np.maximum(bounds, tangent.values(sets))
         if np.count_nonzero(bounds < cutoff) <= _SCORED:
-            return _scored(problem, cutoff, sets, bounds, branch.size)
+            return _score_branch(problem, cutoff, sets, bounds, branch.size)
     rows = np.eye(weights.size) if tangent is None else tangent.rows
     nodes, left, settled = [], np.inf, 0
     for part in branch.halves(rows, weights):
@@ -454,7 +454,7 @@ def _open(problem: Problem, scorer: Convex, cutoff: float, node: _Node) -> _Open
     return _Opened(nodes, np.inf, (), settled, left, 0)
 
 
-def _scored(
+def _score_branch(
     problem: Problem, cutoff: float, sets: list[tuple[int, ...]], bounds: FloatArray, settled: int
 ) -> _Opened:
     """Score the choices of a branch that could be better, the smallest bound first."""

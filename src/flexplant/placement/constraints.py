@@ -130,7 +130,7 @@ class Mirrored(Constraint):
             image = points.copy()
             image[:, k] = 2.0 * self.at - image[:, k]
             images.append(image)
-        near = np.array([[_apart(p, q) for q in images] for p in places.points])
+        near = np.array([[_largest_distance(p, q) for q in images] for p in places.points])
         found = near.argmin(axis=1)
         lone = near.min(axis=1) > places.same
         pairs = [(i, int(j)) for i, j in enumerate(found) if i < j and not lone[i]]
@@ -173,7 +173,7 @@ class Among(Constraint):
         return LinearRows.counted(row, self.at_least, self.at_most)
 
 
-def _apart(points: FloatArray, others: FloatArray) -> float:
+def _largest_distance(points: FloatArray, others: FloatArray) -> float:
     """Return the largest distance from any point of one set to the other; inf if sizes differ."""
     if len(points) != len(others):
         return np.inf
@@ -258,11 +258,11 @@ class Excluded(Constraint):
 
     def rows(self, places: Places) -> LinearRows:
         """Return x_i <= 0 inside."""
-        return LinearRows.closed(places.inside(_listed(self.zones)) > 0)
+        return LinearRows.closed(places.inside(_zone_list(self.zones)) > 0)
 
     def drawn(self, places: Places) -> tuple[Zone, ...]:
         """Return the zones."""
-        return _listed(self.zones)
+        return _zone_list(self.zones)
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,13 +334,13 @@ class Within(Constraint):
 
     def rows(self, places: Places) -> LinearRows:
         """Return the count inside between its check_limits, or x_i <= 0 outside."""
-        inside = places.inside(_listed(self.zones))
+        inside = places.inside(_zone_list(self.zones))
         if self.at_least is None and self.at_most is None:
             return LinearRows.closed(inside == 0)
         return LinearRows.counted(inside, self.at_least, self.at_most)
 
 
-def _listed(zones: Zone | Sequence[Zone]) -> tuple[Zone, ...]:
+def _zone_list(zones: Zone | Sequence[Zone]) -> tuple[Zone, ...]:
     return (zones,) if isinstance(zones, Zone) else tuple(zones)
 
 

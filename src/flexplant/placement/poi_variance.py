@@ -82,17 +82,17 @@ def factors_of(plant: StandardPlant, poi: Named, axes: Named, *, every: bool) ->
             f"such as PoiVariance({next(iter(known), 'die')!r}), or all of them in a list."
         )
     found: dict[str, float] = {}
-    for name, weight in _factors(poi if poi is not None else tuple(known)).items():
+    for name, weight in _axis_factors(poi if poi is not None else tuple(known)).items():
         require_known("POI", [name], known)
         own = known[name]
         usual = tuple(own) if every else tuple(own)[:1]
-        for axis, factor in _factors(usual if axes is None else axes).items():
+        for axis, factor in _axis_factors(usual if axes is None else axes).items():
             require_known(f"axis of POI {name!r}", [axis], own)
             found[own[axis]] = weight * factor
     return found
 
 
-def _factors(named: Any) -> dict[str, float]:
+def _axis_factors(named: Any) -> dict[str, float]:
     if isinstance(named, Mapping):
         return dict(named)
     return dict.fromkeys((named,) if isinstance(named, str) else named, 1.0)

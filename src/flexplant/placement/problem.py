@@ -278,7 +278,7 @@ class Problem:
         chosen, shut = list(self.required), self.rows.shut(self.required)
         left = self.layouts.rigid.rows.copy()
         for i in self.required:
-            left = _without(left, left[i])
+            left = _rows_without(left, left[i])
         while len(chosen) < self.count:
             sizes = np.linalg.norm(left, axis=1) * (1.0 if weights is None else weights)
             sizes[chosen] = 0.0
@@ -287,7 +287,7 @@ class Problem:
             if np.linalg.norm(left[pick]) < WEAK:
                 break
             chosen.append(pick)
-            left = _without(left, left[pick])
+            left = _rows_without(left, left[pick])
         return chosen
 
 
@@ -348,7 +348,7 @@ class Search(Value):
         """
 
 
-def _without(rows: FloatArray, row: FloatArray) -> FloatArray:
+def _rows_without(rows: FloatArray, row: FloatArray) -> FloatArray:
     size = float(np.linalg.norm(row))
     if size < WEAK:
         return rows

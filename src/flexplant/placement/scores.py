@@ -177,7 +177,9 @@ def score_sensors(
     >>> fx.score_sensors(plant, scores.layouts, candidates=candidates, constraints=off).reasons
     ('', '', 'against OffPoi(radius=0.0).')
     """
-    return _scored(plant, "y", layouts, criterion, candidates, constraints, executor, progress)
+    return _score_layouts(
+        plant, "y", layouts, criterion, candidates, constraints, executor, progress
+    )
 
 
 def score_actuators(
@@ -226,10 +228,12 @@ def score_actuators(
     >>> scores.best
     ('a2',)
     """
-    return _scored(plant, "u", layouts, criterion, candidates, constraints, executor, progress)
+    return _score_layouts(
+        plant, "u", layouts, criterion, candidates, constraints, executor, progress
+    )
 
 
-def _scored(
+def _score_layouts(
     plant: StandardPlant,
     side: Side,
     layouts: Sequence[Sequence[Any]],

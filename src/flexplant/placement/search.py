@@ -324,7 +324,7 @@ def problem_of(
     constraints: Sequence[Constraint],
 ) -> Problem:
     """Return the problem of choosing so many candidates of each side, with everything checked."""
-    listed = {side: _listed(plant, side, given) for side, (given, _) in wanted.items()}
+    listed = {side: _candidate_ports(plant, side, given) for side, (given, _) in wanted.items()}
     ports = tuple(port for part in listed.values() for port in part)
     names = [port.name for port in ports]
     kept = _required(names, required)
@@ -347,7 +347,7 @@ def problem_of(
     return problem
 
 
-def _listed(plant: StandardPlant, side: str, given: Sequence[Any]) -> tuple[Port, ...]:
+def _candidate_ports(plant: StandardPlant, side: str, given: Sequence[Any]) -> tuple[Port, ...]:
     ports = tuple(known_candidates(plant, side, given).values())
     if not ports:
         raise ModelError("there are no candidates: pass a list of at least one to choose from.")

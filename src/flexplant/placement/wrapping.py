@@ -101,21 +101,23 @@ class PenalisedScores(Scorer):
 
     def value(self, chosen: Sequence[int]) -> float:
         """Return it for one choice."""
-        return float(_sum(self.base.value(chosen), self.penalty.value(chosen), self.weight))
+        return float(
+            _penalised_sum(self.base.value(chosen), self.penalty.value(chosen), self.weight)
+        )
 
     def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
         """Return it for several choices."""
         values = self.base.score(sets)
         finite = np.flatnonzero(np.isfinite(values)).tolist()
         more = self.penalty.score([sets[i] for i in finite])
-        values[finite] = _sum(values[finite], more, self.weight)
+        values[finite] = _penalised_sum(values[finite], more, self.weight)
         return values
 
     def bound(self, count: int, required: Sequence[int]) -> float:
         """Return the bound without a penalty, or with the least one."""
         base = self.base.bound(count, required)
         least = max(self.penalty.bound(count, required), 0.0)
-        return float(_sum(base, least, self.weight)) if base >= 0 else base
+        return float(_penalised_sum(base, least, self.weight)) if base >= 0 else base
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +152,7 @@ class Penalised(Wrapping):
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return it on a plant."""
-        return float(_sum(self.criterion(plant), self.penalty(plant), self.weight))
+        return float(_penalised_sum(self.criterion(plant), self.penalty(plant), self.weight))
 
     def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
         """Check both."""
@@ -165,7 +167,7 @@ class Penalised(Wrapping):
         )
 
 
-def _sum(value: Any, penalty: Any, weight: float) -> Any:
+def _penalised_sum(value: Any, penalty: Any, weight: float) -> Any:
     return value + weight * np.abs(value) * penalty
 
 
@@ -177,7 +179,7 @@ def _worth(shapes: Shapes, which: npt.NDArray[np.bool_]) -> FloatArray:
 _MEASURES = ("worst", "mean")
 
 
-def _plants(machines: Any, name: str) -> tuple[StandardPlant, ...]:
+def _checked_machines(machines: Any, name: str) -> tuple[StandardPlant, ...]:
     """Return the machines of a criterion, one at least."""
     if isinstance(machines, str) or not isinstance(machines, Sequence) or not machines:
         raise ModelError(
@@ -233,7 +235,7 @@ class OverMachines(Wrapping):
     ('s1',)
     """
 
-    machines: Sequence[StandardPlant] = field(metadata=checked(_plants))
+    machines: Sequence[StandardPlant] = field(metadata=checked(_checked_machines))
     measure: str = field(default="worst", kw_only=True, metadata=checked(one_of, choices=_MEASURES))
 
     def __repr__(self) -> str:

@@ -130,7 +130,7 @@ def legend(ax: Axes, *, given: bool) -> None:
     shown = ax.legend(frameon=False)
     box = shown.get_window_extent().transformed(ax.transAxes.inverted())
     width, height = box.width + 0.02, box.height + 0.03
-    points = _drawn(ax)
+    points = _drawn_points(ax)
     across = {"right": points[:, 0] > 1 - width, "left": points[:, 0] < width}
     along = {"upper": points[:, 1] > 1 - height, "lower": points[:, 1] < height}
     corners = {
@@ -152,18 +152,18 @@ def _raise_top(ax: Axes, top: float) -> None:
     ax.set_ylim(top=float(further[0]), auto=True)  # for what is drawn later
 
 
-def _drawn(ax: Axes) -> FloatArray:
+def _drawn_points(ax: Axes) -> FloatArray:
     """Return points (k, 2) along all lines and at the edges of areas, in units of the axes."""
     _ = ax.get_xlim(), ax.get_ylim()  # which brings the limits up to date, as transforms do not
     to_axes = ax.transData + ax.transAxes.inverted()
-    parts = [_between(np.asarray(line.get_xydata(), dtype=float)) for line in ax.get_lines()]
+    parts = [_resample_line(np.asarray(line.get_xydata(), dtype=float)) for line in ax.get_lines()]
     for area in ax.collections:
         if isinstance(area, PolyCollection):
-            parts += [_between(np.asarray(path.vertices)) for path in area.get_paths()]
+            parts += [_resample_line(np.asarray(path.vertices)) for path in area.get_paths()]
     return np.vstack([np.zeros((0, 2)), *(to_axes.transform(part) for part in parts)])
 
 
-def _between(points: FloatArray) -> FloatArray:
+def _resample_line(points: FloatArray) -> FloatArray:
     """Return points (k, 2) along a line, also between those far apart."""
     if len(points) > _DENSE or len(points) < 2:
         return points
@@ -297,7 +297,7 @@ def curves(
         line = dict(POINTS) if label in measured else next(modelled)
         if colors and label in colors:
             line["color"] = colors[label]
-        drawn.append(Curve(label, _response(one, freq), line))
+        drawn.append(Curve(label, _response_to_draw(one, freq), line))
     return drawn
 
 
@@ -307,7 +307,7 @@ def _is_measured(label: str, one: Any) -> bool:
     return isinstance(one, Frf) and (one.variance is not None or one.coherence is not None)
 
 
-def _response(one: Any, freq: FloatArray | None) -> Frf:
+def _response_to_draw(one: Any, freq: FloatArray | None) -> Frf:
     if isinstance(one, Frf):
         return one
     if isinstance(one, int | float):

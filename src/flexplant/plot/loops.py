@@ -100,7 +100,7 @@ def nyquist(
             raise unknown_label("channel", str(chosen), [str(one) for one in known])
         lines, values = curve.response.freq, curve.response[chosen]
         if curve.label in measured:
-            lines, values = _followed(lines, values)
+            lines, values = _refine_loop_gain(lines, values)
         nearest = int(np.argmin(np.abs(1.0 + values)))
         size = -20.0 * np.log10(abs(1.0 + values[nearest]))
         text = f"|S| up to {size:.1f} dB, at {lines[nearest]:.4g} Hz"
@@ -134,7 +134,7 @@ def nyquist(
     return finish(ax, x="real part of L", y="imaginary part of L")
 
 
-def _followed(freq: FloatArray, L: ComplexArray) -> tuple[FloatArray, ComplexArray]:
+def _refine_loop_gain(freq: FloatArray, L: ComplexArray) -> tuple[FloatArray, ComplexArray]:
     """Return a loop gain with points between lines where it moves much beside 1 + L."""
     if freq.size < LINES:
         return freq, L
@@ -205,9 +205,9 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
     for i, (label, one) in enumerate(named.items()):
         g, color = as_statespace(one), str(looks[i]["color"])
         pole, zero = _MARKERS[i % len(_MARKERS)]
-        _draw(ax, continuous_poles(g), pole, color, f"{label} poles".strip())
+        _draw_roots(ax, continuous_poles(g), pole, color, f"{label} poles".strip())
         if zeros:
-            _draw(ax, _continuous(g.zeros(), g), zero, color, f"{label} zeros".strip())
+            _draw_roots(ax, _continuous(g.zeros(), g), zero, color, f"{label} zeros".strip())
     ax.set_xscale("log")
     _wide(ax)
     # a drawn root is on the right of the imaginary axis, or on it
@@ -239,7 +239,7 @@ def _continuous(roots: ComplexArray, g: StateSpace) -> ComplexArray:
     return np.asarray(np.log(kept) / g.dt)
 
 
-def _draw(ax: Axes, roots: ComplexArray, marker: str, color: str, label: str) -> None:
+def _draw_roots(ax: Axes, roots: ComplexArray, marker: str, color: str, label: str) -> None:
     upper = roots[roots.imag >= -SAME * np.abs(roots)]
     size = np.abs(upper)
     still = size < SPLIT * size.max(initial=0.0)
@@ -303,7 +303,7 @@ def sensitivity(
     >>> ax.get_xlabel()
     'frequency [Hz]'
     """
-    lines = {label: _size(one, freq) for label, one in by_label(curves).items()}
+    lines = {label: _sensitivity_size(one, freq) for label, one in by_label(curves).items()}
     given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
     for (label, line), style in zip(lines.items(), styles(lines, colors), strict=True):
         if label in dashed:
@@ -314,7 +314,7 @@ def sensitivity(
     _limit(ax, weight, "S", list(lines.values()))
     if not given:
         _from_where_it_rises(ax, list(lines.values()))
-    _levels(ax)
+    _draw_levels(ax)
     legend(ax, given=given)
     return finish(ax, x="frequency [Hz]", y="|S| [dB]")
 
@@ -395,7 +395,7 @@ def sensitivities(
         if what == "KS":
             readable(panel)
         else:
-            _levels(panel)
+            _draw_levels(panel)
         unit = f", 0 dB = {shared_reference(found[0])}" if what == "KS" else ""
         finish(panel, x="frequency [Hz]" if what == "KS" else "", y=f"|{what}| [dB{unit}]")
         legend(panel, given=ax is not None)
@@ -438,7 +438,7 @@ def _kind_of(what: str, loop: Any, at: Literal["u", "y"], freq: FloatArray | Non
     return found(loop, freq=freq, at=at)
 
 
-def _size(one: Any, freq: FloatArray | None) -> _Line:
+def _sensitivity_size(one: Any, freq: FloatArray | None) -> _Line:
     """Return frequencies and sizes of one sensitivity."""
     if isinstance(one, Frf):
         return one.freq, largest(one)
@@ -486,7 +486,7 @@ def _limit(ax: Axes, weight: Any, what: str, lines: Sequence[_Line]) -> None:
     ax.semilogx(freq, -decibel(size), label=f"1 / |W| of {what}", **STYLES["bound"])
 
 
-def _levels(ax: Axes) -> None:
+def _draw_levels(ax: Axes) -> None:
     for level, style in ((0.0, "-"), (6.0, ":")):
         ax.axhline(level, color=GREY, linestyle=style, linewidth=0.8, zorder=1.0)
     readable(ax)

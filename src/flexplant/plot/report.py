@@ -76,7 +76,7 @@ def sections(design: Design, gallery: Gallery) -> Iterator[Chapter]:
     headed = {room: heading for heading, rooms in _HEADINGS.items() for room in rooms}
     for heading in (*_HEADINGS, "Other values"):
         parts = [
-            _shown(name, value, design, gallery)
+            _value_lines(name, value, design, gallery)
             for name, value in shown.items()
             if headed.get(type(value).__module__.split(".")[1], "Other values") == heading
         ]
@@ -84,7 +84,7 @@ def sections(design: Design, gallery: Gallery) -> Iterator[Chapter]:
             yield Chapter(heading, "".join(parts))
 
 
-def _shown(name: str, value: Any, design: Design, gallery: Gallery) -> str:
+def _value_lines(name: str, value: Any, design: Design, gallery: Gallery) -> str:
     """Return a value: its name, what it says of itself, tables and pictures."""
     parts = [f"<h3>{escape(name)}</h3>", value._repr_html_()]
     loop = next(iter(design.of(ClosedLoop).values()), None)
@@ -205,7 +205,7 @@ def certificates(design: Design) -> Chapter | None:
     """Return the section of all that was verified after it was computed."""
     rows = []
     for name, value in design.named.items():
-        for what, number in _verified(value):
+        for what, number in _certificate_lines(value):
             plain = _WORDS.get(what, what.replace("_", " "))
             rows.append([name, plain, figure(what, number)])
     if not rows:
@@ -213,7 +213,7 @@ def certificates(design: Design) -> Chapter | None:
     return Chapter("Certificates", table(["value", "verified by another computation", ""], rows))
 
 
-def _verified(value: Any) -> Iterator[tuple[str, Any]]:
+def _certificate_lines(value: Any) -> Iterator[tuple[str, Any]]:
     own = getattr(value, "certificate", None)
     if isinstance(own, Certificate):
         own = {n: v for n, v in own._fields().items() if v is not None}
@@ -254,14 +254,14 @@ def moving_shapes(modes: Modes) -> str:
     shapes = shapes / divisor(largest)
     count = shapes.shape[2]
     data = {
-        "xyz": _whole((xyz - centre) / size),
+        "xyz": _whole_thousandths((xyz - centre) / size),
         "edges": neighbours(xyz).tolist(),
-        "modes": [_whole(shapes[:, :, k]) for k in range(count)],
+        "modes": [_whole_thousandths(shapes[:, :, k]) for k in range(count)],
     }
     first = min(modes.n_rigid, count - 1)  # the first that deforms
     options = "".join(
-        f'<option value="{k}"{_SELECTED if k == first else ""}>{escape(_name(modes, k))}</option>'
-        for k in range(count)
+        f'<option value="{k}"{_SELECTED if k == first else ""}>{escape(name)}</option>'
+        for k, name in enumerate(_mode_name(modes, k) for k in range(count))
     )
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     return (
@@ -275,13 +275,13 @@ def moving_shapes(modes: Modes) -> str:
     )
 
 
-def _name(modes: Modes, k: int) -> str:
+def _mode_name(modes: Modes, k: int) -> str:
     if k < modes.n_rigid:
         return f"{k + 1}: rigid-body"
     return f"{k + 1}: {modes.freq[k]:.4g} Hz, damping {100 * modes.zeta[k]:.2g} %"
 
 
-def _whole(values: FloatArray) -> list[int]:
+def _whole_thousandths(values: FloatArray) -> list[int]:
     """Return thousandths, row by row."""
     return [int(v) for v in np.rint(1000.0 * values).ravel()]
 

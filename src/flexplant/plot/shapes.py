@@ -147,7 +147,7 @@ class _Moving:
         self.ax = solid_axes(self.skin.xyz, ax, beyond=float(scale) * self.skin.extent)
         self.factor = in_unit(self.skin.extent, "m")[0]
         finer = np.sqrt(_MANY / max(len(self.skin.triangles), 1))
-        self.parts = _parts(int(np.clip(finer, 1, _PARTS)))
+        self.parts = _subtriangles(int(np.clip(finer, 1, _PARTS)))
         self.faces, self.lines = self._start(color)
         zeta = modes.zeta[number - 1]
         damped = f", damping {100 * zeta:.2g} %" if zeta else ""
@@ -192,7 +192,7 @@ class _Moving:
         return self.ax
 
 
-def _parts(count: int) -> FloatArray:
+def _subtriangles(count: int) -> FloatArray:
     """Return the corners (count^2, 3, 3) of equal parts of a triangle, in shares of its corners."""
     upright = [(i, j) for i in range(count) for j in range(count - i)]
     turned = [(i, j) for i, j in upright if i + j < count - 1]

@@ -90,7 +90,7 @@ def localisation(
     return _plan(found, candidates, dofs, ax)
 
 
-def _kind(found: Localisation, name: str) -> str:
+def _candidate_kind(found: Localisation, name: str) -> str:
     if name in found.chosen:
         return "chosen"
     if len(found.alike) > 1 and name in found.alike:
@@ -102,7 +102,7 @@ def _bars(found: Localisation, ax: Axes | None) -> Axes:
     names = found.leading
     ax = axes(ax, figsize=(7.0, 0.8 + 0.33 * len(names)))
     rows = np.arange(len(names))
-    kinds = [_kind(found, name) for name in names]
+    kinds = [_candidate_kind(found, name) for name in names]
     for kind, colour in COLOURS.items():
         mine = [i for i in rows.tolist() if kinds[i] == kind]
         if mine:
@@ -138,7 +138,7 @@ def _plan(
     )
     ax.figure.colorbar(dots, ax=ax, label="of the misfit explained alone [%]")
     for kind, marker in (("chosen", "*"), ("alike", "o"), ("rival", "s")):
-        mine = [i for i, (q, _) in enumerate(placed) if _kind(found, q.name) == kind]
+        mine = [i for i, (q, _) in enumerate(placed) if _candidate_kind(found, q.name) == kind]
         if mine:
             ax.scatter(
                 xy[mine, 0],
@@ -244,7 +244,7 @@ def update(
     _parameters(axs["parameters"], fit, level)
     _convergence(axs["convergence"], fit)
     if shown:
-        _response(axs["response"], shown[-1], before, fit.model)
+        _draw_responses(axs["response"], shown[-1], before, fit.model)
     said = "converged" if fit.converged else "NOT CONVERGED"
     figure.suptitle(f"update: {said} in {counted(len(fit.history), 'step')} ({fit.reason})")
     return axs
@@ -344,7 +344,7 @@ def _convergence(ax: Axes, fit: UpdateResult) -> None:
     finish(ax, x="iteration", y=error_label(fit), title="convergence")
 
 
-def _response(ax: Axes, residual: FrfResidual, before: Any, after: Any) -> None:
+def _draw_responses(ax: Axes, residual: FrfResidual, before: Any, after: Any) -> None:
     frf, lines = residual.measured, residual.lines
     freq = frf.freq[lines]
     # the pair of channels that was measured strongest

@@ -201,7 +201,7 @@ class Irs(ReductionMethod):
             # rigid-body motions have no rate: rounding in K is kept out of them
             inertia = inertia - inertia @ rigid @ la.pinv(rigid) if rigid.shape[1] else inertia
             T = part.static + part.whole(np.zeros_like(rates), part.solver.solve(inertia))
-            if before.size and _settled(squares, before, self.tolerance):
+            if before.size and _is_settled(squares, before, self.tolerance):
                 break
             before = squares
         return projected(
@@ -232,7 +232,7 @@ def _rates(M: FloatArray, K: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(rates), np.asarray(squares)
 
 
-def _settled(squares: FloatArray, before: FloatArray, tolerance: float) -> bool:
+def _is_settled(squares: FloatArray, before: FloatArray, tolerance: float) -> bool:
     floor = ROUNDING * squares[-1]
     return bool(np.all(np.abs(squares - before) <= tolerance * np.abs(squares) + floor))
 

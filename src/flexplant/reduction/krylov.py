@@ -124,7 +124,7 @@ def _real_moments(model: FEModel, B: FloatArray, omega: float, count: int, D: An
     for _ in range(count - 1):
         # a new start in the same Krylov space: what is already there taken out first
         block = _normed(
-            model, _without(model, np.hstack(found), solve(np.asarray(model.M @ block)))
+            model, _orthogonal_to(model, np.hstack(found), solve(np.asarray(model.M @ block)))
         )
         found.append(block)
     return np.hstack(found)
@@ -198,7 +198,7 @@ def _normed(model: FEModel, vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors / np.sqrt(square.clip(TINY)))
 
 
-def _without(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArray:
+def _orthogonal_to(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArray:
     """Return vectors M-orthogonal to the span of others."""
     gram = basis.T @ np.asarray(model.M @ basis)
     for _ in range(2):

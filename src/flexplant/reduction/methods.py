@@ -300,7 +300,7 @@ class DesiredDofs(ReductionMethod):
             dofs=modes.dofs.select(labels),
             full_dofs=modes.dofs,
             rigid_body=partition[:, : modes.n_rigid],
-            method=_named(modes),
+            method=_modes_text(modes),
             condition=condition,
             truncated=truncated,
             n_vectors=modes.n_vectors,
@@ -345,8 +345,8 @@ def _proposal(dofs: DofSet, basis: FloatArray, labels: tuple[str, ...]) -> str:
     straight = [label for label in pool if ":r" not in label]
     for candidates in (straight, pool):
         try:
-            taken = PivotedQr().chosen(basis[dofs.indices(kept)], _rows(dofs, basis, candidates),
-                                       k - len(kept))  # fmt: skip
+            held, free = basis[dofs.indices(kept)], basis[dofs.indices(candidates)]
+            taken = PivotedQr().chosen(held, free, k - len(kept))
         except FlexplantError:
             continue
         fresh = [candidates[i] for i in taken]
@@ -359,10 +359,6 @@ def _proposal(dofs: DofSet, basis: FloatArray, labels: tuple[str, ...]) -> str:
                 "must stay])."
             )
     return f"Choose others: select_dofs(modes, {k}, required=[those that must stay])."
-
-
-def _rows(dofs: DofSet, basis: FloatArray, labels: list[str]) -> FloatArray:
-    return np.asarray(basis[dofs.indices(labels)])
 
 
 def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
@@ -417,7 +413,7 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
         return method.reduced(model)
 
 
-def _named(modes: Modes) -> str:
+def _modes_text(modes: Modes) -> str:
     found = counted(modes.n_modes, "mode")
     vectors = counted(modes.n_vectors, "attachment vector")
     return f"{found} and {vectors}" if modes.n_vectors else found

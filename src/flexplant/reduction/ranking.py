@@ -267,13 +267,13 @@ class ErrorBound(Value):
         if self.terms is None:
             return self.value
         gain, omega, zeta = np.asarray(self.terms).T
-        found = min(self.value, float(gain @ _largest(omega, zeta, top)))
+        found = min(self.value, float(gain @ _largest_modal_gain(omega, zeta, top)))
         if self.static is not None:
             found = min(found, self.static + float(gain @ _largest_change(omega, zeta, top)))
         return found
 
 
-def _largest(omega: FloatArray, zeta: FloatArray, top: float) -> FloatArray:
+def _largest_modal_gain(omega: FloatArray, zeta: FloatArray, top: float) -> FloatArray:
     """Return the largest ``1 / |omega^2 - w^2 + 2 i zeta omega w|`` for w up to `top`."""
     r = top / omega
     peak = peak_gains(omega, zeta)

@@ -120,7 +120,7 @@ def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
                 joint_motions=None if model is None else model.joint_motions,
             )
         written = 0.0 if digits is None else 10.0**-digits
-        lowest, scaled, failure = _lowest(
+        lowest, scaled, failure = _try_lowest_modes(
             given, K, M, there, loose, bool(mass_definite), written, motions
         )
     if lowest is not None and motions is not None:
@@ -152,7 +152,7 @@ def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
         loss=None if lowest is None or digits is None else loss(lowest, digits),
         digits=digits,
         swapped=swapped,
-        damping={} if D is None else _damping(D, motions, proven),
+        damping={} if D is None else _damping_facts(D, motions, proven),
     )
 
 
@@ -235,7 +235,7 @@ def _of_springs(K: Any, M: Any, lowest: Lowest, motions: ZeroEnergy) -> tuple[Lo
     return springs, pulled if np.all(are_rigid(M, every, springs.negative[1])) else 0
 
 
-def _lowest(
+def _try_lowest_modes(
     given: FEMatrices,
     K: Any,
     M: Any,
@@ -298,7 +298,7 @@ def _lowest(
     return every, scaled, ""
 
 
-def _damping(D: Any, motions: ZeroEnergy | None, proven: bool) -> dict[str, Any]:
+def _damping_facts(D: Any, motions: ZeroEnergy | None, proven: bool) -> dict[str, Any]:
     kept = np.flatnonzero(~empty_rows(D))
     definite = proven or not kept.size or is_positive_definite(D[kept][:, kept], SAME)
     drag = 0.0

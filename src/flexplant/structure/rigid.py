@@ -55,7 +55,7 @@ def _beside_few_springs(
 ) -> FloatArray:
     """Return the combinations (r, m) without outliers among the forces."""
     n, r = motions.shape
-    force, most = np.abs(np.asarray(K @ motions)), _sizes(size_of_K, motions)
+    force, most = np.abs(np.asarray(K @ motions)), _uncancelled_forces(size_of_K, motions)
     part = np.divide(force, most, out=np.zeros_like(force), where=most > 0)
     usual = np.maximum(np.median(part, axis=0), rounding)
     rows = np.flatnonzero(np.any(part > _OUTLIER * usual, axis=1))
@@ -98,7 +98,7 @@ def _in_their_order(null: FloatArray, untouched: Any) -> FloatArray:
     return null
 
 
-def _sizes(size_of_K: Absolute, motions: FloatArray) -> FloatArray:
+def _uncancelled_forces(size_of_K: Absolute, motions: FloatArray) -> FloatArray:
     """Return the forces (n, r) that do not cancel, each DOF moving as far as the farthest.
 
     So that rounding is seen in proportion also where a motion passes through zero.
@@ -120,11 +120,11 @@ def pieces(K: Any, M: Any, dofs: DofSet | None) -> IntArray:
     label: Any = csgraph.connected_components(sp.csr_array(by_rows(K)), directed=False)[1]
     if M is not None and label.max(initial=0) > 0:
         entries = sp.coo_array(M)
-        label = _joined(label, *entries.coords)
+        label = _join_parts(label, *entries.coords)
     if dofs is not None and label.max(initial=0) > 0:
         node = dofs.node_index
         first = np.unique(node, return_index=True)[1]
-        label = _joined(label, np.arange(label.size), first[node])
+        label = _join_parts(label, np.arange(label.size), first[node])
     sizes = np.bincount(label)
     place = np.empty(sizes.size, dtype=np.int64)
     place[np.argsort(-sizes, kind="stable")] = np.arange(sizes.size)
@@ -155,7 +155,7 @@ def bodies(K: Any, M: Any, dofs: DofSet) -> list[IntArray]:
     return np.split(kept[order], ends[:-1])
 
 
-def _joined(label: IntArray, one: Any, other: Any) -> IntArray:
+def _join_parts(label: IntArray, one: Any, other: Any) -> IntArray:
     """Return the number (n,) of the part each DOF belongs to, with some pairs of DOFs joined."""
     size = int(label.max()) + 1
     graph = sp.coo_array((np.ones(one.size, bool), (label[one], label[other])), shape=(size, size))
@@ -257,11 +257,11 @@ def rigid_body_basis(M: Matrix, K: Matrix, motions: FloatArray, xyz: FloatArray)
     """
     parts = _bodies_of(motions)
     if len(parts) < 2:
-        return _free(M, K, motions, farness(xyz))
+        return _free_motions(M, K, motions, farness(xyz))
     found, mass, stiffness = [], cast(Any, M), cast(Any, K)
     for rows, columns in parts:
         own = mass[rows][:, rows], stiffness[rows][:, rows], motions[np.ix_(rows, columns)]
-        free = _free(*own, farness(xyz[rows]))
+        free = _free_motions(*own, farness(xyz[rows]))
         found.append(np.zeros((motions.shape[0], free.shape[1])))
         found[-1][rows] = free
     return np.hstack(found)
@@ -275,7 +275,7 @@ def _bodies_of(motions: FloatArray) -> list[tuple[IntArray, IntArray]]:
     return [(np.flatnonzero(moved[:, one].any(axis=1)), one) for one in columns]
 
 
-def _free(M: Matrix, K: Matrix, motions: FloatArray, far: float) -> FloatArray:
+def _free_motions(M: Matrix, K: Matrix, motions: FloatArray, far: float) -> FloatArray:
     """Return the M-orthonormal motions of one body that cost no energy."""
     # K r and |K| |r|, row by row: forces of rounding size say that no energy is stored
     K = by_rows(K)

@@ -28,7 +28,7 @@ def beam_stiffness(length: float) -> FloatArray:
     half = np.array(
         [[6, 3 * h, -6, 3 * h], [0, 2 * h**2, -3 * h, h**2], [0, 0, 6, -3 * h], [0, 0, 0, 2 * h**2]]
     )
-    return _mirrored(2 * half / h**3)
+    return _mirror_upper(2 * half / h**3)
 
 
 def beam_mass(length: float) -> FloatArray:
@@ -42,7 +42,7 @@ def beam_mass(length: float) -> FloatArray:
             [0, 0, 0, 4 * h**2],
         ]
     )
-    return _mirrored(half * h / 420)
+    return _mirror_upper(half * h / 420)
 
 
 def beam_rotary(length: float) -> FloatArray:
@@ -56,7 +56,7 @@ def beam_rotary(length: float) -> FloatArray:
             [0, 0, 0, 4 * h**2],
         ]
     )
-    return _mirrored(half / (30 * h))
+    return _mirror_upper(half / (30 * h))
 
 
 def hermite(s: float, length: float, order: int = 0) -> FloatArray:
@@ -99,7 +99,7 @@ def plate_coefficients(a: float, b: float) -> FloatArray:
     return np.asarray(_unit_coefficients() * np.tile([1.0, b, a], 4), dtype=np.float64)
 
 
-def _product(first: tuple[int, int], second: tuple[int, int]) -> FloatArray:
+def _derivative_products(first: tuple[int, int], second: tuple[int, int]) -> FloatArray:
     """Return the exact integrals (12, 12) of products of derivatives over the unit square."""
 
     def factor(power: IntArray, order: int) -> IntArray:
@@ -117,16 +117,16 @@ def _product(first: tuple[int, int], second: tuple[int, int]) -> FloatArray:
 def plate_mass(a: float, b: float) -> FloatArray:
     """Return the consistent mass (12, 12) of a plate element for unit mass per area."""
     shape = plate_coefficients(a, b)
-    return _symmetrised(a * b * shape.T @ _product((0, 0), (0, 0)) @ shape)
+    return _symmetrised(a * b * shape.T @ _derivative_products((0, 0), (0, 0)) @ shape)
 
 
 def plate_stiffness(a: float, b: float) -> tuple[FloatArray, FloatArray]:
     """Return K0, K1 (12, 12): the stiffness is ``E t^3 / 12 (1 - nu^2) (K0 + nu K1)``."""
     xx, yy, xy = (2, 0), (0, 2), (1, 1)
-    cross = _product(xx, yy) / (a * b) ** 2
-    twist = 2 * _product(xy, xy) / (a * b) ** 2
+    cross = _derivative_products(xx, yy) / (a * b) ** 2
+    twist = 2 * _derivative_products(xy, xy) / (a * b) ** 2
     shape = plate_coefficients(a, b)
-    plain = _product(xx, xx) / a**4 + _product(yy, yy) / b**4 + twist
+    plain = _derivative_products(xx, xx) / a**4 + _derivative_products(yy, yy) / b**4 + twist
     return (
         _symmetrised(a * b * shape.T @ plain @ shape),
         _symmetrised(a * b * shape.T @ (cross + cross.T - twist) @ shape),
@@ -190,7 +190,7 @@ def _symmetrised(matrix: FloatArray) -> FloatArray:
     return 0.5 * (matrix + matrix.T)
 
 
-def _mirrored(upper: FloatArray) -> FloatArray:
+def _mirror_upper(upper: FloatArray) -> FloatArray:
     return np.asarray(upper + np.triu(upper, 1).T, dtype=np.float64)
 
 
@@ -312,7 +312,7 @@ class Grid:
         done, step = 0, max(1, _CHUNK // flat.shape[1])
         for start in range(0, self.nodes.size, step):
             some = slice(start, start + step)
-            values = _weighted(weight_of[some], flat).reshape(-1, f, n_seen, f)
+            values = _symmetric_sum(weight_of[some], flat).reshape(-1, f, n_seen, f)
             there = self._there[some]
             if not there.all():
                 keep = np.broadcast_to(there[:, None, :, None], values.shape)
@@ -325,7 +325,7 @@ class Grid:
         return found
 
 
-def _weighted(weights: FloatArray, table: FloatArray) -> FloatArray:
+def _symmetric_sum(weights: FloatArray, table: FloatArray) -> FloatArray:
     """Return weights @ table, summed in one order: the matrix is symmetric to the last bit.
 
     BLAS may fuse a product with a sum, and then (w e)_1 + (w e)_2 depends on which one comes first.

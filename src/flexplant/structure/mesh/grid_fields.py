@@ -206,7 +206,7 @@ def present_of(
 
     if holes is None or (isinstance(holes, Sequence) and not len(holes)):
         return None
-    missing = _missing(holes, lengths, counts)
+    missing = _hole_mask(holes, lengths, counts)
     present = ~missing.reshape(tuple(counts[::-1]))
     if present.all():
         return None
@@ -221,7 +221,7 @@ def present_of(
     return present
 
 
-def _missing(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> Any:
+def _hole_mask(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> Any:
     if not isinstance(holes, Hole) and not callable(holes):
         given = np.asarray(holes) if not isinstance(holes, set) else np.array(None)
         if given.dtype == bool:

@@ -155,9 +155,9 @@ def rib_matrices(
     for rib in ribs:
         axis, first, second, under = _edges(grid, lengths, rib)
         h = lengths[axis] / grid.counts[axis]
-        thickness = _beside(skin.thickness, under)
+        thickness = _mean_beside_edges(skin.thickness, under)
         own = {
-            name: _beside(getattr(skin, name), under)
+            name: _mean_beside_edges(getattr(skin, name), under)
             if getattr(rib, name) is None
             else np.full(first.size, float(getattr(rib, name)))
             for name in ("density", "youngs_modulus", "poisson_ratio")
@@ -229,7 +229,7 @@ def _edges(
     return axis, first, first + stride[axis], sides
 
 
-def _beside(value: Any, sides: list[IntArray]) -> FloatArray:
+def _mean_beside_edges(value: Any, sides: list[IntArray]) -> FloatArray:
     """Return the mean of a property over the elements on both sides of each edge."""
     if np.ndim(value) == 0:
         return np.full(sides[0].size, float(value))

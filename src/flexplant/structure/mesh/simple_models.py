@@ -95,7 +95,7 @@ def chain(
         raise ModelError("masses is empty: a chain needs one mass at least. Pass [1.0], say.")
     shape = None if np.ndim(ground) == 0 else (n,)
     held = np.zeros(n) + positive_array(ground, "ground", shape, zero=True)
-    k = _between(stiffnesses, "stiffnesses", n)
+    k = _between_masses(stiffnesses, "stiffnesses", n)
     xyz = np.zeros((n, 3))
     xyz[:, 0] = positive(spacing, "spacing") * np.arange(n)
     return FEModel._proven(
@@ -103,13 +103,13 @@ def chain(
         K=frozen(_laplacian(k, held)),
         D=None
         if dampings is None
-        else frozen(_laplacian(_between(dampings, "dampings", n), np.zeros(n))),
+        else frozen(_laplacian(_between_masses(dampings, "dampings", n), np.zeros(n))),
         dofs=DofSet(np.arange(1, n + 1), ("x",) * n, xyz),
         name="chain" if name is None else name,
     )
 
 
-def _between(given: Any, name: str, n: int) -> FloatArray:
+def _between_masses(given: Any, name: str, n: int) -> FloatArray:
     values = positive_array(given, name, (None,), zero=True)
     if values.size != n - 1:
         raise ShapeError(
@@ -293,7 +293,7 @@ def kirchhoff_plate(
     share = share_of(holes, lengths, counts)
     M = grid.matrix([(plate_mass(a, b), share * skin.density * skin.thickness)])
     bending = share * skin.youngs_modulus * skin.thickness**3 / (12 * (1 - skin.poisson_ratio**2))
-    K = grid.matrix(_weighted(plate_stiffness(a, b), bending, skin.poisson_ratio))
+    K = grid.matrix(_plate_stiffness(plate_stiffness(a, b), bending, skin.poisson_ratio))
     listed = _ribs(ribs)
     if listed:
         M, K = rib_matrices(grid, lengths, skin, listed, M, K)
@@ -308,7 +308,7 @@ def kirchhoff_plate(
     )
 
 
-def _weighted(parts: tuple[FloatArray, FloatArray], bending: Any, nu: Any) -> Any:
+def _plate_stiffness(parts: tuple[FloatArray, FloatArray], bending: Any, nu: Any) -> Any:
     plain, cross = parts
     if np.ndim(nu) == 0:
         return [(plain + nu * cross, bending)]
