@@ -1,7 +1,7 @@
 """Readers and writers of foreign formats; for our own values use `.save` and `flexplant.load`.
 
 `read_model`, `read_matrices` and `read_modes` find the format themselves; the reader of one format
-says more. All of them raise FileNotFoundError where there is no such file.
+says more.
 
 ====================  ====================  =======================================================
 format                reader                what is read

@@ -65,6 +65,8 @@ def read_matrices(
 
     Raises
     ------
+    FileNotFoundError
+        When there is no such file, as with every reader.
     FlexplantError
         When the format is not known, holds no matrices, or the file is damaged.
     ModelError, LabelError, ShapeError
@@ -169,6 +171,8 @@ def read_model(
 
     Raises
     ------
+    FileNotFoundError
+        When there is no such file, as with every reader.
     FlexplantError
         When the format is not known, holds no matrices, or the file is damaged.
     ModelError, LabelError, ShapeError

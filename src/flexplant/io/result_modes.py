@@ -140,6 +140,8 @@ def read_modes(
 
     Raises
     ------
+    FileNotFoundError
+        When there is no such file, as with every reader.
     FlexplantError
         When the format is not known, holds no modes, or the file is damaged.
     ModelError
