@@ -42,7 +42,7 @@ LINES = [
     ("lti/discretisation.py", "np.arctan(0.5 * dt * omega)", "np.arctan(0.4 * dt * omega)"),
     ("lti/discretisation.py", "np.sin(turning), -0.5 *", "np.sin(turning), -0.6 *"),
     ("identification/spectra.py", "count / (1.0 + 2.0 * doubled)", "1.0 * count"),
-    ("reduction/bounds.py", "np.sqrt(1 + 2 * a)", "np.sqrt(1 + a)"),
+    ("reduction/ranking.py", "np.sqrt(1 + 2 * a)", "np.sqrt(1 + a)"),
     ("estimation/filter_model.py", "L_z @ m.R - 2.0 * N", "L_z @ m.R - N"),
     ("structure/damping.py", "ratio = 0.5 * (self.alpha", "ratio = 1.0 * (self.alpha"),
     ("loop/mode_tolerance.py", "zeta = -0.5 * trace", "zeta = -1.0 * trace"),

@@ -205,8 +205,9 @@ WRONG = {
         "by the observability",
     ),
     "cost of a layout": (
-        "placement.poi_lqr.AGREEMENT", lambda allowed: -allowed,
-        lambda: import_module("flexplant.placement.poi_lqr").confirmed(1.0, 1.0), "loop costs",
+        "placement.closed_loop_h2.AGREEMENT", lambda allowed: -allowed,
+        lambda: import_module("flexplant.placement.closed_loop_h2").confirmed(1.0, 1.0),
+        "loop costs",
     ),
     "affine channels of a sampled plant": (
         "plant.uncertainty.delta_channels._distance", lambda _: lambda *_: 1.0,

@@ -34,16 +34,16 @@ def check(modules):
     found = {name: runs(name) for name in modules}
     wrong = {name: failed for name, (_, failed) in found.items() if failed}
     assert not wrong, f"examples that fail, by module: {wrong}"
-    return sum(tried > 0 for tried, _ in found.values())
+    return sum(tried for tried, _ in found.values())
 
 
 def test_doctests():
-    assert check([name for name in MODULES if not name.startswith(DESIGNS)]) > 50
+    assert check([name for name in MODULES if not name.startswith(DESIGNS)]) > 500
 
 
 @pytest.mark.slow
 def test_doctests_of_designs():
-    assert check([name for name in MODULES if name.startswith(DESIGNS)]) > 90
+    assert check([name for name in MODULES if name.startswith(DESIGNS)]) > 500
 
 
 #: public names without a doctest: what read_ansys reads cannot be written in a few lines, a Problem

@@ -1,8 +1,7 @@
-"""The house: rooms import only from rooms above, stay small, load nothing heavy, speak plainly."""
+"""The house: rooms import only from rooms above, stay small, load nothing heavy."""
 
 import ast
 import json
-import re
 import subprocess
 import sys
 from functools import cache
@@ -39,19 +38,6 @@ ROOMS = (
 LEVEL = {
     name: i for i, room in enumerate(ROOMS) for name in ([room] if isinstance(room, str) else room)
 }
-#: figures of speech that make sentences hard to read, and what to write instead
-FIGURES = {
-    "told|tells?|telling": "distinguish, determine, show",
-    "ask|asks|asked|asking": "request, require, choose",
-    "knows|believes?|thinks?|speaks?|hears?|heard|listens?|feigns?": "has, includes, contains",
-    r"doubt\w*": "uncertainty, variance",
-    "(?:looked|to look|looking) at": "examined, used, checked",
-    r"aloud|screwed|reseat\w*|lessened|drown\w*|undying|culprits?|deaf|blind": "the plain word",
-    "doors?|hands? (?:back|out)|runs? away|goes on and on": "constructor, returns, diverges",
-    r"promis\w*|forgets?|remembers?|nobody": "guarantees, claims, loses, the plain word",
-    "(?:route|norm) of (?:its|their) own": "by another computation",
-}
-WORDS = re.compile(rf"\b(?:{'|'.join(FIGURES)})\b".replace(" ", r"\s+"), re.IGNORECASE)
 HEAVY = {"matplotlib", "control", "cvxpy", "clarabel", "filterpy", "tqdm"}
 MODULES = sorted(ROOT.rglob("*.py"))
 LONGEST = 600
@@ -312,36 +298,4 @@ def test_class_names_are_unique():
 def test_module_names_are_unique():
     """Also where rooms differ; a picture's module is called as what it shows."""
     names = [p.stem for p in MODULES if room_of(p) != "plot" and p.stem != "__init__"]
-    assert sorted({name for name in names if names.count(name) > 1}) == []
-
-
-def figures(source):
-    """Return (line, word) of each figure of speech."""
-    return [(source.count("\n", 0, m.start()) + 1, m[0]) for m in WORDS.finditer(source)]
-
-
-def advice(word):
-    plain = " ".join(word.split())
-    return next(a for figure, a in FIGURES.items() if re.fullmatch(figure, plain, re.IGNORECASE))
-
-
-def test_the_words_are_plain():
-    wrong = [
-        f"{name_of(path)}:{line} {word!r}: write {advice(word)}"
-        for path in MODULES
-        for line, word in figures(path.read_text())
-    ]
-    assert not wrong, "\n".join(wrong)
-
-
-def test_the_check_of_words_can_fail():
-    source = '"""What the filter knows."""\n# to look at\nraise ValueError(f"ask for {1} less")\n'
-    assert figures(source) == [(1, "knows"), (2, "to look at"), (3, "ask")]
-    assert figures("x\n  of the doors")[0] == (2, "doors")
-    assert advice("doubted") == "uncertainty, variance"
-
-
-def test_files_of_tests_have_names_of_their_own():
-    """Two of one name cannot be collected in one run."""
-    names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
     assert sorted({name for name in names if names.count(name) > 1}) == []

@@ -28,6 +28,11 @@ def found(maglev):
     return maglev.main()
 
 
+@pytest.fixture(scope="module")
+def text(maglev, found):
+    return maglev.table(found)
+
+
 def test_the_magnets_make_six_unstable_pairs(maglev, found):
     """A rigid block by hand: sqrt(k / m) and sqrt(k arm^2 / J), magnets at its corners."""
     lx, ly, lz = maglev.SIZE
@@ -46,7 +51,7 @@ def test_the_magnets_make_six_unstable_pairs(maglev, found):
     assert "6 unstable rigid-body pairs" in found["report"]["detectable"].finding
 
 
-def test_the_machine_keeps_what_the_loop_promises(maglev, found):
+def test_the_machine_keeps_what_the_loop_promises(maglev, found, text):
     """Of another formulation than the bricks, with another mass and other magnets."""
     promised, kept = found["path"][0]["loop"], found["machine"]
     assert kept.is_stable
@@ -54,7 +59,7 @@ def test_the_machine_keeps_what_the_loop_promises(maglev, found):
     for axis in maglev.AXES:
         assert kept.rms(f"die:{axis}") == pytest.approx(promised.rms(f"die:{axis}"), rel=0.03)
         assert kept.rms(f"die:{axis}") != pytest.approx(promised.rms(f"die:{axis}"), rel=1e-4)
-    assert f"{kept.modulus_margin:.3f}" in maglev.table(found)
+    assert f"{kept.modulus_margin:.3f}" in text
 
 
 def test_the_budget_is_that_of_the_spectra(maglev, found):
@@ -91,8 +96,7 @@ def test_the_path_of_the_poi(found):
     assert ratio == pytest.approx(1.230, abs=0.01)
 
 
-def test_the_tables_and_the_picture(maglev, found, tmp_path):
-    text = maglev.table(found)
+def test_the_tables_and_the_picture(maglev, found, text, tmp_path):
     for words in ("doubles in [ms]", "6 unstable rigid-body pairs", "share", "(0.36, 0.26)",
                   "decoupled motions"):  # fmt: skip
         assert words in text

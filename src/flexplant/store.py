@@ -33,7 +33,11 @@ def checked(check: Callable[..., Any], *, unit: str = "", **rules: Any) -> dict[
 
 
 class Value(ABC):  # noqa: B024 - its kinds have abstract methods
-    """A frozen dataclass whose arrays are read-only copies, also after pickling and loading."""
+    """A frozen dataclass whose arrays are read-only copies, also after pickling and loading.
+
+    What is no such field as its kind describes is refused at construction: by ShapeError where
+    sizes do not fit, LabelError where names do not, else by ModelError.
+    """
 
     registry: ClassVar[dict[str, type[Value]]] = {}
 

@@ -67,7 +67,7 @@ def test_exchanges_score_only_what_a_bound_leaves(make, monkeypatch):
     plant, sensors, _ = make(5, count=36)
     found = {}
     for many in (24, 1000):
-        monkeypatch.setattr("flexplant.placement.exchange._MANY", many)
+        monkeypatch.setattr("flexplant.placement.branch_and_bound._MANY", many)
         found[many] = place_sensors(plant, sensors, 4, method=Exchange(starts=2), rng=0)
     assert found[24].chosen == found[1000].chosen
     assert found[24].history == found[1000].history

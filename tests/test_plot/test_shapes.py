@@ -6,7 +6,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import ModelError
-from flexplant.plot.mode_shapes import surface_of
+from flexplant.plot.shapes import surface_of
 from stages import L, fitted, reduced, some_modes
 
 ALUMINIUM = {"density": 2700.0, "youngs_modulus": 70e9, "poisson_ratio": 0.33}

@@ -185,7 +185,7 @@ def test_the_bound_of_chosen_modes_of_a_model_has_no_band(plate):
 
 def test_the_largest_departure_from_the_static_response_is_that_of_a_dense_grid():
     """Below, at and above the resonance, up to critical damping."""
-    from flexplant.reduction.bounds import _largest_change
+    from flexplant.reduction.ranking import _largest_change
 
     w = np.linspace(0.0, 3.0, 60001)
     for zeta in (0.001, 0.1, 0.4, 0.9):

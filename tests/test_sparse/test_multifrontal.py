@@ -11,7 +11,7 @@ import meshes
 from flexplant.errors import SolverError
 from flexplant.sparse import ordering
 from flexplant.sparse.factor import is_positive_definite, lowest_eigenvalue_bound
-from flexplant.sparse.inertia import SignedFactor, multifrontal_inertia
+from flexplant.sparse.lowest import SignedFactor, multifrontal_inertia
 from flexplant.sparse.multifrontal import ComplexSymmetricFactor, MultifrontalCholesky
 from flexplant.sparse.ordering import dissect
 

@@ -74,8 +74,6 @@ def read_abaqus(
         When a node has no coordinates in `inp`.
     ShapeError
         When `dofs` has another number of rows.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----
@@ -161,20 +159,20 @@ def _triplets(path: str | Path) -> _Triplets:
     for line in lines:
         match = re.search(rb"SCALE\s*FACTOR\s*=\s*([^,\s]+)", line.upper())
         if match and line[:1] == b"*" and line[:2] != b"**":
-            scale = _scale(match[1], path)
+            scale = _unit_factor(match[1], path)
     if not data:
         raise FlexplantError(f"{str(path)!r} holds no matrix. Write it again.")
     width = len(_WORD.findall(data[0]))
     if width not in (3, 5) or (width == 3 and b"," in data[0]):
-        raise _wrong(path, lines, data[0], 5)
+        raise _abaqus_line_error(path, lines, data[0], 5)
     table = rows_of_numbers(b"\n".join(data).replace(b",", b" "), width)
     if table is None:
         at = wrong_line((line.replace(b",", b" ") for line in data), width)
-        raise _wrong(path, lines, data[at or 0], width)
+        raise _abaqus_line_error(path, lines, data[at or 0], width)
     labels = table[:, :-1]
     if not np.all(np.isfinite(table)) or np.any(labels != np.round(labels)):
         bad = np.argmax(~np.isfinite(table).all(axis=1) | (labels != np.round(labels)).any(axis=1))
-        raise _wrong(path, lines, data[int(bad)], width)
+        raise _abaqus_line_error(path, lines, data[int(bad)], width)
     whole: Any = labels.astype(np.int64)
     inner = whole[:, :: 2 if width == 5 else 1]
     if np.any(inner < 1):
@@ -200,14 +198,16 @@ def _triplets(path: str | Path) -> _Triplets:
     )
 
 
-def _scale(word: bytes, path: str | Path) -> float:
+def _unit_factor(word: bytes, path: str | Path) -> float:
     try:
         return decimal(word.decode("latin-1"))
     except ValueError as error:
         raise FlexplantError(f"{str(path)!r}: SCALE FACTOR={error}. Write it again.") from None
 
 
-def _wrong(path: str | Path, lines: list[bytes], line: bytes, width: int) -> FlexplantError:
+def _abaqus_line_error(
+    path: str | Path, lines: list[bytes], line: bytes, width: int
+) -> FlexplantError:
     form = "node, dof, node, dof, value" if width == 5 else "row column value"
     do = "Write it with *MATRIX OUTPUT, FORMAT=MATRIX INPUT."
     return wrong_line_of(path, lines.index(line) + 1, f"{form!r} is", line, do)
@@ -218,13 +218,13 @@ def _dofs(order: IntArray, inp: str | Path | None) -> DofSet:
     directions = [DIRECTIONS[i - 1] for i in (order & 15).tolist()]
     if inp is None:
         return DofSet(ids, tuple(directions), np.zeros((ids.size, 3)))
-    places = _nodes(inp)
+    places = _input_nodes(inp)
     xyz = np.array(list(places.values())).reshape(-1, 3)
     known = np.array(list(places), dtype=np.int64)
     return DofSet(ids, tuple(directions), at_nodes(ids, known, xyz, f"{inp}, *NODE"))
 
 
-def _nodes(path: str | Path) -> dict[int, list[float]]:
+def _input_nodes(path: str | Path) -> dict[int, list[float]]:
     """Return the coordinates of an input file's nodes."""
     places: dict[int, list[float]] = {}
     defined: dict[int, str] = {}

@@ -65,8 +65,6 @@ def read_ansys(
         local coordinate system.
     LabelError
         When a node has no coordinates.
-    FileNotFoundError
-        When there is no such file.
     """
     path = file_path(path)
     full = read_parsed("ansys_full", path)

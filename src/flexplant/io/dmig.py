@@ -62,8 +62,6 @@ def read_dmig(
         When there is no matrix of such a name, or a node has no coordinates in `bdf`.
     ModelError
         When a matrix is complex, not square, gives an entry twice, or scalar points are there.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----
@@ -86,7 +84,7 @@ def read_dmig(
     """
     content = file_path(path).read_bytes()
     lines = content.splitlines()
-    blocks = _blocks(lines, str(path))
+    blocks = _read_blocks(lines, str(path))
     check_whole(content, [line[8:].split()[-1] for line in lines[-9:-1] if line[8:].split()], path)
     if not blocks:
         raise FlexplantError(
@@ -173,7 +171,7 @@ class _Block:
         return sp.csc_array(half + mirrored)
 
 
-def _blocks(lines: list[bytes], path: str) -> dict[str, _Block]:
+def _read_blocks(lines: list[bytes], path: str) -> dict[str, _Block]:
     """Return the matrices of a file by name."""
     blocks: dict[str, _Block] = {}
     heads = [i for i, line in enumerate(lines) if line[:4].upper() == b"DMIG" and _is_head(line)]
@@ -186,12 +184,14 @@ def _blocks(lines: list[bytes], path: str) -> dict[str, _Block]:
         except (ValueError, IndexError):
             sound = False
         if not sound:
-            raise _wrong(path, head, lines[head], "a header DMIG, NAME, 0, IFO, TIN")
+            raise _dmig_line_error(path, head, lines[head], "a header DMIG, NAME, 0, IFO, TIN")
         if name in blocks:
-            raise _wrong(path, head, lines[head], f"one matrix {name} only, here is a second")
+            raise _dmig_line_error(
+                path, head, lines[head], f"one matrix {name} only, here is a second"
+            )
         size = fields[7].strip() if len(fields) > 7 else ""
         announced = int(size) if size.isdecimal() and size.isascii() else 0
-        blocks[name] = _block(lines, first, last, (name, form, kind, announced), path)
+        blocks[name] = _read_block(lines, first, last, (name, form, kind, announced), path)
     return blocks
 
 
@@ -214,7 +214,7 @@ def _split(line: bytes) -> list[bytes]:
     return [line[i : i + width] for i in range(8, min(len(line), 72), width)]
 
 
-def _block(
+def _read_block(
     lines: list[bytes], first: int, last: int, head: tuple[str, int, int, int], path: str
 ) -> _Block:
     stop = first
@@ -237,25 +237,27 @@ def _large(part: list[bytes], first: int, real: bool, path: str) -> Any:
     table = table.reshape(-1, 72)
     heads = table[:, 0] == ord("D")
     if not heads[0]:
-        raise _wrong(path, first, part[0], "DMIG*, NAME, GJ, CJ of the first column")
+        raise _dmig_line_error(path, first, part[0], "DMIG*, NAME, GJ, CJ of the first column")
 
     def whole(rows: Any, start: int) -> IntArray:
         numbers = _field(table[rows, start : start + 16])
         if numbers is None or np.any(numbers != np.round(numbers)) or np.any(numbers < 0):
-            raise _named(part, np.flatnonzero(rows), start, first, path, "a whole number")
+            raise _error_at_line(part, np.flatnonzero(rows), start, first, path, "a whole number")
         return numbers.astype(np.int64)
 
     columns = _codes(whole(heads, 24), whole(heads, 40), path)
     rows = _codes(whole(~heads, 8), whole(~heads, 24), path)
     values = _field(table[~heads, 40:56])
     if values is None:
-        raise _named(part, np.flatnonzero(~heads), 40, first, path, "a number")
+        raise _error_at_line(part, np.flatnonzero(~heads), 40, first, path, "a number")
     if real:
         beyond = _field(table[~heads, 56:72])
         if beyond is None or np.any(beyond):
             wrong = 0 if beyond is None else int(np.argmax(beyond != 0))
             at = int(np.flatnonzero(~heads)[wrong])
-            raise _wrong(path, first + at, part[at], "no imaginary part (the matrix is real)")
+            raise _dmig_line_error(
+                path, first + at, part[at], "no imaginary part (the matrix is real)"
+            )
     places = np.flatnonzero(~heads)
     words = [part[i][40:56] for i in places[:: max(1, places.size // 1000)]]
     return columns[np.cumsum(heads)[~heads] - 1], rows, values, words
@@ -269,7 +271,7 @@ def _field(table: Any) -> FloatArray | None:
     return fixed_numbers(np.ascontiguousarray(table).tobytes(), 16)
 
 
-def _named(
+def _error_at_line(
     part: list[bytes], places: IntArray, start: int, first: int, path: str, due: str
 ) -> FlexplantError:
     for i in places.tolist():
@@ -279,8 +281,10 @@ def _named(
                 continue
         except (ValueError, OverflowError):
             pass
-        return _wrong(path, first + i, part[i], f"{due} in columns {start + 1} to {start + 16}")
-    return _wrong(path, first, part[0], "numbers in every field")
+        return _dmig_line_error(
+            path, first + i, part[i], f"{due} in columns {start + 1} to {start + 16}"
+        )
+    return _dmig_line_error(path, first, part[0], "numbers in every field")
 
 
 def _any(part: list[bytes], first: int, name: str, real: bool, path: str) -> Any:
@@ -312,7 +316,7 @@ def _any(part: list[bytes], first: int, name: str, real: bool, path: str) -> Any
                     columns.append(column)
                     words.append(entry[2])
         except (ValueError, IndexError, OverflowError):
-            raise _wrong(path, at, line, f"DMIG, {name}, GJ, CJ, , G1, C1, A1") from None
+            raise _dmig_line_error(path, at, line, f"DMIG, {name}, GJ, CJ, , G1, C1, A1") from None
     return np.array(columns, np.int64), np.array(rows, np.int64), np.array(values), words[:1000]
 
 
@@ -356,7 +360,7 @@ def _dofs(order: IntArray, nodes: Nodes | None, scalar: str | None, path: str) -
     )
 
 
-def _wrong(path: str, at: int, line: bytes, due: str) -> FlexplantError:
+def _dmig_line_error(path: str, at: int, line: bytes, due: str) -> FlexplantError:
     return wrong_line_of(
         path, at + 1, f"{due} is", line, "It is cut off or damaged: write it again."
     )

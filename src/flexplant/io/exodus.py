@@ -65,8 +65,6 @@ def read_exodus_modes(
         not mass-normalised with `M`.
     LabelError
         When `times` or `variables` name what is not known.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----
@@ -110,7 +108,7 @@ def read_shapes(
     one_of(times, "times", ("frequency", "omega", "eigenvalue"))
     with opened(path) as file:
         xyz, ids = file.nodes()
-        chosen = _chosen(file.variables(), variables, str(path))
+        chosen = _motion_variables(file.variables(), variables, str(path))
         values = np.asarray(file.array("time_whole"), dtype=np.float64)
         shapes = [np.asarray(file.shapes(at), dtype=np.float64) for at in chosen.values()]
     n, k = ids.size, values.size
@@ -128,7 +126,9 @@ def read_shapes(
     return values * (2 * np.pi if times == "frequency" else 1.0), phi, dofs
 
 
-def _chosen(names: list[str], given: Mapping[str, str] | None, path: str) -> dict[str, int]:
+def _motion_variables(
+    names: list[str], given: Mapping[str, str] | None, path: str
+) -> dict[str, int]:
     """Return {direction: place of the variable} in the order of directions."""
     if given is not None:
         wrong = sorted(set(given) - set(DIRECTIONS))

@@ -24,7 +24,7 @@ def matlab(path: str) -> dict[str, Any]:
     import scipy.io.matlab
 
     # deflated data grow a thousand times at most
-    _bounded(path, 1100)
+    _bound_memory(path, 1100)
     content = scipy.io.matlab.loadmat(path, struct_as_record=False)
     return {name: _plain(value) for name, value in content.items() if name[:2] != "__"}
 
@@ -33,7 +33,7 @@ def ansys_full(path: str) -> dict[str, Any]:
     """Return the table of rows (node, DOF), K, M and the header of an ANSYS .full file."""
     from ansys.mapdl import reader
 
-    _bounded(path, 60)
+    _bound_memory(path, 60)
     full = reader.read_binary(path)
     if not hasattr(full, "load_km"):
         return {"class": type(full).__name__}
@@ -45,7 +45,7 @@ def ansys_mesh(path: str) -> dict[str, Any]:
     """Return node numbers, coordinates and nodal angles of an ANSYS .rst or .cdb file."""
     from ansys.mapdl import reader
 
-    _bounded(path, 60)
+    _bound_memory(path, 60)
     archive = path.lower().endswith(".cdb")
     mesh = reader.Archive(path, parse_vtk=False) if archive else reader.read_binary(path).mesh
     return {"nodes": mesh.nnum, "xyz": mesh.nodes, "angles": mesh.node_angles}
@@ -56,7 +56,7 @@ def ansys_modes(path: str) -> dict[str, Any]:
     import numpy as np
     from ansys.mapdl import reader
 
-    _bounded(path, 60)
+    _bound_memory(path, 60)
     results = reader.read_binary(path)
     freq = np.asarray(results.time_values)
     solutions = [results.nodal_solution(step) for step in range(freq.size)]
@@ -107,7 +107,7 @@ def sound(matrix: Any) -> Any:
     return matrix
 
 
-def _bounded(path: str, times: int) -> None:
+def _bound_memory(path: str, times: int) -> None:
     """Bound the memory that may still be taken, by the size of the file, where the system can."""
     if not ALONE:
         return

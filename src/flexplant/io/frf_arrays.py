@@ -40,10 +40,6 @@ def read_frf_npz(
         Which axis of the responses is frequency, such as 0 for (n_freq, n_out, n_in); when not
         given, the only one of that length.
 
-    Returns
-    -------
-    Frf
-
     Raises
     ------
     FlexplantError
@@ -54,8 +50,6 @@ def read_frf_npz(
         When frequencies do not increase, or entries are not finite.
     LabelError
         When an array or the quantity is unknown.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------
@@ -98,10 +92,6 @@ def read_frf_mat(
     freq, data, quantity, frequency_axis : optional
         As in `read_frf_npz`.
 
-    Returns
-    -------
-    Frf
-
     Raises
     ------
     FlexplantError
@@ -112,8 +102,6 @@ def read_frf_mat(
         When frequencies do not increase, or entries are not finite.
     LabelError
         When a variable or the quantity is unknown.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------

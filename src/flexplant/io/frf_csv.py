@@ -106,18 +106,12 @@ def read_frf_csv(path: str | Path) -> Frf:
     path : str or Path
         A file in the form of `write_frf_csv`.
 
-    Returns
-    -------
-    Frf
-
     Raises
     ------
     FlexplantError
         When the header or a line has another form, or a cell is no number; the line is named.
     ModelError
         When frequencies do not increase.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------

@@ -43,10 +43,6 @@ def read_harwell_boeing(
     dofs : DofSet, or path of a table for `read_dofs`, optional
         What the rows stand for: the files do not say.
 
-    Returns
-    -------
-    FEMatrices
-
     Raises
     ------
     FlexplantError
@@ -55,8 +51,6 @@ def read_harwell_boeing(
         When a matrix is complex, skew-symmetric, a pattern, or not assembled.
     ShapeError
         When sizes differ.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----
@@ -102,7 +96,9 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
     blocks = []
     needed = (n_columns + 1, n_entries, n_entries)
     for count, form, size in zip(counts[1:4], forms, needed, strict=True):
-        blocks.append(_block(lines[first : first + count], form, size, f"{str(path)!r}", first))
+        blocks.append(
+            _read_number_block(lines[first : first + count], form, size, f"{str(path)!r}", first)
+        )
         first += count
     with parsing(path), np.errstate(invalid="raise"):
         pointer, index = (block.astype(np.int64) - 1 for block in blocks[:2])
@@ -132,7 +128,9 @@ def _form(text: str) -> tuple[int, int]:
     return per_line, width
 
 
-def _block(lines: list[bytes], form: tuple[int, int], size: int, source: str, before: int) -> Any:
+def _read_number_block(
+    lines: list[bytes], form: tuple[int, int], size: int, source: str, before: int
+) -> Any:
     """Return the `size` numbers of a block that follows `before` lines."""
     per_line, width = form
     full = per_line * width

@@ -42,10 +42,6 @@ def read_matlab(
     dofs : DofSet, or path of a table for `read_dofs`, optional
         What the rows stand for: the file does not say.
 
-    Returns
-    -------
-    FEMatrices
-
     Raises
     ------
     FlexplantError
@@ -54,8 +50,6 @@ def read_matlab(
         When a variable is missing, or entries are no finite real numbers.
     ShapeError
         When sizes differ.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------
@@ -96,10 +90,6 @@ def read_npz(
     dofs : DofSet, or path of a table for `read_dofs`, optional
         What the rows stand for: the files do not say.
 
-    Returns
-    -------
-    FEMatrices
-
     Raises
     ------
     FlexplantError
@@ -108,8 +98,6 @@ def read_npz(
         When there is no K, or entries are no finite real numbers.
     ShapeError
         When sizes differ.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------

@@ -74,9 +74,9 @@ def write_mat(
     if isinstance(value, Mapping) and not isinstance(value, Frf):
         for name in value:
             _check_name(name)
-        content = {str(name): _fields(item) for name, item in value.items()}
+        content = {str(name): _struct_fields(item) for name, item in value.items()}
     else:
-        content = _fields(value)
+        content = _struct_fields(value)
     file: Any  # the type stubs take names of files only
     with written(path) as file:
         scipy.io.savemat(file, content, oned_as="column", long_field_names=True)
@@ -103,8 +103,6 @@ def read_mat(path: str | Path, name: str | None = None) -> MatValue:
         When it is no MATLAB file (version 7.3 is HDF5: save with '-v7').
     ModelError, ShapeError, LabelError
         When matrices are missing, what they hold is no system, or which of several is not said.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------
@@ -121,9 +119,9 @@ def read_mat(path: str | Path, name: str | None = None) -> MatValue:
     if name is not None:
         require_known("structure", [name], named, repr(str(path)))
         return _value(named[name], f"{name!r} of {str(path)!r}")
-    if not _kind(content) and len(named) == 1:
+    if not _value_kind(content) and len(named) == 1:
         return _value(next(iter(named.values())), repr(str(path)))
-    if not _kind(content) and named:
+    if not _value_kind(content) and named:
         raise LabelError(
             f"{str(path)!r} holds several values, {sorted(named)[:8]}. Say which: read_mat(path, "
             f"{min(named)!r}), or read all: read_mat_values(path)."
@@ -150,8 +148,6 @@ def read_mat_values(path: str | Path) -> dict[str, MatValue]:
         When it is no MATLAB file (version 7.3 is HDF5: save with '-v7').
     ModelError, ShapeError, LabelError
         When there is no such structure, or what one holds does not belong together.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------
@@ -164,7 +160,9 @@ def read_mat_values(path: str | Path) -> dict[str, MatValue]:
     ['slow', 'fast']
     """
     content = mat_variables(path)
-    found = {key: item for key, item in content.items() if isinstance(item, dict) and _kind(item)}
+    found = {
+        key: item for key, item in content.items() if isinstance(item, dict) and _value_kind(item)
+    }
     if not found:
         raise ModelError(
             f"{str(path)!r} holds no structures of values, but {sorted(content)[:8]}. One value in "
@@ -182,7 +180,7 @@ def _check_name(name: Any) -> None:
         )
 
 
-def _fields(value: Any) -> dict[str, Any]:
+def _struct_fields(value: Any) -> dict[str, Any]:
     if isinstance(value, ReducedModel):
         return reduced_fields(value)
     if isinstance(value, Frf):
@@ -192,14 +190,14 @@ def _fields(value: Any) -> dict[str, Any]:
     return system_fields(value if plain else within)
 
 
-def _kind(content: Mapping[str, Any]) -> str:
+def _value_kind(content: Mapping[str, Any]) -> str:
     """Return what some fields are: "system", "reduced", "frf" or "" for nothing of the kind."""
     kinds = {"system": "ABCD", "reduced": ("M", "D", "K", "T", "dofs"), "frf": ("freq", "data")}
     return next((kind for kind, names in kinds.items() if set(names) <= set(content)), "")
 
 
 def _value(content: Mapping[str, Any], where: str) -> MatValue:
-    kind = _kind(content)
+    kind = _value_kind(content)
     if not kind:
         missing = [name for name in "ABCD" if name not in content]
         raise ModelError(

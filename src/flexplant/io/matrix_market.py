@@ -49,10 +49,6 @@ def read_matrix_market(
     dofs : DofSet, or path of a table for `read_dofs`, optional
         What the rows stand for: the files do not say.
 
-    Returns
-    -------
-    FEMatrices
-
     Raises
     ------
     FlexplantError
@@ -62,8 +58,6 @@ def read_matrix_market(
         When a matrix is complex, skew-symmetric or a pattern without numbers.
     ShapeError
         When sizes differ.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----
@@ -96,10 +90,10 @@ def _matrix_market(path: Path) -> tuple[Any, int | None]:
     if head.listed:
         entries = _plain_entries(body, head)
         if entries is None:
-            entries = _entries(_numbers(body, head, path), head, path)
-        matrix = _mirrored(entries, head, path) if head.symmetric else entries
+            entries = _entries(_entry_table(body, head, path), head, path)
+        matrix = _complete_triangle(entries, head, path) if head.symmetric else entries
     else:
-        matrix = _columns(_numbers(body, head, path)[:, 0], head)
+        matrix = _columns(_entry_table(body, head, path)[:, 0], head)
     if head.whole:
         return matrix, None
     lines = body[: 80 * _SAMPLE].splitlines()[:_SAMPLE]
@@ -108,7 +102,7 @@ def _matrix_market(path: Path) -> tuple[Any, int | None]:
     return matrix, printed_digits(words)
 
 
-def _numbers(body: bytes, head: _Header, path: Path) -> FloatArray:
+def _entry_table(body: bytes, head: _Header, path: Path) -> FloatArray:
     """Return the numbers (entries, 3 or 1) of all lines, in any notation of C or Fortran."""
     width = 3 if head.listed else 1
     table = rows_of_numbers(body, width)
@@ -201,7 +195,7 @@ def _entries(table: FloatArray, head: _Header, path: Path) -> Any:
     return sp.coo_array((table[:, 2], (i, j)), shape=head.shape)
 
 
-def _mirrored(entries: Any, head: _Header, path: Path) -> Any:
+def _complete_triangle(entries: Any, head: _Header, path: Path) -> Any:
     """Return the symmetric matrix of which the file lists one of each pair of entries."""
     i, j = entries.coords
     _refuse_both_triangles(entries, head, path)

@@ -63,18 +63,14 @@ def read_matrices(
     stiffness, mass, damping, dofs, nodes, scalar_direction, dof_map, exodus, rotations : optional
         As for `read_model`.
 
-    Returns
-    -------
-    FEMatrices
-
     Raises
     ------
+    FileNotFoundError
+        When there is no such file, as with every reader.
     FlexplantError
         When the format is not known, holds no matrices, or the file is damaged.
     ModelError, LabelError, ShapeError
         When the reader of this format has no such option, and what it raises itself.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------
@@ -173,19 +169,15 @@ def read_model(
         Of one format each: what scalar points move in (`read_dmig`), the map and the mesh of
         `read_sierra`, local systems (`read_ansys`).
 
-    Returns
-    -------
-    FEModel
-
     Raises
     ------
+    FileNotFoundError
+        When there is no such file, as with every reader.
     FlexplantError
         When the format is not known, holds no matrices, or the file is damaged.
     ModelError, LabelError, ShapeError
         When the reader of this format has no such option, and what it raises itself; when the
         matrices make no model.
-    FileNotFoundError
-        When there is no such file.
 
     Warns
     -----

@@ -43,7 +43,7 @@ def read_nodes(path: str | Path) -> Nodes:
     GRID, GRDSET and CORD2R, CORD2C, CORD2S in free, small or large fields, also in files that it
     INCLUDEs, up to ENDDATA; all other cards are passed over.
     """
-    lines = _lines(file_path(path, "bdf"))
+    lines = _bulk_lines(file_path(path, "bdf"))
     grids: dict[int, list[str]] = {}
     systems: dict[int, tuple[str, list[str]]] = {}
     default = ["", ""]
@@ -92,7 +92,7 @@ def nodes_of(
     return Nodes(xyz, axes)
 
 
-def _lines(path: Path, above: tuple[Path, ...] = ()) -> list[tuple[str, int, str]]:
+def _bulk_lines(path: Path, above: tuple[Path, ...] = ()) -> list[tuple[str, int, str]]:
     """Return (file, line number, text) of all lines, those of INCLUDEd files in their place.
 
     ENDDATA, in whatever file, ends all of them.
@@ -120,7 +120,7 @@ def _lines(path: Path, above: tuple[Path, ...] = ()) -> list[tuple[str, int, str
                 f"{str(path)!r}, line {number}: the INCLUDEd file {name!r} {why}: its nodes would "
                 "be missing. Put it beside, or give the file that holds the GRID cards."
             )
-        found += _lines(file, (*above, path))
+        found += _bulk_lines(file, (*above, path))
         if found and _END.match(found[-1][2]):
             break
     return found
@@ -145,17 +145,17 @@ def cards(lines: Iterable[str], kinds: tuple[str, ...]) -> Iterator[tuple[int, s
             continue
         if line[0] in "+* ,":
             if kind:
-                fields += _fields(line)[1]
+                fields += _card_fields(line)[1]
             continue
         if kind:
             yield number, kind, fields
-        name, found = _fields(line)
+        name, found = _card_fields(line)
         number, kind, fields = at, name if name in kinds else "", found
     if kind:
         yield number, kind, fields
 
 
-def _fields(line: str) -> tuple[str, list[str]]:
+def _card_fields(line: str) -> tuple[str, list[str]]:
     if "," in line:
         words = [word.strip() for word in line.split(",")]
         wide = words[0].endswith("*") or words[0].startswith("*")

@@ -128,7 +128,7 @@ def read_op2_shapes(path: Path, nodes: Path | None) -> FileShapes:
             "superelements: one structure has one. Write one subcase."
         )
     block, (numbers, eigenvalues, ids, kinds, phi) = sets[0]
-    known = _nodes(found, str(path)) if nodes is None else None
+    known = _geometry_nodes(found, str(path)) if nodes is None else None
     return shapes_at(
         (ids, kinds, phi),
         np.sign(eigenvalues) * np.sqrt(np.abs(eigenvalues)),
@@ -180,7 +180,7 @@ def _masses(found: list[Block], numbers: IntArray, eigenvalues: FloatArray) -> F
     return None
 
 
-def _nodes(found: list[Block], path: str) -> Nodes | None:
+def _geometry_nodes(found: list[Block], path: str) -> Nodes | None:
     """Return the nodes of the tables GEOM1, None where there are none."""
     grids: dict[int, list[Any]] = {}
     systems: dict[int, tuple[str, list[str]]] = {}

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import struct
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -13,9 +16,416 @@ from ..checks import name_list
 from ..errors import FlexplantError, ModelError, require_known
 from ..labels import DofSet
 from ..structure.matrices import FEMatrices, completed
+from ..structure.precision import digits_of
 from .nastran import named_matrices
-from .op4_binary import binary_matrices, text_matrices
-from .paths import FORMATS, USUAL, Format, file_path
+from .numbers import fixed_numbers
+from .paths import FORMATS, USUAL, Format, check_size, damaged, file_path
+
+
+@dataclass(frozen=True)
+class _MatrixLayout:
+    """How integers and record lengths are stored."""
+
+    order: str  # "<" or ">"
+    integer: int  # bytes of an integer and of a word: 4 or 8
+    marker: int  # bytes of a record length: 4 or 8
+
+
+def _layout(content: bytes, path: str) -> _MatrixLayout:
+    for order in "<>":
+        for marker in (8, 4):  # 8 first: in little endian its first half looks like one of 4
+            length = int(np.frombuffer(content, f"{order}i{marker}", 1)[0])
+            if length in (24, 48):
+                return _MatrixLayout(order, length // 6, marker)
+    raise FlexplantError(
+        f"{path!r}, byte 0: an OUTPUT4 file begins with a record of 24 or 48 bytes, got "
+        f"{content[:8].hex(' ')}. It is another format (OUTPUT2?), or was changed in transfer: "
+        "copy it in binary mode."
+    )
+
+
+class _Words:
+    """The records of a binary file, seen as words."""
+
+    def __init__(self, content: bytes, path: str) -> None:
+        self.path, self.content, self.size = path, content, len(content)
+        self.layout = _layout(content, path)
+        self.kind: Any = np.dtype(f"{self.layout.order}i{self.layout.integer}")
+        self.length: Any = np.dtype(f"{self.layout.order}i{self.layout.marker}")
+        self.real = (f"{self.layout.order}f{self.layout.integer}", f"{self.layout.order}f8")
+
+    def record(self, at: int) -> tuple[int, int]:
+        """Return the first and the last byte + 1 of the record that begins at a byte."""
+        marker = self.layout.marker
+        order = "little" if self.layout.order == "<" else "big"
+        length = int.from_bytes(self.content[at : at + marker], order, signed=True)  # type: ignore[arg-type]
+        start = at + marker
+        stop = start + length
+        if at + marker > self.size or length < 0 or stop + marker > self.size:
+            raise FlexplantError(
+                f"{self.path!r}, byte {at}: the record of {length} bytes goes beyond the end of "
+                f"the file ({self.size} bytes): it is cut off or damaged. Write or copy it again."
+            )
+        if self.content[at : at + marker] != self.content[stop : stop + marker]:
+            what = f"byte {stop}: the record of {length} bytes does not end with its length again"
+            raise damaged(self.path, what, "Write or copy it again, in binary mode.")
+        return start, stop
+
+    def integers(self, at: int, count: int) -> list[int]:
+        form = f"{self.layout.order}{count}{'i' if self.layout.integer == 4 else 'q'}"
+        return list(struct.unpack_from(form, self.content, at))
+
+
+def binary_matrices(content: bytes, path: str) -> Iterable[tuple[str, Any, int, int | None]]:
+    """Yield (name, matrix, form, significant digits or None) of each matrix."""
+    words = _Words(content, path)
+    size, marker = words.layout.integer, words.layout.marker
+    at = 0
+    while at < words.size:
+        start, stop = words.record(at)
+        if stop - start != 6 * size:
+            due = f"a matrix begins with a record of {6 * size} bytes, got {stop - start}"
+            raise damaged(path, f"byte {at}: {due}")
+        columns, rows, form, kind = words.integers(start, 4)
+        name = _header_name(content[start + 4 * size : stop].decode("latin-1"))
+        if columns < 1 or not rows or kind not in (1, 2, 3, 4) or not name.isprintable():
+            got = f"{columns} columns, {rows} rows, type {kind}, name {name!r}"
+            raise damaged(path, f"byte {start}: no header of a matrix: {got}")
+        check_shape(columns, rows, words.size, path)
+        at = stop + marker
+        starts: list[int] = []
+        stops: list[int] = []
+        while True:
+            start, stop = words.record(at)
+            if stop - start < 3 * size:
+                few = f"a column of {name} has {stop - start} bytes, too few for its header"
+                raise damaged(path, f"byte {at}: {few}")
+            column = words.integers(start, 1)[0]
+            at = stop + marker
+            if column > columns:
+                break
+            if column < 1:
+                raise damaged(path, f"byte {start}: column {column} of {name}")
+            starts.append(start)
+            stops.append(stop)
+        matrix = _matrix(words, name, (abs(rows), columns), rows < 0, kind, starts, stops)
+        yield name, matrix, form, digits_of(np.zeros(0, dtype=words.real[kind % 2 == 0]))
+
+
+def _header_name(text: str) -> str:
+    """Return the name in a header; words of 8 bytes may hold 4 letters each."""
+    clean = text.replace("\0", " ")
+    if len(clean) == 16 and clean[8:].strip() and not clean[4:8].strip():
+        clean = clean[:4] + clean[8:12]
+    return clean.strip()
+
+
+def _matrix(
+    words: _Words,
+    name: str,
+    shape: tuple[int, int],
+    big: bool,
+    kind: int,
+    starts: list[int],
+    stops: list[int],
+) -> Any:
+    """Return one matrix from the places of its columns.
+
+    A column is (column, first row, words of data) and then the values; the first row is 0 where
+    it is sparse, and the data are strings, each with a header: (L + 1, row) in the big form,
+    row + 65536 (L + 1) in the other, for L words of values.
+    """
+    size = words.layout.integer
+    dtype: Any = np.dtype(words.real[0] if kind in (1, 3) else words.real[1])
+    per = dtype.itemsize * (2 if kind > 2 else 1)
+    target = np.complex128 if kind > 2 else np.float64
+    value: Any = np.dtype(f"{words.layout.order}c{per}") if kind > 2 else dtype
+    heads = [words.integers(start, 3) for start in starts]
+    if not heads and not big:
+        thin = is_thin(shape, 0)
+        return sp.csc_array(shape, dtype=target) if thin else np.zeros(shape, dtype=target)
+    if heads and all(row > 0 for _, row, _ in heads):
+        parts: list[Any] = []
+        thin = is_thin(shape, words.size // per)
+        dense = np.zeros((0, 0) if thin else shape, dtype=target, order="F")
+        for start, stop, (column, row, _) in zip(starts, stops, heads, strict=True):
+            count = (stop - start - 3 * size) // per
+            if row - 1 + count > shape[0]:
+                raise _outside_error(words.path, start, name, row - 1 + count, shape)
+            part = np.frombuffer(words.content, value, count, start + 3 * size)
+            if thin:
+                parts.append(
+                    (part, np.arange(row - 1, row - 1 + count), np.full(count, column - 1))
+                )
+            else:
+                dense[row - 1 : row - 1 + count, column - 1] = part
+        if not thin:
+            return dense
+        data, rows, places = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return sp.csc_array(sp.coo_array((data.astype(target), (rows, places)), shape=shape))
+    first = np.array(starts, dtype=np.int64) + 3 * size
+    counts = np.clip([count for _, _, count in heads], 0, words.size)  # sums of them must not wrap
+    end = np.minimum(first + counts * size, np.array(stops, dtype=np.int64))
+    place, length, row, column = _strings(words, first, end, big, per, name)
+    column = np.array([c for c, _, _ in heads], dtype=np.int64)[column] - 1
+    outside = (row < 1) | (row > shape[0] + 1 - length)
+    if np.any(outside):
+        bad = int(np.argmax(outside))
+        raise _outside_error(
+            words.path, int(place[bad]), name, int(row[bad] - 1 + length[bad]), shape
+        )
+    # strings in the order of columns, as they are in the file
+    order = np.argsort(column, kind="stable")
+    place, length, row, column = place[order], length[order], row[order], column[order]
+    # where each value of each string lies in the file, and which row it is of
+    inside = np.arange(int(length.sum())) - np.repeat(np.cumsum(length) - length, length)
+    at = np.repeat(place, length) + inside * per
+    data = _gather(words.content, at, per).view(value).astype(target)
+    rows = np.repeat(row - 1, length) + inside
+    counts = np.bincount(column, weights=length, minlength=shape[1])
+    pointers = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    matrix = sp.csc_array((data, rows, pointers), shape=shape)
+    matrix.sum_duplicates()
+    return matrix
+
+
+def _strings(words: _Words, first: Any, end: Any, big: bool, per: int, name: str) -> Any:
+    """Return where each string's values begin, how many there are, their row and their column.
+
+    The strings of a column are a chain; those of all columns are followed at once.
+    """
+    size = words.layout.integer
+    head = 2 * size if big else size
+    alive = np.arange(first.size)
+    at = first.copy()
+    found = []
+    while alive.size:
+        here = at[alive]
+        if np.any(here + head > end[alive]):
+            raise _broken(words.path, int(here[np.argmax(here + head > end[alive])]), name)
+        numbers = _gather(words.content, here, head).view(words.kind).astype(np.int64)
+        if big:
+            length, row = numbers.reshape(-1, 2).T - np.array([[1], [0]])
+        else:
+            length, row = (numbers >> 16) - 1, numbers & 0xFFFF
+        wrong = (length < 1) | (length > (end[alive] - here - head) // size)
+        bytes_ = np.where(wrong, 0, length) * size  # no product wraps
+        wrong |= bytes_ % per != 0
+        if np.any(wrong):
+            raise _broken(words.path, int(here[np.argmax(wrong)]), name)
+        found.append((here + head, bytes_ // per, row, alive))
+        at[alive] = here + head + bytes_
+        alive = alive[at[alive] < end[alive]]
+    if not found:
+        return tuple(np.zeros(0, dtype=np.int64) for _ in range(4))
+    return tuple(np.concatenate(part) for part in zip(*found, strict=True))
+
+
+def _gather(content: bytes, at: Any, width: int) -> Any:
+    """Return the `width` bytes at each place, side by side (records are whole 4-byte words)."""
+    raw = np.frombuffer(content, np.uint32, len(content) // 4)
+    if np.any(at % 4):
+        index = at[:, None] + np.arange(width)
+        return np.ascontiguousarray(np.frombuffer(content, np.uint8)[index]).reshape(-1)
+    index = (at // 4)[:, None] + np.arange(width // 4)
+    return np.ascontiguousarray(raw[index]).reshape(-1)
+
+
+def _outside_error(
+    path: str, at: int, name: str, row: int, shape: tuple[int, int]
+) -> FlexplantError:
+    return damaged(path, f"byte {at}: a string of {name} reaches row {row} of {shape[0]}")
+
+
+def _broken(path: str, at: int, name: str) -> FlexplantError:
+    what = f"byte {at}: a string of {name} has an impossible length"
+    return damaged(path, what, "Write it again (above 65535 rows with BIGMAT=YES).")
+
+
+#: digits of single precision (types 1 and 3), however many are printed
+_SINGLE = 7
+#: characters of a line at most
+_LINE = 4096
+_FORMAT = re.compile(r"(?:(\d+)P,?)?\s*(\d+)\s*[EDG](\d+)\.(\d+)")
+
+
+def text_matrices(content: bytes, path: str) -> list[tuple[str, Any, int, int]]:
+    """Return (name, matrix, form, significant digits) of each matrix."""
+    reader = _Reader(content.splitlines(), path)
+    matrices = []
+    while reader.more():
+        matrices.append(reader.matrix())
+    if not matrices:
+        raise reader.wrong("no matrix in the file")
+    return matrices
+
+
+@dataclass
+class _Reader:
+    """Goes through the lines; `at` is the next one (from 0)."""
+
+    lines: list[bytes]
+    path: str
+    at: int = 0
+    width: int = 0
+    per_line: int = 1
+    chunks: list[bytes] = field(default_factory=list)
+    strings: list[tuple[int, int, int]] = field(default_factory=list)  # column, row, count
+
+    def more(self) -> bool:
+        while self.at < len(self.lines) and not self.lines[self.at].strip():
+            self.at += 1
+        return self.at < len(self.lines)
+
+    def wrong(self, what: str) -> FlexplantError:
+        return FlexplantError(
+            f"{self.path!r}, line {self.at + 1}: {what}. The file is cut off, damaged or no "
+            "OUTPUT4 text. Write it again, or in binary form."
+        )
+
+    def line(self) -> bytes:
+        if self.at >= len(self.lines):
+            raise self.wrong("the file ends inside of a matrix")
+        self.at += 1
+        return self.lines[self.at - 1]
+
+    def integers(self, line: bytes, widths: tuple[int, ...]) -> list[int]:
+        """Return numbers in fields of fixed width: they may touch each other."""
+        numbers, start = [], 0
+        for width in widths:
+            try:
+                numbers.append(int(line[start : start + width]))
+            except ValueError:
+                self.at -= 1
+                got = line[:72].decode("latin-1")
+                raise self.wrong(f"{len(widths)} whole numbers are due here, got {got!r}") from None
+            start += width
+        return numbers
+
+    def matrix(self) -> tuple[str, Any, int, int]:
+        line = self.line()
+        head = (16, 16, 8, 8) if b"I16" in line else (8, 8, 8, 8)
+        columns, rows, form, kind = self.integers(line, head)
+        rest = line[sum(head) :].decode("latin-1")
+        name, shown = rest[:8].strip(), rest[8:].strip().upper()
+        match = _FORMAT.search(shown) if shown else _FORMAT.search("5E16.9")
+        if columns < 1 or not rows or kind not in (1, 2, 3, 4) or match is None:
+            self.at -= 1
+            raise self.wrong(
+                f"no header of a matrix: {columns} columns, {rows} rows, type {kind}, numbers as "
+                f"{shown!r}"
+            )
+        self.per_line, self.width = int(match[2]), int(match[3])
+        if not 0 < self.per_line * self.width <= _LINE:
+            self.at -= 1
+            raise self.wrong(f"numbers as {shown!r}")
+        check_shape(columns, rows, sum(map(len, self.lines)), self.path)
+        # Fortran's scale factor 1P puts one digit before the point
+        digits = int(match[4]) + (int(match[1]) if match[1] else 0)
+        digits = min(digits, _SINGLE) if kind in (1, 3) else digits
+        self.chunks, self.strings = [], []
+        sparse = rows < 0
+        per = 2 if kind > 2 else 1
+        # lengths of strings are counted in words of 4 bytes, those of dense columns in values
+        words = 1 if kind in (1, 3) else 2
+        key = (16, 16, 16) if head[0] == 16 and len(self._peek()) > 24 else (8, 8, 8)
+        while True:
+            column, row, count = self.integers(self.line(), key)
+            if column > columns:
+                # one number without a meaning, whatever its count says
+                if len(self.line()) < self.width:
+                    raise self.wrong("the last number is cut off")
+                break
+            if column < 1 or count < 1 or row < 0:
+                self.at -= 1
+                raise self.wrong(f"column {column} of {name} from row {row} with {count} values")
+            if row:
+                if count % per:
+                    self.at -= 1
+                    raise self.wrong(f"{count} numbers of a complex column of {name}")
+                self._take(count)
+                self.strings.append((column, row, count // per))
+            else:
+                sparse = True
+                self._sparse(column, count, words, per, rows < 0)
+        matrix = self._assembled((abs(rows), columns), kind > 2, sparse, name)
+        return name, matrix, form, digits
+
+    def _peek(self) -> bytes:
+        return self.lines[self.at].rstrip() if self.at < len(self.lines) else b""
+
+    def _sparse(self, column: int, left: int, words: int, per: int, big: bool) -> None:
+        while left > 0:
+            line = self.line()
+            if big:
+                wide = len(line.rstrip()) > 16
+                length, row = self.integers(line, (16, 16) if wide else (8, 8))
+                length -= 1
+                left -= length + 2
+            else:
+                (number,) = self.integers(line, (len(line),))
+                length, row = (number >> 16) - 1, number & 0xFFFF
+                left -= length + 1
+            if length < 1 or left < 0 or row < 1 or length % (words * per):
+                self.at -= 1
+                raise self.wrong(f"a string of {length} words from row {row}")
+            self._take(length // words)
+            self.strings.append((column, row, length // words // per))
+
+    def _take(self, count: int) -> None:
+        """Keep the fields of `count` numbers, which fill the next lines."""
+        n_lines = -(-count // self.per_line)
+        lines = self.lines[self.at : self.at + n_lines]
+        full = self.per_line * self.width
+        last = (count - (n_lines - 1) * self.per_line) * self.width
+        if len(lines) < n_lines or len(lines[-1]) < last:
+            self.at = min(self.at + len(lines), len(self.lines))
+            raise self.wrong(f"{count} numbers of {self.width} characters are due before here")
+        chunk = b"".join(lines)
+        if len(chunk) != count * self.width:  # blanks after the numbers
+            chunk = b"".join(line[:full].ljust(full) for line in lines)[: count * self.width]
+        self.at += n_lines
+        self.chunks.append(chunk)
+
+    def _assembled(self, shape: tuple[int, int], complex_: bool, sparse: bool, name: str) -> Any:
+        numbers: Any = fixed_numbers(b"".join(self.chunks), self.width)
+        if numbers is None:
+            raise FlexplantError(
+                f"{self.path!r}, before line {self.at + 1}: matrix {name} holds what is no number. "
+                "The file is damaged, or a number too large for its field (***): write it in "
+                "binary form."
+            )
+        if complex_:
+            numbers = numbers[0::2] + 1j * numbers[1::2]
+        column, row, count = np.array(self.strings, dtype=np.int64).reshape(-1, 3).T
+        inside = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+        rows = np.repeat(row - 1, count) + inside
+        if rows.size and rows.max() >= shape[0]:
+            reached = f"matrix {name} reaches row {int(rows.max()) + 1} of {shape[0]}"
+            raise damaged(self.path, f"before line {self.at + 1}: {reached}")
+        columns = np.repeat(column - 1, count)
+        if sparse or is_thin(shape, numbers.size):
+            return sp.csc_array(sp.coo_array((numbers, (rows, columns)), shape=shape))
+        dense = np.zeros(shape, dtype=numbers.dtype, order="F")
+        dense[rows, columns] = numbers
+        return dense
+
+
+#: entries that are kept dense however few of them the file holds
+_SMALL = 2**20
+#: a dense matrix may take so many times the numbers in the file
+_TIMES = 16
+
+
+def check_shape(columns: int, rows: int, held: int, path: str) -> None:
+    """Refuse a size of a matrix that a file of `held` bytes cannot hold."""
+    check_size(max(columns, abs(rows)), held, path)
+
+
+def is_thin(shape: tuple[int, int], held: int) -> bool:
+    """Return whether a matrix of which the file holds so many numbers is too large to be dense."""
+    return shape[0] * shape[1] > max(_SMALL, _TIMES * held)
+
 
 #: a matrix of the file: dense where the file holds it dense, real or complex
 Op4Matrix: TypeAlias = Any
@@ -58,8 +468,6 @@ def read_op4(
         When there is no matrix of such a name.
     ModelError
         When which matrix is meant is not clear, or it is complex.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----
@@ -83,7 +491,7 @@ def read_op4(
     found = _read(path, None)
     given = {"stiffness": stiffness, "mass": mass, "damping": damping}
     chosen = named_matrices(found, given, _ENDINGS, str(path))
-    K, M, D = (_real(found, name, path) for name in chosen)
+    K, M, D = (_real_matrix(found, name, path) for name in chosen)
     assert K is not None  # noqa: S101 - its name is known
     M, D = (None if _is_absent(part, K.shape[0]) else part for part in (M, D))
     digits = found[str(chosen[0])][2]
@@ -114,8 +522,6 @@ def read_op4_matrices(
         When the file is cut off, damaged, or no OUTPUT4 file; the byte or line is named.
     LabelError
         When there is no matrix of such a name.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------
@@ -140,7 +546,7 @@ def _is_absent(matrix: sp.csc_array | None, n: int) -> bool:
     return matrix is None or (n > 1 and matrix.shape == (1, 1) and not matrix.count_nonzero())
 
 
-def _real(found: dict[str, Any], name: str | None, path: str | Path) -> sp.csc_array | None:
+def _real_matrix(found: dict[str, Any], name: str | None, path: str | Path) -> sp.csc_array | None:
     if name is None:
         return None
     matrix, form, _ = found[name]

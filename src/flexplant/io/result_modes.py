@@ -36,22 +36,22 @@ def read_punch_shapes(path: Path, nodes: Path | None) -> FileShapes:
         if line[:1] == b"$":
             match = _EIGENVALUE.match(line)
             if match:
-                parts.append((_number(match[1], path, at, line), {}))
+                parts.append((_punch_number(match[1], path, at, line), {}))
             elif line[:2] == b"$D" or line[:12] == b"$EIGENVECTOR":
                 inside = line[:12] == b"$EIGENVECTOR"
             continue
         if not (inside and parts and line.strip()):
             continue
-        values = [_number(line[i : i + 18], path, at, line) for i in (18, 36, 54)]
+        values = [_punch_number(line[i : i + 18], path, at, line) for i in (18, 36, 54)]
         if line[:6] == b"-CONT-":
             if not first or node in parts[-1][1]:
-                raise _wrong(path, at, line)
+                raise _punch_line_error(path, at, line)
             parts[-1][1][node] = (kind, first + values)
             first = []
         else:
             words = line[:18].split()
             if first or len(words) != 2 or not words[0].isdigit():
-                raise _wrong(path, at, line)
+                raise _punch_line_error(path, at, line)
             node, kind, first = int(words[0]), words[1], values
     if first or not any(points for _, points in parts):
         raise FlexplantError(
@@ -70,14 +70,14 @@ def read_punch_shapes(path: Path, nodes: Path | None) -> FileShapes:
     return shapes_at(table, omega, nodes=nodes, turned=False, masses=None, path=str(path))
 
 
-def _number(text: bytes, path: Path, at: int, line: bytes) -> float:
+def _punch_number(text: bytes, path: Path, at: int, line: bytes) -> float:
     try:
         return decimal(text.decode("latin-1"))
     except (ValueError, OverflowError):
-        raise _wrong(path, at, line) from None
+        raise _punch_line_error(path, at, line) from None
 
 
-def _wrong(path: Path, at: int, line: bytes) -> FlexplantError:
+def _punch_line_error(path: Path, at: int, line: bytes) -> FlexplantError:
     do = "The file is cut off or damaged: write it again."
     return wrong_line_of(path, at + 1, "a point of an eigenvector is", line, do)
 
@@ -140,6 +140,8 @@ def read_modes(
 
     Raises
     ------
+    FileNotFoundError
+        When there is no such file, as with every reader.
     FlexplantError
         When the format is not known, holds no modes, or the file is damaged.
     ModelError
@@ -147,8 +149,6 @@ def read_modes(
         several sets of modes are there, or the shapes are not mass-normalised with `matrices`.
     LabelError
         When a node has no place or its coordinate system is not there.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------

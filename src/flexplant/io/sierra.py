@@ -74,8 +74,6 @@ def read_sierra(
         When the map, the mesh and the matrices do not belong together.
     ModelError
         When rows are no motion of a node, or a map and `dofs` are both given.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------
@@ -91,7 +89,7 @@ def read_sierra(
     if dof_map is not None and dofs is not None:
         raise ModelError("the rows are named twice, by dof_map and by dofs: give one of them.")
     files = [stiffness, *(file for file in (mass, damping) if file is not None)]
-    tables = {str(file): _table(file, 3) for file in files}
+    tables = {str(file): _read_numbers(file, 3) for file in files}
     n = max(int(table[:, :2].max()) for table, _ in tables.values())
     check_size(n, sum(file_path(file).stat().st_size for file in files), stiffness)
 
@@ -104,7 +102,7 @@ def read_sierra(
 
     located = True
     if dof_map is not None:
-        dofs, located = _named(dof_map, exodus, n)
+        dofs, located = _read_row_names(dof_map, exodus, n)
     K = matrix(stiffness)
     assert K is not None  # noqa: S101 - its file is no option
     return FEMatrices(
@@ -118,7 +116,7 @@ def read_sierra(
     )
 
 
-def _table(path: str | Path, width: int) -> tuple[FloatArray, int | None]:
+def _read_numbers(path: str | Path, width: int) -> tuple[FloatArray, int | None]:
     """Return the numbers of the first bracketed table (m, width), and the digits printed."""
     content = file_path(path).read_bytes()
     start, stop = content.find(b"["), content.find(b"]")
@@ -158,7 +156,7 @@ def _vector(path: str | Path) -> IntArray:
     content = file_path(path).read_bytes()
     size = _ZEROS.search(content)
     if size is None:
-        return _table(path, 1)[0].ravel().astype(np.int64)
+        return _read_numbers(path, 1)[0].ravel().astype(np.int64)
     count = int(size[1])
     check_size(count, 9 * len(content), path)
     body = content[size.end() :].lstrip(b" \t;,").splitlines()
@@ -184,7 +182,7 @@ def _mesh(path: str | Path | None) -> tuple[FloatArray | None, IntArray | None]:
         return file.nodes()
 
 
-def _named(path: str | Path, exodus: str | Path | None, n: int) -> tuple[DofSet, bool]:
+def _read_row_names(path: str | Path, exodus: str | Path | None, n: int) -> tuple[DofSet, bool]:
     """Return the rows, and whether they have coordinates."""
     places = _vector(path)
     if sorted(places[places > 0].tolist()) != list(range(1, n + 1)):

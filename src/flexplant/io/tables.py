@@ -68,18 +68,12 @@ def read_dofs(
     length : str or float
         The unit of the coordinates, "mm" for instance, or its size in metres.
 
-    Returns
-    -------
-    DofSet
-
     Raises
     ------
     FlexplantError
         When a line has another number of columns, or holds no number where one is needed.
     LabelError
         When a column is missing, a direction is unknown, or a node has no coordinates.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------
@@ -94,11 +88,11 @@ def read_dofs(
     >>> dofs.labels, dofs.xyz[1].tolist()
     (('1:x', '2:x'), [0.01, 0.0, 0.0])
     """
-    table = _table(path)
+    table = _read_table(path)
     columns = table.columns
     scale = units(length).length
     if directions is not None:
-        numbers, xyz = _nodes(table)
+        numbers, xyz = _node_table(table)
         each = [_direction(name, path) for name in directions]
         return DofSet(
             np.repeat(numbers, len(each)),
@@ -131,10 +125,10 @@ def read_dofs(
 
 def read_nodes_table(path: str | Path) -> tuple[IntArray, FloatArray]:
     """Return the node numbers (m,) and coordinates (m, 3) of a text table `node, x, y, z`."""
-    return _nodes(_table(path, plain=("node", "x", "y", "z")))
+    return _node_table(_read_table(path, plain=("node", "x", "y", "z")))
 
 
-def _nodes(table: _Table) -> tuple[IntArray, FloatArray]:
+def _node_table(table: _Table) -> tuple[IntArray, FloatArray]:
     missing = [name for name in ("node", "x", "y", "z") if name not in table.columns]
     if missing:
         raise table.lacks(missing, "A table of nodes has node, x, y, z: add them.")
@@ -173,7 +167,7 @@ class _Table:
         return numbers.astype(np.int64)
 
 
-def _table(path: str | Path, plain: Sequence[str] = ()) -> _Table:
+def _read_table(path: str | Path, plain: Sequence[str] = ()) -> _Table:
     text = text_of(file_path(path))
     numbered = [
         (number, line)

@@ -17,17 +17,20 @@ from ..structure.units import Units
 from .file_shapes import FileShapes, ModesFormat
 from .paths import ELSEWHERE, GLOBAL, ONCE, Elsewhere, at_zero, damaged, file_path, refused, unread
 from .tables import read_nodes_table
-from .uff_analysis import NORMAL_MODE, AnalysisData, mode_records, responses_of_model
 from .uff_records import (
     KINDS,
+    NORMAL_MODE,
+    AnalysisData,
     check_complete,
     check_systems,
     coherence_of,
     common_frequencies,
     datasets,
+    mode_records,
     paired_records,
     record_scale,
     record_sides,
+    responses_of_model,
     whole_entry,
 )
 
@@ -76,8 +79,6 @@ def read_frf_uff(
         When units or quantities are not clear, or zero frequency would be integrated.
     LabelError
         When `quantity` is another word.
-    FileNotFoundError
-        When there is no such file.
 
     Notes
     -----
@@ -180,8 +181,6 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
         When a mode that is named is not there.
     ModelError
         When a mode has zero frequency (a rigid-body mode), or a pole is not stable.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------
@@ -250,8 +249,6 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
         When nodes are given, or move, in a coordinate system of their own (dataset 2420).
     LabelError
         When a direction is unknown or a node appears twice.
-    FileNotFoundError
-        When there is no such file.
 
     Examples
     --------

@@ -15,8 +15,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
 from ..lti.frequency import ORDERS
 from ..structure.rigid import rigid_motions
-from .ends import JointEnd, joint_axes
-from .joint import Joint, Patch
+from .joint import Joint, JointEnd, Patch, joint_axes
 
 #: a joint that adds less than this part to the others repeats them
 _RANK = 1e-9
@@ -102,7 +101,7 @@ def _end(parts: Sequence[Channels], end: Any, side: str) -> JointEnd:
     size = np.ptp(np.vstack([part.dofs.xyz for part in sides]), axis=0).max(initial=0.0)
     try:
         if isinstance(end, Patch):
-            end = _measured(end, _owner(end, parts), side)
+            end = _measured_patch(end, _owner(end, parts), side)
         return JointEnd(
             sides, end, float(size) or 1.0, [rigid_motions(part.dofs) for part in sides]
         )
@@ -114,7 +113,7 @@ def _end(parts: Sequence[Channels], end: Any, side: str) -> JointEnd:
         ) from None
 
 
-def _measured(patch: Patch, owner: Channels, side: str) -> Patch:
+def _measured_patch(patch: Patch, owner: Channels, side: str) -> Patch:
     """Return the part of a patch that is measured: sensors may be at other nodes than hammers."""
     if patch.nodes is None:
         return patch
@@ -159,7 +158,11 @@ def warn_of_bending(
             if not isinstance(end, Patch):
                 continue
             owner = _owner(end, parts)
-            side, frf, patch = owner.outputs, frfs[owner.name], _measured(end, owner, "outputs")
+            side, frf, patch = (
+                owner.outputs,
+                frfs[owner.name],
+                _measured_patch(end, owner, "outputs"),
+            )
             mean, A, _ = patch.mean(side.dofs, patch.point(side.dofs))
             channels = [side.channels[row] for row in patch.rows(side.dofs)]
             moved = frf.data[[frf.outputs.index(channel) for channel in channels]]

@@ -23,10 +23,9 @@ from ..structure.placed import SPANNED
 from ..structure.rigid import orthonormalised, rigid_body_basis
 from ..tolerances import TINY, divisor
 from .component import Component, JoinedShape, Model, Pose, components_of
-from .ends import split_end
 from .frf_coupling import joined_frfs
 from .joining_certificate import certified
-from .joint import Joint, Patch
+from .joint import Joint, Patch, split_end
 from .links import (
     Elimination,
     Link,
@@ -154,8 +153,8 @@ def joined(
     B, S = rows_of(rigid, parts), rows_of(soft, parts)
     _check_stiffness(soft, S, parts)
     owners = np.repeat(np.arange(len(parts)), [part.n for part in parts])
-    done = eliminated(B, _sizes(parts), owners)
-    matrices = _matrices(parts, soft, S, done)
+    done = eliminated(B, _coordinate_reach(parts), owners)
+    matrices = _machine_matrices(parts, soft, S, done)
     groups, kept = groups_of(links, len(parts)), done.kept
     motions = left_motions(parts, groups, B, matrices["M"], kept, free=False)
     springs = [i for i, link in enumerate(soft) if link.stiffness]
@@ -170,7 +169,7 @@ def joined(
     common = {"joint_motions": motions, "joining": certificate}
     if not any(part.is_reduced for part in parts):
         return _full(parts, done, matrices | common, name)
-    return _reduced(parts, done, matrices | common, rigid_body)
+    return _joined_reduced_model(parts, done, matrices | common, rigid_body)
 
 
 def _check_stiffness(soft: Sequence[Link], S: Any, parts: Sequence[Component]) -> None:
@@ -193,7 +192,7 @@ def _check_stiffness(soft: Sequence[Link], S: Any, parts: Sequence[Component]) -
         )
 
 
-def _sizes(parts: Sequence[Component]) -> FloatArray:
+def _coordinate_reach(parts: Sequence[Component]) -> FloatArray:
     """Return how far each coordinate (n,) moves its component at most, rotations times its size."""
     length, found = machine_size(parts), []
     for part in parts:
@@ -206,7 +205,7 @@ def _sizes(parts: Sequence[Component]) -> FloatArray:
     return divisor(size)
 
 
-def _matrices(
+def _machine_matrices(
     parts: Sequence[Component], soft: Sequence[Link], S: Any, done: Elimination
 ) -> dict[str, Any]:
     """Return M, D and K of the machine; D is None where nothing has damping."""
@@ -231,7 +230,7 @@ def _matrices(
         if name == "D" and not any(damped) and not rates and not reduced:
             found[name] = None
             continue
-        blocks = [_block(part, name) for part in parts]
+        blocks = [_component_matrix(part, name) for part in parts]
         whole: Any = sp.block_diag(blocks, format="csc")
         if name in weights and soft:
             whole = whole + S.T @ sp.diags_array(np.array(weights[name])) @ S
@@ -241,7 +240,7 @@ def _matrices(
     return found
 
 
-def _block(part: Component, name: str) -> Any:
+def _component_matrix(part: Component, name: str) -> Any:
     matrix = getattr(part.model, name)
     return sp.csc_array((part.n, part.n)) if matrix is None else sp.csc_array(matrix)
 
@@ -289,7 +288,7 @@ def _full(
     )
 
 
-def _reduced(
+def _joined_reduced_model(
     parts: Sequence[Component], done: Elimination, fields: dict[str, Any], rigid: FloatArray
 ) -> ReducedModel:
     full = _all_dofs(parts)

@@ -1,10 +1,11 @@
-"""What holds two components together: rigid, or a spring and a damper."""
+"""What holds two components together, and its ends: motions of places, with lever arms."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -52,11 +53,6 @@ class Joint(Value):
         the first end. DOFs have no lever arm; a node without rotations turns with its neighbours,
         for arms up to 1e-4 of the machine's size, such as few digits of coordinates leave.
 
-    Raises
-    ------
-    LabelError, ModelError
-        When an end, an axis or a number is none; when a rigid joint has no second end.
-
     Examples
     --------
     >>> Joint("stage/41:z", "frame/7:z")
@@ -78,23 +74,24 @@ class Joint(Value):
         if axes is not None and (not axes or len(set(axes)) < len(axes)):
             raise LabelError(f"axes of a joint must be different ones, got {axes!r}: name each.")
         self._set(
-            first=_checked(self.first),
-            second=None if self.second is None else _checked(self.second),
+            first=_check_end(self.first),
+            second=None if self.second is None else _check_end(self.second),
             axes=axes,
-            stiffness=_numbers(self.stiffness, "stiffness of a joint"),
-            rate=_numbers(self.rate, "rate of a joint"),
+            stiffness=_axis_numbers(self.stiffness, "stiffness of a joint"),
+            rate=_axis_numbers(self.rate, "rate of a joint"),
             point=None if self.point is None else real_array(self.point, "point", (3,)),
         )
         if self.is_rigid and self.second is None:
             raise ModelError(
-                f"a rigid joint of {_shown(self.first)} needs a second end. Hold DOFs to the "
+                f"a rigid joint of {_end_text(self.first)} needs a second end. Hold DOFs to the "
                 "ground by model.fixed([...]) before they are joined, or give stiffness=."
             )
         if self.rate is not None and np.any(np.asarray(self.rate) < 0):
             raise ModelError(f"the rate of a damper must not be negative, got {self.rate}.")
 
     def __repr__(self) -> str:
-        ends = f"{_shown(self.first)} - {'ground' if self.second is None else _shown(self.second)}"
+        second = "ground" if self.second is None else _end_text(self.second)
+        ends = f"{_end_text(self.first)} - {second}"
         along = "" if self.axes is None else f" along {', '.join(self.axes)}"
         if self.is_rigid:
             return f"<Joint {ends}{along}, rigid>"
@@ -136,7 +133,7 @@ class Joint(Value):
         return found[0], found[1]
 
 
-def _checked(end: Any) -> Any:
+def _check_end(end: Any) -> Any:
     if isinstance(end, Patch):
         return end
     if isinstance(end, str) and all(end.partition("/")):
@@ -149,14 +146,14 @@ def _checked(end: Any) -> Any:
     )
 
 
-def _numbers(value: Any, name: str) -> Any:
+def _axis_numbers(value: Any, name: str) -> Any:
     if value is None:
         return None
     array = real_array(value, name)
     return float(array) if array.ndim == 0 else real_array(array, name, (None,))
 
 
-def _shown(end: Any) -> str:
+def _end_text(end: Any) -> str:
     if isinstance(end, tuple):
         return f"{end[0]}/({', '.join(f'{x:g}' for x in end[1])})"
     return repr(end) if isinstance(end, Patch) else str(end)
@@ -189,11 +186,6 @@ class Patch(Value):
         nodes.
     weights : (m,) array, optional
         Of the nodes, in the order of `nodes`: the area that each stands for, say. None: equal.
-
-    Raises
-    ------
-    LabelError, ModelError, ShapeError
-        When neither nodes nor a box are given, or weights are not positive.
 
     Examples
     --------
@@ -296,3 +288,177 @@ def mean_motions(
     by_node = (inverse * root.T) / scale[:, None]
     by_node[~made] = 0.0
     return by_node, A, [name for name, there in zip(DIRECTIONS, made, strict=True) if there]
+
+
+#: lever arms below this part of the machine's size are none
+_NO_ARM = 1e-9
+#: up to this part, a node without rotations turns as the nodes next to it do
+_SHORT_ARM, _NEIGHBOURS = 1e-4, 12
+
+
+class Jointed(Protocol):
+    """What has ends of joints: a component, or channels that were measured on it."""
+
+    @property
+    def name(self) -> str:
+        """What labels begin with."""
+        ...
+
+    @property
+    def dofs(self) -> DofSet:
+        """All that moves."""
+        ...
+
+
+class JointEnd:
+    """One end of a joint."""
+
+    def __init__(
+        self, parts: Sequence[Jointed], end: Any, size: float, motions: Sequence[FloatArray]
+    ) -> None:
+        self.text = repr(end) if isinstance(end, Patch) else str(end)
+        names = [part.name for part in parts]
+        text = f"{end.component}/" if isinstance(end, Patch) else end
+        name, rest = split_end(text, names) if isinstance(text, str) else (end[0], "")
+        require_known("component", [name], names)
+        self.index, self._size = names.index(name), size
+        self._dofs, self._motions = parts[self.index].dofs, motions[self.index]
+        self.label = ":" in rest
+        self.axes: tuple[str, ...]
+        if self.label:
+            try:
+                self._rows = {rest.rpartition(":")[2]: self._dofs.row(rest)}
+            except LabelError as error:
+                raise LabelError(f"component {name!r}: {error}") from None
+            self.point = np.asarray(self._dofs.location(rest))
+        elif isinstance(end, Patch):
+            self._at_patch(end)
+        elif rest:
+            self._at_node(rest)
+        else:
+            self._at_point(end[1])
+        self.axes = tuple(axis for axis in DIRECTIONS if axis in self._rows)
+
+    def _at_node(self, node: str) -> None:
+        dofs, self._rows = self._dofs, {}
+        if dofs.component_of is None and node.lstrip("-").isdigit():
+            for row in np.flatnonzero(dofs.nodes == int(node)):
+                self._rows[dofs.directions[row]] = _unit_rows(len(dofs), row)
+                self.point = np.asarray(dofs.xyz[row])
+        else:  # of a machine: "frame/41", of which DOFs may follow others
+            for axis in DIRECTIONS:
+                with suppress(LabelError):
+                    self._rows[axis] = dofs.row(f"{node}:{axis}")
+                    self.point = np.asarray(dofs.location(f"{node}:{axis}"))
+        if not self._rows:
+            raise LabelError(
+                f"no node {node!r} for the joint at {self.text!r}: {dofs!r}. "
+                "dofs.nearest((x, y, z)) finds one by its place."
+            )
+
+    def _at_patch(self, patch: Patch) -> None:
+        self.point = patch.point(self._dofs)
+        mean, _, made = patch.mean(self._dofs, self.point)
+        rows, self._rows = patch.rows(self._dofs), {}
+        for axis in made:
+            self._rows[axis] = np.zeros(len(self._dofs))
+            self._rows[axis][rows] = mean[DIRECTIONS.index(axis)]
+
+    def _at_point(self, point: Any) -> None:
+        self.point, self._rows = np.asarray(point, dtype=np.float64), {}
+        failed = ""
+        for axis in sorted(DIRECTIONS, key=lambda axis: axis not in self._dofs.directions):
+            try:
+                self._rows[axis] = self._dofs.row(self.point, axis)
+            except LabelError as error:
+                failed = failed or str(error)
+        if not self._rows:
+            raise LabelError(f"the joint at {self.text} is nowhere: {failed}")
+
+    def is_near(self, point: FloatArray) -> bool:
+        """Return whether a point is so near that coordinates with few digits explain its gap."""
+        return bool(np.linalg.norm(point - self.point) <= _SHORT_ARM * self._size)
+
+    def row(self, axis: str, point: FloatArray) -> FloatArray:
+        """Return the motion (n,) along an axis at a point that moves with this end.
+
+        A displacement there is ``u + theta x (point - own point)``.
+        """
+        if axis not in self._rows:
+            raise LabelError(
+                f"the joint at {self.text} has no axis {axis!r}: it moves along "
+                f"{', '.join(self.axes)}. Join along these, or join a Patch of nodes, which has "
+                "mean rotations."
+            )
+        found = self._rows[axis]
+        arm = point - self.point
+        if DIRECTIONS.index(axis) >= 3 or self.label or np.abs(arm).max() <= _NO_ARM * self._size:
+            return found
+        along = np.eye(3)[DIRECTIONS.index(axis)]
+        for k, turn in enumerate(("rx", "ry", "rz")):
+            share = float(np.cross(np.eye(3)[k], arm) @ along)
+            if abs(share) <= _NO_ARM * self._size:
+                continue
+            turned = self._rows.get(turn)
+            if turned is None and self.is_near(point):
+                turned = self._turn_of_neighbours(turn)
+            if turned is None:
+                raise LabelError(
+                    f"the lever arm ({', '.join(f'{x:g}' for x in arm)}) m of the joint at "
+                    f"{self.text} needs its rotation {turn}, which it has not. Give point=, where "
+                    "the joint acts, on its side, or join a Patch of nodes, which has mean "
+                    "rotations."
+                )
+            found = found + share * turned
+        return found
+
+    def _turn_of_neighbours(self, turn: str) -> FloatArray | None:
+        """Return the mean rotation (n,) of the nodes next to this end, None where there is none.
+
+        Coordinates with few digits leave gaps between nodes that are meant to be one.
+        """
+        dofs = self._dofs
+        first = np.unique(dofs.node_index, return_index=True)[1]
+        distance = np.linalg.norm(dofs.xyz[first] - self.point, axis=1)
+        near = first[np.argsort(distance, kind="stable")[:_NEIGHBOURS]]
+        rows = np.flatnonzero(np.isin(dofs.node_index, dofs.node_index[near]) & (dofs.kinds < 3))
+        mean, _, made = mean_motions(dofs._taken(rows), self.point, np.ones(rows.size))
+        if turn not in made:
+            return None
+        found = np.zeros(len(dofs))
+        found[rows] = mean[DIRECTIONS.index(turn)]
+        return found
+
+    def carried(self, row: FloatArray) -> FloatArray:
+        """Return what a row (n,) gives for the six rigid-body motions of the machine (6,)."""
+        some = np.flatnonzero(row)
+        return np.asarray(row[some] @ self._motions[some])
+
+
+def joint_axes(joint: Joint, first: JointEnd, second: JointEnd | None) -> tuple[str, ...]:
+    """Return the axes that a joint joins: those given, that of a DOF, or those of both ends."""
+    if joint.axes is not None:
+        return tuple(joint.axes)
+    for place in (first, second):
+        if place is not None and place.label:
+            return place.axes
+    if second is not None and first.axes != second.axes:
+        raise LabelError(
+            f"the ends of {joint!r} move along {', '.join(first.axes)} and along "
+            f"{', '.join(second.axes)}: it is not clear what is joined. Name axes=[...]."
+        )
+    return first.axes
+
+
+def split_end(text: str, names: Sequence[str]) -> tuple[str, str]:
+    """Return which component a text such as "stage/41:z" begins with, and the rest of it."""
+    for name in sorted(names, key=len, reverse=True):
+        if text.startswith(f"{name}/"):
+            return name, text[len(name) + 1 :]
+    return text.partition("/")[0], text.partition("/")[2]
+
+
+def _unit_rows(n: int, row: Any) -> FloatArray:
+    found = np.zeros(n)
+    found[row] = 1.0
+    return found

@@ -18,8 +18,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..structure.rigid import rigid_motions
 from ..tolerances import TYPED
 from .component import Component, Model, Pose, components_of
-from .ends import JointEnd, joint_axes
-from .joint import Joint
+from .joint import Joint, JointEnd, joint_axes
 
 #: relative: what a joint feels of a motion of the whole machine below this is rounding
 BALANCED = 1e-9
@@ -193,10 +192,6 @@ def coincident_joints(
     tolerance : float [m], optional
         How far apart nodes may be; None: 1e-6 of the machine's size.
 
-    Returns
-    -------
-    list of Joint
-
     Raises
     ------
     ModelError
@@ -225,7 +220,7 @@ def coincident_joints(
 def _joints(one: Component, other: Component, box: Any, reach: float) -> list[Joint]:
     from scipy.spatial import KDTree
 
-    first, second = _nodes(one.dofs, box), _nodes(other.dofs, None)
+    first, second = _box_nodes(one.dofs, box), _box_nodes(other.dofs, None)
     if not first.size or not second.size:
         return []
     found_at: Any = KDTree(other.dofs.xyz[second]).query(one.dofs.xyz[first])
@@ -240,12 +235,15 @@ def _joints(one: Component, other: Component, box: Any, reach: float) -> list[Jo
     for i, j in pairs:
         both = _axes(one.dofs, i) & _axes(other.dofs, j)
         if both:
-            ends = (f"{one.name}/{_name(one.dofs, i)}", f"{other.name}/{_name(other.dofs, j)}")
+            ends = (
+                f"{one.name}/{_row_label(one.dofs, i)}",
+                f"{other.name}/{_row_label(other.dofs, j)}",
+            )
             found.append(Joint(*ends, axes=[axis for axis in DIRECTIONS if axis in both]))
     return found
 
 
-def _nodes(dofs: DofSet, box: Any) -> Any:
+def _box_nodes(dofs: DofSet, box: Any) -> Any:
     """Return one row for each node in a box."""
     inside = np.ones(len(dofs), dtype=bool) if box is None else in_box(dofs.xyz, box)
     first = np.unique(dofs.node_index, return_index=True)[1]
@@ -256,7 +254,7 @@ def _axes(dofs: DofSet, row: int) -> set[str]:
     return {dofs.directions[i] for i in np.flatnonzero(dofs.node_index == dofs.node_index[row])}
 
 
-def _name(dofs: DofSet, row: int) -> str:
+def _row_label(dofs: DofSet, row: int) -> str:
     return dofs._label(row).partition(":")[0]
 
 
@@ -326,8 +324,8 @@ def _by_blocks(B: Any, size: FloatArray, order: IntArray) -> Elimination:
     n = B.shape[1]
     touched = np.unique(B.indices).astype(np.int64)
     follow, rows, columns, values = [np.zeros(0, np.int64)], [], [], []
-    for some, own in _blocks(B, touched):
-        lead, X = _solved(B[some][:, own].toarray(), size[own], order[own])
+    for some, own in _constraint_blocks(B, touched):
+        lead, X = _follower_rows(B[some][:, own].toarray(), size[own], order[own])
         rest = np.setdiff1d(np.arange(own.size), lead)
         i, j = np.nonzero(X)
         follow.append(own[lead])
@@ -343,7 +341,7 @@ def _by_blocks(B: Any, size: FloatArray, order: IntArray) -> Elimination:
     return Elimination(sp.csc_array((entries, where), shape=(n, kept.size)), kept, gone.size)
 
 
-def _blocks(B: Any, touched: IntArray) -> list[tuple[IntArray, IntArray]]:
+def _constraint_blocks(B: Any, touched: IntArray) -> list[tuple[IntArray, IntArray]]:
     """Return the rows and columns of constraints that share coordinates."""
     m = B.shape[0]
     if not m:
@@ -357,7 +355,9 @@ def _blocks(B: Any, touched: IntArray) -> list[tuple[IntArray, IntArray]]:
     return [(group[group < m], touched[group[group >= m] - m]) for group in groups]
 
 
-def _solved(block: FloatArray, size: FloatArray, order: IntArray) -> tuple[IntArray, FloatArray]:
+def _follower_rows(
+    block: FloatArray, size: FloatArray, order: IntArray
+) -> tuple[IntArray, FloatArray]:
     """Return the columns that follow (r,) and how: ``q_lead = X q_rest``."""
     k = block.shape[1]
     scaled = block / size

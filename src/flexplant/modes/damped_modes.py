@@ -11,8 +11,8 @@ import scipy.sparse as sp
 from ..checks import ComplexArray, FloatArray
 from ..errors import SolverError, counted, warn
 from ..sparse.factor import by_rows, diagonal
+from ..sparse.lanczos import Absolute, beyond
 from ..sparse.pardiso import Pardiso
-from ..sparse.rayleigh_ritz import Absolute, beyond
 from ..structure import FEModel
 from ..structure.definite import signed_square
 from ..tolerances import ROUNDING, TINY, divisor

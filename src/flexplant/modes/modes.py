@@ -1,4 +1,4 @@
-"""Modes of a structure: frequencies, damping, shapes, and what the truncated ones leave behind."""
+"""Modes of a structure, what truncated ones leave behind, and what a mesh costs."""
 
 from __future__ import annotations
 
@@ -7,14 +7,180 @@ from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
+import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, real_array
-from ..errors import ModelError, ShapeError, counted
+from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, real_array
+from ..errors import ModelError, ShapeError, SolverError, counted, unknown_label
 from ..labels import DofSet, Place
 from ..structure.definite import signed_square
 from ..structure.placed import Placed, missed
-from .calibration import measured_poles
-from .mesh_error import MeshError, mesh_error
+from .matching import paired
+
+#: places at which shapes of two meshes are compared, at most
+_PLACES = 300
+#: least ratio of element sizes: the difference of nearer ones is not that to the limit
+_RATIO = 1.2
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MeshError(Value):
+    """Relative errors of the frequencies of a mesh, from a finer one.
+
+    Parameters
+    ----------
+    modes : (m,) array
+        Numbers of elastic modes from 1, rigid-body modes included.
+    freq : (m,) array [Hz]
+        Of the coarse mesh.
+    limit : (m,) array [Hz]
+        That both meshes point to, ``f_fine + (f_fine - f_coarse) / (r^p - 1)``.
+    ratio : float
+        r, of the sizes of elements.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> def modes(n):
+    ...     plate = fx.kirchhoff_plate(size=(0.6, 0.6), thickness=0.02, elements=(n, n),
+    ...         density=2700, youngs_modulus=70e9, poisson_ratio=0.3)
+    ...     return fx.solve_modes(plate, count=6)
+    >>> modes(8).mesh_error(modes(16))
+    <MeshError: 3 modes, +0.11 % (mode 5) to +0.19 % (mode 6)>
+    """
+
+    modes: IntArray
+    freq: FloatArray
+    limit: FloatArray
+    ratio: float
+
+    @property
+    def error(self) -> FloatArray:
+        """Frequency of the mesh over that of the limit, less 1 (m,)."""
+        return np.asarray(self.freq / self.limit - 1.0)
+
+    def __repr__(self) -> str:
+        low, high = int(np.argmin(self.error)), int(np.argmax(self.error))
+        ends = " to ".join(
+            f"{100 * self.error[i]:+.2g} % (mode {self.modes[i]})" for i in (low, high)
+        )
+        return f"<MeshError: {counted(self.modes.size, 'mode')}, {ends}>"
+
+
+def mesh_error(coarse: Any, finer: Any, order: float) -> MeshError:
+    """Return the errors of Modes by those of a finer mesh, paired by their shapes."""
+    p = positive(order, "order")
+    if np.iscomplexobj(coarse.phi) or np.iscomplexobj(finer.phi):
+        raise ModelError(
+            "complex modes of two meshes are not compared: solve with damping=ModalDamping(...)."
+        )
+    nodes = [np.unique(modes.dofs.xyz, axis=0) for modes in (coarse, finer)]
+    extent = np.ptp(nodes[0], axis=0)
+    dimensions = int(np.count_nonzero(extent > 1e-6 * extent.max()))
+    ratio = (len(nodes[1]) / len(nodes[0])) ** (1.0 / max(dimensions, 1))
+    if ratio < _RATIO:
+        raise ModelError(
+            f"the finer model has {len(nodes[1])} nodes, this one {len(nodes[0])}: element sizes "
+            f"with a ratio of {ratio:.3g} do not show where both lead. Halve the elements."
+        )
+    shapes = _at_common_places(coarse, finer)
+    X, Y = (one / np.linalg.norm(one, axis=0) for one in shapes)
+    pairs = paired(
+        coarse.freq,
+        finer.freq,
+        X.T @ X,
+        X.T @ Y,
+        Y.T @ Y,
+        n_rigid=min(coarse.n_rigid, finer.n_rigid),
+    )
+    found = np.flatnonzero((pairs.partner >= 0) & (np.arange(coarse.n_modes) >= coarse.n_rigid))
+    if not found.size:
+        raise ModelError(
+            "no elastic mode of the two meshes has a shape in common: they are not of one "
+            "structure, or its coordinates have other units."
+        )
+    f, fine = coarse.freq[found], finer.freq[pairs.partner[found]]
+    return MeshError(found + 1, f, fine + (fine - f) / (ratio**p - 1.0), float(ratio))
+
+
+def _at_common_places(coarse: Any, finer: Any) -> tuple[FloatArray, FloatArray]:
+    """Return the shapes (p, k) of both at DOFs of the coarse mesh, along x, y and z."""
+    dofs = coarse.dofs
+    moves = [i for i, direction in enumerate(dofs.directions) if direction in ("x", "y", "z")]
+    chosen = np.array(moves)[:: max(len(moves) // _PLACES, 1)]
+    rows = np.array([finer.dofs.row(dofs.xyz[i], dofs.directions[i]) for i in chosen])
+    return np.real(coarse.phi[chosen]), rows @ np.real(finer.phi)
+
+
+#: relative distance of the poles from those measured at which the search ends, and its most steps:
+#: with coupling by damping of a share c of a pole's distance from the next an error falls by c
+_REACHED, _STEPS = 1e-10, 50
+
+
+def measured_poles(measured: Any, known: range) -> tuple[IntArray, ComplexArray]:
+    """Return the places (m,) from 0 of measured modes among all, and their poles [rad/s].
+
+    Raises
+    ------
+    ModelError, LabelError
+        When they are no numbered measured poles, or a mode is not among those known.
+    """
+    poles, numbers = getattr(measured, "poles", None), getattr(measured, "modes", None)
+    if poles is None or numbers is None:
+        raise ModelError(
+            "a model is calibrated by measured poles with the numbers of its modes, got "
+            f"{type(measured).__name__}" + (" without numbers" if poles is not None else "") + ". "
+            "Pass MeasuredModes(poles, modes=[...]), or flexplant.numbered(measured, model)."
+        )
+    for number in numbers:
+        if number not in known:
+            raise unknown_label("elastic mode", number, map(str, known))
+    return np.asarray(numbers, dtype=np.int64) - 1, np.asarray(poles, dtype=np.complex128)
+
+
+def calibrated_matrices(
+    M: FloatArray, D: FloatArray, K: FloatArray, n_rigid: int, places: IntArray, poles: ComplexArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return D and K with the poles of some modes as measured, and the shapes as they are.
+
+    With phi of (K, M), ``K + M phi diag(omega_m^2 - omega^2) phi^T M`` and the same of D; the
+    coupling of modes by D stays, so that the diagonal is searched for.
+
+    Raises
+    ------
+    SolverError
+        When damping couples the modes so much that no such diagonal is found.
+    """
+    phi = la.eigh(K, M)[1]
+    stiff, damp = phi.T @ K @ phi, phi.T @ D @ phi
+    square, rate = np.diag(stiff).copy(), np.diag(damp).copy()
+    square[:n_rigid] = 0.0  # not the rounding of K
+    square[places], rate[places] = np.abs(poles) ** 2, -2.0 * poles.real
+    for _ in range(_STEPS):
+        now = _poles_near(square, rate, damp, poles)
+        if np.all(np.abs(now - poles) <= _REACHED * np.abs(poles)):
+            moved = M @ phi[:, places]
+            change_k = (moved * (square - np.diag(stiff))[places]) @ moved.T
+            change_d = (moved * (rate - np.diag(damp))[places]) @ moved.T
+            return D + 0.5 * (change_d + change_d.T), K + 0.5 * (change_k + change_k.T)
+        square[places] += np.abs(poles) ** 2 - np.abs(now) ** 2
+        rate[places] += 2.0 * (now.real - poles.real)
+    raise SolverError(
+        "damping couples the modes so much that no change of each alone gives them the measured "
+        "poles. Update the dampers first (AddedDamping), or measure the coupled modes too."
+    )
+
+
+def _poles_near(
+    square: FloatArray, rate: FloatArray, damp: FloatArray, wanted: ComplexArray
+) -> ComplexArray:
+    """Return the poles of ``p'' + (rate + coupling) p' + square p = 0`` next to those wanted."""
+    C, scale = damp.copy(), np.sqrt(np.maximum(square, 0.0))
+    np.fill_diagonal(C, rate)
+    # balanced: speeds beside frequency times position, which rigid-body modes do not need
+    A = np.block([[np.zeros_like(C), np.diag(scale)], [-np.diag(scale), -C]])
+    found = np.linalg.eigvals(A)
+    return np.asarray(found[np.argmin(np.abs(found[:, None] - wanted), axis=0)])
+
 
 #: relative: a frequency that rounding of K may change by more is one to know of
 _SOFT = 1e-4
@@ -298,10 +464,6 @@ class Modes(Placed, Value):
             Of the same structure with smaller elements: half as large, say.
         order : float
             2 for plates and for bricks of eight nodes.
-
-        Returns
-        -------
-        MeshError
 
         Raises
         ------

@@ -213,7 +213,7 @@ class RealForm(NamedTuple):
     @property
     def drags(self) -> bool:
         """Whether D damps rigid-body motion more than the convention lets pass."""
-        return bool(self.drag > RIGID_DRAG * _first(self.omega))
+        return bool(self.drag > RIGID_DRAG * _first_frequency(self.omega))
 
     @property
     def drag(self) -> float:
@@ -256,7 +256,7 @@ def check_drag(rigid: FloatArray, D: Matrix, omega: FloatArray) -> None:
     """Raise ModelError when D damps rigid-body motion too much to leave it at 0."""
     if not rigid.shape[1] or not omega.size:
         return
-    drag, first = float(np.abs(rigid.T @ np.asarray(D @ rigid)).max()), _first(omega)
+    drag, first = float(np.abs(rigid.T @ np.asarray(D @ rigid)).max()), _first_frequency(omega)
     if drag > RIGID_DRAG * first:
         raise ModelError(
             f"D damps rigid-body motion at {drag:.3g} 1/s, more than {RIGID_DRAG:g} of the first "
@@ -267,7 +267,7 @@ def check_drag(rigid: FloatArray, D: Matrix, omega: FloatArray) -> None:
         )
 
 
-def _first(omega: FloatArray) -> float:
+def _first_frequency(omega: FloatArray) -> float:
     """Return the lowest frequency above 0, or 0."""
     above = omega[omega > 0]
     return float(above[0]) if above.size else 0.0
@@ -330,7 +330,7 @@ def complex_modes(omega: FloatArray, C: FloatArray, *, lowest: int | None) -> Co
     for cluster in runs(poles, _CLUSTER):
         mix[:, cluster] = _normalised(poles[cluster], mix[:, cluster], C, scale[cluster])
     mix = _polished(poles, mix, C, scale)
-    worst = float(_left(poles, mix, omega, C).max(initial=0.0))
+    worst = float(_relative_residual(poles, mix, omega, C).max(initial=0.0))
     if not worst < _RESIDUAL:
         raise SolverError(
             f"complex modes leave a relative residual of {worst:.2g} (limit {_RESIDUAL:g}): the "
@@ -380,7 +380,9 @@ def _eigen(omega: FloatArray, C: FloatArray, *, low: bool) -> tuple[ComplexArray
     return np.asarray(values), np.asarray(vectors)
 
 
-def _left(poles: ComplexArray, mix: ComplexArray, omega: FloatArray, C: FloatArray) -> FloatArray:
+def _relative_residual(
+    poles: ComplexArray, mix: ComplexArray, omega: FloatArray, C: FloatArray
+) -> FloatArray:
     """Return the relative residual (k,) that modes leave."""
     rest = mix * poles**2 + (C @ mix) * poles + signed_square(omega)[:, None] * mix
     # what damping beside them is rounded to counts as well

@@ -11,11 +11,11 @@ import scipy.sparse as sp
 from ..checks import FloatArray
 from ..errors import ModelError, SolverError, counted
 from ..sparse.factor import DENSE_LIMIT, same_pattern
-from ..sparse.inertia import SignedFactor, multifrontal_inertia, signed_factor
+from ..sparse.lanczos import rounding_of
+from ..sparse.lowest import SignedFactor, multifrontal_inertia, signed_factor
 from ..sparse.multifrontal import MultifrontalCholesky
 from ..sparse.ordering import Dissection, dissect
 from ..sparse.pardiso import Pardiso, PardisoCholesky
-from ..sparse.rayleigh_ritz import rounding_of
 from ..structure.definite import unstable_stiffness
 from ..structure.model import FEModel
 from ..tolerances import ROUNDING, TINY, divisor

@@ -14,9 +14,8 @@ from ..errors import ModelError, SolverError, warn
 from ..labels import Place
 from ..parallel import Progress
 from ..sparse.factor import DENSE_LIMIT, by_rows, dense, diagonal
-from ..sparse.lanczos import STEPS
+from ..sparse.lanczos import STEPS, Absolute, column_groups, rounding_of
 from ..sparse.pardiso import Pardiso
-from ..sparse.rayleigh_ritz import Absolute, column_groups, rounding_of
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping
 from ..structure.definite import signed_root, signed_square
 from ..structure.eigen import elastic_modes, signed
@@ -344,7 +343,7 @@ def checked(
     Returned are the error of orthonormality, the residual of each mode, and the relative error of
     its frequency that rounding of K's entries may make.
     """
-    gram, size, limit, left, rounding = _measured(model, omega, phi)
+    gram, size, limit, left, rounding = _mode_residuals(model, omega, phi)
     error = float(np.abs(gram - np.eye(omega.size)).max(initial=0.0))
     if not error <= _ORTHONORMAL:
         raise SolverError(
@@ -367,7 +366,7 @@ def checked(
     return error, left, rounding
 
 
-def _measured(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple[FloatArray, ...]:
+def _mode_residuals(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple[FloatArray, ...]:
     """Return what `checked` judges, from products of their own."""
     M, K = by_rows(model.M), by_rows(model.K)
     size_of_K, stiff = Absolute(K), diagonal(model.K)

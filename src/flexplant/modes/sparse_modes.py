@@ -13,9 +13,21 @@ from ..checks import FloatArray, IntArray, Matrix, Rng
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread, tick
 from ..sparse.factor import by_rows
-from ..sparse.lanczos import BLOCK, REACHED, SAME, STEPS, BlockLanczos, along_basis, iterated
+from ..sparse.lanczos import (
+    BLOCK,
+    REACHED,
+    SAME,
+    SPREAD,
+    STEPS,
+    Absolute,
+    BlockLanczos,
+    along_basis,
+    column_groups,
+    iterated,
+    rayleigh_ritz,
+    rounding_of,
+)
 from ..sparse.pardiso import Pardiso
-from ..sparse.rayleigh_ritz import SPREAD, Absolute, column_groups, rayleigh_ritz, rounding_of
 from ..structure.definite import are_rigid
 from ..structure.eigen import check_stiffness
 from ..structure.model import FEModel
@@ -95,7 +107,7 @@ def _counted(
             factor, new = None, stiffness_factor
             factor = new(model, method)
             found = _search(model, factor, locked, missing, search)
-        squares, phi = _beside(model, phi, *found)
+        squares, phi = _merge_modes(model, phi, *found)
         rounding = rounding_of(model.K, phi)
         # a motion of the geometry that is not free has springs, which rounding does not hide
         suspended = are_rigid(model.M, model.body_motions, phi)
@@ -103,7 +115,7 @@ def _counted(
         check_stiffness(squares, phi, least, model.rigid_body, model.dofs, suspended)
         # the count needs the memory
         factor = None
-        if below == count and _apart(squares, count, top, rounding):
+        if below == count and _is_gap(squares, count, top, rounding):
             counted, sure, shift = count, count, top
         else:
             sure, shift = _gap(squares, count, rounding)
@@ -140,7 +152,7 @@ def _certificate(shift: float, counted: int, found: int) -> dict[str, float]:
     }
 
 
-def _beside(
+def _merge_modes(
     model: FEModel, known: FloatArray, squares: FloatArray, phi: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return omega^2 and shapes of modes known before and of those found beside them."""
@@ -160,19 +172,19 @@ def _search(
     # soft modes first: they are locked, and a new search finds those that their rounding hides
     held, block = model.body_motions, BLOCK
     start = None if locked.shape[1] >= held.shape[1] else held
-    squares, found = _searched(model, factor, locked, want, rng, start)
+    squares, found = _search_once(model, factor, locked, want, rng, start)
     while 0 < found.shape[1] < want:
         beside, missing = np.hstack([locked, found]), want - found.shape[1]
         # of a repeated mode, a block sees no more copies than it has vectors
         block = min(2 * block, max(block, missing))
-        more = _searched(model, factor, beside, missing, rng, None, block)
+        more = _search_once(model, factor, beside, missing, rng, None, block)
         if not more[0].size:
             break
-        squares, found = _beside(model, found, *more)
+        squares, found = _merge_modes(model, found, *more)
     return squares, found
 
 
-def _searched(
+def _search_once(
     model: FEModel,
     factor: StiffnessFactor | CountingFactor,
     locked: FloatArray,
@@ -244,7 +256,7 @@ def _let_pass(K: Any, size_of_K: Absolute, phi: FloatArray) -> tuple[FloatArray,
     return force, np.maximum(_RESIDUAL, _ROUNDINGS * rounding / np.linalg.norm(force, axis=0))
 
 
-def _apart(squares: FloatArray, count: int, top: float, rounding: FloatArray) -> bool:
+def _is_gap(squares: FloatArray, count: int, top: float, rounding: FloatArray) -> bool:
     """Return whether `top` is well between the last mode below it and the next."""
     near = squares[count - 1 : count + 1]
     closest = np.maximum(_GAP * top, _GAP_ROUNDINGS * rounding[count - 1 : count + 1])

@@ -13,9 +13,9 @@ from ..plant import StandardPlant
 from ..reduction import EffectiveIndependence
 from ..reduction.criteria import SelectionCriterion
 from ..work import Work
-from .candidate_shapes import ByShapes, Shapes
+from .convex import SummedMatrices
+from .gramian import ByShapes, Shapes
 from .problem import Found, Problem, Search
-from .summed import SummedMatrices
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +32,6 @@ class ByRows(Search):
     driving_point : bool
         Whether E_i is weighted by the driving-point residue ``sum_j phi_ij^2 / omega_j^2``, so
         that places that move little are left out first (EfI-DPR).
-
-    Raises
-    ------
-    ModelError
-        When the method is no SelectionCriterion, or driving_point is given without
-        EffectiveIndependence.
 
     References
     ----------
@@ -138,11 +132,6 @@ class ModeInformation(ByShapes):
     ----------
     elastic : bool
         Whether rigid-body modes are left out.
-
-    Raises
-    ------
-    ModelError
-        When elastic is neither True nor False; when called, for a plant made elsewhere.
 
     References
     ----------

@@ -214,11 +214,6 @@ class Wrapping(Criterion):
     ----------
     criterion : Criterion or callable
         From plant to float.
-
-    Raises
-    ------
-    ModelError
-        When it is not callable.
     """
 
     criterion: Any = field(

@@ -15,9 +15,8 @@ from ..plant import Actuator, Assumption, SensorPort, StandardPlant, assemble_pl
 from ..tolerances import divisor
 from ..work import Work
 from .candidates import Port, Side, checked_plant, side_of, with_side
-from .closed_loop_h2 import ClosedLoopH2
+from .closed_loop_h2 import ClosedLoopH2, PoiLqr
 from .criterion import AGREEMENT, Criterion, OnPlant, Scorer, as_criterion
-from .poi_lqr import PoiLqr
 from .poi_variance import PoiVariance
 
 ASSUMPTION = {"y": "detectable", "u": "stabilisable"}

@@ -13,8 +13,8 @@ from ..errors import SolverError
 from ..lti.equations import doubled, doubled_riccati, relative
 from ..lti.riccati import control_dare
 from ..tolerances import divisor
+from .convex import Convex, Tangent
 from .criterion import Scorer
-from .tangent import Convex, Tangent
 
 #: largest residual of the Riccati equation, relative, that is taken without another solver
 RESIDUAL = 1e-10
@@ -186,12 +186,12 @@ def _slopes(closed: FloatArray, seen: FloatArray, into: FloatArray) -> Iterator[
 
 def measured(X: FloatArray, g: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return I - K g, and X+ as a sum of squares: ``(I - K g) X (I - K g)' + K K'``."""
-    gain = _gain(X, g)
+    gain = _update_gain(X, g)
     left = np.eye(X.shape[0]) - gain @ g
     return left, left @ X @ left.T + gain @ gain.T
 
 
-def _gain(X: FloatArray, g: FloatArray) -> FloatArray:
+def _update_gain(X: FloatArray, g: FloatArray) -> FloatArray:
     """Return K with ``X+ = (I - K g) X``."""
     seen = X @ g.T
     inner = g @ seen
@@ -203,7 +203,7 @@ def _gain(X: FloatArray, g: FloatArray) -> FloatArray:
 
 def _terms(S: FloatArray, X: FloatArray, g: FloatArray) -> FloatArray:
     """Return the diagonal of ``S X+ S'`` as sums of squares: nothing cancels with good sensors."""
-    gain = S @ _gain(X, g)
+    gain = S @ _update_gain(X, g)
     left = S - gain @ g
     return np.asarray(np.einsum("ij,jk,ik->i", left, X, left) + np.sum(gain**2, axis=1))
 

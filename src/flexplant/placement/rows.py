@@ -192,7 +192,9 @@ class Branch:
     def halves(self, rows: FloatArray, weights: FloatArray) -> Iterator[Branch]:
         """Return the parts that arise when the most diverse group is cut in two."""
         open_groups = [i for i, (group, count) in enumerate(self.groups) if count < group.size]
-        spread = [_spread(rows[g], weights[g]) for g, _ in (self.groups[i] for i in open_groups)]
+        spread = [
+            _main_variance(rows[g], weights[g]) for g, _ in (self.groups[i] for i in open_groups)
+        ]
         most = open_groups[int(np.argmax([size for size, _ in spread]))]
         group, count = self.groups[most]
         along = spread[open_groups.index(most)][1]
@@ -207,7 +209,7 @@ class Branch:
             yield Branch(rest + tuple((g, c) for g, c in counts if c))
 
 
-def _spread(rows: FloatArray, weights: FloatArray) -> tuple[float, FloatArray]:
+def _main_variance(rows: FloatArray, weights: FloatArray) -> tuple[float, FloatArray]:
     """Return the weighted variance of rows, and each row's place along its main direction."""
     # those of weight zero are to be cut as well
     weights = weights + 1e-3 * np.max(weights) + TINY

@@ -18,8 +18,7 @@ from ..lti.grid import sampled_freq
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace, System
 from ..modes import Modes
-from ..modes.direct_check import checked_response
-from ..modes.dynamic_basis import DynamicBasis
+from ..modes.dynamic_basis import DynamicBasis, checked_response
 from ..modes.shifted import held_factor
 from ..modes.solve import modes_reaching
 from ..parallel import Progress

@@ -13,8 +13,19 @@ from matplotlib.ticker import MultipleLocator
 from ..checks import FloatArray, name_list, real_array, short
 from ..errors import ModelError, unknown_label
 from ..lti.frequency import Frf
-from ._axes import STYLES, axes, finish, legend, role_of
-from .gains import Curve, curves, decibel, gain_label, readable, shared_reference
+from ._axes import (
+    STYLES,
+    Curve,
+    axes,
+    curves,
+    decibel,
+    finish,
+    gain_label,
+    legend,
+    readable,
+    role_of,
+    shared_reference,
+)
 
 #: channels for which a grid of diagrams can still be read
 _MOST = 36
@@ -72,7 +83,7 @@ def bode(
             pair = panels[2 * i, j], panels[2 * i + 1, j]
             continuous: tuple[FloatArray, FloatArray] | None = None
             for curve in sorted(drawn, key=lambda curve: "marker" in curve.line):
-                continuous = _draw(pair, curve, output, name, continuous)
+                continuous = _draw_channel(pair, curve, output, name, continuous)
             readable(pair[0])
             _whole_turns(pair[1])
             finish(pair[0], x="", y=gain_label(output, name, first.unit(output, name)))
@@ -109,7 +120,7 @@ def _panels(ax: Sequence[Axes] | None, rows: int, columns: int) -> Any:
     return given.reshape(2, 1)
 
 
-def _draw(
+def _draw_channel(
     pair: tuple[Axes, Axes],
     curve: Curve,
     output: str,
@@ -163,10 +174,6 @@ def singular_values(
         Where systems are evaluated; a grid of each, refined at resonances, when not given.
     ax : Axes, optional
         Where to draw.
-
-    Returns
-    -------
-    Axes
 
     Raises
     ------
@@ -236,10 +243,6 @@ def frf(
     ax : Axes, optional
         Where to draw.
 
-    Returns
-    -------
-    Axes
-
     Raises
     ------
     LabelError
@@ -261,7 +264,7 @@ def frf(
         raise ModelError(
             f"need a mapping of labels to Frfs, got {short(responses)}. Type {{'model': frf}}."
         )
-    drawn = [_part(curve, band) for curve in curves(responses, freq, colors)]
+    drawn = [_within_band(curve, band) for curve in curves(responses, freq, colors)]
     found = {curve.label: curve.response.unit(output, input) or unit for curve in drawn}
     known = {own for own in found.values() if own is not None}
     if len(known) > 1:
@@ -291,7 +294,7 @@ def frf(
     return finish(ax, x="frequency [Hz]", y=gain_label(output, input, gain))
 
 
-def _part(curve: Curve, band: tuple[float, float] | None) -> Curve:
+def _within_band(curve: Curve, band: tuple[float, float] | None) -> Curve:
     """Return the part of a curve within a band of frequencies."""
     if band is None:
         return curve

@@ -184,10 +184,6 @@ def estimate(
     ax : Axes, optional
         Where to draw.
 
-    Returns
-    -------
-    Axes
-
     Raises
     ------
     ModelError

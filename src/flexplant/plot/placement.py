@@ -13,8 +13,8 @@ from matplotlib.patches import Rectangle as Box
 from ..checks import FloatArray, in_unit, instance, whole
 from ..errors import ModelError
 from ..placement import ParetoCurve, SensorMap
-from ..placement.candidate_shapes import shapes_of
 from ..placement.candidates import Zone, places_of
+from ..placement.gramian import shapes_of
 from ..plant import Ports, StandardPlant
 from ..structure import Disc
 from ._axes import BLUE, LIGHT, PORTS, RED, STYLES, axes, finish, legend, legend_below, named, plan
@@ -148,10 +148,6 @@ def placed(
         Where nothing may be, hatched.
     ax : Axes, optional
         Where to draw.
-
-    Returns
-    -------
-    Axes
 
     Raises
     ------

@@ -20,8 +20,7 @@ from ..lti.responses import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
 from ..simulation import Response
 from ..tolerances import SPLIT
-from ._axes import GREY, finish, legend, named, panel_axes, quantity_of, shown_in, styles
-from .gains import labelled
+from ._axes import GREY, finish, labelled, legend, named, panel_axes, quantity_of, shown_in, styles
 
 
 def response(
@@ -80,7 +79,7 @@ def response(
     'time [ms]'
     """
     instance(run, Response, "run", "Pass what simulate returned.")
-    run = run if span is None else _part(run, span)
+    run = run if span is None else _within_span(run, span)
     chosen = None if channels is None else name_list(channels, "channels")
     names = list(chosen or [n for n in run if n.endswith(":error")] or list(run)[:1])
     panels: dict[str | None, list[str]] = {}
@@ -123,7 +122,7 @@ def _label(label: str | None, name: str, names: Sequence[str]) -> str:
     return label if len(names) == 1 else f"{label}: {name}"
 
 
-def _part(run: Response, span: tuple[float, float]) -> Response:
+def _within_span(run: Response, span: tuple[float, float]) -> Response:
     """Return the samples of a run within a span of time."""
     start, end = real_array(span, "span", (2,)).tolist()
     within = (run.time >= start) & (run.time <= end)
@@ -229,7 +228,7 @@ def step(
         time, data = _responses(g.select(rows, columns), end)
         for i, output in enumerate(rows):
             for j, name in enumerate(columns):
-                _draw(panels[i, j], time, data[i, j], g, (output, name), label or None, look)
+                _draw_step(panels[i, j], time, data[i, j], g, (output, name), label or None, look)
     for panel in panels[:-1].ravel():
         panel.set_xlabel("")
     for panel, name in zip(panels[0], columns, strict=True):
@@ -263,7 +262,7 @@ def _panels(ax: Axes | None, rows: int, columns: int) -> Any:
     )[1]
 
 
-def _draw(
+def _draw_step(
     ax: Axes,
     time: FloatArray,
     signal: FloatArray,

@@ -1,7 +1,6 @@
 """Fewer degrees of freedom, same input-output behaviour: reductions, their bounds and quality."""
 
 from ..rooms import public_names as _public_names
-from .bounds import ErrorBound as ErrorBound
 from .component_modes import CraigBampton as CraigBampton
 from .component_modes import MacNeal as MacNeal
 from .component_modes import Rubin as Rubin
@@ -19,6 +18,7 @@ from .krylov import Krylov as Krylov
 from .methods import DesiredDofs as DesiredDofs
 from .methods import ReductionMethod as ReductionMethod
 from .methods import reduce as reduce
+from .ranking import ErrorBound as ErrorBound
 from .ranking import ModeRanking as ModeRanking
 from .ranking import rank_modes as rank_modes
 from .reduced import ReducedModel as ReducedModel

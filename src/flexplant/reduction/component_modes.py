@@ -17,8 +17,8 @@ from ..sparse.factor import dense, unit_diagonal
 from ..structure import Damping, FEModel, ModalDamping
 from ..tolerances import RANK, TINY
 from .condensation import DofPartition
-from .methods import ReductionMethod
-from .projection import (
+from .methods import (
+    ReductionMethod,
     block,
     fe_model,
     inner,
@@ -47,11 +47,6 @@ class CraigBampton(ReductionMethod):
         In place of `modes`: all fixed-interface modes up to this frequency.
     damping : ModalDamping or Rayleigh, optional
         Of the reduced model's own modes; None: ``T^T D T``.
-
-    Raises
-    ------
-    LabelError, ModelError
-        For bad labels or numbers.
 
     References
     ----------
@@ -229,11 +224,6 @@ class Rubin(_FreeInterface):
     damping : ModalDamping or Rayleigh, optional
         Of modes and attachment vectors; None: ``T^T D T``.
 
-    Raises
-    ------
-    LabelError, ModelError
-        For bad labels or numbers.
-
     References
     ----------
     [Rubin1975]_.
@@ -265,11 +255,6 @@ class MacNeal(_FreeInterface):
         As for `Rubin`.
     damping : ModalDamping or Rayleigh, optional
         Of the modes; None: their part of D.
-
-    Raises
-    ------
-    LabelError, ModelError
-        For bad labels or numbers.
 
     References
     ----------

@@ -16,14 +16,15 @@ from ..modes.solve import solve_modes
 from ..sparse.factor import unit_diagonal
 from ..structure import FEModel, ModalDamping
 from ..tolerances import ROUNDING, SAME
-from .methods import ReductionMethod, refused_partition
-from .projection import (
+from .methods import (
+    ReductionMethod,
     Solver,
     block,
     fe_model,
     inner,
     labels_given,
     projected,
+    refused_partition,
 )
 from .reduced import ReducedModel
 
@@ -113,11 +114,6 @@ class Guyan(ReductionMethod):
     damping : ModalDamping or Rayleigh, optional
         Of the reduced model's own modes; None: ``T^T D T``.
 
-    Raises
-    ------
-    LabelError
-        When a label appears twice, or none is given.
-
     References
     ----------
     [Guyan1965]_.
@@ -166,11 +162,6 @@ class Irs(ReductionMethod):
     damping : ModalDamping or Rayleigh, optional
         Of the reduced model's own modes; None: ``T^T D T``.
 
-    Raises
-    ------
-    LabelError, ModelError
-        For bad labels, or options that are not positive.
-
     Notes
     -----
     Each mode converges like the ratio of its omega^2 to the lowest one of the structure with
@@ -210,7 +201,7 @@ class Irs(ReductionMethod):
             # rigid-body motions have no rate: rounding in K is kept out of them
             inertia = inertia - inertia @ rigid @ la.pinv(rigid) if rigid.shape[1] else inertia
             T = part.static + part.whole(np.zeros_like(rates), part.solver.solve(inertia))
-            if before.size and _settled(squares, before, self.tolerance):
+            if before.size and _is_settled(squares, before, self.tolerance):
                 break
             before = squares
         return projected(
@@ -241,7 +232,7 @@ def _rates(M: FloatArray, K: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(rates), np.asarray(squares)
 
 
-def _settled(squares: FloatArray, before: FloatArray, tolerance: float) -> bool:
+def _is_settled(squares: FloatArray, before: FloatArray, tolerance: float) -> bool:
     floor = ROUNDING * squares[-1]
     return bool(np.all(np.abs(squares - before) <= tolerance * np.abs(squares) + floor))
 
@@ -261,11 +252,6 @@ class Serep(ReductionMethod):
         As many mode numbers (from 1, rigid-body modes included and all there); None: the lowest.
     damping : ModalDamping or Rayleigh, optional
         Of the reduced model's own modes; None: ``T^T D T``.
-
-    Raises
-    ------
-    LabelError, ModelError
-        For bad labels or mode numbers.
 
     Notes
     -----

@@ -116,7 +116,7 @@ class EffectiveIndependence(SelectionCriterion):
         alive = np.arange(fixed + p)
         while alive.size > fixed + wanted:
             drops = min(_REFRESH, alive.size - fixed - wanted)
-            dropped = _lowest(rows[alive], fixed, drops)
+            dropped = _dropped_rows(rows[alive], fixed, drops)
             alive = np.delete(alive, dropped)
         left = alive[fixed:] - fixed
         if wanted > count:
@@ -129,7 +129,7 @@ class EffectiveIndependence(SelectionCriterion):
         return np.asarray(np.sum(np.abs(vectors[:, size > _UNSEEN * size[0]]) ** 2, axis=1))
 
 
-def _lowest(rows: Rows, fixed: int, drops: int) -> list[int]:
+def _dropped_rows(rows: Rows, fixed: int, drops: int) -> list[int]:
     """Return the rows that effective independence drops, one after the other."""
     inverse = la.inv(rows.conj().T @ rows)
     share = np.einsum("ij,ij->i", rows @ inverse, rows.conj()).real

@@ -13,15 +13,14 @@ from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..lti.grid import climbed
 from ..modes.attachment_vectors import labels_of, places, static_response
-from ..modes.direct_check import DirectCheck, antiresonances, checked_response
-from ..modes.dynamic_basis import DynamicBasis
+from ..modes.dynamic_basis import DirectCheck, DynamicBasis, antiresonances, checked_response
 from ..modes.matching import paired
 from ..modes.modes import Modes
 from ..modes.shifted import held_factor
 from ..modes.solve import modes_reaching
 from ..structure import FEModel, Hysteretic
 from ..tolerances import SAME, divisor
-from .bounds import ErrorBound
+from .ranking import ErrorBound
 
 #: refinements of the frequencies at which the error is largest
 _ROUNDS = 3
@@ -45,10 +44,10 @@ def quality_of(
             "pass that."
         )
     low, high = _band(band)
-    pushed, watched = _channels(reduced, inputs, outputs)
+    pushed, watched = _judged_places(reduced, inputs, outputs)
     own = _undamped_modes(reduced)
     modes = _full_modes(full, count, high)
-    B, C = _rows(full, pushed).T, _rows(full, watched)
+    B, C = _place_rows(full, pushed).T, _place_rows(full, watched)
     Br, Cr = reduced.T.T @ B, C @ reduced.T
     undamped = full.D is None if isinstance(full, FEModel) else not np.any(full.basis_zeta)
     factor = _loss(reduced, own, loss) if undamped else None
@@ -92,8 +91,8 @@ def quality_of(
         **_compared(full, modes, own, count, high),
         check_freq=grid,
         frf_error=frf,
-        resonance_error=_largest(at_peaks, np.isin(grid, peaks)),
-        antiresonance_error=_largest(at_dips, np.isin(grid, deep)),
+        resonance_error=_largest_error(at_peaks, np.isin(grid, peaks)),
+        antiresonance_error=_largest_error(at_dips, np.isin(grid, deep)),
         static_error=static_error(responses.static(), reduced, Br, Cr),
         true_error=float(np.linalg.norm(found - whole_response, 2, axis=(1, 2)).max(initial=0.0))
         if gap.size
@@ -109,7 +108,7 @@ def quality_of(
     )
 
 
-def _largest(error: FloatArray, chosen: Any) -> FloatArray:
+def _largest_error(error: FloatArray, chosen: Any) -> FloatArray:
     """Return the largest of errors (f, p, q) over the chosen frequencies, NaN where none is."""
     if not chosen.any():
         return np.full(error.shape[1:], np.nan)
@@ -123,7 +122,7 @@ def _band(band: Any) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
 
 
-def _channels(reduced: Reduced, inputs: Any, outputs: Any) -> tuple[list[Place], list[Place]]:
+def _judged_places(reduced: Reduced, inputs: Any, outputs: Any) -> tuple[list[Place], list[Place]]:
     pushed: Any = places(inputs)
     watched: Any = places(outputs)
     if not pushed and reduced.bound is not None:
@@ -133,7 +132,7 @@ def _channels(reduced: Reduced, inputs: Any, outputs: Any) -> tuple[list[Place],
     return pushed, watched or pushed
 
 
-def _rows(full: FEModel | Modes, at: list[Place]) -> FloatArray:
+def _place_rows(full: FEModel | Modes, at: list[Place]) -> FloatArray:
     return np.array([full.dofs.row(place) for place in at]).reshape(-1, len(full.dofs))
 
 

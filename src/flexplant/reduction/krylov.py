@@ -20,8 +20,7 @@ from ..modes.shifted import stiffness_factor
 from ..sparse.factor import DENSE_LIMIT, dense, dynamic_lu
 from ..structure import FEModel
 from ..tolerances import RANK, TINY
-from .methods import ReductionMethod
-from .projection import fe_model, projected
+from .methods import ReductionMethod, fe_model, projected
 from .reduced import ReducedModel
 
 #: M-norm of what is new in a vector, of the whole vector, below which it adds nothing
@@ -53,11 +52,6 @@ class Krylov(ReductionMethod):
     damping : ModalDamping or Rayleigh, optional
         Of the reduced model's own modes, beside a basis of the undamped structure; None: the
         model's D, in the basis too.
-
-    Raises
-    ------
-    LabelError, ModelError
-        For bad places, frequencies or numbers.
 
     References
     ----------
@@ -130,7 +124,7 @@ def _real_moments(model: FEModel, B: FloatArray, omega: float, count: int, D: An
     for _ in range(count - 1):
         # a new start in the same Krylov space: what is already there taken out first
         block = _normed(
-            model, _without(model, np.hstack(found), solve(np.asarray(model.M @ block)))
+            model, _orthogonal_to(model, np.hstack(found), solve(np.asarray(model.M @ block)))
         )
         found.append(block)
     return np.hstack(found)
@@ -204,7 +198,7 @@ def _normed(model: FEModel, vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors / np.sqrt(square.clip(TINY)))
 
 
-def _without(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArray:
+def _orthogonal_to(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArray:
     """Return vectors M-orthogonal to the span of others."""
     gram = basis.T @ np.asarray(model.M @ basis)
     for _ in range(2):

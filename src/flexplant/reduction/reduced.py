@@ -13,17 +13,16 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, IntArray, Value, name_list, positive, real_array
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
-from ..modes.calibration import calibrated_matrices, measured_poles
 from ..modes.damped_modes import leaving_overdamped
-from ..modes.modes import Modes
+from ..modes.modes import Modes, calibrated_matrices, measured_poles
 from ..modes.normal_form import normal_form
 from ..parallel import Progress
 from ..structure import FEModel
 from ..structure.definite import refuse_unstable, unstable_stiffness
 from ..structure.placed import SPANNED, missed
 from ..structure.rigid import orthonormalised, rigid_motions
-from .bounds import ErrorBound
 from .judging import ReductionQuality, quality_of
+from .ranking import ErrorBound
 
 
 class Spanned:
@@ -163,11 +162,6 @@ class ReducedModel(Spanned, Value):
         Of a joined machine: motions of its components as rigid bodies that its rigid joints allow.
     joining : Value, optional
         Of a joined machine: how it was joined, with the checks that were made; not after an update.
-
-    Raises
-    ------
-    ShapeError, ModelError
-        When sizes do not match or entries are not finite.
 
     References
     ----------

@@ -17,11 +17,9 @@ from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..structure import FEModel, ModalDamping
 from ..tolerances import SAME
-from .bounds import ErrorBound
 from .condensation import kept_columns, mode_numbers
-from .methods import ReductionMethod
-from .projection import inner
-from .ranking import channels, peak_gains, rank_modes
+from .methods import ReductionMethod, inner
+from .ranking import ErrorBound, channels, peak_gains, rank_modes
 from .reduced import STATIC, ReducedModel
 
 _SUM = "sum of the peaks of the neglected modes"
@@ -47,11 +45,6 @@ class ModalTruncation(ReductionMethod):
         Channels of the a-priori bound; no outputs: the inputs.
     damping : ModalDamping or Rayleigh, optional
         With an FEModel: of modes and vectors, in place of its D.
-
-    Raises
-    ------
-    ModelError
-        When neither or both of `count` and `modes` are given.
 
     Notes
     -----
@@ -132,7 +125,7 @@ class ModalTruncation(ReductionMethod):
             )
         bound = self._bound(model, kept) if self.inputs else None
         names = [f"mode {i}" for i in numbers]
-        found = _diagonal(kept, names, "modal truncation", bound)
+        found = _modal_model(kept, names, "modal truncation", bound)
         if law is None and model.D is not None:
             found = found.replace(D=inner(model.D, found.T))
         return found
@@ -153,7 +146,7 @@ class ModalTruncation(ReductionMethod):
         right = np.sum(C.T * flexible[:, q:]) - np.sum(seen[:, r:].T ** 2 / square)
         both = float(np.sqrt(max(float(left), 0.0) * max(float(right), 0.0)))
         value = both * float(peak_gains(np.ones(1), np.array([law.ratio]))[0])
-        vectors, _ = _parts(_vectors(kept), (self.inputs, self.outputs))
+        vectors, _ = _channel_terms(_vectors(kept), (self.inputs, self.outputs))
         value += _peaks(vectors)
         # of the lowest modes: none unseen is below the last, all are at most like one there
         lowest = self._numbers == tuple(range(1, kept.n_modes + 1))
@@ -184,11 +177,6 @@ class ModalBalanced(ReductionMethod):
         Where the static compliance of what was left out is kept.
     damping : ModalDamping or Rayleigh, optional
         With an FEModel: of its modes.
-
-    Raises
-    ------
-    ModelError
-        When numbers do not fit or no input is given.
 
     Notes
     -----
@@ -269,15 +257,15 @@ def truncated(
     if bound_of is not None:
         gone = Modes(omega[others], zeta[others], basis[:, others], modes.dofs)
         into, out, _, _ = channels(gone, *bound_of)
-        terms, missed = _parts(gone, bound_of)
-        vectors, given = _parts(_vectors(kept), bound_of)
+        terms, missed = _channel_terms(gone, bound_of)
+        vectors, given = _channel_terms(_vectors(kept), bound_of)
         at_rest = float(np.linalg.norm(missed - given, 2)) if others.size else 0.0
         terms = np.vstack([terms, vectors])
         value = _peaks(terms)
         if np.isfinite(value):
             covers = modes.n_modes if modes.n_modes < len(modes.dofs) else None
             bound = ErrorBound(value, into, out, _SUM, terms=terms, static=at_rest, covers=covers)
-    found = _diagonal(kept, [f"mode {i}" for i in numbers], method, bound)
+    found = _modal_model(kept, [f"mode {i}" for i in numbers], method, bound)
     return found.replace(truncated=_left_out(modes, columns))
 
 
@@ -322,7 +310,7 @@ def _vectors(kept: Modes) -> Modes:
     return Modes(kept.vector_omega, kept.vector_zeta, kept.vectors, kept.dofs)
 
 
-def _parts(modes: Modes, bound_of: tuple[Any, Any]) -> tuple[FloatArray, FloatArray]:
+def _channel_terms(modes: Modes, bound_of: tuple[Any, Any]) -> tuple[FloatArray, FloatArray]:
     """Return gain, frequency and damping (k, 3) of modes between channels, and their static sum."""
     _, _, force, seen = channels(modes, *bound_of)
     gain = np.linalg.norm(force, axis=1) * np.linalg.norm(seen, axis=0)
@@ -336,7 +324,7 @@ def _peaks(terms: FloatArray) -> float:
         return float(gain @ peak_gains(omega, zeta))
 
 
-def _diagonal(
+def _modal_model(
     modes: Modes, names: list[str], method: str, bound: ErrorBound | None
 ) -> ReducedModel:
     """Return the reduced model whose coordinates are the modes themselves, equation (5)."""

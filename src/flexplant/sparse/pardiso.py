@@ -89,13 +89,13 @@ class PardisoCholesky:
     def _call(self, phase: int, b: FloatArray, x: FloatArray, columns: int) -> None:
         error = ctypes.c_int32(0)
         arguments = [
-            *(_number(v) for v in (1, 1, _POSITIVE_DEFINITE, phase, self._n)),
+            *(_pardiso_integer(v) for v in (1, 1, _POSITIVE_DEFINITE, phase, self._n)),
             *(a.ctypes.data_as(ctypes.c_void_p) for a in (self._entries, self._begin)),
             self._columns.ctypes.data_as(ctypes.c_void_p),
-            _number(0),
-            _number(columns),
+            _pardiso_integer(0),
+            _pardiso_integer(columns),
             self._options.ctypes.data_as(ctypes.c_void_p),
-            _number(0),
+            _pardiso_integer(0),
             *(a.ctypes.data_as(ctypes.c_void_p) for a in (b, x)),
         ]
         self._mkl.pardiso(
@@ -113,7 +113,7 @@ class PardisoCholesky:
             )
 
 
-def _number(value: int) -> Any:
+def _pardiso_integer(value: int) -> Any:
     return ctypes.byref(ctypes.c_int32(value))
 
 
@@ -121,11 +121,11 @@ def _release(mkl: Any, memory: Any, options: Any, n: int) -> None:
     nothing = [ctypes.byref(ctypes.c_int32(0)) for _ in range(6)]
     mkl.pardiso(
         memory.ctypes.data_as(ctypes.c_void_p),
-        *(_number(v) for v in (1, 1, _POSITIVE_DEFINITE, _RELEASE, n)),
+        *(_pardiso_integer(v) for v in (1, 1, _POSITIVE_DEFINITE, _RELEASE, n)),
         *nothing[:4],
-        _number(1),
+        _pardiso_integer(1),
         options.ctypes.data_as(ctypes.c_void_p),
-        _number(0),
+        _pardiso_integer(0),
         *nothing[4:],
         ctypes.byref(ctypes.c_int32(0)),
     )

@@ -53,11 +53,6 @@ class PointMass(Value):
         About its own centre and the axes x, y, z: it rides on the rotations that the model has (or
         that follow from its shapes) at a point.
 
-    Raises
-    ------
-    ModelError
-        When mass or inertia is negative.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -118,11 +113,6 @@ class Spring(Value):
     to : place, optional
         The other end; the ground when not given.
 
-    Raises
-    ------
-    ShapeError, ModelError
-        When the stiffness is no finite number.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -159,11 +149,6 @@ class Damper(Value):
     to : place, optional
         The other end; the ground when not given. A grounded damper slows rigid-body motions down:
         hold the structure by springs too, or modes and plants refuse it.
-
-    Raises
-    ------
-    ModelError
-        When the rate is negative.
 
     Examples
     --------

@@ -35,10 +35,6 @@ class Damping(Value):
         ----------
         omega : (k,) array [rad/s]
             Undamped frequencies.
-
-        Returns
-        -------
-        (k,) array [-]
         """
 
     def ratios(self, omega: FloatArray, shapes: FloatArray, K: Matrix, dofs: DofSet) -> FloatArray:
@@ -54,10 +50,6 @@ class Damping(Value):
             The stiffness of the structure.
         dofs : DofSet
             Its DOFs.
-
-        Returns
-        -------
-        (k,) array [-]
         """
         return self.zeta(omega)
 
@@ -78,11 +70,6 @@ class ModalDamping(Damping):
         What slows rigid-body motions down in ``FEModel.with_damping``: their velocity decays with
         this rate. `assemble_plant` takes such a model as it is, in dense form; `solve_modes`, whose
         rigid-body modes are at 0, refuses it.
-
-    Raises
-    ------
-    ModelError
-        When a ratio is negative, or 1 and more.
 
     Examples
     --------
@@ -221,11 +208,6 @@ class Rayleigh(Damping):
         Let alpha slow rigid-body motions down too, in ``FEModel.with_damping``: D is then
         ``alpha M + beta K`` as it stands. `assemble_plant` takes such a model as it is, in dense
         form; `solve_modes`, whose rigid-body modes are at 0, refuses it.
-
-    Raises
-    ------
-    ModelError
-        When alpha or beta is negative.
 
     References
     ----------

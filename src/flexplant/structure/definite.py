@@ -20,7 +20,7 @@ from ..sparse.factor import (
     is_positive_definite,
     unit_diagonal,
 )
-from ..sparse.rayleigh_ritz import rounding_of
+from ..sparse.lanczos import rounding_of
 
 #: what becomes a matrix of a structure
 MatrixLike: TypeAlias = "npt.ArrayLike | sp.sparray | sp.spmatrix"
@@ -59,7 +59,7 @@ def symmetric(given: Any, name: str, n: int) -> Matrix:
         matrix = sp.csc_array((entries, indices, pointer), shape=(n, n))
     else:
         matrix = real_array(value, name, (n, n))
-    if sp.issparse(matrix) and _mirrored(matrix):
+    if sp.issparse(matrix) and _equals_transpose(matrix):
         return cast(Matrix, matrix)
     scaled, _ = unit_diagonal(matrix)
     skew: Any = abs(scaled - scaled.T)
@@ -74,7 +74,7 @@ def symmetric(given: Any, name: str, n: int) -> Matrix:
     return cast(Matrix, matrix)
 
 
-def _mirrored(matrix: Any) -> bool:
+def _equals_transpose(matrix: Any) -> bool:
     """Return whether a sparse matrix equals its transpose to the bit, entry by entry."""
     matrix.sum_duplicates()
     other: Any = sp.csc_array(matrix.T)

@@ -12,7 +12,7 @@ from ..checks import FloatArray
 from ..errors import ModelError
 from ..labels import DofSet
 from ..sparse.factor import DENSE_LIMIT, dense, unit_diagonal
-from ..sparse.rayleigh_ritz import rayleigh_ritz, rounding_of, soft_group
+from ..sparse.lanczos import rayleigh_ritz, rounding_of, soft_group
 from ..tolerances import TYPED
 from .definite import are_rigid, signed_root
 from .zero_energy import beyond, most_moved

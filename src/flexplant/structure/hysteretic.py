@@ -51,11 +51,6 @@ class Hysteretic(Damping):
         `LossRegion`. They must not overlap. An exported matrix of structural damping (Nastran's K4)
         is one of loss factor 1, beside a `loss_factor` of 0.
 
-    Raises
-    ------
-    ModelError
-        When a loss factor is not in [0, 2), or a region is none.
-
     References
     ----------
     [Ewins2000]_, sections 2.4 and 2.7; [JohnsonKienholz1982]_.
@@ -273,11 +268,6 @@ class LossRegion(Value):
     stiffness : (n, n) array or sparse matrix [N/m, ...], Spring or sequence of Spring
         K_i, part of the structure's K and over the same DOFs; or springs that K has already. Of
         joints, what they add: the machine's K less that of one joined with ``stiffness=0`` there.
-
-    Raises
-    ------
-    ModelError, ShapeError
-        When the loss factor is not in [0, 2), or the stiffness is none.
 
     Examples
     --------

@@ -109,11 +109,13 @@ class Units:
 def units(length: Any = "m", mass: Any = "kg", time: Any = "s") -> Units:
     """Return a unit system by the names of its units, or by their size in SI."""
     return Units(
-        _size(length, "length", LENGTHS), _size(mass, "mass", MASSES), _size(time, "time", TIMES)
+        _unit_size(length, "length", LENGTHS),
+        _unit_size(mass, "mass", MASSES),
+        _unit_size(time, "time", TIMES),
     )
 
 
-def _size(given: Any, name: str, known: Mapping[str, float]) -> float:
+def _unit_size(given: Any, name: str, known: Mapping[str, float]) -> float:
     if not isinstance(given, str):
         return positive(given, name)
     if given not in known:

@@ -14,8 +14,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..sparse.factor import by_rows, dense
 from ..sparse.lowest import PRECISION, ROUNDING
 from ..tolerances import divisor
-from .rigid import farness, orthonormalised, rigid_motions
-from .soft_springs import bodies, unheld
+from .rigid import bodies, farness, orthonormalised, rigid_motions, unheld
 
 #: times the energy that rounding of the entries allows: free
 _MARGIN = 3.0

@@ -15,7 +15,7 @@ from ..modes import solve_modes
 from ..modes.dynamic_basis import static_shapes
 from ..modes.sparse_modes import counted_modes
 from ..reduction import ReducedModel
-from ..sparse.rayleigh_ritz import beyond
+from ..sparse.lanczos import beyond
 from ..structure.attachments import summed
 from ..structure.model import FEModel
 from .parameters.added import Parameter, PointParameter

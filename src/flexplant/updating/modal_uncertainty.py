@@ -10,8 +10,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, Value, instance
 from ..errors import ModelError, counted
-from ..modes.calibration import measured_poles
-from ..modes.mesh_error import MeshError
+from ..modes.modes import MeshError, measured_poles
 from ..tolerances import divisor
 from .discrepancy import restricted
 from .residuals.eigenvalues import USUAL, ZETA, Eigenvalues, growth

@@ -138,14 +138,14 @@ class Gallery:
             try:
                 draw()
                 new = [n for n in plt.get_fignums() if n not in open_before]
-                parts = [_drawn(plt.figure(n), prefix, caption) for n in new]
+                parts = [_picture_html(plt.figure(n), prefix, caption) for n in new]
             finally:
                 for n in set(plt.get_fignums()) - open_before:
                     plt.close(n)
         return "".join(parts)
 
 
-def _drawn(figure: Figure, prefix: str, caption: str) -> str:
+def _picture_html(figure: Figure, prefix: str, caption: str) -> str:
     file = io.StringIO()
     figure.savefig(file, format="svg", metadata=dict.fromkeys(_METADATA))
     image = _inline(file.getvalue(), prefix, caption)
@@ -209,7 +209,7 @@ def _panel(ax: Axes, width: float, height: float) -> dict[str, Any] | None:
         return None
     box = ax.get_position()
     scales = [
-        _scale(axis, limits)
+        _axis_scale(axis, limits)
         for axis, limits in ((ax.xaxis, ax.get_xlim()), (ax.yaxis, ax.get_ylim()))
     ]
     if not any(scales):
@@ -218,7 +218,7 @@ def _panel(ax: Axes, width: float, height: float) -> dict[str, Any] | None:
     return {"box": [round(c, 2) for c in corners], "x": scales[0], "y": scales[1]}
 
 
-def _scale(axis: Any, limits: tuple[float, float]) -> list[Any] | None:
+def _axis_scale(axis: Any, limits: tuple[float, float]) -> list[Any] | None:
     """Return (low, high, whether logarithmic, label) of an axis of numbers."""
     kind, formatter = axis.get_scale(), axis.get_major_formatter()
     if kind not in ("linear", "log") or isinstance(formatter, FixedFormatter | FuncFormatter):

@@ -14,9 +14,8 @@ from ...errors import FlexplantError, ModelError, counted
 from ...loop import ClosedLoop, ErrorBudget, LoopFigures, compare_loops, report_loops
 from ...plant import StandardPlant
 from ...simulation import ExposureErrors, Verdict
-from ..budget import budget
-from ..nyquist import nyquist
-from ..sensitivity import sensitivity
+from ..errors import budget
+from ..loops import nyquist, sensitivity
 from .page import Chapter, Gallery, note, table, tiles
 
 Tile = tuple[str, str, str, str]
@@ -31,7 +30,7 @@ def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | N
     compared = compare_loops(loops)
     main = channel or next((n for n in loop.plant.z if n.endswith(":error")), loop.plant.z[0])
     found, why = _budget(loop, main)
-    parts = [tiles([_error(main, found), *_stability(loop), *_margins(compared.rows[name])])]
+    parts = [tiles([_error_tile(main, found), *_stability(loop), *_margins(compared.rows[name])])]
     for verdict in design.of(Verdict).values():
         said = "The specification is met."
         if not verdict.passed:
@@ -91,7 +90,7 @@ def _budget(loop: ClosedLoop, channel: str) -> tuple[ErrorBudget | None, str]:
         return None, f"No error budget: {error}"
 
 
-def _error(channel: str, found: ErrorBudget | None) -> Tile:
+def _error_tile(channel: str, found: ErrorBudget | None) -> Tile:
     if found is None:
         return (f"{channel}, rms", "none", "see below", "bad")
     beside, kind = "modes left out: not known", ""
@@ -164,8 +163,8 @@ class Design:
 
     def __init__(self, parts: Sequence[Any]) -> None:
         self.named: dict[str, Any] = {}
-        for name, value in _listed(parts):
-            own = name or _free(type(value).__name__, self.named)
+        for name, value in _named_parts(parts):
+            own = name or _free_name(type(value).__name__, self.named)
             if own in self.named:
                 raise ModelError(f"two parts of the report are named {own!r}: rename one.")
             self.named[own] = value
@@ -185,7 +184,7 @@ class Design:
         return next(iter([*own, *(loop.plant for loop in self.of(ClosedLoop).values())]), None)
 
 
-def _listed(parts: Sequence[Any]) -> Iterator[tuple[str, Any]]:
+def _named_parts(parts: Sequence[Any]) -> Iterator[tuple[str, Any]]:
     for part in parts:
         named = isinstance(part, Mapping) and not isinstance(part, Value)
         for name, value in part.items() if named else [("", part)]:
@@ -197,6 +196,6 @@ def _listed(parts: Sequence[Any]) -> Iterator[tuple[str, Any]]:
             yield str(name), value
 
 
-def _free(name: str, taken: Mapping[str, Any]) -> str:
+def _free_name(name: str, taken: Mapping[str, Any]) -> str:
     numbers = (f" {i}" if i > 1 else "" for i in range(1, len(taken) + 2))
     return next(f"{name}{number}" for number in numbers if f"{name}{number}" not in taken)

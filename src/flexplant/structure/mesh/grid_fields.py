@@ -13,7 +13,7 @@ import numpy as np
 from ...checks import FloatArray, Value, positive, real_array, short, whole
 from ...errors import ModelError, ShapeError
 from ...labels import DofSet, Interpolation
-from .grid_matrices import Grid
+from .element_matrices import Grid
 
 #: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre
 Field: TypeAlias = "float | Sequence[Any] | FloatArray | Callable[..., float]"
@@ -27,11 +27,6 @@ class Rectangle(Value):
     ----------
     lower, upper : (2,) array [m]
         Its corners of smallest and largest x, y.
-
-    Raises
-    ------
-    ModelError
-        When upper is not above lower.
 
     Examples
     --------
@@ -70,11 +65,6 @@ class Disc(Value):
         Its middle.
     radius : float [m]
         Above 0.
-
-    Raises
-    ------
-    ModelError
-        When the radius is not positive.
 
     Examples
     --------
@@ -216,7 +206,7 @@ def present_of(
 
     if holes is None or (isinstance(holes, Sequence) and not len(holes)):
         return None
-    missing = _missing(holes, lengths, counts)
+    missing = _hole_mask(holes, lengths, counts)
     present = ~missing.reshape(tuple(counts[::-1]))
     if present.all():
         return None
@@ -231,7 +221,7 @@ def present_of(
     return present
 
 
-def _missing(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> Any:
+def _hole_mask(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> Any:
     if not isinstance(holes, Hole) and not callable(holes):
         given = np.asarray(holes) if not isinstance(holes, set) else np.array(None)
         if given.dtype == bool:

@@ -11,8 +11,7 @@ import scipy.sparse as sp
 
 from ...checks import FloatArray, IntArray, Value, positive, real_array
 from ...errors import ModelError
-from .element_matrices import beam_mass, beam_rotary, beam_stiffness
-from .grid_matrices import Grid
+from .element_matrices import Grid, beam_mass, beam_rotary, beam_stiffness
 
 #: of an element: a rib's ends are this close to nodes
 _ON_NODE = 1e-6
@@ -62,11 +61,6 @@ class Rib(Value):
         standing on the plate, otherwise 0 when not given.
     density, youngs_modulus, poisson_ratio : float, optional
         Of its material; that of the plate under it when not given.
-
-    Raises
-    ------
-    ModelError
-        When it is not along x or y, has no section or two, or a number is not positive.
 
     References
     ----------
@@ -161,9 +155,9 @@ def rib_matrices(
     for rib in ribs:
         axis, first, second, under = _edges(grid, lengths, rib)
         h = lengths[axis] / grid.counts[axis]
-        thickness = _beside(skin.thickness, under)
+        thickness = _mean_beside_edges(skin.thickness, under)
         own = {
-            name: _beside(getattr(skin, name), under)
+            name: _mean_beside_edges(getattr(skin, name), under)
             if getattr(rib, name) is None
             else np.full(first.size, float(getattr(rib, name)))
             for name in ("density", "youngs_modulus", "poisson_ratio")
@@ -235,7 +229,7 @@ def _edges(
     return axis, first, first + stride[axis], sides
 
 
-def _beside(value: Any, sides: list[IntArray]) -> FloatArray:
+def _mean_beside_edges(value: Any, sides: list[IntArray]) -> FloatArray:
     """Return the mean of a property over the elements on both sides of each edge."""
     if np.ndim(value) == 0:
         return np.full(sides[0].size, float(value))

@@ -14,8 +14,14 @@ from ...checks import FloatArray, real_array
 from ...errors import LabelError, counted
 from ...labels import Interpolation
 from ...tolerances import SAME
-from .element_matrices import brick_shape, brick_slopes, hermite, plate_coefficients, plate_terms
-from .grid_matrices import Grid
+from .element_matrices import (
+    Grid,
+    brick_shape,
+    brick_slopes,
+    hermite,
+    plate_coefficients,
+    plate_terms,
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -122,7 +128,7 @@ class PlateShape(GridShape):
             )
         point = real_array(xyz, "xyz", (3,))
         slack = SAME * max(self.size)
-        if not _inside(point[:2], self.size, slack):
+        if not _is_inside(point[:2], self.size, slack):
             raise self._off(point, float(np.max(self.thickness)))
         element, (s, t), (a, b) = self._located(point, self.size, lambda: self._in_hole(point))
         thick: Any = self.thickness
@@ -218,7 +224,7 @@ class BeamShape(GridShape):
             raise LabelError(f"a beam in bending has no motion {direction!r}: use one of z, ry.")
         point = real_array(xyz, "xyz", (3,))
         slack = SAME * self.length
-        if not _inside(point[:1], (self.length,), slack) or np.abs(point[1:]).max() > slack:
+        if not _is_inside(point[:1], (self.length,), slack) or np.abs(point[1:]).max() > slack:
             raise LabelError(
                 f"the point {tuple(point.tolist())} is off the beam, whose axis reaches from "
                 f"(0, 0, 0) to ({self.length:g}, 0, 0) m: its motion is not known. Coordinates are "
@@ -284,7 +290,7 @@ class BlockShape(GridShape):
                 f"(0, 0, 0) to {self.size} m: its motion is not known. Coordinates are in metres."
             )
 
-        if not _inside(point, self.size, SAME * max(self.size)):
+        if not _is_inside(point, self.size, SAME * max(self.size)):
             raise off("outside")
         element, inside, sizes = self._located(point, self.size, lambda: off("in a hole of"))
         kind = _BLOCK_MOTIONS.index(direction)
@@ -311,5 +317,5 @@ def _plate_weights(direction: str, s: Any, t: Any, a: float, b: float) -> FloatA
     return np.asarray(terms @ plate_coefficients(a, b))
 
 
-def _inside(point: FloatArray, lengths: Sequence[float], slack: float) -> bool:
+def _is_inside(point: FloatArray, lengths: Sequence[float], slack: float) -> bool:
     return bool(np.all(point >= -slack) and np.all(point <= np.array(lengths) + slack))

@@ -1,24 +1,185 @@
-"""Criteria over several machines, and after the loss of a device."""
+"""Criteria made of others: with a penalty, over several machines, after the loss of a device."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
-from ..checks import FloatArray, checked, one_of, short
-from ..errors import FlexplantError, ModelError
-from ..plant import StandardPlant
+from ..checks import FloatArray, checked, function, one_of, positive, short
+from ..errors import AssumptionError, FlexplantError, ModelError
+from ..plant import StandardPlant, larger_plant
+from ..tolerances import TINY
 from .candidates import SIDES, Port, checked_plant, side_of, sides_of, with_side
-from .criterion import Scorer, Wrapping
+from .criterion import Criterion, Scorer, Wrapping, as_criterion
+from .gramian import Shapes, shapes_of
 from .layouts import RigidPart
+
+
+@dataclass(frozen=True, eq=False)
+class Share(Scorer):
+    """A sum over the chosen of one worth over that of another."""
+
+    parts: FloatArray
+    wholes: FloatArray
+
+    def value(self, chosen: Sequence[int]) -> float:
+        """Return it for one choice."""
+        kept = list(chosen)
+        return float(np.sum(self.parts[kept]) / max(float(np.sum(self.wholes[kept])), TINY))
+
+    def bound(self, count: int, required: Sequence[int]) -> float:
+        """Return 0."""
+        return 0.0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LeftOutModes(Criterion):
+    """Share of the modes left out of the plant in what devices measure or excite.
+
+    ``sum_i sum_k phi_ik^2 / (4 zeta_k omega_k^3)`` over the elastic modes left out, over the same
+    sum for those of the plant: squared H2 norms of the modes. A controller that is fast there
+    excites the former by spill-over.
+
+    Parameters
+    ----------
+    larger : Modes, FEModel or ReducedModel, optional
+        The structure with more modes; None: those of the plant's reduced model beyond those kept.
+    of : {"sensors", "actuators"}
+        Of which devices, when it is called on a plant.
+
+    Raises
+    ------
+    ModelError
+        When `of` is none of these; when called, when larger is no structure.
+    AssumptionError
+        When called, where no modes left out are known.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.placement.LeftOutModes(of="sensors")
+    LeftOutModes(of='sensors')
+    """
+
+    scale: ClassVar[float] = 1e-6
+    larger: Any = None
+    of: str = field(default="sensors", kw_only=True, metadata=checked(one_of, choices=SIDES))
+
+    def __call__(self, plant: StandardPlant) -> float:
+        """Return the share of the plant's own sensors or actuators."""
+        own = getattr(plant.assembled.ports, SIDES[self.of])
+        return float(self.scorer(plant, own).value(range(len(own))))
+
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+        """Return the share of choices among candidates of this kind; others do not count."""
+        own = [side_of(port) == SIDES[self.of] for port in candidates]
+        counted = np.array(own, dtype=np.float64)
+        whole = larger_plant(plant, self.larger)
+        kept = shapes_of(plant, candidates)
+        more = None if whole is None else shapes_of(whole, candidates)
+        if more is None or more.omega.size <= kept.omega.size:
+            raise AssumptionError(
+                "no modes left out of the plant are known: pass LeftOutModes(larger), the "
+                "structure with more modes."
+            )
+        # modes are in order of their frequency: the plant has the first of them
+        beyond = more.omega > 1.0001 * np.max(kept.omega)
+        return Share(counted * _worth(more, beyond), counted * _worth(kept, kept.omega > 0))
+
+
+@dataclass(frozen=True, eq=False)
+class PenalisedScores(Scorer):
+    """``J + weight |J| penalty`` of the same choices."""
+
+    base: Scorer
+    penalty: Scorer
+    weight: float
+
+    def value(self, chosen: Sequence[int]) -> float:
+        """Return it for one choice."""
+        return float(
+            _penalised_sum(self.base.value(chosen), self.penalty.value(chosen), self.weight)
+        )
+
+    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
+        """Return it for several choices."""
+        values = self.base.score(sets)
+        finite = np.flatnonzero(np.isfinite(values)).tolist()
+        more = self.penalty.score([sets[i] for i in finite])
+        values[finite] = _penalised_sum(values[finite], more, self.weight)
+        return values
+
+    def bound(self, count: int, required: Sequence[int]) -> float:
+        """Return the bound without a penalty, or with the least one."""
+        base = self.base.bound(count, required)
+        least = max(self.penalty.bound(count, required), 0.0)
+        return float(_penalised_sum(base, least, self.weight)) if base >= 0 else base
+
+
+@dataclass(frozen=True, eq=False)
+class Penalised(Wrapping):
+    """``J + weight |J| penalty``: a criterion that grows by a part of itself.
+
+    Parameters
+    ----------
+    criterion : Criterion or callable
+        J, from plant to float.
+    penalty : Criterion or callable
+        From plant to float, 0 or more, such as `LeftOutModes`.
+    weight : float
+        Of the penalty.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> sensors = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> cautious = fx.placement.Penalised(fx.PoiVariance(), penalty=lambda plant: 0.1)
+    >>> fx.place_sensors(plant, sensors, 1, cautious).chosen
+    ('s1',)
+    """
+
+    penalty: Any = None
+    weight: float = field(default=1.0, metadata=checked(positive))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        function(self.penalty, "a penalty", "Name one.")
+
+    def __call__(self, plant: StandardPlant) -> float:
+        """Return it on a plant."""
+        return float(_penalised_sum(self.criterion(plant), self.penalty(plant), self.weight))
+
+    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+        """Check both."""
+        super().check(plant, candidates)
+        as_criterion(self.penalty, sides_of(candidates)).check(plant, candidates)
+
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+        """Return the scores of choices by those of both."""
+        base, more = self.inner, as_criterion(self.penalty)
+        return PenalisedScores(
+            base.scorer(plant, candidates), more.scorer(plant, candidates), self.weight
+        )
+
+
+def _penalised_sum(value: Any, penalty: Any, weight: float) -> Any:
+    return value + weight * np.abs(value) * penalty
+
+
+def _worth(shapes: Shapes, which: npt.NDArray[np.bool_]) -> FloatArray:
+    omega, zeta = shapes.omega[which], shapes.zeta[which]
+    return np.asarray(np.sum(shapes.phi[:, which] ** 2 / (4.0 * zeta * omega**3), axis=1))
+
 
 _MEASURES = ("worst", "mean")
 
 
-def _plants(machines: Any, name: str) -> tuple[StandardPlant, ...]:
+def _checked_machines(machines: Any, name: str) -> tuple[StandardPlant, ...]:
     """Return the machines of a criterion, one at least."""
     if isinstance(machines, str) or not isinstance(machines, Sequence) or not machines:
         raise ModelError(
@@ -64,12 +225,6 @@ class OverMachines(Wrapping):
     measure : {"worst", "mean"}
         Over the machines.
 
-    Raises
-    ------
-    ModelError
-        When there are no machines, one of them is no sampled plant, the measure is none of these,
-        or the criterion is not callable.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -80,7 +235,7 @@ class OverMachines(Wrapping):
     ('s1',)
     """
 
-    machines: Sequence[StandardPlant] = field(metadata=checked(_plants))
+    machines: Sequence[StandardPlant] = field(metadata=checked(_checked_machines))
     measure: str = field(default="worst", kw_only=True, metadata=checked(one_of, choices=_MEASURES))
 
     def __repr__(self) -> str:
@@ -142,11 +297,6 @@ class AfterLoss(Wrapping):
         Which devices may be lost.
     measure : {"worst", "mean"}
         Over the devices.
-
-    Raises
-    ------
-    ModelError
-        When `of` or the measure is none of these, or the criterion not callable.
 
     Examples
     --------

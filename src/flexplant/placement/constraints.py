@@ -1,10 +1,11 @@
-"""Constraints by name: all or none, mirror images, so many among some, a budget."""
+"""Constraints by name (all or none, so many, a budget) and on where devices may be."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from ..checks import (
     whole,
 )
 from ..errors import LabelError, ModelError
+from ..structure import Disc
 from .candidates import Places, Zone
 from .rows import LinearRows
 
@@ -60,11 +62,6 @@ class Together(Constraint):
     ----------
     groups : sequence of sequences of str
         Names, two or more in each group.
-
-    Raises
-    ------
-    LabelError
-        When a group has fewer than two names; when used, for an unknown name.
 
     Examples
     --------
@@ -111,11 +108,6 @@ class Mirrored(Constraint):
     at : float [m]
         Where the plane is.
 
-    Raises
-    ------
-    ModelError
-        When the axis is none of these or the place no number.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -138,7 +130,7 @@ class Mirrored(Constraint):
             image = points.copy()
             image[:, k] = 2.0 * self.at - image[:, k]
             images.append(image)
-        near = np.array([[_apart(p, q) for q in images] for p in places.points])
+        near = np.array([[_largest_distance(p, q) for q in images] for p in places.points])
         found = near.argmin(axis=1)
         lone = near.min(axis=1) > places.same
         pairs = [(i, int(j)) for i, j in enumerate(found) if i < j and not lone[i]]
@@ -155,13 +147,6 @@ class Among(Constraint):
         Candidates.
     at_least, at_most : int, optional
         How many of them.
-
-    Raises
-    ------
-    ModelError
-        When a count is no whole number, or at_least is above at_most.
-    LabelError
-        When these are no names; when used, for an unknown name.
 
     Examples
     --------
@@ -188,7 +173,7 @@ class Among(Constraint):
         return LinearRows.counted(row, self.at_least, self.at_most)
 
 
-def _apart(points: FloatArray, others: FloatArray) -> float:
+def _largest_distance(points: FloatArray, others: FloatArray) -> float:
     """Return the largest distance from any point of one set to the other; inf if sizes differ."""
     if len(points) != len(others):
         return np.inf
@@ -208,13 +193,6 @@ class Budget(Constraint):
         Cost of candidates by name.
     default : float
         Cost of the others.
-
-    Raises
-    ------
-    ModelError
-        When a number is negative.
-    LabelError
-        When used, for an unknown name.
 
     Examples
     --------
@@ -242,3 +220,185 @@ class Budget(Constraint):
         places.index(list(self.costs), "candidate with a cost")
         costs = np.array([self.costs.get(name, self.default) for name in places.names])
         return LinearRows(costs[None], np.array([0.0]), np.array([self.total]))
+
+
+def _zones(given: Any, name: str) -> tuple[Zone, ...]:
+    listed = (given,) if isinstance(given, Zone) or not isinstance(given, Sequence) else given
+    for zone in listed:
+        if not isinstance(zone, Zone):
+            raise ModelError(
+                f"{name} is a Rectangle or a Disc, got {short(zone)}. Type "
+                "Disc((0.3, 0.3), radius=0.05)."
+            )
+    if not listed:
+        raise ModelError(f"there is no zone: {name} is a Rectangle or a Disc. Give one.")
+    return tuple(listed)
+
+
+@dataclass(frozen=True, eq=False)
+class Excluded(Constraint):
+    """Zones in which no candidate is chosen, seen from above.
+
+    Parameters
+    ----------
+    zones : Rectangle, Disc or sequence of them
+        At least one.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> off = fx.placement.Excluded(fx.Disc((0.0, 0.0), radius=0.5))  # where the first mass is
+    >>> fx.place_sensors(plant, candidates, 1, constraints=[off]).chosen
+    ('s3',)
+    """
+
+    zones: Zone | Sequence[Zone] = field(metadata=checked(_zones, name="an excluded zone"))
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return x_i <= 0 inside."""
+        return LinearRows.closed(places.inside(_zone_list(self.zones)) > 0)
+
+    def drawn(self, places: Places) -> tuple[Zone, ...]:
+        """Return the zones."""
+        return _zone_list(self.zones)
+
+
+@dataclass(frozen=True, eq=False)
+class OffPoi(Constraint):
+    """No candidate on a POI: what is there cannot be measured.
+
+    Sensors are never placed on the point of a POI. A radius keeps them off the whole die; a
+    negative one allows all places.
+
+    Parameters
+    ----------
+    radius : float [m]
+        Candidates with a point no farther from any POI are excluded.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> anywhere = fx.placement.OffPoi(-1)  # the middle mass, where the POI is, is free too
+    >>> fx.place_sensors(plant, candidates, 1, constraints=[anywhere]).chosen
+    ('s2',)
+    """
+
+    radius: float = field(default=0.0, metadata=checked(number))
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return x_i <= 0 near a POI."""
+        if self.radius < 0 or not places.pois:
+            return LinearRows.closed(np.zeros(places.total, dtype=bool))
+        near = places.distances(places.pois).min(axis=1)
+        return LinearRows.closed(near <= self.radius + places.same)
+
+    def drawn(self, places: Places) -> tuple[Zone, ...]:
+        """Return discs about the POIs."""
+        if self.radius <= 0:
+            return ()
+        return tuple(Disc(point[:2], self.radius) for poi in places.pois for point in poi)
+
+
+@dataclass(frozen=True, eq=False)
+class Within(Constraint):
+    """Limits on how many chosen candidates lie in zones, seen from above; by default all do.
+
+    Parameters
+    ----------
+    zones : Rectangle, Disc or sequence of them
+        At least one; their union counts.
+    at_least, at_most : int, optional
+        How many. A candidate is inside when any of its points is.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> right = fx.placement.Within(fx.Rectangle((1.5, -1.0), (2.5, 1.0)), at_least=1)
+    >>> fx.place_sensors(plant, candidates, 1, constraints=[right]).chosen
+    ('s3',)
+    """
+
+    zones: Zone | Sequence[Zone] = field(metadata=checked(_zones, name="a zone"))
+    at_least: int | None = field(default=None, kw_only=True, metadata=checked(whole, minimum=0))
+    at_most: int | None = field(default=None, kw_only=True, metadata=checked(whole, minimum=0))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_limits(self.at_least, self.at_most)
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return the count inside between its check_limits, or x_i <= 0 outside."""
+        inside = places.inside(_zone_list(self.zones))
+        if self.at_least is None and self.at_most is None:
+            return LinearRows.closed(inside == 0)
+        return LinearRows.counted(inside, self.at_least, self.at_most)
+
+
+def _zone_list(zones: Zone | Sequence[Zone]) -> tuple[Zone, ...]:
+    return (zones,) if isinstance(zones, Zone) else tuple(zones)
+
+
+@dataclass(frozen=True, eq=False)
+class MinimumDistance(Constraint):
+    """A smallest distance between any two chosen candidates.
+
+    Parameters
+    ----------
+    distance : float [m]
+        Between the nearest points of the two.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> apart = fx.placement.MinimumDistance(1.5)
+    >>> fx.place_sensors(plant, candidates, 2, constraints=[apart]).chosen
+    ('s1', 's3')
+    """
+
+    distance: float = field(metadata=checked(positive))
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return x_i + x_j <= 1 for each pair that is too close."""
+        close = places.distances(places.points) < self.distance - places.same
+        first, second = np.nonzero(np.triu(close, 1))
+        pairs = np.zeros((first.size, places.total))
+        line = np.arange(first.size)
+        pairs[line, first] = pairs[line, second] = 1.0
+        return LinearRows(pairs, np.zeros(first.size), np.ones(first.size))
+
+
+def rows_of(constraints: Any, places: Places, side: str) -> LinearRows:
+    """Return the rows of all constraints, OffPoi() among them for sensors unless one is given."""
+    return LinearRows.stacked([c.rows(places) for c in all_of(constraints, side)], places.total)
+
+
+def all_of(constraints: Any, side: str) -> tuple[Constraint, ...]:
+    """Return constraints as a tuple, OffPoi() among them for sensors unless one is given."""
+    given = constraints_of(constraints)
+    usual = "y" in side and not any(isinstance(item, OffPoi) for item in given)
+    return (*given, OffPoi()) if usual else given
+
+
+def constraints_of(constraints: Any) -> tuple[Constraint, ...]:
+    """Return a constraint, or several, as a tuple."""
+    given = (constraints,) if isinstance(constraints, Constraint) else constraints
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        raise ModelError(
+            f"constraints are a list of Excluded(...), MinimumDistance(...) and others, got "
+            f"{short(given)}. Put them in a list."
+        )
+    for item in given:
+        if not isinstance(item, Constraint):
+            raise ModelError(
+                f"a constraint is Excluded(...), MinimumDistance(...) or another such value, got "
+                f"{short(item)}. Write Excluded(Disc((0.3, 0.3), radius=0.05)), say."
+            )
+    return tuple(given)

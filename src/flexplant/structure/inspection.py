@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, Value
-from ...errors import ModelError, counted
-from ...parallel import Progress
-from ..matrices import FEMatrices
-from ..model import FEModel
-from ..precision import held_motions, verdict
-from ..zero_energy import nearly_free
+from ..checks import FloatArray, Value
+from ..errors import ModelError, counted
+from ..parallel import Progress
 from .check_facts import Facts, facts
 from .check_lines import Line, listed, masses, matrices, rigid, scales, spread, zero_rows
+from .matrices import FEMatrices
+from .model import FEModel
+from .precision import held_motions, verdict
+from .zero_energy import nearly_free
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -115,10 +115,6 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
     ----------
     model : FEModel or FEMatrices
         What is checked; matrices as a file holds them may be wrong in any way.
-
-    Returns
-    -------
-    ModelCheck
 
     Raises
     ------

@@ -8,19 +8,18 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...checks import FloatArray, IntArray
-from ...errors import ModelError, SolverError
-from ...sparse.factor import by_rows, diagonal, is_positive_definite, unit_diagonal
-from ...sparse.lowest import PRECISION, ROUNDING, Lowest, lowest_modes
-from ...tolerances import SAME, divisor
-from ..definite import are_rigid, are_swapped, unstable_stiffness
-from ..matrices import FEMatrices
-from ..model import FEModel
-from ..precision import loss, shown_digits
-from ..rigid import RigidMass, farness, orthonormalised, rigid_mass, rigid_motions
-from ..singular_mass import empty_rows, left_out, null_motions
-from ..soft_springs import pieces, unheld
-from ..zero_energy import ZeroEnergy, beyond, own_motions, zero_energy
+from ..checks import FloatArray, IntArray
+from ..errors import ModelError, SolverError
+from ..sparse.factor import by_rows, diagonal, is_positive_definite, unit_diagonal
+from ..sparse.lowest import PRECISION, ROUNDING, Lowest, lowest_modes
+from ..tolerances import SAME, divisor
+from .definite import are_rigid, are_swapped, unstable_stiffness
+from .matrices import FEMatrices
+from .model import FEModel
+from .precision import loss, shown_digits
+from .rigid import RigidMass, farness, orthonormalised, pieces, rigid_mass, rigid_motions, unheld
+from .singular_mass import empty_rows, left_out, null_motions
+from .zero_energy import ZeroEnergy, beyond, own_motions, zero_energy
 
 #: requested from the solver: six rigid-body motions and some elastic modes, a few beside more
 _MODES, _FEW = 10, 4
@@ -121,7 +120,7 @@ def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
                 joint_motions=None if model is None else model.joint_motions,
             )
         written = 0.0 if digits is None else 10.0**-digits
-        lowest, scaled, failure = _lowest(
+        lowest, scaled, failure = _try_lowest_modes(
             given, K, M, there, loose, bool(mass_definite), written, motions
         )
     if lowest is not None and motions is not None:
@@ -153,7 +152,7 @@ def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
         loss=None if lowest is None or digits is None else loss(lowest, digits),
         digits=digits,
         swapped=swapped,
-        damping={} if D is None else _damping(D, motions, proven),
+        damping={} if D is None else _damping_facts(D, motions, proven),
     )
 
 
@@ -236,7 +235,7 @@ def _of_springs(K: Any, M: Any, lowest: Lowest, motions: ZeroEnergy) -> tuple[Lo
     return springs, pulled if np.all(are_rigid(M, every, springs.negative[1])) else 0
 
 
-def _lowest(
+def _try_lowest_modes(
     given: FEMatrices,
     K: Any,
     M: Any,
@@ -299,7 +298,7 @@ def _lowest(
     return every, scaled, ""
 
 
-def _damping(D: Any, motions: ZeroEnergy | None, proven: bool) -> dict[str, Any]:
+def _damping_facts(D: Any, motions: ZeroEnergy | None, proven: bool) -> dict[str, Any]:
     kept = np.flatnonzero(~empty_rows(D))
     definite = proven or not kept.size or is_positive_definite(D[kept][:, kept], SAME)
     drag = 0.0

@@ -8,14 +8,14 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import FloatArray
-from ...errors import counted
-from ...labels import DIRECTIONS, DofSet
-from ...sparse.factor import diagonal
-from ...tolerances import TYPED
-from ..rigid import rigid_motions
-from ..zero_energy import ZeroEnergy, most_moved
+from ..checks import FloatArray
+from ..errors import counted
+from ..labels import DIRECTIONS, DofSet
+from ..sparse.factor import diagonal
+from ..tolerances import TYPED
 from .check_facts import Facts
+from .rigid import rigid_motions
+from .zero_energy import ZeroEnergy, most_moved
 
 #: verdict, subject, finding, next step
 Line: TypeAlias = tuple[str, str, str, str]

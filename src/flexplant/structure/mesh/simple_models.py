@@ -1,0 +1,390 @@
+"""Machines of simple form: chains, straight beams, rectangular plates, blocks of bricks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from ...checks import (
+    FloatArray,
+    frozen,
+    members,
+    one_of,
+    positive,
+    positive_array,
+    real_array,
+    short,
+)
+from ...errors import ModelError, ShapeError
+from ...labels import DofSet
+from ..model import FEModel
+from .element_matrices import (
+    Grid,
+    beam_mass,
+    beam_stiffness,
+    brick_mass,
+    brick_stiffness,
+    plate_mass,
+    plate_stiffness,
+)
+from .grid_fields import (
+    Field,
+    Hole,
+    counts_of,
+    dofs_of,
+    field_of,
+    lengths_of,
+    poisson_of,
+    present_of,
+    share_of,
+)
+from .ribs import Rib, Skin, rib_matrices
+from .shapes import BeamShape, BlockShape
+from .shapes import PlateShape as PlateShape
+
+
+def chain(
+    *,
+    masses: Sequence[float] | FloatArray,
+    stiffnesses: Sequence[float] | FloatArray,
+    dampings: Sequence[float] | FloatArray | None = None,
+    ground: float | Sequence[float] | FloatArray = 0.0,
+    spacing: float = 1.0,
+    name: str | None = None,
+) -> FEModel:
+    """Return masses in a row along x, springs and dampers between neighbours.
+
+    ``m_i x_i'' = k_{i-1} (x_{i-1} - x_i) + k_i (x_{i+1} - x_i) - g_i x_i``, likewise with dampers.
+
+    Parameters
+    ----------
+    masses : (n,) array [kg]
+        The masses; their DOFs are "1:x", "2:x", ...
+    stiffnesses : (n - 1,) array [N/m]
+        Between neighbours.
+    dampings : (n - 1,) array [N s/m], optional
+        Between neighbours; without them the model has no D.
+    ground : float or (n,) array [N/m]
+        From each mass to the ground.
+    spacing : float [m]
+        Between neighbours; only the coordinates depend on it.
+    name : str, optional
+        For display.
+
+    Returns
+    -------
+    FEModel
+        Sparse, of n DOFs.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When numbers are negative or do not fit one another.
+
+    Examples
+    --------
+    >>> chain(masses=[1, 2, 3], stiffnesses=[5, 7])
+    <FEModel 'chain': 3 DOFs, sparse, 1 rigid-body motion, D not given>
+    """
+    m = positive_array(masses, "masses", (None,), hint="Leave massless ones out.")
+    n = m.size
+    if not n:
+        raise ModelError("masses is empty: a chain needs one mass at least. Pass [1.0], say.")
+    shape = None if np.ndim(ground) == 0 else (n,)
+    held = np.zeros(n) + positive_array(ground, "ground", shape, zero=True)
+    k = _between_masses(stiffnesses, "stiffnesses", n)
+    xyz = np.zeros((n, 3))
+    xyz[:, 0] = positive(spacing, "spacing") * np.arange(n)
+    return FEModel._proven(
+        M=frozen(sp.diags_array(m, format="csc")),
+        K=frozen(_laplacian(k, held)),
+        D=None
+        if dampings is None
+        else frozen(_laplacian(_between_masses(dampings, "dampings", n), np.zeros(n))),
+        dofs=DofSet(np.arange(1, n + 1), ("x",) * n, xyz),
+        name="chain" if name is None else name,
+    )
+
+
+def _between_masses(given: Any, name: str, n: int) -> FloatArray:
+    values = positive_array(given, name, (None,), zero=True)
+    if values.size != n - 1:
+        raise ShapeError(
+            f"{n} masses have {n - 1} {name} between them, got {values.size}. Springs to the "
+            "ground are given by ground=, dampers by model.with_parts([Damper(...)])."
+        )
+    return values
+
+
+def _laplacian(between: FloatArray, ground: FloatArray) -> sp.csc_array:
+    main = ground + np.append(between, 0.0) + np.append(0.0, between)
+    return sp.csc_array(sp.diags_array([-between, main, -between], offsets=[-1, 0, 1]))
+
+
+#: which motions an end does not have
+_ENDS = {"free": (), "pinned": ("z",), "clamped": ("z", "ry"), "guided": ("ry",)}
+
+
+def beam(
+    *,
+    length: float,
+    elements: int,
+    density: Field,
+    youngs_modulus: Field,
+    area: Field,
+    inertia: Field,
+    ends: tuple[str, str] = ("free", "free"),
+    name: str | None = None,
+) -> FEModel:
+    """Return a straight beam in bending (Euler-Bernoulli), along x from the origin.
+
+    ``rho A z'' + (E I z_xx)_xx = f``: two-node elements with cubic shape functions and consistent
+    mass. Nodes are numbered from 1; each has the DOFs z [m] and ry = -dz/dx [rad], less those that
+    its end holds. Shear and the inertia of turning sections are left out: good for wave lengths
+    well above ten times the height.
+
+    Parameters
+    ----------
+    length : float [m]
+        Of the beam.
+    elements : int
+        Their number.
+    density, youngs_modulus : float, (elements,) array or function of x [kg/m^3], [Pa]
+        Of the material.
+    area, inertia : float, (elements,) array or function of x [m^2], [m^4]
+        Of the cross section, and its second moment of area.
+    ends : (str, str)
+        How each end is held: "free", "pinned" (z), "clamped" (z and ry) or "guided" (ry).
+    name : str, optional
+        For display.
+
+    Returns
+    -------
+    FEModel
+        Sparse, without D, interpolating with the cubic shape functions.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When a number is not physical, an end is unknown, or nothing is left to move.
+
+    Examples
+    --------
+    >>> steel = {"density": 7850, "youngs_modulus": 210e9}
+    >>> beam(length=1.0, elements=10, area=1e-4, inertia=8.3e-10, **steel, ends=("clamped", "free"))
+    <FEModel 'beam': 20 DOFs, sparse, no rigid-body motions, D not given>
+    """
+    lengths, counts = (positive(length, "length"),), counts_of(elements, 1)
+    held = _ends(ends)
+    rho, E, A, inertia_of = (
+        field_of(value, text, lengths, counts)
+        for value, text in (
+            (density, "density"),
+            (youngs_modulus, "youngs_modulus"),
+            (area, "area"),
+            (inertia, "inertia"),
+        )
+    )
+    grid, h = Grid(counts, 2, np.ones(counts, dtype=bool)), lengths[0] / counts[0]
+    sign = np.outer([1, -1, 1, -1], [1, -1, 1, -1])  # ry = -dz/dx
+    free = FEModel._proven(
+        M=grid.matrix([(sign * beam_mass(h), rho * A)]),
+        K=grid.matrix([(sign * beam_stiffness(h), E * inertia_of)]),
+        D=None,
+        dofs=dofs_of(grid, lengths, ("z", "ry"), BeamShape(lengths[0], counts[0])),
+        name="beam" if name is None else name,
+    )
+    labels = [
+        f"{node}:{d}" for node, kind in zip((1, counts[0] + 1), held, strict=True) for d in kind
+    ]
+    return free.fixed(labels) if labels else free
+
+
+def _ends(ends: Any) -> list[tuple[str, ...]]:
+    if isinstance(ends, str) or not isinstance(ends, Iterable) or len(list(ends)) != 2:
+        raise ModelError(
+            f"ends must be two words, for the ends at 0 and at the length, got {short(ends)}. "
+            '("clamped", "free"), say.'
+        )
+    for end in ends:
+        one_of(end, "an end of a beam", _ENDS)
+    return [_ENDS[end] for end in ends]
+
+
+def kirchhoff_plate(
+    *,
+    size: Sequence[float],
+    thickness: Field,
+    elements: Sequence[int],
+    density: Field,
+    youngs_modulus: Field,
+    poisson_ratio: Field,
+    holes: Iterable[Hole] | Hole | FloatArray | Callable[[float, float], bool] | None = None,
+    ribs: Iterable[Rib] | Rib = (),
+    name: str | None = None,
+) -> FEModel:
+    """Return a free rectangular plate in bending.
+
+    Four-node non-conforming elements with the complete cubic and x^3 y, x y^3 (Adini, Clough and
+    Melosh), stiffness and consistent mass integrated exactly. The plate lies in the x-y plane with
+    one corner at the origin and its middle plane at z = 0. Nodes are numbered from 1, x fastest;
+    each has the DOFs z [m], rx = dz/dy and ry = -dz/dx [rad]. Beside holes, nodes keep the numbers
+    of the full plate.
+
+    Thickness and material are one number, an array (nx, ny) with one for each element, or a
+    function of the centre (x, y) of an element.
+
+    Parameters
+    ----------
+    size : (2,) array [m]
+        Lengths in x and y.
+    thickness : float, (nx, ny) array or function [m]
+        Thickness, symmetric about the middle plane.
+    elements : (2,) array of int
+        Number of elements nx, ny.
+    density : float, (nx, ny) array or function [kg/m^3]
+        Mass density.
+    youngs_modulus : float, (nx, ny) array or function [Pa]
+        Young's modulus.
+    poisson_ratio : float, (nx, ny) array or function [-]
+        Above -1 and below 0.5.
+    holes : Rectangle, Disc, list of them, (nx, ny) array of bool or function of (x, y), optional
+        Which elements are missing (True). Elements that the edge of a Rectangle or Disc cuts have
+        their stiffness and mass times the part of their area that is left: frequencies of a plate
+        with a disc of a third of its length are within 0.4 % at 24 x 16 elements, 0.2 % at 48 x 32.
+    ribs : Rib or list of them
+        Beams along edges of elements.
+    name : str, optional
+        For display.
+
+    Returns
+    -------
+    FEModel
+        Sparse, without D, its DofSet interpolating with the element's own shape functions.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When a number is not physical, there is not one for each element, the plate falls apart, or
+        a rib is not along edges.
+
+    Examples
+    --------
+    >>> kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(8, 8), density=2702,
+    ...                 youngs_modulus=70e9, poisson_ratio=0.35)
+    <FEModel 'plate': 243 DOFs, sparse, 3 rigid-body motions, D not given>
+    """
+    lengths, counts = lengths_of(size, 2), counts_of(elements, 2)
+    if isinstance(holes, Iterator | Set):
+        holes = list(holes)
+    present = present_of(holes, lengths, counts, corners=True)
+    skin = Skin(
+        field_of(thickness, "thickness", lengths, counts, present),
+        field_of(density, "density", lengths, counts, present),
+        field_of(youngs_modulus, "youngs_modulus", lengths, counts, present),
+        poisson_of(poisson_ratio, lengths, counts, present),
+    )
+    there = np.ones(counts[::-1], dtype=bool) if present is None else present
+    grid = Grid(counts, 3, there)
+    a, b = lengths[0] / counts[0], lengths[1] / counts[1]
+    share = share_of(holes, lengths, counts)
+    M = grid.matrix([(plate_mass(a, b), share * skin.density * skin.thickness)])
+    bending = share * skin.youngs_modulus * skin.thickness**3 / (12 * (1 - skin.poisson_ratio**2))
+    K = grid.matrix(_plate_stiffness(plate_stiffness(a, b), bending, skin.poisson_ratio))
+    listed = _ribs(ribs)
+    if listed:
+        M, K = rib_matrices(grid, lengths, skin, listed, M, K)
+    shape = PlateShape((lengths[0], lengths[1]), skin.thickness, (counts[0], counts[1]), present)
+    # sums of definite elements are definite: nothing to check again
+    return FEModel._proven(
+        M=M,
+        K=K,
+        D=None,
+        dofs=dofs_of(grid, lengths, ("z", "rx", "ry"), shape),
+        name="plate" if name is None else name,
+    )
+
+
+def _plate_stiffness(parts: tuple[FloatArray, FloatArray], bending: Any, nu: Any) -> Any:
+    plain, cross = parts
+    if np.ndim(nu) == 0:
+        return [(plain + nu * cross, bending)]
+    return [(plain, bending), (cross, bending * nu)]
+
+
+def _ribs(ribs: Any) -> list[Rib]:
+    listed = [ribs] if isinstance(ribs, Rib) else ribs
+    hint = "Rib((0, 0.3), (0.6, 0.3), width=0.01, height=0.02), say."
+    return list(members(listed, Rib, "ribs", hint, least=0))
+
+
+def solid_block(
+    *,
+    size: Sequence[float],
+    elements: Sequence[int],
+    density: Field,
+    youngs_modulus: Field,
+    poisson_ratio: float,
+    holes: FloatArray | Callable[[float, float, float], bool] | None = None,
+    name: str | None = None,
+) -> FEModel:
+    """Return a free rectangular block of eight-node bricks, corner at the origin.
+
+    Trilinear displacements with incompatible modes inside each element (Wilson and Taylor), so that
+    bending is not locked; consistent mass. Nodes are numbered from 1, x fastest, then y, z; each
+    has the DOFs x, y, z [m]. Beside holes, nodes keep the numbers of the full block.
+
+    Parameters
+    ----------
+    size : (3,) array [m]
+        Lengths in x, y and z.
+    elements : (3,) array of int
+        Number of elements nx, ny, nz.
+    density : float, (nx, ny, nz) array or function of an element's centre [kg/m^3]
+        Mass density.
+    youngs_modulus : float, (nx, ny, nz) array or function of an element's centre [Pa]
+        Young's modulus.
+    poisson_ratio : float [-]
+        Above -1 and below 0.5, the same everywhere.
+    holes : (nx, ny, nz) array of bool or function of an element's centre, optional
+        Which elements are missing (True).
+    name : str, optional
+        For display.
+
+    Returns
+    -------
+    FEModel
+        Sparse, without D, its DofSet interpolating with the trilinear shape functions.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When a number is not physical, there is not one for each element, or the block falls apart.
+
+    Examples
+    --------
+    >>> solid_block(size=(0.4, 0.3, 0.1), elements=(4, 3, 1), density=2700, youngs_modulus=70e9,
+    ...             poisson_ratio=0.33)
+    <FEModel 'block': 120 DOFs, sparse, 6 rigid-body motions, D not given>
+    """
+    lengths, counts = lengths_of(size, 3), counts_of(elements, 3)
+    present = present_of(holes, lengths, counts, corners=False)
+    rho = field_of(density, "density", lengths, counts, present)
+    E = field_of(youngs_modulus, "youngs_modulus", lengths, counts, present)
+    nu = poisson_of(real_array(poisson_ratio, "poisson_ratio", ()).item(), lengths, counts, present)
+    there = np.ones(counts[::-1], dtype=bool) if present is None else present
+    grid = Grid(counts, 3, there)
+    a, b, c = (n / k for n, k in zip(lengths, counts, strict=True))
+    shape = BlockShape(
+        (lengths[0], lengths[1], lengths[2]), (counts[0], counts[1], counts[2]), present
+    )
+    return FEModel._proven(
+        M=grid.matrix([(brick_mass(a, b, c), rho)]),
+        K=grid.matrix([(brick_stiffness(a, b, c, nu), E)]),
+        D=None,
+        dofs=dofs_of(grid, lengths, ("x", "y", "z"), shape),
+        name="block" if name is None else name,
+    )
