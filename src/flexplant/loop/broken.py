@@ -11,7 +11,7 @@ import numpy as np
 
 from ..checks import ComplexArray, FloatArray, short
 from ..errors import LabelError
-from ..lti.grid import SOUGHT, highest, resonance_grid
+from ..lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant

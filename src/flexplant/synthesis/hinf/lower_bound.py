@@ -10,7 +10,7 @@ import scipy.linalg as la
 from ...checks import ComplexArray, FloatArray
 from ...errors import SolverError
 from ...lti.equations import OnAxisError, stabilising
-from ...lti.grid import highest, resonance_grid
+from ...lti.frequency_sweep import highest, resonance_grid
 from ...lti.preparation import Prepared
 from ...lti.responses import responses
 from ...lti.statespace import StateSpace

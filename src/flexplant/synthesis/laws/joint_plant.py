@@ -13,7 +13,7 @@ from ...checks import ComplexArray, FloatArray, IntArray
 from ...loop.hidden_modes import hidden_modes
 from ...loop.report import nyquist_count
 from ...lti.frequency import Frf
-from ...lti.grid import SOUGHT, highest, resonance_grid
+from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ...lti.interconnection import loop_poles
 from ...lti.joining import stacked
 from ...lti.responses import responder
