@@ -11,10 +11,10 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, Value, whole
 from ..errors import counted, unknown_label
 from ..lti.frequency_sweep import crossings
+from ..lti.measured_lines import FEWEST, HiddenModes, low_slope
 from ..lti.responses import Responder
 from ..tolerances import TINY
 from .broken import BrokenLoop, inverted
-from .hidden_modes import FEWEST, HiddenModes, low_slope
 from .sensitivity import Loop, taken_apart
 
 #: a pole of the controller this near to zero frequency integrates

@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray, short
 from ..errors import AssumptionError, LabelError, ModelError, ShapeError, unknown_label
-from ..lti.between_lines import followed
 from ..lti.frequency import Frf, frequency_response, sampled_freq
 from ..lti.frequency_sweep import crossings
 from ..lti.interconnection import loop_poles
+from ..lti.measured_lines import followed
 from ..lti.responses import remembered, responder
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant

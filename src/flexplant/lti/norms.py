@@ -11,11 +11,11 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray
 from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
+from .equations import balanced_matrix, even_scale, state_scale
 from .frequency_sweep import SOUGHT, gains, highest, resonance_grid
 from .lyapunov import controllability_gramian, observability_gramian
 from .peaks import Residues, proved_peak, residues
 from .responses import points, responder
-from .scaling import balanced_matrix, even_scale, state_scale
 from .statespace import StateSpace, System, as_statespace
 
 #: the norm lies between the gain found and (1 + TOLERANCE) times it

@@ -11,8 +11,8 @@ from matplotlib.patches import Circle
 from ..checks import ComplexArray, FloatArray, positive
 from ..errors import ModelError, unknown_label
 from ..loop import ClosedLoop, sensitivity
-from ..lti.between_lines import LINES, followed, steps_between
 from ..lti.frequency import Frf
+from ..lti.measured_lines import LINES, followed, steps_between
 from ..lti.responses import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
 from ..tolerances import SAME, SPLIT
