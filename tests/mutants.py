@@ -34,7 +34,7 @@ LINES = [
     ("synthesis/hinf/mode_channels.py", "with_G = -1j *", "with_G = 1j *"),
     ("placement/quadratic.py", "<= RESIDUAL:", "<= 1e300:"),
     ("placement/branch_and_bound.py", "bound = max(bound, found)", "bound = 1.2 * found"),
-    ("simulation/stepping.py", "/= np.sqrt(hold)", "/= 1.0"),
+    ("simulation/runs.py", "/= np.sqrt(hold)", "/= 1.0"),
     ("identification/refine.py", "self.cost += float(error @ error)",
      "self.cost += 2.0 * float(error @ error)"),
     ("plant/sampling.py", "np.asarray(asd)[loud] / np.sqrt(2.0)", "np.asarray(asd)[loud]"),

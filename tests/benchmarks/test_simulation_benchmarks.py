@@ -11,8 +11,7 @@ from timing import best
 import flexplant as fx
 from flexplant.loop.budget import white_noise
 from flexplant.parallel import one_thread
-from flexplant.simulation.runs import SampleBySample
-from flexplant.simulation.stepping import Drawn, machine
+from flexplant.simulation.runs import Drawn, SampleBySample, machine
 from stages import L, ports
 
 COUNT = 100_000

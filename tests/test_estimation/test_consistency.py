@@ -11,8 +11,7 @@ from test_robust import one_state
 
 from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import consistency, design_kalman
-from flexplant.estimation.innovation_spectrum import parts_of
-from flexplant.estimation.whiteness import cumulative_periodogram, ljung_box, spectrum_of
+from flexplant.estimation.innovations import cumulative_periodogram, lines_of, ljung_box, parts_of
 from flexplant.identification import MeasuredModes
 from flexplant.loop import close_loop
 from flexplant.modes import solve_modes
@@ -265,7 +264,7 @@ def test_statistics_by_direct_sums():
         G = x[lag:].T @ x[:-lag] / N
         total += N * N / (N - lag) * np.trace(G.T @ G0 @ G @ G0)
     assert ljung_box(x, lags).statistic == pytest.approx(total, rel=1e-10, abs=0)
-    found = spectrum_of(x)
+    found = lines_of(x).pooled
     line = np.exp(-2j * np.pi * found.freq[10] * np.arange(300)) @ x
     assert found.density[10] == pytest.approx(np.mean(np.abs(line) ** 2) / N, rel=1e-10, abs=0)
     distance = cumulative_periodogram(found).statistic

@@ -7,7 +7,7 @@ import scipy.linalg as la
 import flexplant as fx
 from flexplant.errors import ModelError
 from flexplant.loop import in_axes, report_loops
-from flexplant.loop.axis_scaling import scaled_size
+from flexplant.loop.broken import scaled_size
 from flexplant.loop.report import loop_margins
 from flexplant.lti import Frf, StateSpace, append, discretized, frequency_response
 from flexplant.lti.interconnection import loop_poles

@@ -19,9 +19,9 @@ from flexplant.lti import (
     norm_report,
 )
 from flexplant.lti.discretisation import discretized
+from flexplant.lti.filters import tf
 from flexplant.lti.lyapunov import controllability_factor, observability_factor
 from flexplant.lti.modal import split_stable
-from flexplant.lti.transfer import tf
 from oracles_lti import hankel, largest_gain, lyapunov, stein, sweep
 from systems_lti import machine
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from flexplant import Frf
 from flexplant.loop import in_axes
-from flexplant.lti.between_lines import between_lines
+from flexplant.lti.measured_lines import between_lines
 
 
 def mode(freq, centre=100.0, zeta=1e-3):

@@ -13,7 +13,7 @@ from scipy.io import loadmat
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.lti import StateSpace, minimal, modal_form, parallel, series, split_stable
 from flexplant.lti.discretisation import discretized
-from flexplant.lti.scaling import balanced_matrix, state_scale
+from flexplant.lti.equations import balanced_matrix, state_scale
 from oracles_lti import sweep
 from systems_lti import machine, system
 

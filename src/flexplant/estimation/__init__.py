@@ -6,12 +6,12 @@ from .consistency import consistency as consistency
 from .estimate import Estimate as Estimate
 from .estimator import KalmanEstimator as KalmanEstimator
 from .filter_model import FilterModel as FilterModel
+from .filter_model import KalmanCertificate as KalmanCertificate
+from .filter_model import check_gain as check_gain
 from .invertibility import Invertibility as Invertibility
 from .invertibility import check_bias as check_bias
 from .invertibility import invertibility as invertibility
 from .kalman import design_kalman as design_kalman
-from .kalman_certificate import KalmanCertificate as KalmanCertificate
-from .kalman_certificate import check_gain as check_gain
 from .lag_report import Filter as Filter
 from .lag_report import FixedLag as FixedLag
 from .lag_report import LagReport as LagReport

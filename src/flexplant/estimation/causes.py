@@ -11,9 +11,8 @@ from ..errors import counted
 from ..plant import StandardPlant
 from ..tolerances import SAME, TINY, divisor
 from .estimator import KalmanEstimator
-from .innovation_spectrum import InnovationLines, InnovationParts, impulse, steady_gain
+from .innovations import ExcessPeak, InnovationLines, InnovationParts, impulse, steady_gain
 from .moved_modes import ModeChange, explained_by_change, peak_band
-from .whiteness import ExcessPeak
 
 Cause = Literal[
     "none", "noise level", "noise ratio", "frequency", "truncation", "folding", "offset", "outliers"

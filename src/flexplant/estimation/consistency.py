@@ -32,11 +32,22 @@ from .causes import (
 from .estimate import Estimate
 from .estimator import KalmanEstimator
 from .estimator_channels import poi_channels, read_alike, row_of
-from .innovation_spectrum import InnovationLines, InnovationParts, expected, lines_of, parts_of
+from .innovations import (
+    ExcessPeak,
+    InnovationLines,
+    InnovationParts,
+    Statistic,
+    cumulative_periodogram,
+    expected,
+    level_test,
+    lines_of,
+    ljung_box,
+    parts_of,
+    peaks,
+)
 from .kalman import design_kalman
 from .left_out import left_out
 from .moved_modes import ModeChange, MovedModes, moved_modes
-from .whiteness import ExcessPeak, Statistic, cumulative_periodogram, level_test, ljung_box, peaks
 
 #: fewest samples for a verdict
 _FEWEST = 200

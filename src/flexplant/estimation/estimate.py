@@ -13,11 +13,10 @@ from ..checks import BoolArray, FloatArray, Value, instance, known_units, real_a
 from ..errors import LabelError, counted, unknown_label, warn
 from ..lti.equations import scale_of
 from ..parallel import one_thread
-from .estimator_channels import estimates
+from .estimator_channels import estimates, recorded
 from .filter_model import FilterModel, Sight, Steady
 from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother
 from .passage import Passage, Start, passed, stationary_start
-from .recorded import recorded
 from .smoothing import lagged, smoothed
 
 #: part of a sensor's samples above which those beyond a gate are no outliers

@@ -17,8 +17,7 @@ from ..plant import StandardPlant
 from .error import NODES, NOTED, PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels
-from .filter_model import FilterModel, Sight, filter_model
-from .kalman_certificate import KalmanCertificate
+from .filter_model import FilterModel, KalmanCertificate, Sight, filter_model
 from .lag_report import LAGS, Filter, Lag, LagReport, lag_report
 from .left_out import LeftOut, left_out
 

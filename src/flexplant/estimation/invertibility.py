@@ -11,7 +11,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, Value, check_names, name_list
 from ..errors import AssumptionError, require_known
-from ..lti.scaling import state_scale
+from ..lti.equations import state_scale
 from ..lti.statespace import System
 from ..plant import StandardPlant
 from ..tolerances import SPLIT, TINY, divisor

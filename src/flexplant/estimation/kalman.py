@@ -19,13 +19,14 @@ from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike
 from .filter_model import (
     FilterModel,
+    KalmanCertificate,
     check_noises,
     check_precision,
+    error_of,
     filter_model,
     filter_system,
     weighed,
 )
-from .kalman_certificate import KalmanCertificate, error_of
 from .left_out import left_out
 
 

@@ -16,7 +16,7 @@ from ..plant import StandardPlant
 from ..plant.uncertainty.uncertain_plant import Delta, with_changes
 from .estimate import Estimate
 from .estimator import KalmanEstimator
-from .innovation_spectrum import InnovationLines, parts_of, whitening
+from .innovations import InnovationLines, parts_of, whitening
 from .kalman import redesigned
 from .lag_report import Filter
 

@@ -17,10 +17,8 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..tolerances import TINY
-from .estimator_channels import checked_plant, estimates, poi_channels, row_of, sensors
-from .filter_model import FilterModel, check_noises, filter_model, filter_system, weighed
-from .kalman_certificate import AGREEMENT
-from .recorded import recorded
+from .estimator_channels import checked_plant, estimates, poi_channels, recorded, row_of, sensors
+from .filter_model import AGREEMENT, FilterModel, check_noises, filter_model, filter_system, weighed
 
 #: longest period [samples], and most measurements in one
 _LONGEST, _MOST = 1000, 2000

@@ -20,7 +20,7 @@ from .consistency import consistency
 from .estimate import Estimate
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike, sensors
-from .innovation_spectrum import seen_from_states
+from .innovations import seen_from_states
 from .kalman import design_kalman
 
 #: designs of the filter whose innovations are used, and the change of all ratios that ends them

@@ -12,8 +12,8 @@ from ..checks import BoolArray, FloatArray, IntArray
 from ..lti.equations import sylvester
 from ..lti.lyapunov import solve_stein
 from ..lti.recursion import Recursion
+from .estimator_channels import Recorded
 from .filter_model import FilterGains, FilterModel, Sight, Steady, gains
-from .recorded import Recorded
 
 #: the gain counts as stationary when all that its last changes would still do to the estimates and
 #: innovations, summed over time, is this part of their variances

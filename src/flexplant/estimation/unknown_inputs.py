@@ -19,9 +19,8 @@ from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..tolerances import TINY, divisor
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of
-from .filter_model import FilterModel, check_noises, filter_model, weighed
+from .filter_model import AGREEMENT, FilterModel, check_noises, filter_model, weighed
 from .invertibility import InputEntry, Invertibility, entry, judged, unknown_names
-from .kalman_certificate import AGREEMENT
 from .noise_from_records import with_densities
 
 #: variance of white inputs at the start of the search, beside what the sensors resolve

@@ -11,7 +11,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, Value, positive, real_array, signal_names
 from ..errors import ModelError, ShapeError, warn
 from ..lti.frequency import Frf
-from ..lti.line_correlation import checked_overlap, checked_window
+from ..lti.measured_lines import checked_overlap, checked_window
 from ..tolerances import ROUNDING, TINY
 from .feedback import feedback, feedback_warned
 

@@ -9,7 +9,6 @@ from .closed import close_loop as close_loop
 from .comparison import LoopComparison as LoopComparison
 from .comparison import LoopFigures as LoopFigures
 from .comparison import compare_loops as compare_loops
-from .machine_draws import MachineDraws as MachineDraws
 from .mode_tolerance import ModeTolerances as ModeTolerances
 from .report import LoopMargins as LoopMargins
 from .report import LoopReport as LoopReport
@@ -20,6 +19,7 @@ from .sensitivity import control_sensitivity as control_sensitivity
 from .sensitivity import loop_gain as loop_gain
 from .sensitivity import modulus_margin as modulus_margin
 from .sensitivity import sensitivity as sensitivity
+from .spill_over import MachineDraws as MachineDraws
 from .spill_over import SpillOver as SpillOver
 
 __dir__ = _public_names(__name__)

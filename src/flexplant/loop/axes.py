@@ -8,8 +8,8 @@ import numpy as np
 
 from ..checks import ComplexArray, FloatArray, flag, instance, positive
 from ..errors import ModelError, ShapeError, counted
-from ..lti.between_lines import followed
 from ..lti.frequency import Frf
+from ..lti.measured_lines import followed
 from ..lti.statespace import StateSpace, System, as_statespace
 
 #: degrees of freedom above which a variance is taken as it is

@@ -18,7 +18,7 @@ from ..errors import (
     require_known,
     unknown_label,
 )
-from ..lti.grid import resonance_grid
+from ..lti.frequency_sweep import resonance_grid
 from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..lti.responses import continuous_poles, responder
 from ..lti.statespace import StateSpace

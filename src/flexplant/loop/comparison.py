@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks import FloatArray, Value, short
 from ..errors import LabelError, ModelError, require_known
-from ..lti.grid import climbed
+from ..lti.frequency_sweep import climbed
 from .closed import ClosedLoop
 from .sensitivity import first_above
 

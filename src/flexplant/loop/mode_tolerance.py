@@ -21,7 +21,7 @@ from ..plant.uncertainty.uncertain_plant import (
 )
 from ..tolerances import SETTLED, TINY
 from .broken import BrokenLoop, inverted
-from .machine_draws import MachineDraws
+from .spill_over import MachineDraws
 
 #: relative change of frequency up to which a mode is followed
 LIMIT = 0.05

@@ -10,10 +10,11 @@ import numpy as np
 
 from ..checks import ComplexArray, FloatArray, Value, whole
 from ..errors import counted, unknown_label
+from ..lti.frequency_sweep import crossings
+from ..lti.measured_lines import FEWEST, HiddenModes, low_slope
 from ..lti.responses import Responder
 from ..tolerances import TINY
 from .broken import BrokenLoop, inverted
-from .hidden_modes import FEWEST, HiddenModes, low_slope
 from .sensitivity import Loop, taken_apart
 
 #: a pole of the controller this near to zero frequency integrates
@@ -22,8 +23,6 @@ _INTEGRATES = 1e-9
 _REAL = 0.05
 #: slope of its size over frequency at the first line below which it is taken to be level
 _LEVEL = 0.5
-#: relative accuracy of the frequencies of crossovers: margins there are right to nine digits
-_ACCURATE = 1e-12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -286,10 +285,10 @@ def loop_margins(
     from scipy.optimize import minimize_scalar
 
     find = between if exact is None else exact
-    crossovers = _roots(freq, np.abs(L) - 1.0, lambda f: np.abs(find(f)) - 1.0)
+    crossovers = crossings(lambda f: np.abs(find(f)) - 1.0, freq, np.abs(L) - 1.0)
     phases = np.abs(np.degrees(np.angle(find(crossovers))))
     # L is real where the imaginary part changes sign; positive: towards the critical point
-    reals = find(_roots(freq, L.imag, lambda f: find(f).imag)).real.tolist()
+    reals = find(crossings(lambda f: find(f).imag, freq, L.imag)).real.tolist()
     # and at its ends, half the rate and zero frequency (unless it integrates), where it is real
     slope = (
         np.log(abs(L[1] / L[0])) / np.log(freq[1] / freq[0])
@@ -319,29 +318,6 @@ def loop_margins(
         margin,
         where,
     )
-
-
-def _roots(
-    freq: FloatArray, values: FloatArray, function: Callable[[FloatArray], FloatArray]
-) -> FloatArray:
-    """Return the zeros of a function of frequency between the lines where its sign changes."""
-    # all at once: a response at many frequencies costs little more than at one
-    from scipy.optimize.elementwise import find_root
-
-    first = np.flatnonzero((values[1:] > 0) != (values[:-1] > 0))
-    if not first.size:
-        return np.zeros(0)
-    low, high = freq[first], freq[first + 1]
-    ends = function(low), function(high)
-    found = np.where(np.abs(ends[0]) < np.abs(ends[1]), low, high)
-    real = ends[0] * ends[1] < 0  # else rounding at a line
-    if real.any():
-        found[real] = find_root(
-            function,
-            (low[real], high[real]),
-            tolerances={"xatol": 0.0, "xrtol": _ACCURATE, "fatol": 0.0, "frtol": 0.0},
-        ).x
-    return np.asarray(found)
 
 
 #: how far the phase of det(I - L) may be from where its ends have to be

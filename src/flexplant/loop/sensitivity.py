@@ -10,9 +10,10 @@ import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray, short
 from ..errors import AssumptionError, LabelError, ModelError, ShapeError, unknown_label
-from ..lti.between_lines import followed
 from ..lti.frequency import Frf, frequency_response, sampled_freq
+from ..lti.frequency_sweep import crossings
 from ..lti.interconnection import loop_poles
+from ..lti.measured_lines import followed
 from ..lti.responses import remembered, responder
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
@@ -422,12 +423,14 @@ def bandwidth(loop: Loop) -> float:
     right = first_above(values)
     if right is None:
         return float("inf")
-    low, high = float(grid[right - 1]), float(grid[right])
-    for _ in range(6 if parts.measured is None else 0):
-        inner = np.linspace(low, high, 17)
-        first = int(np.argmax(_sensitivity_along(acting, parts, inner[1:]) >= 1.0))
-        low, high = float(inner[first]), float(inner[first + 1])
-    return high
+    if parts.measured is not None:
+        return float(grid[right])
+    pair = slice(right - 1, right + 1)
+
+    def above(freq: FloatArray) -> FloatArray:
+        return _sensitivity_along(acting, parts, freq) - 1.0
+
+    return float(next(iter(crossings(above, grid[pair], values[pair] - 1.0)), grid[right]))
 
 
 def first_above(size: FloatArray) -> int | None:

@@ -1,16 +1,16 @@
-"""Spill-over: stability and margin of a loop on the plant with the modes left out of its design."""
+"""A loop on other machines than its plant: with the modes left out, and drawn at random."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import scipy.linalg as la
 
 from ..certificates import in_words, stability_name
-from ..checks import FloatArray, IntArray, Value
+from ..checks import FloatArray, IntArray, Value, checked, floats
 from ..errors import ModelError
 from ..lti.statespace import StateSpace
 from ..tolerances import TINY
@@ -192,3 +192,51 @@ def _summed(part: FloatArray, numbers: IntArray) -> FloatArray:
     share = np.bincount(numbers, weights=part)
     share[0] = 0.0
     return np.asarray(share)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MachineDraws(Value):
+    """The modulus margins of one controller on machines drawn from an uncertainty.
+
+    Everything that is uncertain is off at once: at delta = 1 two standard deviations unless the
+    uncertain plant says otherwise.
+
+    Parameters
+    ----------
+    margins : (n,) array
+        Modulus margin at u on each machine, 0 where the loop is unstable there.
+    margin : float
+        The one that shall be kept.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.loop.MachineDraws([0.5, 0.4, 0.3, 0.0], margin=0.35)
+    <MachineDraws: 3 of 4 stable, 2 keep a modulus margin of 0.35, the least is 0>
+    """
+
+    margins: FloatArray = field(metadata=checked(floats))
+    margin: float
+
+    @property
+    def stable(self) -> float:
+        """The share of machines on which the loop is stable."""
+        return float(np.mean(self.margins > 0))
+
+    @property
+    def kept(self) -> float:
+        """The share of machines on which it keeps the margin."""
+        return float(np.mean(self.margins >= self.margin))
+
+    @property
+    def summary(self) -> str:
+        """The counts in words."""
+        n = self.margins.size
+        stable, kept = (np.count_nonzero(self.margins > 0), round(n * self.kept))
+        return (
+            f"{stable} of {n} stable, {kept} keep a modulus margin of {self.margin:.3g}, the least "
+            f"is {self.margins.min():.3g}"
+        )
+
+    def __repr__(self) -> str:
+        return f"<MachineDraws: {self.summary}>"

@@ -9,6 +9,15 @@ from .balancing import hankel_values as hankel_values
 from .balancing import norm_report as norm_report
 from .discretisation import discretized as discretized
 from .discretisation import tustin as tustin
+from .filters import highpass as highpass
+from .filters import inverse_sensitivity as inverse_sensitivity
+from .filters import leadlag as leadlag
+from .filters import lowpass as lowpass
+from .filters import matched as matched
+from .filters import notch as notch
+from .filters import pade as pade
+from .filters import tf as tf
+from .filters import zpk as zpk
 from .frequency import Frf as Frf
 from .frequency import default_freq as default_freq
 from .frequency import frequency_response as frequency_response
@@ -38,14 +47,5 @@ from .riccati import solve_care as solve_care
 from .riccati import solve_dare as solve_dare
 from .statespace import StateSpace as StateSpace
 from .statespace import as_statespace as as_statespace
-from .transfer import matched as matched
-from .transfer import tf as tf
-from .transfer import zpk as zpk
-from .weights import highpass as highpass
-from .weights import inverse_sensitivity as inverse_sensitivity
-from .weights import leadlag as leadlag
-from .weights import lowpass as lowpass
-from .weights import notch as notch
-from .weights import pade as pade
 
 __dir__ = _public_names(__name__)

@@ -25,11 +25,11 @@ from ..checks import (
 )
 from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
 from ..tolerances import SAME
-from .grid import checked_freq as checked_freq
-from .grid import default_freq as default_freq
-from .grid import sampled_freq as sampled_freq
+from .frequency_sweep import checked_freq as checked_freq
+from .frequency_sweep import default_freq as default_freq
+from .frequency_sweep import sampled_freq as sampled_freq
 from .joining import chosen_pair, rows_of, short_list
-from .line_correlation import checked_correlation, checked_overlap, checked_window, line_correlation
+from .measured_lines import checked_correlation, checked_overlap, checked_window, line_correlation
 from .responses import responses
 from .statespace import System, as_statespace
 

@@ -11,8 +11,8 @@ from scipy.sparse import csgraph
 from ..checks import ComplexArray, FloatArray, inner_names, name_list
 from ..errors import LabelError, ModelError, ShapeError, require_known
 from ..tolerances import ROUNDING
+from .equations import balanced_matrix
 from .joining import Matrices, common_dt, common_fields, joined_units, stacked, state_names
-from .scaling import balanced_matrix
 from .statespace import StateSpace, System, as_statespace
 
 

@@ -8,9 +8,19 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, real_array
 from ..errors import SolverError
 from ..parallel import one_thread
-from .equations import accumulated, lyapunov, relative, scale_of, stein, symmetric, symmetrised
+from .equations import (
+    accumulated,
+    even_scale,
+    lyapunov,
+    reciprocal,
+    relative,
+    scale_of,
+    state_scale,
+    stein,
+    symmetric,
+    symmetrised,
+)
 from .joining import is_block_diagonal
-from .scaling import even_scale, reciprocal, state_scale
 from .statespace import StateSpace, System, as_statespace
 
 

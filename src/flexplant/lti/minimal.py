@@ -11,12 +11,12 @@ from scipy.sparse import csgraph
 
 from ..checks import ComplexArray, FloatArray, between
 from ..tolerances import TINY
+from .equations import reciprocal, state_scale
 from .joining import is_block_diagonal, joined_blocks, stacked
 from .lyapunov import controllability_factor, observability_factor
 from .modal import modal_form, part_of, split_stable
 from .norms import DOUBLE, eigenvalues_with_error
 from .responses import responses
-from .scaling import reciprocal, state_scale
 from .statespace import StateSpace, System, as_statespace
 
 #: shares and Hankel singular values below this of what they are computed from are rounding

@@ -18,8 +18,8 @@ from ..checks import FloatArray, Value, inner_names
 from ..errors import ModelError
 from ..tolerances import ROUNDING, divisor
 from .discretisation import bilinear, image_freq, tustin
+from .equations import bordered_scale, mean_speed, state_scale
 from .modal import modal_form
-from .scaling import bordered_scale, mean_speed, state_scale
 from .statespace import StateSpace
 
 #: a direction of D12 or D21 that is smaller beside what the plant does on its channels is missing

@@ -12,8 +12,8 @@ from scipy.sparse import csgraph
 from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..parallel import one_thread
+from .equations import scaled_schur, state_scale
 from .joining import pair_eigenvalues
-from .scaling import scaled_schur, state_scale
 from .statespace import StateSpace
 
 #: so many complex numbers are less than 128 kB

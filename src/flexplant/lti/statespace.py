@@ -35,8 +35,7 @@ from .joining import (
     rows_of,
     short_list,
 )
-from .sections import matrix_fields, tf_fields, zpk_fields
-from .zeros import invariant_zeros
+from .roots import invariant_zeros, matrix_fields, tf_fields, zpk_fields
 
 if TYPE_CHECKING:
     import control

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 from ..checks import Value, check_names, instance, short
 from ..errors import LabelError, ModelError, unknown_label
+from ..lti.filters import pade
 from ..lti.interconnection import series
-from ..lti.weights import pade
 from .forces import Actuator as Actuator
 from .forces import Disturbance as Disturbance
 from .port import QUANTITIES as QUANTITIES

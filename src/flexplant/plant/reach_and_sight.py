@@ -11,9 +11,9 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, Value
 from ..errors import counted
 from ..labels import DIRECTIONS
-from ..lti.scaling import state_scale
+from ..lti.equations import state_scale
+from ..lti.roots import axis_zeros
 from ..lti.statespace import StateSpace
-from ..lti.zeros import axis_zeros
 from ..tolerances import ROUNDING, SAME, SPLIT, TINY, TYPED, divisor
 from .partition import Partition
 from .rigid.rigid_motion import body_of, rigid_modes

@@ -14,7 +14,7 @@ from ..checks import ComplexArray, FloatArray, instance, positive, real_array, w
 from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf
 from ..lti.frequency import frequency_response as system_response
-from ..lti.grid import sampled_freq
+from ..lti.frequency_sweep import sampled_freq
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace, System
 from ..modes import Modes

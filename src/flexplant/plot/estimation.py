@@ -14,8 +14,8 @@ from ..checks import FloatArray, between, instance, name_list, positive, real_ar
 from ..errors import ModelError, ShapeError
 from ..estimation import Consistency, Estimate, LagReport
 from ..estimation.estimator_channels import row_of
+from ..estimation.innovations import lines_of
 from ..estimation.lag_report import PREDICTOR, SMOOTHER, STATIC
-from ..estimation.whiteness import spectrum_of
 from ..simulation import EstimatorComparison
 from ._axes import (
     BLACK,
@@ -392,7 +392,7 @@ def _correlation(ax: Axes, white: FloatArray, dt: float, level: float) -> None:
 def _periodogram(ax: Axes, white: FloatArray, rate: float, level: float) -> None:
     from scipy.stats import kstwobign
 
-    found = spectrum_of(white)
+    found = lines_of(white).pooled
     total = np.cumsum(found.density) / found.density.sum()
     line = np.arange(1, total.size + 1) / total.size
     bound = float(kstwobign.ppf(level)) / np.sqrt(found.density.size * found.channels)

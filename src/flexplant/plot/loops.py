@@ -15,8 +15,8 @@ from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..loop import ClosedLoop, complementary_sensitivity, control_sensitivity
 from ..loop import sensitivity as sensitivity_of
 from ..loop.comparison import error_sensitivity
-from ..lti.between_lines import LINES, followed, steps_between
 from ..lti.frequency import Frf, frequency_response
+from ..lti.measured_lines import LINES, followed, steps_between
 from ..lti.responses import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
 from ..tolerances import SAME, SPLIT

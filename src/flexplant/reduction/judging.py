@@ -11,7 +11,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, real_array, whole
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
-from ..lti.grid import climbed
+from ..lti.frequency_sweep import climbed
 from ..modes.attachment_vectors import labels_of, places, static_response
 from ..modes.dynamic_basis import DirectCheck, DynamicBasis, antiresonances, checked_response
 from ..modes.matching import paired

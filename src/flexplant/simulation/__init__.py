@@ -19,11 +19,11 @@ from .machine_pipeline import MachinePipeline as MachinePipeline
 from .machine_pipeline import MachineReport as MachineReport
 from .motion import Motion as Motion
 from .motion import SetPoint as SetPoint
+from .motion import scan as scan
+from .motion import setpoint as setpoint
 from .nonlinear_elements import Quantiser as Quantiser
 from .nonlinear_elements import Saturation as Saturation
 from .response import Response as Response
-from .setpoint import scan as scan
-from .setpoint import setpoint as setpoint
 from .simulate import simulate as simulate
 from .specification import Specification as Specification
 from .specification import Verdict as Verdict

@@ -11,16 +11,16 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..certificates import in_words, stability, stability_name
-from ..checks import ComplexArray, FloatArray, Value
+from ..checks import FloatArray, Value
 from ..errors import CertificateError, FlexplantWarning, counted, warn
 from ..loop import ClosedLoop, ModeTolerances, SpillOver, close_loop
+from ..lti.frequency_sweep import gains, highest, resonance_grid
 from ..lti.norms import peak_gain
 from ..lti.preparation import Prepared
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant, larger_plant
 from ..structure import FEModel
-from ..tolerances import ROUNDING, TINY
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -128,6 +128,8 @@ class SynthesisMethod(Protocol):
 
 #: the two norms agree to this part, and the claim holds to it
 AGREEMENT = 1e-3
+#: half-widths beside a resonance where a gain is computed that no other search finds
+_AROUND = (0.0, *np.geomspace(0.05, 20.0, 24).tolist())
 
 
 def certified_norm(
@@ -161,11 +163,11 @@ def reached_norms(P: StandardPlant, loop: StateSpace, respond: Responder) -> dic
     # groups by the names that `assemble_plant` gives; empty for other plants
     if not P.is_assembled:
         return {}
-    gain = respond(_sweep(loop))
+    gain = respond(_grid(loop))
     w = {"references": ":ref", "noises": ":noise"}
     sides = [_grouped(P.z, {"efforts": ":effort"}, "motions"), _grouped(P.w, w, "disturbances")]
     return {
-        f"{to} from {source}": _peak(gain[rows][:, columns])[0]
+        f"{to} from {source}": float(gains(gain[rows][:, columns]).max())
         for to, rows in sides[0].items()
         for source, columns in sides[1].items()
     }
@@ -186,44 +188,14 @@ def swept_norm(loop: StateSpace, respond: Responder | None = None) -> float:
         return 0.0
     if not loop.n_states:
         return float(np.linalg.norm(loop.D, 2))
-    find, freq = respond or responder(loop), _sweep(loop)
-    best = float(np.linalg.norm(loop.D, 2)) if not loop.dt else 0.0
-    for _ in range(3):
-        largest, peak = _peak(find(freq))
-        best = max(best, largest)
-        bracket = freq[max(peak - 1, 0)], freq[min(peak + 1, freq.size - 1)]
-        freq = np.linspace(*bracket, 40)
-    return best
+    respond = respond or responder(loop)
+    swept, _ = highest(lambda freq: gains(respond(freq)), _grid(loop), 3)
+    return swept if loop.dt else max(swept, float(np.linalg.norm(loop.D, 2)))
 
 
-def _sweep(loop: StateSpace) -> FloatArray:
+def _grid(loop: StateSpace) -> FloatArray:
     """Return frequencies [Hz] from 0 up, dense around the resonances of a loop with states."""
-    poles = loop.poles()
-    if loop.dt:
-        poles = np.asarray(np.log(np.where(np.abs(poles) > 0, poles, TINY)) / loop.dt)
-    nyquist = 0.5 / loop.dt if loop.dt else np.inf
-    speeds = np.abs(poles.imag[np.abs(poles.imag) > 0]) / (2 * np.pi)
-    sizes = np.abs(poles) / (2 * np.pi)
-    low, high = (
-        (0.01 * float(sizes[sizes > 0].min()), min(100.0 * float(sizes.max()), nyquist))
-        if np.any(sizes > 0)
-        else (1e-3, min(1e3, nyquist))
-    )
-    width = np.abs(poles.real[np.abs(poles.imag) > 0]) / (2 * np.pi)
-    offsets = np.concatenate([[0.0], np.geomspace(0.05, 20.0, 24)])
-    near = (speeds[:, None] + width[:, None] * np.concatenate([-offsets, offsets])).ravel()
-    freq = np.concatenate([[0.0], np.geomspace(min(low, 0.5 * high), high, 600), near])
-    return np.asarray(np.unique(freq[(freq >= 0) & (freq <= nyquist)]))
-
-
-def _peak(H: ComplexArray) -> tuple[float, int]:
-    """Return the largest singular value of responses (p, m, n_freq), and at which frequency."""
-    # between the Frobenius norm over the root of the rank and the Frobenius norm: few need an SVD
-    size = np.sqrt(np.sum(H.real**2 + H.imag**2, axis=(0, 1)))
-    near = np.flatnonzero(size >= size.max() * (1.0 - ROUNDING) / np.sqrt(min(H.shape[:2])))
-    gains = np.linalg.norm(np.moveaxis(H[:, :, near], 2, 0), 2, axis=(1, 2))
-    largest = int(np.argmax(gains))
-    return float(gains[largest]), int(near[largest])
+    return np.append(0.0, resonance_grid(loop.poles(), loop.dt, around=_AROUND))
 
 
 #: what a high peak means

@@ -11,9 +11,9 @@ import numpy as np
 from ...checks import Value, positive
 from ...errors import AssumptionError, LabelError, ModelError, require_known
 from ...lti.discretisation import tustin
+from ...lti.filters import inverse_sensitivity, leadlag
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
-from ...lti.weights import inverse_sensitivity, leadlag
 from ..forces import BaseAcceleration
 from ..ports import Ports
 from ..standard import StandardPlant, standard_plant

@@ -11,8 +11,8 @@ import scipy.linalg as la
 from ...checks import FloatArray
 from ...errors import CertificateError, ModelError
 from ...lti.discretisation import bilinear, discretized, tustin
+from ...lti.equations import state_scale
 from ...lti.interconnection import lft
-from ...lti.scaling import state_scale
 from ...lti.statespace import StateSpace
 from ...tolerances import ROUNDING, TINY, divisor
 from ..partition import Partition

@@ -14,7 +14,7 @@ from ...errors import CertificateError, FlexplantError, FlexplantWarning, ModelE
 from ...loop import close_loop
 from ...lti.balancing import balanced
 from ...lti.frequency import frequency_response
-from ...lti.grid import resonance_grid
+from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import connect, feedback, lft, series
 from ...lti.modal import split_stable
 from ...lti.norms import peak_gain

@@ -10,11 +10,11 @@ import scipy.linalg as la
 from ...checks import ComplexArray, FloatArray
 from ...errors import SolverError
 from ...lti.equations import OnAxisError, stabilising
-from ...lti.grid import highest, resonance_grid
+from ...lti.frequency_sweep import highest, resonance_grid
 from ...lti.preparation import Prepared
 from ...lti.responses import responses
+from ...lti.roots import axis_zeros
 from ...lti.statespace import StateSpace
-from ...lti.zeros import axis_zeros
 from ...tolerances import divisor
 from .central import indefinite
 

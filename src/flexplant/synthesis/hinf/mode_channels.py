@@ -11,7 +11,7 @@ import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray, Value
 from ...errors import AssumptionError, ModelError
-from ...lti.grid import resonance_grid
+from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import lft
 from ...lti.responses import points, responder
 from ...lti.statespace import StateSpace

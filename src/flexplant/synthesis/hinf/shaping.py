@@ -14,11 +14,11 @@ from ...checks import FloatArray, Value, positive
 from ...errors import CertificateError, ModelError, SolverError, warn
 from ...loop import LoopReport, report_loops
 from ...lti.discretisation import tustin
+from ...lti.filters import lowpass
 from ...lti.interconnection import series, side_by_side
 from ...lti.minimal import minimal
 from ...lti.responses import responses
 from ...lti.statespace import StateSpace, System, as_statespace
-from ...lti.weights import lowpass
 from ...parallel import one_thread
 from ...plant import StandardPlant
 from ..controller import Controller, with_left_out

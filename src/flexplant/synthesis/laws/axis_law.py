@@ -8,9 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from ...checks import ComplexArray, FloatArray, IntArray
-from ...loop.hidden_modes import FEWEST, hidden_modes
 from ...loop.report import nyquist_count
-from ...lti.between_lines import between_lines, steps_between
+from ...lti.measured_lines import FEWEST, between_lines, hidden_modes, steps_between
 from .controller_elements import LowPass, Notch, Pid
 from .law import Law, Section, product, tustin_s
 

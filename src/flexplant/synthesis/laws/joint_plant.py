@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ...checks import ComplexArray, FloatArray, IntArray
-from ...loop.hidden_modes import hidden_modes
 from ...loop.report import nyquist_count
 from ...lti.frequency import Frf
-from ...lti.grid import SOUGHT, highest, resonance_grid
+from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ...lti.interconnection import loop_poles
 from ...lti.joining import stacked
+from ...lti.measured_lines import hidden_modes
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace
 from .law import Law

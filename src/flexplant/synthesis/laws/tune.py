@@ -12,7 +12,7 @@ from ...checks import FloatArray, between, whole
 from ...errors import SolverError, warn
 from ...loop import in_axes
 from ...lti.frequency import Frf
-from ...lti.grid import resonance_grid
+from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import Progress, one_thread

@@ -16,11 +16,11 @@ from ...errors import (
     ModelError,
     SolverError,
 )
+from ...lti.equations import mean_speed, state_scale
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
 from ...lti.preparation import prepared
 from ...lti.riccati import control_care, control_dare, solve_care, solve_dare
-from ...lti.scaling import mean_speed, state_scale
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant

@@ -9,7 +9,7 @@ import numpy as np
 from ...checks import FloatArray, whole
 from ...errors import AssumptionError, FlexplantError, ModelError, SolverError, counted
 from ...lti.discretisation import tustin
-from ...lti.grid import resonance_grid
+from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import series, side_by_side
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread

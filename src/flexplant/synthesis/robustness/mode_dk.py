@@ -9,7 +9,7 @@ import numpy as np
 
 from ...checks import FloatArray
 from ...errors import AssumptionError, CertificateError, FlexplantError, SolverError, counted
-from ...lti.grid import resonance_grid
+from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import lft
 from ...lti.preparation import prepared
 from ...lti.responses import responder

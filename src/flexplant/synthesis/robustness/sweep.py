@@ -17,8 +17,8 @@ import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray
 from ...errors import SolverError
+from ...lti.equations import state_scale
 from ...lti.responses import responder
-from ...lti.scaling import state_scale
 from ...lti.statespace import StateSpace
 from ...parallel import tick
 from ...tolerances import ROUNDING, TINY

@@ -13,7 +13,7 @@ from ...checks import ComplexArray, FloatArray, frozen
 from ...errors import AssumptionError, FlexplantError, LabelError, counted
 from ...loop.broken import BrokenLoop, inverted
 from ...lti.discretisation import held_exactly
-from ...lti.grid import highest, resonance_grid
+from ...lti.frequency_sweep import highest, resonance_grid
 from ...lti.responses import responder, responses
 from ...lti.statespace import StateSpace
 from ...plant import Foreign, Poi, StandardPlant

@@ -1,4 +1,4 @@
-"""Grids of frequencies, dense around the resonances of a system."""
+"""The sweep over frequency: grids dense at resonances, peaks, crossings, largest gains."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ NARROWEST = 1e-8
 _PEAKS, _HIGH = 6, 0.5
 #: a bracket and its inner points; a maximum that gains less than this part is found
 _ASIDE, _EIGHTHS, _GAIN = np.array([-1, 0, 1]), np.arange(1, 8) / 8.0, 1e-9
+#: relative accuracy of the frequencies of crossings: margins there are right to nine digits
+_ACCURATE = 1e-12
 #: around a resonance, in units of its half-power half-width: for a curve that is drawn through
 #: the points, and for a search that seeks the top between them
 DRAWN = (0.0, 0.3, 0.7, 1.2, 2.0, 3.5, 6.0, 12.0)
@@ -236,6 +238,41 @@ def _vertex(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         way = 0.5 * slope * width / (slopes[:, 0] - slopes[:, 1])
     inside = np.clip(np.where(np.isfinite(way), x[:, 1] + way, x[:, 1]), x[:, 0], x[:, 2])
     return inside, np.asarray(0.5 * slope * way)
+
+
+def gains(H: ComplexArray) -> FloatArray:
+    """Return the largest singular values of responses (p, m, n): lower bounds off the peak."""
+    # between the Frobenius norm over the root of the rank and the Frobenius norm: few need an SVD
+    size, root = np.sqrt(np.sum(H.real**2 + H.imag**2, axis=(0, 1))), np.sqrt(min(H.shape[:2]))
+    if root == 1.0:
+        return np.asarray(size)
+    near = size * root >= size.max(initial=0.0) * (1.0 - ROUNDING)
+    size[~near] /= root
+    size[near] = np.linalg.norm(np.moveaxis(H[:, :, near], 2, 0), 2, axis=(1, 2))
+    return np.asarray(size)
+
+
+def crossings(
+    find: Callable[[FloatArray], FloatArray], freq: FloatArray, values: FloatArray
+) -> FloatArray:
+    """Return the zeros of a function of frequency between the points where its sign changes."""
+    # all at once: a response at many frequencies costs little more than at one
+    from scipy.optimize.elementwise import find_root
+
+    first = np.flatnonzero((values[1:] > 0) != (values[:-1] > 0))
+    if not first.size:
+        return np.zeros(0)
+    low, high = freq[first], freq[first + 1]
+    ends = find(low), find(high)
+    found = np.where(np.abs(ends[0]) < np.abs(ends[1]), low, high)
+    real = ends[0] * ends[1] < 0  # else rounding at a point
+    if real.any():
+        found[real] = find_root(
+            find,
+            (low[real], high[real]),
+            tolerances={"xatol": 0.0, "xrtol": _ACCURATE, "fatol": 0.0, "frtol": 0.0},
+        ).x
+    return np.asarray(found)
 
 
 def checked_freq(freq: npt.ArrayLike) -> FloatArray:

@@ -1,0 +1,314 @@
+"""A measured response on its lines and between them: correlated errors, modes that lie between."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from ..checks import ComplexArray, FloatArray, IntArray, between
+from ..errors import ModelError, ShapeError
+from ..tolerances import SAME, TINY
+
+#: samples of a window that stand for all lengths
+SAMPLES = 256
+#: correlations below this are left out, and so are lines farther apart than this many
+LEAST, FARTHEST = 1e-3, 40
+
+
+def checked_correlation(value: Any, shape: tuple[int, ...]) -> ComplexArray:
+    """Return the correlation (n_out, n_out, n_freq) of the errors of outputs."""
+    correlation = np.array(value, dtype=np.complex128)
+    if correlation.shape != (shape[0], shape[0], shape[2]):
+        raise ShapeError(
+            f"correlation must have shape ({shape[0]}, {shape[0]}, {shape[2]}), "
+            f"got {correlation.shape}: one row and column for each output."
+        )
+    unit = np.eye(shape[0])[:, :, None]
+    hermitian = np.abs(correlation - correlation.conj().transpose(1, 0, 2))
+    wrong = np.maximum(np.abs(correlation * unit - unit), hermitian)
+    if not (np.all(np.abs(correlation) <= 1 + SAME) and np.all(wrong <= SAME)):
+        raise ModelError(
+            "correlation must be Hermitian with ones on the diagonal and none larger than one. "
+            "Divide a covariance by the standard deviations of both outputs."
+        )
+    return correlation
+
+
+def checked_window(window: Any) -> str | tuple[Any, ...]:
+    """Return a window that `scipy.signal.get_window` takes."""
+    from scipy.signal import get_window  # costs a third of a second that few need
+
+    window = tuple(window) if isinstance(window, list) else window
+    try:
+        get_window(window, 16)
+    except (ValueError, TypeError) as error:
+        raise ModelError(f"window {window!r} is not one of scipy.signal: {error}") from error
+    return window  # type: ignore[no-any-return]
+
+
+def checked_overlap(overlap: Any) -> float:
+    """Return an overlap below 0.95."""
+    return between(overlap, "overlap", 0.0, 0.95, "More brings nothing new: try 0.5.", ends="[")
+
+
+def line_correlation(
+    freq: FloatArray, *, window: Any, resolution: float, overlap: float
+) -> sp.csr_array:
+    r"""Return the correlation (n_freq, n_freq) of the errors of an averaged FRF.
+
+    The error at a line is the mean over segments of products ``V U^*`` of noise and input, both
+    seen through the window w. For random inputs and noise whose spectra change little over a few
+    lines, the correlation of lines a distance x (in units of the resolution) apart is
+
+    .. math:: \rho(x) = \frac{\sum_s |C_s(x)|^2}{\sum_s |C_s(0)|^2}, \quad
+        C_s(x) = \sum_t w_t w_{t+s} e^{-2 \pi i x t / L}
+
+    over the shifts s between segments: 4/9 and 1/36 for neighbours under a Hann window without
+    overlap ([BendatPiersol2010]_, section 11.5; [Welch1967]_).
+    """
+    n = freq.size
+    diagonals: Any = [np.ones(n)]
+    offsets = [0]
+    for apart in range(1, min(n, FARTHEST)):
+        distance = np.round((freq[apart:] - freq[:-apart]) / resolution, 6)
+        values, places = np.unique(distance, return_inverse=True)
+        shares = _correlation(values, checked_window(window), overlap)[places]
+        if values.size and values.min() > FARTHEST:
+            break
+        if np.any(shares > LEAST):
+            shares = np.where(shares > LEAST, shares, 0.0)
+            diagonals += [shares, shares]
+            offsets += [apart, -apart]
+    return sp.csr_array(sp.diags_array(diagonals, offsets=offsets, shape=(n, n)))
+
+
+def _correlation(distance: FloatArray, window: Any, overlap: float) -> FloatArray:
+    from scipy.signal import get_window
+
+    w = np.asarray(get_window(window, SAMPLES), dtype=np.float64)
+    hop = max(1, round(SAMPLES * (1.0 - overlap)))
+    turn = np.exp(-2j * np.pi * np.outer(distance, np.arange(SAMPLES)) / SAMPLES)
+    power, own = np.zeros(distance.size), 0.0
+    for shift in range(0, SAMPLES, hop):
+        # shifts to both sides count alike
+        product, count = w[: SAMPLES - shift] * w[shift:], 1 if shift == 0 else 2
+        power += count * np.abs(turn[:, : product.size] @ product) ** 2
+        own += count * float(product.sum()) ** 2
+    return np.asarray(power / own)
+
+
+#: change of a response between two lines, beside its size, below which it is a straight line
+_STRAIGHT = 1e-9
+#: third difference, beside the terms of its sum, that is rounding, and how far away the pole of
+#: such lines is put
+_ROUNDING, _FAR = 1e-14, 1e6
+#: neighbouring lines through which a mode on a straight line is fitted
+LINES = 4
+#: where an interval is filled: by its length, and about a resonance by its half-width
+_SHARES = (0.25, 0.5, 0.75)
+AROUND = np.array([-6.0, -3.0, -1.5, -0.8, -0.4, 0.0, 0.4, 0.8, 1.5, 3.0, 6.0])
+
+
+def between_lines(
+    lines: FloatArray, data: ComplexArray, freq: FloatArray
+) -> tuple[ComplexArray, FloatArray]:
+    """Return responses between lines, and what two estimates of them differ by."""
+    # the circle through three neighbours is exact for one mode on a constant; each frequency lies
+    # in two
+    last = lines.size - 3
+    i = np.searchsorted(lines, freq, side="right") - 1
+    below = _through(lines, data, np.clip(i - 1, 0, last), freq)
+    above = _through(lines, data, np.clip(i, 0, last), freq)
+    return 0.5 * (below + above), np.asarray(np.abs(below - above))
+
+
+def followed(lines: FloatArray, data: ComplexArray, freq: FloatArray) -> ComplexArray:
+    """Return responses (..., k) at frequencies within the lines: as given on them, else between."""
+    place = np.minimum(np.searchsorted(lines, freq), lines.size - 1)
+    found = np.asarray(data[..., place], dtype=np.complex128)
+    off = lines[place] != freq
+    if lines.size < LINES:
+        straight = [np.interp(freq[off], lines, one) for one in data.reshape(-1, lines.size)]
+        found[..., off] = np.reshape(straight, (*data.shape[:-1], -1))
+    elif off.any():
+        found[..., off] = between_lines(lines, data, freq[off])[0]
+    return found
+
+
+def steps_between(lines: FloatArray, data: ComplexArray, places: IntArray) -> FloatArray:
+    """Return frequencies [Hz] in some intervals, dense where the circles through lines turn."""
+    low, wide = lines[places], lines[places + 1] - lines[places]
+    found = [low + share * wide for share in _SHARES]
+    for first in (places - 1, places):
+        first = np.clip(first, 0, lines.size - 3)
+        c = _circle(lines, data, first)[1]
+        pole = lines[first] - 1.0 / np.where(c == 0.0, TINY, c)
+        near = pole.real + np.abs(pole.imag) * AROUND[:, None]
+        found += list(np.clip(near, low + 0.01 * wide, low + 0.99 * wide))
+    return np.unique(np.concatenate(found))
+
+
+def pole_between(
+    lines: FloatArray, data: ComplexArray
+) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """Return p and rho of ``g = a + b f + rho / (f - p)``, through `LINES` lines each."""
+    # third divided differences, in which a + b f is nothing: [g] = -rho / prod(f_j - p), [f g] = p
+    # [g]
+    apart = lines[:, None] - lines[None]
+    apart[range(LINES), range(LINES)] = 1.0
+    weighed = data / apart.prod(axis=1)
+    third = weighed.sum(axis=0)
+    bent = np.abs(third) > _ROUNDING * np.abs(weighed).sum(axis=0)
+    third = np.where(bent, third, 0.0)
+    pole = (lines * weighed).sum(axis=0) / np.where(bent, third, 1.0)
+    pole = np.where(bent, pole, _FAR * np.abs(lines).max(axis=0))
+    residue = -third * np.prod(lines - pole, axis=0)
+    return pole, residue, np.abs(third * np.prod(lines, axis=0))
+
+
+def _circle(
+    lines: FloatArray, data: ComplexArray, first: IntArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return a and c of ``g1 + a h / (1 + c h)``, h = f - f1, through three lines."""
+    g1, g2, g3 = (data[..., first + k] for k in range(3))
+    slope, second = ((g - g1) / (lines[first + k] - lines[first]) for k, g in ((1, g2), (2, g3)))
+    apart = g3 - g2
+    bent = np.abs(apart) > _STRAIGHT * (np.abs(g1) + np.abs(g2) + np.abs(g3))
+    c = np.where(bent, (slope - second) / np.where(bent, apart, 1.0), 0.0)
+    return slope + c * (g2 - g1), c
+
+
+def _through(
+    lines: FloatArray, data: ComplexArray, first: IntArray, freq: FloatArray
+) -> ComplexArray:
+    a, c = _circle(lines, data, first)
+    h = freq - lines[first]
+    below = 1.0 + c * h
+    below = np.where(np.abs(below) > _STRAIGHT, below, _STRAIGHT)
+    return np.asarray(data[..., first] + a * h / below)
+
+
+#: damping ratio below which a mode is not considered: no structure has less
+_LEAST = 1e-5
+#: how far outside its interval, beside its length, a fit may find a mode of it
+_ASIDE = 0.25
+#: what fits are taken to be wrong by, beside what they differ by; the part of an interval up to
+#: which that is a mode found; and the part of its shift within which they have to agree on that
+_SAFETY, _FOUND, _ALIKE = 2.0, 0.3, 0.5
+#: half-power width, beside the distance of two lines, of a mode that the lines themselves show:
+#: some of them lie on its circle, so that the steps from line to line follow it
+_SHOWN = 4.0
+#: phase step of det(I - L) between two lines above which its path is not known
+_STEP = 0.6 * np.pi
+#: lines that the three fits of an interval use
+FEWEST = LINES + 2
+
+
+class HiddenModes(NamedTuple):
+    """What is known of a loop in each interval between two lines of its plant."""
+
+    step: FloatArray
+    unknown: npt.NDArray[np.bool_]
+    undecided: npt.NDArray[np.bool_]
+    width: FloatArray
+    found: FloatArray
+
+
+def low_slope(freq: FloatArray, plant: ComplexArray) -> float:
+    """Return how P (ny, nu, n) falls at the lowest lines: 2 for a free body, 0 for a held one."""
+    low = freq <= max(1.5 * freq[0], freq[min(3, freq.size - 1)])
+    size = np.maximum(np.linalg.norm(plant[:, :, low], axis=(0, 1)), TINY)
+    return -float(np.polyfit(np.log(freq[low]), np.log(size), 1)[0])
+
+
+def hidden_modes(freq: FloatArray, plant: ComplexArray, controller: ComplexArray) -> HiddenModes:
+    """Return what lies between lines.
+
+    With S K that of one end, ``det(I - L)`` changes over an interval as ``1 - g``,
+    ``g = tr(S K P) = a + b f + rho / (f - p)``: a mode p of the plant is ``p + d`` in the loop,
+    d rho over what 1 - g is beside it. Three fits through four lines each, by S K of both ends,
+    find p and d. Where they agree a mode is there, unstable in the loop when its half-width Im p
+    is below -Im d; where they do not, d bounds what may be there unseen.
+    """
+    slope = 2 if low_slope(freq, plant) > 1.0 else 0  # f^slope P is level at the lowest lines
+    plant, controller = (np.moveaxis(part, -1, 0) for part in (plant, controller))
+    n, L = freq.size, controller @ plant
+    eye = np.eye(L.shape[-1])
+    F, SK = np.linalg.det(eye - L), np.linalg.inv(eye - L) @ controller
+    i, wide, middle = np.arange(n - 1), np.diff(freq), 0.5 * (freq[1:] + freq[:-1])
+    level = plant * (freq**slope)[:, None, None]
+    first = np.clip(i - 2, 0, n - FEWEST)
+    h = np.array([freq[first + j] - middle for j in range(FEWEST)])
+    poles, moves, others = [], [], []
+    for base in (0, 1):
+        at = freq[i + base]
+        weight = SK[i + base] / (at**slope)[:, None, None]
+        g = np.array([np.einsum("fuy,fyu->f", weight, level[first + j]) for j in range(FEWEST)])
+        ends = [np.einsum("fuy,fyu->f", weight, level[i + end]) for end in (0, 1)]
+        fits = [pole_between(h[j : j + LINES], g[j : j + LINES]) for j in range(FEWEST - LINES + 1)]
+        for p, rho, _ in fits:
+            near = np.clip(p.real, -0.5 * wide, 0.5 * wide)
+            left, right = (ends[k] - rho / ((k - 0.5) * wide - p) for k in (0, 1))
+            moved = (at / (middle + near)) ** slope
+            beside = 1.0 + ends[base] - moved * (left + (right - left) * (near / wide + 0.5))
+            poles.append(p)
+            moves.append(moved * rho / beside)
+            # what another mode in the middle would have for rho, of which one fit shows more
+            others += [
+                np.abs(p - q) * tail / (np.maximum(np.abs(p), 0.5 * wide) * np.abs(beside))
+                for q, _, tail in fits
+            ]
+    return _judged(freq, F, np.array(poles), np.array(moves), np.max(others, axis=0))
+
+
+def _judged(
+    freq: FloatArray, F: ComplexArray, p: ComplexArray, d: ComplexArray, other: FloatArray
+) -> HiddenModes:
+    """Return what fits (k, n - 1) say: poles p from the middle of each interval, moved by d."""
+    wide, middle = np.diff(freq), 0.5 * (freq[1:] + freq[:-1])
+    step, least = np.angle(F[1:] / F[:-1]), _LEAST * middle
+    acts = (np.abs(p.real) <= (0.5 + _ASIDE) * wide) & (np.abs(d) > least)
+    there, size = acts.any(axis=0), np.abs(d)
+    error = _SAFETY * _spread(p)
+    width, needed = p.imag, -d.imag
+    alike = (error < _FOUND * wide) & (_spread(d) < _ALIKE * size.max(axis=0))
+    found = there & alike & (width.min(axis=0) > -error)
+    turn = _turn(p + d, wide) - _turn(p, wide)
+    turns = np.round((turn - step) / (2.0 * np.pi))
+    followed = np.abs(turn - step - 2.0 * np.pi * turns).max(axis=0) < _STEP
+    followed &= turns.max(axis=0) == turns.min(axis=0)
+    far = np.abs(step) > _STEP  # also beside a mode of a neighbouring interval
+    turns = np.where(found | (far & alike & followed), turns[0], 0.0)
+    unknown = np.where(found, ~followed, far & ~(alike & followed))
+    critical = np.max(np.where(acts, np.where(found, needed, size), 0.0), axis=0, initial=0.0)
+    safe = (critical <= least) | (width.min(axis=0) - error > critical)
+    unstable = found & (width.max(axis=0) + error < needed.min(axis=0))
+    undecided = found & ~safe & ~unstable & ((p + d).imag.min(axis=0) < 0.0)
+    narrow = np.maximum(
+        np.where(safe | unstable, 0.0, critical), np.where(other > least, other, 0.0)
+    )
+    near = [middle + at.mean(axis=0) for at in (p, p + d)]
+    through = np.concatenate(
+        [at[found].real + np.abs(at[found].imag) * AROUND[:, None] for at in near]
+    )
+    through = through[(through > freq[0]) & (through < freq[-1])]
+    return HiddenModes(
+        step + 2.0 * np.pi * turns,
+        unknown,
+        undecided,
+        np.minimum(2.0 * narrow, _SHOWN * wide),
+        np.unique(through),
+    )
+
+
+def _spread(values: ComplexArray) -> FloatArray:
+    """Return the size of the box that holds all fits."""
+    return np.asarray(np.hypot(np.ptp(values.real, axis=0), np.ptp(values.imag, axis=0)))
+
+
+def _turn(at: ComplexArray, wide: FloatArray) -> FloatArray:
+    """Return the change of the argument of ``f - at`` over an interval."""
+    return np.asarray(np.angle(0.5 * wide - at) - np.angle(-0.5 * wide - at))
