@@ -118,6 +118,7 @@
 .. [Hassibi1999] Hassibi, Sayed, Kailath, Indefinite-Quadratic Estimation and Control, SIAM, 1999.
 .. [HeylenLammens1996] Heylen, Lammens, FRAC: a consistent way of comparing frequency response
    functions, Identification in Engineering Systems, 1996.
+.. [Higham2008] Higham, Functions of Matrices: Theory and Computation, SIAM, 2008.
 .. [Hosking1980] Hosking, The multivariate portmanteau statistic, J. Amer. Stat. Assoc. 75, 1980.
 .. [Hoyle1991] Hoyle, Hyde, Limebeer, An H-infinity approach to two degree of freedom design, IEEE
    CDC, 1991.
@@ -164,6 +165,8 @@
    reconstruction, IEEE Control Systems 38, 2018.
 .. [McFarlaneGlover1992] McFarlane, Glover, A loop-shaping design procedure using H-infinity
    synthesis, IEEE Trans. Autom. Control 37, 1992.
+.. [Modelica2022] Modelica Association, Functional Mock-up Interface for Model Exchange,
+   Co-Simulation, and Scheduled Execution, version 3.0, 2022.
 .. [MorganScott1986] Morgan, Scott, Generalizations of Davidson's method for computing eigenvalues
    of sparse symmetric matrices, SIAM J. Sci. Stat. Comput. 7, 1986.
 .. [OCallahan1989a] O'Callahan, A procedure for an improved reduced system (IRS) model, IMAC 7,

@@ -17,7 +17,7 @@ from ...lti.statespace import System
 from ...plant import StandardPlant
 from ..laws.law import Element, Law, SingleElement, chained
 from ..laws.loop_design import axes_of, checked_laws
-from ..structured_loop import Matrices
+from .scaled_loop import Matrices
 from .structures import ControllerFamily, differenced
 
 #: what an element may have free; the depth of a notch is not, unless it is named
@@ -70,13 +70,7 @@ class TunedLaws(Value):
         require_known("number of an element", self.free, _NUMBERS)
 
     def family(self, plant: StandardPlant, prepared: Prepared) -> _Laws:
-        """Return the structure made ready for a plant.
-
-        Raises
-        ------
-        LabelError, ModelError, ShapeError, AssumptionError
-            When laws, transformations and plant do not go together.
-        """
+        """Return the structure made ready for a plant."""
         axes = axes_of(plant, self.before, self.after, None, 0.0, True)
         laws = checked_laws(axes, self.laws)
         before = np.zeros((len(plant.u), len(axes.names)))
