@@ -26,7 +26,8 @@ mix in modes of almost one frequency above 10 kHz. There 12 x 12 elements are wi
 beside 24 x 24. The certificate states which share of a variance is from modes left out with fewer
 than 4 nodes of their mesh per wavelength (``unresolved``); more than half warns.
 
-Names elsewhere: ``kalman``, ``lqe`` (MATLAB, python-control); filterpy (`KalmanEstimator.to_filterpy`).
+Names elsewhere: ``kalman``, ``lqe`` (MATLAB, python-control), filterpy
+(`KalmanEstimator.to_filterpy`).
 """
 
 from ..rooms import public_names as _public_names

@@ -1,7 +1,8 @@
 """Closing the loop by names, its sensitivities and margins.
 
 - `close_loop(plant, *blocks)`: blocks are connected by the names of their channels.
-- `ClosedLoop`: ``is_stable``, ``modulus_margin``, ``rms("die:error")``, ``psd``, ``budget`` by source.
+- `ClosedLoop`: ``is_stable``, ``modulus_margin``, ``rms("die:error")``, ``psd``,
+  ``budget`` by source.
 - `sensitivity`, `complementary_sensitivity`, `control_sensitivity`, `loop_gain`, `bandwidth`.
 - `report_loops`: crossovers, gain, phase and modulus margins of each loop, broken at u or y.
 - `compare_loops`: several designs, or one on model and machine, in one table.

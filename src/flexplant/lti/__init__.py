@@ -30,13 +30,16 @@ goes back. Their names (``fx.c2d``) raise an error that says ours.
 | there | here |
 |---|---|
 | ``ss``, ``tf``, ``zpk`` | `fx.StateSpace`, `fx.lti.tf`, `fx.lti.zpk` |
-| ``sys(s)``, ``dcgain``, ``pole``, ``tzero`` | `sys(s)`, `sys.dcgain()`, `sys.poles()`, `sys.zeros()` |
+| ``sys(s)``, ``dcgain`` | `sys(s)`, `sys.dcgain()` |
+| ``pole``, ``tzero`` | `sys.poles()`, `sys.zeros()` |
 | ``sys(1, 2)``, ``sys[0, 1]`` | `sys["y1", "u2"]`, `sys[0, 1]`, counted from 0 |
-| ``series``, ``feedback``, ``append``, ``lft`` | the same in `fx.lti`; `g2 * g1`, `1 / (1 + L)` too |
-| ``freqresp``, ``bode``, ``sigma`` | `fx.frequency_response`, `fx.plot.bode`, `fx.plot.singular_values` |
+| ``series``, ``feedback``, ``lft`` | the same in `fx.lti`; `g2 * g1`, `g1 + g2`, `1 / (1 + L)` |
+| ``freqresp`` | `fx.frequency_response` |
+| ``bode``, ``sigma`` | `fx.plot.bode`, `fx.plot.singular_values` |
 | ``nyquist``, ``pzmap``, ``step`` | `fx.plot.nyquist`, `fx.plot.pole_map`, `fx.plot.step` |
 | ``c2d`` | `fx.discretized(sys, rate, delay=)`, `fx.lti.tustin`, `fx.lti.matched` |
-| ``norm(sys)``, ``norm(sys, inf)`` | `fx.h2_norm`, `fx.hinf_norm`; ``getPeakGain``: `fx.peak_gain` |
+| ``norm(sys)``, ``norm(sys, inf)`` | `fx.h2_norm`, `fx.hinf_norm` |
+| ``getPeakGain`` | `fx.peak_gain` |
 | ``minreal``, ``balred``, ``canon(sys, "modal")`` | `fx.minimal`, `fx.balanced`, `fx.modal_form` |
 | ``lyap``, ``dlyap`` | `fx.lti.solve_lyapunov`, `fx.lti.solve_stein` |
 | ``care``, ``dare`` | `fx.lti.solve_care`, `fx.lti.solve_dare` |

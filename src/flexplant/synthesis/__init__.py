@@ -29,7 +29,8 @@ To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`
 | ``mixsyn``, ``augw`` | `fx.plant.mixed_sensitivity`, then `design_hinf` |
 | ``ncfsyn``, ``loopsyn``, ``ncfmargin`` | `design_ncf`, `shape_loop`, `ncf_margin` |
 | ``hinfstruct``, ``systune``, ``pidtune`` | `design_structured`, `tune_loops`, `design_servo` |
-| ``mussv``, ``robstab``, ``wcgain``, ``musyn`` | `mu`, `robust_stability`, `worst_case_gain`, `design_mu` |
+| ``mussv``, ``robstab`` | `mu`, `robust_stability` |
+| ``wcgain``, ``musyn`` | `worst_case_gain`, `design_mu` |
 
 Dense methods suit plants of up to some 500 states; `Lmi` takes 30 states, `design_lmi` 20.
 """
