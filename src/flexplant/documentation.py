@@ -37,12 +37,25 @@ _PAGE = """{% extends "default/module.html.jinja2" %}
 <a class="pdoc-button module-list-button" href="{{ root }}examples.html">Examples</a>
 {% endif %}
 {% endblock %}
+{% block nav_submodules %}
+{% if module.modulename == "flexplant" %}{{ super() | replace("Submodules", "Rooms") }}{% endif %}
+{% endblock %}
+{% block nav_members %}{{ super() | replace("API Documentation", "Names") }}{% endblock %}
 {% defaultmacro bases(cls) %}{% enddefaultmacro %}
+{% defaultmacro inherited(cls) %}
+{% for base, members in cls.inherited_members.items() if base[0].startswith("flexplant.") %}
+{% for m in members if is_public(m) | trim %}
+<div id="{{ m.qualname }}" class="classattr">
+{% if base[1] == "Value" %}<code>.{{ m.name }}</code>{% else %}{{ member(m) }}{% endif %}
+</div>
+{% endfor %}
+{% endfor %}
+{% enddefaultmacro %}
 """
 _STYLE = """
 main.pdoc img { max-width: 100%; height: auto; }
 main.pdoc .docstring table { display: block; overflow-x: auto; font-size: 0.9em; }
-main.pdoc pre { overflow-x: auto; }
+main.pdoc pre { overflow-x: auto; font-size: 0.78rem; }
 .gallery { display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: 1rem; }
 .gallery > a { border: 1px solid var(--accent2); border-radius: 4px; padding: 0.6rem; }
 .gallery img { display: block; width: 100%; height: 10rem; object-fit: cover;
@@ -124,6 +137,7 @@ class _Site:
                 self.where.setdefault(name, room)
         self.stories = sorted(_EXAMPLES.glob("*.py")) if _EXAMPLES.is_dir() else []
         self.page, self.root = "flexplant", ""
+        self.searched: set[str] | None = None  # pages, while the search index is written
 
     def at(self, page: str) -> None:
         """Say which page is written: links are relative to it."""
@@ -155,13 +169,10 @@ class _Site:
         room = short.pop(0) if short[0] in self.rooms else self.where.get(short[0])
         if room is None or self.page == f"flexplant.{room}":
             return match[0]
-        place = ""
-        if short:
-            if short[0] not in self.names[room]:
-                return match[0]
-            own = getattr(getattr(self.rooms[room], short[0]), "__dict__", {})
-            inside = short[1:2] if short[1:] and short[1] in own else []
-            place = "#" + ".".join([short[0], *inside])
+        if short and short[0] not in self.names[room]:
+            return match[0]
+        # to the class of a member: pdoc would take ".member" in a link for a name of its own
+        place = f"#{short[0]}" if short else ""
         return f"[{match[0]}]({self.root}flexplant/{room}.html{place})"
 
     def bibliography(self) -> str:
@@ -175,7 +186,7 @@ class _Site:
     def front(self) -> str:
         """Return README, then what the package says of itself, then the rooms."""
         readme = _ROOT / "README.md"
-        text = readme.read_text(encoding="utf-8") if readme.exists() else ""
+        text = readme.read_text(encoding="utf-8").partition("\n")[2] if readme.exists() else ""
         text = text.replace("](examples/", "](pictures/").replace("](examples)", "](examples.html)")
         own = inspect.getdoc(import_module("flexplant")) or ""
         room = "\n".join(
@@ -205,7 +216,7 @@ class _Site:
         shown = [f"![{name}](../pictures/{name})" for name in drawn]
         missing = f"``python examples/{path.name}`` draws its pictures."
         text = [f"## {title}", re.sub(r"::$", ":", rest, flags=re.MULTILINE)]
-        text += shown or ([missing] if "savefig" in "".join(cells) else [])
+        text += shown or ([missing] if ".png" in "".join(cells) else [])
         for cell in cells:
             title, _, code = cell.partition("\n")
             text += [f"### {title}", f"```python\n{code.strip()}\n```"]
@@ -225,6 +236,17 @@ class _Site:
 
 def _protected(match: re.Match[str]) -> str:
     return match[1] + match[2].replace(":", _COLON)
+
+
+def _public(text: str, pages: dict[str, Any]) -> str:
+    """Return a page without the modules behind the rooms, and types without quotes."""
+
+    def short(match: re.Match[str]) -> str:
+        return match[0] if match[1] in pages else match[2]
+
+    text = re.sub(r"\b(flexplant(?:\.[a-z_0-9]+)+)\.([A-Z]\w*)", short, text)
+    quoted = r"(<span class=\\?\"s\d\\?\">)(?:'|&#39;)([A-Z][\w\[\], .|]*)(?:'|&#39;)(</span>)"
+    return re.sub(quoted, r"\2", text)
 
 
 @contextmanager
@@ -284,14 +306,17 @@ def write_site(folder: str | Path) -> Links:
             "Install it by: python -m pip install 'flexplant[docs]'"
         ) from error
     folder, site = Path(folder), _Site()
-    convert = docstrings.convert
+    texts: Any = docstrings  # whose function is replaced for this run
+    convert = texts.convert
 
     def converted(text: str, docformat: str, source: Path | None) -> str:
-        return convert(site.markdown(text), docformat, source).replace(_COLON, ":")
+        if site.searched is not None and text not in site.searched:
+            text = text.partition("\n\n")[0]  # of what a room exports the first lines are enough
+        return str(convert(site.markdown(text), docformat, source)).replace(_COLON, ":")
 
-    render.configure(docformat="numpy", show_source=False, math=False)
+    render.configure(docformat="numpy", show_source=False, math=True)
     ours = jinja2.DictLoader({"module.html.jinja2": _PAGE, "custom.css": _STYLE})
-    render.env.loader = jinja2.ChoiceLoader([ours, render.env.loader])
+    render.env.loader = jinja2.ChoiceLoader([ours, *filter(None, [render.env.loader])])
     drawn = {path.stem: site.pictures(path, folder / "pictures") for path in site.stories}
     with _exporting(site), warnings.catch_warnings():
         # annotations that pdoc cannot evaluate it shows as they are written
@@ -305,16 +330,18 @@ def write_site(folder: str | Path) -> Links:
         for path in site.stories:
             name = f"examples.{path.stem}"
             pages[name] = _page(name, site.story(path, drawn[path.stem]))
-        docstrings.convert = converted
+        texts.convert = converted
         try:
             for name, page in pages.items():
                 site.at(name)
                 file = folder / f"{name.replace('.', '/')}.html"
                 file.parent.mkdir(parents=True, exist_ok=True)
-                file.write_text(render.html_module(page, pages), encoding="utf-8")
-            (folder / "search.js").write_text(render.search_index(pages), encoding="utf-8")
+                file.write_text(_public(render.html_module(page, pages), pages), encoding="utf-8")
+            site.searched = {page.docstring for page in pages.values()}
+            index = _public(render.search_index(pages), pages)
+            (folder / "search.js").write_text(index, encoding="utf-8")
         finally:
-            docstrings.convert = convert
+            texts.convert = convert
     moved = '<!doctype html><meta http-equiv="refresh" content="0; url=flexplant.html"/>'
     (folder / "index.html").write_text(moved, encoding="utf-8")
     found = check_links(folder)
