@@ -249,6 +249,34 @@ def _public(text: str, pages: dict[str, Any]) -> str:
     return re.sub(quoted, r"\2", text)
 
 
+class _AsWritten:
+    """A type that is shown as it stands in the source."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+def _as_written(space: Any) -> None:
+    """Show types below a page of pdoc as they are written, not what their aliases stand for."""
+    for one in space.own_members:
+        if one.kind == "class":
+            _as_written(one)
+        elif one.kind == "function":
+            raw = getattr(getattr(one.obj, "__func__", one.obj), "__annotations__", {})
+            said = {n: _AsWritten(text) for n, text in raw.items() if isinstance(text, str)}
+            given = one.signature
+            one.signature = given.replace(
+                parameters=[
+                    p.replace(annotation=said.get(p.name, p.annotation))
+                    for p in given.parameters.values()
+                ],
+                return_annotation=said.get("return", given.return_annotation),
+            )
+
+
 @contextmanager
 def _exporting(site: _Site) -> Iterator[None]:
     """Let pdoc see the public names of the rooms, for this run."""
@@ -323,6 +351,8 @@ def write_site(folder: str | Path) -> Links:
         warnings.filterwarnings("ignore", "Error parsing type annotation", UserWarning)
         pages: dict[str, Any] = {"flexplant": doc.Module.from_name("flexplant")}
         pages |= {f"flexplant.{n}": doc.Module.from_name(f"flexplant.{n}") for n in site.rooms}
+        for page in pages.values():
+            _as_written(page)
         pages["flexplant"].docstring = site.front()
         pages["flexplant.bibliography"].docstring = site.bibliography()
         if site.stories:
