@@ -18,7 +18,7 @@ KNOBS = {"peak", "disturbance", "effort", "noise"}
 def rows():
     """Return (bandwidth, changed knobs, numbers) of each line of the table; unstable is 0."""
     found = []
-    for line in (fx.stage_weights.__doc__ or "").splitlines():
+    for line in (fx.plant.__doc__ or "").splitlines():
         cells = re.split(r"\s{2,}", line.strip().replace("unstable", "0"))
         if re.fullmatch(r"\d+", cells[0]) and len(cells) in (6, 7):
             words = " ".join(cells[1:-5]).split()
