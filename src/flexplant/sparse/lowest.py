@@ -12,7 +12,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 from ..checks import FloatArray, IntArray
-from ..errors import SolverError
+from ..errors import SolverError, attempted
 from .factor import DENSE_LIMIT, dense, diagonal, negative_pivots, symmetric_lu
 from .inertia import multifrontal_inertia
 from .lanczos import VALUE, BlockLanczos, iterated
@@ -190,10 +190,8 @@ def definite_solver(K: Any, M: Any, shift: float) -> Callable[[FloatArray], Floa
 def _factor(matrix: Any, order: Dissection | None) -> Any:
     """Return a factorisation with a method solve; by fronts where K + s M is definite and large."""
     if order is not None:
-        try:
+        with attempted("a multifrontal Cholesky factor", SolverError):
             return MultifrontalCholesky(matrix, order)
-        except SolverError:
-            pass
     return symmetric_lu(matrix)
 
 

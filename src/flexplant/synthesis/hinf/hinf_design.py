@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from ...errors import (
     InfeasibleError,
     ModelError,
     SolverError,
+    attempted,
     counted,
     warn,
 )
@@ -171,7 +171,8 @@ def tolerant(
     open_plant = with_channels(plant, channels)
     problem = prepared(open_plant.system, open_plant.u, open_plant.y)
     first = np.inf
-    with suppress(FlexplantError):  # only the scales hang on it: where it fails, all is said below
+    # only the scales hang on it: where it fails, all is said below
+    with attempted("evening out the scales of modes"):
         found = (method or Riccati(progress=progress)).solve(problem)
         loop = problem.restored(found.A, found.B, found.C, found.D)
         channels, first = rebalanced(channels, open_plant, loop), found.gamma
@@ -341,7 +342,7 @@ def best_answer(plant: StandardPlant, problem: Prepared, progress: bool | None) 
             break
     if not answers:
         for tried_method, claimed in broken:
-            with suppress(FlexplantError):
+            with attempted("another controller than that which was claimed"):
                 answers.append(_beyond_claim(plant, problem, tried_method, claimed))
         if not answers:
             raise _failure(failures)
