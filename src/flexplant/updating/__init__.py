@@ -5,7 +5,7 @@ What the drawing has wrong is found from what was measured, with its uncertainty
 - `update(model, parameters, residuals)`: parameters are `AddedMass`, `AddedDamping`,
   `AddedStiffness`, `MatrixParameter`, ...; residuals `Eigenvalues`, `ModeShapes`, `FrfResidual`,
   `Antiresonances`, `StaticCompliance`; chi-square says whether they explain the data.
-- `localise(model, residuals, candidates)`: where the error is, among candidates.
+- `localise(model, candidates, residuals)`: where the error is, among candidates.
 - `identifiability`: what the data can say at all; `validate` with data left out;
   `sample_posterior` where the uncertainty is no ellipsoid.
 - `UpdateResult.calibrated(measured)`: the measured poles in the model; `applied_to(full)`: the
