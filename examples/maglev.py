@@ -208,7 +208,7 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
                 label = axis if what == "loop" else f"{axis}, estimate"
                 color = fx.plot.CYCLE[i]["color"]
                 ax.plot(way, rms, style, color=color, marker="o^s"[i], markersize=4, label=label)
-        ax.set(xlabel="way of the POI from the middle to a corner [mm]", ylim=(0.0, None))
+        ax.set(xlabel="distance of the POI from the middle [mm]", ylim=(0.0, None))
         ax.set(ylabel=f"rms error [{_unit(kind[0])}]", title=f"{', '.join(kind)} along the path")
         ax.legend(frameon=False, ncols=3)
         ax.grid(alpha=0.3)

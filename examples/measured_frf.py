@@ -84,10 +84,10 @@ def response(frf: fx.Frf, lines: Any, outputs: list[str]) -> fx.FrfResidual:
 def located(frf: fx.Frf, eigenvalues: fx.Eigenvalues) -> tuple[Localisation, Localisation]:
     """Return where the mass may be: by the poles, then by FRFs at the places left."""
     everywhere = {"nuisance": [stiffness, damping], "most": 1}
-    by_poles = fx.localise(drawing, [eigenvalues], [*masses.values()], screen=8, **everywhere)
+    by_poles = fx.localise(drawing, [*masses.values()], [eigenvalues], screen=8, **everywhere)
     low = np.flatnonzero((frf.freq > BAND[0]) & (frf.freq < 700.0))[::4]
     left = [masses[place] for place in by_poles.alike]
-    return by_poles, fx.localise(drawing, [response(frf, low, FITTED)], left, **everywhere)
+    return by_poles, fx.localise(drawing, left, [response(frf, low, FITTED)], **everywhere)
 
 
 # %% What the model says about responses that were not used

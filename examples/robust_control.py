@@ -160,12 +160,12 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
         (f"servo, {BANDWIDTH:g} Hz", robust, fx.plot.CYCLE[0]["color"]),
         (f"H-infinity, {MORE:g} Hz", found["sharp"], fx.plot.CYCLE[1]["color"]),
     ):
-        dots = None if one is robust else "dots: at the frequencies of their scalings"
+        dots = None if one is robust else "dots: at single frequencies"
         axs[0].loglog(one.frequencies, one.bounds, ".", ms=3, color=color, label=dots)
-        axs[0].axhline(one.upper, color=color, label=f"{name}: proven at all frequencies")
-    axs[0].axhline(1.0, label="all that is not known", **fx.plot.STYLES["bound"])
-    axs[0].set(title="robust stability", xlabel="frequency [Hz]", ylabel="upper bound of mu [1]",
-               xlim=(80.0, 5e3), ylim=(1e-3, 300.0))  # fmt: skip
+        axs[0].axhline(one.upper, color=color, label=f"{name}: proven bound, all frequencies")
+    axs[0].axhline(1.0, label="below 1: every machine is stable", **fx.plot.STYLES["bound"])
+    axs[0].set(title="stability of all machines that the data allow", xlabel="frequency [Hz]",
+               ylabel="upper bound of mu [1]", xlim=(80.0, 5e3), ylim=(1e-3, 300.0))  # fmt: skip
     near = worst.freq * (1.0 + np.linspace(-2e-3, 2e-3, 201))  # a resonance of 0.1 % damping
     freq = np.union1d(np.geomspace(5.0, 4e3, 1500), near)
     for name, loop, color in (

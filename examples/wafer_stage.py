@@ -256,8 +256,8 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     figure, axs = plt.subplots(2, 3, figsize=(17, 9), layout="constrained")
     figure.suptitle("A virtual machine that no drawing resembles, with 0.1 % damping")
     shades = dict(zip(case["errors"][1e-3].names, SHADES, strict=True))
-    forces, rows = [f"{f:g} N/√Hz" for f in FORCES], list(case["errors"].values())
-    fx.plot.predictions(rows, colors=shades, cases=forces, ax=axs[0, 0])
+    forces = [f"amplifiers\n{1e3 * f:g} mN/√Hz" for f in FORCES]
+    fx.plot.predictions(list(case["errors"].values()), colors=shades, cases=forces, ax=axs[0, 0])
     for (name, loop), color in zip(case["loops"].items(), COLORS, strict=True):
         run, held = loop["run"], loop["machine"].is_stable
         style = {"label": name + ("" if held else ": unstable"), "color": color}

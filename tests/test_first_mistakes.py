@@ -1,12 +1,21 @@
 """Mistakes of a first hour: the message says which one it was."""
 
+import pickle
 import re
 
 import numpy as np
 import pytest
 
 import flexplant as fx
-from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
+from flexplant.errors import (
+    CertificateError,
+    FlexplantWarning,
+    LabelError,
+    ModelError,
+    ShapeError,
+    SolverError,
+    attempted,
+)
 from flexplant.foreign_names import OURS
 
 
@@ -83,3 +92,20 @@ def test_one_over_one_plus_l():
         fx.modulus_margin(fx.StateSpace([[-1.0]], [[1.0, 2.0]], [[1.0]], 0))
     with pytest.raises(ModelError, match="need a ClosedLoop, "):
         fx.modulus_margin("L")
+
+
+def test_what_is_tried_and_dropped_is_in_the_log(caplog):
+    """Silent for whoever does not want it; other errors than the expected pass."""
+    with caplog.at_level("INFO", logger="flexplant"):
+        with attempted("a quick factor", SolverError):
+            raise SolverError("a pivot is zero")
+        with pytest.raises(ModelError), attempted("a quick factor", SolverError):
+            raise ModelError("M is indefinite")
+    assert caplog.messages == ["a quick factor failed and is dropped: a pivot is zero"]
+
+
+def test_a_failed_certificate_says_what_to_report():
+    error = CertificateError("the norm is 2, claimed was 1")
+    assert str(error) == "the norm is 2, claimed was 1"
+    assert "flexplant.show_versions()" in error.__notes__[0]
+    assert pickle.loads(pickle.dumps(error)).args == error.args

@@ -34,6 +34,7 @@ ROOMS = (
     "testbeds",
     "io",
     "plot",
+    "documentation",
 )
 LEVEL = {
     name: i for i, room in enumerate(ROOMS) for name in ([room] if isinstance(room, str) else room)

@@ -1,4 +1,4 @@
-"""Long work shows a bar where somebody sees it, is silent in pipes, and can be interrupted."""
+"""Long work shows a bar where somebody sees it, says so once in pipes, and can be interrupted."""
 
 import json
 import os
@@ -78,7 +78,7 @@ print("done")
 
 
 @pytest.mark.slow
-def test_bars_on_a_terminal_and_none_in_a_pipe():
+def test_bars_on_a_terminal_and_a_line_each_in_a_pipe():
     pty, termios = pytest.importorskip("pty"), pytest.importorskip("termios")
     ours, theirs = pty.openpty()
     termios.tcsetwinsize(theirs, (24, 100))
@@ -99,7 +99,11 @@ def test_bars_on_a_terminal_and_none_in_a_pipe():
     names = re.findall('    "(.*)": lambda', WORK)
     assert len(names) == 8 and not [name for name in names if name[:12] not in text]
     piped = child(SHOWN, subprocess.PIPE)
-    assert piped.communicate(timeout=300) == (b"done\n", b"")
+    out, said = piped.communicate(timeout=300)
+    assert out == b"done\n"
+    lines = said.decode().splitlines()
+    assert len(lines) > 4, "a line each, where they run at once"
+    assert not [line for line in lines if not re.search(r": 0 s(, \d+ of \d+ done, .*)?$", line)]
 
 
 INTERRUPTED = """
@@ -166,9 +170,22 @@ def test_a_notebook_is_somebody(monkeypatch, capsys):
         bar.advance()
     said = capsys.readouterr()
     assert "modes" in said.out and not said.err
-    shell.get_ipython = lambda: None
-    with Progress(3, "modes") as bar:
-        bar.advance()
+
+
+def test_where_nobody_looks_one_line_says_how_long(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "PATIENCE", 0.05)
+    for total, said in ((4, r"modes: 0 s, 1 of 4 done, some 0 s more\n"), (None, r"modes: 0 s\n")):
+        with Progress(total, "modes:") as bar:
+            bar.advance()
+            time.sleep(0.2)
+            with Progress(3, "inside"):
+                time.sleep(0.1)
+        printed = capsys.readouterr()
+        assert re.fullmatch(said, printed.err) and not printed.out
+    with Progress(4, "modes", progress=False):
+        time.sleep(0.1)
+    with Progress(4, "modes"):
+        pass  # over before
     assert capsys.readouterr() == ("", "")
 
 

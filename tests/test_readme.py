@@ -1,4 +1,4 @@
-"""The README keeps its word: its commands are there, its code runs."""
+"""README and the rooms' docstrings keep their word: commands, names, code and what it prints."""
 
 import os
 import re
@@ -12,12 +12,20 @@ import scipy.io
 import scipy.linalg
 
 import flexplant
-from flexplant import h2_norm, solid_block
+from flexplant import h2_norm, io, simulation, solid_block
+from test_public_api import ROOMS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 FLAGS = re.MULTILINE | re.DOTALL
-BLOCKS = re.findall(r"^```python\n(.*?)^```", README, FLAGS)
+OWN = re.findall(r"^```python\n(.*?)^```", README, FLAGS)
+#: code in the rooms' docstrings that goes on with the README's names, or takes long
+LONGER = [
+    code
+    for room in (io, simulation)
+    for code in re.findall(r"^```python\n(.*?)^```", room.__doc__ or "", FLAGS)
+]
+BLOCKS = [*OWN, *LONGER]
 COMMANDS = (
     "python -m pip install -e . && python examples/wafer_stage.py",
     "python -m pip install -e '.[test]' && python -m pytest",
@@ -40,13 +48,42 @@ def test_files_that_it_names_exist():
         assert (ROOT / path).exists() or path.startswith("examples/out"), path
 
 
+def test_it_is_short():
+    assert len(README.splitlines()) <= 150
+
+
+def found(name, *places):
+    """Return what a dotted name reaches in one of some objects; raise where it reaches nothing."""
+    for place in places:
+        value = place
+        try:
+            for part in name.removeprefix("fx.").removeprefix("flexplant.").split("."):
+                value = getattr(value, part)
+        except AttributeError:
+            continue
+        return value
+    raise AssertionError(f"{name} is no name")
+
+
 def test_names_that_it_gives_exist():
-    named = set(re.findall(r"\bfx((?:\.\w+)+)", README))
+    named = set(re.findall(r"\bfx(?:\.\w+)+", README))
     assert len(named) > 30
     for name in named:
-        value = flexplant
-        for part in name[1:].split("."):
-            value = getattr(value, part)
+        found(name, flexplant)
+
+
+@pytest.mark.parametrize("name", sorted(ROOMS - {"errors"}))
+def test_a_rooms_docstring_says_what_it_is_for(name):
+    """Names in single quotes are ours, an example runs (test_doctests), names elsewhere follow."""
+    room = getattr(flexplant, name)
+    text = room.__doc__
+    named = re.findall(r"(?<!`)`([A-Za-z_][\w.]*)`(?!`)", text)
+    for one in set(named) - {"fx"}:
+        assert one.startswith("examples/") or found(one, room, flexplant) is not None
+    ours = [one for one in named if one.split(".")[0] in {*dir(room), "fx"}]
+    assert len(ours) >= (0 if name == "sparse" else 4), "its main verbs"
+    assert ">>> " in text
+    assert name in ("testbeds", "io") or "elsewhere" in text or "MATLAB" in text
 
 
 LISTS = """
@@ -65,7 +102,9 @@ def test_its_scripts_pass_strict_type_checks(tmp_path):
     """
     pytest.importorskip("mypy")
     script, options = tmp_path / "readme.py", tmp_path / "options.toml"
-    script.write_text("\n".join([*BLOCKS, "wrong: str = fx.lowpass(60.0)"]), encoding="utf-8")
+    script.write_text(
+        "\n".join([*BLOCKS, LISTS, "wrong: str = fx.lowpass(60.0)"]), encoding="utf-8"
+    )
     rules = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     declared = '[[tool.mypy.overrides]]\nmodule = ["flexplant.*"]\nignore_errors = true\n'
     options.write_text(f"{rules}\n{declared}", encoding="utf-8")
@@ -122,8 +161,9 @@ def test_the_table_of_peers_is_that_of_the_command():
     folder = ROOT / "tests" / "benchmarks"
     script = (folder / "readme_table.py").read_text(encoding="utf-8")
     tasks = re.findall(r"^    (\w+),$", script.split("ROWS = (")[1].split(")")[0], re.MULTILINE)
-    lines = README.split("| ratio |\n|---|---|---|---|---|\n")[1].split("\n\n")[0].splitlines()
-    assert "OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py" in README
+    text = flexplant.__doc__
+    lines = text.split("| ratio |\n|---|---|---|---|---|\n")[1].split("\n\n")[0].splitlines()
+    assert "OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py" in text
     assert len(lines) == len(tasks) > 10
     ratios = [line.split("|")[5].strip() for line in lines]
     known = [float(ratio) for ratio in ratios if ratio != "-"]
@@ -131,27 +171,27 @@ def test_the_table_of_peers_is_that_of_the_command():
 
 
 def test_every_example_has_its_task():
-    table = README.split("## Which example for which task")[1].split("\n## ")[0]
-    for path in (ROOT / "examples").glob("*.py"):
-        assert f"`examples/{path.name}`" in table, path.name
-    rows = [line for line in table.splitlines() if line.startswith("|")]
-    assert {row.replace("\\|", "").count("|") for row in rows} == {3}, "two columns"
+    named = set(re.findall(r"`examples/(\w+\.py)`", flexplant.__doc__))
+    assert named == {path.name for path in (ROOT / "examples").glob("*.py")}
 
 
 @pytest.mark.slow
 def test_the_code_runs(tmp_path, monkeypatch, capsys):
     """All python blocks, in order, in one namespace, as a reader would paste them.
 
-    What the first one prints is the text below it.
+    What those of the README print is the text below each.
     """
-    assert BLOCKS
+    texts = re.findall(r"^```text\n(.*?)^```", README, FLAGS)
+    assert len(texts) == len(OWN) == 3
+    assert len(LONGER) == 3
     monkeypatch.chdir(tmp_path)
     write_stage(tmp_path)
     names = {"__name__": "readme"}
-    for i, code in enumerate(BLOCKS, 1):
-        exec(compile(code, f"README block {i}", "exec"), names)
-        if i == 1:
-            alike(capsys.readouterr().out, re.findall(r"^```text\n(.*?)^```", README, FLAGS)[0])
+    for i, code in enumerate(BLOCKS):
+        exec(compile(code, f"block {i + 1}", "exec"), names)
+        printed = capsys.readouterr().out
+        if i < len(texts):
+            alike(printed, texts[i])
     g = names["loop"].system
     P = scipy.linalg.solve_discrete_lyapunov(g.A, g.B @ g.B.T)
     by_scipy = np.sqrt(np.trace(g.C @ P @ g.C.T) + np.sum(g.D**2))

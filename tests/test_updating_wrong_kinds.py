@@ -65,7 +65,7 @@ def shapes(**options):
 
 def located(**options):
     pool = options.pop("candidates", [fx.AddedMass(f"{i}:z") for i in (1, 2, 3)])
-    return fx.localise(chain(), options.pop("residuals", data()), pool, **options)
+    return fx.localise(chain(), pool, options.pop("residuals", data()), **options)
 
 
 def region(**options):
@@ -171,7 +171,7 @@ CALLS = [
         lambda x: fx.updating.StaticCompliance(1.0, "1:z", x),
         ("text", "dict"),
     ),
-    ("localise model", lambda x: fx.localise(x, data(), MASS), ()),
+    ("localise model", lambda x: fx.localise(x, MASS, data()), ()),
     ("localise residuals", lambda x: located(residuals=x), ()),
     ("localise candidates", lambda x: located(candidates=x), ()),
     ("localise nuisance", lambda x: located(nuisance=x), ()),

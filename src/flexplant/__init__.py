@@ -3,7 +3,118 @@
 From finite-element matrices and a measurement to the closed-loop error at a point of interest::
 
     FEModel --solve_modes--> Modes --reduce--> ReducedModel --update--> UpdateResult.model
-        --assemble_plant--> StandardPlant --design_...--> blocks --close_loop--> --simulate-->
+      (M, D, K, dofs)                           (M*, D*, K*, T)  ^            |
+                                              MeasuredModes -----'            |
+                                                      assemble_plant(model, ports)
+                                                                              v
+      +-----------+   [w;u] -> [z;y]      StandardPlant --discretized(rate, delay)--> sampled
+    z<|           |<w                          +-----------+-----------+--------------+
+    y<|     P     |<u                  design_kalman   design_servo,   score_sensors,
+      +-----------+                            |       design_hinf     place_sensors, ...
+        +-->K--+                               v           v
+                         close_loop(plant, *blocks) --> ClosedLoop --simulate--> Response
+
+Every model of one machine takes the same `Ports`: the drawing, the updated model, the truth. Each
+room below has its own page, ``help(fx.plant)``: what it is for, an example, its names elsewhere.
+
+>>> import flexplant as fx
+>>> plant = fx.testbeds.three_masses()
+>>> observer = fx.design_kalman(plant)
+>>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+>>> print(fx.close_loop(plant, observer, servo))
+<ClosedLoop: plant 7 states, controller 11 states, dt 0.0005 s>
+  stable: spectral radius 0.996842717, modulus margin 0.57
+  driven: u1
+  monitored: die:hat
+  no frequency of a mode off by 1 % does harm
+
+**Conventions**
+
+| convention | |
+|---|---|
+| units | SI; `freq` in Hz, `omega` in rad/s; rx = dz/dy, ry = -dz/dx |
+| spectra | `psd`, `asd` one-sided; white noise has the intensity asd^2 / 2 |
+| channels | inputs `[w; u]`, outputs `[z; y]`; `u = K y`: the sign is in the controller |
+| names | `die:z` (POI), `die:ref`, `die:error` (reference minus POI), `die:hat` (estimate) |
+| time | dt = 0 is continuous; within a sample: measure, update, control, hold |
+| modes | numbered from 1, rigid-body modes included; these are undamped unless a damper says so |
+
+**What to rely on**
+
+- Answers carry a check made by another route. A Kalman filter's predicted error is recomputed by a
+  Stein equation, an H-infinity controller is verified by the closed-loop norm, found with proof and
+  by a sweep; modes by residual and count. A failed check raises.
+- Checks go beyond the model. Modes that a reduction left out are noise in a filter's predicted
+  error, and every loop is tried on the plant that has them: what they make unstable is named. A fit
+  says by chi-square whether the parameters explain the data.
+- SI units serve as they are. Gains of 1e-9 m/N, damping of 0.1 %, rigid-body modes at exactly zero,
+  repeated modes: scaling happens inside.
+- Nothing is repaired silently. Errors say what is wrong, what was got, why it matters and what to
+  do next.
+
+**Which example for which task** (``python examples/<name>.py`` in the repository)
+
+- see what a model of this machine buys: `examples/wafer_stage.py`
+- read matrices of a finite-element program: `examples/from_nastran.py`; an imported solid in six
+  axes: `examples/solid_stage.py`
+- reduce: `examples/reduction_methods.py`, twelve ways in one table
+- solve a large model: `examples/million_dofs.py`
+- identify and update: `examples/measured_frf.py`; a real record: `examples/ruler.py`; the paper's
+  numbers and figures: `examples/paper_plate.py`
+- estimate from records: `examples/recorded_data.py`; a POI that moves: `examples/moving_poi.py`
+- control six axes: `examples/maglev.py`
+- follow set-points: `examples/feedforward.py`
+- guarantee robustness: `examples/robust_control.py`
+- join components: `examples/joined_machine.py`
+- place sensors and actuators: `examples/placement.py`
+- design for many machines: `examples/fleet.py`
+- write a specification as tests: `examples/test_specifications.py`
+
+**Beside its peers.** CPU seconds on one core of a server, ours and a peer's in one run of
+``OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py``. A ratio above 1 means that ours is
+faster; the answers are compared first. Figures of another run differ by some 20 %.
+
+| task | flexplant | peer | its time | ratio |
+|---|---|---|---|---|
+| 24 modes of a solid, 27 783 DOFs | 3.3 s | scipy eigsh | 23 s | 7 |
+| all 243 modes of a plate, dense | 16 ms | scipy eigh | 4.7 ms | 0.29 |
+| 200 lines of a plate's responses, 30 000 DOFs | 2.4 s | scipy splu (4 of them) | 420 s | 180 |
+| 8 x 8 frequency responses, 10 000 lines | 4.5 ms | python-control, slycot | 0.13 s | 28 |
+| H-infinity norm, 48 states, 0.1 % damping | 2.4 ms | slycot ab13dd | 2.3 ms | 0.94 |
+| the same, A dense | 2.4 ms | slycot ab13dd | 2.2 ms | 0.95 |
+| H2 norm, 200 states | 8.1 ms | python-control, slycot | 4.2 ms | 0.52 |
+| zero-order hold, 48 states | 1.7 ms | scipy cont2discrete | 0.2 ms | 0.12 |
+| a discrete Riccati equation, 48 states | 3.5 ms | scipy solve_discrete_are | 7.9 ms | 2.2 |
+| 100 000 samples through a Kalman filter | 29 ms | filterpy (5000 of them) | 5.1 s | 180 |
+| 100 000 samples of a loop, 218 states | 60 ms | python-control | 1.5 s | 25 |
+| H-infinity, 3 states: norm 0.143 | 28 ms | python-control, slycot: 0.137 | 17 ms | 0.61 |
+| H-infinity, 61 states of a stage: norm 0.947 | 0.45 s | slycot: no answer in 10 s | - | - |
+| mu of 12 complex scalars, both bounds | 0.19 s | slycot ab13md, the upper one | 12 ms | 0.063 |
+| poles of a close pair in noise: error 5e-07 | 0.41 s | scikit-rf: 7e-07 | 0.18 s | 0.44 |
+| a sparse OUTPUT4 file of Nastran | 7.1 ms | pyYeti | 32 ms | 4.5 |
+
+Peers are better where no check is wanted: SciPy and slycot solve small dense problems in less time,
+for ours compute residuals, bounds and norms by a second route.
+``python -m pytest -m benchmark -s tests/benchmarks`` times many more.
+
+**Limits**
+
+- Sizes tried: models of 2 to 998 787 DOFs (24 modes of that one: 39 to 45 s and 4.8 GB on one core;
+  of a solid of 292 008: 85 s and 4.1 GB; ``python tests/benchmarks/modes_peers.py solid 45 ours``
+  repeats it; memory settings are in `flexplant.sparse`); plants of 2 to 490 states; 60 candidate
+  places; studies of 200 machines. Dense methods suit plants of up to some 500 states.
+- Dampings tried: 0.01 % to 1 %, none at all, and magnets of negative stiffness.
+- Units tried: SI, and files in mm and t or other units of length, mass and time.
+- Structures are linear and time-invariant, M, D and K symmetric: no gyroscopic terms, contact or
+  temperature. POIs may move.
+
+**Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy, python-control
+and threadpoolctl (BSD-3), cvxpy and Clarabel (Apache-2.0), filterpy (MIT), matplotlib (its own, of
+BSD kind), tqdm (MPL-2.0 and MIT). Extras, as in ``pip install -e '.[ansys]'``: ``hdf5`` is h5py
+(BSD-3), ``uff`` pyuff and ``ansys`` ansys-mapdl-reader (MIT), ``mkl`` Intel's own, ``docs`` pdoc
+(MIT-0). slycot (GPL-2) and other peers are used in tests only. Sources are cited by the keys of
+`flexplant.bibliography`; the method is that of [paper]_. Its text says 0.1 % modal damping while
+its printed eigenvalues have 1 %; `examples/paper_plate.py` shows both.
 """
 
 from importlib import import_module as _import_module

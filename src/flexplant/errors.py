@@ -12,12 +12,16 @@
     └── CertificateError (RuntimeError)  an answer failed the check by another route
     FlexplantWarning     (UserWarning)
 
-Every message says what is wrong, what was got, why it matters and what to do next.
+Every message says what is wrong, what was got, why it matters and what to do next. What is tried
+inside, fails and is replaced by something else is no error: ``logging.getLogger("flexplant")`` says
+so at the level INFO (``logging.basicConfig(level="INFO")`` shows it).
 """
 
+import logging
 import sys
 import warnings
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 
 
@@ -62,6 +66,13 @@ class SolverError(FlexplantError, RuntimeError):
 class CertificateError(FlexplantError, RuntimeError):
     """A computed answer failed its check by another route."""
 
+    def __init__(self, *said: object) -> None:
+        super().__init__(*said)
+        self.add_note(
+            "Where the input is right this is a mistake of flexplant: report it, with what "
+            "flexplant.show_versions() prints."
+        )
+
 
 class FlexplantWarning(UserWarning):
     """A result that the caller should use with care.
@@ -80,6 +91,21 @@ class FlexplantWarning(UserWarning):
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun: `1 mode`, `2 modes`."""
     return f"{number} {noun}{'s' * (number != 1)}"
+
+
+@contextmanager
+def attempted(what: str, kind: type[FlexplantError] = FlexplantError) -> Iterator[None]:
+    """Let fail what has something else behind it; the log of "flexplant" says that it was dropped.
+
+    Examples
+    --------
+    >>> with attempted("a factor in single precision", SolverError):
+    ...     raise SolverError("a pivot is zero")
+    """
+    try:
+        yield
+    except kind as error:
+        logging.getLogger("flexplant").info("%s failed and is dropped: %s", what, error)
 
 
 def warn(said: str) -> None:

@@ -18,7 +18,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from math import inf
@@ -374,6 +374,9 @@ _open = threading.local()
 class Progress:
     """A bar for long work: after two seconds, on a terminal or in a notebook, unless forced.
 
+    Elsewhere (pipes, files of a cluster) one line on the standard error says after two seconds what
+    runs, and how long it will take where that can be said; `progress=False` is silent.
+
     Work inside of other work shows none of its own, neither here nor in the process of a pool.
     """
 
@@ -386,7 +389,11 @@ class Progress:
         self.description = description
         self._over = threading.Event()
         self._forced = bool(progress)
-        stream = watched() if progress is None and not _open_bars() else None
+        self._total = total
+        outermost = progress is None and not _open_bars()
+        stream = watched() if outermost else None
+        self._unseen = outermost and stream is None and sys.stderr is not None
+        self._thread: threading.Thread | None = None
         if progress or stream is not None:
             from tqdm import tqdm
 
@@ -401,8 +408,10 @@ class Progress:
 
     def __enter__(self) -> Self:
         _open_bars().append(self)
-        if self.bar is not None and not self._forced:
-            threading.Thread(target=self._shown, daemon=True).start()
+        if (self.bar is not None and not self._forced) or self._unseen:
+            work = self._said if self._unseen else self._shown
+            self._thread = threading.Thread(target=work, daemon=True)
+            self._thread.start()
         return self
 
     def __exit__(
@@ -415,6 +424,8 @@ class Progress:
         _open_bars().remove(self)
         if self.bar is not None:
             self.bar.close()
+        elif self._thread is not None:
+            self._thread.join()
 
     def advance(self, items: int = 1) -> None:
         """Count some items as done."""
@@ -428,6 +439,18 @@ class Progress:
         while not self._over.wait(wait):
             self.bar.refresh()
             wait = _AGAIN
+
+    def _said(self) -> None:
+        """Say once, in a line, what runs and how long it will take."""
+        begin = monotonic()
+        if self._over.wait(PATIENCE):
+            return
+        spent, text = monotonic() - begin, ""
+        if self._total and self.done:
+            left = spent * (self._total - self.done) / self.done
+            text = f", {self.done} of {self._total} done, some {max(left, 0.0):.0f} s more"
+        with suppress(OSError, ValueError):  # a closed stream
+            sys.stderr.write(f"{self.description.rstrip(':')}: {spent:.0f} s{text}\n")
 
 
 def tick(description: str) -> None:

@@ -167,7 +167,7 @@ def test_ninety_nine_places_with_shapes(kind, monkeypatch):
         if not few:
             monkeypatch.setattr(subsets, "coordinates", lambda *arguments: None)
         begun = time.process_time()
-        found.append(localise(model, places.data, pool, most=2))
+        found.append(localise(model, pool, places.data, most=2))
         taken.append(time.process_time() - begun)
     known = np.isfinite(found[1].bic)
     apart = float(np.abs(found[0].bic[known] - found[1].bic[known]).max())

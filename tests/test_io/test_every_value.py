@@ -257,7 +257,7 @@ def of_updates(rom, unknowns, residual, fit):
     blow[[10, 50]] = 1.0
     yield fx.identification.impact_frf(blow, answer, 100.0, segment=0.3)
     yield fx.identifiability(rom, unknowns, [residual])
-    yield fx.localise(rom, [residual], [fx.AddedMass(label) for label in rom.dofs.labels[:4]])
+    yield fx.localise(rom, [fx.AddedMass(label) for label in rom.dofs.labels[:4]], [residual])
     yield fx.updating.correlate(fit.model, [residual])
     yield from (fx.updating.Discrepancy("damping", 0.3, 6.0), fit.uncertainty())
     bounded = [fx.AddedMass(at, bounds=(0.0, 1.0)), fx.AddedDamping(at, bounds=(-1.0, 1.0))]

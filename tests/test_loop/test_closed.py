@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import flexplant as fx
 import oracles_loop as oracle
 from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError
 from flexplant.estimation import design_static
@@ -326,3 +327,14 @@ def test_a_command_without_feedback_keeps_the_whole_margin():
     loop = close_loop(plant, ahead)
     assert loop.modulus_margin == pytest.approx(1.0, rel=1e-12)
     assert "modulus margin 1\n" in repr(loop)
+
+
+def test_a_reference_that_nothing_follows_is_named():
+    plant = fx.testbeds.three_masses()
+    sensors = [name for name in plant.y if name not in plant.w]
+    blind = plant.system.select([*plant.z, *sensors], [*plant.w, *plant.u])
+    own = fx.StandardPlant.from_statespace(blind, u=plant.u, y=sensors)
+    loop = fx.close_loop(plant, fx.design_h2(own.weighted(z={"u1:effort": 1e-6})))
+    assert "\n  references that no block reads: die:ref" in repr(loop)
+    followed = fx.close_loop(plant, fx.design_h2(plant.weighted(z={"u1:effort": 1e-6})))
+    assert "no block reads" not in repr(followed)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import flexplant as fx
 from flexplant.errors import AssumptionError, LabelError, ModelError
 from flexplant.lti import frequency_response
 from flexplant.modes import solve_modes
@@ -180,3 +181,17 @@ def test_other_points_of_the_body_move_with_the_reference_and_are_left_out():
     assert gammas[0] < 3.0
     resting = stage_weights(sampled(model, ports(z=[left, right], references=[])), 30.0, poi="left")
     assert None not in resting.z.values()
+
+
+def test_the_weights_are_taken_as_they_are():
+    """By `weighted` whole, by name, and by design_hinf from a bandwidth: one plant each time."""
+    plant = fx.testbeds.three_masses()
+    weights = fx.stage_weights(plant, 20.0)
+    by_name = plant.weighted(z=weights.z, w=weights.w).system
+    np.testing.assert_array_equal(plant.weighted(weights).system.B, by_name.B)
+    other = plant.weighted(weights, z={"u1:effort": 0.0}).system
+    np.testing.assert_array_equal(other.C[other.output_index("u1:effort")], 0.0)
+    whole = fx.design_hinf(plant, bandwidth=20.0)
+    assert whole.gamma == fx.design_hinf(plant.weighted(weights)).gamma
+    with pytest.raises(ModelError, match=r"StageWeights, got 3\.0.* Pass stage_weights"):
+        plant.weighted(3.0)

@@ -99,3 +99,21 @@ def test_the_message_of_a_failed_test_is_the_table(tmp_path):
     assert "specification: FAILED (MA)" in done.stdout
     shown = [line for line in done.stdout.splitlines() if "2 <= 1 " in line]
     assert shown and shown[0].split()[-2:] == ["nm", "FAILED"]
+
+
+def test_the_only_error_is_meant_or_one_is_named():
+    """Whatever the POI is called; without an error the channel must be named."""
+    ports = fx.testbeds.three_masses().assembled.ports
+    called = {"z": [fx.Poi("tip", at="2:x", axes=("x",))], "y": ports.y, "u": ports.u, "w": ports.w}
+    for references in ([fx.Reference("tip")], []):
+        own = fx.Ports(**called, references=references)
+        plant = fx.testbeds.three_masses().with_ports(own)
+        servo = {"noise": 1.0}
+        loop = fx.close_loop(plant, fx.design_h2(plant.weighted(z={"u1:effort": 1e-6})))
+        if references:
+            found = fx.Specification(**servo).check(loop)
+            assert found["noise"] == loop.rms("tip:error")
+        else:
+            with pytest.raises(LabelError, match=r"0 error channels\. Say which .* channel="):
+                fx.Specification(**servo).check(loop)
+            assert fx.Specification(**servo, channel="tip:x").check(loop)["noise"] > 0

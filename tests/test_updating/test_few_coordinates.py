@@ -86,10 +86,10 @@ def test_localisation_is_that_in_all_coordinates(plate, monkeypatch):
         return B
 
     monkeypatch.setattr(subsets, "coordinates", noted)
-    found = localise(rom, data, pool, most=1)
+    found = localise(rom, pool, data, most=1)
     assert max(sizes) < (25, 18)
     monkeypatch.setattr(subsets, "coordinates", lambda *arguments: None)
-    exact = localise(rom, data, pool, most=1)
+    exact = localise(rom, pool, data, most=1)
     assert found.chosen == exact.chosen == (plate.z8,)
     np.testing.assert_allclose(found.bic, exact.bic, atol=0.05, rtol=1e-6)
     np.testing.assert_allclose(found.values, exact.values, rtol=1e-4)

@@ -410,7 +410,7 @@ def test_localisation_finds_z8_up_to_the_plates_symmetry(plate):
     std = 2e-5 * np.abs(poles)
     noise = (rng.normal(size=6) + 1j * rng.normal(size=6)) * std / np.sqrt(2)
     data = MeasuredModes(poles + noise, modes=range(4, 10), covariance=std**2)
-    found = localise(rom, [Eigenvalues(data)], candidates, most=2)
+    found = localise(rom, candidates, [Eigenvalues(data)], most=2)
     assert found.chosen == (hidden,)
     assert found.chosen_values[0] == pytest.approx(0.5, rel=1e-3)
     # its three mirror images come next, all others far behind
@@ -435,7 +435,7 @@ def test_localisation_finds_z8_up_to_the_plates_symmetry(plate):
     # as much noise as hides the truncated compliance: poles cannot tell mirror images
     std = 1e-3 * np.abs(poles)
     loud = MeasuredModes(poles + 50 * noise, modes=range(4, 10), covariance=std**2)
-    found = localise(rom, [Eigenvalues(loud)], candidates, most=1)
+    found = localise(rom, candidates, [Eigenvalues(loud)], most=1)
     assert set(found.alike) == {hidden} | images
     assert "AMBIGUOUS, 4 alike: " in repr(found)
     assert all(name in repr(found) for name in [hidden, *images])
@@ -457,24 +457,24 @@ def test_localisation_beside_a_wrong_stiffness(plate):
     data = [Eigenvalues(MeasuredModes(poles + noise, modes=range(4, 10), covariance=std**2))]
     masses = [AddedMass(label, name=label) for label in plate.grid]
     stiffer = MatrixParameter("stiffness", dK=rom.K)
-    found = localise(rom, data, masses, nuisance=[stiffer], most=1)
+    found = localise(rom, masses, data, nuisance=[stiffer], most=1)
     assert found.chosen == (plate.z8,)
     assert found.chosen_values[0] == pytest.approx(0.5, rel=2e-3)
     assert found.nuisance == ("stiffness",)
     assert found.nuisance_values[0] == pytest.approx(0.02, rel=2e-3)
     assert "beside stiffness = 0.0" in repr(found)
     with pytest.warns(FlexplantWarning, match=r"leaves more than noise.*nuisance="):
-        alone = localise(rom, data, masses, most=1)
+        alone = localise(rom, masses, data, most=1)
     assert alone.chosen != (plate.z8,) or abs(alone.chosen_values[0] - 0.5) > 0.1
     with pytest.raises(ModelError, match="at once"):
-        localise(rom, data, masses, nuisance=masses[:1])
+        localise(rom, masses, data, nuisance=masses[:1])
     with pytest.raises(ModelError, match="data do not determine"):
-        localise(rom, [data[0].select([4])], masses[:3], nuisance=masses[3:6])
+        localise(rom, masses[:3], [data[0].select([4])], nuisance=masses[3:6])
 
 
 def test_localisation_says_when_nothing_changed(chain):
     data = Eigenvalues(measured(changed(chain), 1e-3, seed=4))
-    found = localise(chain, [data], [AddedMass(f"{i}:z") for i in range(1, 5)])
+    found = localise(chain, [AddedMass(f"{i}:z") for i in range(1, 5)], [data])
     assert found.chosen == ()
     assert "no change" in repr(found)
     two = changed(chain, mass=[(0, 0.2)], stiffness=[(3, 9.0)])
@@ -482,10 +482,10 @@ def test_localisation_says_when_nothing_changed(chain):
         *(AddedMass(f"{i}:z") for i in range(1, 5)),
         *(AddedStiffness(f"{i}:z") for i in (2, 4)),
     ]
-    found = localise(chain, [Eigenvalues(measured(two, 1e-4))], pool)
+    found = localise(chain, pool, [Eigenvalues(measured(two, 1e-4))])
     assert set(found.chosen) == {"mass at 1:z", "stiffness at 4:z"}
     with pytest.raises(ModelError, match="most"):
-        localise(chain, [data], MASS, most=0)
+        localise(chain, MASS, [data], most=0)
     with pytest.raises(LabelError, match="candidate"):
         found["mass at 9:z"]
 
@@ -616,7 +616,7 @@ def test_results_are_stored(chain, tmp_path):
         fit,
         inside[0],
         Eigenvalues(measured(parts)),
-        localise(chain, [Eigenvalues(measured(parts, 1e-3))], MASS),
+        localise(chain, MASS, [Eigenvalues(measured(parts, 1e-3))]),
     ):
         value.save(tmp_path / "value.npz")
         assert repr(load(tmp_path / "value.npz")) == repr(value)

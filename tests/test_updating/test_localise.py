@@ -49,7 +49,7 @@ def test_two_masses_are_found_together(plate, uneven, seed):
     rng = np.random.default_rng(100 + seed)
     hidden = {str(label): rng.uniform(0.1, 0.4) for label in rng.choice(plate.grid, 2, False)}
     masses = [AddedMass(label, name=label) for label in plate.grid]
-    found = localise(uneven, measured(uneven, hidden, seed), masses, most=2)
+    found = localise(uneven, masses, measured(uneven, hidden, seed), most=2)
     assert set(found.chosen) == set(hidden)
     for name, value in zip(found.chosen, found.chosen_values, strict=True):
         assert value == pytest.approx(hidden[name], rel=0.05)
@@ -62,7 +62,7 @@ def test_two_masses_are_found_together(plate, uneven, seed):
 def test_nothing_changed_names_nothing(plate, uneven):
     """Of 25 places each can fit noise a little: the criterion counts how many were tried."""
     masses = [AddedMass(label, name=label) for label in plate.grid]
-    found = [localise(uneven, measured(uneven, {}, seed), masses, most=1) for seed in range(8)]
+    found = [localise(uneven, masses, measured(uneven, {}, seed), most=1) for seed in range(8)]
     # chi-square of one above 9.6, in 25 places that are not independent: 5 % at most
     named = sum(bool(one.chosen) for one in found)
     assert named <= 1
@@ -75,7 +75,7 @@ def test_misfit_that_no_candidate_explains_is_said(plate, uneven):
     data = measured(uneven, {grid[7]: 0.3, grid[18]: 0.4}, seed=0)
     few = [AddedMass(label, name=label) for label in (grid[0], grid[4], grid[20])]
     with pytest.warns(FlexplantWarning, match=r"more than noise: chi-square.*It fits worst mode"):
-        found = localise(uneven, data, few, most=2)
+        found = localise(uneven, few, data, most=2)
     assert found.p_value < 1e-4
     assert "MORE THAN NOISE IS LEFT" in repr(found)
 
@@ -84,10 +84,10 @@ def test_misfit_that_no_candidate_explains_is_said(plate, uneven):
 def test_long_work_shows_a_bar(uneven, capsys):
     data = measured(uneven, {uneven.dofs.labels[3]: 0.3}, 0)
     localise(
-        uneven, data, [AddedMass(label) for label in uneven.dofs.labels], most=1, progress=True
+        uneven, [AddedMass(label) for label in uneven.dofs.labels], data, most=1, progress=True
     )
     assert "candidates: 100%" in capsys.readouterr().err
-    localise(uneven, data, [AddedMass(uneven.dofs.labels[3])], most=1)
+    localise(uneven, [AddedMass(uneven.dofs.labels[3])], data, most=1)
     assert capsys.readouterr().err == ""
 
 

@@ -84,7 +84,7 @@ def test_a_mass_looked_for_in_the_wrong_place():
     assert abs(fit.values[0] - 0.5) > 3 * fit.std[0] / np.sqrt(fit.chi2 / fit.dof)
     # as the warning says
     pool = [AddedMass(wrong, name="wrong"), AddedMass(right, name="right")]
-    found = localise(campaign.rom, data, pool, most=1)
+    found = localise(campaign.rom, pool, data, most=1)
     assert found.chosen == ("right",)
     assert found.chosen_values[0] == pytest.approx(0.5, rel=1e-3)
 

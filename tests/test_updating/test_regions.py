@@ -130,7 +130,7 @@ def test_a_soft_region_is_localised(rom):
     pool = MatrixParameter.regions(build, masks, value=70e9)
     # damping stays proportional to frequency in the data, which noise of 1e-5 shows
     with pytest.warns(FlexplantWarning, match="more than noise"):
-        found = localise(rom, [Eigenvalues(data)], pool, most=1)
+        found = localise(rom, pool, [Eigenvalues(data)], most=1)
     images = {"20", "21", "30", "31"}
     assert set(found.alike) | set(found.rivals) >= images
     assert set(found.ranking[:4]) == images

@@ -191,7 +191,7 @@ def blamed(seed):
     heavier[at, at] += rng.uniform(0.1, 0.5)
     data = measured(poles(heavier, 2e-5 * K, K), 5, 1e-4, rng)
     pool = [AddedMass(f"{i + 1}:z", name=str(i)) for i in range(n)]
-    return localise(FEModel(M, K, 2e-5 * K, dofs=line(n)), [data], pool), str(at)
+    return localise(FEModel(M, K, 2e-5 * K, dofs=line(n)), pool, [data]), str(at)
 
 
 @pytest.mark.slow

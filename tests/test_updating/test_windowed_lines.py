@@ -35,7 +35,7 @@ def test_localisation_judges_by_the_correlated_noise(monkeypatch):
     masses = [AddedMass(place, name=place) for place in places]
     data = [FrfResidual(windowed(campaign, np.random.default_rng(7)))]
     damping = [AddedDamping(campaign.at)]
-    found = localise(campaign.rom, data, masses, nuisance=damping, most=2)
+    found = localise(campaign.rom, masses, data, nuisance=damping, most=2)
     assert found.chosen == (campaign.at,)
     assert found.dof == 2 * 2 * 60 - 2
     assert found.chi2 / found.dof == pytest.approx(1.0, abs=0.3)
@@ -43,7 +43,7 @@ def test_localisation_judges_by_the_correlated_noise(monkeypatch):
     fit = update(campaign.rom, [masses[0], *damping], data)
     assert found.chi2 == pytest.approx(fit.chi2, rel=1e-4)
     with pytest.warns(FlexplantWarning, match="leaves more than noise"):
-        wrong = localise(campaign.rom, data, masses[1:], nuisance=damping, most=1)
+        wrong = localise(campaign.rom, masses[1:], data, nuisance=damping, most=1)
     assert wrong.p_value < 1e-9
 
 

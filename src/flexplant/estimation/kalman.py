@@ -36,25 +36,21 @@ def design_kalman(
 ) -> KalmanEstimator:
     """Return the stationary Kalman filter of the POIs on a sampled plant.
 
-    The noise model is that of `simulate`: `plant.process_noise` per sample into x and
-    `plant.sensor_noise` on a sample of y. The filter reads the sensors (not the references) and the
-    applied u; delays of u are known exactly. The Riccati equation is solved scaled inside, in any
-    units (`flexplant.lti.solve_dare`).
+    It reads the sensors (not the references) and the applied u, and gives `die:hat` for a POI
+    "die": ``observer.rms("die")`` is the error that is predicted, ``close_loop(plant, observer,
+    servo)`` runs it in a loop, ``observer.estimate(records)`` on recorded data. Give `larger`, a
+    model with the modes that the plant left out: their motion then counts as noise, and the
+    predicted error is as good as that model (how good: ``help(flexplant.estimation)``).
 
-    Modes left out of the plant add no states. Their motion under the disturbances is noise with
-    covariances R_t at the sensors, V_t at the POIs and N_t between them (see `left_out`), and they
-    follow u by their static compliance::
+    The noise model is that of `simulate`: `plant.process_noise` per sample into x and
+    `plant.sensor_noise` on a sample of y; delays of u are known exactly. The Riccati equation is
+    solved scaled inside, in any units (`flexplant.lti.solve_dare`). Modes left out add no states.
+    Their motion under the disturbances is noise with covariances R_t at the sensors, V_t at the
+    POIs and N_t between them (see `left_out`), and they follow u by their static compliance::
 
         S = C2 P C2' + R + R_t,   L = P C2' S^-1,   L_z = (C1 P C2' + N_t) S^-1
 
-    with P of the Riccati equation of (A, C2, Q, R + R_t). The predicted error is that of this
-    filter on the plant with the modes left out. It is as good as `larger`, mesh errors
-    of those modes included: on a plate of 0.6 m x 0.6 m 8 x 8 elements predict the error
-    of z on finer ones within 6 %, that of rotations within 23 %; on one of 0.5 m x 0.3 m it
-    predicts z 65 % too large, since other shapes mix in modes of almost one frequency above
-    10 kHz. 12 x 12 elements are within 5 % for z there, beside 24 x 24. The certificate states
-    which share of a variance is from modes left out with fewer than 4 nodes of their mesh per
-    wavelength (`unresolved`); more than half warns. Without any delay of u the static
+    with P of the Riccati equation of (A, C2, Q, R + R_t). Without any delay of u the static
     compliance is left out: it would close an algebraic loop from y to u to y.
 
     Parameters

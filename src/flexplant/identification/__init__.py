@@ -1,4 +1,27 @@
-"""What was measured: frequency responses, measured poles and mode shapes."""
+"""What was measured: frequency responses, measured poles and mode shapes.
+
+- `estimate_frf(inputs, outputs, rate)`: records become an `Frf` with coherence and variance.
+- `identify_modes(frf, band=)`: poles, shapes and covariance (pLSCF, then maximum likelihood).
+- `numbered(found, model, at=)`: identified modes paired with a model's, for `fx.Eigenvalues`.
+- `MeasuredModes.from_freq`: frequencies and dampings that were found elsewhere.
+- `structural_modes`: measured modes as the structure itself, where no model exists;
+  `identify_output_only` where forces are unknown; `impact_frf` of hammer tests.
+
+>>> import flexplant as fx
+>>> machine = fx.testbeds.wafer_stage(elements=(8, 8))
+>>> ports = fx.Ports(
+...     u=[fx.Actuator("u1", at=(0.15, 0.15, 0.0))],
+...     y=[fx.Sensor("y1", at=(0.0, 0.0, 0.0), asd=1e-12)],
+... )
+>>> plant = fx.assemble_plant(machine.truth, ports)
+>>> frf = fx.frequency_response(plant.Gyu, [200.0 + 0.5 * i for i in range(600)])
+>>> found = fx.identify_modes(frf)
+>>> print(found)
+<IdentifiedModes: 3 poles at 245.8, 357.7, 459.0 Hz, with covariance; refined>
+
+Names elsewhere: ``tfestimate``, ``modalfrf``, ``modalfit`` (MATLAB), PolyMAX (Simcenter),
+sdypy-EMA, vector fitting (scikit-rf). Files: `fx.io.read_frf_uff`, `fx.io.read_frf_csv`.
+"""
 
 from ..rooms import public_names as _public_names
 from .diagram import PoleSelection as PoleSelection

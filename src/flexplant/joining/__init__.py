@@ -1,4 +1,24 @@
-"""Components joined: placed, coupled by joints and patches, certified; measured FRFs too."""
+"""Components joined: placed, coupled by joints and patches, certified; measured FRFs too.
+
+- `joined(components, joints)`: models and reduced models become one; labels are ``"stage/41:z"``.
+- `Joint`: rigid, or springs and dampers, between places of two components.
+- `Patch`: surfaces whose meshes do not match; `coincident_joints` for meshes that do.
+- `Pose`: where a component stands, and how it is turned.
+- `uncoupled`: takes a component out of a measured machine's responses.
+
+>>> import flexplant as fx
+>>> stage = fx.chain(masses=[2.0, 1.0], stiffnesses=[1e5])
+>>> frame = fx.chain(masses=[10.0, 5.0], stiffnesses=[1e6])
+>>> joint = fx.Joint("frame/2:x", "stage/1:x", stiffness=1e4)
+>>> machine = fx.joined({"stage": stage, "frame": frame}, [joint])
+>>> fx.solve_modes(machine).freq.round(1)
+array([ 0. , 10. , 62. , 87.4])
+>>> machine.dofs.labels
+('stage/1:x', 'stage/2:x', 'frame/1:x', 'frame/2:x')
+
+Names elsewhere: component-mode synthesis, substructuring, LM-FBS (pyFBS), CONTACT and CEINTF
+(Ansys), RBE2 and CBUSH (Nastran). ``examples/joined_machine.py`` joins, reduces and takes apart.
+"""
 
 from ..rooms import public_names as _public_names
 from .component import JoinedShape as JoinedShape

@@ -1,4 +1,29 @@
-"""Closing the loop by names, its sensitivities and margins."""
+"""Closing the loop by names, its sensitivities and margins.
+
+- `close_loop(plant, *blocks)`: blocks are connected by the names of their channels.
+- `ClosedLoop`: ``is_stable``, ``modulus_margin``, ``rms("die:error")``, ``psd``,
+  ``budget`` by source.
+- `sensitivity`, `complementary_sensitivity`, `control_sensitivity`, `loop_gain`, `bandwidth`.
+- `report_loops`: crossovers, gain, phase and modulus margins of each loop, broken at u or y.
+- `compare_loops`: several designs, or one on model and machine, in one table.
+
+Every quantity takes a measured `fx.Frf` as plant too; `in_axes` brings it into decoupled axes.
+
+>>> import flexplant as fx
+>>> plant = fx.testbeds.three_masses()
+>>> observer = fx.design_kalman(plant)
+>>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+>>> loop = fx.close_loop(plant, observer, servo)
+>>> loop.is_stable, round(loop.modulus_margin, 2)
+(True, 0.57)
+>>> report = fx.loop.report_loops(loop)
+>>> round(report["u1"].phase_margin), round(loop.rms("die:error") * 1e9)
+(41, 245)
+
+Names elsewhere (MATLAB): ``margin``, ``allmargin``: `report_loops`, `fx.modulus_margin`, of a loop
+gain L (a system or a measured `fx.Frf`), of ``(plant, controller)`` or of a closed loop;
+``loopsens``: `sensitivity` and its like.
+"""
 
 from ..rooms import public_names as _public_names
 from .axes import in_axes as in_axes

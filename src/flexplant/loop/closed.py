@@ -96,6 +96,9 @@ class ClosedLoop(Value):
         if self.watched:
             shown = " ".join(self.watched[:8]) + (" ..." if len(self.watched) > 8 else "")
             lines.append(f"  monitored: {shown}")
+        read = {name for block in self.blocks for name in block.inputs}
+        if unread := [name for name in self.plant.y if name in self.plant.w and name not in read]:
+            lines.append(f"  references that no block reads: {' '.join(unread)}")
         if self.left_out is not None:
             lines.append(f"  with the modes left out: {self.left_out.summary}")
         if self.tolerances is not None:

@@ -1,4 +1,49 @@
-"""Linear time-invariant systems: the control side's one type and its methods."""
+"""Linear time-invariant systems: the control side's one type and its methods.
+
+A `StateSpace` has named inputs and outputs and keeps the block structure of modes, which makes
+its frequency responses, norms and sampling exact and fast. Everything a controller, a plant or a
+weight is made of is one.
+
+- `tf`, `zpk`, `StateSpace`: make a system; `as_statespace` takes those of python-control and SciPy.
+- `frequency_response`: an `Frf`, of systems, of structures between their ports, measured or not.
+- `discretized`: exact sampling with a hold and a delay; `tustin`, `matched` for controllers.
+- `h2_norm`, `hinf_norm`, `peak_gain`: norms, the last two with the frequency, found with proof.
+- `series`, `parallel`, `feedback`, `connect`, `lft`: connections by name; `balanced`, `minimal`,
+  `modal_form`: fewer or clearer states.
+
+>>> import flexplant as fx
+>>> g = fx.lti.tf([1.0], [1.0, 0.02, 1.0])
+>>> gain, freq = fx.peak_gain(g)
+>>> round(gain, 2), round(freq, 4)
+(50.0, 0.1591)
+>>> round(abs(g(1.0j)), 6)
+50.0
+>>> sampled = fx.discretized(g, 10.0, delay=1.3)
+>>> sampled.n_states, sampled.is_stable
+(4, True)
+>>> print(fx.lti.feedback(g, 0.5 * fx.lowpass(2.0)))
+<StateSpace: 3 states, continuous, in -> out>
+
+**From MATLAB and python-control.** Their systems are taken wherever a system is; `to_control()`
+goes back. Their names (``fx.c2d``) raise an error that says ours.
+
+| there | here |
+|---|---|
+| ``ss``, ``tf``, ``zpk`` | `fx.StateSpace`, `fx.lti.tf`, `fx.lti.zpk` |
+| ``sys(s)``, ``dcgain`` | `sys(s)`, `sys.dcgain()` |
+| ``pole``, ``tzero`` | `sys.poles()`, `sys.zeros()` |
+| ``sys(1, 2)``, ``sys[0, 1]`` | `sys["y1", "u2"]`, `sys[0, 1]`, counted from 0 |
+| ``series``, ``feedback``, ``lft`` | the same in `fx.lti`; `g2 * g1`, `g1 + g2`, `1 / (1 + L)` |
+| ``freqresp`` | `fx.frequency_response` |
+| ``bode``, ``sigma`` | `fx.plot.bode`, `fx.plot.singular_values` |
+| ``nyquist``, ``pzmap``, ``step`` | `fx.plot.nyquist`, `fx.plot.pole_map`, `fx.plot.step` |
+| ``c2d`` | `fx.discretized(sys, rate, delay=)`, `fx.lti.tustin`, `fx.lti.matched` |
+| ``norm(sys)``, ``norm(sys, inf)`` | `fx.h2_norm`, `fx.hinf_norm` |
+| ``getPeakGain`` | `fx.peak_gain` |
+| ``minreal``, ``balred``, ``canon(sys, "modal")`` | `fx.minimal`, `fx.balanced`, `fx.modal_form` |
+| ``lyap``, ``dlyap`` | `fx.lti.solve_lyapunov`, `fx.lti.solve_stein` |
+| ``care``, ``dare`` | `fx.lti.solve_care`, `fx.lti.solve_dare` |
+"""
 
 from ..rooms import public_names as _public_names
 from .balancing import BalancedReduction as BalancedReduction

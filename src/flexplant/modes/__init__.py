@@ -1,4 +1,28 @@
-"""Modes of a structure: the eigenvalue problem solved, counted and checked; attachment vectors."""
+"""Modes of a structure: the eigenvalue problem solved, counted and checked; attachment vectors.
+
+`solve_modes` gives the lowest modes, mass-normalised, rigid-body modes at exactly 0. A Sturm count
+says that no mode is missing, a residual comes with each. `compliance_at=` keeps the static
+compliance of the truncated modes where forces act. Modes are numbered from 1.
+
+- `solve_modes(model, count=, damping=, compliance_at=)`: small and large models.
+- `Modes.at`: shapes at a label or a point; `Modes.freq`, ``omega``, ``zeta``, ``phi``.
+- `Modes.calibrated`: with frequency and damping of measured modes as measured.
+- `Modes.mesh_error`: from a second mesh, by what each frequency is off (`MeshError`).
+- `normal_form`: real modes of damping that is not modal.
+
+>>> import flexplant as fx
+>>> plate = fx.kirchhoff_plate(
+...     size=(0.6, 0.4), thickness=0.02, elements=(6, 4),
+...     density=2700, youngs_modulus=70e9, poisson_ratio=0.33,
+... )
+>>> modes = fx.solve_modes(plate, count=12, damping=fx.ModalDamping(0.01))
+>>> print(modes)
+<Modes: 12 of 105 DOFs (3 rigid-body, 9 elastic at 271.8 to 1671 Hz)>
+>>> modes.freq[:5].round(1)
+array([  0. ,   0. ,   0. , 271.8, 293. ])
+
+Names elsewhere: Nastran SOL 103 and RESVEC, Ansys MODOPT and RESVEC, ``scipy.sparse.linalg.eigsh``.
+"""
 
 from ..rooms import public_names as _public_names
 from .modes import MeshError as MeshError

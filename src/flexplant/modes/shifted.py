@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..checks import FloatArray
-from ..errors import ModelError, SolverError, counted
+from ..errors import ModelError, SolverError, attempted, counted
 from ..sparse.factor import DENSE_LIMIT, same_pattern
 from ..sparse.lanczos import rounding_of
 from ..sparse.lowest import SignedFactor, multifrontal_inertia, signed_factor
@@ -164,10 +164,8 @@ def search_factor(model: FEModel, method: Pardiso | None = None) -> StiffnessFac
     known, order = _held.get(model), dissection_of(model)
     unused = known is None or known() is None
     if unused and method is None and not model.n_unstable and order.is_costly:
-        try:
+        with attempted("a factor in single precision", SolverError):
             return StiffnessFactor(model, single=True)
-        except SolverError:
-            pass
     return stiffness_factor(model, method)
 
 

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy.typing as npt
 
-from ..checks import FloatArray
+from ..checks import FloatArray, short
+from ..errors import ModelError
 from ..labels import Place
 from ..lti.statespace import System
 from .assumptions import AssumptionReport
@@ -23,6 +24,8 @@ from .rigid.rigid_motion import RigidModes, rigid_modes_of
 from .uncertainty.opening import uncertain
 from .uncertainty.uncertain_plant import UncertainPlant
 from .weighting import measured_through, weighted
+
+_WEIGHTS = "Pass stage_weights(plant, bandwidth), or z={...} and w={...}."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -107,6 +110,7 @@ class StandardPlant(Partition):
 
     def weighted(
         self,
+        weights: Any = None,
         *,
         z: Mapping[str, Any] | None = None,
         w: Mapping[str, Any] | None = None,
@@ -115,6 +119,8 @@ class StandardPlant(Partition):
 
         Parameters
         ----------
+        weights : StageWeights, optional
+            Of `stage_weights`: its z and w, which those that are given replace.
         z, w : mapping {name: weight}
             A weight is a number or a system with one input and one output, of this plant's dt or
             continuous: then it is sampled at the plant's rate (Tustin). None leaves the channel
@@ -132,6 +138,10 @@ class StandardPlant(Partition):
         ModelError
             When a weight is not one by one, or of another sampling time.
         """
+        if weights is not None:
+            if not isinstance(getattr(weights, "z", None), Mapping):
+                raise ModelError(f"weights must be StageWeights, got {short(weights)}. {_WEIGHTS}")
+            z, w = {**weights.z, **(z or {})}, {**weights.w, **(w or {})}
         return weighted(self, z, w)
 
     def through(self, block: System) -> StandardPlant:

@@ -1,9 +1,39 @@
 """All pictures: functions that take values and `ax=`, and return the axes they drew on.
 
-Labels that name a thing give it the look of `STYLES`: "measured", "truth" (or "machine", "full
-model"), "model" ("updated"), "nominal" ("drawing", "before"), "reduced", "bound"; other lines
-follow `CYCLE`. Axes carry SI units with the prefix that brings the largest value to 1 .. 1000;
-what is drawn into them later keeps it. Frequencies are in Hz, gains in dB with what 0 dB is.
+- `bode`, `frf`, `singular_values`, `nyquist`, `sensitivity`: responses and loops.
+- `response`, `exposures`, `budget`, `spectra`: runs and errors by source.
+- `update`, `parameters`, `residual`, `stabilisation`, `identified`: measurements and updates.
+- `layout`, `mode_shape`, `animate_mode`, `sensor_map`, `placed`: the machine and its devices.
+- `report(path, ...)`: a whole design as one HTML file, with pictures to zoom, modes that move,
+  certificates, seeds and versions.
+
+>>> import flexplant as fx
+>>> plant = fx.testbeds.three_masses()
+>>> observer = fx.design_kalman(plant)
+>>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+>>> loop = fx.close_loop(plant, observer, servo)
+>>> axes = fx.plot.sensitivity(loop)
+>>> axes.get_xlabel()
+'frequency [Hz]'
+
+**Legend.** Labels that name a thing give it the look of `STYLES`; other lines follow `CYCLE`.
+
+| drawn | label | look |
+|---|---|---|
+| what was measured | "measured" | black |
+| the truth of a virtual machine | "truth", "machine", "full model" | wide green |
+| the model | "model", "updated" | blue |
+| the drawing | "nominal", "drawing", "before" | grey dashes |
+| a reduced model | "reduced" | orange dashes |
+| bounds | "bound" | red dots |
+| differences | | purple |
+
+Seen from above, sensors are black crosses, actuators triangles, POIs circles. Axes carry SI units
+with the prefix that brings the largest value to 1 .. 1000 (mm, ms, nm, g); what is drawn into them
+later keeps it. Frequencies are in Hz, gains in dB with what 0 dB is.
+
+Names elsewhere: ``bode``, ``sigma``, ``nyquist``, ``pzmap``, ``step`` of MATLAB: `bode`,
+`singular_values`, `nyquist`, `pole_map`, `step`.
 """
 
 from ..rooms import public_names as _public_names

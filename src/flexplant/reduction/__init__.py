@@ -1,4 +1,31 @@
-"""Fewer degrees of freedom, same input-output behaviour: reductions, their bounds and quality."""
+"""Fewer degrees of freedom, same input-output behaviour: reductions, their bounds and quality.
+
+A `ReducedModel` has small M, D and K in physical DOFs and the expansion T of the whole structure.
+
+- `reduce(modes, DesiredDofs(labels))`: the paper's; the DOFs are chosen, modes stay exact.
+- `select_dofs(modes, count)`: DOFs at which the modes are well distinguished.
+- other methods: `ModalTruncation`, `ModalBalanced`, `Guyan`, `Irs`, `Serep`, `CraigBampton`,
+  `Rubin`, `MacNeal`, `Krylov`; a new one is a value with one method.
+- `ReducedModel.quality(model, band=, inputs=, outputs=)`: frequencies, shapes, responses, bound.
+- `rank_modes`: which modes matter between ports.
+
+>>> import flexplant as fx
+>>> plate = fx.kirchhoff_plate(
+...     size=(0.6, 0.4), thickness=0.02, elements=(6, 4),
+...     density=2700, youngs_modulus=70e9, poisson_ratio=0.33,
+... )
+>>> modes = fx.solve_modes(plate, count=12, damping=fx.ModalDamping(0.01))
+>>> desired = fx.select_dofs(modes, 12)
+>>> small = fx.reduce(modes, fx.DesiredDofs(desired.labels))
+>>> print(small)
+<ReducedModel: 12 of 105 DOFs by 12 modes, 3 rigid-body motions, cond(phi_kk) 6.19>
+>>> bool(abs(small.modes().freq[3:] / modes.freq[3:] - 1).max() < 1e-6)
+True
+
+Names elsewhere: superelements and CMS (Ansys), EXTSEOUT and ASET (Nastran), ``pymor``'s
+reductors, MATLAB's ``modalfit`` and ``reducespec``. ``examples/reduction_methods.py`` compares
+twelve ways.
+"""
 
 from ..rooms import public_names as _public_names
 from .component_modes import CraigBampton as CraigBampton

@@ -298,7 +298,7 @@ class MachinePipeline(Value):
     def _updated(self, measured: MeasuredModes) -> tuple[Localisation | None, UpdateResult]:
         residuals, unknowns, places = [Eigenvalues(measured)], list(self.parameters), None
         if self.candidates:
-            places = localise(self.model, residuals, self.candidates, nuisance=unknowns)
+            places = localise(self.model, self.candidates, residuals, nuisance=unknowns)
             chosen = [one for one in self.candidates if one.name in places.chosen]
             unknowns = [*unknowns, *chosen]
         return places, update(self.model, unknowns, residuals, starts=self.starts)

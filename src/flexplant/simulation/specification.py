@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray, Value, checked, in_unit, instance, positive, short
-from ..errors import AssumptionError, ModelError, require_known
+from ..errors import AssumptionError, LabelError, ModelError, counted, require_known
 from ..loop import ClosedLoop, bandwidth
 from .exposure import exposure_errors, settling_time
 from .response import Response
@@ -122,8 +122,8 @@ class Specification(Value):
     modulus_margin : float, optional
         At least; the smaller one of those with and without the modes left out, where these are
         known.
-    channel : str
-        The error that is meant.
+    channel : str, optional
+        The error that is meant; the only one of the loop when not given.
     window : float [s]
         Of MA and MSD.
     start : float [s]
@@ -154,7 +154,7 @@ class Specification(Value):
     noise: float | None = field(default=None, metadata=checked(positive))
     bandwidth: float | None = field(default=None, metadata=checked(positive))
     modulus_margin: float | None = field(default=None, metadata=checked(positive))
-    channel: str = "die:error"
+    channel: str | None = None
     window: float = field(default=5e-3, metadata=checked(positive))
     start: float = field(default=0.0, metadata=checked(positive, zero=True))
 
@@ -209,6 +209,19 @@ class Specification(Value):
         names, units, values, limits, least = zip(*rows, strict=True)
         return Verdict(names, units, np.array(values), np.array(limits), np.array(least))
 
+    def _watched(self, loop: ClosedLoop) -> str:
+        """Return the channel that is meant: the one named, or the only error."""
+        errors = [name for name in loop.plant.z if name.endswith(":error")]
+        if self.channel is not None:
+            return self.channel
+        if len(errors) != 1:
+            raise LabelError(
+                f"the loop has {counted(len(errors), 'error channel')}"
+                f"{': ' + ', '.join(errors) if errors else ''}. Say which channel of z or of the "
+                "run is specified: Specification(..., channel='y1')."
+            )
+        return errors[0]
+
     def _of_loop(self, loop: ClosedLoop) -> list[tuple[str, str, float, float, bool]]:
         rows = []
         if self.bandwidth is not None:
@@ -223,30 +236,32 @@ class Specification(Value):
                 margin = min(margin, loop.left_out.modulus_margin)
             rows.append(("modulus margin", "", margin, self.modulus_margin, True))
         if self.noise is not None:
-            unit = loop.units.get(self.channel, "")
-            reached = loop.rms(self.channel) if loop.is_stable else float("nan")
+            channel = self._watched(loop)
+            unit = loop.units.get(channel, "")
+            reached = loop.rms(channel) if loop.is_stable else float("nan")
             rows.append(("noise", unit, reached, self.noise, False))
         return rows
 
     def _of_run(
         self, loop: ClosedLoop, run: Response, exposures: Any
     ) -> list[tuple[str, str, float, float, bool]]:
-        unit = run.units.get(self.channel, "")
+        channel = self._watched(loop)
+        unit = run.units.get(channel, "")
         rows: list[tuple[str, str, float, float, bool]] = []
         if self.ma is not None or self.msd is not None:
             begin = self.start + (self.settling or 0.0)
             found = exposure_errors(
-                run, [self.channel], window=self.window, start=begin, exposures=exposures
-            )[self.channel]
+                run, [channel], window=self.window, start=begin, exposures=exposures
+            )[channel]
             pairs = (("MA", found.ma, self.ma), ("MSD", found.msd, self.msd))
             rows += [(n, unit, value, lim, False) for n, value, lim in pairs if lim is not None]
         for name in ("rms", "peak"):
             if (limit := getattr(self, name)) is not None:
-                worst = np.max(getattr(run, name)(self.channel, start=self.start))
+                worst = np.max(getattr(run, name)(channel, start=self.start))
                 rows.append((name, unit, float(worst), limit, False))
         if self.settling is not None and self.ma is not None:
             took = settling_time(
-                run, self.channel, ma=self.ma, msd=self.msd, window=self.window, after=self.start
+                run, channel, ma=self.ma, msd=self.msd, window=self.window, after=self.start
             )
             rows.append(("settling", "s", float(np.max(took)), self.settling, False))
         if self.effort is not None:

@@ -13,7 +13,7 @@ import scipy.sparse.linalg as spla
 from scipy.linalg import blas, lapack
 
 from ..checks import FloatArray, IntArray
-from ..errors import SolverError
+from ..errors import SolverError, attempted
 from ..parallel import one_thread
 from .factor import DENSE_LIMIT, by_rows, dense, diagonal, negative_pivots, symmetric_lu
 from .lanczos import VALUE, BlockLanczos, beyond, iterated, rayleigh_ritz
@@ -412,10 +412,8 @@ def definite_solver(K: Any, M: Any, shift: float) -> Callable[[FloatArray], Floa
 def _factor(matrix: Any, order: Dissection | None) -> Any:
     """Return a factorisation with a method solve; by fronts where K + s M is definite and large."""
     if order is not None:
-        try:
+        with attempted("a multifrontal Cholesky factor", SolverError):
             return MultifrontalCholesky(matrix, order)
-        except SolverError:
-            pass
     return symmetric_lu(matrix)
 
 

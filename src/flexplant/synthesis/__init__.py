@@ -1,4 +1,39 @@
-"""Controllers: the servo on the estimated point of interest, H2 and H-infinity."""
+"""Controllers: the servo on the estimated point of interest, H2 and H-infinity, tuned loops.
+
+A `Controller` carries what was checked of it: norm by two routes, stability, the loop on a model
+with the modes left out (``larger=``), and how far each mode may be off.
+
+- `design_servo(plant, bandwidth=)`: decoupled PID on the estimate; `servo_bandwidth`: the largest.
+- `design_stage(plant)`: the fastest H-infinity controller that tolerates errors of the modes.
+- `design_hinf(plant.weighted(...))` by `Riccati` or `Lmi`; `design_h2`; `design_ncf` and
+  `shape_loop` (loop shaping); `design_structured` (fixed order, PID and notches).
+- `design_loops`, `tune_loops` with `Pid`, `Lead`, `Notch`, `LowPass`: on a measured FRF alone too.
+- `mu`, `robust_stability`, `worst_case_gain`, `design_mu`: guarantees for uncertain plants.
+
+To the machine: `reduce_controller`, `discretise_controller`, `anti_windup_form`,
+`second_order_sections`, `write_c`.
+
+>>> import flexplant as fx
+>>> plant = fx.testbeds.three_masses()
+>>> errors, weights = fx.reference_errors(plant), fx.stage_weights(plant, 20.0)
+>>> hinf = fx.design_hinf(plant.through(errors).weighted(z=weights.z, w=weights.w))
+>>> round(hinf.gamma, 2), round(hinf.lower, 2)
+(0.67, 0.66)
+>>> loop = fx.close_loop(plant, errors, hinf)
+>>> loop.is_stable, round(loop.modulus_margin, 2)
+(True, 0.55)
+
+| MATLAB | here |
+|---|---|
+| ``hinfsyn``, ``h2syn``, ``lqg`` | `design_hinf`, `design_h2` |
+| ``mixsyn``, ``augw`` | `fx.plant.mixed_sensitivity`, then `design_hinf` |
+| ``ncfsyn``, ``loopsyn``, ``ncfmargin`` | `design_ncf`, `shape_loop`, `ncf_margin` |
+| ``hinfstruct``, ``systune``, ``pidtune`` | `design_structured`, `tune_loops`, `design_servo` |
+| ``mussv``, ``robstab`` | `mu`, `robust_stability` |
+| ``wcgain``, ``musyn`` | `worst_case_gain`, `design_mu` |
+
+Dense methods suit plants of up to some 500 states; `Lmi` takes 30 states, `design_lmi` 20.
+"""
 
 from ..rooms import public_names as _public_names
 from .aftercare.c_code import write_c as write_c

@@ -1,4 +1,25 @@
-"""Virtual machines: full-order truths with hidden differences, which answer like hardware."""
+"""Virtual machines: full-order truths with hidden differences, which answer like hardware.
+
+No machine here has the mesh or the formulation of a model that is designed on, so that what a
+design claims is judged by something else than itself.
+
+- `wafer_stage`: a free plate in polynomials with rotary inertia, masses that no drawing shows,
+  scattered stiffness and damping, sensors with steps, a delay.
+- `magnet_stage`: a stage on magnets of negative stiffness, in six axes.
+- `three_masses`: a sampled standard plant of three masses, for small examples.
+- `WaferStage.measure_frf`, ``poles``: measurements; ``run``, ``loop``: a design runs on it.
+
+>>> import flexplant as fx
+>>> machine = fx.testbeds.wafer_stage(damping=0.01)
+>>> measured = machine.poles([4, 5, 6])
+>>> measured.freq.round(1)
+array([244.7, 355.3, 455.1])
+>>> fx.testbeds.three_masses().u
+('u1',)
+
+A machine of one's own has the same two methods, ``loop(ports, *blocks)`` and ``poles(modes)`` or
+``measure_frf(ports)``, and goes into `fx.study` like these.
+"""
 
 from ..rooms import public_names as _public_names
 from .magnet_stage import magnet_stage as magnet_stage

@@ -1,4 +1,31 @@
-"""Model updating: parameters, residuals, sensitivities, searches and their judgement."""
+"""Model updating: parameters, residuals, sensitivities, searches and their judgement.
+
+What the drawing has wrong is found from what was measured, with its uncertainty.
+
+- `update(model, parameters, residuals)`: parameters are `AddedMass`, `AddedDamping`,
+  `AddedStiffness`, `MatrixParameter`, ...; residuals `Eigenvalues`, `ModeShapes`, `FrfResidual`,
+  `Antiresonances`, `StaticCompliance`; chi-square says whether they explain the data.
+- `localise(model, candidates, residuals)`: where the error is, among candidates.
+- `identifiability`: what the data can say at all; `validate` with data left out;
+  `sample_posterior` where the uncertainty is no ellipsoid.
+- `UpdateResult.calibrated(measured)`: the measured poles in the model; `applied_to(full)`: the
+  updated full model.
+- `UpdateResult.uncertainty()`: what remains open of each mode, for controllers that tolerate it.
+
+>>> import flexplant as fx
+>>> nominal = fx.chain(masses=[1.0, 0.3, 0.2], stiffnesses=[2e4, 3e4])
+>>> true = nominal.with_parts(fx.PointMass("3:x", 0.05))
+>>> poles = 1j * fx.solve_modes(true).omega[1:]
+>>> measured = fx.MeasuredModes(poles, modes=[2, 3])
+>>> fit = fx.update(nominal, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
+>>> round(float(fit.values[0]), 6)
+0.05
+>>> fit.converged
+True
+
+Names elsewhere: FEMtools, Nastran SOL 200, Simcenter Correlation. ``examples/measured_frf.py`` goes
+from noisy responses to a model, ``examples/paper_plate.py`` has the paper's numbers.
+"""
 
 from ..rooms import public_names as _public_names
 from .discrepancy import Discrepancy as Discrepancy

@@ -277,7 +277,7 @@ def _complaint(fit: UpdateResult, named: str) -> str:
         f"the updated model leaves more than noise: chi-square {fit.chi2:.4g} for {fit.dof} "
         f"degrees of freedom. It fits worst {named}. {negative}"
         "Something else differs between model and machine, or the noise is understated; "
-        f"localise(model, residuals, candidates) searches for the place. {tried}{kept}"
+        f"localise(model, candidates, residuals) searches for the place. {tried}{kept}"
     )
 
 

@@ -20,9 +20,9 @@ from ..standard import StandardPlant, standard_plant
 from .rigid_motion import RigidModes, require_weak, rigid_gain, seen
 
 #: |S| of the finished loop crosses 1 below the weight's crossing by about this factor (measured:
-#: the table in `stage_weights`)
+#: the table in the room's docstring)
 _HEADROOM = 1.6
-#: disturbance and effort: the middle of the table in `stage_weights`; and where frequencies are
+#: disturbance and effort: the middle of that table; and where frequencies are
 #: uncertain, with which tolerant designs of eleven machines had margins of 0.40 to 0.43
 _SURE, _UNSURE = 3.0, (20.0, 10.0)
 
@@ -152,39 +152,18 @@ def stage_weights(
 ) -> StageWeights:
     """Return a four-block set of weights for a positioning stage.
 
-    Everything is measured in one length at the POI (1 m of reference) and in the force f0 that
-    accelerates the rigid body by ``w_c^2`` times it, f_c being 1.6 times the bandwidth:
+    ``plant.weighted(z=weights.z, w=weights.w)`` is what `flexplant.design_hinf` then takes; a
+    controller with one degree of freedom reads `reference_errors`. `design_stage` does all three,
+    and finds the largest bandwidth. What the numbers do is measured on one machine in a table of
+    ``help(flexplant.plant)``.
+
+    In one length at the POI (1 m of reference) and in the force f0 that accelerates the rigid body
+    by ``w_c^2`` times it, f_c being 1.6 times the bandwidth, the blocks are
     ``[W_S S, W_S P W_d; W_u K S, W_u K P W_d]`` with 1/W_S rising as f/f_c up to peak, W_u letting
     the efforts roll off from 6 f_c, W_d = disturbance f0. K P W_d is the complementary sensitivity
     T at u, and the weights of z are divided by ``peak disturbance effort``, so that gamma = 1
     requires |T| < peak at u: with the default ratios this block decides, and gamma is how far the
     loop is from it. The controller lists what each block reaches (`Controller.reached`).
-
-    What the knobs do, with the plate of ``examples/wafer_stage.py`` at 0.1 % damping, 10 kHz, 1.3
-    samples late: designed on a reduced model with measured poles, with `uncertainty` for the
-    others, judged on a machine of another formulation. "to" is where |S| from reference to error
-    reaches 1, then its peak, the modulus margin at u, and |S| at 5 Hz::
-
-        bandwidth  changed          gamma   to [Hz]  |S| [dB]  margin at u  |S| at 5 Hz
-               60                    1.01      51       5.3        0.51        0.0024
-              100                    1.04      78       5.9        0.43        0.0006
-              120                    1.08      89       6.3        0.41        0.0004
-              140                    1.18      97       7.8        0.39        0.0003
-              120  peak 1.3          1.60      88       7.0        0.45        0.0004
-              120  peak 6            1.00      65       8.1      unstable      0.0005
-              120  disturbance 6     1.08      89       6.1        0.40        0.0004
-              120  effort 3          1.77     102       9.2        0.35        0.0002
-              120  effort 30         1.01      68       5.7        0.46        0.0010
-              120  noise 0.5         1.08      90       6.3        0.41        0.0004
-
-    A larger effort makes the loop slower and its margin larger; disturbance and noise matter
-    little here; peak 6 lets a mode that is off go unstable. Where frequencies are certain the
-    ratios are 3 and 3: the larger disturbance or effort, the more |T| at u decides. Noise below
-    0.02 leaves the controller more gain at the modes that the model lacks.
-
-    Without `uncertainty` the same model, designed for 80 Hz, is unstable on that machine. At 1 %
-    damping it keeps a margin of 0.35 there (0.24 on the drawing), with `uncertainty` 0.48 at the
-    same bandwidth. `design_stage` finds the largest bandwidth whose margin is 0.4.
 
     Parameters
     ----------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from ...errors import (
     InfeasibleError,
     ModelError,
     SolverError,
+    attempted,
     counted,
     warn,
 )
@@ -25,7 +25,7 @@ from ...lti.preparation import Prepared, departure_from_normal, prepared
 from ...lti.responses import Responder, remembered, responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
-from ...plant import StandardPlant
+from ...plant import StandardPlant, stage_weights
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import (
     Controller,
@@ -56,6 +56,7 @@ def design_hinf(
     plant: StandardPlant | UncertainPlant[Any] | System,
     method: SynthesisMethod | None = None,
     *,
+    bandwidth: float | None = None,
     u: Sequence[str] | None = None,
     y: Sequence[str] | None = None,
     uncertain: UncertainPlant[Any] | None = None,
@@ -80,6 +81,9 @@ def design_hinf(
         `Riccati(regularised=True)`, which adds them anyway. `Lmi()` needs no rank and suits up to
         30 states. Where all fail, a stable plant is left without feedback, K = 0, and the notes
         say why.
+    bandwidth : float [Hz], optional
+        Of a stage that has no weights yet: those of `stage_weights` are used, for the POI's only
+        reference. `design_stage` finds the largest that holds.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
     uncertain : UncertainPlant, optional
@@ -149,6 +153,8 @@ def design_hinf(
             f"method must be Riccati(...) or Lmi(...), got {short(method)}. Pass one, or none."
         )
     plant = posed(plant, u, y, "H-infinity synthesis")
+    if bandwidth is not None:
+        plant = plant.weighted(stage_weights(plant, bandwidth, uncertainty=uncertain))
     known = uncertain
     if known is None and plant.uncertainty is not None and plant.uncertainty.frequencies:
         known = plant.uncertainty
@@ -171,7 +177,8 @@ def tolerant(
     open_plant = with_channels(plant, channels)
     problem = prepared(open_plant.system, open_plant.u, open_plant.y)
     first = np.inf
-    with suppress(FlexplantError):  # only the scales hang on it: where it fails, all is said below
+    # only the scales hang on it: where it fails, all is said below
+    with attempted("evening out the scales of modes"):
         found = (method or Riccati(progress=progress)).solve(problem)
         loop = problem.restored(found.A, found.B, found.C, found.D)
         channels, first = rebalanced(channels, open_plant, loop), found.gamma
@@ -341,7 +348,7 @@ def best_answer(plant: StandardPlant, problem: Prepared, progress: bool | None) 
             break
     if not answers:
         for tried_method, claimed in broken:
-            with suppress(FlexplantError):
+            with attempted("another controller than that which was claimed"):
                 answers.append(_beyond_claim(plant, problem, tried_method, claimed))
         if not answers:
             raise _failure(failures)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...checks import FloatArray, Value, checked, flag, function, instance, real_array, whole
-from ...errors import FlexplantError, ModelError, ShapeError, counted
+from ...errors import ModelError, ShapeError, attempted, counted
 from ...lti.balancing import balanced
 from ...lti.discretisation import bilinear, tustin
 from ...lti.preparation import Prepared
@@ -131,11 +131,10 @@ def _reduced(plant: StandardPlant, order: int) -> StateSpace | None:
     """Return the controller of full order, reduced; None where that is not possible."""
     if not order:
         return None
-    try:
+    with attempted("a start from the reduced controller of full order"):
         full = design_hinf(plant).system
         return balanced(full, order=order).system if full.n_states > order else None
-    except FlexplantError:
-        return None
+    return None
 
 
 class _Entries(ControllerFamily):

@@ -29,8 +29,8 @@ LARGE = 150
 
 def localise(
     model: Any,
-    residuals: Sequence[Any],
     candidates: Sequence[Parameter],
+    residuals: Sequence[Any],
     *,
     nuisance: Sequence[Parameter] = (),
     most: int = 3,
@@ -63,10 +63,10 @@ def localise(
     model : ReducedModel or FEModel
         Without the change. An FEModel of more than 150 DOFs is replaced by a basis of its modes
         and the static responses to loads at the candidates.
-    residuals : sequence of Residual
-        Measured with the change.
     candidates : sequence of c Parameter
         Added masses or springs at every DOF in question, say.
+    residuals : sequence of Residual
+        Measured with the change.
     nuisance : sequence of Parameter, optional
         Unknowns beside the candidates; their priors are not used.
     most : int
@@ -105,7 +105,7 @@ def localise(
     >>> heavier = fx.chain(masses=[1.0, 2.0, 1.8], stiffnesses=[4e5, 3e5])
     >>> measured = fx.MeasuredModes(poles=fx.solve_modes(heavier, count=3).poles[1:], modes=[2, 3])
     >>> masses = [fx.AddedMass(place, name=place) for place in drawing.dofs.labels]
-    >>> fx.localise(drawing, [fx.Eigenvalues(measured)], masses).ranking[0]
+    >>> fx.localise(drawing, masses, [fx.Eigenvalues(measured)]).ranking[0]
     '3:x'
     """
     listed = checked_parameters(candidates)
@@ -245,7 +245,7 @@ class Localisation(Value):
     >>> heavier = fx.chain(masses=[1.0, 2.0, 1.8], stiffnesses=[4e5, 3e5])
     >>> measured = fx.MeasuredModes(poles=fx.solve_modes(heavier, count=3).poles[1:], modes=[2, 3])
     >>> masses = [fx.AddedMass(place, name=place) for place in drawing.dofs.labels]
-    >>> found = fx.localise(drawing, [fx.Eigenvalues(measured)], masses, most=1)
+    >>> found = fx.localise(drawing, masses, [fx.Eigenvalues(measured)], most=1)
     >>> found.chosen, found.chosen_values.round(6)
     (('3:x',), array([0.3]))
     """
