@@ -130,7 +130,7 @@ def _node_graph(matrix: sp.csc_array, member: IntArray, count: int) -> sp.csr_ar
 
 
 @dataclass(frozen=True)
-class _Cutting:
+class _GraphLevel:
     """What one level cuts: nodes, the part (0, 1, ...) and width of each, edges inside parts.
 
     `heads` and `tails` are positions in `nodes`, each edge once.
@@ -150,7 +150,7 @@ class _Cutting:
 
 
 #: what cuts the parts of a level: masks over its nodes, the upper sides and the separators
-_Cut = Callable[[_Cutting], tuple[BoolArray, BoolArray]]
+_Cut = Callable[[_GraphLevel], tuple[BoolArray, BoolArray]]
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ def _bisect(
         inside = live[heads] & live[tails]
         heads, tails = heads[inside], tails[inside]
         _, number = np.unique(part[nodes], return_inverse=True)
-        level = _Cutting(nodes, number, width[nodes], local[heads], local[tails])
+        level = _GraphLevel(nodes, number, width[nodes], local[heads], local[tails])
         upper, between = cut(level)
         if depth == 0:
             separator = int(np.count_nonzero(between))
@@ -196,7 +196,7 @@ def _bisect(
     return _Parts(part, separator)
 
 
-def _smaller_shore(level: _Cutting, upper: BoolArray) -> BoolArray:
+def _smaller_shore(level: _GraphLevel, upper: BoolArray) -> BoolArray:
     """Return the nodes on one side that touch the other, of the side with fewer such DOFs."""
     across = upper[level.heads] != upper[level.tails]
     heads, tails = level.heads[across], level.tails[across]
@@ -210,14 +210,14 @@ def _smaller_shore(level: _Cutting, upper: BoolArray) -> BoolArray:
 def _coordinate_cut(where: FloatArray) -> _Cut:
     """Return the cut through the median of the longest side."""
 
-    def cut(level: _Cutting) -> tuple[BoolArray, BoolArray]:
+    def cut(level: _GraphLevel) -> tuple[BoolArray, BoolArray]:
         upper = _upper_half(where[level.nodes], level.part)
         return upper, _smaller_shore(level, upper)
 
     return cut
 
 
-def _graph_cut(level: _Cutting) -> tuple[BoolArray, BoolArray]:
+def _graph_cut(level: _GraphLevel) -> tuple[BoolArray, BoolArray]:
     """Return the smallest separator near the middle of the longest way through each part.
 
     Its nodes are the minimum cut of the flow through a band of nodes, each of which passes as
@@ -242,7 +242,7 @@ def _graph_cut(level: _Cutting) -> tuple[BoolArray, BoolArray]:
     return upper, np.where(lopsided, _smaller_shore(level, half), between)
 
 
-def _along(level: _Cutting) -> tuple[IntArray, FloatArray]:
+def _along(level: _GraphLevel) -> tuple[IntArray, FloatArray]:
     """Return each node's connected piece, and a coordinate along the longest way through it.
 
     The difference of the distances to two far ends, averaged over neighbours: steps towards the
@@ -285,7 +285,7 @@ def _steps(graph: sp.csr_array, starts: IntArray) -> FloatArray:
 
 
 def _minimum_cut(
-    level: _Cutting, low: BoolArray, high: BoolArray, band: BoolArray
+    level: _GraphLevel, low: BoolArray, high: BoolArray, band: BoolArray
 ) -> tuple[BoolArray, BoolArray]:
     """Return the upper sides and the fewest DOFs in the band that part `low` from `high`.
 
