@@ -206,10 +206,6 @@ def design_multirate(
     every : mapping {sensor: interval or (interval, offset)} [samples]
         Sensors that are not named are read in each sample.
 
-    Returns
-    -------
-    PeriodicEstimator
-
     Raises
     ------
     AssumptionError

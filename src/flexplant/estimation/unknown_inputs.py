@@ -112,10 +112,6 @@ def design_input_estimator(
     method : Unbiased or Augmented
         What is assumed of them.
 
-    Returns
-    -------
-    InputEstimator
-
     Raises
     ------
     AssumptionError

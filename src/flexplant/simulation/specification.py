@@ -184,10 +184,6 @@ class Specification(Value):
         exposures : (k, 2) array [s], optional
             As for `exposure_errors`; all after `start` (and `settling`) when not given.
 
-        Returns
-        -------
-        Verdict
-
         Raises
         ------
         ModelError
