@@ -433,16 +433,6 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         """Return the unit of a response, such as "rad/N", "1" of a ratio; None when not known.
 
         By the units of the channels, else, of a measurement, by its quantity for one N.
-
-        Parameters
-        ----------
-        output, input : str
-            The channel.
-
-        Raises
-        ------
-        LabelError
-            When a name is unknown.
         """
         self._place((output, input))
         known = self.channel_units
@@ -464,13 +454,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         return dict.fromkeys(self.inputs, "N") | dict.fromkeys(self.outputs, per) | dict(self.units)
 
     def to_control(self, dt: float = 0.0) -> Any:
-        """Return a `control.FrequencyResponseData` with the same names.
-
-        Parameters
-        ----------
-        dt : float [s]
-            Sampling time of the system it came from; 0 for continuous time.
-        """
+        """Return a `control.FrequencyResponseData` of the same names; dt [s] is the system's."""
         import control
 
         return control.FrequencyResponseData(
