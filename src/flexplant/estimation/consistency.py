@@ -200,10 +200,6 @@ def consistency(
     level : float
         Share of records at which a right model passes.
 
-    Returns
-    -------
-    Consistency
-
     Raises
     ------
     ModelError

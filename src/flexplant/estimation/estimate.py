@@ -156,18 +156,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
         return float(self.time[-1] - self.time[0]) / (self.time.size - 1)
 
     def deviation(self, channel: str) -> FloatArray:
-        """Return the standard deviation (N,) of an estimate's error, or of an innovation.
-
-        Parameters
-        ----------
-        channel : str
-            `die:hat`, `y1:innovation`.
-
-        Raises
-        ------
-        LabelError
-            When there is no such channel.
-        """
+        """Return the deviation (N,) of an estimate's error (`die:hat`), or of `y1:innovation`."""
         side, row = self._found(channel)
         return np.asarray((self.deviations, self.innovation_deviations)[side][row])
 

@@ -269,10 +269,6 @@ class KalmanEstimator(PoiFilter):
         lags : (k,) array [s]
             Rounded to samples; those below half a sample are left out.
 
-        Returns
-        -------
-        LagReport
-
         Raises
         ------
         ModelError

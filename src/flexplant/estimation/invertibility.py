@@ -136,10 +136,6 @@ def invertibility(plant: StandardPlant | System, inputs: Sequence[str]) -> Inver
     inputs : sequence of str
         Disturbances in w.
 
-    Returns
-    -------
-    Invertibility
-
     Raises
     ------
     AssumptionError

@@ -75,19 +75,9 @@ class LagReport(Value):
         return np.asarray(self.rms[list(self.names).index(row)])
 
     def recovered(self, row: str, channel: str) -> float:
-        """Return which part of the variance that smoothing can take away a row takes away.
+        """Return which part of the variance that smoothing can take away a row ("1 ms") takes away.
 
-        Parameters
-        ----------
-        row : str
-            Such as "1 ms".
-        channel : str
-            A POI's motion.
-
-        Raises
-        ------
-        LabelError
-            When there is no such row or channel.
+        Of a POI's motion.
         """
         i = row_of(self.channels, channel)
         filtered, smooth = self[FILTER][i] ** 2, self[SMOOTHER][i] ** 2

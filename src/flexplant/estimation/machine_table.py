@@ -99,10 +99,6 @@ def errors_on_machines(
         Controllers that close the loop on the estimates (or on y): each estimator runs in
         `close_loop(machine, estimator, *blocks)`. None: u is at rest.
 
-    Returns
-    -------
-    MachineTable
-
     Raises
     ------
     ModelError

@@ -102,21 +102,9 @@ class PeriodicEstimator(Value):
         return sensors(self.plant)
 
     def rms(self, channel: str, phase: int | None = None) -> float:
-        """Return the rms of the estimation error, over a period or in one sample of it.
+        """Return the rms of the error of a POI's motion (`die`, `die:z`, `die:hat`) over a period.
 
-        Parameters
-        ----------
-        channel : str
-            A POI's motion: `die`, `die:z`, `die:hat`.
-        phase : int, optional
-            Sample of the period, from 0; the whole period when not given.
-
-        Raises
-        ------
-        LabelError
-            When it is no motion of a POI.
-        ModelError
-            When there is no such sample in a period.
+        Or in one sample of it, `phase` from 0.
         """
         column = self.variances[:, row_of(poi_channels(self.plant), channel)]
         if phase is not None:
@@ -125,43 +113,18 @@ class PeriodicEstimator(Value):
         return float(np.sqrt(np.mean(np.maximum(column, 0.0))))
 
     def system(self, phase: int) -> StateSpace:
-        """Return the filter of one sample of a period, from sensors and u to the estimates.
-
-        Parameters
-        ----------
-        phase : int
-            Sample of the period, from 0.
-
-        Raises
-        ------
-        ModelError
-            When there is no such sample in a period.
-        """
+        """Return the filter of one sample of a period, from sensors and u to the estimates."""
         k = whole(phase, "phase", minimum=0, maximum=self.period - 1)
         model = filter_model(self.plant)
         gains = self.predictor_gains[k], model.C1 @ self.gains[k]
         return filter_system(self.plant, model, *gains, f"sample {k} of a period")
 
     def estimate(self, records: Any, *, start: Any = None) -> dict[str, FloatArray]:
-        """Return the estimates over a record whose first sample is the first one of a period.
+        """Return the estimates by name over a record that begins with the first sample of a period.
 
-        Parameters
-        ----------
-        records : Response, mapping {channel: (N,) array} or data frame
-            All sensors and commands at the plant's rate. Samples in which a sensor is not read may
-            be NaN, or anything.
-        start : (n,) array, optional
-            x at the first sample; rest when not given.
-
-        Returns
-        -------
-        dict {name: (N,) array}
-            `die:hat`, ...
-
-        Raises
-        ------
-        LabelError, ShapeError, ModelError
-            When channels are missing or of different lengths, or a sample that is due is NaN.
+        All sensors and commands at the plant's rate, as for `KalmanEstimator.estimate`; samples in
+        which a sensor is not read may be NaN, or anything. `start` is x (n,) at the first sample;
+        rest when not given.
         """
         model = filter_model(self.plant)
         record = recorded(records, model)
@@ -205,10 +168,6 @@ def design_multirate(
         Sampled, not weighted. A sensor's noise per sample is that of its asd at the plant's rate.
     every : mapping {sensor: interval or (interval, offset)} [samples]
         Sensors that are not named are read in each sample.
-
-    Returns
-    -------
-    PeriodicEstimator
 
     Raises
     ------

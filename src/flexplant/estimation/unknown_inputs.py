@@ -112,10 +112,6 @@ def design_input_estimator(
     method : Unbiased or Augmented
         What is assumed of them.
 
-    Returns
-    -------
-    InputEstimator
-
     Raises
     ------
     AssumptionError
@@ -450,23 +446,7 @@ class InputEstimator(Value):
         )
 
     def rms(self, channel: str) -> float:
-        """Return the rms of the error of a POI's motion or of an unknown input.
-
-        Parameters
-        ----------
-        channel : str
-            `die`, `die:z`, `die:hat`, or `amp1`, `amp1:hat`.
-
-        Returns
-        -------
-        float
-            In the channel's unit.
-
-        Raises
-        ------
-        LabelError
-            When it is neither.
-        """
+        """Return the rms of the error of a POI's motion or an unknown input: `die`, `amp1:hat`."""
         row = row_of([*poi_channels(self.plant), *self.inputs], channel)
         both = np.concatenate([self.variances, self.input_variances])
         return float(np.sqrt(max(both[row], 0.0)))

@@ -92,13 +92,7 @@ class ErrorBudget(Value):
         return self.variances / total if total else self.variances
 
     def half_below(self, source: str) -> float:
-        """Return the frequency [Hz] below which half of a source's variance lies.
-
-        Raises
-        ------
-        LabelError
-            When there is no such source.
-        """
+        """Return the frequency [Hz] below which half of a source's variance lies."""
         half = 0.5 * self[source] ** 2
         row = self.cumulative[self.names.index(source)]
         known = np.isfinite(self.freq)

@@ -188,13 +188,6 @@ class ClosedLoop(Value):
         """Return the function of frequency [Hz] that gives the response from a w to a z.
 
         Prepared once for many calls: the frequencies are not checked, (1, 1, n_freq) comes back.
-
-        Parameters
-        ----------
-        reference : str
-            A channel of w.
-        error : str
-            A channel of z.
         """
         return self._responses([reference], [error])
 

@@ -197,10 +197,6 @@ def report_loops(
     unstable : int
         Of a measured plant: poles outside the stability region (negative stiffness).
 
-    Returns
-    -------
-    LoopReport
-
     Raises
     ------
     LabelError

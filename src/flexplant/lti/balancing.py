@@ -95,10 +95,6 @@ def balanced(
     input_weight, output_weight : StateSpace, optional
         Stable filters before the inputs and behind the outputs, matched in order.
 
-    Returns
-    -------
-    BalancedReduction
-
     Raises
     ------
     ModelError
@@ -343,10 +339,6 @@ def norm_report(sys: System) -> NormReport:
     ----------
     sys : StateSpace or control.StateSpace
         Continuous or sampled.
-
-    Returns
-    -------
-    NormReport
 
     Raises
     ------

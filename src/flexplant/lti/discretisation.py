@@ -316,19 +316,18 @@ def bilinear(sys: System, rate: float) -> StateSpace:
     # z = (a + s) / (a - s), a = 2 rate: stability and norms are kept; w = a tan(theta / 2)
     g = as_statespace(sys)
     a = 2.0 * positive(rate, "rate")
-    plus = np.eye(g.n_states) + g.A
     if _has_pole_at(-1.0, g.A):
         raise ModelError(f"{g!r} has a pole at z = -1, which the bilinear map sends to infinity.")
-    inverse = np.linalg.inv(plus)
-    root = np.sqrt(2.0 * a)
-    return g.replace(
-        A=a * inverse @ (g.A - np.eye(g.n_states)),
-        B=root * inverse @ g.B,
-        C=root * g.C @ inverse,
-        D=g.D - g.C @ inverse @ g.B,
-        dt=0.0,
-        blocks=None,
-    )
+    A, B, C, D = bilinear_matrices((g.A, g.B, g.C, g.D), a)
+    return g.replace(A=A, B=B, C=C, D=D, dt=0.0, blocks=None)
+
+
+def bilinear_matrices(matrices: Matrices, a: float) -> Matrices:
+    """Return A, B, C, D with ``z = (a + s) / (a - s)``; no pole lies at -1."""
+    A, B, C, D = matrices
+    eye, root = np.eye(len(A)), np.sqrt(2.0 * a)
+    inverse = np.linalg.inv(eye + A)
+    return a * inverse @ (A - eye), root * inverse @ B, root * C @ inverse, D - C @ inverse @ B
 
 
 #: times half the rate: where even the lowest mode lies above this, the rate is in another unit

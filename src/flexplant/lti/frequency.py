@@ -47,81 +47,6 @@ class Operand(NamedTuple):
     quantity: str | None
 
 
-class Arithmetic:
-    """What `Frf` calculates with: numbers, responses on the same lines, systems.
-
-    Errors of two responses are taken to be independent, so that variances add; those of a product
-    follow to first order, ``|G2|^2 var G1 + |G1|^2 var G2``. A system adds none. What belongs to
-    one measurement (coherence, correlation of outputs, segments) is left out of sums and products.
-    """
-
-    #: arrays leave `2.0 * frf` with a numpy number to this class
-    __array_ufunc__ = None
-
-    @property
-    def mag(self: Any) -> FloatArray:
-        """Magnitude (n_out, n_in, n_freq)."""
-        return np.asarray(np.abs(self.data))
-
-    @property
-    def phase(self: Any) -> FloatArray:
-        """Phase (n_out, n_in, n_freq) [rad], between -pi and pi."""
-        return np.asarray(np.angle(self.data))
-
-    def __neg__(self) -> Any:
-        """Return the responses negated."""
-        return self * -1.0
-
-    def __add__(self: Any, other: Any) -> Any:
-        """Return the sum of two responses between the same channels."""
-        one, two = _operand(self, self), _operand(other, self)
-        if (tuple(one.inputs), tuple(one.outputs)) != (tuple(two.inputs), tuple(two.outputs)):
-            raise LabelError(
-                f"a sum needs the same channels, got {_sides(one)} and {_sides(two)}. Select or "
-                "rename them first."
-            )
-        variance = _sum(one.variance, two.variance)
-        quantity = one.quantity if two.quantity in (None, one.quantity) else None
-        return _computed(self, one.data + two.data, variance, quantity=quantity)
-
-    __radd__ = __add__
-
-    def __rsub__(self, other: Any) -> Any:
-        """Return a system minus these responses."""
-        return -self + other
-
-    def __sub__(self, other: Any) -> Any:
-        """Return the difference of two responses between the same channels."""
-        return self + (-other if isinstance(other, Arithmetic) else -as_statespace(other))
-
-    def __mul__(self: Any, other: Any) -> Any:
-        """Return ``G1 G2``, the second one's outputs driving this one's inputs; or a multiple."""
-        if isinstance(other, _NUMBERS):
-            return _multiple(self, complex(other))
-        return _product(self, _operand(self, self), _operand(other, self))
-
-    def __rmul__(self: Any, other: Any) -> Any:
-        """Return a multiple, or the product of a system before this one."""
-        if isinstance(other, _NUMBERS):
-            return _multiple(self, complex(other))
-        return _product(self, _operand(other, self), _operand(self, self))
-
-    def __truediv__(self: Any, other: Any) -> Any:
-        """Return the responses divided by a number, or by a response of one channel."""
-        if isinstance(other, Arithmetic):
-            return self * _reciprocal(other)
-        if not isinstance(other, _NUMBERS) or other == 0:
-            raise ModelError(
-                f"responses are divided by a number other than 0 or by a response of one input "
-                f"and one output, got {short(other)}. Pass one of these."
-            )
-        return self * (1.0 / complex(other))
-
-    def __rtruediv__(self: Any, other: Any) -> Any:
-        """Return a number divided by a response of one channel."""
-        return _reciprocal(self) * other
-
-
 def _reciprocal(frf: Any) -> Any:
     """Return 1/G, from the output to the input of G; its variance is ``var G / |G|^4``."""
     if frf.data.shape[:2] != (1, 1):
@@ -141,7 +66,7 @@ def _reciprocal(frf: Any) -> Any:
 
 def _operand(given: Any, frf: Any) -> Operand:
     """Return a response, or that of a system, on the lines of an Frf."""
-    if not isinstance(given, Arithmetic):
+    if not isinstance(given, Frf):
         g = as_statespace(given)
         return Operand(responses(g, frf.freq), None, g.inputs, g.outputs, dict(g.units), None)
     own: Any = given
@@ -210,7 +135,7 @@ _PER_TIME = ("", "/s", "/s^2")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
+class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     """Frequency response functions between named channels, computed or measured.
 
     Parameters
@@ -244,6 +169,13 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
     units : mapping {channel: unit}, optional
         SI units of the inputs and outputs that have a known one.
 
+    Notes
+    -----
+    It calculates with numbers, responses on the same lines and systems. Errors of two responses are
+    taken to be independent, so that variances add; those of a product follow to first order,
+    ``|G2|^2 var G1 + |G1|^2 var G2``. A system adds none. What belongs to one measurement
+    (coherence, correlation of outputs, segments) is left out of sums and products.
+
     Raises
     ------
     ShapeError, ModelError, LabelError
@@ -258,6 +190,9 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
     >>> complex(frf["x", "f"][1])
     0.5j
     """
+
+    #: arrays leave `2.0 * frf` with a numpy number to this class
+    __array_ufunc__ = None
 
     freq: FloatArray
     data: ComplexArray
@@ -359,6 +294,69 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
     def __len__(self) -> int:
         return len(self.outputs) * len(self.inputs)
 
+    @property
+    def mag(self) -> FloatArray:
+        """Magnitude (n_out, n_in, n_freq)."""
+        return np.asarray(np.abs(self.data))
+
+    @property
+    def phase(self) -> FloatArray:
+        """Phase (n_out, n_in, n_freq) [rad], between -pi and pi."""
+        return np.asarray(np.angle(self.data))
+
+    def __neg__(self) -> Any:
+        """Return the responses negated."""
+        return self * -1.0
+
+    def __add__(self, other: Any) -> Any:
+        """Return the sum of two responses between the same channels."""
+        one, two = _operand(self, self), _operand(other, self)
+        if (tuple(one.inputs), tuple(one.outputs)) != (tuple(two.inputs), tuple(two.outputs)):
+            raise LabelError(
+                f"a sum needs the same channels, got {_sides(one)} and {_sides(two)}. Select or "
+                "rename them first."
+            )
+        variance = _sum(one.variance, two.variance)
+        quantity = one.quantity if two.quantity in (None, one.quantity) else None
+        return _computed(self, one.data + two.data, variance, quantity=quantity)
+
+    __radd__ = __add__
+
+    def __rsub__(self, other: Any) -> Any:
+        """Return a system minus these responses."""
+        return -self + other
+
+    def __sub__(self, other: Any) -> Any:
+        """Return the difference of two responses between the same channels."""
+        return self + (-other if isinstance(other, Frf) else -as_statespace(other))
+
+    def __mul__(self, other: Any) -> Any:
+        """Return ``G1 G2``, the second one's outputs driving this one's inputs; or a multiple."""
+        if isinstance(other, _NUMBERS):
+            return _multiple(self, complex(other))
+        return _product(self, _operand(self, self), _operand(other, self))
+
+    def __rmul__(self, other: Any) -> Any:
+        """Return a multiple, or the product of a system before this one."""
+        if isinstance(other, _NUMBERS):
+            return _multiple(self, complex(other))
+        return _product(self, _operand(other, self), _operand(self, self))
+
+    def __truediv__(self, other: Any) -> Any:
+        """Return the responses divided by a number, or by a response of one channel."""
+        if isinstance(other, Frf):
+            return self * _reciprocal(other)
+        if not isinstance(other, _NUMBERS) or other == 0:
+            raise ModelError(
+                f"responses are divided by a number other than 0 or by a response of one input "
+                f"and one output, got {short(other)}. Pass one of these."
+            )
+        return self * (1.0 / complex(other))
+
+    def __rtruediv__(self, other: Any) -> Any:
+        """Return a number divided by a response of one channel."""
+        return _reciprocal(self) * other
+
     def select(
         self, outputs: Sequence[str] | str | None = None, inputs: Sequence[str] | str | None = None
     ) -> Frf:
@@ -435,16 +433,6 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
         """Return the unit of a response, such as "rad/N", "1" of a ratio; None when not known.
 
         By the units of the channels, else, of a measurement, by its quantity for one N.
-
-        Parameters
-        ----------
-        output, input : str
-            The channel.
-
-        Raises
-        ------
-        LabelError
-            When a name is unknown.
         """
         self._place((output, input))
         known = self.channel_units
@@ -466,13 +454,7 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
         return dict.fromkeys(self.inputs, "N") | dict.fromkeys(self.outputs, per) | dict(self.units)
 
     def to_control(self, dt: float = 0.0) -> Any:
-        """Return a `control.FrequencyResponseData` with the same names.
-
-        Parameters
-        ----------
-        dt : float [s]
-            Sampling time of the system it came from; 0 for continuous time.
-        """
+        """Return a `control.FrequencyResponseData` of the same names; dt [s] is the system's."""
         import control
 
         return control.FrequencyResponseData(

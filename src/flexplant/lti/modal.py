@@ -74,10 +74,6 @@ def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
     largest_condition : float
         Of the eigenvectors; above it the system is kept as given, and `reason` says so.
 
-    Returns
-    -------
-    ModalForm
-
     Raises
     ------
     ModelError

@@ -11,6 +11,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray
 from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
+from .discretisation import bilinear_matrices
 from .equations import balanced_matrix, even_scale, state_scale
 from .frequency_sweep import SOUGHT, gains, highest, resonance_grid
 from .lyapunov import controllability_gramian, observability_gramian
@@ -388,13 +389,7 @@ class _Level:
         self.dt = g.dt
         A, B, C, D = g.A, g.B, g.C, g.D
         if g.dt:  # z = (1 + s) / (1 - s)
-            eye = np.eye(A.shape[0])
-            factor = la.lu_factor(A + eye)
-            inverse_B = la.lu_solve(factor, B)
-            A = la.lu_solve(factor, A - eye)
-            D = D - C @ inverse_B
-            C = np.sqrt(2.0) * la.lu_solve(factor, C.T, trans=1).T
-            B = np.sqrt(2.0) * inverse_B
+            A, B, C, D = bilinear_matrices((A, B, C, D), 1.0)
         self.A, self.B, self.C, self.D = A, B, C, D
         self.through = float(np.linalg.norm(D, 2))
 

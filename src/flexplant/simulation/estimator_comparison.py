@@ -125,10 +125,6 @@ def compare_estimators(
     level : float
         Of the confidence intervals (`Response.rms_interval`).
 
-    Returns
-    -------
-    EstimatorComparison
-
     Raises
     ------
     ModelError

@@ -102,10 +102,6 @@ def exposure_errors(
     exposures : (k, 2) array [s], optional
         Beginning and end of each, such as `SetPoint.exposures`.
 
-    Returns
-    -------
-    ExposureErrors
-
     Raises
     ------
     ModelError
@@ -359,10 +355,6 @@ def error_map(
         Whether the white noises act.
     rng : int, SeedSequence, Generator or None
         Seed of the noises.
-
-    Returns
-    -------
-    ErrorMap
 
     Raises
     ------

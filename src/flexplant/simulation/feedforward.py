@@ -103,38 +103,16 @@ class Feedforward(Value):
         )
 
     def up_to(self, term: str) -> Feedforward:
-        """Return the feedforward without the derivatives above one.
-
-        Parameters
-        ----------
-        term : str
-            position, velocity, acceleration, jerk or snap.
-
-        Raises
-        ------
-        LabelError
-            When it is none of these.
-        """
+        """Return the feedforward without the derivatives above position, velocity, ... or snap."""
         gains = self.gains.copy()
         gains[:, :, _term(term) + 1 :] = 0.0
         return self.replace(gains=gains)
 
     def forces(self, move: SetPoint, time: npt.ArrayLike) -> dict[str, FloatArray]:
-        """Return the force of each actuator over time, named for `known_forces`.
+        """Return the force of each actuator at times (n_time,) [s], named for `known_forces`.
 
-        Parameters
-        ----------
-        move : SetPoint
-            The set-point.
-        time : (n_time,) array [s]
-            The samples; as many as places where the gains depend on the place.
-
-        Raises
-        ------
-        ModelError
-            When `move` is no SetPoint, or its order is below that of the highest gain.
-        ShapeError
-            When there are places for other times.
+        As many times as places where the gains depend on the place. A set-point of an order below
+        that of the highest gain is refused.
         """
         _check_order(move, self.gains)
         t = real_array(time, "time", (None,) if len(self.gains) == 1 else (len(self.gains),))

@@ -93,10 +93,6 @@ def learn_feedforward(
     step : float
         Part of each correction that is made: 1 unless noise is large beside what repeats.
 
-    Returns
-    -------
-    LearnedFeedforward
-
     Raises
     ------
     LabelError

@@ -211,13 +211,7 @@ class MachinePipeline(Value):
         return row
 
     def report(self, machine: Any, rng: Any = None) -> MachineReport:
-        """Return all that is found for one machine.
-
-        Parameters
-        ----------
-        machine, rng
-            As for a call.
-        """
+        """Return all that is found for one machine; arguments as for a call."""
         of_run, of_measurement = (None, None) if rng is None else generator(rng).spawn(2)
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
@@ -452,13 +446,7 @@ class MachineReport(Value):
             return f"not judged: {error}"
 
     def write(self, path: str | Path) -> None:
-        """Write the text to a file, at once or not at all; `save` keeps the values themselves.
-
-        Parameters
-        ----------
-        path : str or Path
-            The file, replaced when it is there.
-        """
+        """Write the text to a file, at once or not at all; `save` keeps the values themselves."""
         with written(path) as file:
             file.write(f"{self!r}\n".encode())
 

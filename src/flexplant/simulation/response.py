@@ -108,26 +108,10 @@ class Response(Value, Mapping[str, FloatArray]):
         return float(self.time[-1] - self.time[0]) / (self.time.size - 1)
 
     def rms(self, channel: str, *, start: float = 0.0) -> Numbers:
-        """Return the root mean square of a channel, about zero.
+        """Return the root mean square of a channel about zero, a number or one for each run.
 
-        Parameters
-        ----------
-        channel : str
-            Its name.
-        start : float [s]
-            Samples before this time are left out: transients.
-
-        Returns
-        -------
-        float, or (n_runs,) array
-            In the channel's unit.
-
-        Raises
-        ------
-        LabelError
-            When there is no such channel.
-        ModelError
-            When nothing is left after `start`.
+        Samples before `start` [s] are left out: transients. An unknown channel is a LabelError, a
+        start that leaves nothing a ModelError; so in all that follow.
         """
         signal = self._from(channel, start)
         unit = unit_of(signal)
@@ -138,27 +122,8 @@ class Response(Value, Mapping[str, FloatArray]):
     ) -> tuple[float, float, float]:
         """Return the root mean square over all runs, and the ends of its confidence interval.
 
-        The mean squares of independent runs are taken as normal: Student's interval of their mean.
-
-        Parameters
-        ----------
-        channel, start : str, float [s]
-            As for `rms`.
-        level : float
-            Of the interval.
-
-        Returns
-        -------
-        tuple of float
-            Value, lower and upper end, in the channel's unit; the lower end is not below zero.
-
-        Raises
-        ------
-        LabelError
-            When there is no such channel.
-        ModelError
-            When there is only one run, nothing is left after `start`, or the level is not
-            between 0 and 1.
+        The mean squares of two or more independent runs are taken as normal: Student's interval of
+        their mean; its lower end is not below zero.
         """
         if self.data.ndim != 3 or self.data.shape[0] < 2:
             raise ModelError(
@@ -178,53 +143,14 @@ class Response(Value, Mapping[str, FloatArray]):
         return value, low, high
 
     def peak(self, channel: str, *, start: float = 0.0) -> Numbers:
-        """Return the largest magnitude of a channel.
-
-        Parameters
-        ----------
-        channel, start : str, float [s]
-            As for `rms`.
-
-        Returns
-        -------
-        float, or (n_runs,) array
-            In the channel's unit.
-
-        Raises
-        ------
-        LabelError
-            When there is no such channel.
-        ModelError
-            When nothing is left after `start`.
-        """
+        """Return the largest magnitude of a channel from `start` on, one for each run."""
         return _numbers(np.max(np.abs(self._from(channel, start)), axis=-1))
 
     def psd(self, channel: str, *, start: float = 0.0, segment: float | None = None) -> Spectrum:
         """Return the one-sided power spectral density of a channel, over all runs.
 
-        Welch's method: Hann windows that overlap by half, no mean removed, so that the integral is
-        the mean square.
-
-        Parameters
-        ----------
-        channel, start : str, float [s]
-            As for `rms`.
-        segment : float [s], optional
-            Length of a window, the inverse of the resolution; an eighth of the record when not
-            given.
-
-        Returns
-        -------
-        Spectrum
-            Named tuple (freq [Hz], psd [unit^2/Hz]).
-
-        Raises
-        ------
-        LabelError
-            When there is no such channel.
-        ModelError
-            When nothing is left after `start`, or the segment is shorter than two samples or
-            longer than the record.
+        Welch's method: Hann windows of the length `segment` [s] (an eighth of the record when not
+        given) that overlap by half, no mean removed, so that the integral is the mean square.
         """
         from scipy.signal import welch
 
@@ -243,53 +169,19 @@ class Response(Value, Mapping[str, FloatArray]):
         return Spectrum(freq, unit**2 * density.reshape(-1, freq.size).mean(axis=0))
 
     def moving_average(self, channel: str, *, window: float = 5e-3) -> FloatArray:
-        """Return the mean of a channel over a window centred at each time (MA).
+        """Return the mean of a channel over a window [s] centred at each time (MA).
 
         In lithography the window is the exposure time of a point: the MA of the error is overlay.
-
-        Parameters
-        ----------
-        channel : str
-            Its name.
-        window : float [s]
-            Length; rounded to whole samples. An even number of samples reaches one sample further
-            back than ahead. At both ends of the record the window is cut off by it.
-
-        Returns
-        -------
-        (n_time,) or (n_runs, n_time) array
-            At the times of the response.
-
-        Raises
-        ------
-        LabelError
-            When there is no such channel.
-        ModelError
-            When the window is shorter than one sample or longer than the record.
+        It is rounded to whole samples; an even number reaches one sample further back than ahead.
+        At both ends of the record the window is cut off by it.
         """
         return self._moments(channel, window)[0]
 
     def moving_std(self, channel: str, *, window: float = 5e-3) -> FloatArray:
-        """Return the standard deviation of a channel in a window centred at each time (MSD).
+        """Return the standard deviation of a channel in a window [s] centred at each time (MSD).
 
-        In lithography the MSD of the error is fading: how much the image is smeared out.
-
-        Parameters
-        ----------
-        channel, window : str, float [s]
-            As for `moving_average`.
-
-        Returns
-        -------
-        (n_time,) or (n_runs, n_time) array
-            Root of the mean squared deviation from the window's own mean.
-
-        Raises
-        ------
-        LabelError
-            When there is no such channel.
-        ModelError
-            When the window is shorter than one sample or longer than the record.
+        From the window's own mean. In lithography the MSD of the error is fading: how much the
+        image is smeared out.
         """
         return self._moments(channel, window)[1]
 
@@ -298,39 +190,14 @@ class Response(Value, Mapping[str, FloatArray]):
     ) -> tuple[float, float]:
         """Return the largest |MA| and the largest MSD of a channel after a time, over all runs.
 
-        Parameters
-        ----------
-        channel : str
-            Its name.
-        window : float [s]
-            Exposure time of a point, as for `moving_average`.
-        start : float [s]
-            Windows centred before this time are left out: the move and its settling.
-
-        Returns
-        -------
-        tuple of float
-            MA and MSD, in the channel's unit.
-
-        Raises
-        ------
-        LabelError
-            When there is no such channel.
-        ModelError
-            When the window does not fit the record, or nothing is left after `start`.
+        Windows [s] centred before `start` [s] are left out: the move and its settling.
         """
         late = self._late(start)
         average, deviation = self._moments(channel, window)
         return float(np.abs(average[..., late]).max()), float(deviation[..., late].max())
 
     def to_sep005(self) -> list[dict[str, object]]:
-        """Return the channels of a single run as SDyPy's time series (SEP 5).
-
-        Raises
-        ------
-        ModelError
-            When the response holds several runs: take one of them first.
-        """
+        """Return the channels of a single run as SDyPy's time series (SEP 5)."""
         if self.data.ndim != 2:
             raise ModelError(
                 f"SEP 5 holds single series, this response has {self.data.shape[0]} runs: take one "

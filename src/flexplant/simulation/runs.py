@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -218,22 +218,6 @@ _TYPICAL = 10_000
 _AGREE, _ROUNDING = 1e-10, 100.0
 
 
-class Runner(Protocol):
-    """Runs side by side, stretch after stretch."""
-
-    stretch: int
-    abreast: int
-
-    def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
-        """Put all runs at a state of plant and controller; each draws from its generator."""
-
-    def fill(self, given: FloatArray, data: FloatArray) -> bool:
-        """Run one stretch: w as `given` (k, nw) or (runs, k, nw) plus noise; return if finite.
-
-        The channels z, y, driven u and monitored go into `data` (runs, channels, k).
-        """
-
-
 def make_runner(
     loop: ClosedLoop,
     noise: WhiteNoise,
@@ -241,7 +225,7 @@ def make_runner(
     *,
     grows: bool = False,
     met: Conditions | None = None,
-) -> Runner:
+) -> SampleBySample | InBlocks:
     """Return the faster way through a linear loop.
 
     Blocks of samples cost less unless a plant in modal blocks is so large that its O(n) operations
@@ -327,7 +311,10 @@ class SampleBySample:
                 acting.begin(count)
 
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
-        """Run one stretch."""
+        """Run one stretch: w as `given` (k, nw) or (runs, k, nw) plus noise; return if finite.
+
+        The channels z, y, driven u and monitored go into `data` (runs, channels, k).
+        """
         states, y, _ = self.buffers
         k = given.shape[-2]
         self.w[:, :k], self.w[:, k:] = given, 0.0

@@ -173,27 +173,10 @@ class Specification(Value):
     def check(
         self, loop: ClosedLoop, run: Response | None = None, *, exposures: Any = None
     ) -> Verdict:
-        """Return what a loop and a run of it reach, beside the limits.
+        """Return what a loop, on the machine or on its model, and a run of it reach.
 
-        Parameters
-        ----------
-        loop : ClosedLoop
-            On the machine, or on its model.
-        run : Response, optional
-            From `simulate`; for the limits on errors and efforts. All its runs count.
-        exposures : (k, 2) array [s], optional
-            As for `exposure_errors`; all after `start` (and `settling`) when not given.
-
-        Returns
-        -------
-        Verdict
-
-        Raises
-        ------
-        ModelError
-            When there is no loop, or no run although a limit needs one.
-        LabelError
-            When the channel or an actuator is unknown.
+        All runs of the run count; `exposures` (k, 2) [s] are as for `exposure_errors`, all after
+        `start` (and `settling`) when not given. Limits on errors and efforts need a run.
         """
         given: object = loop
         instance(given, ClosedLoop, "loop", "Use close_loop(plant, ...).")
