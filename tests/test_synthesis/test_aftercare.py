@@ -1,7 +1,5 @@
 """Controllers after their design: reduced, sampled, limited, as sections and in C."""
 
-import shutil
-import subprocess
 from functools import cache
 
 import numpy as np
@@ -9,7 +7,7 @@ import pytest
 from scipy.signal import freqz_sos, sosfilt
 
 import flexplant as fx
-from flexplant.errors import AssumptionError, CertificateError, LabelError, ModelError
+from flexplant.errors import AssumptionError, CertificateError, ModelError
 from flexplant.lti import StateSpace, frequency_response, lft, minimal, tustin
 from flexplant.lti.discretisation import discretized
 from flexplant.synthesis import (
@@ -18,7 +16,6 @@ from flexplant.synthesis import (
     discretise_controller,
     reduce_controller,
     second_order_sections,
-    write_c,
 )
 
 RATE = 500.0
@@ -222,57 +219,3 @@ def test_a_slow_suspension_beside_a_fast_mode_stays_in_the_controller(rate, gain
         sections = second_order_sections(found)["f", "s"]
         _, response = freqz_sos(sections, both, fs=rate)
         np.testing.assert_allclose(response, responses[1], rtol=1e-4)
-
-
-DRIVER = """
-#include <stdio.h>
-#include "{name}.h"
-int main(void)
-{{
-    {name}_t self;
-    double in[{upper}_INPUTS], out[{upper}_OUTPUTS];
-    int i;
-    {name}_reset(&self);
-    for (;;) {{
-        for (i = 0; i < {upper}_INPUTS; ++i) {{
-            if (scanf("%lf", &in[i]) != 1) return 0;
-        }}
-        {name}_step(&self, in, out);
-        for (i = 0; i < {upper}_OUTPUTS; ++i) printf("%.17g ", out[i]);
-        printf("\\n");
-    }}
-}}
-"""
-
-
-def test_the_c_file_gives_what_simulate_gives(tmp_path):
-    """Compiled with all warnings as errors; the commands of a run, from its sensor samples."""
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    _, full = designed()
-    source, header = write_c(full, tmp_path / "stage.c")
-    text = source.read_text() + header.read_text()
-    assert "malloc" not in text
-    assert "stdlib" not in text
-    if compiler is None:
-        pytest.skip("no C compiler")
-    main = tmp_path / "main.c"
-    main.write_text(DRIVER.format(name="stage", upper="STAGE"))
-    flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-contract=off"]
-    binary = tmp_path / "stage"
-    subprocess.run([compiler, *flags, str(source), str(main), "-o", str(binary)], check=True)
-    run = fx.simulate(fx.close_loop(plant(), full), duration=2.0, rng=5)
-    lines = "\n".join(f"{value:.17g}" for value in run["s"])
-    answer = subprocess.run([str(binary)], input=lines, capture_output=True, text=True, check=True)
-    got = np.array(answer.stdout.split(), dtype=float)
-    np.testing.assert_allclose(got, run["f"], atol=1e-12 * np.abs(run["f"]).max())
-
-
-def test_refusals_of_the_c_export(tmp_path):
-    with pytest.raises(LabelError, match="C allows"):
-        write_c(designed()[1], tmp_path / "1st.c")
-    with pytest.raises(LabelError, match="C allows"):
-        write_c(designed()[1], tmp_path / "a.c", name="while")
-    with pytest.raises(ModelError, match=r"\.c"):
-        write_c(designed()[1], tmp_path / "a.txt")
-    with pytest.raises(ModelError, match="sampled controller"):
-        write_c(designed(False)[1], tmp_path / "a.c")

@@ -6,18 +6,15 @@ from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import scipy.linalg as la
 
 from ..checks import FloatArray, IntArray
-from ..errors import AssumptionError, ModelError
 from ..loop import ClosedLoop
-from ..loop.blocks import joined
+from ..loop.applied import applied_law
 from ..loop.budget import WhiteNoise
-from ..lti.lyapunov import solve_stein
 from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, Recursion, cheapest
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..tolerances import TINY, divisor
+from ..tolerances import divisor
 from .nonlinear_elements import Acting, Conditions, Moving
 
 
@@ -493,67 +490,14 @@ def lifted(
     return Recursion(*map(np.ascontiguousarray, parts))
 
 
-#: smallest part of the largest observability of slow states by the commands that counts
-_SEEN = 1e-12
-
-
 def split_law(loop: ClosedLoop, recovery: float | None) -> tuple[FloatArray, FloatArray]:
     """Return the command, and then the rest, of a controller whose commands are not all applied."""
-    plant, driven = loop.plant, list(loop.driven)
-    law = joined(plant, loop.blocks, driven, list(loop.watched), applied=True)
-    nc, ny, nu = law.n_states, len(plant.y), len(driven)
-    if np.any(law.D[:nu, ny:]):
-        i, j = np.argwhere(law.D[:nu, ny:])[0]
-        raise AssumptionError(
-            f"the command {driven[i]!r} depends on the applied {driven[j]!r} of the same sample, "
-            "which is known after the command only. Let the block read it one sample late, or "
-            "design the observer on a plant with a delay: plant.discretized(rate, delay=1)."
-        )
+    law, L = applied_law(loop, recovery)
+    nc, ny, nu = law.n_states, len(loop.plant.y), len(loop.driven)
     C, D = law.C[:nu], law.D[:nu, :ny]
-    L = np.zeros((nc, nu))
-    if recovery is not None:
-        L = _back(loop, law.A, C, float(np.exp(-1.0 / recovery)))
     rows = [
         [law.A - L @ C, law.B[:, :ny] - L @ D, law.B[:, ny:] + L],
         [np.zeros((nu, nc + ny)), np.eye(nu)],
         [law.C[nu:], law.D[nu:, :ny], law.D[nu:, ny:]],
     ]
     return np.hstack([C, D]), np.vstack([np.hstack(row) for row in rows])
-
-
-def _back(loop: ClosedLoop, A: FloatArray, C: FloatArray, radius: float) -> FloatArray:
-    """Return L that mirrors the slow poles of the driving blocks at a circle.
-
-    Only poles beyond the circle move: with V a basis of their invariant subspace, ``A V = V S``
-    and ``L = V L_s``, where L_s is the filter gain of (S / radius, C V) for no process noise. It
-    takes each pole p to radius^2 / p, with the least gain that does.
-    """
-    owner = np.repeat(np.arange(len(loop.blocks)), [b.n_states for b in loop.blocks])
-    drives = [bool(set(b.outputs) & set(loop.driven)) for b in loop.blocks]
-    own = np.flatnonzero(np.asarray(drives, dtype=bool)[owner])
-    L = np.zeros((A.shape[0], C.shape[0]))
-    if not own.size:
-        return L
-
-    def beyond(real: float, imaginary: float) -> bool:
-        return bool(np.hypot(real, imaginary) > radius)
-
-    T, Z, slow = la.schur(A[np.ix_(own, own)], sort=beyond)
-    if not slow:
-        return L
-    V, S = Z[:, :slow], T[:slow, :slow]
-    see = C[:, own] @ V
-    see = see / np.abs(see).max(initial=TINY)
-    inverse = np.asarray(np.linalg.inv(S / radius), dtype=np.float64)
-    X = solve_stein(inverse.T, inverse.T @ see.T @ see @ inverse)
-    values = np.linalg.eigvalsh(X)
-    if values[0] <= _SEEN * values[-1]:
-        raise ModelError(
-            f"{slow} slow states of the blocks that drive actuators cannot all be found from the "
-            f"{C.shape[0]} commands, so that anti_windup cannot return them. Leave anti_windup out "
-            "and give the blocks one of their own, or let fewer integrators drive each actuator."
-        )
-    M = np.linalg.solve(X, see.T)
-    gain = S @ M @ np.linalg.inv(see @ M + np.eye(C.shape[0]))
-    L[own] = V @ gain / np.abs(C[:, own] @ V).max()
-    return L

@@ -1,9 +1,9 @@
 """Controllers: the servo on the estimated point of interest, H2 and H-infinity."""
 
 from ..rooms import public_names as _public_names
-from .aftercare.c_code import second_order_sections as second_order_sections
 from .aftercare.c_code import write_c as write_c
-from .aftercare.controller_sampling import discretise_controller as discretise_controller
+from .aftercare.filter_sections import second_order_sections as second_order_sections
+from .aftercare.order import discretise_controller as discretise_controller
 from .aftercare.order import reduce_controller as reduce_controller
 from .aftercare.windup import anti_windup_form as anti_windup_form
 from .controller import Controller as Controller

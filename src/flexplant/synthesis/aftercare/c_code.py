@@ -1,85 +1,24 @@
-"""write_c: a sampled controller as one C99 file with its header, without allocation."""
+"""write_c: what a sampled controller does, as one C99 file with its header, without allocation."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...checks import ComplexArray, FloatArray, short
-from ...errors import CertificateError, LabelError, ModelError
-from ...lti.frequency import frequency_response
-from ...lti.frequency_sweep import resonance_grid
-from ...lti.minimal import minimal
+from ...checks import FloatArray, flag, number, positive, short
+from ...errors import AssumptionError, LabelError, ModelError, require_known
+from ...loop import ClosedLoop
+from ...loop.applied import applied_law
 from ...lti.statespace import StateSpace, as_statespace
-
-_HEADER = """\
-/* {title}
- * Sampling time {dt:.17g} s, {n} states. Inputs, in order: {inputs}.
- * Outputs, in order: {outputs}. SI units; u = K y, the sign of the feedback is in it.
- * Call {name}_reset once, then in every sample {name}_step; or {name}_output as soon as the inputs
- * are there and {name}_update after the outputs have been applied.
- */
-#ifndef {guard}_H
-#define {guard}_H
-
-#define {guard}_STATES {n}
-#define {guard}_INPUTS {m}
-#define {guard}_OUTPUTS {p}
-
-typedef struct {{
-    double x[{room}];
-}} {name}_t;
-
-void {name}_reset({name}_t *self);
-void {name}_output(const {name}_t *self, const double in[{m}], double out[{p}]);
-void {name}_update({name}_t *self, const double in[{m}]);
-void {name}_step({name}_t *self, const double in[{m}], double out[{p}]);
-
-#endif
-"""
-
-_SOURCE = """\
-/* {title}: x[k+1] = A x[k] + B in[k], out[k] = C x[k] + D in[k]. */
-#include "{name}.h"
-
-{tables}
-void {name}_reset({name}_t *self)
-{{
-    int i;
-    for (i = 0; i < {room}; ++i) {{
-        self->x[i] = 0.0;
-    }}
-}}
-
-void {name}_output(const {name}_t *self, const double in[{m}], double out[{p}])
-{{
-    int i;
-    (void)self;
-    for (i = 0; i < {p}; ++i) {{
-        out[i] = 0.0;
-    }}
-{output}}}
-
-void {name}_update({name}_t *self, const double in[{m}])
-{{
-    double next[{room}] = {{0.0}};
-    int i;
-    (void)in;
-{update}    for (i = 0; i < {room}; ++i) {{
-        self->x[i] = next[i];
-    }}
-}}
-
-void {name}_step({name}_t *self, const double in[{m}], double out[{p}])
-{{
-    {name}_output(self, in, out);
-    {name}_update(self, in);
-}}
-"""
+from ...tolerances import SAME
+from .c_text import CText
+from .two_state import TwoStateForm, two_state_form
+from .windup import back_gain
 
 #: words that C takes for itself
 _RESERVED = frozenset(
@@ -89,21 +28,47 @@ _RESERVED = frozenset(
 )
 
 
-def write_c(controller: Any, path: Any, *, name: str | None = None) -> tuple[Path, Path]:
+def write_c(
+    controller: Any,
+    path: Any,
+    *,
+    name: str | None = None,
+    limits: Any = None,
+    anti_windup: float | None = None,
+    schedule: str | None = None,
+    single: bool = False,
+) -> tuple[Path, Path]:
     """Write a sampled controller as C99: one source file and its header, no allocation.
 
-    Entries of the matrices that are zero are not stored: modal forms cost what their blocks cost.
-    Numbers are written with 17 digits, which is exact.
+    The states become blocks of two that lie side by side, so that a compiler computes several at a
+    time (at -O2 too); the response of these blocks is compared with the controller's. Numbers are
+    written with 17 digits (9 in single precision), which is exact.
+
+    The functions: `_reset`; `_start` with the commands that act now (bumpless: steady states that
+    give them, as far as the controller has such); `_output` and `_update`, or `_step`. A sample
+    with a value that is not finite holds the last outputs and raises a flag.
 
     Parameters
     ----------
-    controller : StateSpace or Controller
-        Sampled; from `anti_windup_form` its inputs hold the applied commands: call `_output`,
-        apply and limit, then `_update`.
+    controller : StateSpace, Controller, ClosedLoop, or mapping {place: one of these}
+        Sampled. Of a ClosedLoop all blocks (observer, servo, feedforward) go to one file: in are
+        the channels of `plant.y`, out the driven actuators, then the monitored outputs. Inputs
+        that have the name of an output (observer, `anti_windup_form`) are fed what is applied,
+        in the file. A mapping is of controllers whose outputs alone differ (feedforward,
+        decoupling, gains after the states), interpolated linearly between places.
     path : path
         Of the source; the header stands beside it.
     name : str, optional
         Prefix of the functions; the file's own when not given.
+    limits : float, (low, high) or mapping {actuator: one of these}, optional
+        What actuators apply at most, in the units of u; commands are limited to it.
+    anti_windup : float [s], optional
+        In a ClosedLoop, as for `simulate`. Of a controller by itself that does not read what is
+        applied, as `recovery` for `anti_windup_form`; limits without it need Hanus' form.
+    schedule : str, optional
+        The input whose value is the place, of a mapping.
+    single : bool
+        Whether to compute in float instead of double.
 
     Returns
     -------
@@ -112,10 +77,16 @@ def write_c(controller: Any, path: Any, *, name: str | None = None) -> tuple[Pat
 
     Raises
     ------
+    AssumptionError
+        When a command depends on what is applied in the same sample, or limits need a recovery
+        time.
+    CertificateError
+        When the blocks differ from the controller, by rounding to single precision for instance.
     LabelError
-        When the name is no C identifier.
+        When the name is no C identifier, or an actuator or the input of a schedule is unknown.
     ModelError
-        When the controller is continuous, or the path no `.c` file.
+        When the controller is continuous, the path no `.c` file, or controllers of a schedule
+        differ in more than their outputs.
 
     Examples
     --------
@@ -125,15 +96,30 @@ def write_c(controller: Any, path: Any, *, name: str | None = None) -> tuple[Pat
     >>> observer = fx.design_kalman(plant)
     >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = fx.synthesis.write_c(servo, os.path.join(folder, "servo.c"))
+    ...     loop = fx.close_loop(plant, observer, servo)
+    ...     _ = fx.synthesis.write_c(loop, os.path.join(folder, "servo.c"), limits=20.0)
     ...     sorted(os.listdir(folder))
     ['servo.c', 'servo.h']
     """
-    K = as_statespace(controller)
-    if not K.dt and K.n_states:
-        raise ModelError(
-            "a computer runs a sampled controller: discretise_controller(plant, controller) first."
-        )
+    source = _source_path(path)
+    prefix = c_name(source.stem if name is None else name)
+    if source.stem != prefix:
+        source = source.with_name(f"{prefix}.c")
+    program = c_program(
+        controller,
+        prefix,
+        limits=limits,
+        anti_windup=anti_windup,
+        schedule=schedule,
+        single=single,
+    )
+    header = source.with_suffix(".h")
+    header.write_text(program.header, encoding="ascii")
+    source.write_text(program.source, encoding="ascii")
+    return source, header
+
+
+def _source_path(path: Any) -> Path:
     try:
         source = Path(path)
     except TypeError as error:
@@ -144,190 +130,187 @@ def write_c(controller: Any, path: Any, *, name: str | None = None) -> tuple[Pat
         raise ModelError(
             f"path must end in .c, got {short(str(path))}. Pass a name such as 'stage.c'."
         )
-    prefix = source.stem if name is None else name
-    valid = isinstance(prefix, str) and re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", prefix)
-    if not valid or prefix in _RESERVED:
+    return source
+
+
+def c_name(name: Any) -> str:
+    """Return a name that C allows for functions."""
+    valid = isinstance(name, str) and re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name)
+    if not valid or name in _RESERVED:
         raise LabelError(
-            f"{short(prefix)} is no name that C allows for functions. Pass name= with letters, "
+            f"{short(name)} is no name that C allows for functions. Pass name= with letters, "
             "digits and underscores."
         )
-    if source.with_suffix(".c").stem != prefix:
-        source = source.with_name(f"{prefix}.c")
-    header = source.with_suffix(".h")
-    fields = _fields(K, prefix)
-    header.write_text(_HEADER.format(**fields), encoding="ascii")
-    source.write_text(_SOURCE.format(**fields), encoding="ascii")
-    return source, header
+    return str(name)
 
 
-def _fields(K: StateSpace, name: str) -> dict[str, Any]:
-    """Return what the templates are filled with."""
-    tables, calls = [], {}
-    for key, matrix in (("A", K.A), ("B", K.B), ("C", K.C), ("D", K.D)):
-        table, loop = _table(key, matrix)
-        tables.append(table)
-        calls[key] = loop
-    return {
-        "title": _ascii(K.name or name),
-        "name": name,
-        "guard": name.upper(),
-        "dt": K.dt,
-        "n": K.n_states,
-        "room": max(K.n_states, 1),
-        "m": len(K.inputs),
-        "p": len(K.outputs),
-        "inputs": _ascii(", ".join(K.inputs)),
-        "outputs": _ascii(", ".join(K.outputs)),
-        "tables": "".join(tables),
-        "output": calls["C"].format(to="out", of="self->x") + calls["D"].format(to="out", of="in"),
-        "update": calls["A"].format(to="next", of="self->x")
-        + calls["B"].format(to="next", of="in"),
-    }
+class _Law(NamedTuple):
+    """A controller [in] -> [driven; watched], and how ``applied - commanded`` moves its states."""
+
+    system: StateSpace
+    driven: int
+    back: FloatArray | None
 
 
-def _table(key: str, matrix: FloatArray) -> tuple[str, str]:
-    """Return the entries of a matrix that are not zero, and the loop that applies them."""
-    rows, columns = np.nonzero(matrix)
-    count = rows.size
-    if not count:
-        return "", ""
-    values = _wrapped([f"{value:.17g}" for value in matrix[rows, columns]])
-    text = f"static const double {key}_value[{count}] = {{\n{values}\n}};\n"
-    for part, numbers in (("row", rows), ("column", columns)):
-        listed = _wrapped([str(i) for i in numbers.tolist()])
-        text += f"static const int {key}_{part}[{count}] = {{\n{listed}\n}};\n"
-    loop = (
-        f"    for (i = 0; i < {count}; ++i) {{{{\n"
-        f"        {{to}}[{key}_row[i]] += {key}_value[i] * {{of}}[{key}_column[i]];\n"
-        "    }}\n"
-    )
-    return text, loop
+@dataclass(frozen=True)
+class CProgram:
+    """The text of a system in C, and the system."""
+
+    system: StateSpace
+    form: TwoStateForm
+    header: str
+    source: str
 
 
-def _wrapped(parts: list[str]) -> str:
-    lines = [", ".join(parts[i : i + 4]) for i in range(0, len(parts), 4)]
-    return ",\n".join(f"    {line}" for line in lines)
+def c_program(
+    controller: Any,
+    name: str,
+    *,
+    limits: Any = None,
+    anti_windup: float | None = None,
+    schedule: str | None = None,
+    single: bool = False,
+    driven: bool = True,
+) -> CProgram:
+    """Return the C text of a sampled controller, or of a system without commands (a plant)."""
+    recovery = None if anti_windup is None else positive(anti_windup, "anti_windup")
+    places, laws = _scheduled(controller, schedule, recovery, limits is not None, driven)
+    law = laws[0]
+    K, p, m = law.system, len(law.system.outputs), len(law.system.inputs)
+    ends = _limits(limits, K.outputs[: law.driven])
+    whole = K
+    if len(laws) > 1:
+        whole = K.replace(
+            C=np.vstack([one.system.C for one in laws]),
+            D=np.vstack([one.system.D for one in laws]),
+            outputs=[f"{name}|{q}" for q in range(len(laws)) for name in K.outputs],
+            units={},
+        )
+    back = law.back if law.back is not None and np.any(law.back) else None
+    if back is not None:
+        D = np.hstack([whole.D, np.zeros((len(whole.outputs), law.driven))])
+        names = [*K.inputs, *(f"{one}|missed" for one in K.outputs[: law.driven])]
+        whole = whole.replace(B=np.hstack([whole.B, back]), D=D, inputs=names, units={})
+    groups = [slice(q * p, q * p + law.driven) for q in range(len(laws) if law.driven else 0)]
+    form = two_state_form(whole, driven=groups, inputs=m, single=flag(single, "single"))
+    at = K.inputs.index(str(schedule)) if len(laws) > 1 else 0
+    text = CText(name, K, form, law.driven, ends, places, at, single)
+    return CProgram(K, form, text.header, text.source)
 
 
-def _ascii(text: str) -> str:
-    """Return text that cannot end a comment."""
-    return text.encode("ascii", "replace").decode().replace("*/", "* /").replace("\n", " ")
+def _scheduled(
+    given: Any, schedule: Any, recovery: float | None, limited: bool, driven: bool
+) -> tuple[FloatArray, list[_Law]]:
+    """Return the places in rising order, and the law of each."""
+    if not isinstance(given, Mapping):
+        if schedule is not None:
+            raise ModelError(
+                f"schedule={short(schedule)} needs controllers by place: pass a mapping such as "
+                "{0.0: controller, 0.1: other}."
+            )
+        return np.zeros(0), [_law(given, recovery, limited, driven)]
+    places = sorted(number(place, "a place") for place in given)
+    if len(places) < 2 or len(set(places)) < len(places):
+        raise ModelError(f"a schedule needs two places or more, all different, got {places}.")
+    by_place = {number(place, "a place"): one for place, one in given.items()}
+    laws = [_law(by_place[place], recovery, limited, driven) for place in places]
+    first = laws[0]
+    require_known("input of the schedule", [schedule], first.system.inputs, "the controller")
+    for place, one in zip(places, laws, strict=True):
+        a, b = first.system, one.system
+        if (a.inputs, a.outputs, a.dt, a.n_states) != (b.inputs, b.outputs, b.dt, b.n_states):
+            raise ModelError(
+                f"the controller at {place:g} has other channels, rate or states than the first. "
+                "Design all with the same structure."
+            )
+        moved = [
+            part
+            for part, u, v in (("A", a.A, b.A), ("B", a.B, b.B), ("back", first.back, one.back))
+            if u is not None
+            and v is not None
+            and not np.allclose(u, v, rtol=SAME, atol=SAME * np.abs(u).max(initial=0.0))
+        ]
+        if moved:
+            raise ModelError(
+                f"the controller at {place:g} differs from the first in more than its outputs "
+                f"({', '.join(moved)}): poles between places would be of no design. Schedule "
+                "what follows the states (feedforward, decoupling, gains)."
+            )
+    return np.array(places), laws
 
 
-#: largest difference of the responses, relative to the largest gain of a channel
-_AGREEMENT = 1e-6
+def _law(given: Any, recovery: float | None, limited: bool, driven: bool) -> _Law:
+    """Return a controller with what is applied fed back, and how the rest moves it."""
+    if isinstance(given, ClosedLoop):
+        dt = given.plant.dt
+        _check_sampled(dt, given.controller.n_states)
+        law, L = applied_law(given, None if recovery is None else recovery / dt)
+        return _closed(law, len(given.driven), [*given.plant.y], L)
+    K = as_statespace(given)
+    _check_sampled(K.dt, K.n_states)
+    if not driven:
+        return _Law(K, 0, None)
+    fed = [name for name in K.inputs if name in K.outputs]
+    if fed:
+        rows = [*fed, *(name for name in K.outputs if name not in fed)]
+        outer = [name for name in K.inputs if name not in fed]
+        law = K.select(rows, [*outer, *fed])
+        found = _closed(law, len(fed), outer, np.zeros((K.n_states, len(fed))))
+        if len(fed) < len(K.outputs) and limited:
+            raise ModelError(
+                f"limits need all commands back, and the controller reads {fed} of {K.outputs} "
+                "only: pass the ClosedLoop, which has the actuators."
+            )
+        return found
+    if not limited or not K.n_states:
+        return _Law(K, len(K.outputs), None)
+    return _Law(K, len(K.outputs), back_gain(K, recovery))
 
 
-def second_order_sections(controller: Any) -> Mapping[tuple[str, str], FloatArray]:
-    """Return each channel of a sampled controller as second-order sections.
-
-    ::
-
-        K_ij(z) = prod_k (b0 + b1 z^-1 + b2 z^-2) / (1 + a1 z^-1 + a2 z^-2)
-
-    Poles and zeros are those of the channel's minimal states; the product is compared with the
-    channel over all frequencies.
-
-    Parameters
-    ----------
-    controller : StateSpace or Controller
-        Sampled.
-
-    Returns
-    -------
-    mapping {(output, input): (k, 6) array}
-        Rows [b0, b1, b2, 1, a1, a2], the form of `scipy.signal.sosfilt`; the gain is in the first.
-
-    Raises
-    ------
-    CertificateError
-        When the sections differ from the channel by more than 1e-6 of its largest gain, as where
-        the rate is so high above a pole that rounded coefficients move it.
-    ModelError
-        When the controller is continuous.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> observer = fx.design_kalman(plant)
-    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
-    >>> list(fx.synthesis.second_order_sections(servo))
-    [('u1', 'die:ref'), ('u1', 'die:hat')]
-    """
-    K = as_statespace(controller)
-    if not K.dt and K.n_states:
+def _check_sampled(dt: float, states: int) -> None:
+    if not dt and states:
         raise ModelError(
-            "sections are of a sampled controller: discretise_controller(plant, controller) first."
+            "a computer runs a sampled controller: discretise_controller(plant, controller) first."
         )
-    return {(output, name): _sections(K[output, name]) for output in K.outputs for name in K.inputs}
 
 
-def _sections(g: StateSpace) -> FloatArray:
-    """Return the sections of one channel."""
-    from scipy.signal import zpk2sos
-
-    small = minimal(g) if g.n_states else g
-    poles: Any = small.poles()
-    zeros: Any = small.zeros()
-    grid = resonance_grid(poles, g.dt or 1.0, points=100)
-    wanted = frequency_response(g.replace(dt=g.dt or 1.0), grid).data[0, 0]
-    size = float(np.abs(wanted).max(initial=0.0))
-    if not size:
-        return np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
-    back = np.expm1(-2j * np.pi * grid * (g.dt or 1.0))  # 1/z - 1
-    shape = _product(poles, zeros, back)
-    at = int(np.argmax(np.abs(wanted)))
-    gain = float((wanted[at] / shape[at]).real)
-    # with a zero at z = 0 for each that is missing: so many samples too early
-    sections = np.asarray(zpk2sos(zeros, poles, gain, pairing="nearest"), dtype=np.float64)
-    late = len(poles) - len(zeros)
-    for row in sections:
-        while late and not row[2]:
-            row[:3], late = [0.0, *row[:2]], late - 1
-    off = float(np.abs(_response(sections, back) - wanted).max()) / size
-    if not off <= _AGREEMENT:
-        exact = float(np.abs(gain * shape - wanted).max()) / size
-        raise CertificateError(
-            f"the sections of {g.outputs[0]!r} from {g.inputs[0]!r} differ from it by {off:.1e} of "
-            f"its largest gain: {_cause(exact, poles, g.dt)}, or export its states (write_c)."
+def _closed(law: StateSpace, nu: int, outer: Sequence[str], L: FloatArray) -> _Law:
+    """Return ``[outer; applied] -> [u; watched]`` with what is commanded applied."""
+    ny = len(outer)
+    if np.any(law.D[:, ny:]):
+        i, j = np.argwhere(law.D[:, ny:])[0]
+        raise AssumptionError(
+            f"{law.outputs[i]!r} depends on the applied {law.outputs[j]!r} of the same sample, "
+            "which is known after the command only. Let the block read it one sample late."
         )
-    return sections
-
-
-def _product(poles: ComplexArray, zeros: ComplexArray, back: ComplexArray) -> ComplexArray:
-    """Return ``prod (z - zeros) / prod (z - poles)`` at 1/z - 1 = back."""
-    z = 1.0 / (1.0 + back)
-    rise = -back * z  # z - 1
-    found = np.ones(z.size, dtype=np.complex128)
-    for root in zeros:
-        found *= rise + (1.0 - root)
-    for root in poles:
-        found /= rise + (1.0 - root)
-    return found
-
-
-def _response(sections: FloatArray, back: ComplexArray) -> ComplexArray:
-    """Return the response of sections: in powers of 1/z - 1, small where coefficients cancel."""
-    found = np.ones(back.size, dtype=np.complex128)
-    for row in sections:
-        above, below = (
-            (c0 + c1 + c2) + (c1 + 2.0 * c2) * back + c2 * back**2
-            for c0, c1, c2 in (row[:3], row[3:])
-        )
-        found *= above / below
-    return found
-
-
-def _cause(exact: float, poles: ComplexArray, dt: float) -> str:
-    """Return why sections differ, and what helps: the product of their factors differs less."""
-    if exact > _AGREEMENT:
-        return (
-            "poles and zeros of so many states are lost to rounding. Reduce the controller first "
-            "(reduce_controller)"
-        )
-    slow = float(np.abs(poles - 1.0).min()) / (2.0 * np.pi * dt)
-    return (
-        f"a pole at {slow:.3g} Hz is so near z = 1 at a rate of {1.0 / dt:g} Hz that coefficients "
-        "in double precision cannot hold it: 1 + a1 + a2 is (w dt)^2. Lower the rate"
+    Ba = law.B[:, ny:]
+    system = StateSpace(
+        law.A + Ba @ law.C[:nu],
+        law.B[:, :ny] + Ba @ law.D[:nu, :ny],
+        law.C,
+        law.D[:, :ny],
+        law.dt,
+        inputs=outer,
+        outputs=law.outputs,
+        units={key: unit for key, unit in law.units.items() if key in (*outer, *law.outputs)},
+        name=law.name,
     )
+    return _Law(system, nu, Ba + L)
+
+
+def _limits(given: Any, names: Sequence[str]) -> FloatArray | None:
+    """Return the lowest and the highest command (2, n) of each actuator."""
+    if given is None:
+        return None
+    each = dict(given) if isinstance(given, Mapping) else dict.fromkeys(names, given)
+    require_known("actuator with a limit", list(each), names, "the outputs")
+    found = np.tile([[-np.inf], [np.inf]], (1, len(names)))
+    for name, ends in each.items():
+        pair = ends if isinstance(ends, list | tuple) else (-number(ends, "a limit"), ends)
+        if len(pair) != 2:
+            raise ModelError(f"limits of {name!r} must be one number or (low, high), got {ends}.")
+        low, high = (number(end, f"a limit of {name!r}") for end in pair)
+        if not low < high:
+            raise ModelError(f"limits of {name!r} must be low < high, got ({low:g}, {high:g}).")
+        found[:, names.index(name)] = low, high
+    return found

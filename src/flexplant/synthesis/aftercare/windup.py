@@ -64,6 +64,19 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
     ('die:ref', 'die:hat', 'u1')
     """
     K = as_statespace(controller)
+    L = back_gain(K, recovery)
+    n_u = len(K.outputs)
+    return K.replace(
+        A=K.A - L @ K.C,
+        B=np.hstack([K.B - L @ K.D, L]),
+        D=np.hstack([K.D, np.zeros((n_u, n_u))]),
+        inputs=[*K.inputs, *K.outputs],
+        blocks=None,
+    )
+
+
+def back_gain(K: StateSpace, recovery: float | None) -> FloatArray:
+    """Return L (n, nu): the states move by ``L (applied - commanded)``, with stable A - L C."""
     L = _hanus(K) if recovery is None else _observer(K, positive(recovery, "recovery"))
     A = K.A - L @ K.C
     poles = np.linalg.eigvals(A) if K.n_states else np.zeros(0)
@@ -76,14 +89,7 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
             "not clearly: its states would run off while an actuator saturates. Give a recovery "
             "time."
         )
-    n_u = len(K.outputs)
-    return K.replace(
-        A=A,
-        B=np.hstack([K.B - L @ K.D, L]),
-        D=np.hstack([K.D, np.zeros((n_u, n_u))]),
-        inputs=[*K.inputs, *K.outputs],
-        blocks=None,
-    )
+    return L
 
 
 def _hanus(K: StateSpace) -> FloatArray:

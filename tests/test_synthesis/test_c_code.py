@@ -1,0 +1,335 @@
+"""The C of controllers: compiled with strict warnings, run against machines, beside simulate."""
+
+import ctypes
+import itertools
+import shutil
+import subprocess
+from functools import cache
+
+import numpy as np
+import pytest
+from test_aftercare import designed, pi_controller, plant
+
+import flexplant as fx
+from flexplant.errors import AssumptionError, CertificateError, LabelError, ModelError
+from flexplant.lti import StateSpace
+from flexplant.simulation import Saturation
+from flexplant.synthesis import anti_windup_form, write_c
+
+COMPILER = shutil.which("cc") or shutil.which("gcc")
+STRICT = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow"]
+STRICT += ["-Wdouble-promotion", "-Werror"]
+compiles = pytest.mark.skipif(COMPILER is None, reason="no C compiler")
+numbers = itertools.count()
+
+
+class Compiled:
+    """A written controller, compiled, called sample by sample."""
+
+    def __init__(self, folder, controller, **options):
+        name = f"stage{next(numbers)}"
+        source, header = write_c(controller, folder / f"{name}.c", **options)
+        self.text = source.read_text() + header.read_text()
+        library = folder / f"{name}.so"
+        command = [COMPILER, *STRICT, "-O2", "-shared", "-fPIC", str(source), "-o", str(library)]
+        subprocess.run(command, check=True)
+        self.calls = {
+            part: getattr(ctypes.CDLL(str(library)), f"{name}_{part}")
+            for part in ("reset", "start", "output", "update", "step")
+        }
+        kind = np.float32 if options.get("single") else np.float64
+        read = {
+            part: int(line.split()[-1])
+            for line in self.text.splitlines()
+            for part in ("INPUTS", "OUTPUTS", "DRIVEN", "STATES")
+            if line.startswith(f"#define {name.upper()}_{part}")
+        }
+        self.read, self.kind = read, kind
+        self.state = ctypes.create_string_buffer(100_000)
+        self.out = np.zeros(read["OUTPUTS"], kind)
+        self.calls["reset"](self.state)
+
+    def __call__(self, values, part="step"):
+        given = np.ascontiguousarray(values, self.kind)
+        assert given.size == self.read["INPUTS"]
+        self.given = given
+        pointers = [ctypes.c_void_p(a.ctypes.data) for a in (given, self.out)]
+        self.calls[part](self.state, *pointers[: 1 if part == "update" else 2])
+        return self.out.copy()
+
+    def start(self, values, applied):
+        given, held = (np.ascontiguousarray(part, self.kind) for part in (values, applied))
+        pointers = [ctypes.c_void_p(a.ctypes.data) for a in (given, held)]
+        self.calls["start"](self.state, *pointers)
+
+
+def closed(run_plant, code, names, references, samples, apply=lambda u: u):
+    """The controller in C in the loop with a plant in NumPy: commands and outputs, by samples."""
+    g = run_plant.system
+    B, C = g.B[:, g.input_index(names)], g.C[g.output_index(run_plant.y)]
+    enter = g.D[np.ix_(g.output_index(run_plant.y), g.input_index(list(references)))]
+    Br = g.B[:, g.input_index(list(references))]
+    x, found = np.zeros(g.n_states), []
+    for k in range(samples):
+        r = np.array([signal[k] for signal in references.values()])
+        out = code(C @ x + enter @ r)
+        found.append(out)
+        x = g.A @ x + B @ apply(out[: len(names)]) + Br @ r
+    return np.array(found)
+
+
+def agree(got, run, driven, watched, rtol):
+    """To the size of all commands, and of all estimates: a tilt that is symmetry is rounding."""
+    count = len(driven)
+    for names, part in ((driven, got[:, :count]), (watched, got[:, count:])):
+        wanted = np.array([run[name] for name in names]).T
+        size = np.abs(wanted).max(initial=0.0)
+        np.testing.assert_allclose(part, wanted, rtol=0, atol=rtol * size)
+
+
+@cache
+def readme():
+    """Plate, ports, plant, observer and servo of README's script, without its update."""
+    length, damping = 0.6, fx.ModalDamping(0.01)
+    plate = fx.kirchhoff_plate(
+        size=(length, length), thickness=0.0272, elements=(8, 8), density=2702,
+        youngs_modulus=70e9, poisson_ratio=0.35,
+    )  # fmt: skip
+    z8 = plate.dofs.nearest((length / 2, length / 4, 0.0), "z")
+    plate = plate.with_parts(fx.PointMass(z8, 0.5))
+    modes = fx.solve_modes(plate, count=24, damping=damping)
+    corners = [(x, y, 0.0) for y in (0.0, length) for x in (0.0, length)]
+    inset = [(x, y, 0.0) for y in (0.15, 0.45) for x in (0.15, 0.45)]
+    ports = fx.Ports(
+        w=[fx.Disturbance(f"amp{i}", at=p, asd=1e-3) for i, p in enumerate(inset, 1)],
+        u=[fx.Actuator(f"u{i}", at=p) for i, p in enumerate(inset, 1)],
+        z=[fx.Poi("die", at=(0.3, 0.3, 0.0), axes=("z", "rx", "ry"))],
+        y=[fx.Sensor(f"y{i}", at=p, asd=1.4e-12) for i, p in enumerate(corners, 1)],
+        references=[fx.Reference("die")],
+    )
+    made = fx.assemble_plant(modes, ports).discretized(10e3, delay=1.3)
+    observer = fx.design_kalman(made)
+    servo = fx.design_servo(made, bandwidth=50.0, observer=observer)
+    return ports, made, observer, servo, fx.testbeds.wafer_stage(damping=0.01)
+
+
+@compiles
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["observer and servo", "H-infinity"])
+def test_readmes_design_runs_in_c_against_the_virtual_machine(kind, tmp_path):
+    """The loop closed around the C gives the run of `simulate` to 1e-9, and holds the machine."""
+    ports, made, observer, servo, machine = readme()
+    blocks = (observer, servo)
+    if kind == "H-infinity":
+        errors, weights = fx.reference_errors(made), fx.stage_weights(made, 40.0)
+        weighted = made.through(errors).weighted(z=weights.z, w=weights.w)
+        blocks = (errors, fx.design_hinf(weighted))
+    loop = machine.loop(ports, *blocks)
+    assert loop.is_stable
+    code = Compiled(tmp_path, loop)
+    move = fx.setpoint(100e-6, velocity=5e-3, acceleration=0.5, jerk=100.0)
+    run = fx.simulate(loop, reference=move, duration=0.1, noise=False)
+    refs = {"die:ref": move.at(run.time).position}
+    agree(
+        closed(loop.plant, code, loop.driven, refs, run.time.size),
+        run,
+        loop.driven,
+        loop.watched,
+        1e-9,
+    )
+    # and with noise, from what its sensors read
+    run = fx.simulate(loop, reference=move, duration=0.1, rng=3)
+    again = Compiled(tmp_path, loop)
+    got = np.array([again(np.array([run[name][k] for name in loop.plant.y])) for k in range(1000)])
+    agree(got, run, loop.driven, loop.watched, 1e-9)
+
+
+@compiles
+def test_an_observer_a_servo_and_feedforward_in_one_file_with_limits(tmp_path):
+    """Saturated commands reach the observer, integrators return: as simulate has it."""
+    given = fx.testbeds.three_masses()
+    observer = fx.design_kalman(given)
+    servo = fx.design_servo(given, bandwidth=20.0, observer=observer)
+    forward = fx.simulation.design_feedforward(given).up_to("acceleration")
+    loop = fx.close_loop(given, observer, servo, forward)
+    move = fx.setpoint(1e-3, velocity=0.1, acceleration=5.0, jerk=1e3)
+    most = 9.0
+    free = fx.simulate(loop, reference=move, duration=0.3, noise=False)
+    assert np.abs(free["u1"]).max() > 1.3 * most
+    options = {"elements": {"u1": Saturation(most)}, "anti_windup": 0.02}
+    run = fx.simulate(loop, reference=move, duration=0.3, noise=False, **options)
+    at = move.at(run.time)
+    refs = {"die:ref": at.position, "die:ref:acceleration": at.acceleration}
+    for limits, wanted in ((None, free), (most, run), ({"u1": (-most, most)}, run)):
+        code = Compiled(tmp_path, loop, limits=limits, anti_windup=0.02)
+        agree(
+            closed(loop.plant, code, ["u1"], refs, run.time.size),
+            wanted,
+            loop.driven,
+            loop.watched,
+            1e-9,
+        )
+
+
+@compiles
+@pytest.mark.parametrize("single", [False, True])
+def test_the_c_file_gives_what_simulate_gives(single, tmp_path):
+    """Compiled with all warnings as errors; the commands of a run, from its sensor samples."""
+    _, full = designed()
+    code = Compiled(tmp_path, full, single=single)
+    assert "malloc" not in code.text
+    assert "stdlib" not in code.text
+    assert ("double" in code.text) != single or "in single" in code.text
+    run = fx.simulate(fx.close_loop(plant(), full), duration=2.0, rng=5)
+    got = np.array([code([value])[0] for value in run["s"]])
+    # single: 24 bits, in resonances that keep what rounding leaves for 1/(2 zeta) periods
+    np.testing.assert_allclose(
+        got, run["f"], atol=(1e-3 if single else 1e-11) * np.abs(run["f"]).max()
+    )
+
+
+@compiles
+@pytest.mark.parametrize("kind", ["chain", "double integrator", "static", "alike", "one"])
+def test_systems_without_distinct_poles(kind, tmp_path):
+    """Delays in a row, integrators, equal poles: blocks of any size, or none."""
+    rng = np.random.default_rng(4)
+    A = {
+        "chain": np.diag(np.ones(6), 1),
+        "double integrator": np.array([[1.0, 0.1], [0.0, 1.0]]),
+        "static": np.zeros((0, 0)),
+        "alike": np.kron(np.eye(3), [[0.9, 0.2], [-0.2, 0.9]]) + np.diag([0.3, 0, 0.3, 0], 2),
+        "one": np.array([[0.5]]),
+    }[kind]
+    n = len(A)
+    T = np.linalg.qr(rng.standard_normal((n, n)))[0] if n else A
+    B, C = rng.standard_normal((n, 2)), rng.standard_normal((3, n))
+    K = StateSpace(T @ A @ T.T, T @ B, C @ T.T, rng.standard_normal((3, 2)), 0.01,
+                   inputs=["a", "b"], outputs=["p", "q", "r"])  # fmt: skip
+    code, x = Compiled(tmp_path, K), np.zeros(n)
+    for k in range(40):
+        given = rng.standard_normal(2)
+        wanted = K.C @ x + K.D @ given
+        # both ways to call it
+        got = code(given, "step" if k % 2 else "output")
+        if not k % 2:
+            code(given, "update")
+        np.testing.assert_allclose(
+            got, wanted, rtol=1e-9, atol=1e-9 * (1 + np.abs(x).max(initial=0))
+        )
+        x = K.A @ x + K.B @ given
+
+
+@compiles
+def test_what_is_not_finite_holds_the_outputs_and_raises_the_flag(tmp_path):
+    K = pi_controller()
+    code, other = Compiled(tmp_path, K), Compiled(tmp_path, K)
+    last = [code([0.1 * k]) for k in range(5)][-1]
+    for bad in (np.nan, np.inf, -np.inf):
+        np.testing.assert_array_equal(code([bad]), last)
+    after = [code([0.1 * k]) for k in range(5, 9)]
+    wanted = [other([0.1 * k]) for k in range(9)][5:]
+    np.testing.assert_array_equal(after, wanted)
+    # flag and count stand at the end of the structure
+    ends = np.frombuffer(code.state, dtype=np.int64, count=200)
+    assert 3 in ends[:60]
+
+
+@compiles
+def test_a_bumpless_start(tmp_path):
+    """From any command and input it continues there, and rests when the input is one of rest."""
+    K = pi_controller()
+    code = Compiled(tmp_path, K)
+    code.start([0.0], [-4.2])
+    for _ in range(50):
+        assert code([0.0])[0] == pytest.approx(-4.2, rel=1e-9)
+    code.start([0.3], [1.5])
+    assert code([0.3])[0] == pytest.approx(1.5, rel=1e-9)
+    code.calls["reset"](code.state)
+    assert code([0.0])[0] == 0.0
+
+
+@compiles
+def test_limits_of_a_controller_by_itself(tmp_path):
+    """Hanus' form by hand, and a controller that reads what is applied by its own name."""
+    K = pi_controller()
+    form = anti_windup_form(K)
+    rng = np.random.default_rng(1)
+    given, most = 2.0 * rng.standard_normal(300) + 1.0, 12.0
+    x, wanted = np.zeros(form.n_states), []
+    for value in given:
+        u = float(np.clip(form.C @ x + form.D[:, 0] * value, -most, most)[0])
+        x = form.A @ x + form.B @ np.array([value, u])
+        wanted.append(u)
+    assert np.ptp(wanted) == 2 * most
+    for one in (K, form):
+        code = Compiled(tmp_path, one, limits=most)
+        np.testing.assert_allclose(
+            [code([value])[0] for value in given], wanted, rtol=0, atol=1e-9 * most
+        )
+    plain = Compiled(tmp_path, form)  # nothing limits: the controller itself
+    other = Compiled(tmp_path, K)
+    np.testing.assert_allclose(
+        [plain([value])[0] for value in given], [other([value])[0] for value in given], rtol=1e-8
+    )
+
+
+@compiles
+def test_a_schedule_interpolates_the_outputs(tmp_path):
+    """Gains after an integrator by place: exact at places, linear between, held beyond."""
+
+    def law(gain):
+        return StateSpace([[1.0]], [[0.01, 0.0]], [[2.0 * gain]], [[gain, 0.1]], 0.01,
+                          inputs=["e", "x"], outputs=["u"])  # fmt: skip
+
+    code = Compiled(tmp_path, {0.2: law(5.0), 0.0: law(1.0), 0.1: law(2.0)}, schedule="x")
+    state = 0.0
+    for place in (-1.0, 0.0, 0.03, 0.1, 0.15, 0.2, 7.0):
+        gain = np.interp(place, [0.0, 0.1, 0.2], [1.0, 2.0, 5.0])
+        wanted = 2.0 * gain * state + gain * 0.5 + 0.1 * place
+        assert code([0.5, place])[0] == pytest.approx(wanted, rel=1e-12)
+        state += 0.005
+    code.start([0.0, 0.1], [3.0])
+    assert code([0.0, 0.1])[0] == pytest.approx(3.0, rel=1e-9)
+    other = law(1.0).replace(A=[[0.9]])
+    with pytest.raises(ModelError, match=r"more than its outputs \(A\)"):
+        write_c({0.0: law(1.0), 1.0: other}, tmp_path / "a.c", schedule="x")
+    with pytest.raises(LabelError, match="input of the schedule"):
+        write_c({0.0: law(1.0), 1.0: law(2.0)}, tmp_path / "a.c", schedule="y")
+
+
+def test_refusals_of_the_c_export(tmp_path):
+    slow = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01, inputs=["s"], outputs=["f"])
+    reads = StateSpace([[0.5]], [[1.0, 0.0]], [[1.0]], [[0.0, 1.0]], 0.01,
+                       inputs=["s", "f"], outputs=["f"])  # fmt: skip
+    path = tmp_path / "a.c"
+    for error, cause, call in (
+        (LabelError, "C allows", lambda: write_c(designed()[1], tmp_path / "1st.c")),
+        (LabelError, "C allows", lambda: write_c(designed()[1], path, name="while")),
+        (ModelError, r"\.c", lambda: write_c(designed()[1], tmp_path / "a.txt")),
+        (ModelError, "sampled controller", lambda: write_c(designed(False)[1], path)),
+        (AssumptionError, "recovery", lambda: write_c(slow, path, limits=1.0)),
+        (AssumptionError, "same sample", lambda: write_c(reads, path)),
+        (LabelError, "with a limit", lambda: write_c(pi_controller(), path, limits={"g": 1.0})),
+        (ModelError, "low < high", lambda: write_c(pi_controller(), path, limits=(2.0, 1.0))),
+        (ModelError, "by place", lambda: write_c(slow, path, schedule="s")),
+        (ModelError, "two places", lambda: write_c({0.0: slow}, path, schedule="s")),
+    ):
+        with pytest.raises(error, match=cause):
+            call()
+
+
+def test_a_wrong_block_is_found(monkeypatch, tmp_path):
+    """The certificate compares responses: one entry off by 1e-5 is refused."""
+    from flexplant.synthesis.aftercare import two_state
+
+    right = two_state._arranged
+
+    def wrong(*args):
+        form = right(*args)
+        pairs = form.pairs.copy()
+        pairs[0, 1, 0] *= 1 + 1e-5
+        return form._replace(pairs=pairs)
+
+    monkeypatch.setattr(two_state, "_arranged", wrong)
+    with pytest.raises(CertificateError, match="differ from the system"):
+        write_c(designed()[1], tmp_path / "a.c")
