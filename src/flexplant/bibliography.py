@@ -164,6 +164,8 @@
    reconstruction, IEEE Control Systems 38, 2018.
 .. [McFarlaneGlover1992] McFarlane, Glover, A loop-shaping design procedure using H-infinity
    synthesis, IEEE Trans. Autom. Control 37, 1992.
+.. [Modelica2022] Modelica Association, Functional Mock-up Interface for Model Exchange,
+   Co-Simulation, and Scheduled Execution, version 3.0, 2022.
 .. [MorganScott1986] Morgan, Scott, Generalizations of Davidson's method for computing eigenvalues
    of sparse symmetric matrices, SIAM J. Sci. Stat. Comput. 7, 1986.
 .. [OCallahan1989a] O'Callahan, A procedure for an improved reduced system (IRS) model, IMAC 7,

@@ -21,6 +21,7 @@ universal file        read_modes_uff, ...   .uff, .unv: 55, 58, 2414, nodes; wit
 tables                read_dofs             .csv, text: node, direction, x, y, z
 responses             read_frf_csv, ...     .csv, .mat, .npz: frequency responses
 values for MATLAB     read_mat, write_mat   .mat: systems, plants, reduced models, responses
+functional mock-up    write_fmu             .fmu: sampled plants and controllers, FMI 2.0 and 3.0
 ====================  ====================  =======================================================
 """
 
@@ -29,6 +30,7 @@ from .abaqus import read_abaqus as read_abaqus
 from .ansys import read_ansys as read_ansys
 from .dmig import read_dmig as read_dmig
 from .exodus import read_exodus_modes as read_exodus_modes
+from .fmu import write_fmu as write_fmu
 from .frf_arrays import read_frf_mat as read_frf_mat
 from .frf_arrays import read_frf_npz as read_frf_npz
 from .frf_csv import read_frf_csv as read_frf_csv
