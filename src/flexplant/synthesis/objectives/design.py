@@ -9,7 +9,6 @@ import numpy as np
 
 from ...checks import positive, short, whole
 from ...errors import (
-    AssumptionError,
     CertificateError,
     FlexplantError,
     InfeasibleError,
@@ -31,6 +30,7 @@ from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati
 from ..lmi.lmi_solution import Plant
 from ..reach import require_stabilisable
+from ..structured.judges import require_finite_h2
 from .lmis import ObjectivePrograms
 from .specifications import H2, Hinf, PeakGain, PoleRegion
 
@@ -171,13 +171,8 @@ def _checked(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) ->
                 f"{short(one)}. Give it the bound that has to hold."
             )
         w, z = one.chosen(plant)
-        direct = plant.system[list(z), list(w)].D
-        if isinstance(one, H2) and not plant.dt and np.any(direct):
-            i, k = np.argwhere(direct)[0]
-            raise AssumptionError(
-                f"white noise on {w[k]} reaches {z[i]} at once: the H2 norm is infinite. Weight "
-                "that w or z by a low-pass, leave one of them out, or sample the plant."
-            )
+        if isinstance(one, H2):
+            require_finite_h2(plant, w, z)
     n = plant.system.n_states
     if not 0 < n <= most:
         raise ModelError(

@@ -13,6 +13,7 @@ from ...lti.responses import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
 from ...tolerances import TINY
+from ..structured.judges import GainJudge, H2Judge, Judge, PeakJudge, require_finite_h2, selected
 
 #: samples of an impulse response that are computed together, and at most
 _TOGETHER, _LONGEST = 256, 4e6
@@ -67,6 +68,12 @@ class H2(_ChannelNorm):
         """Return the norm of a closed loop by its Gramians."""
         return h2_norm(closed)
 
+    def judges(self, plant: StandardPlant, order: int) -> list[Judge]:
+        """Return what finds the norm for controllers of an order."""
+        w, z = self.chosen(plant)
+        require_finite_h2(plant, w, z)
+        return [H2Judge(selected(plant, w, z), order)]
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Hinf(_ChannelNorm):
@@ -87,6 +94,10 @@ class Hinf(_ChannelNorm):
     def measured(self, closed: StateSpace) -> float:
         """Return the norm of a closed loop."""
         return peak_gain(closed)[0]
+
+    def judges(self, plant: StandardPlant, order: int) -> list[Judge]:
+        """Return what finds the norm for controllers of an order."""
+        return [GainJudge(selected(plant, *self.chosen(plant)), order)]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -115,6 +126,11 @@ class PeakGain(_ChannelNorm):
     def measured(self, closed: StateSpace) -> float:
         """Return the largest integral or sum of an absolute impulse response."""
         return impulse_sum(closed) if closed.dt else impulse_integral(closed)
+
+    def judges(self, plant: StandardPlant, order: int) -> list[Judge]:
+        """Return what finds the sum of each channel for controllers of an order."""
+        w, z = self.chosen(plant)
+        return [PeakJudge(selected(plant, [i], [o]), order) for i in w for o in z]
 
 
 @dataclass(frozen=True, eq=False)

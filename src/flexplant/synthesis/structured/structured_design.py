@@ -1,25 +1,29 @@
-"""design_structured: H-infinity with a controller of given structure, verified on every plant."""
+"""design_structured: norms minimised by a controller of given structure, verified on each plant."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from ...certificates import stability, stability_name
 from ...checks import FloatArray, Rng, generator, short, whole
-from ...errors import CertificateError, InfeasibleError, ModelError
+from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError
 from ...lti.interconnection import lft
 from ...lti.preparation import Prepared, prepared
 from ...lti.responses import responder
-from ...lti.statespace import System
+from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant, standard_plant
 from ...tolerances import SAME
 from ..controller import Controller, certified_norm, reached_norms, with_left_out
+from ..objectives.specifications import H2, Hinf
 from ..reach import require_stabilisable
-from ..structured_loop import DECAY, ScaledLoop
+from .judges import GainJudge, Judge, Objective
 from .nonsmooth import Pieces, bfgs, decrease_left, joined, minimax
+from .scaled_loop import DECAY, ScaledLoop
 from .structures import ControllerFamily, ControllerStructure, as_system
 
 #: steps for stability, from each start towards the least norm, and on from the best of them
@@ -58,6 +62,7 @@ def design_structured(
     plant: StandardPlant | System | Sequence[StandardPlant],
     structure: ControllerStructure,
     *,
+    objective: Objective | Sequence[Objective] = Hinf(),  # noqa: B008 - a frozen value
     u: Sequence[str] | None = None,
     y: Sequence[str] | None = None,
     starts: int = 8,
@@ -66,10 +71,11 @@ def design_structured(
     larger: Any = None,
     progress: bool | None = None,
 ) -> Controller:
-    """Return the controller of a structure with the least H-infinity norm found from w to z.
+    """Return the controller of a structure with the least norm found from w to z.
 
     From several starts the spectral abscissa of the closed loop is lowered until it is stable, then
-    the norm, the largest over all plants. At the minimum several peaks are equally high: each step
+    the norm, the largest over all plants (of several objectives the largest in multiples of their
+    `below`). H-infinity: at the minimum several peaks are equally high: each step
     takes the gains at all high frequencies together, with their gradients
     (``d|T| = Re u* dT v``, u and v the singular vectors there) and second derivatives. The best
     ends are continued. The problem is not convex: another start may do better.
@@ -81,6 +87,10 @@ def design_structured(
         positions, with the same u, y and rate. A labelled StateSpace serves too.
     structure : FixedOrder, TunedLaws, ObserverGains or Parametrised
         What the controller looks like, and where the search begins.
+    objective : Hinf, H2, PeakGain, or sequence of these
+        What is minimised; several each with `below`, the one that is farthest from it counts.
+        Anything with the methods of `Objective` serves. H2 of a continuous plant is finite for
+        controllers without feedthrough where D12 and D21 are: ``FixedOrder(n, direct=False)``.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
     starts : int
@@ -98,8 +108,10 @@ def design_structured(
     -------
     Controller
         `structure` is the one given with the numbers found, of `TunedLaws` the laws; a further
-        design can begin there. `gamma` is the largest verified norm, `tried` holds what each
-        start reached. The certificate holds the norm of each plant, and of the local minimum
+        design can begin there. `gamma` is the largest verified norm (over `below`), `tried` holds
+        what each start reached, `reached` what each objective is (of H-infinity from all w to all z
+        the norms between groups of channels). The certificate holds the norm of each plant, and of
+        the local minimum
         `slope`, the norm of the smallest convex combination of the gradients (of log gamma, by the
         parameters), and `decrease left`, what a step of the length `radius` would still lower gamma
         by to first order, relative to it.
@@ -144,7 +156,12 @@ def design_structured(
     for one, problem in zip(plants, problems, strict=True):
         require_stabilisable(one, problem, "structured synthesis")
     family = structure.family(plants[0], problems[0])
-    search = _StructureSearch(family, problems, evaluations)
+    objectives = _objectives(objective)
+    if not plants[0].dt:
+        _require_no_feedthrough(family, plants[0], objectives)
+    search = _StructureSearch(
+        family, problems, evaluations, partial(_judges, objectives, plants, problems)
+    )
     with Progress(starts + _CONTINUED, "starts of the search", progress=progress) as bar:
         found = search.best(starts, random, bar)
     final = family.structure(found.x)
@@ -152,7 +169,7 @@ def design_structured(
     K = K.replace(name="structured", units=plants[0].units)
     closed = [lft(one.system, K) for one in plants]
     claim = _norm(found)
-    each = [certified_norm(loop, claim) for loop in closed]
+    each = [_verified(*pair, objectives, claim) for pair in zip(plants, closed, strict=True)]
     worst = int(np.argmax([one["norm"] for one in each]))
     if not abs(each[worst]["norm"] - claim) <= _AGREEMENT * claim:
         raise CertificateError(
@@ -160,6 +177,11 @@ def design_structured(
             f"{claim:.6g} in the scaled problem: it is too badly conditioned to trust. Bring "
             "the weights closer together."
         )
+    kind = _kind(objectives)
+    if kind == "H-infinity":
+        reached = reached_norms(plants[worst], closed[worst], responder(closed[worst]))
+    else:
+        reached = {name: each[worst][name] for name in map(repr, objectives)}
     radius = _RADIUS * max(1.0, float(np.linalg.norm(found.x)))
     slope, decrease = decrease_left(search.pieces(found.x), radius)
     certificate = dict(each[worst]) | {
@@ -174,10 +196,10 @@ def design_structured(
         notes += ("not yet a local minimum (decrease left): more evaluations or another order",)
     answer = Controller(
         K,
-        f"H-infinity of structure {(structure if final is None else final)!r}",
+        f"{kind} of structure {(structure if final is None else final)!r}",
         gamma=each[worst]["norm"],
         certificate=certificate,
-        reached=reached_norms(plants[worst], closed[worst], responder(closed[worst])),
+        reached=reached,
         notes=notes,
         structure=final,
         tried=search.tried,
@@ -212,6 +234,94 @@ def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> lis
     return plants
 
 
+#: judges, and the bounds that their numbers are counted in
+_Judged: TypeAlias = "list[tuple[Judge, float]]"
+
+
+def _objectives(given: Any) -> list[Objective]:
+    """Return the objectives, each with the methods of one."""
+    every = list(given) if isinstance(given, list | tuple) else [given]
+    for one in every:
+        if isinstance(one, type) or not hasattr(one, "judges"):
+            raise ModelError(
+                f"objective must be Hinf(...), H2(...), PeakGain(...) or several of them, got "
+                f"{short(one)}."
+            )
+        if len(every) > 1 and one.below is None:
+            raise ModelError(
+                f"{one!r} is one of several objectives and has no bound: give each `below=`, in "
+                "multiples of which they are compared."
+            )
+    if not every:
+        raise ModelError("objective is an empty list: pass at least one.")
+    return every
+
+
+def _kind(objectives: Sequence[Objective]) -> str:
+    """Return what is minimised, in a word."""
+    if len(objectives) > 1:
+        return "several objectives"
+    one = objectives[0]
+    if isinstance(one, Hinf) and one.w is None and one.z is None and one.below is None:
+        return "H-infinity"
+    return repr(one)
+
+
+def _judges(
+    objectives: Sequence[Objective],
+    plants: Sequence[StandardPlant],
+    problems: Sequence[Prepared],
+    order: int,
+) -> _Judged:
+    """Return the judges of all plants."""
+    if _kind(objectives) == "H-infinity":  # the problems are ready
+        return [(GainJudge(problem, order), 1.0) for problem in problems]
+    return [
+        (judge, one.below or 1.0)
+        for plant in plants
+        for one in objectives
+        for judge in one.judges(plant, order)
+    ]
+
+
+def _require_no_feedthrough(
+    family: ControllerFamily, plant: StandardPlant, objectives: Sequence[Objective]
+) -> None:
+    """Raise AssumptionError where white noise of an H2 norm passes through a controller at once."""
+    k, g = family.order, plant.system
+    free = np.any(family.jacobian(family.first)[:, k:, k:], axis=0)
+    free = free | (family.matrices(family.first).D != 0.0)
+    for one in objectives:
+        w, z = one.chosen(plant)
+        out, into = g[list(z), list(plant.u)].D, g[list(plant.y), list(w)].D
+        if isinstance(one, H2) and np.any((out != 0) @ free @ (into != 0)):
+            raise AssumptionError(
+                "the structure has a feedthrough from y to u, through which white noise of a "
+                "continuous plant passes at once: the H2 norm is infinite. Take "
+                "FixedOrder(n, direct=False), laws with a LowPass, or sample the plant."
+            )
+
+
+def _verified(
+    plant: StandardPlant, loop: StateSpace, objectives: Sequence[Objective], claim: float
+) -> dict[str, float]:
+    """Return what was verified of a closed loop: `norm` is the largest, over its bound."""
+    if _kind(objectives) == "H-infinity":
+        return certified_norm(loop, claim)
+    least = stability(loop.poles(), loop.dt)
+    if not least < (1.0 if loop.dt else 0.0):
+        raise CertificateError(
+            f"the closed loop is not stable ({stability_name(loop.dt)} {least:.6g}): the "
+            "controller is refused."
+        )
+    found, norm = {}, 0.0
+    for one in objectives:
+        w, z = one.chosen(plant)
+        found[repr(one)] = one.measured(loop.select(z, w))
+        norm = max(norm, found[repr(one)] / (one.below or 1.0))
+    return {"norm": norm, stability_name(loop.dt): least, "claim": claim} | found
+
+
 class _End(NamedTuple):
     """Where a start ended: log of the norm (infinite when not stabilised), and the abscissa."""
 
@@ -225,13 +335,21 @@ class _End(NamedTuple):
 class _StructureSearch:
     """The functions of the parameters, how often they were computed, and the search from starts."""
 
-    def __init__(self, family: ControllerFamily, problems: list[Prepared], limit: float) -> None:
+    def __init__(
+        self,
+        family: ControllerFamily,
+        problems: list[Prepared],
+        limit: float,
+        judging: Callable[[int], _Judged] | None = None,
+    ) -> None:
         self.family, self.problems, self.limit = family, problems, limit
         self.loops = [ScaledLoop(p, family.order) for p in problems]
+        self._judging = judging or (lambda order: [(GainJudge(p, order), 1.0) for p in problems])
+        self.judged = self._judging(family.order)
         self.evaluations = 0
         self.notes: tuple[str, ...] = ()
-        #: the parameters of the last value, and the gain and frequency of each loop there
-        self._latest: tuple[FloatArray, list[tuple[float, float]]] = np.zeros(0), []
+        #: the parameters of the last value, and the number and place of each judge there
+        self._latest: tuple[FloatArray, list[tuple[float, Any]]] = np.zeros(0), []
         #: the norm that each start reached
         self.tried: dict[str, float] = {}
 
@@ -247,41 +365,47 @@ class _StructureSearch:
         value, by, _ = max((loop.stability(K) for loop in self.loops), key=lambda one: one[0])
         return value, np.tensordot(self.family.jacobian(theta), by, axes=2)
 
-    def value(self, theta: FloatArray) -> tuple[float, tuple[int, float]]:
-        """Return the logarithm of the largest norm of the loops, and which and where it is."""
+    def value(self, theta: FloatArray) -> tuple[float, tuple[int, Any]]:
+        """Return the logarithm of the largest number of the loops, and which and where it is."""
         # a little more for large parameters: ends infima that are only neared as gains grow
         self.evaluations += 1
         K = self.family.matrices(theta)
         if not np.all(np.isfinite(K.joined)):
             return np.inf, (0, 0.0)
-        self._latest = theta, [loop.gain(K) for loop in self.loops]
-        worst = int(np.argmax([gain for gain, _ in self._latest[1]]))
-        gain, freq = self._latest[1][worst]
-        return float(np.log(max(gain, _NOTHING))) + _SMALL * _size(theta), (worst, freq)
+        each = []
+        for judge, below in self.judged:
+            number, place = judge.value(K)
+            each.append((number / below, place))
+        self._latest = theta, each
+        worst = int(np.argmax([number for number, _ in each]))
+        number, place = each[worst]
+        return float(np.log(max(number, _NOTHING))) + _SMALL * _size(theta), (worst, place)
 
     def pieces(self, theta: FloatArray) -> Pieces:
-        """Return the gains that are near the largest, as `value` counts them."""
+        """Return the numbers that are near the largest, as `value` counts them."""
         if not np.array_equal(theta, self._latest[0]):
             self.value(theta)
         _, each = self._latest
         most = max(gain for gain, _ in each)
         return joined(
             [
-                self._of_loop(theta, i, freq, sweep=True)
-                for i, (gain, freq) in enumerate(each)
+                self._of_judge(theta, i, place, sweep=True)
+                for i, (gain, place) in enumerate(each)
                 if gain >= _PART * most
             ]
         )
 
-    def piece(self, theta: FloatArray, place: tuple[int, float]) -> Pieces:
-        """Return the gains at the place of a peak elsewhere."""
-        return self._of_loop(theta, *place, sweep=False)
+    def piece(self, theta: FloatArray, place: tuple[int, Any]) -> Pieces:
+        """Return the numbers at the place of a peak elsewhere."""
+        return self._of_judge(theta, *place, sweep=False)
 
-    def _of_loop(self, theta: FloatArray, number: int, freq: float, *, sweep: bool) -> Pieces:
+    def _of_judge(self, theta: FloatArray, which: int, place: Any, *, sweep: bool) -> Pieces:
         K, by = self.family.matrices(theta), self.family.jacobian(theta)
-        found, size = self.loops[number].pieces(K, by, freq, sweep=sweep), _size(theta)
+        judge, below = self.judged[which]
+        found, size = judge.pieces(K, by, place, sweep=sweep), _size(theta)
         return found._replace(
-            value=found.value + _SMALL * size, gradient=found.gradient + _SMALL / size * theta
+            value=found.value - np.log(below) + _SMALL * size,
+            gradient=found.gradient + _SMALL / size * theta,
         )
 
     def best(self, starts: int, rng: np.random.Generator, bar: Progress) -> _End:
@@ -353,7 +477,7 @@ class _StructureSearch:
         With a quarter of the evaluations that are left; None when it is not stabilised.
         """
         left = self.limit - self.evaluations
-        other = _StructureSearch(family, self.problems, _QUARTER * left)
+        other = _StructureSearch(family, self.problems, _QUARTER * left, self._judging)
         # a plant without a controller may be stationary: a free mass is
         draw = np.random.default_rng(family.order).standard_normal(family.first.size)
         starts = (family.first, family.first + family.spread * draw)

@@ -9,7 +9,7 @@ from typing import Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ...checks import FloatArray, Value, checked, function, instance, real_array, whole
+from ...checks import FloatArray, Value, checked, flag, function, instance, real_array, whole
 from ...errors import FlexplantError, ModelError, ShapeError, counted
 from ...lti.balancing import balanced
 from ...lti.discretisation import bilinear, tustin
@@ -18,7 +18,7 @@ from ...lti.riccati import control_care, solve_care
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
 from ..hinf.hinf_design import design_hinf
-from ..structured_loop import Matrices
+from .scaled_loop import Matrices
 
 #: step of a derivative by differences, and the steps and weights of fourth order
 _STEP = 1e-3
@@ -63,7 +63,7 @@ class ControllerStructure(Protocol):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FixedOrder(Value):
-    """A controller of given order, all entries of A, B, C and D free.
+    """A controller of given order, all entries of A, B, C and (unless left out) D free.
 
     Starts are the controller of full order, reduced, and the best of each lower order in turn,
     one state added at a time.
@@ -76,6 +76,8 @@ class FixedOrder(Value):
         Of a static gain: which entries are free, the others are zero (decentralised feedback).
     start : StateSpace, optional
         A controller y -> u to begin with, of this order; of an earlier design.
+    direct : bool
+        Whether D is free; zero when not: a controller that rolls off.
 
     Examples
     --------
@@ -87,9 +89,14 @@ class FixedOrder(Value):
     order: int = field(default=0, metadata=checked(whole, minimum=0))
     pattern: npt.NDArray[np.bool_] | None = None
     start: StateSpace | None = None
+    direct: bool = field(default=True, metadata=checked(flag))
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.direct and not self.order:
+            raise ModelError(
+                "a controller of order 0 is its D: leave direct out, or give an order."
+            )
         if self.pattern is not None:
             if self.order:
                 raise ModelError("a pattern is that of a static gain: leave order out, or it.")
@@ -97,7 +104,8 @@ class FixedOrder(Value):
 
     def __repr__(self) -> str:
         free = "" if self.pattern is None else f", {int(self.pattern.sum())} entries free"
-        return f"FixedOrder({self.order}{free})"
+        rolls = "" if self.direct else ", direct=False"
+        return f"FixedOrder({self.order}{free}{rolls})"
 
     def family(self, plant: StandardPlant, prepared: Prepared) -> _Entries:
         """Return the structure made ready for a plant.
@@ -108,7 +116,7 @@ class FixedOrder(Value):
             When pattern or start do not fit the plant.
         """
         nu, ny = len(plant.u), len(plant.y)
-        pattern = np.ones((nu, ny), dtype=bool) if self.pattern is None else self.pattern
+        pattern = np.full((nu, ny), self.direct) if self.pattern is None else self.pattern
         if pattern.shape != (nu, ny):
             raise ShapeError(
                 f"pattern must have shape ({nu}, {ny}) of (u, y), got {pattern.shape}."
@@ -165,7 +173,8 @@ class _Entries(ControllerFamily):
         The norm of a controller of low order has fewer local minima.
         """
         found: FloatArray | None = None
-        for order in range(self.order if self._nests else 0):
+        least = 0 if self.pattern.any() else 1
+        for order in range(least, self.order if self._nests else 0):
             lower = _Entries(order, self.pattern, self._p, nests=False)
             if found is not None:
                 lower.first = lower._grown(found)
@@ -178,7 +187,9 @@ class _Entries(ControllerFamily):
         entries = np.zeros(self.scale.shape)
         others = np.delete(np.arange(k + len(self.names[1])), k - 1)
         columns = np.delete(np.arange(k + len(self.names[0])), k - 1)
-        entries[np.ix_(others, columns)] = lower.reshape(others.size, columns.size)
+        inner = np.zeros((others.size, columns.size))
+        inner[self.free[np.ix_(others, columns)]] = lower
+        entries[np.ix_(others, columns)] = inner
         rng = np.random.default_rng(k)
         entries[k - 1, k:] = _COUPLING * rng.standard_normal(len(self.names[0]))
         entries[k:, k - 1] = _COUPLING * rng.standard_normal(len(self.names[1]))
@@ -204,6 +215,7 @@ class _Entries(ControllerFamily):
             self.order,
             None if self.order else self.pattern,
             as_system(self.matrices(theta), self.names, self.dt),
+            bool(self.pattern.any()),
         )
 
 

@@ -17,7 +17,7 @@ from ...lti.statespace import System
 from ...plant import StandardPlant
 from ..laws.law import Element, Law, SingleElement, chained
 from ..laws.loop_design import axes_of, checked_laws
-from ..structured_loop import Matrices
+from .scaled_loop import Matrices
 from .structures import ControllerFamily, differenced
 
 #: what an element may have free; the depth of a notch is not, unless it is named

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray
-from ..lti.frequency_sweep import climbed, resonance_grid
-from ..lti.norms import peak_gain
-from ..lti.preparation import Prepared
-from ..lti.responses import responses
-from ..lti.statespace import StateSpace
-from .structured.nonsmooth import Pieces
+from ...checks import ComplexArray, FloatArray
+from ...lti.grid import climbed, resonance_grid
+from ...lti.norms import peak_gain
+from ...lti.preparation import Prepared
+from ...lti.responses import responses
+from ...lti.statespace import StateSpace
+from .nonsmooth import Pieces
 
 #: a loop counts as stable with this decay, in the scaled unit of time
 DECAY = 1e-7
@@ -43,6 +43,12 @@ class Matrices(NamedTuple):
         """``[A, B; C, D]``."""
         return np.asarray(np.block([[self.A, self.B], [self.C, self.D]]))
 
+    def moved(self, change: FloatArray) -> Matrices:
+        """Return the controller with a change of `joined`."""
+        k = len(self.A)
+        new = self.joined + change
+        return Matrices(new[:k, :k], new[:k, k:], new[k:, :k], new[k:, k:])
+
 
 class ScaledLoop:
     """A prepared plant that a controller of k states is closed on.
@@ -68,7 +74,7 @@ class ScaledLoop:
         self._out = la.block_diag(slow, np.linalg.inv(p.u_scale))
         self._in = la.block_diag(slow, np.linalg.inv(p.y_scale))
 
-    def closed(self, K: Matrices) -> _Closed | None:
+    def closed(self, K: Matrices) -> Closed | None:
         """Return the loop with a controller in the user's units; None when it is not finite."""
         scaled = self._out @ K.joined @ self._in
         left = np.asarray(np.linalg.inv(np.eye(scaled.shape[0]) - scaled @ self.D22))
@@ -76,7 +82,7 @@ class ScaledLoop:
         Q = left @ scaled
         if not np.all(np.isfinite(Q)):
             return None
-        return _Closed(
+        return Closed(
             self.A + self.B @ Q @ self.C,
             self.B1 + self.B @ Q @ self.D21,
             self.C1 + self.D12 @ Q @ self.C,
@@ -101,15 +107,24 @@ class ScaledLoop:
         overlap = np.vdot(y, x)
         overlap = overlap if abs(overlap) > 1e-12 else 1e-12  # a defective pole: any direction
         slope = np.real(np.outer((y.conj() @ loop.Bu) / overlap, loop.Cy @ x))
-        by = self._out.T @ slope @ self._in.T
+        by = self.by_controller(slope)
         return float(values[worst].real), by, complex(values[worst])
+
+    def stable(self, K: Matrices) -> Closed | None:
+        """Return the loop with a controller; None where it is not stable."""
+        loop = self.closed(K)
+        if loop is None or float(loop.system.poles().real.max(initial=-1.0)) >= -DECAY:
+            return None
+        return loop
+
+    def by_controller(self, slope: FloatArray) -> FloatArray:
+        """Return a derivative by the scaled [A, B; C, D] as one by that in the user's units."""
+        return np.asarray(self._out.T @ slope @ self._in.T)
 
     def gain(self, K: Matrices) -> tuple[float, float]:
         """Return the H-infinity norm, infinite when the loop is not stable, and its frequency."""
-        loop = self.closed(K)
-        if loop is None or float(loop.system.poles().real.max(initial=-1.0)) >= -DECAY:
-            return np.inf, 0.0
-        return peak_gain(loop.system)
+        loop = self.stable(K)
+        return (np.inf, 0.0) if loop is None else peak_gain(loop.system)
 
     def pieces(self, K: Matrices, jacobian: FloatArray, freq: float, *, sweep: bool) -> Pieces:
         """Return the logarithms of the gains at a frequency, and where others are near them."""
@@ -133,7 +148,7 @@ class ScaledLoop:
         )
 
 
-class _Closed(NamedTuple):
+class Closed(NamedTuple):
     """A closed loop, and what changes of the controller do to it: from its outputs, to y."""
 
     A: FloatArray
@@ -145,6 +160,11 @@ class _Closed(NamedTuple):
     Du: FloatArray
     Dy: FloatArray
     Dyu: FloatArray
+
+    def slope(self, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> FloatArray:
+        """Return the derivative by the scaled controller, from those by the loop's matrices."""
+        states = A @ self.Cy.T + B @ self.Dy.T
+        return np.asarray(self.Bu.T @ states + self.Du.T @ (C @ self.Cy.T + D @ self.Dy.T))
 
     @property
     def system(self) -> StateSpace:
