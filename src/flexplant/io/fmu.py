@@ -41,7 +41,15 @@ _FOLDERS = {
 _COMPILERS = ("cc", "gcc", "clang")
 
 
-def write_fmu(system: Any, path: str | Path, *, version: str = "3.0", **options: Any) -> Path:
+def write_fmu(
+    system: Any,
+    path: str | Path,
+    *,
+    version: str = "3.0",
+    limits: Any = None,
+    anti_windup: float | None = None,
+    schedule: str | None = None,
+) -> Path:
     """Write a sampled plant or controller as a unit for co-simulation (FMI).
 
     Simulink, Dymola, OpenModelica and others import it. It holds C sources (those of `write_c` and
@@ -57,8 +65,8 @@ def write_fmu(system: Any, path: str | Path, *, version: str = "3.0", **options:
         Such as "stage.fmu", written atomically; its name is that of the model.
     version : str
         "3.0" or "2.0".
-    **options
-        `limits`, `anti_windup` and `schedule`, as for `write_c`.
+    limits, anti_windup, schedule
+        Of a controller, as for `write_c`.
 
     Returns
     -------
@@ -106,7 +114,12 @@ def write_fmu(system: Any, path: str | Path, *, version: str = "3.0", **options:
             "plant.discretized(rate)."
         )
     program = c_program(
-        system.system if is_plant else system, c_name(name), driven=not is_plant, **options
+        system.system if is_plant else system,
+        c_name(name),
+        limits=limits,
+        anti_windup=anti_windup,
+        schedule=schedule,
+        driven=not is_plant,
     )
     sources = {
         f"{name}.h": program.header,

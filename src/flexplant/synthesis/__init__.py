@@ -3,6 +3,9 @@
 from ..rooms import public_names as _public_names
 from .aftercare.c_code import write_c as write_c
 from .aftercare.filter_sections import second_order_sections as second_order_sections
+from .aftercare.fixed_point import FixedPointController as FixedPointController
+from .aftercare.fixed_point import LimitCycle as LimitCycle
+from .aftercare.fixed_point import fixed_point as fixed_point
 from .aftercare.order import discretise_controller as discretise_controller
 from .aftercare.order import reduce_controller as reduce_controller
 from .aftercare.windup import anti_windup_form as anti_windup_form

@@ -56,6 +56,12 @@ class TwoStateForm(NamedTuple):
         """Blocks, those that fill up included."""
         return int(self.pairs.shape[2])
 
+    @property
+    def change(self) -> FloatArray:
+        """``A - I`` of all states."""
+        (aa, ab), (ba, bb) = (tuple(np.diag(entry) for entry in row) for row in self.pairs)
+        return np.asarray(la.block_diag(np.block([[aa, ab], [ba, bb]]), self.rest))
+
     def response(self, freq: FloatArray, dt: float) -> ComplexArray:
         """Return the response (p, m, n_freq), block by block."""
         N, change = self.lanes, np.expm1(2j * np.pi * freq * dt)  # z - 1

@@ -42,7 +42,7 @@ class Judge(Protocol):
         """
 
 
-class Objective(Protocol):
+class LoopObjective(Protocol):
     """What `design_structured` minimises; `Hinf`, `H2` and `PeakGain` are such values.
 
     A number of the loop from some w to some z, in multiples of `below` where that is given.
@@ -56,7 +56,7 @@ class Objective(Protocol):
         """Return the names of w and z."""
 
     def measured(self, closed: Any, /) -> float:
-        """Return the number of a closed loop by a route of its own: it checks what is claimed."""
+        """Return the number of a closed loop by another computation: it checks the claim."""
 
     def judges(self, plant: StandardPlant, order: int, /) -> Sequence[Judge]:
         """Return what finds the number, the largest of several, for controllers of an order."""

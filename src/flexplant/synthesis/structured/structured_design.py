@@ -21,7 +21,7 @@ from ...tolerances import SAME
 from ..controller import Controller, certified_norm, reached_norms, with_left_out
 from ..objectives.specifications import H2, Hinf
 from ..reach import require_stabilisable
-from .judges import GainJudge, Judge, Objective
+from .judges import GainJudge, Judge, LoopObjective
 from .nonsmooth import Pieces, bfgs, decrease_left, joined, minimax
 from .scaled_loop import DECAY, ScaledLoop
 from .structures import ControllerFamily, ControllerStructure, as_system
@@ -62,7 +62,7 @@ def design_structured(
     plant: StandardPlant | System | Sequence[StandardPlant],
     structure: ControllerStructure,
     *,
-    objective: Objective | Sequence[Objective] = Hinf(),  # noqa: B008 - a frozen value
+    objective: LoopObjective | Sequence[LoopObjective] = Hinf(),  # noqa: B008 - a frozen value
     u: Sequence[str] | None = None,
     y: Sequence[str] | None = None,
     starts: int = 8,
@@ -89,7 +89,7 @@ def design_structured(
         What the controller looks like, and where the search begins.
     objective : Hinf, H2, PeakGain, or sequence of these
         What is minimised; several each with `below`, the one that is farthest from it counts.
-        Anything with the methods of `Objective` serves. H2 of a continuous plant is finite for
+        Anything with the methods of `LoopObjective` serves. H2 of a continuous plant is finite for
         controllers without feedthrough where D12 and D21 are: ``FixedOrder(n, direct=False)``.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
@@ -238,7 +238,7 @@ def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> lis
 _Judged: TypeAlias = "list[tuple[Judge, float]]"
 
 
-def _objectives(given: Any) -> list[Objective]:
+def _objectives(given: Any) -> list[LoopObjective]:
     """Return the objectives, each with the methods of one."""
     every = list(given) if isinstance(given, list | tuple) else [given]
     for one in every:
@@ -257,7 +257,7 @@ def _objectives(given: Any) -> list[Objective]:
     return every
 
 
-def _kind(objectives: Sequence[Objective]) -> str:
+def _kind(objectives: Sequence[LoopObjective]) -> str:
     """Return what is minimised, in a word."""
     if len(objectives) > 1:
         return "several objectives"
@@ -268,7 +268,7 @@ def _kind(objectives: Sequence[Objective]) -> str:
 
 
 def _judges(
-    objectives: Sequence[Objective],
+    objectives: Sequence[LoopObjective],
     plants: Sequence[StandardPlant],
     problems: Sequence[Prepared],
     order: int,
@@ -285,7 +285,7 @@ def _judges(
 
 
 def _require_no_feedthrough(
-    family: ControllerFamily, plant: StandardPlant, objectives: Sequence[Objective]
+    family: ControllerFamily, plant: StandardPlant, objectives: Sequence[LoopObjective]
 ) -> None:
     """Raise AssumptionError where white noise of an H2 norm passes through a controller at once."""
     k, g = family.order, plant.system
@@ -303,7 +303,7 @@ def _require_no_feedthrough(
 
 
 def _verified(
-    plant: StandardPlant, loop: StateSpace, objectives: Sequence[Objective], claim: float
+    plant: StandardPlant, loop: StateSpace, objectives: Sequence[LoopObjective], claim: float
 ) -> dict[str, float]:
     """Return what was verified of a closed loop: `norm` is the largest, over its bound."""
     if _kind(objectives) == "H-infinity":

@@ -1,0 +1,395 @@
+"""fixed_point: a controller in integers, its loop closed again and its limit cycles found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from ...checks import FloatArray, Rng, Value, generator, instance, positive, whole, with_unit
+from ...errors import CertificateError, FlexplantError, ModelError
+from ...loop import ClosedLoop
+from ...lti.statespace import StateSpace
+from ...parallel import one_thread
+from ...tolerances import TINY
+from .c_code import controller_law
+from .order import LoopFacts, kept, loop_facts, reduce_controller, stable_before
+from .two_state import TwoStateForm, two_state_form
+
+Integers: TypeAlias = npt.NDArray[np.int64]
+
+#: word lengths that are tried, in turn; products of two words and their sums fit 63 bits
+_FEWEST, _MOST, _PRODUCT = 4, 32, 58
+#: samples of a run that looks for limit cycles: so many time constants of the loop, within these
+_DECAYS, _SHORTEST, _LONGEST = 30.0, 2_000, 30_000
+#: starts of these runs, and the part of the word in which states start
+_STARTS, _PART = 3, 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class LimitCycle(Value):
+    """What a loop in integers goes on doing without any input.
+
+    Parameters
+    ----------
+    channel : str
+        A channel of y, or a command.
+    freq : float [Hz]
+        Of its largest line; 0 where it stands still beside zero.
+    amplitude : float
+        Largest distance from zero, in the channel's unit.
+    """
+
+    channel: str
+    freq: float
+    amplitude: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FixedPointController(Value):
+    """A controller with coefficients and states in words of stated length.
+
+    Made by `fixed_point`.
+
+    Parameters
+    ----------
+    system : StateSpace
+        The controller that the rounded coefficients make, from y to u.
+    bits, state_bits : int
+        Of a coefficient, and of a state, an input and an output, signs included.
+    sections : int
+        Blocks of two states.
+    ranges : mapping {channel: float}
+        What the words of inputs and outputs hold at most.
+    certificate : mapping
+        Stability and modulus margin with rounded coefficients and before.
+    limit_cycles : sequence of LimitCycle
+        The largest of each channel over some starts; empty where all come to rest at zero.
+    tried : mapping {(sections, bits): str}
+        What else was tried, and what the loop lost with it.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop = fx.close_loop(plant, observer, servo)
+    >>> run = fx.simulate(loop, reference=1e-3, duration=0.5, rng=1)
+    >>> fx.synthesis.fixed_point(loop, run, bits=16, state_bits=32).bits
+    16
+    """
+
+    system: StateSpace
+    bits: int
+    state_bits: int
+    sections: int
+    ranges: Mapping[str, float]
+    certificate: Mapping[str, float]
+    limit_cycles: tuple[LimitCycle, ...]
+    tried: Mapping[str, str]
+
+    def __repr__(self) -> str:
+        margins = [self.certificate[name] for name in ("modulus margin", "modulus margin before")]
+        head = f"<FixedPointController: {self.sections} sections, coefficients of {self.bits} bits"
+        lines = [
+            f"{head}, states of {self.state_bits}",
+            f"  modulus margin {margins[0]:.3g}, before {margins[1]:.3g}",
+        ]
+        for one in self.limit_cycles[:4]:
+            size = with_unit(one.amplitude, self.system.units.get(one.channel))
+            lines.append(f"  limit cycle of {one.channel}: {size} at {one.freq:.3g} Hz")
+        if not self.limit_cycles:
+            lines.append("  no limit cycle found")
+        return "\n".join(lines) + ">"
+
+
+@one_thread()
+def fixed_point(
+    loop: ClosedLoop,
+    run: Any,
+    *,
+    bits: int | None = None,
+    state_bits: int = 32,
+    sections: int | Sequence[int] | None = None,
+    headroom: float = 4.0,
+    loss: float = 0.1,
+    rng: Rng = 0,
+) -> FixedPointController:
+    """Return a loop's controller in fixed-point arithmetic, judged in its loop.
+
+    Blocks of two states as in `write_c`: each row of A - I, B, C and D is rounded to integers of
+    `bits` with one power of two, states, inputs and outputs are integers of `state_bits` whose
+    powers of two follow from a run. The loop is closed again with the rounded coefficients, and
+    run in integers, without inputs, from some states: what does not come to rest is named.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        Around a sampled plant.
+    run : Response
+        A run of the loop that is as large as it gets: it gives the sizes of all signals.
+    bits : int, optional
+        Word length of coefficients; the fewest that keep the loop when not given.
+    state_bits : int
+        Word length of states, inputs and outputs.
+    sections : int or sequence of int, optional
+        Blocks of two states: the controller is reduced to these. Of several numbers the one that
+        needs the fewest bits in all (sections times bits); as many as it has when not given.
+    headroom : float
+        What words hold beyond the run's largest values, as a factor.
+    loss : float
+        Relative loss of the modulus margin that is allowed.
+    rng : int, SeedSequence or Generator
+        Draws the states from which limit cycles are sought.
+
+    Returns
+    -------
+    FixedPointController
+
+    Raises
+    ------
+    CertificateError
+        When no number of sections and bits keeps the loop, with what each lost.
+    ModelError
+        When the words are too long to be multiplied in 64 bits, or the run is of another loop.
+
+    References
+    ----------
+    [AstromWittenmark1997]_, section 9.7.
+    """
+    closed = instance(loop, ClosedLoop, "loop", "Pass close_loop(plant, *blocks).")
+    K = controller_law(closed).select(outputs=closed.driven)
+    wide = whole(state_bits, "state_bits", minimum=8)
+    longest = min(_MOST, _PRODUCT - wide)
+    given = None if bits is None else whole(bits, "bits", minimum=2)
+    if longest < _FEWEST or (given or 0) > longest:
+        raise ModelError(
+            f"products of {given or _FEWEST} and {wide} bits, and their sums, do not fit 64: take "
+            f"fewer; together at most {_PRODUCT}."
+        )
+    before = stable_before(closed.plant, K)
+    inputs = np.array([_record(run, name) for name in K.inputs])
+    room, allowed = positive(headroom, "headroom"), positive(loss, "loss", zero=True)
+    counts = [None] if sections is None else np.atleast_1d(np.asarray(sections)).tolist()
+    tried: dict[str, str] = {}
+    best: tuple[int, int, _Words, StateSpace, LoopFacts] | None = None
+    for count in counts:
+        try:
+            own = _reduced(closed, K, count, allowed)
+        except FlexplantError as error:
+            tried[f"{count} sections"] = str(error)
+            continue
+        form = two_state_form(own)
+        parts = _sizes(form, inputs, room)
+        number = -(-own.n_states // 2)
+        for length in range(_FEWEST, longest + 1) if given is None else (given,):
+            if best is not None and number * length >= best[0]:
+                break
+            words = _words(form, parts, length, wide)
+            system = words.system(own)
+            facts = loop_facts(closed.plant, system)
+            lost = kept(before, facts, allowed)
+            if not lost:
+                best = number * length, length, words, system, facts
+                break
+            tried[f"{number} sections, {length} bits"] = lost
+    if best is None:
+        named = "; ".join(f"{name}: {lost}" for name, lost in list(tried.items())[-4:])
+        raise CertificateError(
+            f"no word length keeps the loop ({named}). Allow more bits, more sections or a larger "
+            "loss."
+        )
+    _, length, words, system, facts = best
+    was = {f"{name} before": value for name, value in before.certificate.items()}
+    held = [*np.exp2(words.into), *np.exp2(words.out)]
+    return FixedPointController(
+        system,
+        length,
+        wide,
+        -(-system.n_states // 2),
+        dict(zip((*system.inputs, *system.outputs), map(float, held), strict=True)),
+        facts.certificate | was,
+        tuple(_limit_cycles(closed, system, words, generator(rng))),
+        tried,
+    )
+
+
+def _record(run: Any, name: str) -> FloatArray:
+    try:
+        values = np.asarray(run[name], dtype=np.float64)
+    except (TypeError, KeyError, FlexplantError) as error:
+        raise ModelError(
+            f"run has no channel {name!r}, which the controller reads: pass simulate(loop, ...)."
+        ) from error
+    return np.asarray(values.reshape(-1, values.shape[-1])[0])
+
+
+def _reduced(loop: ClosedLoop, K: StateSpace, count: Any, loss: float) -> StateSpace:
+    """Return the controller of so many sections."""
+    if count is None or 2 * whole(count, "sections") >= K.n_states:
+        return K
+    return reduce_controller(loop.plant, K, order=2 * count, loss=loss).system
+
+
+class _Sizes(NamedTuple):
+    """Powers of two that hold inputs, states and outputs."""
+
+    into: Integers
+    x: Integers
+    out: Integers
+
+
+def _sizes(form: TwoStateForm, inputs: FloatArray, headroom: float) -> _Sizes:
+    """Return the powers of two above what a run has, replayed through the form."""
+    A = form.change
+    x, most = np.zeros(len(A)), np.zeros(len(A))
+    largest = np.zeros(len(form.C))
+    for value in inputs.T:
+        largest = np.maximum(largest, np.abs(form.C @ x + form.D @ value))
+        x = x + A @ x + form.B @ value
+        most = np.maximum(most, np.abs(x))
+    sizes = (np.abs(inputs).max(axis=1, initial=0.0), most, largest)
+    return _Sizes(*(_powers(headroom * size) for size in sizes))
+
+
+def _powers(size: FloatArray) -> Integers:
+    """Return the powers of two at or above sizes; one that is zero counts as 1."""
+    return np.ceil(np.log2(np.where(size > 0, size, 1.0))).astype(np.int64)
+
+
+class _Words(NamedTuple):
+    """Integers of the coefficients, the bits that rows are shifted by, and powers of signals."""
+
+    A: Integers
+    B: Integers
+    C: Integers
+    D: Integers
+    shifts: tuple[Integers, Integers, Integers, Integers]
+    into: Integers
+    x: Integers
+    out: Integers
+    wide: int
+
+    def system(self, like: StateSpace) -> StateSpace:
+        """Return what the coefficients make, without states that only fill up."""
+        parts = []
+        for coefficients, shift, to, of in (
+            (self.A, self.shifts[0], self.x, self.x),
+            (self.B, self.shifts[1], self.x, self.into),
+            (self.C, self.shifts[2], self.out, self.x),
+            (self.D, self.shifts[3], self.out, self.into),
+        ):
+            power = (to[:, None] - of[None, :] - shift[:, None]).astype(np.float64)
+            parts.append(coefficients * np.exp2(power))
+        A, B, C, D = parts
+        used = np.any(B != 0, axis=1) | np.any(A != 0, axis=1) | np.any(C != 0, axis=0)
+        full = (A + np.eye(len(A)))[np.ix_(used, used)]
+        return like.replace(A=full, B=B[used], C=C[:, used], D=D, states=None, blocks=None)
+
+    def outputs(self, x: Integers, into: Integers) -> Integers:
+        """Return the outputs of a sample."""
+        return self._held(
+            _shifted(self.C @ x, self.shifts[2]) + _shifted(self.D @ into, self.shifts[3])
+        )
+
+    def following(self, x: Integers, into: Integers) -> Integers:
+        """Return the states of the next sample."""
+        return self._held(
+            x + _shifted(self.A @ x, self.shifts[0]) + _shifted(self.B @ into, self.shifts[1])
+        )
+
+    def read(self, values: FloatArray) -> Integers:
+        """Return inputs in words."""
+        steps = values * np.exp2(self.wide - 1.0 - self.into)
+        return self._held(np.rint(np.clip(steps, -(2.0**62), 2.0**62)).astype(np.int64))
+
+    def written(self, out: Integers) -> FloatArray:
+        """Return outputs in their units."""
+        return np.asarray(out * np.exp2(self.out - (self.wide - 1.0)))
+
+    def _held(self, values: Integers) -> Integers:
+        most = 2 ** (self.wide - 1) - 1
+        return np.clip(values, -most, most)
+
+
+def _shifted(sums: Integers, shift: Integers) -> Integers:
+    """Return sums divided by powers of two, rounded to nearest."""
+    right = np.maximum(shift, 0)
+    half = np.where(right > 0, np.left_shift(1, np.maximum(right - 1, 0)), 0)
+    return np.asarray(np.left_shift(np.right_shift(sums + half, right), np.maximum(-shift, 0)))
+
+
+def _words(form: TwoStateForm, sizes: _Sizes, bits: int, wide: int) -> _Words:
+    """Return the integers of a form: each row with as many digits as its largest entry leaves."""
+    made, shifts = [], []
+    for matrix, to, of in (
+        (form.change, sizes.x, sizes.x),
+        (form.B, sizes.x, sizes.into),
+        (form.C, sizes.out, sizes.x),
+        (form.D, sizes.out, sizes.into),
+    ):
+        # y 2^-to = M 2^(of - to) (x 2^-of)
+        relative = matrix * np.exp2((of[None, :] - to[:, None]).astype(np.float64))
+        largest = np.abs(relative).max(axis=1, initial=0.0)
+        most = 2 ** (bits - 1) - 1
+        shift = np.floor(np.log2(most / np.where(largest > 0, largest, most))).astype(np.int64)
+        shift = np.minimum(shift, _PRODUCT)
+        made.append(np.rint(relative * np.exp2(shift[:, None].astype(float))).astype(np.int64))
+        shifts.append(shift)
+    A, B, C, D = made
+    return _Words(A, B, C, D, tuple(shifts), sizes.into, sizes.x, sizes.out, wide)
+
+
+def _limit_cycles(
+    loop: ClosedLoop, K: StateSpace, words: _Words, rng: np.random.Generator
+) -> list[LimitCycle]:
+    """Return what remains of the loop in integers when it is left alone."""
+    plant = loop.plant
+    g, driven = plant.system, list(K.outputs)
+    B, C = g.B[:, g.input_index(driven)], g.C[g.output_index(list(K.inputs))]
+    radius = loop.spectral_radius
+    samples = int(np.clip(_DECAYS / max(-np.log(radius), TINY), _SHORTEST, _LONGEST))
+    names = (*K.inputs, *driven)
+    powers = dict(zip(names, [*words.into.tolist(), *words.out.tolist()], strict=True))
+    found: dict[str, LimitCycle] = {}
+    for _ in range(_STARTS):
+        x = np.zeros(g.n_states)
+        most = _PART * 2.0 ** (words.wide - 1)
+        state = np.rint(most * rng.uniform(-1.0, 1.0, len(words.A))).astype(np.int64)
+        kept_samples = np.zeros((samples // 2, len(names)))
+        for k in range(samples):
+            y = C @ x
+            into = words.read(y)
+            out = words.outputs(state, into)
+            state = words.following(state, into)
+            u = words.written(out)
+            x = g.A @ x + B @ u
+            if k >= samples - len(kept_samples):
+                kept_samples[k - samples] = [*y, *u]
+        left = _decayed(loop, samples - len(kept_samples))
+        for name, values in zip(names, kept_samples.T, strict=True):
+            amplitude = float(np.abs(values).max())
+            size, step = 2.0 ** powers[name], 2.0 ** (powers[name] - words.wide + 1)
+            if amplitude <= max(left * size, 0.5 * step):
+                continue
+            known = found.get(name)
+            if known is None or amplitude > known.amplitude:
+                found[name] = LimitCycle(name, _line(values, K.dt), amplitude)
+    return list(found.values())
+
+
+def _decayed(loop: ClosedLoop, samples: int) -> float:
+    """Return what a linear loop has left of a start after so many samples, or more."""
+    with np.errstate(under="ignore"):
+        return float(10.0 * loop.spectral_radius**samples)
+
+
+def _line(values: FloatArray, dt: float) -> float:
+    """Return the frequency [Hz] of the largest line; 0 of a standstill."""
+    power = np.abs(np.fft.rfft(values))
+    power[1:] *= 2.0
+    return float(np.argmax(power) / (values.size * dt))
