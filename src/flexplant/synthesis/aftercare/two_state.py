@@ -119,10 +119,17 @@ def _blocks(K: StateSpace) -> tuple[StateSpace, list[int]]:
         return modal.system, list(modal.system.blocks or [1] * K.n_states)
     d = state_scale(K.A, K.B, K.C)
     A = K.A * d / d[:, None]
-    values = np.linalg.eigvals(A).astype(np.complex128)
+    T, Z = la.schur(A)
+    real, imag = la.lapack.dtrsen(np.zeros(len(T)), T, Z, job="N")[2:4]
+    values = real + 1j * imag  # in the order of T
     for near in _NEAR:
-        V, sizes = _invariant(A, values, near)
-        if V.shape == A.shape and np.linalg.cond(V) <= _CONDITION:
+        owner = _groups(values, near)
+        sizes = np.bincount(owner).tolist()
+        bases = [
+            la.lapack.dtrsen(owner == k, T, Z, job="N")[1][:, :size] for k, size in enumerate(sizes)
+        ]
+        V = np.hstack(bases)
+        if np.linalg.cond(V) <= _CONDITION:
             break
     kept = la.block_diag(*(np.ones((size, size)) for size in sizes)) > 0
     new = np.where(kept, np.linalg.solve(V, A @ V), 0.0)
@@ -131,33 +138,20 @@ def _blocks(K: StateSpace) -> tuple[StateSpace, list[int]]:
     ), sizes
 
 
-def _invariant(A: FloatArray, values: ComplexArray, near: float) -> tuple[FloatArray, list[int]]:
-    """Return orthonormal bases of the invariant subspaces of poles that are near each other."""
-    left, groups = list(range(values.size)), []
-    while left:
-        group = [left.pop(0)]
-        for one in group:  # grows while it is read: single linkage, conjugates together
-            apart = [
-                min(abs(values[k] - values[one]), abs(values[k] - values[one].conj())) for k in left
-            ]
-            joins = [k for k, far in zip(left, apart, strict=True) if far <= near]
-            group += joins
-            left = [k for k in left if k not in joins]
-        groups.append(np.array(group))
-    columns = []
-    for chosen in groups:
-        rest = np.delete(values, chosen)
-
-        def own(
-            real: float, imag: float, chosen: IntArray = chosen, rest: ComplexArray = rest
-        ) -> bool:
-            pole = complex(real, imag)
-            away = float(np.abs(values[chosen] - pole).min())
-            return away < float(np.min(np.abs(rest - pole), initial=np.inf))
-
-        _, Z, count = la.schur(A, sort=own)
-        columns.append(Z[:, :count])
-    return np.hstack(columns), [part.shape[1] for part in columns]
+def _groups(values: ComplexArray, near: float) -> IntArray:
+    """Return the group of each pole: those within a distance of each other, and conjugates."""
+    folded = values.real + 1j * np.abs(values.imag)
+    owner = np.full(values.size, -1)
+    for first in range(values.size):
+        if owner[first] < 0:
+            group = owner.max() + 1
+            owner[first] = group
+            grown = True
+            while grown:
+                apart = np.abs(folded[:, None] - folded[owner == group]).min(axis=1)
+                joins = (owner < 0) & (apart <= near)
+                owner[joins], grown = group, bool(joins.any())
+    return owner
 
 
 def _arranged(
