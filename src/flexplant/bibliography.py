@@ -118,6 +118,7 @@
 .. [Hassibi1999] Hassibi, Sayed, Kailath, Indefinite-Quadratic Estimation and Control, SIAM, 1999.
 .. [HeylenLammens1996] Heylen, Lammens, FRAC: a consistent way of comparing frequency response
    functions, Identification in Engineering Systems, 1996.
+.. [Higham2008] Higham, Functions of Matrices: Theory and Computation, SIAM, 2008.
 .. [Hosking1980] Hosking, The multivariate portmanteau statistic, J. Amer. Stat. Assoc. 75, 1980.
 .. [Hoyle1991] Hoyle, Hyde, Limebeer, An H-infinity approach to two degree of freedom design, IEEE
    CDC, 1991.

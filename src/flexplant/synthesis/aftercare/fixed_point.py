@@ -41,6 +41,12 @@ class LimitCycle(Value):
         Of its largest line; 0 where it stands still beside zero.
     amplitude : float
         Largest distance from zero, in the channel's unit.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.LimitCycle("y1", freq=33.0, amplitude=2e-9)
+    LimitCycle(channel='y1', freq=33.0, amplitude=2e-09)
     """
 
     channel: str
@@ -74,13 +80,13 @@ class FixedPointController(Value):
     Examples
     --------
     >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> observer = fx.design_kalman(plant)
-    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
-    >>> loop = fx.close_loop(plant, observer, servo)
-    >>> run = fx.simulate(loop, reference=1e-3, duration=0.5, rng=1)
-    >>> fx.synthesis.fixed_point(loop, run, bits=16, state_bits=32).bits
-    16
+    >>> gain = fx.StateSpace([], [], [], [[-2.0]], 1e-4, inputs=["y1"], outputs=["u1"])
+    >>> margins = {"modulus margin": 0.5, "modulus margin before": 0.52}
+    >>> sizes = {"y1": 1e-3, "u1": 2e-3}
+    >>> fx.synthesis.FixedPointController(gain, 16, 32, 0, sizes, margins, (), {})
+    <FixedPointController: 0 sections, coefficients of 16 bits, states of 32
+      modulus margin 0.5, before 0.52
+      no limit cycle found>
     """
 
     system: StateSpace
@@ -160,6 +166,18 @@ def fixed_point(
     References
     ----------
     [AstromWittenmark1997]_, section 9.7.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop = fx.close_loop(plant, observer, servo)
+    >>> run = fx.simulate(loop, reference=1e-3, duration=0.5, rng=1)
+    >>> found = fx.synthesis.fixed_point(loop, run, bits=12)
+    >>> found.sections, fx.close_loop(plant, found.system).is_stable
+    (6, True)
     """
     closed = instance(loop, ClosedLoop, "loop", "Pass close_loop(plant, *blocks).")
     K = controller_law(closed).select(outputs=closed.driven)
@@ -176,7 +194,7 @@ def fixed_point(
     room, allowed = positive(headroom, "headroom"), positive(loss, "loss", zero=True)
     counts = [None] if sections is None else np.atleast_1d(np.asarray(sections)).tolist()
     tried: dict[str, str] = {}
-    best: tuple[int, int, _Words, StateSpace, LoopFacts] | None = None
+    best: tuple[int, int, _WordForm, StateSpace, LoopFacts] | None = None
     for count in counts:
         try:
             own = _reduced(closed, K, count, allowed)
@@ -261,7 +279,7 @@ def _powers(size: FloatArray) -> Integers:
     return np.ceil(np.log2(np.where(size > 0, size, 1.0))).astype(np.int64)
 
 
-class _Words(NamedTuple):
+class _WordForm(NamedTuple):
     """Integers of the coefficients, the bits that rows are shifted by, and powers of signals."""
 
     A: Integers
@@ -323,7 +341,7 @@ def _shifted(sums: Integers, shift: Integers) -> Integers:
     return np.asarray(np.left_shift(np.right_shift(sums + half, right), np.maximum(-shift, 0)))
 
 
-def _words(form: TwoStateForm, sizes: _Sizes, bits: int, wide: int) -> _Words:
+def _words(form: TwoStateForm, sizes: _Sizes, bits: int, wide: int) -> _WordForm:
     """Return the integers of a form: each row with as many digits as its largest entry leaves."""
     made, shifts = [], []
     for matrix, to, of in (
@@ -341,11 +359,11 @@ def _words(form: TwoStateForm, sizes: _Sizes, bits: int, wide: int) -> _Words:
         made.append(np.rint(relative * np.exp2(shift[:, None].astype(float))).astype(np.int64))
         shifts.append(shift)
     A, B, C, D = made
-    return _Words(A, B, C, D, tuple(shifts), sizes.into, sizes.x, sizes.out, wide)
+    return _WordForm(A, B, C, D, tuple(shifts), sizes.into, sizes.x, sizes.out, wide)
 
 
 def _limit_cycles(
-    loop: ClosedLoop, K: StateSpace, words: _Words, rng: np.random.Generator
+    loop: ClosedLoop, K: StateSpace, words: _WordForm, rng: np.random.Generator
 ) -> list[LimitCycle]:
     """Return what remains of the loop in integers when it is left alone."""
     plant = loop.plant
