@@ -266,6 +266,10 @@ def test_limits_of_a_controller_by_itself(tmp_path):
         np.testing.assert_allclose(
             [code([value])[0] for value in given], wanted, rtol=0, atol=1e-9 * most
         )
+    short = Compiled(tmp_path, K, limits=(-most, 0.5 * most), single=True)
+    outs = [short([value])[0] for value in given]
+    assert min(outs) == -most
+    assert max(outs) == 0.5 * most
     plain = Compiled(tmp_path, form)  # nothing limits: the controller itself
     other = Compiled(tmp_path, K)
     np.testing.assert_allclose(
@@ -281,12 +285,15 @@ def test_a_schedule_interpolates_the_outputs(tmp_path):
         return StateSpace([[1.0]], [[0.01, 0.0]], [[2.0 * gain]], [[gain, 0.1]], 0.01,
                           inputs=["e", "x"], outputs=["u"])  # fmt: skip
 
-    code = Compiled(tmp_path, {0.2: law(5.0), 0.0: law(1.0), 0.1: law(2.0)}, schedule="x")
+    laws = {0.2: law(5.0), 0.0: law(1.0), 0.1: law(2.0)}
+    code = Compiled(tmp_path, laws, schedule="x")
+    single = Compiled(tmp_path, laws, schedule="x", single=True)
     state = 0.0
     for place in (-1.0, 0.0, 0.03, 0.1, 0.15, 0.2, 7.0):
         gain = np.interp(place, [0.0, 0.1, 0.2], [1.0, 2.0, 5.0])
         wanted = 2.0 * gain * state + gain * 0.5 + 0.1 * place
         assert code([0.5, place])[0] == pytest.approx(wanted, rel=1e-12)
+        assert single([0.5, place])[0] == pytest.approx(wanted, rel=1e-5)
         state += 0.005
     code.start([0.0, 0.1], [3.0])
     assert code([0.0, 0.1])[0] == pytest.approx(3.0, rel=1e-9)

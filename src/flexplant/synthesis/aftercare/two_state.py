@@ -88,11 +88,6 @@ def two_state_form(
 
     For each group of outputs that are `driven` a start is computed that gives their commands at
     the values of the first `inputs`.
-
-    Raises
-    ------
-    CertificateError
-        When the response differs, as in single precision where the rate is far above a pole.
     """
     form, sizes = _blocks(K)
     found = _arranged(form, sizes, driven, inputs)

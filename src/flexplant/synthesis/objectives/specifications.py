@@ -33,13 +33,7 @@ class _ChannelNorm(Value):
         return f"{type(self).__name__}({sides}{bound})"
 
     def chosen(self, plant: StandardPlant) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return the names of w and z, all where none were given.
-
-        Raises
-        ------
-        LabelError
-            When the plant has no such channel.
-        """
+        """Return the names of w and z, all where none were given."""
         for side in "wz":
             require_known(f"channel of {side}", getattr(self, side) or (), getattr(plant, side))
         return self.w or plant.w, self.z or plant.z

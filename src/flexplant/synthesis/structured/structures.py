@@ -108,13 +108,7 @@ class FixedOrder(Value):
         return f"FixedOrder({self.order}{free}{rolls})"
 
     def family(self, plant: StandardPlant, prepared: Prepared) -> _Entries:
-        """Return the structure made ready for a plant.
-
-        Raises
-        ------
-        ShapeError, ModelError
-            When pattern or start do not fit the plant.
-        """
+        """Return the structure made ready for a plant."""
         nu, ny = len(plant.u), len(plant.y)
         pattern = np.full((nu, ny), self.direct) if self.pattern is None else self.pattern
         if pattern.shape != (nu, ny):
@@ -241,13 +235,7 @@ class ObserverGains(Value):
     """
 
     def family(self, plant: StandardPlant, prepared: Prepared) -> _Gains:
-        """Return the structure made ready for a plant.
-
-        Raises
-        ------
-        AssumptionError, SolverError
-            When LQG has no stabilising gains: a mode is not reached or seen.
-        """
+        """Return the structure made ready for a plant."""
         return _Gains(prepared, self)
 
 
@@ -339,13 +327,7 @@ class Parametrised:
         return f"Parametrised({counted(self.start.size, 'parameter')})"
 
     def family(self, plant: StandardPlant, prepared: Prepared) -> Differenced:
-        """Return the structure made ready for a plant.
-
-        Raises
-        ------
-        ModelError, LabelError
-            When what it makes does not fit the plant.
-        """
+        """Return the structure made ready for a plant."""
         unit = np.where(self.start != 0, np.abs(self.start), 1.0)
 
         def matrices(theta: FloatArray) -> Matrices:

@@ -70,13 +70,7 @@ class TunedLaws(Value):
         require_known("number of an element", self.free, _NUMBERS)
 
     def family(self, plant: StandardPlant, prepared: Prepared) -> _Laws:
-        """Return the structure made ready for a plant.
-
-        Raises
-        ------
-        LabelError, ModelError, ShapeError, AssumptionError
-            When laws, transformations and plant do not go together.
-        """
+        """Return the structure made ready for a plant."""
         axes = axes_of(plant, self.before, self.after, None, 0.0, True)
         laws = checked_laws(axes, self.laws)
         before = np.zeros((len(plant.u), len(axes.names)))
