@@ -326,16 +326,14 @@ def test_refusals_of_the_c_export(tmp_path):
 
 
 def test_a_wrong_block_is_found(monkeypatch, tmp_path):
-    """The certificate compares responses: one entry off by 1e-5 is refused."""
+    """The certificate compares responses: what drives the states off by 1e-6 is refused."""
     from flexplant.synthesis.aftercare import two_state
 
     right = two_state._arranged
 
     def wrong(*args):
         form = right(*args)
-        pairs = form.pairs.copy()
-        pairs[0, 1, 0] *= 1 + 1e-5
-        return form._replace(pairs=pairs)
+        return form._replace(B=(1 + 1e-6) * form.B)
 
     monkeypatch.setattr(two_state, "_arranged", wrong)
     with pytest.raises(CertificateError, match="differ from the system"):
