@@ -23,8 +23,9 @@ Integers: TypeAlias = npt.NDArray[np.int64]
 
 #: word lengths that are tried, in turn; products of two words and their sums fit 63 bits
 _FEWEST, _MOST, _PRODUCT = 4, 32, 58
-#: samples of a run that looks for limit cycles: so many time constants of the loop, within these
-_DECAYS, _SHORTEST, _LONGEST = 30.0, 2_000, 30_000
+#: samples of a run that looks for limit cycles, within these: its first half lasts until a start
+#: has decayed to a part of a word's step; what is left of it where that takes longer is no cycle
+_SHORTEST, _LONGEST, _REST = 2_000, 40_000, 20.0
 #: starts of these runs, and the part of the word in which states start
 _STARTS, _PART = 3, 0.25
 
@@ -222,6 +223,7 @@ def fixed_point(
             "loss."
         )
     _, length, words, system, facts = best
+    cycles, left = _limit_cycles(closed, system, words, generator(rng))
     was = {f"{name} before": value for name, value in before.certificate.items()}
     held = [*np.exp2(words.into), *np.exp2(words.out)]
     return FixedPointController(
@@ -230,8 +232,8 @@ def fixed_point(
         wide,
         -(-system.n_states // 2),
         dict(zip((*system.inputs, *system.outputs), map(float, held), strict=True)),
-        facts.certificate | was,
-        tuple(_limit_cycles(closed, system, words, generator(rng))),
+        facts.certificate | was | {"cycles sought above, of a word": left},
+        cycles,
         tried,
     )
 
@@ -309,25 +311,25 @@ class _WordForm(NamedTuple):
         return like.replace(A=full, B=B[used], C=C[:, used], D=D, states=None, blocks=None)
 
     def outputs(self, x: Integers, into: Integers) -> Integers:
-        """Return the outputs of a sample."""
+        """Return the outputs (p, runs) of a sample."""
         return self._held(
             _shifted(self.C @ x, self.shifts[2]) + _shifted(self.D @ into, self.shifts[3])
         )
 
     def following(self, x: Integers, into: Integers) -> Integers:
-        """Return the states of the next sample."""
+        """Return the states (n, runs) of the next sample."""
         return self._held(
             x + _shifted(self.A @ x, self.shifts[0]) + _shifted(self.B @ into, self.shifts[1])
         )
 
     def read(self, values: FloatArray) -> Integers:
         """Return inputs in words."""
-        steps = values * np.exp2(self.wide - 1.0 - self.into)
+        steps = values * np.exp2(self.wide - 1.0 - self.into)[:, None]
         return self._held(np.rint(np.clip(steps, -(2.0**62), 2.0**62)).astype(np.int64))
 
     def written(self, out: Integers) -> FloatArray:
         """Return outputs in their units."""
-        return np.asarray(out * np.exp2(self.out - (self.wide - 1.0)))
+        return np.asarray(out * np.exp2(self.out - (self.wide - 1.0))[:, None])
 
     def _held(self, values: Integers) -> Integers:
         most = 2 ** (self.wide - 1) - 1
@@ -336,9 +338,11 @@ class _WordForm(NamedTuple):
 
 def _shifted(sums: Integers, shift: Integers) -> Integers:
     """Return sums divided by powers of two, rounded to nearest."""
-    right = np.maximum(shift, 0)
+    right = np.maximum(shift, 0)[:, None]
     half = np.where(right > 0, np.left_shift(1, np.maximum(right - 1, 0)), 0)
-    return np.asarray(np.left_shift(np.right_shift(sums + half, right), np.maximum(-shift, 0)))
+    return np.asarray(
+        np.left_shift(np.right_shift(sums + half, right), np.maximum(-shift, 0)[:, None])
+    )
 
 
 def _words(form: TwoStateForm, sizes: _Sizes, bits: int, wide: int) -> _WordForm:
@@ -364,46 +368,40 @@ def _words(form: TwoStateForm, sizes: _Sizes, bits: int, wide: int) -> _WordForm
 
 def _limit_cycles(
     loop: ClosedLoop, K: StateSpace, words: _WordForm, rng: np.random.Generator
-) -> list[LimitCycle]:
-    """Return what remains of the loop in integers when it is left alone."""
+) -> tuple[tuple[LimitCycle, ...], float]:
+    """Return what remains of the loop in integers left alone, and the part of a word seen."""
     plant = loop.plant
     g, driven = plant.system, list(K.outputs)
     B, C = g.B[:, g.input_index(driven)], g.C[g.output_index(list(K.inputs))]
     radius = loop.spectral_radius
-    samples = int(np.clip(_DECAYS / max(-np.log(radius), TINY), _SHORTEST, _LONGEST))
+    decays = np.log(_REST * 2.0**words.wide)
+    samples = int(np.clip(2.0 * decays / max(-np.log(radius), TINY), _SHORTEST, _LONGEST))
     names = (*K.inputs, *driven)
     powers = dict(zip(names, [*words.into.tolist(), *words.out.tolist()], strict=True))
-    found: dict[str, LimitCycle] = {}
-    for _ in range(_STARTS):
-        x = np.zeros(g.n_states)
-        most = _PART * 2.0 ** (words.wide - 1)
-        state = np.rint(most * rng.uniform(-1.0, 1.0, len(words.A))).astype(np.int64)
-        kept_samples = np.zeros((samples // 2, len(names)))
-        for k in range(samples):
-            y = C @ x
-            into = words.read(y)
-            out = words.outputs(state, into)
-            state = words.following(state, into)
-            u = words.written(out)
-            x = g.A @ x + B @ u
-            if k >= samples - len(kept_samples):
-                kept_samples[k - samples] = [*y, *u]
-        left = _decayed(loop, samples - len(kept_samples))
-        for name, values in zip(names, kept_samples.T, strict=True):
-            amplitude = float(np.abs(values).max())
-            size, step = 2.0 ** powers[name], 2.0 ** (powers[name] - words.wide + 1)
-            if amplitude <= max(left * size, 0.5 * step):
-                continue
-            known = found.get(name)
-            if known is None or amplitude > known.amplitude:
-                found[name] = LimitCycle(name, _line(values, K.dt), amplitude)
-    return list(found.values())
-
-
-def _decayed(loop: ClosedLoop, samples: int) -> float:
-    """Return what a linear loop has left of a start after so many samples, or more."""
+    x = np.zeros((g.n_states, _STARTS))
+    most = _PART * 2.0 ** (words.wide - 1)
+    state = np.rint(most * rng.uniform(-1.0, 1.0, (len(words.A), _STARTS))).astype(np.int64)
+    first = samples - samples // 2
+    last = np.zeros((samples // 2, len(names), _STARTS))
+    for k in range(samples):
+        y = C @ x
+        into = words.read(y)
+        out = words.outputs(state, into)
+        state = words.following(state, into)
+        u = words.written(out)
+        x = g.A @ x + B @ u
+        if k >= first:
+            last[k - first] = np.vstack([y, u])
     with np.errstate(under="ignore"):
-        return float(10.0 * loop.spectral_radius**samples)
+        decayed = float(10.0 * radius**first)
+    left = max(decayed, 2.0**-words.wide)  # half a step
+    found = []
+    for i, name in enumerate(names):
+        run = last[:, i, np.argmax(np.abs(last[:, i]).max(axis=0))]
+        amplitude = float(np.abs(run).max())
+        if amplitude > left * 2.0 ** powers[name]:
+            found.append(LimitCycle(name, _line(run, K.dt), amplitude))
+    return tuple(found), left
 
 
 def _line(values: FloatArray, dt: float) -> float:
