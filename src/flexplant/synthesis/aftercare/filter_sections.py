@@ -10,7 +10,7 @@ import numpy as np
 from ...checks import ComplexArray, FloatArray
 from ...errors import CertificateError, ModelError
 from ...lti.frequency import frequency_response
-from ...lti.grid import resonance_grid
+from ...lti.frequency_sweep import resonance_grid
 from ...lti.minimal import minimal
 from ...lti.statespace import StateSpace, as_statespace
 

@@ -10,11 +10,11 @@ import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray, IntArray
 from ...errors import CertificateError
+from ...lti.equations import state_scale
 from ...lti.frequency import frequency_response
-from ...lti.grid import resonance_grid
+from ...lti.frequency_sweep import resonance_grid
 from ...lti.modal import modal_form
 from ...lti.norms import eigenvalues_with_error
-from ...lti.scaling import state_scale
 from ...lti.statespace import StateSpace
 from ...tolerances import RANK, ROUNDING, divisor
 

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray
-from ...lti.grid import climbed, resonance_grid
+from ...lti.frequency_sweep import climbed, resonance_grid
 from ...lti.norms import peak_gain
 from ...lti.preparation import Prepared
 from ...lti.responses import responses
