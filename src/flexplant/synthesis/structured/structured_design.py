@@ -109,9 +109,8 @@ def design_structured(
     Controller
         `structure` is the one given with the numbers found, of `TunedLaws` the laws; a further
         design can begin there. `gamma` is the largest verified norm (over `below`), `tried` holds
-        what each start reached, `reached` what each objective is (of H-infinity from all w to all z
-        the norms between groups of channels). The certificate holds the norm of each plant, and of
-        the local minimum
+        what each start reached. The certificate holds the norm of each plant, what each objective
+        is, and of the local minimum
         `slope`, the norm of the smallest convex combination of the gradients (of log gamma, by the
         parameters), and `decrease left`, what a step of the length `radius` would still lower gamma
         by to first order, relative to it.
@@ -178,10 +177,9 @@ def design_structured(
             "the weights closer together."
         )
     kind = _kind(objectives)
+    reached = {}
     if kind == "H-infinity":
         reached = reached_norms(plants[worst], closed[worst], responder(closed[worst]))
-    else:
-        reached = {name: each[worst][name] for name in map(repr, objectives)}
     radius = _RADIUS * max(1.0, float(np.linalg.norm(found.x)))
     slope, decrease = decrease_left(search.pieces(found.x), radius)
     certificate = dict(each[worst]) | {
