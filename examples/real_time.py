@@ -25,7 +25,7 @@ import numpy as np
 import flexplant as fx
 from flexplant.synthesis import write_c
 
-OUT = Path(__file__).with_name("out")
+OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 RATE, BANDWIDTH, DAMPING, L = 10e3, 50.0, 0.01, 0.6  # Hz, Hz, 1, m
 MOVE = fx.setpoint(100e-6, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.05, rate=RATE)
 COMPILER = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)

@@ -58,8 +58,6 @@
 .. [deKlerk2008] de Klerk, Rixen, Voormeeren, General framework for dynamic substructuring: history,
    review and classification of techniques, AIAA J. 46, 2008.
 .. [Demmel1989] Demmel, On floating point errors in Cholesky, LAPACK Working Note 14, 1989.
-.. [deSilvaTenenbaum2004] de Silva, Tenenbaum, Sparse multidimensional scaling using landmark
-   points, Stanford University, 2004.
 .. [Dobrowiecki2006] Dobrowiecki, Schoukens, Guillaume, Optimized excitation signals for MIMO
    frequency response function measurements, IEEE Trans. Instrum. Meas. 55, 2006, 1778-1786.
 .. [Doyle1986] Doyle, Lenz, Packard, Design examples using mu-synthesis, IEEE CDC, 1986.
@@ -75,6 +73,7 @@
    unmodeled dynamics, IEEE Trans. Autom. Control 36, 1991.
 .. [FanTits1992] Fan, Tits, A measure of worst-case H-infinity performance and of largest acceptable
    uncertainty, Syst. Control Lett. 18, 1992.
+.. [Fiedler1973] Fiedler, Algebraic connectivity of graphs, Czechoslovak Math. J. 23, 1973.
 .. [Fletcher1987] Fletcher, Practical Methods of Optimization, 2nd ed., Wiley, 1987.
 .. [Franklin1998] Franklin, Powell, Workman, Digital Control of Dynamic Systems, 3rd ed.,
    Addison-Wesley, 1998.

@@ -180,6 +180,7 @@ def finish(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
     return ax
 
 
+#: colours that remain different for colour-blind readers [OkabeIto2008]_
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY = (
     "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9",
 )  # fmt: skip

@@ -246,7 +246,7 @@ def _along(level: _GraphLevel) -> tuple[IntArray, FloatArray]:
     """Return each node's connected piece, and a coordinate along the longest way through it.
 
     The difference of the distances to two far ends, averaged over neighbours: steps towards the
-    vector of Fiedler, whose level sets are smaller than those of distances.
+    vector of Fiedler [Fiedler1973]_, whose level sets are smaller than those of distances.
     """
     n = level.nodes.size
     ends = (np.r_[level.heads, level.tails], np.r_[level.tails, level.heads])
