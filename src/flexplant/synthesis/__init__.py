@@ -61,7 +61,7 @@ from .laws.law import Law as Law
 from .laws.loop_design import LoopDesign as LoopDesign
 from .laws.loop_design import design_loops as design_loops
 from .laws.tune import tune_loops as tune_loops
-from .lmi.full_lmi import Lmi as Lmi
+from .lmi.lmi_programs import Lmi as Lmi
 from .objectives.design import design_lmi as design_lmi
 from .objectives.specifications import H2 as H2
 from .objectives.specifications import Hinf as Hinf

@@ -35,7 +35,7 @@ from ..controller import (
     reached_norms,
     with_left_out,
 )
-from ..lmi.full_lmi import Lmi
+from ..lmi.lmi_programs import Lmi
 from ..reach import posed, require_reach
 from .central import require_shown
 from .hinf_riccati import Riccati
