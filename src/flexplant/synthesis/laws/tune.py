@@ -20,8 +20,7 @@ from ...plant import StandardPlant, larger_plant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..servo.servo_loop import TARGET
 from .axis_law import AxisLaw, MeasuredAxis
-from .joint_plant import JointPlant, Worst
-from .joint_search import JointLaws, JointSearch
+from .joint_search import JointLaws, JointPlant, JointSearch, Worst
 from .law_search import FoundLaw, LawSearch
 from .loop_design import Axes, LoopDesign, axes_of, made
 
