@@ -36,6 +36,8 @@ def test_few_bits_lose_the_loop_and_the_fewest_that_keep_it_are_found():
         assert np.abs(run[name]).max() * 2 <= found.ranges[name] <= np.abs(run[name]).max() * 9
     with pytest.raises(CertificateError, match="6 sections, 4 bits: the loop becomes unstable"):
         fixed_point(loop, run, bits=4)
+    with pytest.raises(CertificateError, match="does not come to rest"):  # of the move's size
+        fixed_point(loop, run, state_bits=8)
     with pytest.raises(ModelError, match="do not fit 64"):
         fixed_point(loop, run, bits=32, state_bits=32)
     with pytest.raises(ModelError, match="no channel"):

@@ -30,6 +30,10 @@ _SHORTEST, _LONGEST, _REST = 2_000, 40_000, 20.0
 _STARTS, _PART = 3, 0.25
 
 
+#: a limit cycle of this part of what the run has is no rest
+_NO_REST = 0.1
+
+
 @dataclass(frozen=True, eq=False)
 class LimitCycle(Value):
     """What a loop in integers goes on doing without any input.
@@ -75,7 +79,7 @@ class FixedPointController(Value):
         Stability and modulus margin with rounded coefficients and before.
     limit_cycles : sequence of LimitCycle
         The largest of each channel over some starts; empty where all come to rest at zero.
-    tried : mapping {(sections, bits): str}
+    tried : mapping {"6 sections, 8 bits": str}
         What else was tried, and what the loop lost with it.
 
     Examples
@@ -160,7 +164,8 @@ def fixed_point(
     Raises
     ------
     CertificateError
-        When no number of sections and bits keeps the loop, with what each lost.
+        When no number of sections and bits keeps the loop, with what each lost; or when it does not
+        come to rest: a limit cycle of a tenth of what the run has.
     ModelError
         When the words are too long to be multiplied in 64 bits, or the run is of another loop.
 
@@ -226,16 +231,32 @@ def fixed_point(
     cycles, left = _limit_cycles(closed, system, words, generator(rng))
     was = {f"{name} before": value for name, value in before.certificate.items()}
     held = [*np.exp2(words.into), *np.exp2(words.out)]
+    ranges = dict(zip((*system.inputs, *system.outputs), map(float, held), strict=True))
+    _require_rest(cycles, ranges, room, wide)
     return FixedPointController(
         system,
         length,
         wide,
         -(-system.n_states // 2),
-        dict(zip((*system.inputs, *system.outputs), map(float, held), strict=True)),
+        ranges,
         facts.certificate | was | {"cycles sought above, of a word": left},
         cycles,
         tried,
     )
+
+
+def _require_rest(
+    cycles: tuple[LimitCycle, ...], ranges: Mapping[str, float], headroom: float, wide: int
+) -> None:
+    """Raise where the loop does not come to rest beside what the run has."""
+    large = [one for one in cycles if headroom * one.amplitude > _NO_REST * ranges[one.channel]]
+    if large:
+        named = ", ".join(f"{one.channel} {one.amplitude:.3g} (SI)" for one in large)
+        raise CertificateError(
+            f"with words of {wide} bits the loop does not come to rest: limit cycles of {named} "
+            f"are more than {_NO_REST:g} of what the run has. Allow more state_bits, or a smaller "
+            "headroom."
+        )
 
 
 def _record(run: Any, name: str) -> FloatArray:
