@@ -157,3 +157,10 @@ def test_refusals_of_units(tmp_path):
     ):
         with pytest.raises(error, match=cause):
             call()
+
+
+@pytest.mark.parametrize("name", ["time", "two\nlines"])
+def test_names_that_no_variable_may_have(name, tmp_path):
+    gain = fx.StateSpace([], [], [], [[-2.0]], 1e-4, inputs=[name], outputs=["u1"])
+    with pytest.raises(LabelError, match="no variable"):
+        fx.io.write_fmu(gain, tmp_path / "unit.fmu")

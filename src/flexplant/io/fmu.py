@@ -17,7 +17,7 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from ..checks import one_of
-from ..errors import ModelError, warn
+from ..errors import LabelError, ModelError, warn
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..store import written
@@ -77,7 +77,7 @@ def write_fmu(
     Raises
     ------
     LabelError
-        When the file's name is no C identifier.
+        When the file's name is no C identifier, or a channel's no variable of a unit.
     ModelError
         When the system is continuous, the path ends in anything but .fmu, or the version is
         unknown.
@@ -176,6 +176,12 @@ def _compiled(sources: dict[str, str], name: str, version: str) -> tuple[str, by
 
 def channels(K: StateSpace) -> tuple[list[str], list[str]]:
     """Return the names of inputs and outputs as variables, all different."""
+    for name in (*K.inputs, *K.outputs):
+        if name == "time" or not name.isprintable():
+            raise LabelError(
+                f"a channel is named {name!r}, which no variable of a functional mock-up may be: "
+                "time is its own, and line feeds end a name. Rename the channel."
+            )
     outputs = [f"{name}|y" if name in K.inputs else name for name in K.outputs]
     return list(K.inputs), outputs
 

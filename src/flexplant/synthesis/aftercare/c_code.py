@@ -20,11 +20,12 @@ from .c_text import CText
 from .two_state import TwoStateForm, two_state_form
 from .windup import back_gain
 
-#: words that C takes for itself
+#: words of C, and what its library has with the ending _t
 _RESERVED = frozenset(
     """auto break case char const continue default do double else enum extern float for goto if
     inline int long register restrict return short signed sizeof static struct switch typedef
-    union unsigned void volatile while main""".split()  # noqa: SIM905 - words, not data
+    union unsigned void volatile while main size ptrdiff int8 int16 int32 int64 uint8 uint16 uint32
+    uint64 time clock""".split()  # noqa: SIM905 - words, not data
 )
 
 
@@ -134,7 +135,7 @@ def _source_path(path: Any) -> Path:
 
 
 def c_name(name: Any) -> str:
-    """Return a name that C allows for functions."""
+    """Return a name that C allows for functions, and with the ending _t for a type."""
     valid = isinstance(name, str) and re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name)
     if not valid or name in _RESERVED:
         raise LabelError(

@@ -403,5 +403,6 @@ class CText:
 
 
 def _ascii(text: str) -> str:
-    """Return text that cannot end a comment."""
-    return text.encode("ascii", "replace").decode().replace("*/", "* /").replace("\n", " ")
+    """Return text that neither ends a comment nor begins one."""
+    plain = text.encode("ascii", "replace").decode().replace("\n", " ")
+    return plain.replace("*/", "* /").replace("/*", "/ *")
