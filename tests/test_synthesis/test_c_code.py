@@ -297,6 +297,12 @@ def test_a_schedule_interpolates_the_outputs(tmp_path):
         state += 0.005
     code.start([0.0, 0.1], [3.0])
     assert code([0.0, 0.1])[0] == pytest.approx(3.0, rel=1e-9)
+    with pytest.raises(ModelError, match="Leave limits out"):
+        write_c(laws, tmp_path / "limited.c", schedule="x", limits=2.0, anti_windup=0.1)
+    ahead = {place: law(1.0).replace(D=[[place, 0.1]]) for place in (0.0, 0.2)}
+    limited = Compiled(tmp_path, ahead, schedule="x", limits=2.0, anti_windup=0.1)
+    assert limited([9.0, 0.2])[0] == pytest.approx(0.2 * 9.0 + 0.1 * 0.2)
+    assert limited([90.0, 0.2])[0] == 2.0
     other = law(1.0).replace(A=[[0.9]])
     with pytest.raises(ModelError, match=r"more than its outputs \(A\)"):
         write_c({0.0: law(1.0), 1.0: other}, tmp_path / "a.c", schedule="x")

@@ -231,6 +231,13 @@ def _scheduled(
             and v is not None
             and not np.allclose(u, v, rtol=SAME, atol=SAME * np.abs(u).max(initial=0.0))
         ]
+        if moved == ["back"]:
+            raise ModelError(
+                f"limits and a schedule: what the applied command gives back to the states follows "
+                f"from the gains, and at {place:g} it is another than at {places[0]:g}; between "
+                "places the states under saturation would be of no design. Leave limits out and "
+                "saturate outside, or schedule only rows of feedforward (D)."
+            )
         if moved:
             raise ModelError(
                 f"the controller at {place:g} differs from the first in more than its outputs "
