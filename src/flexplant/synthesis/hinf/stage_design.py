@@ -11,7 +11,13 @@ from ...errors import AssumptionError, FlexplantError, InfeasibleError, ModelErr
 from ...loop import ClosedLoop, close_loop
 from ...lti.interconnection import series
 from ...parallel import Progress
-from ...plant import StandardPlant, reference_errors, stage_weights, standard_plant
+from ...plant import (
+    StandardPlant,
+    larger_plant,
+    reference_errors,
+    stage_weights,
+    standard_plant,
+)
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import Controller, with_left_out
 from .hinf_design import tolerant
@@ -45,8 +51,8 @@ def design_stage(
 
     `stage_weights` of rising bandwidths on ``plant.through(reference_errors(plant))``, each solved
     by ``design_hinf(uncertain=)``; the largest bandwidth is kept at which the modulus margin at u
-    is at least `margin`, and 7/8 of it with the frequency of any one mode off as far as it is
-    uncertain.
+    is at least `margin`, also with the modes left out where they are known, and 7/8 of it with the
+    frequency of any one mode of the plant off as far as it is uncertain.
 
     Parameters
     ----------
@@ -96,13 +102,13 @@ def design_stage(
     uncertain = given.uncertainty
     if uncertain is None:
         uncertain = given.uncertain(frequency=0.005)
-    task = _StageTask(uncertain, positive(margin, "margin"), poi, disturbance, effort)
+    task = _StageTask(uncertain, positive(margin, "margin"), poi, disturbance, effort, larger)
     with Progress(_MOST, "bandwidths", progress=progress) as bar:
         if bandwidth is not None:
             task.holds(positive(bandwidth, "bandwidth") / _CROSSES)
         else:
             task.search(bar)
-    return with_left_out(task.answer(), uncertain.plant, larger)
+    return with_left_out(task.answer(), uncertain.plant, task.whole)
 
 
 class _StageTask:
@@ -115,6 +121,7 @@ class _StageTask:
         poi: str | None,
         disturbance: float | None,
         effort: float | None,
+        larger: Any,
     ) -> None:
         if margin >= 1.0:
             raise ModelError(f"margin must be below 1, got {margin}: no loop that acts keeps it.")
@@ -127,6 +134,8 @@ class _StageTask:
                 "plant.uncertain(frequency=0.005)."
             )
         self.plant: StandardPlant = uncertain.plant
+        #: with the modes left out: a controller of the reduced plant may make them unstable
+        self.whole = larger_plant(self.plant, larger)
         self.errors = reference_errors(self.plant, poi=poi)
         self.through = self.plant.through(self.errors)
         self.tried: dict[float, float] = {}
@@ -152,7 +161,8 @@ class _StageTask:
             return False
         block = series(self.errors, found.system).replace(name="stage")
         loop = close_loop(self.plant, block)
-        margin = loop.modulus_margin if loop.is_stable else 0.0
+        wholes = [] if self.whole is None else [close_loop(self.whole, block)]
+        margin = min(one.modulus_margin if one.is_stable else 0.0 for one in (loop, *wholes))
         if margin >= self.margin and not self._tolerates(loop):
             margin = 0.0
         self.tried[bandwidth] = margin
