@@ -45,6 +45,8 @@ class LoopMargins(Value):
         Least distance to the critical point, 1 / max |S|.
     freq : float [Hz]
         Where it is.
+    gain_freq, phase_freq : float [Hz]
+        Where the nearer of both gain margins and the phase margin are; NaN where there are none.
 
     Examples
     --------
@@ -64,6 +66,8 @@ class LoopMargins(Value):
     phase_margin: float
     modulus_margin: float
     freq: float
+    gain_freq: float = float("nan")
+    phase_freq: float = float("nan")
 
     def __repr__(self) -> str:
         first = ", ".join(f"{f:.4g}" for f in self.crossovers[:4])
@@ -215,7 +219,13 @@ def report_loops(
     (True, 41)
     """
     rigid, unstable = whole(rigid, "rigid", minimum=0), whole(unstable, "unstable", minimum=0)
-    parts = taken_apart(loop)
+    return broken_report(taken_apart(loop), at, rigid, unstable)
+
+
+def broken_report(
+    parts: BrokenLoop, at: Literal["u", "y"], rigid: int, unstable: int
+) -> LoopReport:
+    """Return the report of a loop that is taken apart; parameters as for `report_loops`."""
     grid = parts.followed
     S = inverted(parts.gain(grid, at))
     count = _count(parts, parts.grid, rigid, unstable)
@@ -284,17 +294,24 @@ def loop_margins(
     crossovers = crossings(lambda f: np.abs(find(f)) - 1.0, freq, np.abs(L) - 1.0)
     phases = np.abs(np.degrees(np.angle(find(crossovers))))
     # L is real where the imaginary part changes sign; positive: towards the critical point
-    reals = find(crossings(lambda f: find(f).imag, freq, L.imag)).real.tolist()
+    turns = crossings(lambda f: find(f).imag, freq, L.imag)
+    reals = find(turns).real.tolist()
     # and at its ends, half the rate and zero frequency (unless it integrates), where it is real
     slope = (
         np.log(abs(L[1] / L[0])) / np.log(freq[1] / freq[0])
         if freq.size > 1 and np.all(L[:2])
         else 0.0
     )
-    ends = [*([L[0]] if abs(slope) < _LEVEL else []), *([L[-1]] if sampled else [])]
-    reals += [end.real for end in ends if abs(end.imag) < _REAL * abs(end.real)]
+    ends = [*([0] if abs(slope) < _LEVEL else []), *([-1] if sampled else [])]
+    ends = [i for i in ends if abs(L[i].imag) < _REAL * abs(L[i].real)]
+    reals += [L[i].real for i in ends]
+    places = [*turns.tolist(), *(float(freq[i]) for i in ends)]
     below = [float(x) for x in reals if 0.0 < x < 1.0]
     above = [float(x) for x in reals if x > 1.0]
+    near = min(
+        ((abs(np.log(x)), place) for x, place in zip(reals, places, strict=True) if x > 0.0),
+        default=(0.0, float("nan")),
+    )
     size = np.abs(1.0 - L)
     least = int(np.argmin(size))
     where, margin = float(freq[least]), float(size[least])
@@ -313,6 +330,8 @@ def loop_margins(
         float(phases.min(initial=180.0)),
         margin,
         where,
+        float(near[1]),
+        float(crossovers[np.argmin(phases)]) if crossovers.size else float("nan"),
     )
 
 
