@@ -259,9 +259,9 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> _Any:
-    """Import the pictures at their first use (they need matplotlib); say which room has a name."""
-    if name == "plot":
-        return _import_module(".plot", __name__)
+    """Import the last rooms at their first use (they need more); say which room has a name."""
+    if name in ("plot", "workbench"):
+        return _import_module(f".{name}", __name__)
     rooms = [n for n, v in globals().items() if hasattr(v, "__path__") and hasattr(v, name)]
     where = "".join(f" Use flexplant.{room}.{name}." for room in rooms)
     ours = _import_module(".foreign_names", __name__).OURS.get(name)
@@ -274,4 +274,4 @@ def __dir__() -> list[str]:
     """Return the public names, and the rooms that hold the others."""
     items = [(name, item) for name, item in globals().items() if not name.startswith("_")]
     names = {n for n, v in items if getattr(v, "__module__", "").startswith(__name__)}
-    return sorted(names | {n for n, v in items if hasattr(v, "__path__")} | {"errors", "plot"})
+    return sorted(names | {n for n, v in items if hasattr(v, "__path__")} | {"errors", "plot", "workbench"})

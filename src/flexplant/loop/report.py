@@ -226,9 +226,18 @@ def broken_report(
     parts: BrokenLoop, at: Literal["u", "y"], rigid: int, unstable: int
 ) -> LoopReport:
     """Return the report of a loop that is taken apart; parameters as for `report_loops`."""
+    count = broken_count(parts, rigid, unstable)
+    loops = broken_margins(parts, at)
+    scaled = 0.0 if count.unstable else 1.0 / parts.worst(at, len(loops) > 1)[0]
+    units = parts.mixed(at)
+    margin = scaled if units or count.unstable else 1.0 / parts.worst(at, False)[0]
+    return LoopReport(loops, margin, *count, scaled_margin=scaled, units=units)
+
+
+def broken_margins(parts: BrokenLoop, at: Literal["u", "y"]) -> tuple[LoopMargins, ...]:
+    """Return crossovers and margins of each loop, the others closed."""
     grid = parts.followed
     S = inverted(parts.gain(grid, at))
-    count = _count(parts, parts.grid, rigid, unstable)
     names = parts.u if at == "u" else parts.y
 
     def one(i: int) -> LoopMargins:
@@ -240,15 +249,12 @@ def broken_report(
 
         return loop_margins(names[i], grid, 1.0 - 1.0 / S[:, i, i], exact, sampled=bool(parts.dt))
 
-    scaled = 0.0 if count.unstable else 1.0 / parts.worst(at, len(names) > 1)[0]
-    units = parts.mixed(at)
-    margin = scaled if units or count.unstable else 1.0 / parts.worst(at, False)[0]
-    loops = tuple(one(i) for i in range(len(names)))
-    return LoopReport(loops, margin, *count, scaled_margin=scaled, units=units)
+    return tuple(one(i) for i in range(len(names)))
 
 
-def _count(parts: BrokenLoop, grid: FloatArray, rigid: int, unstable: int) -> NyquistCount:
-    poles = parts.poles()
+def broken_count(parts: BrokenLoop, rigid: int, unstable: int) -> NyquistCount:
+    """Return the unstable poles of a loop that is taken apart; numbers as for `report_loops`."""
+    grid, poles = parts.grid, parts.poles()
     distance = np.log(np.where(poles == 0, TINY, poles)) if parts.dt else poles
     scale = 1.0 if parts.dt else np.max(np.abs(poles), initial=TINY)
     if parts.measured is None:
