@@ -274,4 +274,6 @@ def __dir__() -> list[str]:
     """Return the public names, and the rooms that hold the others."""
     items = [(name, item) for name, item in globals().items() if not name.startswith("_")]
     names = {n for n, v in items if getattr(v, "__module__", "").startswith(__name__)}
-    return sorted(names | {n for n, v in items if hasattr(v, "__path__")} | {"errors", "plot", "workbench"})
+    return sorted(
+        names | {n for n, v in items if hasattr(v, "__path__")} | {"errors", "plot", "workbench"}
+    )

@@ -4,24 +4,10 @@
 Needs Panel: ``pip install 'flexplant[workbench]'``.
 """
 
-import sys as _sys
-from types import ModuleType as _ModuleType
-from typing import Any as _Any
-
-from ..rooms import public_names as _public_names
-from .bench import Workbench as Workbench
-from .limits import LoopLimits as LoopLimits
+from ..rooms import called_names as _called_names
+from .launch import Workbench as Workbench
 from .launch import open_file as open_file
 from .launch import workbench as workbench
+from .limits import LoopLimits as LoopLimits
 
-__dir__ = _public_names(__name__)
-
-
-class _Room(_ModuleType):
-    """The room is called to open its page: `flexplant.workbench(plant)`."""
-
-    def __call__(self, *args: _Any, **options: _Any) -> Workbench:
-        return workbench(*args, **options)
-
-
-_sys.modules[__name__].__class__ = _Room
+__dir__ = _called_names(__name__)

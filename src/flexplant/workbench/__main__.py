@@ -31,11 +31,8 @@ def main(words: list[str] | None = None) -> int:
     given = parser.parse_args(words)
     try:
         found = [open_file(path) for path in given.files]
-        plants: dict[str, Any] = {
-            path: plant
-            for path, (plant, _, _) in zip(given.files, found, strict=True)
-            if plant is not None
-        }
+        read = zip(given.files, found, strict=True)
+        plants: dict[str, Any] = {path: one[0] for path, one in read if one[0] is not None}
         designs = [design for _, design, _ in found if design is not None]
         if not plants:
             sys.stderr.write("a design has no plant in it: name the file of its plant too.\n")
@@ -56,10 +53,7 @@ def main(words: list[str] | None = None) -> int:
         import webbrowser
 
         webbrowser.open(bench.url)
-    try:
-        bench._server.wait()
-    finally:
-        bench.close()
+    bench.wait()
     return 0
 
 

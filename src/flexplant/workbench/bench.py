@@ -1,16 +1,16 @@
-"""Workbench: a plant, its model and its fleet on the bench; what all tabs of the page share."""
+"""Bench: a plant, its model and its fleet on the bench; what all tabs of the page share."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from ..checks import instance
-from ..errors import FlexplantError, LabelError, ModelError, counted
+from ..errors import LabelError, ModelError, counted
 from ..lti.frequency import Frf
 from ..plant import StandardPlant
 from ..simulation.motion import SetPoint
@@ -18,14 +18,14 @@ from ..synthesis import LoopDesign, LowPass, Pid, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
 from .consequences import Question
 from .limits import LoopLimits
-from .machine import Machine
+from .machine import BenchMachine
 
 #: first crossover beside the lowest resonance, and beside the first line, and the corners beside it
 _BELOW, _ABOVE, _APART, _ROLL = 0.12, 10.0, 3.0, 8.0
 
 
-class Workbench:
-    """What `flexplant.workbench` returns: it shows itself in a notebook, and serves the page."""
+class Bench:
+    """What all tabs share: machines in the axes of a design, the first of them nominal."""
 
     def __init__(
         self,
@@ -43,17 +43,16 @@ class Workbench:
         self.design = design
         self.start = design
         self.limits = limits or LoopLimits()
-        self.machines = [Machine.on(one, design, name) for name, one in machines.items()]
+        self.machines = [BenchMachine.on(one, design, name) for name, one in machines.items()]
         self.larger, self.channel, self.move = larger, channel, move
         nominal = self.machines[0]
         if model is not None:
-            self.model: Machine | None = Machine.on(model, design, "model")
+            self.model: BenchMachine | None = BenchMachine.on(model, design, "model")
         else:
             self.model = None if nominal.is_measured else nominal
-        self._server: Any = None
 
     @classmethod
-    def of(cls, plant: Any, design: LoopDesign | None, options: Mapping[str, Any]) -> Workbench:
+    def of(cls, plant: Any, design: LoopDesign | None, options: Mapping[str, Any]) -> Self:
         """Return the bench of a plant, a list of plants or a mapping of them by name."""
         machines = _named(plant)
         names = ("before", "after", "rate", "delay", "hold", "rigid", "unstable", "references")
@@ -94,60 +93,8 @@ class Workbench:
     def __repr__(self) -> str:
         fleet = f", {counted(len(self.machines), 'machine')}" if len(self.machines) > 1 else ""
         model = ", with a model" if self.model and self.machines[0].is_measured else ""
-        return f"<Workbench of {self.design.made_on or 'a plant'}{model}{fleet}>\n{self.design!r}"
-
-    def panel(self) -> Any:
-        """Return a page of its own, as a Panel object."""
-        from .page import Page
-
-        return Page(self).layout
-
-    def servable(self) -> Any:
-        """Return the page for ``panel serve``."""
-        return self.panel().servable("flexplant workbench")
-
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> Any:
-        """Show the page in the cell of a notebook."""
-        return self.panel()._repr_mimebundle_(include, exclude)
-
-    @property
-    def url(self) -> str:
-        """Where the page is, while it is served."""
-        return "" if self._server is None else f"http://127.0.0.1:{self._server.port}/"
-
-    def serve(self, port: int = 0, *, open_browser: bool = False, block: bool = False) -> Workbench:
-        """Serve the page on this machine, and on it alone.
-
-        Parameters
-        ----------
-        port : int
-            0 takes a free one.
-        open_browser : bool
-            Whether to open it.
-        block : bool
-            Whether to wait until Ctrl-C ends the server.
-        """
-        from .server import Served
-
-        if self._server is not None:
-            raise FlexplantError(f"the page is served already, at {self.url}. close() it first.")
-        self._server = Served(self.panel, port)
-        if open_browser:
-            import webbrowser
-
-            webbrowser.open(self.url)
-        if block:
-            try:
-                self._server.wait()
-            finally:
-                self.close()
-        return self
-
-    def close(self) -> None:
-        """End the server and all its sessions."""
-        if self._server is not None:
-            self._server.close()
-            self._server = None
+        plant = f"{self.design.made_on or 'a plant'}{model}{fleet}"
+        return f"<{type(self).__name__} of {plant}>\n{self.design!r}"
 
 
 def _named(plant: Any) -> dict[str, Any]:
@@ -189,12 +136,12 @@ def _references(plant: Any, design: LoopDesign) -> dict[str, str]:
 
 def started(design: LoopDesign, plant: Any) -> LoopDesign:
     """Return a design with a first law in each axis."""
-    machine = Machine.on(plant, design, "")
+    machine = BenchMachine.on(plant, design, "")
     axes = {name: first_axis(machine, i, design) for i, name in enumerate(design.axes)}
     return design.replace(axes=axes)
 
 
-def first_axis(machine: Machine, axis: int, design: LoopDesign) -> ShapedAxis:
+def first_axis(machine: BenchMachine, axis: int, design: LoopDesign) -> ShapedAxis:
     """Return a first law of an axis: its crossover lies well below the resonances."""
     G = machine.G[axis, axis]
     measured = MeasuredAxis("", machine.freq, G, design.rate, True)

@@ -21,7 +21,7 @@ from ..simulation.motion import SetPoint
 from ..synthesis import LoopDesign
 from ..synthesis.laws.loop_design import axes_controller
 from .evaluation import AxisLoop
-from .machine import Machine
+from .machine import BenchMachine
 
 #: duration of a step beside the time of a crossover, and samples at most
 _PERIODS, _SAMPLES = 8.0, 20_000
@@ -51,8 +51,8 @@ class Consequences:
 class Question:
     """What is computed: a design on a machine, with a model where there is one."""
 
-    machine: Machine
-    model: Machine | None
+    machine: BenchMachine
+    model: BenchMachine | None
     larger: Any
     channel: str | None
     move: SetPoint | None
@@ -140,7 +140,7 @@ class Question:
 
 
 def step_of_model(
-    model: Machine, design: LoopDesign, name: str, duration: float
+    model: BenchMachine, design: LoopDesign, name: str, duration: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return time and error of an axis after a unit step of its reference, all axes closed."""
     axes = model.axes
@@ -152,7 +152,7 @@ def step_of_model(
         T = discretized(T, max(200.0 / duration, 4.0 * _fastest(T)))
     steps = int(np.clip(duration / T.dt, 50, _SAMPLES))
     out, _ = Recursion(T.A, T.B, T.C, T.D).run(np.ones((steps, 1)), np.zeros(T.n_states))
-    return np.arange(steps) * T.dt, 1.0 - out[:, 0]
+    return np.asarray(np.arange(steps) * T.dt), np.asarray(1.0 - out[:, 0])
 
 
 def _fastest(T: Any) -> float:
@@ -176,4 +176,4 @@ def step_of_lines(loop: AxisLoop, duration: float) -> tuple[FloatArray, FloatArr
     S[below] = loop.S[0] * (grid[below] / f[0]) ** max(slope, 1.0)
     error = np.cumsum(np.fft.irfft(S, _LINES))
     steps = int(np.clip(duration * rate, 50, _LINES // 2))
-    return np.arange(steps) / rate, error[:steps]
+    return np.asarray(np.arange(steps) / rate), np.asarray(error[:steps])

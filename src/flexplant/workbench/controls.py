@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -139,7 +140,7 @@ class ElementCards:
                 low, high = min(low, abs(value)), max(high, abs(value))
             number = Number(
                 field.label, field.unit, low, high, value,
-                lambda v, field=field: self._put(i, field, v), self._refuse,
+                partial(self._put, i, field), self._refuse,
             )  # fmt: skip
             numbers.append((field, number))
         self._numbers.append(numbers)

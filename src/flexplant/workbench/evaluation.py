@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from ..lti.between_lines import followed
 from ..lti.interconnection import loop_poles, side_by_side
 from ..synthesis import LoopDesign, ShapedAxis
 from ..synthesis.laws.law import Law
-from .machine import Machine
+from .machine import BenchMachine
 
 #: slope at the lowest lines above which an axis is a free body
 _FREE = 1.0
@@ -29,7 +30,7 @@ _NONE = NyquistCount(0)
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
+class OthersClosed:
     """An axis as its own law sees it: with the loops of the others closed."""
 
     G: ComplexArray
@@ -43,8 +44,8 @@ class AxisLoop:
     """The loop of one axis on one machine: ``L = C G``, closed by negative feedback."""
 
     name: str
-    machine: Machine
-    beside: Beside
+    machine: BenchMachine
+    beside: OthersClosed
     law: Law
     C: ComplexArray
     margins: LoopMargins
@@ -88,19 +89,21 @@ class AxisLoop:
         return None if self.count.unstable is None else not self.count.unstable
 
 
+_Kept: TypeAlias = tuple[BenchMachine, tuple[ShapedAxis, ...], OthersClosed]
+
+
 class Evaluator:
     """Evaluates axes of designs on machines; what does not change with a slider is kept."""
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[int, str], tuple[Machine, tuple[ShapedAxis, ...], Beside]] = {}
+        self._kept: dict[tuple[int, str], _Kept] = {}
 
     def loop(
-        self, machine: Machine, design: LoopDesign, name: str, *, brief: bool = False
+        self, machine: BenchMachine, design: LoopDesign, name: str, *, brief: bool = False
     ) -> AxisLoop:
         """Return the loop of one axis, the others as they are switched; brief: no bandwidth."""
-        laws = design.laws
-        law, beside = laws[name], self._beside(machine, design, name)
-        parts = self._broken(machine, design, laws, name, beside)
+        law, beside = design.laws[name], self._beside(machine, design, name)
+        parts = self._broken(machine, design, name, beside)
         rigid = 0
         if machine.is_measured:
             free = low_slope(machine.freq, beside.G[None, None]) > _FREE
@@ -118,9 +121,10 @@ class Evaluator:
         return AxisLoop(name, machine, beside, law, law.at(machine.freq), margins, count, reach)
 
     def _broken(
-        self, machine: Machine, design: LoopDesign, laws: dict[str, Law], name: str, beside: Beside
+        self, machine: BenchMachine, design: LoopDesign, name: str, beside: OthersClosed
     ) -> BrokenLoop:
         """Return the loop between law and axis, as `report_loops` takes one apart."""
+        laws = design.laws
         law = laws[name]
 
         def plant(freq: FloatArray) -> ComplexArray:
@@ -142,7 +146,7 @@ class Evaluator:
             1.0 / law.rate if law.rate else 0.0, machine.freq if machine.is_measured else None,
         )  # fmt: skip
 
-    def _beside(self, machine: Machine, design: LoopDesign, name: str) -> Beside:
+    def _beside(self, machine: BenchMachine, design: LoopDesign, name: str) -> OthersClosed:
         """Return the axis with the others closed; kept until one of them changes."""
         others = tuple(axis for n, axis in design.axes.items() if n != name)
         key = id(machine), name
@@ -158,13 +162,13 @@ def _same(one: ShapedAxis, other: ShapedAxis) -> bool:
     return one is other or (not one.closed and not other.closed)
 
 
-def _closed_beside(machine: Machine, design: LoopDesign, name: str) -> Beside:
+def _closed_beside(machine: BenchMachine, design: LoopDesign, name: str) -> OthersClosed:
     """Return ``G_aa - G_ao C_o (I + G_oo C_o)^-1 G_oa``, o the other axes that are closed."""
     names = list(design.axes)
     a = names.index(name)
     closed = tuple(n for n in names if n != name and design.axes[n].closed)
     if not closed:
-        return Beside(machine.G[a, a], lambda f: machine.respond(f)[a, a], _NONE, closed)
+        return OthersClosed(machine.G[a, a], lambda f: machine.respond(f)[a, a], _NONE, closed)
     o, laws = [names.index(n) for n in closed], [design.laws[n] for n in closed]
 
     def reduced(freq: FloatArray, G: ComplexArray) -> ComplexArray:
@@ -175,10 +179,12 @@ def _closed_beside(machine: Machine, design: LoopDesign, name: str) -> Beside:
 
     count = _others(machine, design, o, laws) if machine.is_measured else _NONE
     G = reduced(machine.freq, machine.G)
-    return Beside(G, lambda f: reduced(f, machine.respond(f)), count, closed)
+    return OthersClosed(G, lambda f: reduced(f, machine.respond(f)), count, closed)
 
 
-def _others(machine: Machine, design: LoopDesign, o: list[int], laws: list[Law]) -> NyquistCount:
+def _others(
+    machine: BenchMachine, design: LoopDesign, o: list[int], laws: list[Law]
+) -> NyquistCount:
     """Return the count of the other axes of a measured plant, this one open."""
     names, n = tuple(list(design.axes)[i] for i in o), len(o)
     chosen = np.ix_(o, o)
@@ -198,7 +204,7 @@ def _others(machine: Machine, design: LoopDesign, o: list[int], laws: list[Law])
     return broken_count(parts, rigid, 0)
 
 
-def coupling(machine: Machine, design: LoopDesign, name: str) -> dict[str, FloatArray]:
+def coupling(machine: BenchMachine, design: LoopDesign, name: str) -> dict[str, FloatArray]:
     """Return how the command of an axis moves the others, beside its own motion."""
     names = list(design.axes)
     a = names.index(name)

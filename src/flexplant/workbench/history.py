@@ -1,4 +1,4 @@
-"""History: the designs of a tab, to go back and forward; one number moved is one step."""
+"""DesignHistory: the designs of a tab, to go back and forward; one number moved is one step."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..synthesis import LoopDesign
 _MOST = 400
 
 
-class History:
+class DesignHistory:
     """Designs one after the other."""
 
     def __init__(self, first: LoopDesign) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from ..checks import FloatArray
 from ..errors import FlexplantError, ModelError
@@ -16,8 +16,87 @@ from ..plant import StandardPlant
 from ..simulation.motion import SetPoint
 from ..store import load
 from ..synthesis import LoopDesign
-from .bench import Workbench, checked_options
+from .bench import Bench, checked_options
 from .limits import LoopLimits
+from .page import Page
+from .server import Served
+
+
+class Workbench(Bench):
+    """The page of `flexplant.workbench`: it serves itself, and shows itself in a notebook.
+
+    Parameters
+    ----------
+    machines : mapping {name: plant}
+        The first is shaped.
+    design : LoopDesign
+        To begin with; `design` is what was shaped last in any tab.
+    model, larger, channel, move, limits, source
+        As for `workbench`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> mass = fx.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
+    >>> fx.workbench(mass, open_browser=False).top < 1e3  # frequencies of sliders [Hz]
+    True
+    """
+
+    _server: Served | None = None
+
+    def panel(self) -> Any:
+        """Return a page of its own, as a Panel object."""
+        return Page(self).layout
+
+    def servable(self) -> Any:
+        """Return the page for ``panel serve``."""
+        return self.panel().servable("flexplant workbench")
+
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> Any:
+        """Show the page in the cell of a notebook."""
+        return self.panel()._repr_mimebundle_(include, exclude)
+
+    @property
+    def url(self) -> str:
+        """Where the page is, while it is served."""
+        return "" if self._server is None else f"http://127.0.0.1:{self._server.port}/"
+
+    def serve(self, port: int = 0, *, open_browser: bool = False, block: bool = False) -> Self:
+        """Serve the page on this machine, and on it alone.
+
+        Parameters
+        ----------
+        port : int
+            0 takes a free one.
+        open_browser : bool
+            Whether to open it.
+        block : bool
+            Whether to wait until Ctrl-C ends the server.
+        """
+        if self._server is not None:
+            raise FlexplantError(f"the page is served already, at {self.url}. close() it first.")
+        self._server = Served(self.panel, port)
+        if open_browser:
+            import webbrowser
+
+            webbrowser.open(self.url)
+        if block:
+            self.wait()
+        return self
+
+    def wait(self) -> None:
+        """Return when Ctrl-C, or `close` in another thread, ended the server."""
+        if self._server is not None:
+            try:
+                self._server.wait()
+            finally:
+                self.close()
+
+    def close(self) -> None:
+        """End the server and all its sessions."""
+        if self._server is not None:
+            self._server.close()
+            self._server = None
 
 
 def workbench(
@@ -102,11 +181,8 @@ def workbench(
     }  # fmt: skip
     bench = Workbench.of(plant, design, options)
     if open_browser and not in_notebook():
-        bench.serve(
-            port,
-            open_browser=True,
-            block=not sys.flags.interactive and not hasattr(sys, "ps1") if block is None else block,
-        )
+        waits = not sys.flags.interactive and not hasattr(sys, "ps1")
+        bench.serve(port, open_browser=True, block=waits if block is None else block)
     return bench
 
 
@@ -155,7 +231,7 @@ def open_file(path: str | Path) -> tuple[Any, LoopDesign | None, str]:
             f"{str(file)!r} is of no kind that the workbench opens: {', '.join(readers)}."
         )
     name, read = readers[file.suffix.lower()]
-    others = {
+    others: Mapping[str, tuple[str, Callable[[Path], Any]]] = {
         "load": ("io.read_frf_npz", read_frf_npz),
         "io.read_mat": ("io.read_frf_mat", read_frf_mat),
     }

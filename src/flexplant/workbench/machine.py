@@ -1,4 +1,4 @@
-"""Machine: a plant on the bench, in the axes of a design, with what is known of its lines."""
+"""BenchMachine: a plant on the bench, in the axes of a design, with what is known of its lines."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _POINTS = 600
 
 
 @dataclass(frozen=True, eq=False)
-class Machine:
+class BenchMachine:
     """One plant in its axes; `given` is the plant as it came."""
 
     name: str
@@ -35,7 +35,7 @@ class Machine:
     axes: Axes
 
     @classmethod
-    def on(cls, plant: Any, design: LoopDesign, name: str) -> Machine:
+    def on(cls, plant: Any, design: LoopDesign, name: str) -> BenchMachine:
         """Return a plant in the axes of a design."""
         return cls(name, plant, design.placed(plant))
 

@@ -12,13 +12,14 @@ import numpy as np
 from ..errors import FlexplantError
 from ..synthesis import LoopDesign, Notch, ShapedAxis
 from . import exports, style
-from .bench import Workbench, first_axis
+from .bench import Bench, first_axis
 from .consequences import Consequences
 from .controls import ElementCards, Number
 from .evaluation import AxisLoop, Evaluator, coupling
 from .fields import added, new_elements, parsed, with_element
-from .history import History
-from .side import Side
+from .history import DesignHistory
+from .machine import BenchMachine
+from .side import SideCards
 from .tuning import Tuning
 from .verdict import of_fleet
 from .views import KEPT, Views
@@ -32,12 +33,12 @@ _NEAR = 0.06
 class Page:
     """A tab. Everything it does is a change of a LoopDesign."""
 
-    def __init__(self, bench: Workbench) -> None:
+    def __init__(self, bench: Bench) -> None:
         import panel as pn
 
         self.bench = bench
         self.limits = bench.limits
-        self.history = History(bench.start)
+        self.history = DesignHistory(bench.start)
         self.axis = next(iter(bench.start.axes))
         self.index = 0
         self.kept: list[tuple[str, LoopDesign]] = []
@@ -52,7 +53,7 @@ class Page:
         self._doc = pn.state.curdoc
         self.views = Views(self.limits)
         self._widgets()
-        self.side = Side(self)
+        self.side = SideCards(self)
         self.layout = self._layout()
         self._connect()
         self.show_controls()
@@ -74,7 +75,7 @@ class Page:
         )
         self.closed = pn.widgets.CheckButtonGroup(
             options=names, value=[n for n, a in self.design.axes.items() if a.closed],
-            button_type="success", button_style="outline", **small,
+            button_type="primary", button_style="outline", **small,
         )  # fmt: skip
         self.buttons = {
             name: pn.widgets.Button(name=text, button_style="outline", description=tip, **small)
@@ -95,10 +96,14 @@ class Page:
         self.further = pn.pane.HTML("", sizing_mode="stretch_width", margin=(3, 0, 0, 0))
         gain = self.design.axes[self.axis].gain or 1.0
         self.gain = Number(
-            "gain", "", abs(gain) / 100.0, abs(gain) * 100.0, gain, self._set_gain, self.refuse
+            "gain", "", abs(gain) / 20.0, abs(gain) * 20.0, gain, self._set_gain, self.refuse
         )
         self.crossover = pn.widgets.TextInput(
-            placeholder="e.g. 60 Hz", width=86, margin=0, height=26, stylesheets=[style.COMPACT]
+            placeholder="e.g. 60 Hz",
+            width=86,
+            margin=(0, 0, 6, 0),
+            height=26,
+            stylesheets=[style.COMPACT],
         )
         self.cards = ElementCards(self.bench.top, self._change_axis, self.refuse)
         kinds = list(new_elements(100.0, self.bench.top))
@@ -168,7 +173,7 @@ class Page:
         self.buttons["undo"].on_click(lambda _: self._go(self.history.back()))
         self.buttons["redo"].on_click(lambda _: self._go(self.history.forward()))
         self.buttons["keep"].on_click(lambda _: self._keep())
-        self.buttons["fit"].on_click(lambda _: self.loop and self.views.fit(self.loop))
+        self.buttons["fit"].on_click(lambda _: self._fit())
         self.add.on_click(lambda _: self._add())
         figure = self.views.figures["magnitude"]
         figure.on_event(PanStart, self._grasp)
@@ -235,6 +240,8 @@ class Page:
         if self.loop is not None and self.loop.margins.crossovers:
             freq = self.loop.margins.crossovers[0]
         element = new_elements(freq, self.bench.top)[self.kind.value]()
+        if isinstance(element, Notch) and self.loop is not None:
+            element = element.replace(freq=float(f"{_peak(self.loop, 1.5 * freq):.4g}"))
         self._change_axis(added(self.design.axes[self.axis], element), None, True)
 
     def _go(self, design: LoopDesign) -> None:
@@ -262,11 +269,11 @@ class Page:
         for i in range(len(KEPT)):
             loop = None
             if i < len(self.kept):
-                loop = self._evaluator.loop(self.machine, self.kept[i][1], self.axis, brief=True)
+                loop = self._brief(self.machine, self.kept[i][1])
             self.views.show_beside(f"kept {i}", loop)
 
     @property
-    def machine(self) -> Any:
+    def machine(self) -> BenchMachine:
         """The machine whose curves are drawn."""
         return self.bench.machines[self.index]
 
@@ -283,12 +290,13 @@ class Page:
         self._soon()
 
     def _switch_loops(self, event: Any) -> None:
-        axes = {n: a.replace(closed=n in event.new) for n, a in self.design.axes.items()}
-        if any(axes[n].closed != a.closed for n, a in self.design.axes.items()):
-            kept = {
-                n: a if a.closed == axes[n].closed else axes[n] for n, a in self.design.axes.items()
-            }
-            self.take(self.design.replace(axes=kept))
+        changed = {
+            name: axis.replace(closed=name in event.new)
+            for name, axis in self.design.axes.items()
+            if axis.closed != (name in event.new)
+        }
+        if changed:
+            self.take(self.design.replace(axes={**self.design.axes, **changed}))
 
     def show_controls(self) -> None:
         """Show the numbers of the design in all controls."""
@@ -306,6 +314,10 @@ class Page:
         wide = np.log(span.end / span.start)
         tall = fig.y_range.end - fig.y_range.start
         return np.hypot(np.log(np.asarray(xs) / x) / wide, (np.asarray(ys) - y) / tall)
+
+    def _fit(self) -> None:
+        if self.loop is not None:
+            self.views.fit(self.loop)
 
     def _grasp(self, event: Any) -> None:
         handles = self.views.sources["handles"].data
@@ -405,6 +417,9 @@ class Page:
             self.verdict.object = style.headline(loop)
             self._judge()
         self._later("consequences", _LATER, self._consequences)
+
+    def _brief(self, machine: BenchMachine, design: LoopDesign) -> AxisLoop:
+        return self._evaluator.loop(machine, design, self.axis, brief=True)
 
     def _draw_model(self, design: LoopDesign) -> None:
         """Draw the model beside a measurement."""
@@ -561,6 +576,16 @@ class Page:
         if self.tuning is not None:
             self.tuning.stop()
             self.tuning = None
+
+
+def _peak(loop: AxisLoop, above: float) -> float:
+    """Return where the loop gain is highest beyond its slope: what a notch is for, as a rule."""
+    inside = np.flatnonzero((loop.freq > above) & (loop.freq < 0.98 * loop.freq[-1]))
+    size = np.abs(loop.L[inside])
+    if inside.size < 3:
+        return above
+    peak = 1 + np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] > size[2:]))
+    return float(loop.freq[inside[peak[np.argmax(size[peak])]]]) if peak.size else above
 
 
 def _prefixed(size: float, unit: str) -> tuple[float, str]:

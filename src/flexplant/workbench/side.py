@@ -1,9 +1,10 @@
-"""Side: the smaller cards of the page: feedforward, limits, tuning, files."""
+"""SideCards: the smaller cards of the page: feedforward, limits, tuning, files."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ _LIMITS = (
 )  # fmt: skip
 
 
-class Side:
+class SideCards:
     """The cards beside the law; `page` is the tab that they belong to."""
 
     def __init__(self, page: Any) -> None:
@@ -35,14 +36,12 @@ class Side:
     def _card(self, name: str, *items: Any, collapsed: bool) -> Any:
         import panel as pn
 
+        inside = pn.Column(*items, margin=(0, 8, 6, 8), sizing_mode="stretch_width")
         return pn.Card(
-            *items, title=name, collapsed=collapsed, sizing_mode="stretch_width",
-            margin=(0, 0, 6, 0), styles={"background": "#FFFFFF"}, header_background="#FFFFFF",
-            stylesheets=[
-                ":host{border:1px solid #D5DADF;border-radius:6px;box-shadow:none}"
-                ".card-header{padding:3px 8px;font-size:12px}.card-title h3{font-size:12px;"
-                "font-weight:600;margin:2px}"
-            ],
+            inside, header=pn.pane.HTML(style.title(name), margin=(0, 0, 0, 4)),
+            collapsed=collapsed, sizing_mode="stretch_width", margin=(0, 0, 6, 0),
+            styles=style.CARD | {"padding": "0", "box-shadow": "none"},
+            header_background="#FFFFFF", hide_header=False,
         )  # fmt: skip
 
     def _text(self, label: str, value: str, take: Callable[[str], None], **more: Any) -> Any:
@@ -62,6 +61,8 @@ class Side:
         return text
 
     def _guarded(self, take: Callable[[str], None], text: str) -> None:
+        if self._own:
+            return
         try:
             take(text)
         except FlexplantError as problem:
@@ -71,7 +72,7 @@ class Side:
         import panel as pn
 
         self.forward = [
-            self._text(f"{term}", "", lambda text, i=i: self._put_forward(i, text), placeholder="0")
+            self._text(f"{term}", "", partial(self._put_forward, i), placeholder="0")
             for i, term in enumerate(TERMS)
         ]
         box = pn.FlexBox(*self.forward, gap="0px", sizing_mode="stretch_width")
@@ -87,7 +88,7 @@ class Side:
         import panel as pn
 
         self.limits = [
-            self._text(label, self._limit(name, unit), lambda t, n=name: self._put_limit(n, t))
+            self._text(label, self._limit(name, unit), partial(self._put_limit, name))
             for name, label, unit in _LIMITS
         ]
         box = pn.FlexBox(*self.limits, gap="0px", sizing_mode="stretch_width")
@@ -110,11 +111,7 @@ class Side:
     def _tune_card(self) -> Any:
         import panel as pn
 
-        small: dict[str, Any] = {
-            "stylesheets": [style.COMPACT],
-            "margin": (2, 4, 2, 0),
-            "height": 28,
-        }
+        small: dict[str, Any] = style.SMALL | {"margin": (2, 4, 2, 0)}
         self.start = pn.widgets.Button(name="tune", button_type="primary", width=64, **small)
         self.stop = pn.widgets.Button(
             name="stop", button_type="danger", width=56, disabled=True, **small

@@ -19,6 +19,7 @@ textarea.bk-input { height: auto; font-family: monospace; font-size: 11px; paddi
 .noUi-target { margin-top: 2px; }
 .bk-clearfix, .bk-input-group { margin: 0; }
 """
+SMALL = {"stylesheets": [COMPACT], "height": 28}
 CARD = {
     "background": "#FFFFFF", "border": "1px solid #D5DADF", "border-radius": "6px",
     "padding": "6px 8px",
@@ -62,15 +63,12 @@ def headline(loop: AxisLoop) -> str:
         f'color:#5B6670">{escape(where)}</div></td>'
         for name, value, where in figures(loop)
     )
-    reason = f'<div style="font-size:11px;color:#9A6700">{escape(loop.count.reason)}</div>'
-    said = stability(loop)
-    first, _, rest = said.partition(" if ")
+    word, how = stability(loop)
     return (
         f'<div data-verdict="{escape(loop.name)}" style="display:flex;flex-wrap:wrap;gap:4px 18px;'
-        f'align-items:center"><div style="min-width:120px"><div style="font-size:16px;'
-        f'font-weight:700;color:{_state(loop.is_stable)}">{escape(loop.name)}: {escape(first)}'
-        f'</div><div style="font-size:11px;color:#5B6670">{escape("if " + rest if rest else "")}'
-        f"</div>{reason if loop.count.reason else ''}</div>"
+        'align-items:center"><div style="min-width:120px;max-width:290px"><div style="font-size:'
+        f'16px;font-weight:700;color:{_state(loop.is_stable)}">{escape(loop.name)}: {escape(word)}'
+        f'</div><div style="font-size:11px;color:#5B6670">{escape(how)}</div></div>'
         f'<table style="border-collapse:collapse"><tr>{cells}</tr></table></div>'
     )
 

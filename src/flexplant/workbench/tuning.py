@@ -1,4 +1,4 @@
-"""Tuning: tune_loops in a process of its own, which tells how far it is and can be stopped."""
+"""Tuning: tune_loops in a process of its own, which reports how far it is and can be stopped."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def search(folder: Path, peak: float, notches: int) -> None:
     larger = load(folder / "larger.npz") if (folder / "larger.npz").exists() else None
     bars, over = bars_of_thread(), threading.Event()
 
-    def tell() -> None:
+    def report() -> None:
         seconds = 0.0
         while not over.wait(_PERIOD):
             seconds += _PERIOD
@@ -93,7 +93,7 @@ def search(folder: Path, peak: float, notches: int) -> None:
             sys.stdout.write(f"searching, {step} of {len(design.axes)}, {seconds:.0f} s\n")
             sys.stdout.flush()
 
-    threading.Thread(target=tell, daemon=True).start()
+    threading.Thread(target=report, daemon=True).start()
     measured = type(plant).__name__ == "Frf"
     more: dict[str, Any] = {"larger": larger}
     if measured:
@@ -105,7 +105,7 @@ def search(folder: Path, peak: float, notches: int) -> None:
             progress=False, **more,
         )  # fmt: skip
     over.set()
-    axes = {name: ShapedAxis(law.factors, law.gain) for name, law in found.laws.items()}
+    axes = {name: ShapedAxis(tuple(law.factors), law.gain) for name, law in found.laws.items()}
     design.replace(axes=axes).save(folder / "found.npz")
 
 

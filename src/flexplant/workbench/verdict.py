@@ -14,18 +14,16 @@ def decibels(gain: float) -> str:
     return f"{20.0 * np.log10(gain):.1f} dB" if np.isfinite(gain) and gain else "infinite"
 
 
-def stability(loop: AxisLoop) -> str:
-    """Return whether a loop is stable, with the count and what lines leave open."""
-    count = loop.count
+def stability(loop: AxisLoop) -> tuple[str, str]:
+    """Return whether a loop is stable, and how that was counted, with what lines leave open."""
+    count, measured = loop.count, loop.machine.is_measured
     if count.unstable is None:
-        return "stability not judged"
-    if count.unstable:
-        poles = f"{count.unstable} unstable pole{'s' if count.unstable > 1 else ''}"
-        return f"UNSTABLE, {poles}"
-    open_ = ""
-    if loop.machine.is_measured and count.narrowest:
-        open_ = f" if no mode is narrower than {count.narrowest:.2g} Hz (near {count.near:.4g} Hz)"
-    return f"stable{open_}"
+        return "stability not judged", count.reason
+    how = "the Nyquist count" if measured else "the poles"
+    said = f"{count.unstable} unstable pole{'' if count.unstable == 1 else 's'} by {how}"
+    if measured and count.narrowest and not count.unstable:
+        said += f", if no mode is narrower than {count.narrowest:.2g} Hz (near {count.near:.4g} Hz)"
+    return ("UNSTABLE" if count.unstable else "stable"), said
 
 
 def figures(loop: AxisLoop) -> list[tuple[str, str, str]]:

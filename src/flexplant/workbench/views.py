@@ -13,7 +13,7 @@ from .evaluation import AxisLoop
 from .limits import LoopLimits
 from .machine import DEVIATIONS
 
-#: colours that differ for colour-blind readers too: the loop, its second curve, the worst machine,
+#: colours that differ in brightness too: the loop, its second curve, the worst machine,
 #: what is forbidden, the model beside a measurement
 BLUE, ORANGE, RED, GREEN, GREY = "#0B6FB8", "#D98200", "#C23B22", "#2A8C55", "#9AA3AD"
 #: earlier designs, the latest first
@@ -21,7 +21,7 @@ KEPT = ("#8C6BB1", "#B4935A", "#6AA39B", "#B77E96")
 #: points of a pale curve: peaks stay
 _PALE = 500
 #: range of a gain below its largest value that is worth drawing [dB]
-_DEPTH = 160.0
+_DEPTH = 120.0
 #: of a Nyquist picture, around the critical point
 _NYQUIST = (-2.6, 1.2), (-1.9, 1.9)
 #: a curve beyond this is drawn on its edge, so that no line crosses the picture
@@ -65,7 +65,7 @@ class Views:
         self.figures: dict[str, Any] = {}
         for name, title in (
             ("magnitude", "loop gain |L| [dB]"), ("phase", "phase of L [deg]"),
-            ("S", "|S| and |T| [dB]"), ("KS", "|KS|: noise to command [dB]"),
+            ("S", "|S| blue, |T| orange [dB]"), ("KS", "|KS|: noise to command [dB]"),
             ("PS", "|PS|: force to motion [dB]"), ("coupling", "coupling |G_i / G_own| [dB]"),
         ):  # fmt: skip
             self.figures[name] = self._figure(title, height=170 if name == "phase" else 250)
@@ -78,9 +78,13 @@ class Views:
         self.draw_limits(limits)
 
     def _figure(self, title: str, height: int = 250, freq: bool = True, **more: Any) -> Any:
+        from bokeh.models import Range1d
         from bokeh.plotting import figure
 
-        ranges = {"x_range": self.freq_range, "x_axis_type": "log"} if freq else more
+        ranges = more
+        if freq:
+            y = Range1d(-60.0, 20.0)  # of their own: zooming stays while curves change
+            ranges = {"x_range": self.freq_range, "x_axis_type": "log", "y_range": y}
         fig = figure(
             title=title, height=height, min_width=280, sizing_mode="stretch_width",
             tools="pan,wheel_zoom,box_zoom,reset", active_scroll="wheel_zoom",
@@ -181,9 +185,10 @@ class Views:
     def _nyquist(self) -> None:
         from bokeh.models import Range1d
 
-        fig = self._figure("Nyquist: L, closed by negative feedback", height=476, freq=False)
-        fig.x_range, fig.y_range = Range1d(*_NYQUIST[0]), Range1d(*_NYQUIST[1])
-        fig.match_aspect = True
+        (left, right), (low, high) = _NYQUIST
+        ranges = {"x_range": Range1d(left, right), "y_range": Range1d(low, high)}
+        name = "Nyquist: L, closed by negative feedback"
+        fig = self._figure(name, height=476, freq=False, match_aspect=True, **ranges)
         self.figures["nyquist"] = fig
         disc = self._source("disc", x=[], y=[])
         fig.patch("x", "y", source=disc, color=RED, alpha=0.13, line_color=RED, line_alpha=0.7)
@@ -201,24 +206,26 @@ class Views:
         )  # fmt: skip
 
     def _time(self) -> None:
-        fig = self.figures["time"] = self._figure("error in time", freq=False)
+        from bokeh.models import Range1d
+
+        ranges = {"x_range": Range1d(0.0, 1.0), "y_range": Range1d(-1.0, 1.0)}
+        fig = self.figures["time"] = self._figure("error in time", freq=False, **ranges)
         for i, color in enumerate(KEPT):
             self._line("time", f"kept {i}", color, 1.2, alpha=0.55)
         self._line("time", "main", BLUE, 1.6)
         fig.xaxis.axis_label = "time [ms]"
 
     def _budget(self) -> None:
-        from bokeh.models import FactorRange
+        from bokeh.models import FactorRange, Range1d
 
         source = self._source("budget", y=[], right=[], label=[])
-        named = FactorRange(factors=[])
-        fig = self.figures["budget"] = self._figure("error by source (rms)", freq=False, y_range=named)
+        ranges = {"x_range": Range1d(0.0, 1.0), "y_range": FactorRange(factors=[""])}
+        fig = self.figures["budget"] = self._figure("error by source (rms)", freq=False, **ranges)
         fig.hbar("y", right="right", height=0.7, source=source, color=BLUE, alpha=0.75)
         fig.text(
             0, "y", text="label", source=source, text_font_size="11px", x_offset=5,
             text_baseline="middle", text_color="#1D2730",
         )  # fmt: skip
-        fig.x_range.start = 0.0
         fig.ygrid.grid_line_color = None
 
     def draw_limits(self, limits: LoopLimits) -> None:
@@ -324,30 +331,34 @@ class Views:
         i = list(loop.machine.axes.names).index(loop.name)
         own = loop.machine.G[i, i]
         self._put("coupling closed", x=freq, y=decibel(loop.beside.G / own - 1.0))
-        names = ", ".join(list(others)[:5])
-        self.figures[
-            "coupling"
-        ].title.text = f"coupling to {names}; dashed: change by their loops [dB]"
+        names = ", ".join(list(others)[:3])
+        self.figures["coupling"].title.text = f"to {names}; dashed: by their loops [dB]"
 
     def show_time(self, name: str, time: Any, error: Any, label: str = "") -> None:
         """Show the error over time [s]."""
-        self._put(f"time {name}", x=1e3 * np.asarray(time), y=np.asarray(error))
-        if label:
-            self.figures["time"].title.text = label
+        x, y = 1e3 * np.asarray(time), np.asarray(error)
+        self._put(f"time {name}", x=x, y=y)
+        fig = self.figures["time"]
+        fig.title.text = label or "error in time: none"
+        if x.size:
+            low, high = min(float(y.min()), 0.0), max(float(y.max()), 0.0)
+            room = 0.06 * ((high - low) or 1.0)
+            fig.x_range.end = float(x[-1])
+            fig.y_range.start, fig.y_range.end = low - room, high + room
 
     def show_budget(self, names: Sequence[str], rms: Sequence[float], unit: str) -> None:
         """Show the sources of the error as bars, the largest on top."""
-        factors = list(names)[::-1]
+        factors = list(names)[::-1] or [""]
         values = [float(v) for v in rms][::-1]
         fig = self.figures["budget"]
         fig.y_range.factors = factors
         fig.x_range.end = 1.05 * max(values, default=1.0) or 1.0
         fig.title.text = f"error by source, rms [{unit}]"
         labels = [f"{value:.3g}" for value in values]
-        self._put("budget", y=factors, right=values, label=labels)
+        self._put("budget", y=factors[: len(values)], right=values, label=labels)
 
     def fit(self, loop: AxisLoop) -> None:
-        """Choose all ranges for a loop: at the start, and where they are asked for anew."""
+        """Choose all ranges for a loop: at the start, and anew by a button."""
         f = loop.freq
         low = f[0] if loop.machine.is_measured else max(f[0], 0.02 * _lowest(loop))
         self.freq_range.start, self.freq_range.end = float(low), float(f[-1])
