@@ -113,10 +113,10 @@ def test_the_other_axes_count_too(frf, made):
 def test_what_is_kept_follows_the_other_axes(frf, made):
     machine, kept = on(frf, made), Evaluator()
     first = kept.loop(machine, made, "y2")
-    assert kept.loop(machine, made.with_axis("y2", law(20.0)), "y2").beside is first.beside
+    assert kept.loop(machine, made.with_axis("y2", law(20.0)), "y2").others is first.others
     changed = made.with_axis("y1", law(20.0))
     again = kept.loop(machine, changed, "y2")
-    assert again.beside is not first.beside
+    assert again.others is not first.others
     np.testing.assert_allclose(again.L, Evaluator().loop(machine, changed, "y2").L, rtol=1e-12)
 
 

@@ -20,8 +20,9 @@ from .consequences import Question
 from .limits import LoopLimits
 from .machine import BenchMachine
 
-#: first crossover beside the lowest resonance, and beside the first line, and the corners beside it
-_BELOW, _ABOVE, _APART, _ROLL = 0.12, 10.0, 3.0, 8.0
+#: first crossover beside the lowest resonance, and beside the first line; its low-pass beside it;
+#: loop gain at resonances that is small; times that the crossover is lowered until it is
+_BELOW, _ABOVE, _ROLL, _QUIET, _TRIES = 0.12, 10.0, 8.0, 0.4, 12
 
 
 class Bench:
@@ -141,27 +142,32 @@ def started(design: LoopDesign, plant: Any) -> LoopDesign:
     return design.replace(axes=axes)
 
 
-def first_axis(machine: BenchMachine, axis: int, design: LoopDesign) -> ShapedAxis:
+def first_axis(machine: BenchMachine, index: int, design: LoopDesign) -> ShapedAxis:
     """Return a first law of an axis: its crossover lies well below the resonances."""
-    G = machine.G[axis, axis]
+    G = machine.G[index, index]
     measured = MeasuredAxis("", machine.freq, G, design.rate, True)
     if machine.freq.size < 5:
         return ShapedAxis()
     first = float(measured.resonances.min(initial=measured.ceiling))
-    low = float(machine.freq[0])
-    cross = float(f"{max(_BELOW * first, min(_ABOVE * low, 0.3 * first)):.2g}")
-    top = 0.95 * measured.ceiling
-    pid = Pid.corners(
-        1.0, integrator=cross / (2 * _APART), zero=cross / _APART, pole=min(_APART * cross, top)
-    )
-    elements = (pid, LowPass(min(_ROLL * cross, top)))
-    law = ShapedAxis(elements).law
-    law = law.replace(rate=design.rate)
-    there = np.array([cross])
-    gain = 1.0 / abs(complex((law.at(there) * machine.respond(there)[axis, axis])[0]))
-    turned = np.interp(cross, machine.freq, np.unwrap(np.angle(G)))
-    sign = 1.0 if np.cos(turned) < 0.0 else -1.0  # a free body moves against its sine
-    return ShapedAxis(elements, gain=float(f"{sign * gain:.6g}"))
+    low, top = float(machine.freq[0]), 0.95 * measured.ceiling
+    cross = max(_BELOW * first, min(_ABOVE * low, 0.3 * first))
+    for _ in range(_TRIES):
+        cross = float(f"{cross:.3g}")
+        pid = Pid.corners(
+            1.0, integrator=cross / 6.0, zero=cross / 3.0, pole=min(3.0 * cross, top)
+        )  # fmt: skip
+        axis = ShapedAxis((pid, LowPass(min(_ROLL * cross, top))))
+        law, there = axis.law.replace(rate=design.rate), np.array([cross])
+        gain = 1.0 / abs(complex((law.at(there) * machine.respond(there)[index, index])[0]))
+        beyond = machine.freq > 2.0 * cross
+        size = np.abs(gain * law.at(machine.freq) * G)[beyond]
+        if size.max(initial=0.0) < _QUIET or cross < 4.0 * low:
+            break
+        cross *= 0.8
+    # a free body moves against its sine: it turns by half a turn, without a sign in it
+    turned = float(np.angle(machine.respond(there)[index, index])[0])
+    sign = 1.0 if np.cos(turned) < 0.0 else -1.0
+    return axis.replace(gain=float(f"{sign * gain:.6g}"))
 
 
 def checked_options(limits: Any, move: Any, design: Any) -> None:

@@ -117,7 +117,7 @@ class ElementCards:
 
         element = self.axis.elements[i]
         switch = pn.widgets.Checkbox(
-            name=name_of(element), value=self.axis.on[i], sizing_mode="stretch_width",
+            label=name_of(element), value=self.axis.on[i], sizing_mode="stretch_width",
             margin=(3, 0, 0, 0), stylesheets=[COMPACT, "label span{font-weight:600}"],
         )  # fmt: skip
         switch.param.watch(lambda event: self._switch(i, event.new), "value")
@@ -127,8 +127,8 @@ class ElementCards:
             ("✕", lambda: removed(self.axis, i)),
         ):  # fmt: skip
             button = pn.widgets.Button(
-                name=sign, width=28, height=24, margin=(0, 0, 0, 2), stylesheets=[COMPACT],
-                button_type="default", button_style="outline",
+                label=sign, width=28, height=24, margin=(0, 0, 0, 2), stylesheets=[COMPACT],
+                color="default", variant="outline",
             )  # fmt: skip
             button.on_click(lambda event, act=act: self._change(act(), None, True))
             buttons.append(button)

@@ -45,7 +45,7 @@ class AxisLoop:
 
     name: str
     machine: BenchMachine
-    beside: OthersClosed
+    others: OthersClosed
     law: Law
     C: ComplexArray
     margins: LoopMargins
@@ -57,10 +57,17 @@ class AxisLoop:
         """Frequencies [Hz] of the curves."""
         return self.machine.freq
 
+    @property
+    def deviation(self) -> FloatArray | None:
+        """The standard deviation of each line of the axis, where it is known."""
+        i = self.machine.axes.names.index(self.name)
+        known = self.machine.deviation
+        return None if known is None else known[i, i]
+
     @cached_property
     def L(self) -> ComplexArray:
         """The loop gain."""
-        return self.C * self.beside.G
+        return self.C * self.others.G
 
     @cached_property
     def S(self) -> ComplexArray:
@@ -81,7 +88,7 @@ class AxisLoop:
     @property
     def PS(self) -> ComplexArray:
         """From a force in the axis to its motion."""
-        return self.beside.G * self.S
+        return self.others.G * self.S
 
     @property
     def is_stable(self) -> bool | None:
@@ -121,7 +128,7 @@ class Evaluator:
         return AxisLoop(name, machine, beside, law, law.at(machine.freq), margins, count, reach)
 
     def _broken(
-        self, machine: BenchMachine, design: LoopDesign, name: str, beside: OthersClosed
+        self, machine: BenchMachine, design: LoopDesign, name: str, others: OthersClosed
     ) -> BrokenLoop:
         """Return the loop between law and axis, as `report_loops` takes one apart."""
         laws = design.laws

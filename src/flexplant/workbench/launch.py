@@ -54,6 +54,10 @@ class Workbench(Bench):
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> Any:
         """Show the page in the cell of a notebook."""
+        import panel as pn
+
+        if in_notebook():
+            pn.extension()  # once for a notebook
         return self.panel()._repr_mimebundle_(include, exclude)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections.abc import Hashable
 from functools import partial
@@ -11,6 +12,7 @@ import numpy as np
 
 from ..errors import FlexplantError
 from ..synthesis import LoopDesign, Notch, ShapedAxis
+from ..synthesis.laws.axis_law import MeasuredAxis
 from . import exports, style
 from .bench import Bench, first_axis
 from .consequences import Consequences
@@ -71,14 +73,14 @@ class Page:
         }
         names = list(self.bench.start.axes)
         self.axes = pn.widgets.RadioButtonGroup(
-            options=names, value=self.axis, button_type="primary", button_style="outline", **small
+            options=names, value=self.axis, color="primary", variant="outline", **small
         )
         self.closed = pn.widgets.CheckButtonGroup(
             options=names, value=[n for n, a in self.design.axes.items() if a.closed],
-            button_type="primary", button_style="outline", **small,
+            color="primary", variant="outline", **small,
         )  # fmt: skip
         self.buttons = {
-            name: pn.widgets.Button(name=text, button_style="outline", description=tip, **small)
+            name: pn.widgets.Button(label=text, variant="outline", description=tip, **small)
             for name, text, tip in (
                 ("undo", "↶ undo", "one step back"), ("redo", "↷ redo", "one step forward"),
                 ("keep", "keep", "keep this design as a pale curve"),
@@ -110,7 +112,7 @@ class Page:
         self.kind = pn.widgets.Select(
             options=kinds, value="notch", sizing_mode="stretch_width", **small
         )
-        self.add = pn.widgets.Button(name="+ add", button_type="primary", width=70, **small)
+        self.add = pn.widgets.Button(label="+ add", color="primary", width=70, **small)
 
     def _layout(self) -> Any:
         import panel as pn
@@ -259,7 +261,7 @@ class Page:
         buttons = []
         for (name, design), color in zip(self.kept, KEPT, strict=False):
             button = pn.widgets.Button(
-                name=name, margin=(0, 3, 0, 0), height=28, button_style="outline",
+                label=name, margin=(0, 3, 0, 0), height=28, variant="outline",
                 description="go back to this design",
                 stylesheets=[style.COMPACT, f".bk-btn{{border-color:{color};color:{color}}}"],
             )  # fmt: skip
@@ -368,8 +370,11 @@ class Page:
     def _later(self, name: str, wait: int, call: Any) -> None:
         """Call something once after a while; a newer request takes the place of an older one."""
         doc = self._doc
-        if doc is None or doc.session_context is None:  # without a server: at once
-            call()
+        if doc is None or doc.session_context is None:  # in a script at once, in a notebook later
+            try:
+                asyncio.get_running_loop().call_later(1e-3 * wait, call)
+            except RuntimeError:
+                call()
             return
         if name in self._waiting:
             if name == "draw":  # it is drawn soon, with what is there then
@@ -579,13 +584,14 @@ class Page:
 
 
 def _peak(loop: AxisLoop, above: float) -> float:
-    """Return where the loop gain is highest beyond its slope: what a notch is for, as a rule."""
-    inside = np.flatnonzero((loop.freq > above) & (loop.freq < 0.98 * loop.freq[-1]))
-    size = np.abs(loop.L[inside])
-    if inside.size < 3:
-        return above
-    peak = 1 + np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] > size[2:]))
-    return float(loop.freq[inside[peak[np.argmax(size[peak])]]]) if peak.size else above
+    """Return the resonance beyond a frequency where the loop gain is highest: notches are there."""
+    variance = None if loop.deviation is None else loop.deviation**2
+    axis = MeasuredAxis("", loop.freq, loop.others.G, loop.law.rate, True, variance)
+    found = axis.resonances[axis.resonances > above] if loop.freq.size > 4 else np.zeros(0)
+    if not found.size:
+        return 2.0 * above
+    size = np.abs(loop.L[np.searchsorted(loop.freq, found)])
+    return float(found[np.argmax(size)])
 
 
 def _prefixed(size: float, unit: str) -> tuple[float, str]:

@@ -48,7 +48,7 @@ class SideCards:
         import panel as pn
 
         text = pn.widgets.TextInput(
-            name=label,
+            label=label,
             value=value,
             width=100,
             margin=(0, 4, 4, 0),
@@ -112,11 +112,11 @@ class SideCards:
         import panel as pn
 
         small: dict[str, Any] = style.SMALL | {"margin": (2, 4, 2, 0)}
-        self.start = pn.widgets.Button(name="tune", button_type="primary", width=64, **small)
+        self.start = pn.widgets.Button(label="tune", color="primary", width=64, **small)
         self.stop = pn.widgets.Button(
-            name="stop", button_type="danger", width=56, disabled=True, **small
+            label="stop", color="danger", width=56, disabled=True, **small
         )
-        self.anew = pn.widgets.Button(name="first law", width=74, button_style="outline", **small)
+        self.anew = pn.widgets.Button(label="first law", width=74, variant="outline", **small)
         self.notches = pn.widgets.Select(options=[0, 1, 2, 3, 4, 5], value=3, width=56, **small)
         self.tuned = pn.pane.HTML(
             style.note("all axes, highest bandwidth below the peak of |S|"), margin=0
@@ -148,7 +148,7 @@ class SideCards:
         buttons = [
             pn.widgets.FileDownload(
                 callback=lambda make=make: self._made(make), filename=file, label=f"save {label}",
-                button_style="outline", height=28, margin=(0, 4, 4, 0), embed=False, auto=True,
+                variant="outline", height=28, margin=(0, 4, 4, 0), embed=False, auto=True,
                 stylesheets=[style.COMPACT],
             )
             for label, file, make in kinds
@@ -158,7 +158,7 @@ class SideCards:
             stylesheets=[style.COMPACT], max_length=200_000,
         )  # fmt: skip
         copy = pn.widgets.Button(
-            name="copy as Python", button_style="outline", height=28, margin=(0, 4, 4, 0),
+            label="copy as Python", variant="outline", height=28, margin=(0, 4, 4, 0),
             stylesheets=[style.COMPACT],
         )  # fmt: skip
         copy.js_on_click(

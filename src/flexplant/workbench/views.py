@@ -257,12 +257,11 @@ class Views:
         f, L = loop.freq, loop.L
         self._curves("main", loop)
         self._put("S T", x=f, y=decibel(loop.T))
-        deviation = loop.machine.deviation
-        i = list(loop.machine.axes.names).index(loop.name)
-        if deviation is not None:
-            wide = DEVIATIONS * np.abs(loop.C) * deviation[i, i]
+        if loop.deviation is not None:
+            wide = DEVIATIONS * np.abs(loop.C) * loop.deviation
             high, low = np.abs(L) + wide, np.maximum(np.abs(L) - wide, 1e-3 * np.abs(L))
             self._put("band", x=f, low=decibel(low), high=decibel(high))
+        i = loop.machine.axes.names.index(loop.name)
         marked = loop.machine.unresolved(i)
         self._put("unresolved", x=f[marked], y=decibel(L[marked]))
         closest = -1.0 + 0.0j
@@ -328,9 +327,9 @@ class Views:
         """Show how the axis moves the others, and how their loops change it."""
         for k, values in enumerate(list(others.values())[:5]):
             self._put(f"coupling {k}", x=freq, y=decibel(values))
-        i = list(loop.machine.axes.names).index(loop.name)
+        i = loop.machine.axes.names.index(loop.name)
         own = loop.machine.G[i, i]
-        self._put("coupling closed", x=freq, y=decibel(loop.beside.G / own - 1.0))
+        self._put("coupling closed", x=freq, y=decibel(loop.others.G / own - 1.0))
         names = ", ".join(list(others)[:3])
         self.figures["coupling"].title.text = f"to {names}; dashed: by their loops [dB]"
 

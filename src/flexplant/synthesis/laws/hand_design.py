@@ -78,11 +78,13 @@ class ShapedAxis(Value):
         forward = tuple(number(one, "feedforward") for one in self.feedforward)
         if len(forward) > len(TERMS):
             raise ShapeError(f"feedforward has up to {len(TERMS)} gains ({', '.join(TERMS)}).")
+        while forward and not forward[-1]:
+            forward = forward[:-1]
         self._set(
             elements=tuple(elements),
             gain=gain,
             on=tuple(on or [True] * len(elements)),
-            feedforward=forward if any(forward) else (),
+            feedforward=forward,
             closed=flag(self.closed, "closed"),
         )
 
