@@ -4,6 +4,8 @@ import ctypes
 import io
 import shutil
 import subprocess
+import sys
+import types
 import zipfile
 
 import numpy as np
@@ -369,6 +371,10 @@ def test_a_notebook_shows_the_page_in_its_cell(frf, monkeypatch):
     import panel as pn
 
     monkeypatch.setattr(pn.extension, "_loaded", True)  # as pn.extension() does in a notebook
+    for name in ("IPython", "IPython.display"):  # Panel says there which document is shown
+        shell = types.ModuleType(name)
+        shell.display, shell.get_ipython = (lambda *args, **more: None), (lambda: None)
+        monkeypatch.setitem(sys.modules, name, shell)
     bundle, _ = bench._repr_mimebundle_()
     assert "text/html" in bundle
     assert repr(bench).startswith("<Workbench of Frf: u1 -> y1")

@@ -143,31 +143,36 @@ def started(design: LoopDesign, plant: Any) -> LoopDesign:
 
 
 def first_axis(machine: BenchMachine, index: int, design: LoopDesign) -> ShapedAxis:
-    """Return a first law of an axis: its crossover lies well below the resonances."""
+    """Return a first law of an axis: its loop gain is small at the resonances."""
     G = machine.G[index, index]
     measured = MeasuredAxis("", machine.freq, G, design.rate, True)
     if machine.freq.size < 5:
         return ShapedAxis()
-    first = float(measured.resonances.min(initial=measured.ceiling))
-    low, top = float(machine.freq[0]), 0.95 * measured.ceiling
+    first, low = float(measured.resonances.min(initial=measured.ceiling)), float(machine.freq[0])
     cross = max(_BELOW * first, min(_ABOVE * low, 0.3 * first))
     for _ in range(_TRIES):
-        cross = float(f"{cross:.3g}")
-        pid = Pid.corners(
-            1.0, integrator=cross / 6.0, zero=cross / 3.0, pole=min(3.0 * cross, top)
-        )  # fmt: skip
-        axis = ShapedAxis((pid, LowPass(min(_ROLL * cross, top))))
-        law, there = axis.law.replace(rate=design.rate), np.array([cross])
-        gain = 1.0 / abs(complex((law.at(there) * machine.respond(there)[index, index])[0]))
+        axis = crossing_axis(machine, index, design, cross)
         beyond = machine.freq > 2.0 * cross
-        size = np.abs(gain * law.at(machine.freq) * G)[beyond]
-        if size.max(initial=0.0) < _QUIET or cross < 4.0 * low:
+        L = axis.law.replace(rate=design.rate).at(machine.freq) * G
+        if np.abs(L[beyond]).max(initial=0.0) < _QUIET or cross < 4.0 * low:
             break
         cross *= 0.8
-    # a free body moves against its sine: it turns by half a turn, without a sign in it
-    turned = float(np.angle(machine.respond(there)[index, index])[0])
-    sign = 1.0 if np.cos(turned) < 0.0 else -1.0
-    return axis.replace(gain=float(f"{sign * gain:.6g}"))
+    return axis
+
+
+def crossing_axis(
+    machine: BenchMachine, index: int, design: LoopDesign, cross: float
+) -> ShapedAxis:
+    """Return PID and low-pass around a crossover [Hz], with the sign of the plant."""
+    cross = float(f"{cross:.3g}")
+    top = 0.95 * (min(machine.freq[-1], 0.45 * design.rate) if design.rate else machine.freq[-1])
+    pid = Pid.corners(1.0, integrator=cross / 6.0, zero=cross / 3.0, pole=min(3.0 * cross, top))
+    axis = ShapedAxis((pid, LowPass(min(_ROLL * cross, top))))
+    there = np.array([cross])
+    G = complex(machine.respond(there)[index, index][0])
+    gain = 1.0 / abs(complex(axis.law.replace(rate=design.rate).at(there)[0]) * G)
+    # a free body is half a turn behind its force, where the sign is right
+    return axis.replace(gain=float(f"{gain if G.real < 0.0 else -gain:.6g}"))
 
 
 def checked_options(limits: Any, move: Any, design: Any) -> None:

@@ -109,23 +109,23 @@ class Evaluator:
         self, machine: BenchMachine, design: LoopDesign, name: str, *, brief: bool = False
     ) -> AxisLoop:
         """Return the loop of one axis, the others as they are switched; brief: no bandwidth."""
-        law, beside = design.laws[name], self._beside(machine, design, name)
-        parts = self._broken(machine, design, name, beside)
+        law, others = design.laws[name], self._with_others(machine, design, name)
+        parts = self._broken(machine, design, name, others)
         rigid = 0
         if machine.is_measured:
-            free = low_slope(machine.freq, beside.G[None, None]) > _FREE
+            free = low_slope(machine.freq, others.G[None, None]) > _FREE
             rigid = int(free and design.rigid > 0)
-        count = broken_count(parts, rigid, design.unstable + (beside.count.unstable or 0))
-        if beside.count.unstable is None:  # the count of this axis rests on that of the others
-            count = NyquistCount(None, f"the other axes: {beside.count.reason}")
-        elif beside.count.narrowest > count.narrowest:
-            count = count._replace(narrowest=beside.count.narrowest, near=beside.count.near)
+        count = broken_count(parts, rigid, design.unstable + (others.count.unstable or 0))
+        if others.count.unstable is None:  # the count of this axis rests on that of the others
+            count = NyquistCount(None, f"the other axes: {others.count.reason}")
+        elif others.count.narrowest > count.narrowest:
+            count = count._replace(narrowest=others.count.narrowest, near=others.count.near)
         margins = broken_margins(parts, "y")[0]
         reach = float("nan")
         if not brief and not count.unstable:
             with suppress(AssumptionError):  # |S| nowhere below 1
                 reach = broken_bandwidth(parts)
-        return AxisLoop(name, machine, beside, law, law.at(machine.freq), margins, count, reach)
+        return AxisLoop(name, machine, others, law, law.at(machine.freq), margins, count, reach)
 
     def _broken(
         self, machine: BenchMachine, design: LoopDesign, name: str, others: OthersClosed
@@ -136,13 +136,13 @@ class Evaluator:
 
         def plant(freq: FloatArray) -> ComplexArray:
             if machine.is_measured:
-                return followed(machine.freq, beside.G, freq)[None, None]
-            return beside.respond(freq)[None, None]
+                return followed(machine.freq, others.G, freq)[None, None]
+            return others.respond(freq)[None, None]
 
         def poles() -> ComplexArray:
             if machine.is_measured:
                 return law.system.poles()
-            chosen = [n for n in design.axes if n == name or n in beside.closed]
+            chosen = [n for n in design.axes if n == name or n in others.closed]
             inputs = [machine.axes.before.inputs[list(design.axes).index(n)] for n in chosen]
             each = [(-laws[n].system).replace(dt=machine.axes.plant.dt) for n in chosen]
             K = side_by_side(each, chosen).replace(inputs=chosen, outputs=inputs)
@@ -153,14 +153,14 @@ class Evaluator:
             1.0 / law.rate if law.rate else 0.0, machine.freq if machine.is_measured else None,
         )  # fmt: skip
 
-    def _beside(self, machine: BenchMachine, design: LoopDesign, name: str) -> OthersClosed:
+    def _with_others(self, machine: BenchMachine, design: LoopDesign, name: str) -> OthersClosed:
         """Return the axis with the others closed; kept until one of them changes."""
         others = tuple(axis for n, axis in design.axes.items() if n != name)
         key = id(machine), name
         known = self._kept.get(key)
         if known and known[0] is machine and all(map(_same, known[1], others)):
             return known[2]
-        found = _closed_beside(machine, design, name)
+        found = _closed_around(machine, design, name)
         self._kept[key] = machine, others, found
         return found
 
@@ -169,7 +169,7 @@ def _same(one: ShapedAxis, other: ShapedAxis) -> bool:
     return one is other or (not one.closed and not other.closed)
 
 
-def _closed_beside(machine: BenchMachine, design: LoopDesign, name: str) -> OthersClosed:
+def _closed_around(machine: BenchMachine, design: LoopDesign, name: str) -> OthersClosed:
     """Return ``G_aa - G_ao C_o (I + G_oo C_o)^-1 G_oa``, o the other axes that are closed."""
     names = list(design.axes)
     a = names.index(name)

@@ -14,7 +14,7 @@ from ..errors import FlexplantError
 from ..synthesis import LoopDesign, Notch, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
 from . import exports, style
-from .bench import Bench, first_axis
+from .bench import Bench, crossing_axis, first_axis
 from .consequences import Consequences
 from .controls import ElementCards, Number
 from .evaluation import AxisLoop, Evaluator, coupling
@@ -107,6 +107,10 @@ class Page:
             height=26,
             stylesheets=[style.COMPACT],
         )
+        self.anew = pn.widgets.Button(
+            label="new law", width=74, variant="outline", **small,
+            description="PID and low-pass around this crossover, or well below the resonances",
+        )  # fmt: skip
         self.cards = ElementCards(self.bench.top, self._change_axis, self.refuse)
         kinds = list(new_elements(100.0, self.bench.top))
         self.kind = pn.widgets.Select(
@@ -133,7 +137,7 @@ class Page:
             name, label("axis"), self.axes, *several, *fleet, *self.buttons.values(), self.kept_row,
             styles=style.CARD, margin=(0, 0, 6, 0), align_items="center", gap="4px 2px", **wide,
         )  # fmt: skip
-        cross = pn.Row(label("crossover at"), self.crossover, margin=0, **wide)
+        cross = pn.Row(label("crossover at"), self.crossover, self.anew, margin=0, **wide)
         law = pn.Column(
             pn.pane.HTML(style.title("law of the axis"), margin=0), self.gain.row, cross,
             self.cards.column, pn.Row(self.kind, self.add, margin=0, **wide), styles=style.CARD,
@@ -176,6 +180,7 @@ class Page:
         self.buttons["redo"].on_click(lambda _: self._go(self.history.forward()))
         self.buttons["keep"].on_click(lambda _: self._keep())
         self.buttons["fit"].on_click(lambda _: self._fit())
+        self.anew.on_click(lambda _: self.start_anew())
         self.add.on_click(lambda _: self._add())
         figure = self.views.figures["magnitude"]
         figure.on_event(PanStart, self._grasp)
@@ -222,16 +227,23 @@ class Page:
     def _set_gain(self, value: float) -> None:
         self._change_axis(self.design.axes[self.axis].replace(gain=value), "gain", False)
 
-    def _cross_at(self, event: Any) -> None:
-        """Set the gain so that the loop crosses 1 at a frequency."""
-        if not event.new or self.loop is None:
-            return
+    def _wanted(self) -> float | None:
+        """Return the crossover that is typed, if one is."""
+        if not self.crossover.value or self.loop is None:
+            return None
         try:
-            freq = parsed(event.new)
+            freq = parsed(self.crossover.value)
             if not self.loop.freq[0] <= freq <= self.loop.freq[-1]:
                 raise FlexplantError(f"{freq:g} Hz is no frequency of this plant's lines.")
         except FlexplantError as problem:
             self.refuse(str(problem))
+            return None
+        return freq
+
+    def _cross_at(self, event: Any) -> None:
+        """Set the gain so that the loop crosses 1 at a frequency."""
+        freq = self._wanted()
+        if freq is None or self.loop is None:
             return
         there = np.exp(np.interp(np.log(freq), np.log(self.loop.freq), np.log(np.abs(self.loop.L))))
         gain = float(f"{self.design.axes[self.axis].gain / there:.6g}")
@@ -572,9 +584,13 @@ class Page:
         self.take(now.replace(axes=given.axes))
 
     def start_anew(self) -> None:
-        """Take a first law of the axis, well below the resonances."""
-        i = list(self.design.axes).index(self.axis)
-        self._change_axis(first_axis(self.machine, i, self.design), None, True)
+        """Take a new law of the axis: around the crossover that is typed, else a first one."""
+        i, freq = list(self.design.axes).index(self.axis), self._wanted()
+        if freq is None:
+            self._change_axis(first_axis(self.machine, i, self.design), None, True)
+        else:
+            axis = crossing_axis(self.machine, i, self.design, freq)
+            self._change_axis(axis, None, True)
 
     def close(self) -> None:
         """End what the tab has started."""

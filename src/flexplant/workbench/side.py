@@ -116,16 +116,14 @@ class SideCards:
         self.stop = pn.widgets.Button(
             label="stop", color="danger", width=56, disabled=True, **small
         )
-        self.anew = pn.widgets.Button(label="first law", width=74, variant="outline", **small)
         self.notches = pn.widgets.Select(options=[0, 1, 2, 3, 4, 5], value=3, width=56, **small)
         self.tuned = pn.pane.HTML(
             style.note("all axes, highest bandwidth below the peak of |S|"), margin=0
         )
         self.start.on_click(lambda _: self.page.tune(int(self.notches.value)))
         self.stop.on_click(lambda _: self.page.stop_tuning())
-        self.anew.on_click(lambda _: self.page.start_anew())
         label = pn.pane.HTML(style.note("notches"), margin=(8, 4, 0, 0))
-        row = pn.Row(self.start, self.stop, label, self.notches, self.anew, margin=0)
+        row = pn.Row(self.start, self.stop, label, self.notches, margin=0)
         return self._card("automatic", row, self.tuned, collapsed=False)
 
     def show_tuning(self, said: str, running: bool) -> None:
