@@ -14,11 +14,10 @@ from ..checks import ComplexArray, FloatArray
 from ..errors import AssumptionError
 from ..loop import LoopMargins
 from ..loop.broken import BrokenLoop
-from ..loop.hidden_modes import low_slope
 from ..loop.report import NyquistCount, broken_count, broken_margins
 from ..loop.sensitivity import broken_bandwidth
-from ..lti.between_lines import followed
 from ..lti.interconnection import loop_poles, side_by_side
+from ..lti.measured_lines import followed, low_slope
 from ..synthesis import LoopDesign, ShapedAxis
 from ..synthesis.laws.law import Law
 from .machine import BenchMachine

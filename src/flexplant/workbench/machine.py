@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray
-from ..lti.between_lines import followed
 from ..lti.frequency import Frf
-from ..lti.grid import resonance_grid
+from ..lti.frequency_sweep import resonance_grid
+from ..lti.measured_lines import followed
 from ..lti.responses import Responder, responder
 from ..synthesis import LoopDesign
 from ..synthesis.laws.loop_design import Axes

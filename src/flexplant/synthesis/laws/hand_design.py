@@ -422,7 +422,7 @@ def _channels(given: Any, side: str, names: tuple[str, ...], prefix: str) -> tup
 
 def _free_axes(axes: Axes) -> int:
     """Return how many axes of a measured plant fall with slope 2 at their lowest lines."""
-    from ...loop.hidden_modes import low_slope
+    from ...lti.measured_lines import low_slope
 
     frf = axes.plant
     if frf.freq.size < 5:
