@@ -1,5 +1,9 @@
 """Plants for the workbench: a mass with a mode of 0.1 %, measured and as a model; coupled axes."""
 
+import ctypes
+import subprocess
+import zipfile
+
 import numpy as np
 
 import flexplant as fx
@@ -69,3 +73,30 @@ def closed_poles(P, K):
     assert not np.any(P.D)
     A = np.block([[P.A + P.B @ K.D @ P.C, P.B @ K.C], [K.B @ eye @ P.C, K.A]])
     return np.linalg.eigvals(A)
+
+
+def by_matrices(K, error):
+    """The commands of a controller for its first input, by its matrices alone."""
+    x, found = np.zeros(K.n_states), []
+    for e in error:
+        found.append((K.C @ x + K.D[:, 0] * e)[0])
+        x = K.A @ x + K.B[:, 0] * e
+    return np.array(found)
+
+
+def by_c(archive, folder, error):
+    """The same by the C files of an archive, compiled."""
+    with zipfile.ZipFile(archive) as files:
+        assert sorted(files.namelist()) == ["loops.c", "loops.h"]
+        files.extractall(folder)
+    library = folder / "loops.so"
+    words = ["cc", "-std=c99", "-O1", "-shared", "-fPIC", "-o", library, folder / "loops.c"]
+    subprocess.run(words, check=True, timeout=60)
+    code, state = ctypes.CDLL(str(library)), ctypes.create_string_buffer(1 << 16)
+    value, out, found = ctypes.c_double(), ctypes.c_double(), []
+    code.loops_reset(state)
+    for e in error:
+        value.value = e
+        code.loops_step(state, ctypes.byref(value), ctypes.byref(out))
+        found.append(out.value)
+    return np.array(found)

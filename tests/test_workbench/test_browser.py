@@ -1,14 +1,12 @@
 """The page in a real browser: dragged, typed, exported, reloaded; safe, for this machine only."""
 
 import asyncio
-import ctypes
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
-import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -16,7 +14,17 @@ import numpy as np
 import pytest
 
 import flexplant as fx
-from bench_plants import MODE, RATE, closed_poles, coupled, design, light, measured
+from bench_plants import (
+    MODE,
+    RATE,
+    by_c,
+    by_matrices,
+    closed_poles,
+    coupled,
+    design,
+    light,
+    measured,
+)
 
 pytest.importorskip("panel", reason="the workbench needs panel")
 
@@ -163,7 +171,10 @@ def test_a_loop_is_shaped_in_a_browser(browser, served, plant, tmp_path):
     with page.expect_download() as download:
         page.get_by_text("save C99").click()
     download.value.save_as(tmp_path / "loops.zip")
-    compare_c(tmp_path, served.design.controller())
+    error = np.random.default_rng(0).normal(size=200)
+    wanted = by_matrices(served.design.controller(), error)
+    found = by_c(tmp_path / "loops.zip", tmp_path, error)
+    np.testing.assert_allclose(found, wanted, rtol=1e-7)
     # saved, everything undone, loaded again
     with page.expect_download() as download:
         page.get_by_text("save design").click()
@@ -216,21 +227,6 @@ def handle_of(page, freq):
         freq,
     )
     return [float(v) for v in found]
-
-
-def compare_c(folder, K):
-    with zipfile.ZipFile(folder / "loops.zip") as archive:
-        archive.extractall(folder)
-    library = folder / "loops.so"
-    words = ["cc", "-std=c99", "-shared", "-fPIC", "-o", library, folder / "loops.c"]
-    subprocess.run(words, check=True, timeout=60)
-    code, state = ctypes.CDLL(str(library)), (ctypes.c_double * K.n_states)()
-    value, out, x = ctypes.c_double(), ctypes.c_double(), np.zeros(K.n_states)
-    for e in np.random.default_rng(0).normal(size=200):
-        value.value = e
-        code.loops_step(state, ctypes.byref(value), ctypes.byref(out))
-        assert out.value == pytest.approx((K.C @ x + K.D[:, 0] * e)[0], rel=1e-9)
-        x = K.A @ x + K.B[:, 0] * e
 
 
 def test_two_tabs_and_a_closed_one(browser, served):

@@ -1,12 +1,9 @@
 """The page without a browser: each change is one of a LoopDesign, errors leave the last good."""
 
-import ctypes
 import io
 import shutil
-import subprocess
 import sys
 import types
-import zipfile
 
 import numpy as np
 import pytest
@@ -14,7 +11,18 @@ import scipy.io
 from scipy import signal
 
 import flexplant as fx
-from bench_plants import MODE, RATE, closed_poles, coupled, design, law, light, measured
+from bench_plants import (
+    MODE,
+    RATE,
+    by_c,
+    by_matrices,
+    closed_poles,
+    coupled,
+    design,
+    law,
+    light,
+    measured,
+)
 from flexplant.synthesis import FixedBlock, LoopDesign, ShapedAxis
 from flexplant.workbench import exports
 from flexplant.workbench.consequences import step_of_lines, step_of_model
@@ -152,10 +160,10 @@ def test_a_handle_is_dragged_a_machine_is_clicked(frf):
         x, y = MODE, 0.0
 
     Event.y = float(np.interp(MODE, page.loop.freq, page.views.sources["magnitude main"].data["y"]))
-    page._grasp(Event)
+    page.gestures.grasp(Event)
     Event.x, Event.y = 310.0, Event.y - 6.0
-    page._drag(Event)
-    page._drop(Event)
+    page.gestures.drag(Event)
+    page.gestures.drop(Event)
     notch = page.design.axes["y1"].elements[2]
     assert notch.freq == 310.0
     assert notch.depth == pytest.approx(0.1 * 10 ** (-6 / 20), rel=0.02)
@@ -165,7 +173,7 @@ def test_a_handle_is_dragged_a_machine_is_clicked(frf):
     third = page.fleet[2]
     Event.x = 1.3 * MODE
     Event.y = float(20 * np.log10(np.abs(np.interp(Event.x, third.freq, np.abs(third.L)))))
-    page._tap("magnitude", Event)
+    page.gestures.tap("magnitude", Event)
     assert page.machine.name == "stage 3"
     assert page.loop.machine is page.machine
 
@@ -212,24 +220,10 @@ def test_what_is_exported_is_the_controller(page, tmp_path):
     """C compiled, sections, MATLAB and the script against the matrices, over 400 samples."""
     K = page.design.controller()
     error = np.random.default_rng(1).normal(size=400)
-    x, wanted = np.zeros(K.n_states), []
-    for e in error:
-        wanted.append((K.C @ x + K.D[:, 0] * e)[0])
-        x = K.A @ x + K.B[:, 0] * e
-    with zipfile.ZipFile(io.BytesIO(exports.c_code(page.design))) as archive:
-        assert sorted(archive.namelist()) == ["loops.c", "loops.h"]
-        archive.extractall(tmp_path)
+    wanted = by_matrices(K, error)
     if shutil.which("cc"):
-        library = tmp_path / "loops.so"
-        words = ["cc", "-std=c99", "-shared", "-fPIC", "-o", library, tmp_path / "loops.c"]
-        subprocess.run(words, check=True, timeout=60)
-        code, state = ctypes.CDLL(str(library)), (ctypes.c_double * max(K.n_states, 1))()
-        value, out, found = ctypes.c_double(), ctypes.c_double(), []
-        for e in error:
-            value.value = e
-            code.loops_step(state, ctypes.byref(value), ctypes.byref(out))
-            found.append(out.value)
-        np.testing.assert_allclose(found, wanted, rtol=1e-9)
+        found = by_c(io.BytesIO(exports.c_code(page.design)), tmp_path, error)
+        np.testing.assert_allclose(found, wanted, rtol=1e-7)
     table = np.genfromtxt(
         io.BytesIO(exports.sections(page.design)), delimiter=",", skip_header=1, usecols=range(2, 8)
     )

@@ -18,7 +18,8 @@ from .bench import Bench, crossing_axis, first_axis
 from .consequences import Consequences
 from .controls import ElementCards, Number
 from .evaluation import AxisLoop, Evaluator, coupling
-from .fields import added, new_elements, parsed, with_element
+from .fields import added, new_elements, parsed
+from .gestures import Gestures
 from .history import DesignHistory
 from .machine import BenchMachine
 from .side import SideCards
@@ -28,8 +29,6 @@ from .views import KEPT, Views
 
 #: of a burst of moves only the last is drawn; what takes longer waits until a hand rests [ms]
 _SOON, _LATER, _POLL = 12, 350, 300
-#: how near to a machine's curve a click has to be, beside the picture
-_NEAR = 0.06
 
 
 class Page:
@@ -50,7 +49,7 @@ class Page:
         self._evaluator = Evaluator()
         self._serial = self._working = 0
         self._waiting: dict[str, Any] = {}
-        self._dragged: int | None = None
+        self.gestures = Gestures(self)
         self._fitted = False
         self._doc = pn.state.curdoc
         self.views = Views(self.limits)
@@ -111,7 +110,7 @@ class Page:
             label="new law", width=74, variant="outline", **small,
             description="PID and low-pass around this crossover, or well below the resonances",
         )  # fmt: skip
-        self.cards = ElementCards(self.bench.top, self._change_axis, self.refuse)
+        self.cards = ElementCards(self.bench.top, self.change_axis, self.refuse)
         kinds = list(new_elements(100.0, self.bench.top))
         self.kind = pn.widgets.Select(
             options=kinds, value="notch", sizing_mode="stretch_width", **small
@@ -170,7 +169,6 @@ class Page:
 
     def _connect(self) -> None:
         import panel as pn
-        from bokeh.events import Pan, PanEnd, PanStart, Tap
 
         self.axes.param.watch(self._other_axis, "value")
         self.closed.param.watch(self._switch_loops, "value")
@@ -182,12 +180,7 @@ class Page:
         self.buttons["fit"].on_click(lambda _: self._fit())
         self.anew.on_click(lambda _: self.start_anew())
         self.add.on_click(lambda _: self._add())
-        figure = self.views.figures["magnitude"]
-        figure.on_event(PanStart, self._grasp)
-        figure.on_event(Pan, self._drag)
-        figure.on_event(PanEnd, self._drop)
-        for name in ("magnitude", "S"):
-            self.views.figures[name].on_event(Tap, partial(self._tap, name))
+        self.gestures.connect()
         if pn.state.curdoc is not None and pn.state.curdoc.session_context:
             pn.state.on_session_destroyed(lambda _: self.close())
 
@@ -208,24 +201,25 @@ class Page:
         self.history.add(design, key)
         if cards:
             self.show_controls()
-        self._soon()
+        self.soon()
 
     def refuse(self, text: str) -> None:
         """Say what is wrong; the last good design stands."""
         self.message.object = style.error(text)
         self.message.visible = True
 
-    def _change_axis(self, axis: ShapedAxis, key: Hashable, cards: bool) -> None:
+    def change_axis(self, axis: ShapedAxis, key: Hashable, cards: bool) -> None:
+        """Take a changed axis; changes of one key are one step, `cards` shows it everywhere."""
         design = self.design.with_axis(self.axis, axis)
         self.take(design, None if key is None else (self.axis, key), cards=cards)
         self.cards.axis = self.design.axes[self.axis]
 
     def change(self, key: Hashable = None, **changes: Any) -> None:
         """Change fields of the axis that is shaped."""
-        self._change_axis(self.design.axes[self.axis].replace(**changes), key, True)
+        self.change_axis(self.design.axes[self.axis].replace(**changes), key, True)
 
     def _set_gain(self, value: float) -> None:
-        self._change_axis(self.design.axes[self.axis].replace(gain=value), "gain", False)
+        self.change_axis(self.design.axes[self.axis].replace(gain=value), "gain", False)
 
     def _wanted(self) -> float | None:
         """Return the crossover that is typed, if one is."""
@@ -256,11 +250,11 @@ class Page:
         element = new_elements(freq, self.bench.top)[self.kind.value]()
         if isinstance(element, Notch) and self.loop is not None:
             element = element.replace(freq=float(f"{_peak(self.loop, 1.5 * freq):.4g}"))
-        self._change_axis(added(self.design.axes[self.axis], element), None, True)
+        self.change_axis(added(self.design.axes[self.axis], element), None, True)
 
     def _go(self, design: LoopDesign) -> None:
         self.show_controls()
-        self._soon()
+        self.soon()
 
     def _keep(self) -> None:
         """Keep the design as a pale curve, and a button to go back to it."""
@@ -296,12 +290,12 @@ class Page:
         self._fitted = False
         self.show_controls()
         self._show_kept()
-        self._soon()
+        self.soon()
 
     def _other_machine(self, event: Any) -> None:
         self.index = int(event.new)
         self._show_kept()
-        self._soon()
+        self.soon()
 
     def _switch_loops(self, event: Any) -> None:
         changed = {
@@ -320,62 +314,9 @@ class Page:
         self.closed.value = [n for n, a in self.design.axes.items() if a.closed]
         self.side.show(axis)
 
-    # -- dragging and clicking in the pictures --------------------------------------------------
-
-    def _reach(self, x: float, y: float, xs: Any, ys: Any) -> Any:
-        """Return distances to points of the magnitude picture, beside its size."""
-        fig, span = self.views.figures["magnitude"], self.views.freq_range
-        wide = np.log(span.end / span.start)
-        tall = fig.y_range.end - fig.y_range.start
-        return np.hypot(np.log(np.asarray(xs) / x) / wide, (np.asarray(ys) - y) / tall)
-
     def _fit(self) -> None:
         if self.loop is not None:
             self.views.fit(self.loop)
-
-    def _grasp(self, event: Any) -> None:
-        handles = self.views.sources["handles"].data
-        self._dragged = None
-        if event.x is None or event.x <= 0.0 or not len(handles["x"]):
-            return
-        distance = self._reach(event.x, event.y, handles["x"], handles["y"])
-        nearest = int(np.argmin(distance))
-        if distance[nearest] < _NEAR:
-            self._dragged = int(handles["at"][nearest])
-            self._height = event.y
-
-    def _drag(self, event: Any) -> None:
-        if self._dragged is None or event.x is None or not 0.0 < event.x < self.bench.top:
-            return
-        axis = self.design.axes[self.axis]
-        element: Any = axis.elements[self._dragged].replace(freq=float(f"{event.x:.4g}"))
-        if isinstance(element, Notch):  # up and down: its depth
-            depth = element.depth * 10.0 ** ((event.y - self._height) / 20.0)
-            element = element.replace(depth=float(f"{min(max(depth, 1e-3), 10.0):.3g}"))
-        self._height = event.y
-        self._change_axis(with_element(axis, self._dragged, element), ("drag", self._dragged), True)
-
-    def _drop(self, event: Any) -> None:
-        if self._dragged is not None:
-            self._drag(event)
-        self._dragged = None
-        self._soon()
-
-    def _tap(self, name: str, event: Any) -> None:
-        """Take the machine of a fleet whose curve is clicked."""
-        if len(self.bench.machines) < 2 or event.x is None or event.x <= 0.0:
-            return
-        from .views import decibel
-
-        fig = self.views.figures[name]
-        tall = fig.y_range.end - fig.y_range.start
-        distances = []
-        for loop in self.fleet:
-            curve = decibel(loop.L if name == "magnitude" else loop.S)
-            distances.append(abs(float(np.interp(event.x, loop.freq, curve)) - event.y) / tall)
-        nearest = int(np.argmin(distances))
-        if distances[nearest] < _NEAR:
-            self.machines.value = nearest
 
     # -- drawing --------------------------------------------------------------------------------
 
@@ -399,7 +340,8 @@ class Page:
 
         self._waiting[name] = doc.add_timeout_callback(run, wait)
 
-    def _soon(self) -> None:
+    def soon(self) -> None:
+        """Draw once when a burst of changes is over."""
         self._later("draw", _SOON, self.draw)
 
     def draw(self) -> None:
@@ -424,7 +366,7 @@ class Page:
         with hold():
             self.message.visible = False
             # a handle that is dragged is where the hand is
-            self.views.update(loop, design.axes[self.axis], handles=self._dragged is None)
+            self.views.update(loop, design.axes[self.axis], handles=self.gestures.at is None)
             if not self._fitted:
                 self.views.fit(loop)
                 self.views.show_coupling(loop.freq, coupling(self.machine, design, self.axis), loop)
@@ -570,7 +512,7 @@ class Page:
                     if isinstance(one, float)
                     else added(axis, one)
                 )
-            self._change_axis(axis, None, True)
+            self.change_axis(axis, None, True)
         except FlexplantError as problem:
             self.refuse(str(problem))
 
@@ -587,10 +529,10 @@ class Page:
         """Take a new law of the axis: around the crossover that is typed, else a first one."""
         i, freq = list(self.design.axes).index(self.axis), self._wanted()
         if freq is None:
-            self._change_axis(first_axis(self.machine, i, self.design), None, True)
+            self.change_axis(first_axis(self.machine, i, self.design), None, True)
         else:
             axis = crossing_axis(self.machine, i, self.design, freq)
-            self._change_axis(axis, None, True)
+            self.change_axis(axis, None, True)
 
     def close(self) -> None:
         """End what the tab has started."""
