@@ -60,7 +60,7 @@ class Bench:
         given = {n: options[n] for n in names if options.get(n) is not None}
         model = options.get("model")
         first = next(iter(machines.values()))
-        if isinstance(first, Frf) and model is not None:  # a model says how axes are decoupled
+        if design is None and isinstance(first, Frf) and model is not None:  # its axes
             given = _of_model(model, given)
         if design is None:
             design = started(LoopDesign.on(first, **given), first)
