@@ -15,13 +15,14 @@ from ..lti.frequency_sweep import resonance_grid
 from ..lti.measured_lines import followed
 from ..lti.responses import Responder, responder
 from ..synthesis import LoopDesign
+from ..synthesis.laws.axis_law import MeasuredAxis
 from ..synthesis.laws.loop_design import Axes
 
 #: standard deviations of a line that the band around it shows
 DEVIATIONS = 2.0
 #: change from a peak to its neighbour, beside the peak, above which fewer than four lines lie
-#: within the half-power width of a mode, and in standard deviations
-_STEP, _CLEAR = 0.5, 3.0
+#: within the half-power width of a mode
+_STEP = 0.5
 #: logarithmic part of the frequencies at which a model is drawn
 _POINTS = 600
 
@@ -74,12 +75,13 @@ class BenchMachine:
     def unresolved(self, axis: int) -> npt.NDArray[np.bool_]:
         """Return the lines of an axis at a peak that is narrower than its lines resolve."""
         marked = np.zeros(self.freq.size, dtype=bool)
-        if not self.is_measured or self.freq.size < 3:
+        if not self.is_measured or self.freq.size < 5:
             return marked
-        G, size = self.G[axis, axis], np.abs(self.G[axis, axis])
+        variance = None if self.deviation is None else self.deviation[axis, axis] ** 2
+        G, rate = self.G[axis, axis], self.axes.rate
+        found = MeasuredAxis("", self.freq, G, rate, True, variance).resonances
+        peak = np.searchsorted(self.freq, found)
         step = np.abs(np.diff(G))
-        peak = 1 + np.flatnonzero((size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:]))
-        jump = np.maximum(step[peak], step[peak - 1])
-        clear = 0.0 if self.deviation is None else _CLEAR * self.deviation[axis, axis, peak]
-        marked[peak[(jump > _STEP * size[peak]) & (jump > clear)]] = True
+        jump = np.maximum(step[np.minimum(peak, step.size - 1)], step[peak - 1])
+        marked[peak[jump > _STEP * np.abs(G[peak])]] = True
         return marked

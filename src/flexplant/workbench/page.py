@@ -51,6 +51,7 @@ class Page:
         self._waiting: dict[str, Any] = {}
         self.gestures = Gestures(self)
         self._fitted = False
+        self._loaded = pn.state.curdoc is None or pn.state.curdoc.session_context is None
         self._doc = pn.state.curdoc
         self.views = Views(self.limits)
         self._widgets()
@@ -183,6 +184,7 @@ class Page:
         self.gestures.connect()
         if pn.state.curdoc is not None and pn.state.curdoc.session_context:
             pn.state.on_session_destroyed(lambda _: self.close())
+            pn.state.onload(self._begin)
 
     # -- the design and its changes -------------------------------------------------------------
 
@@ -428,9 +430,14 @@ class Page:
 
     # -- what takes longer ----------------------------------------------------------------------
 
+    def _begin(self) -> None:
+        """Begin with what takes longer when the page is on the screen."""
+        self._loaded = True
+        self._consequences()
+
     def _consequences(self) -> None:
         """Compute in a thread what a slider must not wait for."""
-        if self.loop is None or self._working:
+        if self.loop is None or self._working or not self._loaded:
             return
         serial, design, loop = self._serial, self.design, self.loop
         question, doc = self.bench.question_of(self.index), self._doc
