@@ -141,7 +141,7 @@ def test_a_fleet_in_words():
         BenchMachine.on(light(f), made, f"machine {i}")
         for i, f in enumerate((300.0, 303.0, 297.0, 330.0), 1)
     ]
-    loops = [Evaluator().loop(m, made, "y1", brief=True) for m in machines]
+    loops = [Evaluator().loop(m, made, "y1") for m in machines]
     sizes = [np.abs(closed_poles(m.given, made.controller())).max() for m in machines]
     assert [one.is_stable for one in loops] == [size < 1.0 for size in sizes]
     text, worst = of_fleet(loops)

@@ -15,8 +15,8 @@ from .style import COMPACT, ELEMENT, OFF
 
 #: takes a changed axis, a key by which changes of one number are one step, and whether cards change
 Change = Callable[[ShapedAxis, Hashable, bool], None]
-#: steps of a slider in a decade
-_STEPS = 200
+#: steps of a slider in a decade, and what Panel waits for more moves of it [ms]
+_STEPS, _WAIT = 200, 1
 
 
 class Number:
@@ -38,6 +38,8 @@ class Number:
         self.text = pn.widgets.TextInput(
             width=86, height=26, margin=(0, 0, 2, 0), stylesheets=[COMPACT]
         )
+        # Panel waits 50 ms for more of the same; the page has its own way with bursts of moves
+        self.slider._debounce = _WAIT
         self.show(value)
         self.slider.param.watch(self._slid, "value")
         self.text.param.watch(self._typed, "value")

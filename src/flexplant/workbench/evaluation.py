@@ -46,10 +46,30 @@ class AxisLoop:
     machine: BenchMachine
     others: OthersClosed
     law: Law
-    C: ComplexArray
-    margins: LoopMargins
+    parts: BrokenLoop
     count: NyquistCount
-    bandwidth: float
+
+    @cached_property
+    def C(self) -> ComplexArray:
+        """The law."""
+        return self.law.at(self.freq)
+
+    @cached_property
+    def margins(self) -> LoopMargins:
+        """Crossovers and margins, each with its frequency."""
+        return broken_margins(self.parts, "y")[0]
+
+    @cached_property
+    def modulus_margin(self) -> float:
+        """The least distance to -1 on what is followed of the loop; that of `margins` at least."""
+        return float(np.abs(1.0 - self.parts.gain(self.parts.followed, "y")).min())
+
+    @cached_property
+    def bandwidth(self) -> float:
+        """The frequency [Hz] at which |S| first crosses 1; NaN where none is, or of no use."""
+        with suppress(AssumptionError):
+            return float("nan") if self.count.unstable else broken_bandwidth(self.parts)
+        return float("nan")
 
     @property
     def freq(self) -> FloatArray:
@@ -104,10 +124,8 @@ class Evaluator:
     def __init__(self) -> None:
         self._kept: dict[tuple[int, str], _Kept] = {}
 
-    def loop(
-        self, machine: BenchMachine, design: LoopDesign, name: str, *, brief: bool = False
-    ) -> AxisLoop:
-        """Return the loop of one axis, the others as they are switched; brief: no bandwidth."""
+    def loop(self, machine: BenchMachine, design: LoopDesign, name: str) -> AxisLoop:
+        """Return the loop of one axis, the others as they are switched."""
         law, others = design.laws[name], self._with_others(machine, design, name)
         parts = self._broken(machine, design, name, others)
         rigid = 0
@@ -119,12 +137,7 @@ class Evaluator:
             count = NyquistCount(None, f"the other axes: {others.count.reason}")
         elif others.count.narrowest > count.narrowest:
             count = count._replace(narrowest=others.count.narrowest, near=others.count.near)
-        margins = broken_margins(parts, "y")[0]
-        reach = float("nan")
-        if not brief and not count.unstable:
-            with suppress(AssumptionError):  # |S| nowhere below 1
-                reach = broken_bandwidth(parts)
-        return AxisLoop(name, machine, others, law, law.at(machine.freq), margins, count, reach)
+        return AxisLoop(name, machine, others, law, parts, count)
 
     def _broken(
         self, machine: BenchMachine, design: LoopDesign, name: str, others: OthersClosed

@@ -28,7 +28,7 @@ from .verdict import of_fleet
 from .views import KEPT, Views
 
 #: of a burst of moves only the last is drawn; what takes longer waits until a hand rests [ms]
-_SOON, _LATER, _POLL = 12, 350, 300
+_SOON, _LATER, _POLL = 3, 350, 300
 
 
 class Page:
@@ -279,7 +279,7 @@ class Page:
         for i in range(len(KEPT)):
             loop = None
             if i < len(self.kept):
-                loop = self._brief(self.machine, self.kept[i][1])
+                loop = self._of(self.machine, self.kept[i][1])
             self.views.show_beside(f"kept {i}", loop)
 
     @property
@@ -354,9 +354,7 @@ class Page:
         try:
             loop = self._evaluator.loop(self.machine, design, self.axis)
             fleet = [
-                loop
-                if m is self.machine
-                else self._evaluator.loop(m, design, self.axis, brief=True)
+                loop if m is self.machine else self._evaluator.loop(m, design, self.axis)
                 for m in self.bench.machines
             ]
         except (FlexplantError, np.linalg.LinAlgError) as problem:
@@ -379,16 +377,14 @@ class Page:
             self._judge()
         self._later("consequences", _LATER, self._consequences)
 
-    def _brief(self, machine: BenchMachine, design: LoopDesign) -> AxisLoop:
-        return self._evaluator.loop(machine, design, self.axis, brief=True)
+    def _of(self, machine: BenchMachine, design: LoopDesign) -> AxisLoop:
+        return self._evaluator.loop(machine, design, self.axis)
 
     def _draw_model(self, design: LoopDesign) -> None:
         """Draw the model beside a measurement."""
         model = self.bench.model
         if model is not None and model is not self.machine and self.machine.is_measured:
-            self.views.show_beside(
-                "model", self._evaluator.loop(model, design, self.axis, brief=True)
-            )
+            self.views.show_beside("model", self._evaluator.loop(model, design, self.axis))
 
     def _draw_fleet(self) -> None:
         if len(self.fleet) < 2:
@@ -425,7 +421,8 @@ class Page:
         if answer.left_out:
             rows.append(("modes left out", answer.left_out, answer.left_out_fine))
         if np.isfinite(answer.rms):
-            rows.append((f"rms of {answer.channel}", f"{answer.rms:.4g} {answer.unit}", None))
+            scale, unit = _prefixed(answer.rms, answer.unit)
+            rows.append((f"rms of {answer.channel}", f"{scale * answer.rms:.4g} {unit}", None))
         return [*rows, *(("not computed", text, None) for text in answer.missing)]
 
     # -- what takes longer ----------------------------------------------------------------------

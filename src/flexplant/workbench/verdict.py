@@ -49,9 +49,7 @@ def figures(loop: AxisLoop) -> list[tuple[str, str, str]]:
 def of_fleet(loops: Sequence[AxisLoop]) -> tuple[str, int]:
     """Return the verdict of a fleet in words, and the machine that is worst."""
     stable = [loop.is_stable is True for loop in loops]
-    margins = [
-        loop.margins.modulus_margin if ok else -1.0 for loop, ok in zip(loops, stable, strict=True)
-    ]
+    margins = [loop.modulus_margin if ok else -1.0 for loop, ok in zip(loops, stable, strict=True)]
     unstable = [loop for loop in loops if loop.is_stable is False]
     worst = int(np.argmin(margins))
     unknown = sum(loop.is_stable is None for loop in loops)
@@ -67,10 +65,7 @@ def of_fleet(loops: Sequence[AxisLoop]) -> tuple[str, int]:
         if any(stable):
             left = min(
                 (one for one, ok in zip(loops, stable, strict=True) if ok),
-                key=lambda one: one.margins.modulus_margin,
+                key=lambda one: one.modulus_margin,
             )
-            text += (
-                f"; least margin of the others {left.margins.modulus_margin:.2f} on "
-                f"{left.machine.name}"
-            )
+            text += f"; least margin of the others {left.modulus_margin:.2f} on {left.machine.name}"
     return text, worst

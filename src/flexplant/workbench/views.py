@@ -19,7 +19,7 @@ BLUE, ORANGE, RED, GREEN, GREY = "#0B6FB8", "#D98200", "#C23B22", "#2A8C55", "#9
 #: earlier designs, the latest first
 KEPT = ("#8C6BB1", "#B4935A", "#6AA39B", "#B77E96")
 #: points of a pale curve: peaks stay
-_PALE = 500
+_PALE = 360
 #: range of a gain below its largest value that is worth drawing [dB]
 _DEPTH = 120.0
 #: of a Nyquist picture, around the critical point
@@ -37,11 +37,11 @@ def thinned(freq: FloatArray, values: FloatArray, points: int = _PALE) -> tuple[
     """Return a curve of fewer points that keeps the largest of each part, in order."""
     if freq.size <= points:
         return freq, values
-    part = np.floor(np.linspace(0, points // 2, freq.size, endpoint=False)).astype(int)
-    first = np.flatnonzero(np.r_[True, np.diff(part) > 0])
-    ends = np.r_[first[1:], freq.size]
-    high = [a + int(np.argmax(values[a:b])) for a, b in zip(first, ends, strict=True)]
-    keep = np.union1d(first, high)
+    step = -(-2 * freq.size // points)
+    parts = freq.size // step
+    highest = np.argmax(values[: parts * step].reshape(parts, step), axis=1)
+    starts = np.arange(0, freq.size, step)
+    keep = np.union1d(np.append(starts, freq.size - 1), starts[:parts] + highest)
     return freq[keep], values[keep]
 
 
@@ -61,6 +61,7 @@ class Views:
         from bokeh.models import ColumnDataSource, Range1d
 
         self.sources: dict[str, ColumnDataSource] = {}
+        self._drawn: dict[str, Any] = {}
         self.freq_range = Range1d(1.0, 1e3)
         self.figures: dict[str, Any] = {}
         for name, title in (
@@ -102,8 +103,6 @@ class Views:
         fig.grid.grid_line_color = "#E7EAED"
         fig.outline_line_color = "#C9CFD5"
         fig.min_border = 4
-        if freq:
-            fig.xgrid.minor_grid_line_color = "#F2F4F6"
         return fig
 
     def _source(self, key: str, /, **columns: Any) -> Any:
@@ -115,15 +114,16 @@ class Views:
     def _line(
         self, figure: str, curve: str, color: str, width: float = 1.6, /, **look: Any
     ) -> None:
-        """Draw a line of a source of its own."""
-        self.figures[figure].line(
-            "x",
-            "y",
-            source=self._source(f"{figure} {curve}"),
-            color=color,
-            line_width=width,
-            **look,
-        )
+        """Draw a line of a source of its own; the cursor reads the main one."""
+        from bokeh.models import HoverTool
+
+        fig, source = self.figures[figure], self._source(f"{figure} {curve}")
+        drawn = fig.line("x", "y", source=source, color=color, line_width=width, **look)
+        drawn.visible = curve == "main"  # the browser reads the style of each that is visible
+        self._drawn[f"{figure} {curve}"] = drawn
+        if curve == "main" and figure not in ("nyquist", "time"):
+            tips = [("f", "@x{0.00} Hz"), ("", "@y{0.00}")]
+            fig.add_tools(HoverTool(tooltips=tips, mode="vline", renderers=[drawn]))
 
     def _pale(self, figure: str) -> None:
         """Draw what lies behind the loop: machines, the worst, earlier designs."""
@@ -250,7 +250,14 @@ class Views:
 
     def _put(self, key: str, /, **data: Any) -> None:
         source = self.sources[key]
-        source.data = data
+        if key in self._drawn and self._drawn[key].visible != bool(len(data["x"])):
+            self._drawn[key].visible = not self._drawn[key].visible
+        same = "x" in data and data.keys() == source.data.keys()
+        if same and np.array_equal(data["x"], source.data["x"]):
+            for name in data.keys() - {"x"}:  # the rest only: frequencies stay as they are
+                source.data[name] = data[name]
+        else:
+            source.data = data
 
     def update(self, loop: AxisLoop, axis: ShapedAxis, *, handles: bool = True) -> None:
         """Show a loop; nothing else changes, no range either."""

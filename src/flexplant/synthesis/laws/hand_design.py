@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -277,7 +278,7 @@ class LoopDesign(Value):
         require_known("axis", [name], self.axes)
         return self.replace(axes={**self.axes, name: axis})
 
-    @property
+    @cached_property
     def laws(self) -> dict[str, Law]:
         """The law of each axis, at the rate of the controller.
 
