@@ -47,13 +47,16 @@ def main(words: list[str] | None = None) -> int:
     except (FlexplantError, OSError) as problem:
         sys.stderr.write(f"{problem}\n")
         return 1
-    sys.stdout.write(f"flexplant workbench at {bench.url}, Ctrl-C ends it\n")
-    sys.stdout.flush()
-    if not given.no_browser:
-        import webbrowser
+    try:
+        sys.stdout.write(f"flexplant workbench at {bench.url}, Ctrl-C ends it\n")
+        sys.stdout.flush()
+        if not given.no_browser:
+            import webbrowser
 
-        webbrowser.open(bench.url)
-    bench.wait()
+            webbrowser.open(bench.url)
+        bench.wait()
+    except KeyboardInterrupt:  # before it waits
+        bench.close()
     return 0
 
 

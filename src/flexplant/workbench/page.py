@@ -478,17 +478,26 @@ class Page:
         if self._doc is not None:
             self._polled = self._doc.add_periodic_callback(self._poll, _POLL)
 
+    def _tuned(self) -> Tuning | None:
+        """Return the search, which is over for the page."""
+        tuning, self.tuning = self.tuning, None
+        if tuning is not None and self._doc is not None:
+            self._doc.remove_periodic_callback(self._polled)
+        return tuning
+
     def _poll(self) -> None:
         if self.tuning is None:
             return
         if self.tuning.is_running:
             self.side.show_tuning(self.tuning.said, True)
             return
-        tuning, self.tuning = self.tuning, None
-        self._doc.remove_periodic_callback(self._polled)
+        tuning = self._tuned()
+        if tuning is None:
+            return
         try:
+            found = tuning.result()
             self._keep()
-            self.take(tuning.result())
+            self.take(found)
             self.side.show_tuning("taken; what was before is kept", False)
         except FlexplantError as problem:
             self.refuse(str(problem))
@@ -496,10 +505,9 @@ class Page:
 
     def stop_tuning(self) -> None:
         """End the search; the design stays."""
-        if self.tuning is not None:
-            self.tuning.stop()
-            self.tuning = None
-            self._doc.remove_periodic_callback(self._polled)
+        tuning = self._tuned()
+        if tuning is not None:
+            tuning.stop()
             self.side.show_tuning("stopped; the design is as it was", False)
 
     def hand_over(self, data: bytes) -> None:
