@@ -107,6 +107,7 @@ def test_a_loop_is_shaped_in_a_browser(browser, served, plant, tmp_path):
     page.mouse.move(knob["x"] + 5, knob["y"] + 9, steps=2)
     page.mouse.up()
     tab.until(lambda: served.design.axes["y1"].gain != before)
+    page.wait_for_timeout(500)  # the hand is off the slider, its last step is drawn
     gain = served.design.axes["y1"].gain
     assert np.sign(gain - before) == -1.0
     assert np.abs(closed_poles(plant, served.design.controller())).max() < 1.0
