@@ -63,6 +63,7 @@ room below has its own page, ``help(fx.plant)``: what it is for, an example, its
   numbers and figures: `examples/paper_plate.py`
 - estimate from records: `examples/recorded_data.py`; a POI that moves: `examples/moving_poi.py`
 - control six axes: `examples/maglev.py`
+- shape loops by hand in a browser, on measured responses: `examples/workbench.py`
 - follow set-points: `examples/feedforward.py`
 - guarantee robustness: `examples/robust_control.py`
 - join components: `examples/joined_machine.py`

@@ -21,7 +21,7 @@ class Judged(NamedTuple):
     met: bool | None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LoopLimits(Value):
     """Limits on each loop: None leaves one out.
 
