@@ -42,7 +42,7 @@ class Page:
         self.history = DesignHistory(bench.start)
         self.axis = next(iter(bench.start.axes))
         self.index = 0
-        self.kept: list[tuple[str, LoopDesign]] = []
+        self.kept: list[tuple[str, LoopDesign, Consequences | None]] = []
         self.loop: AxisLoop | None = None
         self.answer: Consequences | None = None
         self.tuning: Tuning | None = None
@@ -260,14 +260,15 @@ class Page:
 
     def _keep(self) -> None:
         """Keep the design as a pale curve, and a button to go back to it."""
-        self.kept = [(f"design {len(self.kept) + 1}", self.design), *self.kept][: len(KEPT)]
+        first = f"design {len(self.kept) + 1}", self.design, self.answer
+        self.kept = [first, *self.kept][: len(KEPT)]
         self._show_kept()
 
     def _show_kept(self) -> None:
         import panel as pn
 
         buttons = []
-        for (name, design), color in zip(self.kept, KEPT, strict=False):
+        for (name, design, _), color in zip(self.kept, KEPT, strict=False):
             button = pn.widgets.Button(
                 label=name, margin=(0, 3, 0, 0), height=28, variant="outline",
                 description="go back to this design",
@@ -276,11 +277,10 @@ class Page:
             button.on_click(lambda _, design=design: self.take(design))
             buttons.append(button)
         self.kept_row[:] = buttons
-        for i in range(len(KEPT)):
-            loop = None
-            if i < len(self.kept):
-                loop = self._of(self.machine, self.kept[i][1])
-            self.views.show_beside(f"kept {i}", loop)
+        for i, (_, design, answer) in enumerate(self.kept):
+            self.views.show_beside(f"kept {i}", self._of(self.machine, design))
+            if answer is not None:
+                self.views.show_time(f"kept {i}", answer.time, answer.error)
 
     @property
     def machine(self) -> BenchMachine:

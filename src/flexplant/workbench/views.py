@@ -308,6 +308,9 @@ class Views:
         self._put(f"KS {name}", x=f, y=decibel(loop.KS))
         self._put(f"PS {name}", x=f, y=decibel(loop.PS))
         near = _bounded(L)
+        if name == "main":  # on the wrong side of -1
+            color = RED if loop.is_stable is False else BLUE
+            self._drawn["nyquist main"].glyph.line_color = color
         self._put(f"nyquist {name}", x=near.real, y=near.imag)
 
     def show_beside(self, name: str, loop: AxisLoop | None) -> None:
@@ -341,9 +344,11 @@ class Views:
         self.figures["coupling"].title.text = f"to {names}; dashed: by their loops [dB]"
 
     def show_time(self, name: str, time: Any, error: Any, label: str = "") -> None:
-        """Show the error over time [s]."""
+        """Show the error over time [s]; of the main curve all is seen."""
         x, y = 1e3 * np.asarray(time), np.asarray(error)
         self._put(f"time {name}", x=x, y=y)
+        if name != "main":
+            return
         fig = self.figures["time"]
         fig.title.text = label or "error in time: none"
         if x.size:

@@ -144,11 +144,12 @@ class LoopDesign(Value):
     >>> import flexplant as fx
     >>> from flexplant.synthesis import LoopDesign, ShapedAxis
     >>> elements = [fx.Pid(9e4), fx.Lead(50.0), fx.LowPass(500.0)]
-    >>> design = LoopDesign.on(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), {"y1": ShapedAxis(elements)})
-    >>> design.loops(fx.lti.tf([1.0], [1.0, 0.0, 0.0])).report.is_stable
+    >>> mass = fx.lti.tf([1.0], [1.0, 0.0, 0.0])
+    >>> design = LoopDesign.on(mass, {"out": ShapedAxis(elements)})
+    >>> design.loops(mass).report.is_stable
     True
-    >>> design.controller().outputs
-    ('u1',)
+    >>> design.controller().inputs, design.controller().outputs
+    (('out',), ('in',))
     """
 
     axes: Mapping[str, ShapedAxis]
