@@ -9,8 +9,8 @@
 The page shows L, Nyquist, S, T, KS, PS, the error in time and by source, the modes left out, and
 every machine of a fleet while a slider moves. What it makes is a `fx.synthesis.LoopDesign`, the
 elements of each axis, on or off: it saves, loads, and writes the script that makes it again. It
-needs Panel: ``pip install 'flexplant[workbench]'``. It is served to this machine only, reads no pickle,
-and opens no file but those whose path it was given. `examples/workbench.py` is its story.
+needs Panel: ``pip install 'flexplant[workbench]'``. It is served to this machine only, reads no
+pickle, and opens no file but those whose path it was given. `examples/workbench.py` is its story.
 
 >>> import flexplant as fx
 >>> mass = fx.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
