@@ -346,6 +346,18 @@ def test_files_that_hold_a_plant(frf, tmp_path, capsys):
         again = {"fx": fx}
         exec(line, again)
         assert again["plant"].freq.size == frf.freq.size
+    pyuff = pytest.importorskip("pyuff")
+    record = {
+        "type": 58, "func_type": 4, "rsp_node": 41, "rsp_dir": 3, "ref_node": 41, "ref_dir": 3,
+        "data": frf.data[0, 0], "x": frf.freq, "id1": "", "abscissa_spacing": 1,
+        "abscissa_inc": 0.25, "abscissa_min": 0.25, "spec_data_type": 18,
+        "abscissa_spec_data_type": 18, "ordinate_spec_data_type": 8, "ordinate_axis_units_lab": "m",
+        "orddenom_spec_data_type": 13, "orddenom_axis_units_lab": "N",
+    }  # fmt: skip
+    pyuff.UFF(str(tmp_path / "e.uff")).write_sets(record, mode="overwrite")
+    plant, _, line = open_file(tmp_path / "e.uff")
+    np.testing.assert_allclose(plant.data, frf.data, rtol=1e-6)
+    assert line.startswith("plant = fx.io.read_frf_uff(")
     design(frf, **SAMPLED).save(tmp_path / "design.npz")
     assert open_file(tmp_path / "design.npz")[1].rate == RATE
     with pytest.raises(fx.FlexplantError, match="no kind that the workbench opens"):
