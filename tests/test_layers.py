@@ -34,12 +34,13 @@ ROOMS = (
     "testbeds",
     "io",
     "plot",
+    "workbench",
     "documentation",
 )
 LEVEL = {
     name: i for i, room in enumerate(ROOMS) for name in ([room] if isinstance(room, str) else room)
 }
-HEAVY = {"matplotlib", "control", "cvxpy", "clarabel", "filterpy", "tqdm"}
+HEAVY = {"matplotlib", "control", "cvxpy", "clarabel", "filterpy", "tqdm", "panel", "bokeh"}
 MODULES = sorted(ROOT.rglob("*.py"))
 LONGEST = 600
 

@@ -54,6 +54,7 @@ ROOMS = {
     ),
     *("loop", "estimation", "synthesis", "placement", "simulation", "testbeds", "io", "errors"),
     "plot",
+    "workbench",
 }
 
 

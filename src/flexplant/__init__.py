@@ -63,6 +63,7 @@ room below has its own page, ``help(fx.plant)``: what it is for, an example, its
   numbers and figures: `examples/paper_plate.py`
 - estimate from records: `examples/recorded_data.py`; a POI that moves: `examples/moving_poi.py`
 - control six axes: `examples/maglev.py`
+- shape loops by hand in a browser, on measured responses: `examples/workbench.py`
 - follow set-points: `examples/feedforward.py`
 - guarantee robustness: `examples/robust_control.py`
 - join components: `examples/joined_machine.py`
@@ -259,9 +260,9 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> _Any:
-    """Import the pictures at their first use (they need matplotlib); say which room has a name."""
-    if name == "plot":
-        return _import_module(".plot", __name__)
+    """Import the last rooms at their first use (they need more); say which room has a name."""
+    if name in ("plot", "workbench"):
+        return _import_module(f".{name}", __name__)
     rooms = [n for n, v in globals().items() if hasattr(v, "__path__") and hasattr(v, name)]
     where = "".join(f" Use flexplant.{room}.{name}." for room in rooms)
     ours = _import_module(".foreign_names", __name__).OURS.get(name)
@@ -274,4 +275,6 @@ def __dir__() -> list[str]:
     """Return the public names, and the rooms that hold the others."""
     items = [(name, item) for name, item in globals().items() if not name.startswith("_")]
     names = {n for n, v in items if getattr(v, "__module__", "").startswith(__name__)}
-    return sorted(names | {n for n, v in items if hasattr(v, "__path__")} | {"errors", "plot"})
+    return sorted(
+        names | {n for n, v in items if hasattr(v, "__path__")} | {"errors", "plot", "workbench"}
+    )

@@ -463,6 +463,11 @@ def tick(description: str) -> None:
         bars[-1].advance()
 
 
+def bars_of_thread() -> list[Progress]:
+    """Return the list of work under way in this thread, the innermost last: it goes on changing."""
+    return _open_bars()
+
+
 def watched() -> Any:
     """Return the stream of a terminal or notebook that somebody sees; None in pipes and files."""
     if sys.stderr is not None and sys.stderr.isatty():

@@ -45,6 +45,8 @@ class LoopMargins(Value):
         Least distance to the critical point, 1 / max |S|.
     freq : float [Hz]
         Where it is.
+    gain_freq, phase_freq : float [Hz]
+        Where the nearer of both gain margins and the phase margin are; NaN where there are none.
 
     Examples
     --------
@@ -64,6 +66,8 @@ class LoopMargins(Value):
     phase_margin: float
     modulus_margin: float
     freq: float
+    gain_freq: float = float("nan")
+    phase_freq: float = float("nan")
 
     def __repr__(self) -> str:
         first = ", ".join(f"{f:.4g}" for f in self.crossovers[:4])
@@ -215,10 +219,25 @@ def report_loops(
     (True, 41)
     """
     rigid, unstable = whole(rigid, "rigid", minimum=0), whole(unstable, "unstable", minimum=0)
-    parts = taken_apart(loop)
+    return broken_report(taken_apart(loop), at, rigid, unstable)
+
+
+def broken_report(
+    parts: BrokenLoop, at: Literal["u", "y"], rigid: int, unstable: int
+) -> LoopReport:
+    """Return the report of a loop that is taken apart; parameters as for `report_loops`."""
+    count = broken_count(parts, rigid, unstable)
+    loops = broken_margins(parts, at)
+    scaled = 0.0 if count.unstable else 1.0 / parts.worst(at, len(loops) > 1)[0]
+    units = parts.mixed(at)
+    margin = scaled if units or count.unstable else 1.0 / parts.worst(at, False)[0]
+    return LoopReport(loops, margin, *count, scaled_margin=scaled, units=units)
+
+
+def broken_margins(parts: BrokenLoop, at: Literal["u", "y"]) -> tuple[LoopMargins, ...]:
+    """Return crossovers and margins of each loop, the others closed."""
     grid = parts.followed
     S = inverted(parts.gain(grid, at))
-    count = _count(parts, parts.grid, rigid, unstable)
     names = parts.u if at == "u" else parts.y
 
     def one(i: int) -> LoopMargins:
@@ -230,15 +249,12 @@ def report_loops(
 
         return loop_margins(names[i], grid, 1.0 - 1.0 / S[:, i, i], exact, sampled=bool(parts.dt))
 
-    scaled = 0.0 if count.unstable else 1.0 / parts.worst(at, len(names) > 1)[0]
-    units = parts.mixed(at)
-    margin = scaled if units or count.unstable else 1.0 / parts.worst(at, False)[0]
-    loops = tuple(one(i) for i in range(len(names)))
-    return LoopReport(loops, margin, *count, scaled_margin=scaled, units=units)
+    return tuple(one(i) for i in range(len(names)))
 
 
-def _count(parts: BrokenLoop, grid: FloatArray, rigid: int, unstable: int) -> NyquistCount:
-    poles = parts.poles()
+def broken_count(parts: BrokenLoop, rigid: int, unstable: int) -> NyquistCount:
+    """Return the unstable poles of a loop that is taken apart; numbers as for `report_loops`."""
+    grid, poles = parts.grid, parts.poles()
     distance = np.log(np.where(poles == 0, TINY, poles)) if parts.dt else poles
     scale = 1.0 if parts.dt else np.max(np.abs(poles), initial=TINY)
     if parts.measured is None:
@@ -284,17 +300,24 @@ def loop_margins(
     crossovers = crossings(lambda f: np.abs(find(f)) - 1.0, freq, np.abs(L) - 1.0)
     phases = np.abs(np.degrees(np.angle(find(crossovers))))
     # L is real where the imaginary part changes sign; positive: towards the critical point
-    reals = find(crossings(lambda f: find(f).imag, freq, L.imag)).real.tolist()
+    turns = crossings(lambda f: find(f).imag, freq, L.imag)
+    reals = find(turns).real.tolist()
     # and at its ends, half the rate and zero frequency (unless it integrates), where it is real
     slope = (
         np.log(abs(L[1] / L[0])) / np.log(freq[1] / freq[0])
         if freq.size > 1 and np.all(L[:2])
         else 0.0
     )
-    ends = [*([L[0]] if abs(slope) < _LEVEL else []), *([L[-1]] if sampled else [])]
-    reals += [end.real for end in ends if abs(end.imag) < _REAL * abs(end.real)]
+    ends = [*([0] if abs(slope) < _LEVEL else []), *([-1] if sampled else [])]
+    ends = [i for i in ends if abs(L[i].imag) < _REAL * abs(L[i].real)]
+    reals += [L[i].real for i in ends]
+    places = [*turns.tolist(), *(float(freq[i]) for i in ends)]
     below = [float(x) for x in reals if 0.0 < x < 1.0]
     above = [float(x) for x in reals if x > 1.0]
+    near = min(
+        ((abs(np.log(x)), place) for x, place in zip(reals, places, strict=True) if x > 0.0),
+        default=(0.0, float("nan")),
+    )
     size = np.abs(1.0 - L)
     least = int(np.argmin(size))
     where, margin = float(freq[least]), float(size[least])
@@ -313,6 +336,8 @@ def loop_margins(
         float(phases.min(initial=180.0)),
         margin,
         where,
+        float(near[1]),
+        float(crossovers[np.argmin(phases)]) if crossovers.size else float("nan"),
     )
 
 

@@ -403,7 +403,11 @@ def bandwidth(loop: Loop) -> float:
     >>> round(fx.loop.bandwidth(fx.close_loop(plant, observer, servo)), 1)
     14.1
     """
-    parts = taken_apart(loop)
+    return broken_bandwidth(taken_apart(loop))
+
+
+def broken_bandwidth(parts: BrokenLoop) -> float:
+    """Return the bandwidth of a loop that is taken apart."""
     if parts.is_unstable:
         raise AssumptionError(
             "the closed loop is not stable, so |S| is the size of no response of it and gives no "

@@ -1,4 +1,4 @@
-"""What a control engineer multiplies by hand: PID, lead, notch and low-pass, as values."""
+"""What a control engineer multiplies by hand: PID, lead, lag, integrator, notch and low-pass."""
 
 from __future__ import annotations
 
@@ -78,6 +78,24 @@ class Pid(SingleElement):
         p = k * (1.0 + w_i / w_z - w_i / w_p)
         return cls(p, k * w_i, k / w_z - p / w_p, float(pole))
 
+    def as_corners(self) -> dict[str, float | None] | None:
+        """Return the arguments of `corners` that make it; None where its zeros are complex."""
+        if self.pole is None:
+            corner = self.i / self.p / (2.0 * np.pi) if self.p else -1.0
+            same: dict[str, float | None] = {"gain": self.p, "integrator": corner}
+            return None if corner < 0.0 else same | {"zero": None, "pole": None}
+        w = 2.0 * np.pi * self.pole
+        high, low = self.p / w + self.d, self.p + self.i / w
+        root = low * low - 4.0 * high * self.i
+        if not high or not low or root < 0.0:
+            return None
+        fast = -0.5 * (low + np.copysign(np.sqrt(root), low)) / high  # no cancellation
+        slow = self.i / (high * fast)
+        if fast >= 0.0 or slow > 0.0:
+            return None
+        found = {"gain": -high * fast, "integrator": -slow / (2.0 * np.pi)}
+        return found | {"zero": -float(fast) / (2.0 * np.pi), "pole": self.pole}
+
     def __repr__(self) -> str:
         units = {"p": "", "i": " /s", "d": " s"}
         gains = {name: getattr(self, name) for name in units}
@@ -135,17 +153,83 @@ class Lead(SingleElement):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Notch(SingleElement):
-    """``(p^2 + 2 depth width p + 1) / (p^2 + 2 width p + 1)``, p = s / w.
+class Lag(SingleElement):
+    """``(p + 1) / (p + 1 / ratio)``, p = s / w: gain 1 above w, `ratio` far below it.
 
     Parameters
     ----------
     freq : float [Hz]
-        Centre.
+        Its zero; the pole lies at freq / ratio.
+    ratio : float
+        Gain at low frequency.
+
+    References
+    ----------
+    [Franklin1998]_, section 5.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.Lag(5.0)
+    Lag 5 Hz ratio 10
+    """
+
+    freq: float = field(metadata=checked(positive))
+    ratio: float = field(default=10.0, metadata=checked(positive))
+
+    def __repr__(self) -> str:
+        return f"Lag {self.freq:.4g} Hz ratio {self.ratio:g}"
+
+    @property
+    def section(self) -> Section:
+        """Its transfer function."""
+        w = 2.0 * np.pi * self.freq
+        return Section((0.0, 1.0, 1.0), (0.0, 1.0, 1.0 / self.ratio), w, w)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Integrator(SingleElement):
+    """``1 + w / s``: integral action below a corner, gain 1 above.
+
+    Parameters
+    ----------
+    freq : float [Hz]
+        The corner w, its zero.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.Integrator(5.0)
+    Integrator 5 Hz
+    """
+
+    freq: float = field(metadata=checked(positive))
+
+    def __repr__(self) -> str:
+        return f"Integrator {self.freq:.4g} Hz"
+
+    @property
+    def section(self) -> Section:
+        """Its transfer function."""
+        w = 2.0 * np.pi * self.freq
+        return Section((0.0, 1.0, 1.0), (0.0, 1.0, 0.0), w, w)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Notch(SingleElement):
+    """``(p^2 + 2 depth width p + 1) / (q^2 + 2 width q + 1)``, p = s / w, q = p / skew.
+
+    Parameters
+    ----------
+    freq : float [Hz]
+        Centre, of the zeros.
     depth : float
-        Gain at the centre, below 1; above 1 it is a resonance.
+        Gain at the centre, below 1; above 1 it is a resonance. depth times width is the damping
+        ratio of the zeros.
     width : float
         Damping ratio of the poles: half the relative width.
+    skew : float
+        Frequency of the poles over that of the zeros; the gain far above is its square.
 
     Examples
     --------
@@ -157,15 +241,17 @@ class Notch(SingleElement):
     freq: float = field(metadata=checked(positive))
     depth: float = field(default=0.05, metadata=checked(positive, zero=True))
     width: float = field(default=0.3, metadata=checked(positive))
+    skew: float = field(default=1.0, metadata=checked(positive))
 
     def __repr__(self) -> str:
-        return f"Notch {self.freq:.4g} Hz depth {self.depth:g} width {self.width:g}"
+        skew = f" skew {self.skew:g}" if self.skew != 1.0 else ""
+        return f"Notch {self.freq:.4g} Hz depth {self.depth:g} width {self.width:g}{skew}"
 
     @property
     def section(self) -> Section:
         """Its transfer function."""
-        w, two = 2.0 * np.pi * self.freq, 2.0 * self.width
-        return Section((1.0, self.depth * two, 1.0), (1.0, two, 1.0), w, w)
+        w, two, k = 2.0 * np.pi * self.freq, 2.0 * self.width, self.skew
+        return Section((1.0, self.depth * two, 1.0), (1.0 / k**2, two / k, 1.0), w, w)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

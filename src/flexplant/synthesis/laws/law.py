@@ -16,6 +16,7 @@ from ...errors import ModelError
 from ...lti.discretisation import trapezoidal
 from ...lti.frequency import sampled_freq
 from ...lti.joining import Matrices, cascaded
+from ...lti.responses import responder
 from ...lti.statespace import StateSpace
 
 
@@ -67,6 +68,35 @@ class Section(NamedTuple):
     def system(self) -> StateSpace:
         """The section as a continuous system."""
         return StateSpace(*self.matrices, inputs=["error"], outputs=["command"])
+
+
+class BlockSection(NamedTuple):
+    """A system of one channel in a law, continuous, where a `Section` has one transfer function."""
+
+    own: StateSpace
+
+    @property
+    def centre(self) -> float:
+        """No frequency is kept beside the others."""
+        return 0.0
+
+    def at(self, rate: float) -> BlockSection:
+        """Return the same: nothing is prewarped."""
+        return self
+
+    def gain(self, s: ComplexArray) -> ComplexArray:
+        """Return the response at frequencies s = j omega [rad/s]."""
+        return np.asarray(responder(self.own)(s.imag / (2.0 * np.pi))[0, 0])
+
+    @property
+    def order(self) -> int:
+        """The number of its states."""
+        return self.own.n_states
+
+    @property
+    def matrices(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """A, B, C and D."""
+        return self.own.A, self.own.B, self.own.C, self.own.D
 
 
 class Element(Value):
@@ -134,13 +164,18 @@ class SingleElement(Element):
 
     @property
     @abstractmethod
-    def section(self) -> Section:
+    def section(self) -> Section | BlockSection:
         """Its transfer function."""
+
+    @property
+    def own_rate(self) -> float:
+        """The only rate [Hz] at which it runs; 0 where any will do."""
+        return 0.0
 
     @property
     def law(self) -> Law:
         """The law of this element alone."""
-        return Law((self,))
+        return Law((self,), rate=self.own_rate)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -152,7 +187,7 @@ class Law(Element):
     Parameters
     ----------
     factors : sequence of elements
-        `Pid`, `Lead`, `Notch`, `LowPass`.
+        `Pid`, `Lead`, `Lag`, `Integrator`, `Notch`, `LowPass`, `FixedBlock`.
     gain : float
         A factor.
     rate : float [Hz]
@@ -179,6 +214,13 @@ class Law(Element):
             instance(factor, SingleElement, "a factor of a law", "Pass Pid, Lead, Notch, LowPass.")
         rate = positive(self.rate, "rate", zero=True)
         for factor in factors:
+            if factor.own_rate not in (0.0, rate):
+                runs = f"runs at {rate:g} Hz" if rate else "is continuous"
+                raise ModelError(
+                    f"{factor} is sampled at {factor.own_rate:g} Hz, the law {runs}: its samples "
+                    f"mean nothing there. Sample the law at {factor.own_rate:g} Hz, or take the "
+                    "block before it was sampled."
+                )
             centre = factor.section.centre / (2.0 * np.pi)
             if rate and centre >= 0.5 * rate:
                 raise ModelError(
@@ -233,7 +275,7 @@ class Law(Element):
         )
 
     @cached_property
-    def _sections(self) -> tuple[Section, ...]:
+    def _sections(self) -> tuple[Section | BlockSection, ...]:
         rate = self.rate if self.prewarped else 0.0
         return tuple(factor.section.at(rate) for factor in self.factors)
 
@@ -289,7 +331,7 @@ def tustin_s(freq: FloatArray, rate: float) -> ComplexArray:
     return np.asarray(1j * omega, dtype=np.complex128)
 
 
-def product(sections: Iterable[Section], s: ComplexArray) -> ComplexArray:
+def product(sections: Iterable[Section | BlockSection], s: ComplexArray) -> ComplexArray:
     """Return the response of sections one after the other at complex frequencies s [rad/s]."""
     value = np.ones(s.shape, dtype=np.complex128)
     for section in sections:

@@ -24,7 +24,7 @@ from .law import Element, Law
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LoopDesign(Value):
+class DesignedLoops(Value):
     """A decoupled controller ``u = -before diag(laws) after y`` and its loops, axis by axis.
 
     Parameters
@@ -59,7 +59,7 @@ class LoopDesign(Value):
 
     def __repr__(self) -> str:
         axes = ", ".join(self.laws)
-        lines = [f"<LoopDesign of {axes}: {counted(self.system.n_states, 'state')}>"]
+        lines = [f"<DesignedLoops of {axes}: {counted(self.system.n_states, 'state')}>"]
         lines += [f"  {line}" for line in repr(self.report).splitlines()]
         lines += [f"  law of {axis}: {law!r}" for axis, law in list(self.laws.items())[:4]]
         if self.left_out is not None:
@@ -150,7 +150,7 @@ def design_loops(
     unstable: int = 0,
     references: Mapping[str, str] | None = None,
     larger: Any = None,
-) -> LoopDesign:
+) -> DesignedLoops:
     """Return the controller of laws made by hand, ``u = -before diag(laws) after y``, and a report.
 
     Each law is a product of elements, `Pid`, `Lead`, `Notch`, `LowPass`. The plant may be known by
@@ -178,7 +178,7 @@ def design_loops(
 
     Returns
     -------
-    LoopDesign
+    DesignedLoops
 
     Raises
     ------
@@ -218,7 +218,7 @@ def design_loops(
     return found
 
 
-def _where(axes: Axes, found: LoopDesign) -> str:
+def _where(axes: Axes, found: DesignedLoops) -> str:
     """Return where a loop is unstable: the frequencies of a model's poles, lines of an Frf."""
     if isinstance(axes.plant, Frf):
         closest = min(found.report.loops, key=lambda loop: loop.modulus_margin)
@@ -236,7 +236,7 @@ def made(
     unstable: int,
     references: Mapping[str, str] | None,
     larger: Any,
-) -> LoopDesign:
+) -> DesignedLoops:
     """Return the design of laws that were checked; parameters as for `design_loops`."""
     inner = axes_controller(axes, laws)
     report = report_loops((axes.plant, inner), at="y", rigid=rigid, unstable=unstable)
@@ -245,7 +245,7 @@ def made(
     loop = None if axes.given is None else checked_loop(axes.given, [feedback], larger)
     left_out = None if loop is None else loop.left_out
     lacking = axes.given is not None and left_out is None
-    return LoopDesign(
+    return DesignedLoops(
         system,
         laws,
         report,

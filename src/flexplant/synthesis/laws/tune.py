@@ -22,7 +22,7 @@ from ..servo.servo_loop import TARGET
 from .axis_law import AxisLaw, MeasuredAxis
 from .joint_search import JointLaws, JointPlant, JointSearch, Worst
 from .law_search import FoundLaw, LawSearch
-from .loop_design import Axes, LoopDesign, axes_of, made
+from .loop_design import Axes, DesignedLoops, axes_of, made
 
 #: distance of a pole from zero frequency, beside the farthest, that counts as none
 _ZERO = 1e-6
@@ -42,7 +42,7 @@ def tune_loops(
     notches: int = 3,
     larger: Any = None,
     progress: bool | None = None,
-) -> LoopDesign:
+) -> DesignedLoops:
     """Return the laws of highest bandwidth that keep |S| below a peak, all axes together.
 
     Each axis gets ``k (1 + w_i / s) (1 + a s / w_b) / (1 + s / (b w_b)) F(s)`` with a low-pass and
@@ -84,7 +84,7 @@ def tune_loops(
 
     Returns
     -------
-    LoopDesign
+    DesignedLoops
         Verified in all axes together, each broken with the others closed.
 
     Raises

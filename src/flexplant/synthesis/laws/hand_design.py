@@ -1,0 +1,441 @@
+"""LoopDesign: loops shaped by hand, element by element, some of them switched off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ...checks import FloatArray, Value, flag, instance, number, positive, real_array, short, whole
+from ...errors import AssumptionError, LabelError, ModelError, ShapeError, require_known
+from ...fingerprint import fingerprint
+from ...loop.axes import static_map
+from ...loop.blocks import DERIVATIVES
+from ...lti.frequency import Frf
+from ...lti.interconnection import side_by_side
+from ...lti.statespace import StateSpace
+from .design_script import design_script
+from .law import Element, Law, SingleElement
+from .loop_design import Axes, DesignedLoops, axes_of, connected, made
+
+#: what feedforward gains act on, in this order
+TERMS = ("position", *DERIVATIVES)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ShapedAxis(Value):
+    """The law of one axis as it is shaped: a gain, elements, and which of them are on.
+
+    Parameters
+    ----------
+    elements : sequence of elements
+        `Pid`, `Lead`, `Lag`, `Integrator`, `Notch`, `LowPass`, `FixedBlock`, in this order.
+    gain : float
+        A factor on all of them.
+    on : sequence of bool, optional
+        Which elements act; all unless given.
+    feedforward : sequence of up to 5 float
+        Command of the axis per position, velocity, acceleration, jerk and snap of its reference.
+    closed : bool
+        Whether the loop of this axis is closed while others are shaped (sequential loop closing).
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> axis = fx.synthesis.ShapedAxis([fx.Pid(2.0), fx.Notch(130.0)], on=[True, False])
+    >>> axis.law
+    Pid p 2
+    """
+
+    elements: tuple[SingleElement, ...] = ()
+    gain: float = 1.0
+    on: tuple[bool, ...] = ()
+    feedforward: tuple[float, ...] = ()
+    closed: bool = True
+
+    def __post_init__(self) -> None:
+        given: Any = self.elements
+        if isinstance(given, Element):
+            given = (given,)
+        if not isinstance(given, Iterable) or isinstance(given, str | Mapping):
+            raise ModelError(f"elements are a list of Pid, Lead, Notch ..., got {short(given)}.")
+        elements: list[SingleElement] = []
+        gain = number(self.gain, "gain")
+        on = [flag(one, "on") for one in self.on]
+        for element in given:
+            if isinstance(element, Law):  # its factors, each by itself
+                elements += element.factors
+                gain *= element.gain
+            else:
+                hint = "Pass Pid, Lead, Lag, Integrator, Notch, LowPass or FixedBlock."
+                elements.append(instance(element, SingleElement, "an element", hint))
+        if on and len(on) != len(elements):
+            raise ShapeError(
+                f"on says of each element whether it acts: {len(elements)} elements, got {len(on)}."
+            )
+        forward = tuple(number(one, "feedforward") for one in self.feedforward)
+        if len(forward) > len(TERMS):
+            raise ShapeError(f"feedforward has up to {len(TERMS)} gains ({', '.join(TERMS)}).")
+        while forward and not forward[-1]:
+            forward = forward[:-1]
+        self._set(
+            elements=tuple(elements),
+            gain=gain,
+            on=tuple(on or [True] * len(elements)),
+            feedforward=forward,
+            closed=flag(self.closed, "closed"),
+        )
+
+    @property
+    def active(self) -> tuple[SingleElement, ...]:
+        """The elements that are on."""
+        return tuple(e for e, on in zip(self.elements, self.on, strict=True) if on)
+
+    @property
+    def law(self) -> Law:
+        """The law of the elements that are on, continuous."""
+        rates = {element.own_rate for element in self.active} - {0.0}
+        return Law(self.active, self.gain, rate=max(rates, default=0.0))
+
+    def __repr__(self) -> str:
+        shown = [
+            f"{e!r}" if on else f"({e!r}, off)"
+            for e, on in zip(self.elements, self.on, strict=True)
+        ]
+        forward = [f"{t} {g:.4g}" for t, g in zip(TERMS, self.feedforward, strict=False) if g]
+        more = f"; feedforward {', '.join(forward)}" if forward else ""
+        return " * ".join([f"{self.gain:.5g}", *shown]) + more + ("" if self.closed else "; open")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopDesign(Value):
+    """Loops shaped by hand: elements of each axis, the decoupling, and what it was made on.
+
+    ``u = before diag(law_i) (r - after y)``, with feedforward where an axis has some. All of it is
+    plain numbers: the same value gives the same controller, to the last digit.
+
+    Parameters
+    ----------
+    axes : mapping {axis: ShapedAxis}
+        In the order of the motions of `after`.
+    before, after : StateSpace or array, optional
+        Static transformations: commands of the axes to u, y to motions; none for a plant whose
+        channels are axes.
+    rate : float [Hz]
+        Of the controller; 0 when continuous.
+    delay : float
+        Of a measured plant: samples of delay beside what it shows.
+    hold : bool
+        Of a measured plant: False when it was measured from sample to sample.
+    rigid, unstable : int
+        Of a measured plant: its rigid-body modes, and its poles outside the stability region.
+    references : mapping {axis: channel}
+        References that axes follow. With feedforward an axis has one, ``axis:ref`` unless given.
+    made_on : str
+        What the plant was, in words.
+    fingerprint : str
+        A digest of it: see `is_made_on`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> from flexplant.synthesis import LoopDesign, ShapedAxis
+    >>> elements = [fx.Pid(9e4), fx.Lead(50.0), fx.LowPass(500.0)]
+    >>> mass = fx.lti.tf([1.0], [1.0, 0.0, 0.0])
+    >>> design = LoopDesign.on(mass, {"out": ShapedAxis(elements)})
+    >>> design.loops(mass).report.is_stable
+    True
+    >>> design.controller().inputs, design.controller().outputs
+    (('out',), ('in',))
+    """
+
+    axes: Mapping[str, ShapedAxis]
+    before: StateSpace | None = None
+    after: StateSpace | None = None
+    rate: float = 0.0
+    delay: float = 0.0
+    hold: bool = True
+    rigid: int = 0
+    unstable: int = 0
+    references: Mapping[str, str] = field(default_factory=dict)
+    made_on: str = ""
+    fingerprint: str = ""
+
+    def __post_init__(self) -> None:
+        axes: Any = self.axes
+        if not isinstance(axes, Mapping) or not axes:
+            raise ModelError(f"axes is a mapping {{axis: ShapedAxis}}, got {short(axes)}.")
+        found = {}
+        for name, axis in axes.items():
+            given: Any = axis
+            if isinstance(axis, Element | list | tuple):
+                given = ShapedAxis(axis)  # type: ignore[arg-type]
+            found[str(name)] = instance(given, ShapedAxis, f"axis {name!r}", "Pass a ShapedAxis.")
+        names = tuple(found)
+        before = static_map(self.before, _channels(self.before, "outputs", names, "u"), "before")
+        after = static_map(self.after, _channels(self.after, "inputs", names, "y"), "after")
+        if self.after is None or isinstance(self.after, np.ndarray | list | tuple):
+            after = after.replace(outputs=names)
+        if tuple(after.outputs) != names or len(before.inputs) != len(names):
+            raise LabelError(
+                f"the axes are {', '.join(names)}, but after= leads to {', '.join(after.outputs)} "
+                f"and before= starts from {len(before.inputs)}. Name the axes like the motions."
+            )
+        require_known("axis", self.references, names)
+        self._set(
+            axes=found,
+            before=before.replace(dt=0.0),
+            after=after.replace(dt=0.0),
+            rate=positive(self.rate, "rate", zero=True),
+            delay=positive(self.delay, "delay", zero=True),
+            hold=flag(self.hold, "hold"),
+            rigid=whole(self.rigid, "rigid", minimum=0),
+            unstable=whole(self.unstable, "unstable", minimum=0),
+            references=dict(self.references),
+        )
+
+    @classmethod
+    def on(
+        cls,
+        plant: Any,
+        axes: Mapping[str, ShapedAxis] | None = None,
+        *,
+        before: Any = None,
+        after: Any = None,
+        rate: float | None = None,
+        delay: float = 0.0,
+        hold: bool = True,
+        rigid: int | None = None,
+        unstable: int = 0,
+        references: Mapping[str, str] | None = None,
+    ) -> LoopDesign:
+        """Return a design on a plant, whose rigid-body axes are taken unless they are given.
+
+        Parameters
+        ----------
+        plant : StandardPlant, StateSpace or Frf
+            As for `design_loops`.
+        axes : mapping {axis: ShapedAxis}, optional
+            Axes that are missing have a gain of 1.
+        before, after, rate, delay, hold, unstable, references
+            As for `design_loops`.
+        rigid : int, optional
+            Rigid-body modes of a measured plant; unless given, one for each axis that falls
+            with slope 2 at its lowest lines.
+
+        Raises
+        ------
+        LabelError, ModelError, ShapeError, AssumptionError
+            As for `design_loops`.
+        """
+        parts = axes_of(plant, before, after, rate, delay, hold)
+        given = axes or {}
+        require_known("axis", given, parts.names)
+        if rigid is None:
+            rigid = _free_axes(parts) if isinstance(parts.plant, Frf) else 0
+        shaped = {name: given.get(name, ShapedAxis()) for name in parts.names}
+        first = repr(getattr(plant, "nominal", plant)).splitlines()[0].strip("<>")
+        return cls(
+            shaped, parts.before, parts.after, parts.rate, delay, hold, rigid, unstable,
+            references or {}, first, _digest(plant),
+        )  # fmt: skip
+
+    def __repr__(self) -> str:
+        rate = f"at {self.rate:g} Hz" if self.rate else "continuous"
+        lines = [f"<LoopDesign of {', '.join(self.axes)}, {rate}>"]
+        lines += [f"  {name}: {axis!r}" for name, axis in list(self.axes.items())[:4]]
+        lines += [f"  and {len(self.axes) - 4} more axes"] if len(self.axes) > 4 else []
+        lines += [f"  made on {self.made_on}"] if self.made_on else []
+        return "\n".join(lines)
+
+    def is_made_on(self, plant: Any) -> bool:
+        """Return whether a plant is the one that it was made on, by its numbers.
+
+        Parameters
+        ----------
+        plant : StandardPlant, StateSpace or Frf
+            The plant.
+        """
+        return self.fingerprint == _digest(plant)
+
+    def with_axis(self, name: str, axis: ShapedAxis) -> LoopDesign:
+        """Return the design with another axis in the place of one.
+
+        Parameters
+        ----------
+        name : str
+            The axis.
+        axis : ShapedAxis
+            Its elements.
+
+        Raises
+        ------
+        LabelError
+            When there is no such axis.
+        """
+        require_known("axis", [name], self.axes)
+        return self.replace(axes={**self.axes, name: axis})
+
+    @cached_property
+    def laws(self) -> dict[str, Law]:
+        """The law of each axis, at the rate of the controller.
+
+        Raises
+        ------
+        ModelError
+            When an element lies above half the rate, or a block has another rate.
+        """
+        found = {}
+        for name, axis in self.axes.items():
+            try:
+                law = axis.law
+                found[name] = law if law.rate == self.rate else law.replace(rate=self.rate)
+            except ModelError as error:
+                raise ModelError(f"axis {name!r}: {error}") from None
+        return found
+
+    def controller(self) -> StateSpace:
+        """Return the system from y, and references where axes have one, to u.
+
+        Its inputs after y are the references and those of their derivatives that a feedforward
+        uses, ``z:ref:acceleration`` say: what `close_loop`, `simulate` and `write_c` take. Axes
+        that are not closed while others are shaped take part.
+
+        Raises
+        ------
+        ModelError
+            As for `laws`.
+        """
+        dt = 1.0 / self.rate if self.rate else 0.0
+        each = [(-law.system).replace(dt=dt) for law in self.laws.values()]
+        inner = side_by_side(each, self.axes).replace(outputs=self._before.inputs)
+        parts = Axes(None, self._before, self._after, self.rate)
+        feedback = connected(parts, inner, self._followed)
+        return self._with_feedforward(feedback).replace(name="loops")
+
+    @property
+    def _before(self) -> StateSpace:
+        assert self.before is not None  # noqa: S101 - made at construction
+        return self.before
+
+    @property
+    def _after(self) -> StateSpace:
+        assert self.after is not None  # noqa: S101 - made at construction
+        return self.after
+
+    @property
+    def _followed(self) -> dict[str, str]:
+        """The reference of each axis that has one."""
+        wanted = {n: f"{n}:ref" for n, a in self.axes.items() if a.feedforward}
+        return {
+            n: {**wanted, **self.references}[n]
+            for n in self.axes
+            if n in {**wanted, **self.references}
+        }
+
+    def _with_feedforward(self, feedback: StateSpace) -> StateSpace:
+        columns: dict[str, FloatArray] = {}
+        for i, (name, axis) in enumerate(self.axes.items()):
+            for term, gain in zip(TERMS, axis.feedforward, strict=False):
+                if gain:
+                    reference = self._followed[name]
+                    channel = reference if term == "position" else f"{reference}:{term}"
+                    column = columns.setdefault(channel, np.zeros(len(self._before.outputs)))
+                    column += gain * self._before.D[:, i]
+        if not columns:
+            return feedback
+        inputs = [*feedback.inputs, *(c for c in columns if c not in feedback.inputs)]
+        B = np.zeros((feedback.n_states, len(inputs)))
+        D = np.zeros((len(feedback.outputs), len(inputs)))
+        B[:, : len(feedback.inputs)], D[:, : len(feedback.inputs)] = feedback.B, feedback.D
+        for channel, column in columns.items():
+            D[:, inputs.index(channel)] += column
+        return feedback.replace(B=B, D=D, inputs=inputs)
+
+    def loops(self, plant: Any, *, larger: Any = None) -> DesignedLoops:
+        """Return the loops on a plant, all axes closed: report, check with the modes left out.
+
+        Parameters
+        ----------
+        plant : StandardPlant, StateSpace or Frf
+            With the channels and the rate of the design.
+        larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+            As for `design_loops`.
+
+        Raises
+        ------
+        LabelError, ModelError, ShapeError
+            As for `design_loops`.
+        """
+        return made(
+            self.placed(plant), self.laws, self.rigid, self.unstable, dict(self.references), larger
+        )
+
+    def placed(self, plant: Any) -> Axes:
+        """Return a plant in the axes of the design.
+
+        Parameters
+        ----------
+        plant : StandardPlant, StateSpace or Frf
+            With its channels.
+
+        Raises
+        ------
+        LabelError, ModelError, ShapeError
+            When it does not go with the design.
+        """
+        if isinstance(plant, Frf) or hasattr(plant, "frdata"):
+            rate = self.rate or None
+            return axes_of(plant, self._before, self._after, rate, self.delay, self.hold)
+        parts = axes_of(plant, self._before, self._after, None, 0.0, True)
+        if abs(parts.rate - self.rate) > 1e-9 * self.rate:
+            runs = f"runs at {parts.rate:g} Hz" if parts.rate else "is continuous"
+            raise ModelError(
+                f"the design runs at {self.rate:g} Hz, the plant {runs}: pass "
+                "plant.discretized(rate), or a design of its rate."
+            )
+        return parts
+
+    def script(self, plant: str = "") -> str:
+        """Return a Python script that makes the same design, to the last digit.
+
+        Parameters
+        ----------
+        plant : str, optional
+            The line that makes the plant, ``plant = fx.load("stage.npz")`` say: the script then
+            reports the loops on it.
+        """
+        return design_script(self, str(plant))
+
+
+def _channels(given: Any, side: str, names: tuple[str, ...], prefix: str) -> tuple[str, ...]:
+    """Return the channels at the plant of a transformation that may be a matrix or none."""
+    if isinstance(given, StateSpace):
+        return tuple(getattr(given, side))
+    if given is None:
+        return names if prefix == "y" else tuple(f"u{i}" for i in range(1, len(names) + 1))
+    shape = real_array(given, "a transformation").shape
+    count = shape[0 if prefix == "u" else -1]
+    return tuple(f"{prefix}{i}" for i in range(1, count + 1))
+
+
+def _free_axes(axes: Axes) -> int:
+    """Return how many axes of a measured plant fall with slope 2 at their lowest lines."""
+    from ...lti.measured_lines import low_slope
+
+    frf = axes.plant
+    if frf.freq.size < 5:
+        return 0
+    each = [low_slope(frf.freq, frf.data[i : i + 1, i : i + 1]) for i in range(len(axes.names))]
+    return sum(slope > 1.0 for slope in each)
+
+
+def _digest(plant: Any) -> str:
+    """Return a digest of the numbers of a plant; none of what has no numbers."""
+    try:
+        return fingerprint([getattr(plant, "nominal", plant)])[:16]
+    except (AssumptionError, ModelError):
+        return ""

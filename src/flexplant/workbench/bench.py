@@ -1,0 +1,185 @@
+"""Bench: a plant, its model and its fleet on the bench; what all tabs of the page share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from ..checks import instance
+from ..errors import LabelError, ModelError, counted
+from ..lti.frequency import Frf
+from ..plant import StandardPlant
+from ..simulation.motion import SetPoint
+from ..synthesis import LoopDesign, LowPass, Pid, ShapedAxis
+from ..synthesis.laws.axis_law import MeasuredAxis
+from .consequences import Question
+from .limits import LoopLimits
+from .machine import BenchMachine
+
+#: first crossover beside the lowest resonance, and beside the first line; its low-pass beside it;
+#: loop gain at resonances that is small; times that the crossover is lowered until it is
+_BELOW, _ABOVE, _ROLL, _QUIET, _TRIES = 0.12, 10.0, 8.0, 0.4, 12
+
+
+class Bench:
+    """What all tabs share: machines in the axes of a design, the first of them nominal."""
+
+    def __init__(
+        self,
+        machines: Mapping[str, Any],
+        design: LoopDesign,
+        model: Any = None,
+        larger: Any = None,
+        channel: str | None = None,
+        move: SetPoint | None = None,
+        limits: LoopLimits | None = None,
+        source: str = "",
+    ) -> None:
+        self.source = source
+        #: what was shown last in any tab
+        self.design = design
+        self.start = design
+        self.limits = limits or LoopLimits()
+        self.machines = [BenchMachine.on(one, design, name) for name, one in machines.items()]
+        self.larger, self.channel, self.move = larger, channel, move
+        nominal = self.machines[0]
+        if model is not None:
+            self.model: BenchMachine | None = BenchMachine.on(model, design, "model")
+        else:
+            self.model = None if nominal.is_measured else nominal
+
+    @classmethod
+    def of(cls, plant: Any, design: LoopDesign | None, options: Mapping[str, Any]) -> Self:
+        """Return the bench of a plant, a list of plants or a mapping of them by name."""
+        machines = _named(plant)
+        names = ("before", "after", "rate", "delay", "hold", "rigid", "unstable", "references")
+        given = {n: options[n] for n in names if options.get(n) is not None}
+        model = options.get("model")
+        first = next(iter(machines.values()))
+        if design is None and isinstance(first, Frf) and model is not None:  # its axes
+            given = _of_model(model, given)
+        if design is None:
+            design = started(LoopDesign.on(first, **given), first)
+        elif given:
+            raise ModelError(
+                f"{', '.join(given)} are in the design already: leave them out, or the design."
+            )
+        followed = _references(first if model is None else model, design)
+        if not design.references and followed:
+            design = design.replace(references=followed)
+        kept = {n: options.get(n) for n in ("larger", "channel", "move", "limits")}
+        return cls(machines, design, model, source=str(options.get("source") or ""), **kept)
+
+    @cached_property
+    def question(self) -> Question:
+        """What is computed beside the axis."""
+        return Question(self.machines[0], self.model, self.larger, self.channel, self.move)
+
+    def question_of(self, index: int) -> Question:
+        """Return the same of another machine."""
+        machine = self.machines[index]
+        model = self.model if machine.is_measured or self.model is not self.machines[0] else machine
+        return replace(self.question, machine=machine, model=model)
+
+    @property
+    def top(self) -> float:
+        """The highest frequency of a slider [Hz]."""
+        last = float(self.machines[0].freq[-1])
+        return min(last, 0.499 * self.start.rate) if self.start.rate else last
+
+    def __repr__(self) -> str:
+        fleet = f", {counted(len(self.machines), 'machine')}" if len(self.machines) > 1 else ""
+        model = ", with a model" if self.model and self.machines[0].is_measured else ""
+        plant = f"{self.design.made_on or 'a plant'}{model}{fleet}"
+        return f"<{type(self).__name__} of {plant}>\n{self.design!r}"
+
+
+def _named(plant: Any) -> dict[str, Any]:
+    """Return machines by name, the nominal one first."""
+    if isinstance(plant, Mapping) and not isinstance(plant, Frf):
+        found = {str(name): one for name, one in plant.items()}
+    elif isinstance(plant, Iterable) and not isinstance(plant, Frf | str | bytes):
+        found = {f"machine {i}": one for i, one in enumerate(plant, 1)}
+    else:
+        found = {"machine 1": plant}
+    if not found:
+        raise ModelError("the workbench needs a plant, got none. Pass an Frf or a StandardPlant.")
+    return found
+
+
+def _of_model(model: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options of a measured plant, decoupled and sampled as its model."""
+    own = LoopDesign.on(model)
+    found: dict[str, Any] = {"rate": own.rate or None}
+    if "before" not in given and "after" not in given:
+        found |= {"before": own.before, "after": own.after}
+    return {**found, **given}
+
+
+def _references(plant: Any, design: LoopDesign) -> dict[str, str]:
+    """Return the reference of a plant that each rigid-body axis follows."""
+    plant = getattr(plant, "nominal", plant)
+    if not isinstance(plant, StandardPlant) or not plant.is_assembled:
+        return {}
+    ports = plant.assembled.ports
+    axes = {poi.name: poi.axes for poi in ports.z if hasattr(poi, "axes")}
+    found = {}
+    for reference in ports.references:
+        name = f"cog:{axes[reference.poi][0]}"
+        if name in design.axes and f"{reference.poi}:ref" in plant.y:
+            found[name] = f"{reference.poi}:ref"
+    return found
+
+
+def started(design: LoopDesign, plant: Any) -> LoopDesign:
+    """Return a design with a first law in each axis."""
+    machine = BenchMachine.on(plant, design, "")
+    axes = {name: first_axis(machine, i, design) for i, name in enumerate(design.axes)}
+    return design.replace(axes=axes)
+
+
+def first_axis(machine: BenchMachine, index: int, design: LoopDesign) -> ShapedAxis:
+    """Return a first law of an axis: its loop gain is small at the resonances."""
+    G = machine.G[index, index]
+    measured = MeasuredAxis("", machine.freq, G, design.rate, True)
+    if machine.freq.size < 5:
+        return ShapedAxis()
+    first, low = float(measured.resonances.min(initial=measured.ceiling)), float(machine.freq[0])
+    cross = max(_BELOW * first, min(_ABOVE * low, 0.3 * first))
+    for _ in range(_TRIES):
+        axis = crossing_axis(machine, index, design, cross)
+        beyond = machine.freq > 2.0 * cross
+        L = axis.law.replace(rate=design.rate).at(machine.freq) * G
+        if np.abs(L[beyond]).max(initial=0.0) < _QUIET or cross < 4.0 * low:
+            break
+        cross *= 0.8
+    return axis
+
+
+def crossing_axis(
+    machine: BenchMachine, index: int, design: LoopDesign, cross: float
+) -> ShapedAxis:
+    """Return PID and low-pass around a crossover [Hz], with the sign of the plant."""
+    cross = float(f"{cross:.3g}")
+    top = 0.95 * (min(machine.freq[-1], 0.45 * design.rate) if design.rate else machine.freq[-1])
+    pid = Pid.corners(1.0, integrator=cross / 6.0, zero=cross / 3.0, pole=min(3.0 * cross, top))
+    axis = ShapedAxis((pid, LowPass(min(_ROLL * cross, top))))
+    there = np.array([cross])
+    G = complex(machine.respond(there)[index, index][0])
+    gain = 1.0 / abs(complex(axis.law.replace(rate=design.rate).at(there)[0]) * G)
+    # a free body is half a turn behind its force, where the sign is right
+    return axis.replace(gain=float(f"{gain if G.real < 0.0 else -gain:.6g}"))
+
+
+def checked_options(limits: Any, move: Any, design: Any) -> None:
+    """Refuse options of another kind."""
+    if limits is not None:
+        instance(limits, LoopLimits, "limits", "Pass LoopLimits(peak=2.0).")
+    if move is not None:
+        instance(move, SetPoint, "move", "Pass setpoint(...).")
+    if design is not None and not isinstance(design, LoopDesign):
+        raise LabelError(f"design is a LoopDesign, got {type(design).__name__}.")

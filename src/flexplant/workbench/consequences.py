@@ -1,0 +1,179 @@
+"""Consequences: what a design does beyond its axis: all axes, modes left out, error, time."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..checks import FloatArray
+from ..errors import AssumptionError, FlexplantError
+from ..loop import ClosedLoop, LoopReport, close_loop
+from ..lti.discretisation import discretized
+from ..lti.interconnection import feedback, series
+from ..lti.recursion import Recursion
+from ..plant import StandardPlant
+from ..simulation import simulate
+from ..simulation.motion import SetPoint
+from ..synthesis import LoopDesign
+from ..synthesis.laws.loop_design import axes_controller
+from .evaluation import AxisLoop
+from .machine import BenchMachine
+
+#: duration of a step beside the time of a crossover, and samples at most
+_PERIODS, _SAMPLES = 8.0, 20_000
+#: samples of the response from lines, a power of two
+_LINES = 1 << 14
+
+
+@dataclass(eq=False)
+class Consequences:
+    """What was found; `missing` says what could not be, and why."""
+
+    report: LoopReport | None = None
+    radius: str = ""
+    left_out: str = ""
+    left_out_fine: bool | None = None
+    channel: str = ""
+    rms: float = float("nan")
+    unit: str = ""
+    sources: Sequence[tuple[str, float]] = ()
+    time: FloatArray = field(default_factory=lambda: np.zeros(0))
+    error: FloatArray = field(default_factory=lambda: np.zeros(0))
+    time_label: str = ""
+    missing: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """What is computed: a design on a machine, with a model where there is one."""
+
+    machine: BenchMachine
+    model: BenchMachine | None
+    larger: Any
+    channel: str | None
+    move: SetPoint | None
+
+    @property
+    def plant(self) -> StandardPlant | None:
+        """The standard plant, if there is one."""
+        given = (
+            None if self.model is None else getattr(self.model.given, "nominal", self.model.given)
+        )
+        return given if isinstance(given, StandardPlant) else None
+
+    def answer(self, design: LoopDesign, loop: AxisLoop) -> Consequences:
+        """Return everything that takes longer than a slider may wait."""
+        found = Consequences()
+        with warnings.catch_warnings(action="ignore"):  # what they say is on the page
+            steps = (self._all_axes, self._on_the_plant, self._in_time)
+            for step in steps:
+                try:
+                    step(found, design, loop)
+                except FlexplantError as error:
+                    found.missing.append(str(error))
+                except (ArithmeticError, np.linalg.LinAlgError) as error:
+                    found.missing.append(f"no answer: {error}")
+        return found
+
+    def _all_axes(self, found: Consequences, design: LoopDesign, loop: AxisLoop) -> None:
+        from ..loop import report_loops
+
+        axes = self.machine.axes
+        inner = axes_controller(axes, design.laws)
+        found.report = report_loops(
+            (axes.plant, inner), at="y", rigid=design.rigid, unstable=design.unstable
+        )
+
+    def _closed(self, design: LoopDesign) -> ClosedLoop | None:
+        """Return the loop of the standard plant with the controller, reading what the plant has."""
+        plant = self.plant
+        if plant is None:
+            return None
+        K = design.controller()
+        owners = tuple(f"{name}:" for name in plant.y if name.endswith(":ref"))
+        read = [n for n in K.inputs if n in plant.y or n.startswith(owners)]
+        return close_loop(plant, K.select(inputs=read), larger=self.larger)
+
+    def _on_the_plant(self, found: Consequences, design: LoopDesign, loop: AxisLoop) -> None:
+        closed, plant = self._closed(design), self.plant
+        if closed is None or plant is None:
+            return
+        found.radius = closed.decay
+        if closed.left_out is not None:
+            found.left_out, found.left_out_fine = closed.left_out.summary, closed.left_out.is_fine
+        errors = [name for name in plant.z if name.endswith(":error")]
+        found.channel = self.channel or (errors or list(plant.z))[0]
+        if not closed.is_stable:
+            return
+        budget = closed.budget(found.channel)
+        found.unit = plant.units.get(found.channel, "")
+        found.rms = float(budget.rms)
+        each = zip(budget.names, np.sqrt(np.maximum(budget.variances, 0.0)), strict=True)
+        found.sources = sorted(((n, float(v)) for n, v in each), key=lambda one: -one[1])[:12]
+
+    def _in_time(self, found: Consequences, design: LoopDesign, loop: AxisLoop) -> None:
+        if loop.is_stable is False:
+            raise AssumptionError("the loop is unstable: its error grows and is not drawn.")
+        plant = self.plant
+        if self.move is not None and plant is not None:
+            closed = self._closed(design)
+            if closed is not None and plant.dt:
+                run = simulate(
+                    closed, reference=self.move, duration=1.5 * self.move.duration, noise=False,
+                    progress=False,
+                )  # fmt: skip
+                found.time, found.error = run.time, run[found.channel]
+                found.time_label = f"{found.channel} of the set-point, without noise"
+                return
+        cross = loop.margins.crossovers
+        reach = _PERIODS / cross[0] if cross else 1.0
+        if self.model is not None:
+            found.time, found.error = step_of_model(self.model, design, loop.name, reach)
+            found.time_label = f"error of {loop.name} after a unit step, exact"
+        elif loop.law.rate:
+            found.time, found.error = step_of_lines(loop, reach)
+            found.time_label = f"error of {loop.name} after a unit step, from the lines"
+
+
+def step_of_model(
+    model: BenchMachine, design: LoopDesign, name: str, duration: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return time and error of an axis after a unit step of its reference, all axes closed."""
+    axes = model.axes
+    forward = series(-axes_controller(axes, design.laws), axes.plant)
+    T = feedback(forward)
+    a = axes.names.index(name)
+    T = T.select(T.outputs[a], T.inputs[a])
+    if not T.dt:
+        T = discretized(T, max(200.0 / duration, 4.0 * _fastest(T)))
+    steps = int(np.clip(duration / T.dt, 50, _SAMPLES))
+    out, _ = Recursion(T.A, T.B, T.C, T.D).run(np.ones((steps, 1)), np.zeros(T.n_states))
+    return np.asarray(np.arange(steps) * T.dt), np.asarray(1.0 - out[:, 0])
+
+
+def _fastest(T: Any) -> float:
+    """Return the highest frequency [Hz] of poles that a step shows."""
+    size = np.abs(T.poles()) / (2.0 * np.pi)
+    return float(np.median(size)) if size.size else 1.0
+
+
+def step_of_lines(loop: AxisLoop, duration: float) -> tuple[FloatArray, FloatArray]:
+    """Return time and error of an axis after a unit step, by the transform of S on its lines.
+
+    Below the lines S falls as the loop gain grows there, above them it is 1; the samples of the
+    error are the sums of its impulse response.
+    """
+    rate, f = loop.law.rate, loop.freq
+    grid = np.linspace(0.0, 0.5 * rate, _LINES // 2 + 1)
+    S = np.interp(grid, f, loop.S.real) + 1j * np.interp(grid, f, loop.S.imag)
+    S[grid > f[-1]] = 1.0
+    below = grid < f[0]
+    slope = np.log(np.abs(loop.S[1] / loop.S[0])) / np.log(f[1] / f[0])
+    S[below] = loop.S[0] * (grid[below] / f[0]) ** max(slope, 1.0)
+    error = np.cumsum(np.fft.irfft(S, _LINES))
+    steps = int(np.clip(duration * rate, 50, _LINES // 2))
+    return np.asarray(np.arange(steps) / rate), np.asarray(error[:steps])

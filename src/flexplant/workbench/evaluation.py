@@ -1,0 +1,232 @@
+"""AxisLoop: the loop of one axis with the others closed, its curves and its verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+
+from ..checks import ComplexArray, FloatArray
+from ..errors import AssumptionError
+from ..loop import LoopMargins
+from ..loop.broken import BrokenLoop
+from ..loop.report import NyquistCount, broken_count, broken_margins
+from ..loop.sensitivity import broken_bandwidth
+from ..lti.interconnection import loop_poles, side_by_side
+from ..lti.measured_lines import followed, low_slope
+from ..synthesis import LoopDesign, ShapedAxis
+from ..synthesis.laws.law import Law
+from .machine import BenchMachine
+
+#: slope at the lowest lines above which an axis is a free body
+_FREE = 1.0
+#: no loop is closed, none is unstable
+_NONE = NyquistCount(0)
+
+
+@dataclass(frozen=True, eq=False)
+class OthersClosed:
+    """An axis as its own law sees it: with the loops of the others closed."""
+
+    G: ComplexArray
+    respond: Callable[[FloatArray], ComplexArray]
+    count: NyquistCount
+    closed: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class AxisLoop:
+    """The loop of one axis on one machine: ``L = C G``, closed by negative feedback."""
+
+    name: str
+    machine: BenchMachine
+    others: OthersClosed
+    law: Law
+    parts: BrokenLoop
+    count: NyquistCount
+
+    @cached_property
+    def C(self) -> ComplexArray:
+        """The law."""
+        return self.law.at(self.freq)
+
+    @cached_property
+    def margins(self) -> LoopMargins:
+        """Crossovers and margins, each with its frequency."""
+        return broken_margins(self.parts, "y")[0]
+
+    @cached_property
+    def modulus_margin(self) -> float:
+        """The least distance to -1 on what is followed of the loop; that of `margins` at least."""
+        return float(np.abs(1.0 - self.parts.gain(self.parts.followed, "y")).min())
+
+    @cached_property
+    def bandwidth(self) -> float:
+        """The frequency [Hz] at which |S| first crosses 1; NaN where none is, or of no use."""
+        with suppress(AssumptionError):
+            return float("nan") if self.count.unstable else broken_bandwidth(self.parts)
+        return float("nan")
+
+    @property
+    def freq(self) -> FloatArray:
+        """Frequencies [Hz] of the curves."""
+        return self.machine.freq
+
+    @property
+    def deviation(self) -> FloatArray | None:
+        """The standard deviation of each line of the axis, where it is known."""
+        i = self.machine.axes.names.index(self.name)
+        known = self.machine.deviation
+        return None if known is None else known[i, i]
+
+    @cached_property
+    def L(self) -> ComplexArray:
+        """The loop gain."""
+        return self.C * self.others.G
+
+    @cached_property
+    def S(self) -> ComplexArray:
+        """The sensitivity."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(1.0 / (1.0 + self.L))
+
+    @property
+    def T(self) -> ComplexArray:
+        """The complementary sensitivity."""
+        return self.L * self.S
+
+    @property
+    def KS(self) -> ComplexArray:
+        """From noise of the sensor to the command."""
+        return self.C * self.S
+
+    @property
+    def PS(self) -> ComplexArray:
+        """From a force in the axis to its motion."""
+        return self.others.G * self.S
+
+    @property
+    def is_stable(self) -> bool | None:
+        """Whether all closed loops are stable together; None where lines do not say."""
+        return None if self.count.unstable is None else not self.count.unstable
+
+
+_Kept: TypeAlias = tuple[BenchMachine, tuple[ShapedAxis, ...], OthersClosed]
+
+
+class Evaluator:
+    """Evaluates axes of designs on machines; what does not change with a slider is kept."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[int, str], _Kept] = {}
+
+    def loop(self, machine: BenchMachine, design: LoopDesign, name: str) -> AxisLoop:
+        """Return the loop of one axis, the others as they are switched."""
+        law, others = design.laws[name], self._with_others(machine, design, name)
+        parts = self._broken(machine, design, name, others)
+        rigid = 0
+        if machine.is_measured:
+            free = low_slope(machine.freq, others.G[None, None]) > _FREE
+            rigid = int(free and design.rigid > 0)
+        count = broken_count(parts, rigid, design.unstable + (others.count.unstable or 0))
+        if others.count.unstable is None:  # the count of this axis rests on that of the others
+            count = NyquistCount(None, f"the other axes: {others.count.reason}")
+        elif others.count.narrowest > count.narrowest:
+            count = count._replace(narrowest=others.count.narrowest, near=others.count.near)
+        return AxisLoop(name, machine, others, law, parts, count)
+
+    def _broken(
+        self, machine: BenchMachine, design: LoopDesign, name: str, others: OthersClosed
+    ) -> BrokenLoop:
+        """Return the loop between law and axis, as `report_loops` takes one apart."""
+        laws = design.laws
+        law = laws[name]
+
+        def plant(freq: FloatArray) -> ComplexArray:
+            if machine.is_measured:
+                return followed(machine.freq, others.G, freq)[None, None]
+            return others.respond(freq)[None, None]
+
+        def poles() -> ComplexArray:
+            if machine.is_measured:
+                return law.system.poles()
+            chosen = [n for n in design.axes if n == name or n in others.closed]
+            inputs = [machine.axes.before.inputs[list(design.axes).index(n)] for n in chosen]
+            each = [(-laws[n].system).replace(dt=machine.axes.plant.dt) for n in chosen]
+            K = side_by_side(each, chosen).replace(inputs=chosen, outputs=inputs)
+            return loop_poles(machine.axes.plant.select(chosen, inputs), K)
+
+        return BrokenLoop(
+            (name,), (name,), lambda freq: -law.at(freq)[None, None], plant, poles,
+            1.0 / law.rate if law.rate else 0.0, machine.freq if machine.is_measured else None,
+        )  # fmt: skip
+
+    def _with_others(self, machine: BenchMachine, design: LoopDesign, name: str) -> OthersClosed:
+        """Return the axis with the others closed; kept until one of them changes."""
+        others = tuple(axis for n, axis in design.axes.items() if n != name)
+        key = id(machine), name
+        known = self._kept.get(key)
+        if known and known[0] is machine and all(map(_same, known[1], others)):
+            return known[2]
+        found = _closed_around(machine, design, name)
+        self._kept[key] = machine, others, found
+        return found
+
+
+def _same(one: ShapedAxis, other: ShapedAxis) -> bool:
+    return one is other or (not one.closed and not other.closed)
+
+
+def _closed_around(machine: BenchMachine, design: LoopDesign, name: str) -> OthersClosed:
+    """Return ``G_aa - G_ao C_o (I + G_oo C_o)^-1 G_oa``, o the other axes that are closed."""
+    names = list(design.axes)
+    a = names.index(name)
+    closed = tuple(n for n in names if n != name and design.axes[n].closed)
+    if not closed:
+        return OthersClosed(machine.G[a, a], lambda f: machine.respond(f)[a, a], _NONE, closed)
+    o, laws = [names.index(n) for n in closed], [design.laws[n] for n in closed]
+
+    def reduced(freq: FloatArray, G: ComplexArray) -> ComplexArray:
+        C = np.array([law.at(freq) for law in laws])
+        back = np.eye(len(o))[:, :, None] + G[np.ix_(o, o)] * C
+        fed = np.linalg.solve(np.moveaxis(back, 2, 0), np.moveaxis(G[np.ix_(o, [a])], 2, 0))
+        return np.asarray(G[a, a] - np.einsum("of,fo->f", G[a, o] * C, fed[:, :, 0]))
+
+    count = _others(machine, design, o, laws) if machine.is_measured else _NONE
+    G = reduced(machine.freq, machine.G)
+    return OthersClosed(G, lambda f: reduced(f, machine.respond(f)), count, closed)
+
+
+def _others(
+    machine: BenchMachine, design: LoopDesign, o: list[int], laws: list[Law]
+) -> NyquistCount:
+    """Return the count of the other axes of a measured plant, this one open."""
+    names, n = tuple(list(design.axes)[i] for i in o), len(o)
+    chosen = np.ix_(o, o)
+
+    def controller(freq: FloatArray) -> ComplexArray:
+        K = np.zeros((n, n, freq.size), dtype=np.complex128)
+        K[range(n), range(n)] = [-law.at(freq) for law in laws]
+        return K
+
+    poles = np.concatenate([law.system.poles() for law in laws])
+    each = [low_slope(machine.freq, machine.G[i : i + 1, i : i + 1]) for i in o]
+    rigid = sum(slope > _FREE for slope in each) if design.rigid else 0
+    parts = BrokenLoop(
+        names, names, controller, lambda freq: machine.respond(freq)[chosen], lambda: poles,
+        1.0 / design.rate if design.rate else 0.0, machine.freq,
+    )  # fmt: skip
+    return broken_count(parts, rigid, 0)
+
+
+def coupling(machine: BenchMachine, design: LoopDesign, name: str) -> dict[str, FloatArray]:
+    """Return how the command of an axis moves the others, beside its own motion."""
+    names = list(design.axes)
+    a = names.index(name)
+    own = np.abs(machine.G[a, a])
+    others = (i for i in range(len(names)) if i != a)
+    return {names[i]: np.abs(machine.G[i, a]) / own for i in others}

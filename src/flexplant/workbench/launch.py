@@ -1,0 +1,260 @@
+"""workbench: opens the page on a plant, or on a file that holds one."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Self
+
+from ..checks import FloatArray
+from ..errors import FlexplantError, ModelError
+from ..io import read_frf_csv, read_frf_mat, read_frf_npz, read_frf_uff, read_mat
+from ..lti.frequency import Frf
+from ..lti.statespace import StateSpace, System
+from ..plant import StandardPlant
+from ..simulation.motion import SetPoint
+from ..store import load
+from ..synthesis import LoopDesign
+from .bench import Bench, checked_options
+from .limits import LoopLimits
+from .page import Page
+from .server import Served
+
+
+class Workbench(Bench):
+    """The page of `flexplant.workbench`: it serves itself, and shows itself in a notebook.
+
+    Parameters
+    ----------
+    machines : mapping {name: plant}
+        The first is shaped.
+    design : LoopDesign
+        To begin with; `design` is what was shaped last in any tab.
+    model, larger, channel, move, limits, source
+        As for `workbench`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> mass = fx.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
+    >>> fx.workbench(mass, open_browser=False).top < 1e3  # frequencies of sliders [Hz]
+    True
+    """
+
+    _server: Served | None = None
+
+    def panel(self) -> Any:
+        """Return a page of its own, as a Panel object."""
+        return Page(self).layout
+
+    def servable(self) -> Any:
+        """Return the page for ``panel serve``."""
+        return self.panel().servable("flexplant workbench")
+
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> Any:
+        """Show the page in the cell of a notebook."""
+        import panel as pn
+
+        if in_notebook():
+            pn.extension()  # once for a notebook
+        return self.panel()._repr_mimebundle_(include, exclude)
+
+    @property
+    def url(self) -> str:
+        """Where the page is, while it is served."""
+        return "" if self._server is None else f"http://127.0.0.1:{self._server.port}/"
+
+    def serve(self, port: int = 0, *, open_browser: bool = False, block: bool = False) -> Self:
+        """Serve the page on this machine, and on it alone.
+
+        Parameters
+        ----------
+        port : int
+            0 takes a free one.
+        open_browser : bool
+            Whether to open it.
+        block : bool
+            Whether to wait until Ctrl-C ends the server.
+        """
+        if self._server is not None:
+            raise FlexplantError(f"the page is served already, at {self.url}. close() it first.")
+        self._server = Served(self.panel, port)
+        if open_browser:
+            import webbrowser
+
+            webbrowser.open(self.url)
+        if block:
+            self.wait()
+        return self
+
+    def wait(self) -> None:
+        """Return when Ctrl-C, or `close` in another thread, ended the server."""
+        if self._server is not None:
+            try:
+                self._server.wait()
+            finally:
+                self.close()
+
+    def close(self) -> None:
+        """End the server and all its sessions."""
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+
+
+def workbench(
+    plant: Any,
+    *,
+    design: LoopDesign | None = None,
+    model: StandardPlant | System | None = None,
+    larger: Any = None,
+    before: System | FloatArray | None = None,
+    after: System | FloatArray | None = None,
+    rate: float | None = None,
+    delay: float | None = None,
+    hold: bool | None = None,
+    rigid: int | None = None,
+    unstable: int | None = None,
+    references: Mapping[str, str] | None = None,
+    channel: str | None = None,
+    move: SetPoint | None = None,
+    limits: LoopLimits | None = None,
+    source: str = "",
+    port: int = 0,
+    open_browser: bool = True,
+    block: bool | None = None,
+) -> Workbench:
+    """Open a page in the browser on which loops are shaped by hand, axis by axis.
+
+    The page is served on this machine only. In a notebook the object that is returned shows the
+    page in its cell; `Workbench.design` is what was shaped last.
+
+    Parameters
+    ----------
+    plant : Frf, StandardPlant, StateSpace, or a list or mapping of them
+        Measured or modelled. Of several, a fleet, the first is shaped, the others are judged.
+    design : LoopDesign, optional
+        To go on with; else each axis begins with PID and low-pass well below its resonances.
+    model : StandardPlant or StateSpace, optional
+        Of a measured plant: drawn beside it, for its error and the modes left out.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes left out, as for `larger_plant`.
+    before, after, rate, delay, hold, rigid, unstable, references
+        As for `design_loops`; of an assembled plant, or of the model, the rigid-body axes.
+    channel : str, optional
+        The z whose rms is predicted; the first error of the plant when not given.
+    move : SetPoint, optional
+        The set-point whose error is drawn; a unit step when not given.
+    limits : LoopLimits, optional
+        What the page draws as forbidden, and judges.
+    source : str
+        The line of Python that makes the plant, for the scripts that are copied.
+    port : int
+        Of the server; 0 takes a free one.
+    open_browser : bool
+        False returns the object without serving: call `serve`.
+    block : bool, optional
+        Whether to wait until Ctrl-C; unless given, where Python runs a script.
+
+    Returns
+    -------
+    Workbench
+
+    Raises
+    ------
+    ModelError, LabelError, ShapeError, AssumptionError
+        As for `design_loops`; ModelError when an option is of another kind.
+    FlexplantError
+        When Panel is missing, or the port is taken.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> mass = fx.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=1)
+    >>> bench = fx.workbench(mass, open_browser=False)
+    >>> bench.design.loops(mass).report.is_stable
+    True
+    """
+    checked_options(limits, move, design)
+    options = {
+        "model": model, "larger": larger, "before": before, "after": after, "rate": rate,
+        "delay": delay, "hold": hold, "rigid": rigid, "unstable": unstable,
+        "references": references, "channel": channel, "move": move, "limits": limits,
+        "source": source,
+    }  # fmt: skip
+    bench = Workbench.of(plant, design, options)
+    if open_browser and not in_notebook():
+        waits = not sys.flags.interactive and not hasattr(sys, "ps1")
+        bench.serve(port, open_browser=True, block=waits if block is None else block)
+    return bench
+
+
+def in_notebook() -> bool:
+    """Return whether a notebook shows what a cell returns."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return type(shell).__name__ == "ZMQInteractiveShell"
+
+
+def open_file(path: str | Path) -> tuple[Any, LoopDesign | None, str]:
+    """Return the plant of a file, or the design, and the line of Python that reads it.
+
+    Parameters
+    ----------
+    path : str or Path
+        An Frf in a universal, CSV, MATLAB or NumPy file; what `.save` of a plant, a response or a
+        LoopDesign wrote.
+
+    Raises
+    ------
+    FlexplantError
+        When it holds none of these.
+    FileNotFoundError
+        When there is no such file.
+
+    Examples
+    --------
+    >>> import flexplant as fx, os, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "mass.npz")
+    ...     fx.lti.tf([1.0], [1.0, 0.0, 0.0]).save(path)
+    ...     plant, design, line = fx.workbench.open_file(path)
+    >>> plant.n_states, design
+    (2, None)
+    """
+    file = Path(path)
+    if not file.exists():
+        raise FileNotFoundError(f"there is no file {str(file)!r}.")
+    readers: Mapping[str, tuple[str, Callable[[Path], Any]]] = {
+        ".uff": ("io.read_frf_uff", read_frf_uff), ".unv": ("io.read_frf_uff", read_frf_uff),
+        ".uf": ("io.read_frf_uff", read_frf_uff), ".csv": ("io.read_frf_csv", read_frf_csv),
+        ".mat": ("io.read_mat", read_mat), ".npz": ("load", load),
+    }  # fmt: skip
+    if file.suffix.lower() not in readers:
+        raise FlexplantError(
+            f"{str(file)!r} is of no kind that the workbench opens: {', '.join(readers)}."
+        )
+    name, read = readers[file.suffix.lower()]
+    others: Mapping[str, tuple[str, Callable[[Path], Any]]] = {
+        "load": ("io.read_frf_npz", read_frf_npz),
+        "io.read_mat": ("io.read_frf_mat", read_frf_mat),
+    }
+    try:
+        value = read(file)
+    except FlexplantError as problem:
+        if name not in others:
+            raise
+        name, read = others[name]
+        try:
+            value = read(file)
+        except FlexplantError:
+            raise problem from None
+    line = f"plant = fx.{name}({str(file)!r})"
+    if isinstance(value, LoopDesign):
+        return None, value, ""
+    if not isinstance(value, Frf | StandardPlant | StateSpace):
+        raise ModelError(
+            f"{str(file)!r} holds a {type(value).__name__}: the workbench opens a measured Frf, a "
+            "StandardPlant, a StateSpace or a LoopDesign."
+        )
+    return value, None, line

@@ -1,0 +1,194 @@
+"""SideCards: the smaller cards of the page: feedforward, limits, tuning, files."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ..errors import FlexplantError
+from ..synthesis import ShapedAxis
+from ..synthesis.laws.hand_design import TERMS
+from . import exports, style
+from .fields import parsed, shown
+
+#: limits of the page: field of LoopLimits, label, unit; those in dB are typed so
+_LIMITS = (
+    ("peak", "peak of |S|", "dB"), ("gain_margin", "gain margin", "dB"),
+    ("phase_margin", "phase margin", "deg"), ("bandwidth", "bandwidth", "Hz"),
+    ("suppressed", "|S| below", "dB"), ("below", "up to", "Hz"), ("rms", "rms of the error", ""),
+)  # fmt: skip
+
+
+class SideCards:
+    """The cards beside the law; `page` is the tab that they belong to."""
+
+    def __init__(self, page: Any) -> None:
+        self.page = page
+        self._own = False
+        self.cards = [
+            self._forward_card(), self._limits_card(), self._tune_card(), self._files_card()
+        ]  # fmt: skip
+
+    def _card(self, name: str, *items: Any, collapsed: bool) -> Any:
+        import panel as pn
+
+        inside = pn.Column(*items, margin=(0, 8, 6, 8), sizing_mode="stretch_width")
+        return pn.Card(
+            inside, header=pn.pane.HTML(style.title(name), margin=(0, 0, 0, 4)),
+            collapsed=collapsed, sizing_mode="stretch_width", margin=(0, 0, 6, 0),
+            styles=style.CARD | {"padding": "0", "box-shadow": "none"},
+            header_background="#FFFFFF", hide_header=False,
+        )  # fmt: skip
+
+    def _text(self, label: str, value: str, take: Callable[[str], None], **more: Any) -> Any:
+        import panel as pn
+
+        text = pn.widgets.TextInput(
+            label=label,
+            value=value,
+            width=100,
+            margin=(0, 4, 4, 0),
+            stylesheets=[style.COMPACT],
+            **more,
+        )
+        text.param.watch(
+            lambda event: None if self._own else self._guarded(take, event.new), "value"
+        )
+        return text
+
+    def _guarded(self, take: Callable[[str], None], text: str) -> None:
+        if self._own:
+            return
+        try:
+            take(text)
+        except FlexplantError as problem:
+            self.page.refuse(str(problem))
+
+    def _forward_card(self) -> Any:
+        import panel as pn
+
+        self.forward = [
+            self._text(f"{term}", "", partial(self._put_forward, i), placeholder="0")
+            for i, term in enumerate(TERMS)
+        ]
+        box = pn.FlexBox(*self.forward, gap="0px", sizing_mode="stretch_width")
+        return self._card("feedforward (command per derivative)", box, collapsed=True)
+
+    def _put_forward(self, i: int, text: str) -> None:
+        gains = list(self.page.design.axes[self.page.axis].feedforward)
+        gains += [0.0] * (len(TERMS) - len(gains))
+        gains[i] = parsed(text) if text.strip() else 0.0
+        self.page.change(feedforward=tuple(gains))
+
+    def _limits_card(self) -> Any:
+        import panel as pn
+
+        self.limits = [
+            self._text(label, self._limit(name, unit), partial(self._put_limit, name))
+            for name, label, unit in _LIMITS
+        ]
+        box = pn.FlexBox(*self.limits, gap="0px", sizing_mode="stretch_width")
+        return self._card("specifications", box, collapsed=False)
+
+    def _limit(self, name: str, unit: str) -> str:
+        value = getattr(self.page.limits, name)
+        if value is None:
+            return ""
+        return f"{20.0 * np.log10(value):.3g} dB" if unit == "dB" else shown(value, unit)
+
+    def _put_limit(self, name: str, text: str) -> None:
+        value = parsed(text) if text.strip() else None
+        if name == "peak" and value is None:
+            raise FlexplantError("the peak of |S| has a limit: 6 dB unless another is typed.")
+        self.page.limits = self.page.limits.replace(**{name: value})
+        self.page.views.draw_limits(self.page.limits)
+        self.page.draw()
+
+    def _tune_card(self) -> Any:
+        import panel as pn
+
+        small: dict[str, Any] = style.SMALL | {"margin": (2, 4, 2, 0)}
+        self.start = pn.widgets.Button(label="tune", color="primary", width=64, **small)
+        self.stop = pn.widgets.Button(
+            label="stop", color="danger", width=56, disabled=True, **small
+        )
+        self.notches = pn.widgets.Select(options=[0, 1, 2, 3, 4, 5], value=3, width=56, **small)
+        self.tuned = pn.pane.HTML(
+            style.note("all axes, highest bandwidth below the peak of |S|"), margin=0
+        )
+        self.start.on_click(lambda _: self.page.tune(int(self.notches.value)))
+        self.stop.on_click(lambda _: self.page.stop_tuning())
+        label = pn.pane.HTML(style.note("notches"), margin=(8, 4, 0, 0))
+        row = pn.Row(self.start, self.stop, label, self.notches, margin=0)
+        return self._card("automatic", row, self.tuned, collapsed=False)
+
+    def show_tuning(self, said: str, running: bool) -> None:
+        """Show how far a search is."""
+        self.tuned.object = style.note(said)
+        self.start.disabled, self.stop.disabled = running, not running
+
+    def _files_card(self) -> Any:
+        import panel as pn
+
+        page = self.page
+        kinds: tuple[tuple[str, str, Callable[[], bytes]], ...] = (
+            ("design", "design.npz", lambda: exports.design_file(page.design)),
+            ("C99", "loops.zip", lambda: exports.c_code(page.design)),
+            ("MATLAB", "loops.mat", lambda: exports.matlab(page.design)),
+            ("sections", "sections.csv", lambda: exports.sections(page.design)),
+            ("Python", "loops.py", lambda: exports.script(page.design, page.bench.source)),
+            ("report", "loops.html", self._report),
+        )
+        buttons = [
+            pn.widgets.FileDownload(
+                callback=lambda make=make: self._made(make), filename=file, label=f"save {label}",
+                variant="outline", height=28, margin=(0, 4, 4, 0), embed=False, auto=True,
+                stylesheets=[style.COMPACT],
+            )
+            for label, file, make in kinds
+        ]  # fmt: skip
+        self.script = pn.widgets.TextAreaInput(
+            value="", height=110, sizing_mode="stretch_width", margin=(4, 0, 0, 0),
+            stylesheets=[style.COMPACT], max_length=200_000,
+        )  # fmt: skip
+        copy = pn.widgets.Button(
+            label="copy as Python", variant="outline", height=28, margin=(0, 4, 4, 0),
+            stylesheets=[style.COMPACT],
+        )  # fmt: skip
+        copy.js_on_click(
+            args={"source": self.script}, code="navigator.clipboard.writeText(source.value)"
+        )
+        given = pn.widgets.FileInput(
+            accept=".npz", multiple=False, margin=(2, 0, 2, 0), sizing_mode="stretch_width"
+        )
+        given.param.watch(lambda event: event.new and page.hand_over(event.new), "value")
+        load = pn.pane.HTML(
+            style.note("load a design, or a law or controller as elements"), margin=0
+        )
+        box = pn.FlexBox(*buttons, copy, gap="0px", sizing_mode="stretch_width")
+        return self._card("files", box, load, given, self.script, collapsed=False)
+
+    def _report(self) -> bytes:
+        page = self.page
+        plant = page.bench.question_of(page.index).plant
+        return exports.report(page.design, plant or page.machine.given, page.bench.larger)
+
+    def _made(self, make: Callable[[], bytes]) -> Any:
+        """Return a file for the browser; what is wrong with it appears on the page."""
+        try:
+            return io.BytesIO(make())
+        except FlexplantError as problem:
+            self.page.refuse(str(problem))
+            return io.BytesIO(f"{problem}\n".encode())
+
+    def show(self, axis: ShapedAxis) -> None:
+        """Show the numbers of an axis."""
+        self._own = True
+        gains = [*axis.feedforward, *([0.0] * (len(TERMS) - len(axis.feedforward)))]
+        for text, gain in zip(self.forward, gains, strict=True):
+            text.value = f"{gain:.6g}" if gain else ""
+        self._own = False
