@@ -1,77 +1,98 @@
-"""Designs on the drawing and on the updated model, on random machines: how many loops hold."""
+"""Loops promised and measured, on machines of another formulation than the design model's.
 
+Run with ``-m benchmark -s``: some seven minutes. The drawing is a mesh with 24 modes; the machines
+are plates in polynomials with rotary inertia, scattered stiffness and damping (0.1 % on average),
+0.3 to 0.9 kg that no drawing shows and a second mass. Their first ten poles are measured to 1e-5;
+four of them give mass and stiffness, all calibrate the model, the fit says what is not known.
+"""
+
+import time
 import warnings
 
 import numpy as np
 import pytest
 
 import flexplant as fx
-from flexplant.structure import FEModel
-from stages import L, ports
 
-MACHINES, RATE = 16, 1e4
-MODES = tuple(range(4, 13))
+pytestmark = pytest.mark.benchmark
 
-
-def drawing(modulus=70e9):
-    return fx.kirchhoff_plate(
-        size=(L, L), thickness=0.0272, elements=(8, 8), density=2702,
-        youngs_modulus=modulus, poisson_ratio=0.35,
-    )  # fmt: skip
-
-
-def machine(rng, damping):
-    """0 to 1 kg anywhere, Young's modulus within 3 %; damping is that of the bare plate."""
-    bare = drawing(70e9 * (1 + rng.uniform(-0.03, 0.03))).with_damping(fx.ModalDamping(damping))
-    at = bare.dofs.nearest((*rng.uniform(0, L, 2), 0.0), "z")
-    row = np.zeros(bare.n_dof)
-    row[bare.dofs.index(at)] = 1.0
-    kg = rng.uniform(0, 1)
-    return FEModel(bare.M + kg * np.outer(row, row), bare.K, bare.D, dofs=bare.dofs), at, kg
+RATE, ZETA, MACHINES = 10e3, 0.001, 3
+MATERIAL = {"density": 2702, "poisson_ratio": 0.35}
+MODULUS = 70e9
+#: size [m], thickness [m], elements, actuators as parts of the size
+CASES = {
+    "the paper's plate": ((0.6, 0.6), 0.0272, (8, 8), ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75),
+                                                       (0.75, 0.75))),
+    "actuators uneven": ((0.6, 0.6), 0.0272, (8, 8), ((0.2, 0.25), (0.83, 0.17), (0.25, 0.7),
+                                                      (0.67, 0.8))),
+    "small and thick": ((0.5, 0.35), 0.03, (8, 6), ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75),
+                                                    (0.75, 0.75))),
+}  # fmt: skip
 
 
-def models(truth, at, damping):
-    """The drawing in 25 physical DOFs, and updated by nine measured modes."""
-    modes = fx.solve_modes(
-        drawing(), count=24, damping=fx.ModalDamping(damping), compliance_at=[at]
+def ports(size, forces):
+    places = [(x * size[0], y * size[1], 0.0) for x, y in forces]
+    corners = [(x, y, 0.0) for y in (0.0, size[1]) for x in (0.0, size[0])]
+    return fx.Ports(
+        w=[fx.Disturbance(f"amp{i}", at=p, asd=1e-3) for i, p in enumerate(places, 1)],
+        u=[fx.Actuator(f"u{i}", at=p) for i, p in enumerate(places, 1)],
+        z=[fx.Poi("die", at=(size[0] / 2, size[1] / 2, 0.0), axes=("z", "rx", "ry"))],
+        y=[fx.Sensor(f"y{i}", at=p, asd=1.4e-12) for i, p in enumerate(corners, 1)],
+        references=[fx.Reference("die")],
     )
-    spots = [(x, y, 0.0) for y in np.linspace(0, L, 5) for x in np.linspace(0, L, 5)]
-    nominal = fx.reduce(modes, fx.DesiredDofs([modes.dofs.nearest(p, "z") for p in spots]))
-    true = fx.solve_modes(truth, count=max(MODES))
-    freq, zeta = (np.asarray(part)[[m - 1 for m in MODES]] for part in (true.freq, true.zeta))
-    omega = 2 * np.pi * freq
-    measured = fx.MeasuredModes(omega * (-zeta + 1j * np.sqrt(1 - zeta**2)), modes=MODES)
-    unknowns = [fx.AddedMass(at), fx.MatrixParameter("modulus", dK=drawing().K)]
-    return nominal, fx.update(nominal, unknowns, [fx.Eigenvalues(measured)]).model
 
 
-def radius(model, truth, bandwidth):
-    """The spectral radius on the machine of the design by the default weights."""
-    plant = fx.assemble_plant(model, ports()).discretized(RATE, delay=1)
-    errors, weights = fx.reference_errors(plant), fx.stage_weights(plant, bandwidth)
-    found = fx.design_hinf(plant.through(errors).weighted(z=weights.z, w=weights.w))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", fx.FlexplantWarning)
-        whole = fx.assemble_plant(truth, ports()).discretized(RATE, delay=1)
-        return fx.close_loop(whole, errors, found).spectral_radius
+def meshed(size, thickness, elements, stiffer=0.0):
+    modulus = MODULUS * (1.0 + stiffer)
+    return fx.kirchhoff_plate(
+        size=size, thickness=thickness, elements=elements, youngs_modulus=modulus, **MATERIAL
+    )
 
 
-@pytest.mark.benchmark
-@pytest.mark.parametrize("damping", [0.001, 0.01])
-def test_designs_on_random_machines(damping, capsys):
-    """At 0.1 % damping the drawing is enough for none of them, the updated model for all."""
-    counts = {"drawing": 0, "updated": 0}
-    rows = []
-    for rng in np.random.default_rng(16).spawn(MACHINES):
-        truth, at, kg = machine(rng, damping)
-        found = [radius(m, truth, 100.0) for m in models(truth, at, damping)]
-        for name, value in zip(counts, found, strict=True):
-            counts[name] += value < 1
-        rows.append(f"{kg:8.3f} kg at {at:8s} {found[0]:12.6f} {found[1]:12.6f}")
-    with capsys.disabled():
-        print(f"\n100 Hz at {damping:.1%} damping: radius on the machine, drawing and updated")
-        print("\n".join(rows))
-        print(f"stable on {counts['drawing']} and {counts['updated']} of {MACHINES}")
-    assert counts["updated"] >= 14
-    if damping == 0.001:
-        assert counts["drawing"] <= 2
+def models(machine, size, thickness, elements, seed):
+    """The calibrated model, the one with the modes left out, and what is not known."""
+    drawing = meshed(size, thickness, elements)
+    place = (size[0] / 2, size[1] / 4, 0.0)
+    at, low = drawing.dofs.nearest(place, "z"), fx.ModalDamping(ZETA)
+    modes = fx.solve_modes(drawing, count=24, damping=low, compliance_at=[at])
+    rom = fx.reduce(modes, fx.DesiredDofs(fx.select_dofs(modes, 25, required=[at]).labels))
+    poles = machine.poles(range(4, 14), deviation=1e-5, rng=seed)
+    first = fx.MeasuredModes(poles.poles[:4], modes=poles.modes[:4])
+    unknown = [fx.AddedMass(at), fx.MatrixParameter("E", dK=rom.K)]
+    fit = fx.update(rom, unknown, [fx.Eigenvalues(first)])
+    fine = meshed(size, thickness, [4 * n for n in elements], fit.values[1])
+    loaded = fine.with_parts(fx.PointMass(fine.dofs.nearest(place, "z"), fit.values[0]))
+    whole = fx.solve_modes(loaded, count=120, damping=low).calibrated(poles)
+    return fit.calibrated(poles), whole, fit.frequency_uncertainty(poles)
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_promised_and_measured(name):
+    size, thickness, elements, forces = CASES[name]
+    own = ports(size, forces)
+    print(f"\n{name}: margin promised, with the modes left out, on the machine; |S| < 1 up to")
+    for seed in range(301, 301 + MACHINES):
+        machine = fx.testbeds.wafer_stage(
+            size=size,
+            thickness=thickness,
+            damping=ZETA,
+            individual=seed,
+            added_mass=0.3 + 0.3 * (seed - 301),
+            rate=RATE,
+        )
+        model, whole, off = models(machine, size, thickness, elements, seed)
+        plant = fx.assemble_plant(model, own).discretized(RATE, delay=machine.delay)
+        begin = time.process_time()
+        with warnings.catch_warnings(action="ignore"):
+            controller = fx.design_stage(plant.uncertain(frequency=off), larger=whole)
+            spent = time.process_time() - begin
+            promised = fx.close_loop(plant, controller, larger=whole)
+        loop = machine.loop(own, controller)
+        assert loop.is_stable
+        reach = fx.compare_loops({"machine": loop}).rows["machine"].bandwidth
+        margins = [promised, promised.completed, loop]
+        said = "  ".join(f"{one.modulus_margin:.3f}" for one in margins)
+        print(f"  machine {seed}: {said}  {reach:5.1f} Hz  ({spent:.0f} s of CPU)")
+        # shapes of the modes and those left out are not what the model has: 0.33 for 0.43 at worst
+        assert loop.modulus_margin > 0.7 * promised.completed.modulus_margin
+        assert np.isfinite(reach)

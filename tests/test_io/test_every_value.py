@@ -120,6 +120,7 @@ def made():
     yield synthesis.shape_loop(fx.StateSpace([[0.0]], [[1.0]], [[1.0]], [[0.0]]), bandwidth=1.0)
     yield from (synthesis.TunedLaws(law), synthesis.FixedOrder(1), synthesis.ObserverGains())
     yield from (*law.factors, law, fx.design_loops(sampled, law))
+    yield from by_hand()
     zero, one = np.zeros(1), {"mode6:freq": 1.0}
     yield synthesis.RobustStability(0.5, 0.4, 10.0, one, plant, zero, zero, {"machines": 1.0})
     yield synthesis.WorstCaseGain(2.0, 1.9, 1.0, 10.0, one, plant, zero, zero)
@@ -211,6 +212,15 @@ def of_reductions(fe, modes, rom):
     sizes = {"y1": 1e-3, "u1": 2e-3}
     yield fx.synthesis.FixedPointController(gain, 9, 16, 0, sizes, margins, [cycle], {"8": "lost"})
     yield fx.reduce(modes, truncation).quality(fe, band=(100.0, 400.0), freq=np.array([250.0]))
+
+
+def by_hand():
+    """One of each value that a loop shaped by hand is made of."""
+    block = synthesis.FixedBlock(fx.lti.tf([1.0], [0.01, 1.0]), "shaping filter")
+    axis = synthesis.ShapedAxis([fx.Pid(2.0), synthesis.Lag(5.0), block], on=[True, False, True])
+    yield from (block, synthesis.Lag(5.0), synthesis.Integrator(5.0), axis)
+    yield synthesis.LoopDesign.on(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), {"out": axis})
+    yield fx.workbench.LoopLimits(peak=2.0, phase_margin=30.0)
 
 
 def of_structures():
