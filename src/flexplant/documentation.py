@@ -198,7 +198,7 @@ class _Site:
     def pictures(self, story: Path, folder: Path) -> list[str]:
         """Copy what a story has drawn; return the names of the copies."""
         source = story.read_text(encoding="utf-8")
-        quoted = set(re.findall(r'"(\w+)(?:\.png)?"', source))
+        quoted = {story.stem, *re.findall(r'"(\w+)(?:\.png)?"', source)}
         quoted |= {f"{a}{b}" for a in re.findall(r'f"(\w+)\{\w+\}\.png"', source) for b in quoted}
         drawn = sorted((_EXAMPLES / "out").glob("*.png"))
         kept = [p for p in _EXAMPLES.glob("*.png") if not (_EXAMPLES / "out" / p.name).exists()]
