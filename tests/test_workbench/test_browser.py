@@ -210,6 +210,8 @@ def test_only_the_page_itself_may_talk_to_it(served):
         except HTTPClientError as error:
             return error.code
         found.close()
+        while await found.read_message() is not None:  # until the server has closed it too
+            pass
         return 101
 
     async def both():

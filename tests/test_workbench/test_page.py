@@ -129,7 +129,7 @@ def test_undo_redo_keep_and_go_back(page):
 def test_what_is_wrong_is_said_and_the_last_good_design_stands(page):
     good, shown = page.design, page.views.sources["magnitude main"].data["y"]
     number = numbers(page, 1)["frequency"]
-    for text, said in (("3 kHz", "not below half the rate"), ("many", "is no number with a unit")):
+    for text, said in (("3 kHz", "not below half the rate"), ("many", "is no frequency")):
         number.text.value = text
         assert page.message.visible
         assert said in page.message.object
@@ -148,6 +148,34 @@ def test_two_tabs_do_not_disturb_each_other(frf):
     one.gain.text.value = "2"
     assert two.design.axes["y1"].gain == bench.start.axes["y1"].gain != 2.0
     assert one.design.axes["y1"].gain == 2.0
+
+
+def test_what_is_refused_is_not_shown(frf):
+    """The boxes hold the design's numbers; corners do not change places; a reload goes on."""
+    bench = fx.workbench(frf, **SAMPLED, open_browser=False)
+    page = Page(bench)
+    (_, integrator), (_, zero), *_ = page.cards._numbers[0]
+    kept = page.design.axes["y1"].elements[0].as_corners()
+    for number, text in ((integrator, "9 kHz"), (integrator, "-2"), (integrator, "10 mm"),
+                         (zero, f"{0.5 * kept['integrator']:g}")):  # fmt: skip
+        before = number.text.value
+        number.text.value = text
+        assert number.text.value == before
+        assert page.message.visible
+        assert page.design.axes["y1"].elements[0].as_corners() == kept
+    integrator.slider.value = integrator.slider.end
+    assert "lies below the zero" in page.message.object
+    assert 10.0**integrator.slider.value == pytest.approx(kept["integrator"], rel=0.02)
+    page.gain.text.value = "0"
+    page.crossover.value = "20 Hz"
+    assert "loop gain is zero" in page.message.object
+    page.gain.text.value = "200"
+    assert Page(bench).design.axes["y1"].gain == 200.0
+    limits = page.limits.replace(suppressed=0.1, below=1e-6)
+    low = [one for one in limits.judged(page.loop) if one.name.startswith("|S|")]
+    assert [(one.reached, one.met) for one in low] == [("no line there", None)]
+    with pytest.raises(fx.FlexplantError, match="poles is positive"):
+        fields_of(fx.Notch(100.0), 1e3)[2].put(fx.Notch(100.0), 0.0)
 
 
 def test_a_handle_is_dragged_a_machine_is_clicked(frf):
@@ -369,6 +397,10 @@ def test_files_that_hold_a_plant(frf, tmp_path, capsys):
 
     assert main([str(tmp_path / "none.npz")]) == 1
     assert main([str(tmp_path / "design.npz")]) == 2
+    frf.save(tmp_path / "measured.npz")
+    assert main([str(tmp_path / "measured.npz")]) == 2
+    assert "give --rate" in capsys.readouterr().err
+    assert main([str(tmp_path / "none.npz")]) == 1
     assert "there is no file" in capsys.readouterr().err
 
 

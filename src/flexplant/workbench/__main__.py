@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 from ..errors import FlexplantError
+from ..lti.frequency import Frf
 from .launch import open_file, workbench
 
 
@@ -20,7 +21,8 @@ def main(words: list[str] | None = None) -> int:
         help="measured responses or plants (several: a fleet), and a saved design to go on with",
     )  # fmt: skip
     parser.add_argument("--model", help="a saved StandardPlant beside a measurement")
-    parser.add_argument("--rate", type=float, help="of the controller [Hz]")
+    parser.add_argument("--rate", type=float, help="of the controller [Hz]; of a measurement")
+    parser.add_argument("--continuous", action="store_true", help="no rate, so no C: to look only")
     parser.add_argument("--delay", type=float, help="samples beside what was measured")
     parser.add_argument("--sampled", action="store_true", help="measured from sample to sample")
     parser.add_argument("--rigid", type=int, help="rigid-body modes of the measured plant")
@@ -36,6 +38,14 @@ def main(words: list[str] | None = None) -> int:
         designs = [design for _, design, _ in found if design is not None]
         if not plants:
             sys.stderr.write("a design has no plant in it: name the file of its plant too.\n")
+            return 2
+        measured = isinstance(next(iter(plants.values())), Frf)
+        if measured and not (given.rate or given.model or designs or given.continuous):
+            sys.stderr.write(
+                "a measurement does not say at what rate its controller runs: give --rate, such as "
+                "--rate 10000 (with --sampled if it was measured from sample to sample), or "
+                "--continuous to look only.\n"
+            )
             return 2
         bench = workbench(
             plants, design=designs[-1] if designs else None,

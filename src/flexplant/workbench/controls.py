@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import FlexplantError
 from ..synthesis import ShapedAxis
+from ..tolerances import SAME
 from .fields import Field, fields_of, moved, name_of, parsed, removed, shown, switched, with_element
 from .style import COMPACT, ELEMENT, OFF
 
@@ -24,11 +25,11 @@ class Number:
 
     def __init__(
         self, label: str, unit: str, low: float, high: float, value: float,
-        take: Callable[[float], None], refuse: Callable[[str], None],
+        take: Callable[[float], None], refuse: Callable[[str], None], held: Callable[[], float],
     ) -> None:  # fmt: skip
         import panel as pn
 
-        self.unit, self._take, self._refuse = unit, take, refuse
+        self.unit, self._take, self._refuse, self._held = unit, take, refuse, held
         self._sign, self._own = 1.0, False
         self.slider = pn.widgets.FloatSlider(
             start=float(np.log10(low)), end=float(np.log10(high)), step=1.0 / _STEPS,
@@ -70,17 +71,28 @@ class Number:
         self._own = True
         self.text.value = shown(value, self.unit)
         self._own = False
-        self._take(value)
+        self._offer(value)
+
+    def _offer(self, value: float) -> None:
+        """Hand a number to the design, and show what the design has then."""
+        try:
+            self._take(value)
+        except FlexplantError as problem:
+            self._refuse(str(problem))
+        if not np.isclose(self._held(), value, rtol=SAME, atol=0.0):  # refused
+            self.show(self._held())
 
     def _typed(self, event: Any) -> None:
         if self._own:
             return
         try:
-            value = parsed(event.new)
-            self._take(value)
-            self.show(value)
+            value = parsed(event.new, self.unit)
         except FlexplantError as problem:
             self._refuse(str(problem))
+            self.show(self._held())
+            return
+        self._offer(value)
+        self.show(self._held())
 
 
 class ElementCards:
@@ -142,7 +154,7 @@ class ElementCards:
                 low, high = min(low, abs(value)), max(high, abs(value))
             number = Number(
                 field.label, field.unit, low, high, value,
-                partial(self._put, i, field), self._refuse,
+                partial(self._put, i, field), self._refuse, partial(self._held, i, field),
             )  # fmt: skip
             numbers.append((field, number))
         self._numbers.append(numbers)
@@ -155,6 +167,10 @@ class ElementCards:
     def _switch(self, i: int, on: bool) -> None:
         if on != self.axis.on[i]:
             self._change(switched(self.axis, i, on), None, True)
+
+    def _held(self, i: int, field: Field) -> float:
+        """Return the number that the design has."""
+        return field.read(self.axis.elements[i])
 
     def _put(self, i: int, field: Field, value: float) -> None:
         element = field.put(self.axis.elements[i], value)

@@ -17,6 +17,8 @@ _UNITS = {
     "": 1.0, "hz": 1.0, "khz": 1e3, "mhz": 1e-3, "%": 0.01, "s": 1.0, "ms": 1e-3, "us": 1e-6,
     "m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "deg": 1.0, "rad/s": 0.5 / np.pi,
 }  # fmt: skip
+#: units of a frequency, and of a number without a unit
+_KINDS = {"Hz": {"", "hz", "khz", "mhz", "rad/s"}, "": {"", "%", "db"}}
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S*)\s*")
 
 
@@ -31,16 +33,18 @@ class Field(NamedTuple):
     put: Callable[[Any, float], Any]
 
 
-def parsed(text: str) -> float:
-    """Return the number that was typed, in SI: ``1.2 kHz``, ``-20 dB``, ``0.1 %``."""
+def parsed(text: str, unit: str | None = None) -> float:
+    """Return the number that was typed, in SI: ``1.2 kHz``, ``-20 dB``, ``0.1 %``.
+
+    Of a known unit, "Hz" or none, others are refused.
+    """
     found = _NUMBER.fullmatch(text.replace(",", ".").replace("µ", "u"))
-    unit = found.group(2).lower() if found else ""
-    if not found or unit not in {*_UNITS, "db"}:
-        raise ModelError(
-            f"{text!r} is no number with a unit. Type one such as 130, 1.2 kHz, 0.1 % or -20 dB."
-        )
+    typed = found.group(2).lower() if found else ""
+    if not found or typed not in _KINDS.get("any" if unit is None else unit, {*_UNITS, "db"}):
+        of = {None: "number with a unit", "Hz": "frequency"}.get(unit, "number")
+        raise ModelError(f"{text!r} is no {of}. Type one such as 130, 1.2 kHz, 0.1 % or -20 dB.")
     value = float(found.group(1))
-    return float(10.0 ** (value / 20.0)) if unit == "db" else value * _UNITS[unit]
+    return float(10.0 ** (value / 20.0)) if typed == "db" else value * _UNITS[typed]
 
 
 def shown(value: float, unit: str) -> str:
@@ -69,6 +73,12 @@ def _corner(name: str, label: str, unit: str, low: float, high: float) -> Field:
 
     def put(element: Pid, value: float) -> Pid:
         corners: dict[str, Any] = {**(element.as_corners() or {}), name: value}
+        zero = corners["zero"]
+        if zero is not None and not corners["integrator"] < zero:  # the two would change places
+            raise ModelError(
+                f"the integrator's corner lies below the zero: {corners['integrator']:.4g} Hz is "
+                f"not below {zero:.4g} Hz."
+            )
         return Pid.corners(**corners)
 
     return Field(label, unit, low, high, read, put)
@@ -80,6 +90,8 @@ def _zeros_damping(element: Notch, value: float) -> Notch:
 
 def _poles_damping(element: Notch, value: float) -> Notch:
     """Change the damping of the poles, that of the zeros stays."""
+    if value <= 0.0:
+        raise ModelError(f"the damping of a notch's poles is positive, got {value:g}.")
     return element.replace(width=value, depth=element.depth * element.width / value)
 
 
@@ -136,7 +148,7 @@ def new_elements(crossover: float, top: float) -> Mapping[str, Callable[[], Sing
         "PID": lambda: Pid.corners(
             1.0, integrator=below(f / 6), zero=below(f / 3), pole=below(3 * f)
         ),
-        "PID (gains)": lambda: Pid(1.0, i=float(f"{2 * np.pi * f / 6:.3g}")),
+        "PI": lambda: Pid(1.0, i=float(f"{2 * np.pi * f / 6:.3g}")),
         "lead": lambda: Lead(below(f)),
         "lag": lambda: Lag(below(f / 5), 3.0),
         "integrator": lambda: Integrator(below(f / 6)),

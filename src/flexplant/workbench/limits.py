@@ -80,8 +80,11 @@ class LoopLimits(Value):
         yield from at_least("gain margin", self.gain_margin, gain, "")
         yield from at_least("phase margin", self.phase_margin, margins.phase_margin, " deg")
         yield from at_least("bandwidth", self.bandwidth, loop.bandwidth, " Hz")
-        if self.suppressed is not None and self.below is not None:
-            low = loop.freq <= self.below
+        low = loop.freq <= (self.below or 0.0)
+        if self.suppressed is not None and not np.any(low):
+            reached = "no frequency given" if self.below is None else "no line there"
+            yield Judged("|S| at low frequencies", f"at most {self.suppressed:.3g}", reached, None)
+        elif self.suppressed is not None and self.below is not None:
             worst = float(np.abs(loop.S[low]).max(initial=0.0))
             met = None if stable is None else bool(stable and worst <= self.suppressed)
             level = 20.0 * np.log10([self.suppressed, max(worst, 1e-300)])

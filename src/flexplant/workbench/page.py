@@ -39,7 +39,7 @@ class Page:
 
         self.bench = bench
         self.limits = bench.limits
-        self.history = DesignHistory(bench.start)
+        self.history = DesignHistory(bench.design)  # a page loaded again goes on
         self.axis = next(iter(bench.start.axes))
         self.index = 0
         self.kept: list[tuple[str, LoopDesign, Consequences | None]] = []
@@ -47,10 +47,10 @@ class Page:
         self.answer: Consequences | None = None
         self.tuning: Tuning | None = None
         self._evaluator = Evaluator()
-        self._serial = self._working = 0
+        self._serial = self._working = self._answered = 0
         self._waiting: dict[str, Any] = {}
         self.gestures = Gestures(self)
-        self._fitted = False
+        self._fitted = self._closed = False
         self._loaded = pn.state.curdoc is None or pn.state.curdoc.session_context is None
         self._doc = pn.state.curdoc
         self.views = Views(self.limits)
@@ -98,8 +98,9 @@ class Page:
         self.further = pn.pane.HTML("", sizing_mode="stretch_width", margin=(3, 0, 0, 0))
         gain = self.design.axes[self.axis].gain or 1.0
         self.gain = Number(
-            "gain", "", abs(gain) / 20.0, abs(gain) * 20.0, gain, self._set_gain, self.refuse
-        )
+            "gain", "", abs(gain) / 20.0, abs(gain) * 20.0, gain, self._set_gain, self.refuse,
+            lambda: self.design.axes[self.axis].gain,
+        )  # fmt: skip
         self.crossover = pn.widgets.TextInput(
             placeholder="e.g. 60 Hz",
             width=86,
@@ -228,7 +229,7 @@ class Page:
         if not self.crossover.value or self.loop is None:
             return None
         try:
-            freq = parsed(self.crossover.value)
+            freq = parsed(self.crossover.value, "Hz")
             if not self.loop.freq[0] <= freq <= self.loop.freq[-1]:
                 raise FlexplantError(f"{freq:g} Hz is no frequency of this plant's lines.")
         except FlexplantError as problem:
@@ -240,6 +241,11 @@ class Page:
         """Set the gain so that the loop crosses 1 at a frequency."""
         freq = self._wanted()
         if freq is None or self.loop is None:
+            return
+        if not np.all(self.loop.L):
+            self.refuse(
+                "the loop gain is zero: no gain makes it cross 1. Give the axis a gain first."
+            )
             return
         there = np.exp(np.interp(np.log(freq), np.log(self.loop.freq), np.log(np.abs(self.loop.L))))
         gain = float(f"{self.design.axes[self.axis].gain / there:.6g}")
@@ -399,14 +405,17 @@ class Page:
         if self.loop is None:
             return
         answer = self.answer
-        rms = None if answer is None else answer.rms
+        fresh = self._answered == self._serial
+        rms = answer.rms if answer is not None and fresh else None
         self.judged.object = style.judged(list(self.limits.judged(self.loop, rms)))
         rows: list[tuple[str, str, bool | None]] = []
         if len(self.fleet) > 1:
-            good = all(loop.is_stable for loop in self.fleet)
+            least = 1.0 / self.limits.peak
+            good = all(one.is_stable and one.modulus_margin >= least for one in self.fleet)
             rows.append(("fleet", self.fleet_text, good))
         if answer is not None:
-            rows += self._said(answer)
+            said = self._said(answer)  # of the design before, while that of now is computed
+            rows += said if fresh else [(f"{name} ...", text, None) for name, text, _ in said]
         self.further.object = style.lines(rows)
 
     def _said(self, answer: Consequences) -> list[tuple[str, str, bool | None]]:
@@ -444,8 +453,12 @@ class Page:
         self._working = serial
 
         def work() -> None:
-            answer = question.answer(design, loop)
-            doc.add_next_tick_callback(partial(self._show_answer, serial, answer))
+            try:
+                answer = question.answer(design, loop)
+            except Exception as problem:  # it must appear, and the next must not wait for it
+                answer = Consequences(missing=[f"no answer: {problem}"])
+            if not self._closed:
+                doc.add_next_tick_callback(partial(self._show_answer, serial, answer))
 
         threading.Thread(target=work, daemon=True).start()
 
@@ -453,7 +466,7 @@ class Page:
         from panel.io import hold
 
         self._working = 0
-        self.answer = answer
+        self.answer, self._answered = answer, serial
         with hold():
             scale, unit = _prefixed(answer.rms, answer.unit)
             names = [name for name, _ in answer.sources]
@@ -548,6 +561,7 @@ class Page:
 
     def close(self) -> None:
         """End what the tab has started."""
+        self._closed = True
         if self.tuning is not None:
             self.tuning.stop()
             self.tuning = None

@@ -143,6 +143,9 @@ class SideCards:
             ("Python", "loops.py", lambda: exports.script(page.design, page.bench.source)),
             ("report", "loops.html", self._report),
         )
+        sampled = page.design.rate > 0.0
+        if not sampled:  # a computer runs sampled laws
+            kinds = tuple(kind for kind in kinds if kind[0] not in ("C99", "sections"))
         buttons = [
             pn.widgets.FileDownload(
                 callback=lambda make=make: self._made(make), filename=file, label=f"save {label}",
@@ -166,9 +169,10 @@ class SideCards:
             accept=".npz", multiple=False, margin=(2, 0, 2, 0), sizing_mode="stretch_width"
         )
         given.param.watch(lambda event: event.new and page.hand_over(event.new), "value")
-        load = pn.pane.HTML(
-            style.note("load a design, or a law or controller as elements"), margin=0
-        )
+        note = "load a design, or a law or controller as elements"
+        if not sampled:
+            note = f"C99 and sections need the controller's rate: open the page with it. {note}"
+        load = pn.pane.HTML(style.note(note), margin=0)
         box = pn.FlexBox(*buttons, copy, gap="0px", sizing_mode="stretch_width")
         return self._card("files", box, load, given, self.script, collapsed=False)
 
