@@ -27,7 +27,18 @@ from browser_tabs import Tab, browser_of
 
 pytest.importorskip("panel", reason="the workbench needs panel")
 
-pytestmark = pytest.mark.slow
+#: a browser that is closed leaves sockets which are collected some time later
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def collected():
+    """What is left is collected here, not in the tests of another file."""
+    yield
+    gc.collect()
 
 
 @pytest.fixture(scope="module")
