@@ -1,6 +1,7 @@
 """The page in a real browser: dragged, typed, exported, reloaded; safe, for this machine only."""
 
 import asyncio
+import gc
 import os
 import signal
 import subprocess
