@@ -407,11 +407,15 @@ class Progress:
             )
 
     def __enter__(self) -> Self:
-        _open_bars().append(self)
-        if (self.bar is not None and not self._forced) or self._unseen:
-            work = self._said if self._unseen else self._shown
-            self._thread = threading.Thread(target=work, daemon=True)
-            self._thread.start()
+        try:
+            _open_bars().append(self)
+            if (self.bar is not None and not self._forced) or self._unseen:
+                work = self._said if self._unseen else self._shown
+                self._thread = threading.Thread(target=work, daemon=True)
+                self._thread.start()
+        except BaseException:  # Ctrl-C while the thread starts: nothing would close it
+            self._close()
+            raise
         return self
 
     def __exit__(
@@ -420,11 +424,20 @@ class Progress:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        try:
+            self._close()
+        except BaseException:  # Ctrl-C in there
+            self._close()
+            raise
+
+    def _close(self) -> None:
+        """End what shows the work; again where that was interrupted."""
         self._over.set()
-        _open_bars().remove(self)
+        if self in _open_bars():
+            _open_bars().remove(self)
         if self.bar is not None:
             self.bar.close()
-        elif self._thread is not None:
+        elif self._thread is not None and self._thread.ident is not None:
             self._thread.join()
 
     def advance(self, items: int = 1) -> None:
