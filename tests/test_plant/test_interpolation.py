@@ -118,6 +118,21 @@ def test_an_imported_plant_takes_points():
         assemble_plant(solve_modes(bare, count=12), ports)
 
 
+def test_modes_that_are_already_solved_are_interpolated_as_their_model_is():
+    plate = make_plate()
+    bare = FEModel(plate.M, plate.K, dofs=imported())
+    before = solve_modes(interpolated(bare), count=12)
+    after = interpolated(solve_modes(bare, count=12))
+    place = (0.123, 0.345, 0.0)
+    for direction in ("z", "rx"):
+        np.testing.assert_allclose(
+            abs(after.row(place, direction)[3:]), abs(before.row(place, direction)[3:]), rtol=1e-6
+        )
+    reduced = reduce(after, DesiredDofs(select_dofs(after, 12).labels))
+    with pytest.raises(ModelError, match="before `reduce`"):
+        interpolated(reduced)
+
+
 def test_sums_of_points_and_labels():
     dofs = interpolated(imported())
     a, b = (0.1, 0.2, 0.0), (0.4, 0.3, 0.0)
@@ -154,7 +169,7 @@ def test_motions_that_are_not_known():
     one = DofSet([1], ["z"], [[0, 0, 0]])
     with pytest.raises(LabelError, match="one node"):
         interpolated(one).row((0, 0, 0), "z")
-    with pytest.raises(ModelError, match="dofs must be of type DofSet"):
+    with pytest.raises(ModelError, match="item must be of type DofSet"):
         interpolated("dofs")
     with pytest.raises(ModelError, match="margin"):
         interpolated(imported(), margin=-1.0)

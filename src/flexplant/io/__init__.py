@@ -5,26 +5,6 @@
 - `read_frf_uff`, `read_frf_csv`: measured responses.
 - `read_mat`, `write_mat`: values to and from MATLAB.
 
-format                reader                what is read
-====================  ====================  =======================================================
-Matrix Market         read_matrix_market    .mtx, .mtx.gz: one matrix a file, triangle or full
-Harwell-Boeing        read_harwell_boeing   .rsa, .rua, .rb, .hb: one assembled matrix a file
-MATLAB                read_matlab           .mat v5; v7.3 with `flexplant[hdf5]`: K, M, D by name
-NumPy, SciPy          read_npz              .npz (dense, or save_npz), .npy
-ANSYS                 read_ansys            .full: K, M; with `flexplant[ansys]`; .rst, .cdb: nodes
-Nastran OUTPUT4       read_op4              .op4: text, binary, dense, sparse, both byte orders
-Nastran punch         read_dmig             .pch: DMIG in all fields; GRID, CORD2x of the bulk data
-Abaqus                read_abaqus           .mtx: *MATRIX OUTPUT as text; *NODE of the input file
-Sierra                read_sierra           .m: K, M as text; nodes of an Exodus file
-modes                 read_modes            .op2, .pch, .rst, .exo, .uff: of a solved model
-Exodus                read_exodus_modes     .exo, .e: modes (classic netCDF; HDF5 with an extra)
-universal file        read_modes_uff, ...   .uff, .unv: 55, 58, 2414, nodes; with `flexplant[uff]`
-tables                read_dofs             .csv, text: node, direction, x, y, z
-responses             read_frf_csv, ...     .csv, .mat, .npz: frequency responses
-values for MATLAB     read_mat, write_mat   .mat: systems, plants, reduced models, responses
-functional mock-up    write_fmu             .fmu: sampled plants and controllers, FMI 2.0 and 3.0
-====================  ====================  =======================================================
-=======
 The first three find the format themselves; the reader of one format says more. Files that cannot
 be read are refused with what to write instead.
 

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, instance, positive, real_array
+from ..checks import FloatArray, IntArray, Value, instance, positive, real_array
 from ..errors import LabelError, ModelError, counted
 from ..labels import DIRECTIONS, DofSet, Interpolation
 from ..tolerances import TINY
@@ -26,31 +26,31 @@ _CURL = {
     "rz": ((1.0, "y", 0), (-1.0, "x", 1)),
 }
 
-Interpolated = TypeVar("Interpolated", DofSet, FEModel)
+Interpolated = TypeVar("Interpolated", bound=Value)
 
 
 def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
-    """Return a model (or DofSet) whose shapes are interpolated between its nodes.
+    """Return a model (or its modes, or a DofSet) whose shapes are interpolated between its nodes.
 
     For imported models, whose elements are not known: places may then be any point inside the
     nodes, not only labels. It is done on request, never silently.
 
     Parameters
     ----------
-    item : FEModel or DofSet
+    item : FEModel, Modes or DofSet
         With nodes that are not all in one place.
     margin : float [m]
         How far outside the hull of the nodes a point may lie: a surface beside a mid-plane, say.
 
     Returns
     -------
-    FEModel or DofSet
+    FEModel, Modes or DofSet
         The same, its `dofs.interpolation` a ScatteredShape.
 
     Raises
     ------
     ModelError
-        When it is neither, a joined machine, or margin is negative.
+        When it is none of these, a joined machine, or margin is negative.
 
     Notes
     -----
@@ -69,8 +69,9 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     >>> round(row.sum(), 9)  # the weights of the nodes around add up to one
     np.float64(1.0)
     """
-    dofs = item.dofs if isinstance(item, FEModel) else item
-    instance(dofs, DofSet, "dofs", "Pass an FEModel or its dofs.")
+    dofs: Any = getattr(item, "dofs", item)
+    dofs = dofs if getattr(item, "full_dofs", dofs) is dofs else item
+    instance(dofs, DofSet, "item", "Pass an FEModel, its modes, or its dofs, before `reduce`.")
     if dofs.components:
         raise ModelError(
             f"the nodes of {', '.join(dofs.components)} move independently: interpolate each "
@@ -79,8 +80,8 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     shape = ScatteredShape(dofs.xyz, dofs.directions, positive(margin, "margin", zero=True))
     between = dofs.replace(interpolation=shape)
     if isinstance(item, FEModel):
-        return item._with(dofs=between)
-    return between
+        return item._with(dofs=between)  # its matrices are not checked again
+    return between if item is dofs else item.replace(dofs=between)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
