@@ -273,7 +273,7 @@ def test_other_kinds_are_refused_at_the_door(plant):
         (lambda: plant.discretized(1e4, delay=True), "delay must be one number"),
         (lambda: plant.weighted(z="die:z"), "weights of z must be of type Mapping, got str"),
         (lambda: plant.with_ports(["u1"]), r"ports must be of type Ports, got list.*Ports\(w="),
-        (lambda: plant.at(None), "place of 'die'"),
+        (lambda: plant.at(None), "at needs a place"),
         (lambda: plant.along("dye", [(0.1, 0.1, 0.0)]), "no POI 'dye'"),
         (lambda: plant.along("die", None), "points must"),
         (lambda: plant.uncertain("fit"), "UpdateResult or MeasuredModes, got str"),

@@ -100,6 +100,9 @@ from .rigid.stage import reference_errors as reference_errors
 from .rigid.stage import stage_weights as stage_weights
 from .rigid.suspension import GroundSpring as GroundSpring
 from .rigid.suspension import suspend as suspend
+from .scheduling import Moves as Moves
+from .scheduling import PlaceTable as PlaceTable
+from .scheduling import Position as Position
 from .sensors import Poi as Poi
 from .sensors import Sensor as Sensor
 from .standard import StandardPlant as StandardPlant

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -37,6 +37,8 @@ class Disturbance(ForcePort):
         Whether the noise is held over each sample, as that of a force from a digital output is:
         of variance asd^2 rate / 2 per sample once the plant is sampled. It may then reach an
         acceleration sensor at once: process and sensor noise are correlated.
+    moves : mapping {position: (3,) array} or PlaceTable, optional
+        How its point follows the positions of `Ports`; `at` is where all of them are zero.
 
     Raises
     ------
@@ -47,7 +49,7 @@ class Disturbance(ForcePort):
     --------
     >>> import flexplant as fx
     >>> fx.Disturbance("amp", at="41:z", asd=1e-3)  # white, 1e-3 N/sqrt(Hz) one-sided
-    Disturbance(name='amp', at='41:z', direction='z', asd=0.001, shape=None, held=False)
+    Disturbance(name='amp', at='41:z', direction='z', asd=0.001, shape=None, held=False, moves=None)
     """
 
     name: str
@@ -56,6 +58,7 @@ class Disturbance(ForcePort):
     asd: float = 0.0
     shape: StateSpace | None = None
     held: bool = False
+    moves: Any = None
 
     @property
     def unit(self) -> str | None:
@@ -204,6 +207,8 @@ class Actuator(ForcePort):
     asd : float [N/sqrt(Hz), N m/sqrt(Hz)]
         One-sided amplitude spectral density of white noise at the amplifier's input, the channel
         `name:disturbance` of w. It passes the same `dynamics` as the command, not its latency.
+    moves : mapping {position: (3,) array} or PlaceTable, optional
+        How its point follows the positions of `Ports`; `at` is where all of them are zero.
 
     Raises
     ------
@@ -226,6 +231,7 @@ class Actuator(ForcePort):
     dynamics: StateSpace | None = None
     latency: float = 0.0
     asd: float = 0.0
+    moves: Any = None
 
     @property
     def filter(self) -> StateSpace | None:

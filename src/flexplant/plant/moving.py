@@ -67,9 +67,18 @@ def moved(ports: Ports, places: Any) -> Ports:
         _port(ports, name)
 
     def there(side: Any) -> list[Any]:
-        return [p.replace(at=places[p.name]) if p.name in places else p for p in side]
+        return [_put(p, places[p.name], ports) if p.name in places else p for p in side]
 
     return ports.replace(w=there(ports.w), u=there(ports.u), z=there(ports.z), y=there(ports.y))
+
+
+def _put(port: Any, place: Any, ports: Ports) -> Any:
+    """Return a port elsewhere; one that moves goes on from there."""
+    moves = getattr(port, "moves", None)
+    if moves is None:
+        return port.replace(at=place)
+    new = port.replace(at=place, moves=None)
+    return new.replace(moves=moves.starting(new.at, ports.values))
 
 
 def along(plant: Partition, name: str, points: npt.ArrayLike) -> Along:

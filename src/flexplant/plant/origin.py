@@ -19,6 +19,7 @@ class _Unknown:
     plain: Any = None
     reading: Any = None
     scaled: bool = False
+    steps: tuple[Any, ...] = ()
     #: the plant before sampling, the factor of its noise, and its delay
     continuous: Any = None
     noise_factor: FloatArray | None = None
@@ -101,6 +102,8 @@ class Weighted(_Unknown, Value):
         The block of `through`: from `plain.y` to y.
     scaled : bool
         Whether weights were applied: w and z are then no physical channels.
+    steps : sequence
+        What was applied to `plain`, in order: a block, or the weights of z and of w.
 
     Examples
     --------
@@ -114,6 +117,7 @@ class Weighted(_Unknown, Value):
     plain: Any
     reading: StateSpace | None = None
     scaled: bool = False
+    steps: tuple[Any, ...] = ()
 
 
 #: where a plant may have come from

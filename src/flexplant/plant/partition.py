@@ -69,6 +69,8 @@ class Partition(Value):
         if latencies and not self.dt:
             shown = ", ".join(f"{name} {late:g} s" for name, late in latencies.items())
             lines.append(f"  latencies that act once it is sampled: {shown}")
+        if self.is_assembled and self.assembled.ports.positions:
+            lines.append(f"  at {self.assembled.ports.standing}")
         if self.form.startswith("dense"):
             lines.append(f"  {self.form}")
         if self.unstable_modes:

@@ -13,6 +13,7 @@ from ..errors import LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace, as_statespace
 from .realisation import ModalRealisation
+from .scheduling import checked_moves
 
 Quantity: TypeAlias = Literal["displacement", "velocity", "acceleration"]
 #: in the order of their time derivatives
@@ -245,9 +246,12 @@ def checked_port(port: Any) -> dict[str, Any]:
         "absolute": checked_choice,
     }
     given = port._fields()
-    return {"name": name} | {
+    found = {"name": name} | {
         key: check(name, given[key]) for key, check in checks.items() if key in given
     }
+    if "moves" in given:
+        found["moves"] = checked_moves(name, found["at"], given["moves"])
+    return found
 
 
 def checked_name(name: Any) -> str:

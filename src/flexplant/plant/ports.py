@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from ..checks import Value, check_names, instance, short
-from ..errors import LabelError, ModelError, unknown_label
+from ..checks import Value, check_names, instance, members, short
+from ..errors import LabelError, ModelError, require_known, unknown_label
 from ..lti.filters import pade
 from ..lti.interconnection import series
 from .forces import Actuator as Actuator
@@ -15,6 +15,7 @@ from .forces import Disturbance as Disturbance
 from .port import QUANTITIES as QUANTITIES
 from .port import ForcePort, SensorPort
 from .port import Quantity as Quantity
+from .scheduling import Position, placed, require_positions
 from .sensors import Poi as Poi
 from .sensors import Sensor as Sensor
 
@@ -65,13 +66,18 @@ class Ports(Value):
         Sensors.
     references : sequence of Reference
         Set-points.
+    positions : sequence of Position
+        Where the machine may stand, for ports that move (`moves`).
+    values : mapping {name: float} [m or rad]
+        Where it stands: ports are put there. Each position's start when not given.
 
     Raises
     ------
     LabelError
-        When a name is used twice, a Reference names no POI, or an OutputDisturbance no sensor.
+        When a name is used twice, a Reference names no POI, an OutputDisturbance no sensor, or a
+        port moves with a position that is not there.
     ModelError
-        When an entry has the wrong type.
+        When an entry has the wrong type, or a value is out of its range.
 
     Examples
     --------
@@ -91,6 +97,8 @@ class Ports(Value):
     z: Sequence[Poi] = ()
     y: Sequence[SensorPort] = ()
     references: Sequence[Reference] = ()
+    positions: Sequence[Position] = ()
+    values: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for side, kind in _KINDS.items():
@@ -109,6 +117,7 @@ class Ports(Value):
                         f"Ports.{side} holds {kind}s, got {type(port).__name__}. {where}"
                     )
             self._set(**{side: ports})
+        self._place()
         check_names([port.name for port in self.forces], "inputs w and u")
         # a channel that w and y share is a reference
         names = [*(port.name for port in self.w), *(port.name for port in self.y)]
@@ -121,6 +130,27 @@ class Ports(Value):
             if port.added_to is not None:
                 self.sensor(port.added_to)
 
+    def _place(self) -> None:
+        """Put ports that move where they are at the present values of the positions."""
+        positions = members(
+            self.positions,
+            Position,
+            "positions",
+            "Pass [Position('x', range=(-0.1, 0.1))].",
+            least=0,
+        )
+        known = {one.name: one for one in positions}
+        check_names([one.name for one in positions], "positions")
+        require_known("position", self.values, known)
+        values = {
+            name: float(one.start if name not in self.values else one.within(self.values[name]))
+            for name, one in known.items()
+        }
+        sides = {side: getattr(self, side) for side in "wuzy"}
+        require_positions([port for ports in sides.values() for port in ports], positions)
+        there = {side: tuple(placed(p, values) for p in ports) for side, ports in sides.items()}
+        self._set(positions=positions, values=values, **there)
+
     def __repr__(self) -> str:
         names = {
             "w": [port.name for port in self.w],
@@ -130,7 +160,27 @@ class Ports(Value):
             "references": [reference.poi for reference in self.references],
         }
         sides = ", ".join(f"{side}: {' '.join(listed)}" for side, listed in names.items() if listed)
-        return f"<Ports {sides}>"
+        return f"<Ports {sides}{', at ' + self.standing if self.values else ''}>"
+
+    @property
+    def standing(self) -> str:
+        """Where the machine stands, in words; nothing where it does not move."""
+        return ", ".join(
+            f"{one.name} = {self.values[one.name]:g} ({one.range[0]:g} to {one.range[1]:g})"
+            for one in self.positions
+        )
+
+    def at(self, values: Mapping[str, float]) -> Ports:
+        """Return the ports where the machine stands elsewhere; positions not named stay.
+
+        Raises
+        ------
+        LabelError
+            When no position has such a name.
+        ModelError
+            When a value is out of its range.
+        """
+        return self.replace(values={**self.values, **values})
 
     @property
     def forces(self) -> tuple[ForcePort, ...]:

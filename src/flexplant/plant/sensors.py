@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from ..checks import FloatArray, Value, check_names, short
 from ..errors import LabelError, require_known
@@ -22,6 +22,7 @@ from .port import (
     seen,
 )
 from .realisation import ModalRealisation
+from .scheduling import checked_moves
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +55,8 @@ class Sensor(SensorPort):
         Whether a BaseAcceleration moves it too: True of inertial sensors, as of a geophone
         (absolute velocity), False of what measures against the floor. When not given,
         accelerations are absolute, displacements and velocities are relative to the floor.
+    moves : mapping {position: (3,) array} or PlaceTable, optional
+        How its point follows the positions of `Ports`; `at` is where all of them are zero.
 
     Raises
     ------
@@ -78,6 +81,7 @@ class Sensor(SensorPort):
     dynamics: StateSpace | None = None
     latency: float = 0.0
     absolute: bool | None = None
+    moves: Any = None
 
     @property
     def unit(self) -> str | None:
@@ -107,6 +111,8 @@ class Poi(Value):
         Of x, y, z [m], rx, ry, rz [rad]; the first one is the axis that a Reference follows.
     absolute : bool
         Whether a BaseAcceleration moves it too; its motion relative to the floor otherwise.
+    moves : mapping {position: (3,) array} or PlaceTable, optional
+        How its point follows the positions of `Ports`; `at` is where all of them are zero.
 
     Raises
     ------
@@ -126,6 +132,7 @@ class Poi(Value):
     at: Place
     axes: Sequence[str] = ("z",)
     absolute: bool = False
+    moves: Any = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.axes, Iterable):
@@ -144,7 +151,9 @@ class Poi(Value):
                 "Give a point or a DOF label, or one POI per combination."
             )
         name, absolute = checked_name(self.name), checked_choice(self.name, self.absolute)
-        self._set(axes=axes, name=name, at=checked_place(name, self.at), absolute=bool(absolute))
+        at = checked_place(name, self.at)
+        moves = checked_moves(name, at, self.moves)
+        self._set(axes=axes, name=name, at=at, absolute=bool(absolute), moves=moves)
 
     def channel(self, axis: str) -> str:
         """Return the name of an axis in z, such as `die:z`."""

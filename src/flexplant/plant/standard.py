@@ -10,7 +10,7 @@ from typing import Any
 import numpy.typing as npt
 
 from ..checks import FloatArray, short
-from ..errors import ModelError
+from ..errors import LabelError, ModelError
 from ..labels import Place
 from ..lti.statespace import System
 from .assumptions import AssumptionReport
@@ -23,7 +23,7 @@ from .residual_form import ResidualForm, modes_of
 from .rigid.rigid_motion import RigidModes, rigid_modes_of
 from .uncertainty.opening import uncertain
 from .uncertainty.uncertain_plant import UncertainPlant
-from .weighting import measured_through, weighted
+from .weighting import altered_like, measured_through, weighted
 
 _WEIGHTS = "Pass stage_weights(plant, bandwidth), or z={...} and w={...}."
 
@@ -181,21 +181,41 @@ class StandardPlant(Partition):
         """
         return rebuilt(self, ports=ports)
 
-    def at(self, poi: Place | Mapping[str, Place]) -> StandardPlant:
-        """Return the plant with the POI moved: only its rows of C (and D12, if any) change.
+    def at(
+        self, poi: Place | Mapping[str, Place] | None = None, **positions: float
+    ) -> StandardPlant:
+        """Return the plant where ports are elsewhere: only rows of C, columns of B, and D change.
+
+        ``plant.at(x=0.03)`` is the plant where the machine stands at x = 0.03 m: all ports that
+        move with the position x are put there. The modes, and with them A, are the same: a family
+        of plants over the positions costs rows, not models. A weighted plant keeps its weights.
 
         Parameters
         ----------
-        poi : (3,) array [m] or mapping {name: place}
-            The new point; a mapping when there are several POIs, or to move other ports too:
-            actuators (columns of B), disturbances, sensors.
+        poi : (3,) array [m] or mapping {name: place}, optional
+            A new point of the POI; a mapping when there are several POIs, or to move other ports
+            too: actuators (columns of B), disturbances, sensors.
+        **positions : float [m or rad]
+            Where the machine stands, by the names of its positions; those not named stay.
 
         Raises
         ------
         LabelError
             When a name is unknown, or the plant has several POIs and none is named.
+        ModelError
+            When a position is out of its range.
         """
-        return self.with_ports(moved(self.assembled.ports, poi))
+        if poi is None and not positions:
+            raise LabelError(
+                "at needs a place: a point of the POI, {name: point}, or a position by name "
+                f"({', '.join(self.assembled.ports.values) or 'this plant has none'})."
+            )
+        if self.is_weighted and self.is_assembled:
+            return altered_like(self, self.unweighted.at(poi, **positions))
+        ports = self.assembled.ports
+        if positions:
+            ports = ports.at(positions)
+        return self.with_ports(ports if poi is None else moved(ports, poi))
 
     def along(self, name: str, points: npt.ArrayLike) -> Along:
         """Return the rows of a POI (or the columns of a force) at many points at once.

@@ -40,7 +40,9 @@ def weighted(plant: P, z: Any, w: Any) -> P:
         w=tuple(keep_w),
         z=tuple(keep_z),
         asd={},
-        origin=Weighted(plant.unweighted, plant.origin.reading, True),
+        origin=Weighted(
+            plant.unweighted, plant.origin.reading, True, (*plant.origin.steps, (z, w))
+        ),
     )
 
 
@@ -50,7 +52,9 @@ def _mapping(weights: Any, side: str) -> dict[str, Any]:
     instance(
         weights, Mapping, f"weights of {side}", "{'die:error': inverse_sensitivity(30.0)}, say."
     )
-    return dict(weights)
+    return {
+        name: None if weight is None else as_statespace(weight) for name, weight in weights.items()
+    }
 
 
 def measured_through(plant: P, block: System) -> P:
@@ -64,8 +68,15 @@ def measured_through(plant: P, block: System) -> P:
     return plant.replace(
         system=series(inner, after).replace(name=plant.system.name),
         y=tuple(g.outputs),
-        origin=Weighted(plant.unweighted, block, plant.origin.scaled),
+        origin=Weighted(plant.unweighted, block, plant.origin.scaled, (*plant.origin.steps, g)),
     )
+
+
+def altered_like(plant: P, plain: P) -> P:
+    """Return a plain plant with the weights and blocks of another one, in their order."""
+    for step in plant.origin.steps:
+        plain = weighted(plain, *step) if isinstance(step, tuple) else measured_through(plain, step)
+    return plain
 
 
 def _columns(plant: Partition, g: StateSpace) -> list[int]:

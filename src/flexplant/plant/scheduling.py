@@ -1,0 +1,272 @@
+"""Positions of a machine that moves, and how the places of its ports depend on them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..checks import FloatArray, Value, instance, number, real_array, short
+from ..errors import LabelError, ModelError
+from ..labels import Place
+
+#: relative to a range: a position this little beyond its end is rounding
+_BEYOND = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Position(Value):
+    """A scheduling variable: one coordinate of where the machine stands, within a range.
+
+    Parameters
+    ----------
+    name : str
+        Its name: ``plant.at(x=0.03)``.
+    range : (2,) sequence [m or rad]
+        Least and largest value.
+    start : float, optional [m or rad]
+        Where a plant stands that was just assembled; 0 where that lies in the range, else its
+        middle.
+
+    Raises
+    ------
+    LabelError
+        When the name is no Python identifier, which `at` takes as a keyword.
+    ModelError
+        When the range is not increasing, or start lies outside.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.plant.Position("x", range=(-0.1, 0.1)).start
+    0.0
+    """
+
+    name: str
+    range: Sequence[float] | FloatArray
+    start: float | None = None
+
+    def __post_init__(self) -> None:
+        name: object = self.name
+        if not isinstance(name, str) or not name.isidentifier():
+            raise LabelError(
+                f"a position is named by a word that can be a keyword, got {short(name)}: "
+                "plant.at(x=0.03) names it. Name it 'x', say."
+            )
+        low, high = real_array(self.range, f"range of position {name!r}", (2,)).tolist()
+        if not low < high:
+            raise ModelError(
+                f"the range of position {name!r} goes from {low:g} to {high:g}: give the least "
+                "value first, then a larger one."
+            )
+        start = self.start
+        if start is None:
+            start = 0.0 if low <= 0.0 <= high else 0.5 * (low + high)
+        self._set(range=(low, high))
+        self._set(start=self.within(start))
+
+    def within(self, value: Any) -> float:
+        """Return a value of it as a float.
+
+        Raises
+        ------
+        ModelError
+            When it lies outside the range.
+        """
+        found = number(value, f"position {self.name!r}")
+        low, high = self.range
+        spare = _BEYOND * (high - low)
+        if not low - spare <= found <= high + spare:
+            raise ModelError(
+                f"position {self.name!r} is {found:g}, outside its range from {low:g} to {high:g}: "
+                "nothing is known of the machine there. Stay inside, or widen its range."
+            )
+        return found
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PlaceTable(Value):
+    """Places that were measured on the machine, at a grid of positions; linear between them.
+
+    Parameters
+    ----------
+    grid : mapping {name: (k,) array} [m or rad]
+        Values of each position, increasing.
+    places : (k, ..., 3) array [m]
+        The place at each point of the grid, one axis for each position, in their order.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When values do not increase, or sizes do not fit.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> table = fx.plant.PlaceTable({"x": [-0.1, 0.1]}, [[0.4, 0.3, 0.0], [0.2, 0.302, 0.0]])
+    >>> [float(round(c, 9)) for c in table.place({"x": 0.0})]
+    [0.3, 0.301, 0.0]
+    """
+
+    grid: Mapping[str, FloatArray | Sequence[float]]
+    places: FloatArray | Sequence[Any]
+
+    def __post_init__(self) -> None:
+        instance(self.grid, Mapping, "grid of a PlaceTable", "Pass {'x': values}.")
+        grid = {
+            str(name): real_array(values, f"grid of {name!r}", (None,))
+            for name, values in self.grid.items()
+        }
+        for name, values in grid.items():
+            if values.size < 2 or not np.all(np.diff(values) > 0):
+                raise ModelError(
+                    f"the values of {name!r} in a PlaceTable must increase, two at least, got "
+                    f"{short(values.tolist())}. Sort the table."
+                )
+        shape = (*(values.size for values in grid.values()), 3)
+        self._set(grid=grid, places=real_array(self.places, "places", shape))
+
+    def __repr__(self) -> str:
+        sizes = " x ".join(f"{len(values)} {name}" for name, values in self.grid.items())
+        return f"<PlaceTable {sizes}>"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The positions that it depends on."""
+        return tuple(self.grid)
+
+    def covers(self, position: Position) -> bool:
+        """Return whether its values span the range of a position."""
+        values, (low, high) = np.asarray(self.grid[position.name]), position.range
+        spare = _BEYOND * (high - low)
+        return bool(values[0] <= low + spare and values[-1] >= high - spare)
+
+    def place(self, values: Mapping[str, float]) -> tuple[float, ...]:
+        """Return the place [m] at values of the positions."""
+        from scipy.interpolate import interpn
+
+        axes = tuple(np.asarray(one) for one in self.grid.values())
+        at = [
+            np.clip(values[name], one[0], one[-1])
+            for name, one in zip(self.grid, axes, strict=True)
+        ]
+        return tuple(interpn(axes, np.asarray(self.places), np.array(at))[0].tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class Moves(Value):
+    """How a place follows positions: ``start + sum_i along_i value_i``, or a table.
+
+    Made from what is given as `moves` of a port: the mapping {position: direction}, or a table.
+
+    Parameters
+    ----------
+    start : (3,) array [m] or mapping {point: weight}
+        The place where all positions are zero.
+    along : mapping {name: (3,) array} or PlaceTable
+        How far the place moves per unit of each position: (1, 0, 0) with the stage's x, (-1, 0, 0)
+        against it, as the point of the structure below a head on the frame does.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> head = fx.Sensor("y1", at=(0.3, 0.1, 0.0), moves={"x": (-1, 0, 0)})
+    >>> head.moves.place({"x": 0.1})
+    (0.19999999999999998, 0.1, 0.0)
+    """
+
+    start: Place
+    along: Mapping[str, Any] | PlaceTable
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The positions that it depends on."""
+        return self.along.names if isinstance(self.along, PlaceTable) else tuple(self.along)
+
+    def place(self, values: Mapping[str, float]) -> Place:
+        """Return the place at values of the positions."""
+        if isinstance(self.along, PlaceTable):
+            return self.along.place(values)
+        pairs = [np.asarray(step) * values[name] for name, step in self.along.items()]
+        shift = np.sum(pairs, axis=0)
+        return shifted(self.start, shift)
+
+    def starting(self, place: Place, values: Mapping[str, float]) -> Moves:
+        """Return the same motion of a port that stands elsewhere at some values."""
+        if isinstance(self.along, PlaceTable):
+            raise LabelError(
+                "a port whose places are a table stands where the table says. Replace its table, "
+                "moves=PlaceTable(...)."
+            )
+        pairs = [np.asarray(step) * values[name] for name, step in self.along.items()]
+        return self.replace(start=shifted(place, -np.sum(pairs, axis=0)))
+
+
+def shifted(place: Place, shift: FloatArray) -> Place:
+    """Return a point, or the points of a sum, elsewhere."""
+    if isinstance(place, Mapping):
+        return {
+            tuple((np.asarray(point) + shift).tolist()): weight for point, weight in place.items()
+        }
+    return tuple((np.asarray(place) + shift).tolist())
+
+
+def checked_moves(name: str, at: Any, moves: Any) -> Moves | None:
+    """Return how a port's place follows positions; None where it stays."""
+    if moves is None or isinstance(moves, Moves):
+        return moves
+    if not isinstance(moves, Mapping | PlaceTable) or not getattr(moves, "grid", moves):
+        raise ModelError(
+            f"moves of {name!r} is a direction for each position, {{'x': (-1, 0, 0)}}, or a "
+            f"PlaceTable, got {short(moves)}. Leave it out of a port that stays."
+        )
+    points = list(at) if isinstance(at, Mapping) else [at]
+    if any(isinstance(point, str) for point in points):
+        raise LabelError(
+            f"{name!r} moves, but is at a node: {short(at)}. Give the point where it is when all "
+            "positions are zero, at=(x, y, z): it moves between the nodes."
+        )
+    if isinstance(moves, PlaceTable):
+        if isinstance(at, Mapping):
+            raise LabelError(f"{name!r} is a sum of points, which a PlaceTable does not move.")
+        return Moves(at, moves)
+    along = {
+        str(key): tuple(real_array(step, f"moves of {name!r} with {key!r}", (3,)).tolist())
+        for key, step in moves.items()
+    }
+    return Moves(at, along)
+
+
+def placed(port: Any, values: Mapping[str, float]) -> Any:
+    """Return a port where it is at values of the positions."""
+    moves = getattr(port, "moves", None)
+    if moves is None:
+        return port
+    place = moves.place(values)
+    return port if place == port.at else port.replace(at=place)
+
+
+def require_positions(ports: Sequence[Any], positions: Sequence[Position]) -> None:
+    """Refuse ports that move with a position that nobody named, or by a table too short for it."""
+    known = {one.name: one for one in positions}
+    for port in ports:
+        moves = getattr(port, "moves", None)
+        if moves is None:
+            continue
+        for name in moves.names:
+            if name not in known:
+                raise LabelError(
+                    f"{port.name!r} moves with {name!r}, which is none of the positions "
+                    f"({', '.join(known) or 'there are none'}). Name it and its range: "
+                    f"Ports(..., positions=[Position({name!r}, range=(-0.1, 0.1))])."
+                )
+        for name in moves.names:
+            if isinstance(moves.along, PlaceTable) and not moves.along.covers(known[name]):
+                low, high = known[name].range
+                raise ModelError(
+                    f"the PlaceTable of {port.name!r} does not span position {name!r} from "
+                    f"{low:g} to {high:g}: nothing is known of its place beyond. Measure on, or "
+                    "narrow the range."
+                )
