@@ -113,14 +113,13 @@ def wired(cls: type[P], origin: Assembled) -> P:
     pois = [poi.channel(axis) for poi in ports.z for axis in poi.axes]
     sensors, actuators = [s.name for s in ports.y], [a.name for a in ports.u]
     noises = [f"{s.name}:noise" for s in ports.y if s.asd > 0]
-    tracked = [ports.poi(reference.poi) for reference in ports.references]
-    refs = [poi.derived(poi.axes[0], "ref") for poi in tracked]
+    refs = [poi.derived(axis, "ref") for poi, axis in ports.followed]
     w = [*(d.name for d in ports.w), *ports.input_noises, *noises, *refs]
-    errors = [poi.derived(poi.axes[0], "error") for poi in tracked]
+    errors = [poi.derived(axis, "error") for poi, axis in ports.followed]
     z = [*pois, *errors, *(f"{name}:effort" for name in actuators)]
     y = [*sensors, *refs]
     inputs, outputs = [*w, *actuators], [*z, *y]
-    motions = physical.output_index([poi.channel(poi.axes[0]) for poi in tracked])
+    motions = physical.output_index([poi.channel(axis) for poi, axis in ports.followed])
     through = {(name.removesuffix(":noise"), name): 1.0 for name in noises}
     through |= {
         pair: 1.0

@@ -113,9 +113,9 @@ def _port(ports: Ports, name: str) -> Any:
 
 def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> Along:
     g, realisation = plant.system, plant.assembled.realisation
-    tracked = poi.name in [r.poi for r in plant.assembled.ports.references]
+    tracked = [axis for own, axis in plant.assembled.ports.followed if own.name == poi.name]
     channels = [poi.channel(axis) for axis in poi.axes]
-    shown = [*channels, *([poi.derived(poi.axes[0], "error")] if tracked else [])]
+    shown = [*channels, *(poi.derived(axis, "error") for axis in tracked)]
     at = g.output_index(shown)
     C = np.zeros((points.shape[0], len(shown), g.n_states))
     D = np.repeat(g.D[at][None], points.shape[0], axis=0)
@@ -129,8 +129,8 @@ def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> Along:
     for k, axis in enumerate(poi.axes):
         rows = realisation.model.rows(points, axis)
         C[:, k, plant.modal_states] = realisation.motion(rows, 0)
-    if tracked:
-        C[:, -1] = -C[:, 0]
+    for k, axis in enumerate(tracked, len(channels)):
+        C[:, k] = -C[:, list(poi.axes).index(axis)]
     return Along(poi.name, points, tuple(shown), C, D, np.zeros((points.shape[0], 0, 1)))
 
 

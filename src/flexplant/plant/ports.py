@@ -6,8 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from ..checks import Value, check_names, instance, members, short
+from ..checks import Value, check_names, instance, members, name_list, short
 from ..errors import LabelError, ModelError, require_known, unknown_label
+from ..labels import DIRECTIONS
 from ..lti.filters import pade
 from ..lti.interconnection import series
 from .forces import Actuator as Actuator
@@ -25,29 +26,49 @@ _KINDS = {"w": "disturbance", "u": "Actuator", "z": "Poi", "y": "Sensor", "refer
 
 @dataclass(frozen=True, eq=False)
 class Reference(Value):
-    """A set-point for the first axis of a POI.
+    """Set-points for the axes of a POI.
 
-    It adds `die:ref` to w, the error `die:error` (reference minus POI) to z, and a noise-free
-    `die:ref` to y, so that a controller that uses it has two degrees of freedom.
+    Each adds `die:ref` to w, the error `die:error` (reference minus POI) to z, and a noise-free
+    `die:ref` to y, so that a controller that uses it has two degrees of freedom. Those of the axes
+    after the POI's first one are `die:rx:ref` and `die:rx:error`.
 
     Parameters
     ----------
     poi : str
         The POI's name.
+    axes : sequence of str, optional
+        Which of the POI's axes get one; its first when not given.
+
+    Raises
+    ------
+    LabelError
+        When the POI is no name, or an axis is unknown or named twice.
 
     Examples
     --------
     >>> import flexplant as fx
     >>> fx.Reference("die")  # adds die:ref to w and y, and die:error to z
     Reference(poi='die')
+    >>> fx.Reference("wafer", axes=("x", "y", "rz"))
+    Reference(poi='wafer', axes=('x', 'y', 'rz'))
     """
 
     home: ClassVar = "references"
     poi: str
+    axes: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         poi: object = self.poi
         instance(poi, str, "the POI of a Reference", "Pass its name: Reference('die').", LabelError)
+        if self.axes is not None:
+            axes = name_list(self.axes, "axes")
+            require_known(f"axis of the reference of {poi!r}", axes, DIRECTIONS)
+            check_names(axes, f"axes of the reference of {poi!r}")
+            self._set(axes=axes)
+
+    def __repr__(self) -> str:
+        axes = "" if self.axes is None else f", axes={self.axes}"
+        return f"Reference(poi={self.poi!r}{axes})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,7 +146,8 @@ class Ports(Value):
         check_names([poi.name for poi in self.z], "POIs")
         check_names([reference.poi for reference in self.references], "references")
         for reference in self.references:
-            self.poi(reference.poi)
+            poi = self.poi(reference.poi)
+            require_known(f"axis of POI {poi.name!r}", reference.axes or (), poi.axes)
         for port in self.w:
             if port.added_to is not None:
                 self.sensor(port.added_to)
@@ -238,6 +260,12 @@ class Ports(Value):
             if sensor.name == name:
                 return sensor
         raise unknown_label("sensor", name, [sensor.name for sensor in self.y])
+
+    @property
+    def followed(self) -> tuple[tuple[Poi, str], ...]:
+        """The axes that have a set-point, each after its POI."""
+        pois = ((self.poi(one.poi), one.axes) for one in self.references)
+        return tuple((poi, axis) for poi, axes in pois for axis in axes or poi.axes[:1])
 
     @property
     def latencies(self) -> dict[str, float]:

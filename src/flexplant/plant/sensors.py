@@ -108,7 +108,7 @@ class Poi(Value):
     at : str or (3,) array [m]
         A DOF label (whose direction is replaced by the axes) or any point of the structure.
     axes : sequence of str
-        Of x, y, z [m], rx, ry, rz [rad]; the first one is the axis that a Reference follows.
+        Of x, y, z [m], rx, ry, rz [rad]; a Reference follows the first one unless it names others.
     absolute : bool
         Whether a BaseAcceleration moves it too; its motion relative to the floor otherwise.
     moves : mapping {position: (3,) array} or PlaceTable, optional

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ..checks import FloatArray, Value, instance, name_list, positive, real_array
 from ..errors import LabelError, ModelError, ShapeError, counted, require_known
 from ..loop import ClosedLoop, close_loop
-from ..plant import Poi
+from ..plant import Poi, Ports
 from .response import Numbers, Response, moving_moments, unit_of
 from .simulate import Signal, simulate
 
@@ -210,19 +210,24 @@ def settling_time(
 def error_channels(run: Response) -> tuple[str, ...]:
     """Return the errors of all POIs in a run, and their axes that have no reference."""
     found: list[str] = []
-    errors = [name.removesuffix(":error") for name in run if name.endswith(":error")]
-    tracked = set()
+    errors = {name.removesuffix(":error") for name in run if name.endswith(":error")}
     for name in run:
         poi, _, axis = name.rpartition(":")
         if axis == "error":
             found.append(name)
         elif axis in _AXES and poi:
-            # a reference is for the first axis of its POI
-            if poi in errors and poi not in tracked:
-                tracked.add(poi)
-            else:
+            # `die:error` is of the first axis of a POI, `die:rx:error` of another
+            if poi in errors:
+                errors.remove(poi)
+            elif name not in errors:
                 found.append(name)
-    return tuple(sorted(found, key=lambda name: name.rpartition(":")[0]))
+    return tuple(sorted(found, key=_owner))
+
+
+def _owner(channel: str) -> str:
+    """Return the POI of a channel: `die` of die:x, die:error and die:rx:error."""
+    place, _, axis = channel.removesuffix(":error").rpartition(":")
+    return place if axis in _AXES and place else channel.removesuffix(":error")
 
 
 def _check_run(run: object) -> None:
@@ -382,25 +387,32 @@ def error_map(
     names = [f"map|{i}" for i in range(1, len(places) + 1)]
     pois = [Poi(name, at=tuple(p), axes=(axis,)) for name, p in zip(names, places, strict=True)]
     wide = loop.plant.with_ports(ports.replace(z=[*ports.z, *pois]))
+    followed = "" if reference is None else _followed(ports, axis)
     run = simulate(
         close_loop(wide, *loop.blocks, idle=loop.idle),
         duration=duration,
-        reference=reference,
+        reference={followed: reference} if followed and reference is not None else None,
         noise=noise,
         rng=rng,
     )
-    target: FloatArray = np.zeros(run.time.size)
-    if reference is not None:
-        refs = [name for name in wide.w if name in wide.y]
-        if len(refs) != 1:
-            raise LabelError(
-                f"the loop has {len(refs)} references {refs}, a map is of one: add "
-                "Ports(references=[Reference(poi)]), or leave the reference out."
-            )
-        target = run[refs[0]]
+    target = run[followed] if followed else np.zeros(run.time.size)
     shown = [pois[i].channel(axis) for i in range(len(pois))]
     data = target - np.array([run[name] for name in shown])
     errors = run.replace(data=data, names=shown, units={})
     found = exposure_errors(errors, shown, window=window, start=start, exposures=exposures)
     unit = wide.units.get(shown[0], "")
     return ErrorMap(axis, unit, places, found.values[:, 0], found.values[:, 2], found.window)
+
+
+def _followed(ports: Ports, axis: str) -> str:
+    """Return the reference that a map along an axis follows: the only one, or that of the axis."""
+    found = ports.followed
+    if len(found) > 1:
+        found = tuple(pair for pair in found if pair[1] == axis)
+    if len(found) != 1:
+        refs = [poi.derived(own, "ref") for poi, own in ports.followed]
+        raise LabelError(
+            f"the loop has {len(refs)} references {refs}, {len(found)} of them along {axis!r}; a "
+            "map is of one: add Ports(references=[Reference(poi)]), or leave the reference out."
+        )
+    return found[0][0].derived(found[0][1], "ref")

@@ -183,10 +183,14 @@ def design_feedforward(
       x: acceleration 3  jerk 0.00225
     """
     loop = given if isinstance(given, ClosedLoop) else None
-    plant, poi, name = tracked(given if loop is None else loop.plant, reference)
+    plant, poi, axis, name = tracked(given if loop is None else loop.plant, reference)
     highest = whole(order, "order", minimum=2, maximum=4)
     T, axes = force_axes(plant, poi)
-    find = _of_plant(plant, poi, T, along) if loop is None else _of_loop(loop, poi, T, name, along)
+    wanted = np.eye(len(poi.axes))[:, [poi.axes.index(axis)]]
+    if loop is None:
+        find = _of_plant(plant, poi, T, wanted, along)
+    else:
+        find = _of_loop(loop, poi, T, wanted, name, along)
     gains = coefficients(find, plant.dt, axes)
     gains[:, :, highest + 1 :] = 0.0
     return Feedforward(name, axes, T, tuple(plant.u), gains, plant.dt)
@@ -220,21 +224,20 @@ def known_forces(plant: StandardPlant) -> StateSpace:
     )
 
 
-def tracked(plant: Any, reference: str | None) -> tuple[StandardPlant, Poi, str]:
-    """Return the plant, and the POI and channel of its reference."""
+def tracked(plant: Any, reference: str | None) -> tuple[StandardPlant, Poi, str, str]:
+    """Return the plant, the POI and the axis that a reference is for, and its channel."""
     plant = standard_plant(plant)
     if plant.is_weighted:
         raise ModelError("the plant is weighted: design the feedforward on plant.unweighted.")
-    ports = plant.assembled.ports
-    pois = {p.derived(p.axes[0], "ref"): p for p in (ports.poi(r.poi) for r in ports.references)}
-    if reference is None and len(pois) == 1:
-        reference = next(iter(pois))
-    if not isinstance(reference, str) or reference not in pois:
+    found = {p.derived(axis, "ref"): (p, axis) for p, axis in plant.assembled.ports.followed}
+    if reference is None and len(found) == 1:
+        reference = next(iter(found))
+    if not isinstance(reference, str) or reference not in found:
         raise LabelError(
-            f"need one of the plant's references {list(pois)}, got {short(reference)}. Pass "
+            f"need one of the plant's references {list(found)}, got {short(reference)}. Pass "
             "reference=name; Ports(references=[Reference(poi)]) adds one."
         )
-    return plant, pois[reference], reference
+    return plant, *found[reference], reference
 
 
 def force_axes(plant: StandardPlant, poi: Poi) -> tuple[FloatArray, tuple[str, ...]]:
@@ -244,7 +247,11 @@ def force_axes(plant: StandardPlant, poi: Poi) -> tuple[FloatArray, tuple[str, .
 
 
 def _of_plant(
-    plant: StandardPlant, poi: Poi, T: FloatArray, along: npt.ArrayLike | None
+    plant: StandardPlant,
+    poi: Poi,
+    T: FloatArray,
+    wanted: FloatArray,
+    along: npt.ArrayLike | None,
 ) -> Inverse:
     """Return the function of s that gives F (p, r), the POI at p places."""
     g, inputs = plant.system, plant.system.input_index(plant.u)
@@ -253,7 +260,6 @@ def _of_plant(
     if along is not None:
         places = plant.along(poi.name, real_array(along, "along", (None, 3)))
         C, D = places.C[:, : rows.size], places.D[:, : rows.size, inputs] @ T
-    wanted = np.eye(rows.size)[:, :1]
 
     def found(s: complex) -> tuple[ComplexArray, ComplexArray]:
         return C @ _states(g, g.B[:, inputs] @ T, s) + D, wanted.astype(np.complex128)
@@ -262,7 +268,12 @@ def _of_plant(
 
 
 def _of_loop(
-    loop: ClosedLoop, poi: Poi, T: FloatArray, name: str, along: npt.ArrayLike | None
+    loop: ClosedLoop,
+    poi: Poi,
+    T: FloatArray,
+    wanted: FloatArray,
+    name: str,
+    along: npt.ArrayLike | None,
 ) -> Inverse:
     """Return the function of s that gives F (p, r) in closed loop, the POI at p places.
 
@@ -282,7 +293,6 @@ def _of_loop(
         C = by_u @ g.C[u]
         C[:, :, : plant.system.n_states] += places.C[:, :r]
         D = (own[:, :, plant.system.input_index(plant.w)] + by_u @ g.D[u]) @ acts
-    wanted = np.eye(r)[:, :1]
 
     def found(s: complex) -> tuple[ComplexArray, ComplexArray]:
         both = C @ _states(g, g.B @ acts, s) + D
@@ -436,7 +446,7 @@ def inverse_forces(
     ['u1:feedforward']
     """
     instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
-    plant, poi, name = tracked(loop.plant, reference)
+    plant, poi, axis, name = tracked(loop.plant, reference)
     given: object = move
     instance(given, SetPoint, "move", "Use setpoint(...) or scan(...).")
     if not plant.dt:
@@ -467,7 +477,7 @@ def inverse_forces(
     position = np.asarray(move.at((np.arange(-1, steps + 1)) * plant.dt).position)
     spectrum = np.fft.rfft(np.diff(position, 2), size)
     target = np.zeros((freq.size - 1, len(axes), 1), dtype=np.complex128)
-    target[:, 0, 0] = spectrum[1:]
+    target[:, poi.axes.index(axis), 0] = spectrum[1:]
     U = np.zeros((freq.size, len(axes)), dtype=np.complex128)
     U[1:] = (back @ np.linalg.solve(gram, target))[:, :, 0]
     U[0] = low.gains[0, :, 2] / masses * spectrum[0].real
@@ -493,11 +503,15 @@ def _feedback(loop: ClosedLoop, force: FloatArray, move: SetPoint, name: str) ->
     given = {one: force[:, i] for i, one in enumerate(names)}
     run = simulate(alone, reference={**given, name: move}, duration=len(force) * plant.dt,
                    noise=False)  # fmt: skip
-    both = close_loop(plant, *loop.blocks, known_forces(plant))
+    # a loop that passes forces on already would count them twice
+    passed = {name for block in loop.blocks for name in block.inputs}
+    more = () if passed.issuperset(names) else (known_forces(plant),)
+    both = close_loop(plant, *loop.blocks, *more)
     law, x = both.controller, np.zeros(both.controller.n_states)
-    y_at, f_at = law.input_index(plant.y), law.input_index(names)
+    sensed = [one for one in plant.y if one not in names]
+    y_at, f_at = law.input_index(sensed), law.input_index(names)
     rows = law.output_index(plant.u)
-    read = np.array([run[one] for one in plant.y]).T
+    read = np.array([run[one] for one in sensed]).T
     direct = np.linalg.inv(law.D[np.ix_(rows, f_at)])
     known = np.zeros_like(force)
     for k, y in enumerate(read):

@@ -126,8 +126,8 @@ def learn_feedforward(
     part = positive(step, "step")
     if part > 1.0:
         raise ModelError(f"step is a part of a correction, at most 1, got {part:g}. Pass 1.0.")
-    _, poi, _ = tracked(loop.plant, start.reference)
-    channels = [poi.derived(poi.axes[0], "error"), *(poi.channel(a) for a in poi.axes[1:])]
+    _, poi, own, _ = tracked(loop.plant, start.reference)
+    channels = [poi.derived(own, "error"), *(poi.channel(a) for a in poi.axes if a != own)]
     effects = _effects(start, loop, move, duration, orders, channels)
     unit = np.linalg.norm(effects, axis=1)
     used = unit > 0

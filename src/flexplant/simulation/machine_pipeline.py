@@ -197,7 +197,8 @@ class MachinePipeline(Value):
     @property
     def error(self) -> str:
         """The error channel of the POI, the first that has a reference."""
-        return f"{self.ports.references[0].poi}:error"
+        poi, axis = self.ports.followed[0]
+        return poi.derived(axis, "error")
 
     def __call__(self, machine: Any, rng: Any = None) -> dict[str, Any]:
         """Return the row of one machine, and write its report where there is a folder."""
@@ -349,8 +350,8 @@ class MachinePipeline(Value):
         row |= {one.name: float(p) for one, p in zip(fit.unknowns, fit.values, strict=True)}
         row["modes measured"] = len(found.measured)
         row["p value"] = fit.p_value if fit.p_value is not None else float("nan")
-        poi = next(one for one in self.ports.z if f"{one.name}:error" == self.error)
-        row["estimate rms"] = found.observer.rms(f"{poi.name}:{poi.axes[0]}")
+        poi, axis = self.ports.followed[0]
+        row["estimate rms"] = found.observer.rms(poi.channel(axis))
         row["margin expected"] = (
             float("nan") if found.left_out is None else found.left_out.modulus_margin
         )

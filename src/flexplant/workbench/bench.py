@@ -125,14 +125,10 @@ def _references(plant: Any, design: LoopDesign) -> dict[str, str]:
     plant = getattr(plant, "nominal", plant)
     if not isinstance(plant, StandardPlant) or not plant.is_assembled:
         return {}
-    ports = plant.assembled.ports
-    axes = {poi.name: poi.axes for poi in ports.z if hasattr(poi, "axes")}
-    found = {}
-    for reference in ports.references:
-        name = f"cog:{axes[reference.poi][0]}"
-        if name in design.axes and f"{reference.poi}:ref" in plant.y:
-            found[name] = f"{reference.poi}:ref"
-    return found
+    found = {
+        f"cog:{axis}": poi.derived(axis, "ref") for poi, axis in plant.assembled.ports.followed
+    }
+    return {n: ref for n, ref in found.items() if n in design.axes and ref in plant.y}
 
 
 def started(design: LoopDesign, plant: Any) -> LoopDesign:

@@ -31,7 +31,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     """Return the static block from sensors and references to errors at the sensors.
 
     ``y_i:error = y_i,ref - y_i``, where y_i,ref is where sensor i would be if the whole body were
-    rigid and the POI followed its reference, its other axes at rest. A controller that reads these
+    rigid and the POI followed its references, its other axes at rest. A controller that reads these
     errors has one degree of freedom: what it does to a reference it does to a disturbance.
 
     Parameters
@@ -82,14 +82,16 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
             f"POI {followed.name!r} with axes {followed.axes} does not determine the {count} "
             "rigid-body motions: give the POI all its axes."
         )
-    moved = seen(plant, motions, sensors) @ np.linalg.pinv(axes)[:, 0]
+    own = [axis for one, axis in ports.followed if one is followed]
+    turned = np.linalg.pinv(axes)[:, [followed.axes.index(axis) for axis in own]]
+    moved = seen(plant, motions, sensors) @ turned
     return StateSpace(
         [],
         [],
         [],
-        np.hstack([-np.eye(len(sensors)), moved[:, None]]),
+        np.hstack([-np.eye(len(sensors)), moved]),
         plant.dt,
-        inputs=[*sensors, followed.derived(followed.axes[0], "ref")],
+        inputs=[*sensors, *(followed.derived(axis, "ref") for axis in own)],
         outputs=[f"{name}:error" for name in sensors],
         name="reference errors",
         units=plant.units | {f"{n}:error": plant.units[n] for n in sensors if n in plant.units},

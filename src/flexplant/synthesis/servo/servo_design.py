@@ -456,12 +456,13 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
 
 
 def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, T_u: FloatArray) -> StateSpace:
-    """Return [ref, hats] -> u: ``T_u (I x c) E``, E the errors, c the controller of an axis."""
-    reference = poi.derived(poi.axes[0], "ref")
-    inputs = [reference] if reference in plant.y else []
+    """Return [refs, hats] -> u: ``T_u (I x c) E``, E the errors, c the controller of an axis."""
+    refs = [poi.derived(name, "ref") for name in poi.axes]
+    inputs = [name for name in refs if name in plant.y]
     hats = [poi.derived(name, "hat") for name in poi.axes]
     errors = -np.eye(len(hats), len(hats) + len(inputs), len(inputs))
-    errors[0, : len(inputs)] = 1.0
+    for column, name in enumerate(inputs):
+        errors[refs.index(name), column] = 1.0
     A, B, C, D = (stacked([one] * len(hats)) for one in (axis.A, axis.B, axis.C, axis.D))
     return StateSpace(
         A,
