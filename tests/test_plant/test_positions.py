@@ -156,3 +156,43 @@ def test_refusals(modes):
             y=[fx.Sensor("y", at=(0.3, 0.3, 0), moves=table)], positions=POSITIONS[:1],
         )  # fmt: skip
         fx.assemble_plant(modes, given).at({"y": (0.1, 0.1, 0.0)})
+
+
+def test_a_map_of_the_range(modes):
+    """Decoupling by lever arms, modes by their shapes, figures as given."""
+    given = ports().replace(
+        w=[],
+        values={},
+        positions=[Position("x", range=(-0.1, 0.1)), Position("y", range=(-0.02, 0.02))],
+        y=[fx.Sensor(f"y{i}", at=(*p, 0.0), moves=MOVES) for i, p in enumerate(CORNERS)],
+        u=[fx.Actuator(f"u{i}", at=(*p, 0.0)) for i, p in enumerate(INSET)],
+        z=[fx.Poi("die", at=(0.3, 0.3, 0.0))],
+    )
+    plant = fx.assemble_plant(modes, given)
+    found = plant.map({"first": lambda p: p.system.C[-3, 0]}, points={"x": 5, "y": [0.0, 0.02]})
+    assert found.figures["first"].shape == (5, 2)
+    assert found.figures["first"][1, 1] == plant.at(x=-0.05, y=0.02).system.C[-3, 0]
+    # heads shifted by s see z - s tilt: off by s in units of the radius of gyration of the plate
+    for i, x in enumerate(np.linspace(-0.1, 0.1, 5)):
+        arm = np.hypot(x, np.array([0.0, 0.02])) / (0.6 / np.sqrt(12.0))
+        np.testing.assert_allclose(found.decoupling[i, :, 0], arm, rtol=1e-2, atol=1e-9)
+    np.testing.assert_allclose(found.decoupling[..., 1], 0.0, atol=1e-9)
+    shapes = abs(make_plate().dofs.rows(np.array([(*p, 0.0) for p in CORNERS]), "z") @ modes.phi)
+    omega = modes.omega[3:]
+    best = (shapes[:, 3:] / shapes[:, 3:].max(axis=1, keepdims=True)).max(axis=0)
+    np.testing.assert_allclose(found.seen[2, 0], best, rtol=1e-6)
+    assert omega.size == len(found.modes)
+    assert "decoupling off by up to" in repr(found)
+    one = plant.map({"first": lambda p: p.system.C[-3, 0]}, points={"x": 5, "y": [0.0, 0.01]})
+    assert [ax.get_xlabel() for ax in fx.plot.position_map(one)] == ["position x [mm]"] * 3
+    line = fx.plant.PositionMap(
+        {"x": one.grid["x"]}, one.decoupling[:, 0], one.seen[:, 0], one.reached[:, 0],
+        one.modes, {"first": one.figures["first"][:, 0]},
+    )  # fmt: skip
+    panels = fx.plot.position_map(line)
+    np.testing.assert_allclose(panels[0].lines[0].get_ydata(), 100 * one.decoupling[:, 0, 0])
+    assert panels[-1].get_xlabel() == "position x [mm]"
+    with pytest.raises(LabelError, match="has no positions"):
+        fx.testbeds.three_masses().map()
+    with pytest.raises(ModelError, match=r"'figure' at x = -0\.1"):
+        plant.map(lambda p: "poor", points=3)

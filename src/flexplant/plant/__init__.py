@@ -90,6 +90,7 @@ from .port import Seen as Seen
 from .port import SensorPort as SensorPort
 from .ports import Ports as Ports
 from .ports import Reference as Reference
+from .position_map import PositionMap as PositionMap
 from .reach_and_sight import Assumption as Assumption
 from .residual_form import FastStates as FastStates
 from .residual_form import Feedthrough as Feedthrough

@@ -18,6 +18,7 @@ from .building import continuous_plant, rebuilt, sampled
 from .moving import Along, along, moved
 from .partition import Partition
 from .ports import Ports
+from .position_map import PositionMap, position_map
 from .realisation import ModalRealisation, Structure
 from .residual_form import ResidualForm, modes_of
 from .rigid.rigid_motion import RigidModes, rigid_modes_of
@@ -216,6 +217,32 @@ class StandardPlant(Partition):
         if positions:
             ports = ports.at(positions)
         return self.with_ports(ports if poi is None else moved(ports, poi))
+
+    def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
+        """Return what the position does: decoupling, modes seen and reached, figures of one's own.
+
+        Parameters
+        ----------
+        judge : callable or mapping {name: callable}, optional
+            Of a plant at each position, to a number: ``{"margin": lambda p: fx.modulus_margin((p,
+            controller))}``.
+        points : int or mapping {name: int or array}
+            How many values of each position are taken over its range, or which [m or rad].
+
+        Returns
+        -------
+        PositionMap
+            For `flexplant.plot.position_map`.
+
+        Raises
+        ------
+        LabelError
+            When the plant has no positions.
+        ModelError
+            When it was not assembled from a structure, a value is out of range, or a judge gives
+            no number.
+        """
+        return position_map(self, judge, points)
 
     def along(self, name: str, points: npt.ArrayLike) -> Along:
         """Return the rows of a POI (or the columns of a force) at many points at once.

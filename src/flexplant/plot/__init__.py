@@ -60,6 +60,7 @@ from .loops import sensitivity as sensitivity
 from .placement import pareto_curve as pareto_curve
 from .placement import placed as placed
 from .placement import sensor_map as sensor_map
+from .positions import position_map as position_map
 from .report import report as report
 from .response import response as response
 from .response import step as step

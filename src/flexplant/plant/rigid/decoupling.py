@@ -10,7 +10,7 @@ import numpy as np
 from ...checks import FloatArray, Value, name_list
 from ...errors import AssumptionError, counted, require_known
 from ...lti.statespace import StateSpace
-from ..standard import StandardPlant, standard_plant
+from ..partition import Partition
 from .rigid_body import RigidBody, refuse_lost, rigid_body_of
 from .rigid_motion import projected
 
@@ -79,7 +79,7 @@ class Decoupling(Value):
         return self.to_motions.D
 
 
-def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Decoupling:
+def decouple(plant: Partition, *, axes: Sequence[str] | None = None) -> Decoupling:
     """Return the static transformations to and from the centre of gravity.
 
     From the geometry: no mode shape is involved but the rigid-body ones, so that a structure on
@@ -117,7 +117,7 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
     >>> fx.decouple(fx.testbeds.three_masses()).mass.round(6)  # all three masses
     array([[3.]])
     """
-    plant = standard_plant(plant)
+    plant = Partition.of(plant)
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     body = rigid_body_of(realisation)
     if axes is None:
@@ -185,7 +185,7 @@ def _check(
 
 
 def _static(
-    gain: FloatArray, inputs: Sequence[str], outputs: Sequence[str], plant: StandardPlant
+    gain: FloatArray, inputs: Sequence[str], outputs: Sequence[str], plant: Partition
 ) -> StateSpace:
     units = plant.units
     for channel in (*inputs, *outputs):
