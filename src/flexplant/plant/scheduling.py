@@ -106,7 +106,8 @@ class PlaceTable(Value):
     --------
     >>> import flexplant as fx
     >>> table = fx.plant.PlaceTable({"x": [-0.1, 0.1]}, [[0.4, 0.3, 0.0], [0.2, 0.302, 0.0]])
-    >>> [float(round(c, 9)) for c in table.place({"x": 0.0})]
+    >>> head = fx.Sensor("y1", at=(0.3, 0.3, 0.0), moves=table)
+    >>> [round(c, 9) for c in head.moves.place({"x": 0.0})]
     [0.3, 0.301, 0.0]
     """
 
@@ -132,27 +133,11 @@ class PlaceTable(Value):
         sizes = " x ".join(f"{len(values)} {name}" for name, values in self.grid.items())
         return f"<PlaceTable {sizes}>"
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The positions that it depends on."""
-        return tuple(self.grid)
-
     def covers(self, position: Position) -> bool:
         """Return whether its values span the range of a position."""
         values, (low, high) = np.asarray(self.grid[position.name]), position.range
         spare = _BEYOND * (high - low)
         return bool(values[0] <= low + spare and values[-1] >= high - spare)
-
-    def place(self, values: Mapping[str, float]) -> tuple[float, ...]:
-        """Return the place [m] at values of the positions."""
-        from scipy.interpolate import interpn
-
-        axes = tuple(np.asarray(one) for one in self.grid.values())
-        at = [
-            np.clip(values[name], one[0], one[-1])
-            for name, one in zip(self.grid, axes, strict=True)
-        ]
-        return tuple(interpn(axes, np.asarray(self.places), np.array(at))[0].tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,15 +168,30 @@ class Moves(Value):
     @property
     def names(self) -> tuple[str, ...]:
         """The positions that it depends on."""
-        return self.along.names if isinstance(self.along, PlaceTable) else tuple(self.along)
+        return tuple(self.along.grid if isinstance(self.along, PlaceTable) else self.along)
 
     def place(self, values: Mapping[str, float]) -> Place:
         """Return the place at values of the positions."""
+        one = {name: np.array([values[name]]) for name in self.names}
+        found = [(tuple(points[0].tolist()), weight) for weight, points in self.points(one)]
+        return dict(found) if isinstance(self.start, Mapping) else found[0][0]
+
+    def points(self, values: Mapping[str, FloatArray]) -> list[tuple[float, FloatArray]]:
+        """Return weights, and points (n, 3) [m], of the place at values (n,) of the positions."""
         if isinstance(self.along, PlaceTable):
-            return self.along.place(values)
-        pairs = [np.asarray(step) * values[name] for name, step in self.along.items()]
-        shift = np.sum(pairs, axis=0)
-        return shifted(self.start, shift)
+            from scipy.interpolate import interpn
+
+            axes = tuple(np.asarray(one) for one in self.along.grid.values())
+            at = np.column_stack(
+                [np.clip(values[n], a[0], a[-1]) for n, a in zip(self.names, axes, strict=True)]
+            )
+            return [(1.0, np.asarray(interpn(axes, np.asarray(self.along.places), at)))]
+        shift = np.sum(
+            [np.multiply.outer(values[n], np.asarray(step)) for n, step in self.along.items()],
+            axis=0,
+        )
+        terms = self.start if isinstance(self.start, Mapping) else {self.start: 1.0}
+        return [(weight, np.asarray(point) + shift) for point, weight in terms.items()]
 
     def starting(self, place: Place, values: Mapping[str, float]) -> Moves:
         """Return the same motion of a port that stands elsewhere at some values."""

@@ -27,6 +27,7 @@ from ..parallel import Progress, one_thread
 from ..plant import StandardPlant
 from ..tolerances import SAME, TYPED
 from .motion import SetPoint
+from .moving_machine import MovingMachine, trajectory
 from .nonlinear_elements import Element, conditions, finer_loop
 from .response import Response
 from .runs import make_runner
@@ -78,9 +79,11 @@ def simulate(
     anti_windup : float [s], optional
         Time constant in which integrators (all poles slower than it) of blocks that drive
         actuators return to what is applied while that is not what they command.
-    moving : mapping {POI: path}, optional
+    moving : mapping {POI or position: path}, optional
         Places (n_time, 3) [m] of POIs over time, or functions of the times: the channels of such a
-        POI in z are those of its place at each sample.
+        POI in z are those of its place at each sample. Or values of the plant's positions [m or
+        rad] over time, as a SetPoint (which may be a reference too), a function, or an array
+        (n_time,): all ports that move with it do, forces within each sample too.
     finer : int
         Samples of the plant in each sample of the controller, whose commands are held: what z does
         between samples. Sensors are read (noise, elements) in the controller's samples; between
@@ -138,7 +141,13 @@ def simulate(
             f"duration {float(duration):g} s is less than half a sample ({plant.dt:g} s)."
         )
     time: FloatArray = np.arange(steps, dtype=np.float64) * plant.dt
-    met = conditions(loop, elements, anti_windup, finer, moving, time)
+    positions = _positions(plant, moving)
+    if positions and (elements or finer > 1 or len(positions) < len(moving or {})):
+        raise ModelError(
+            "positions move in runs without elements, finer samples and paths of single POIs: "
+            "leave these out, or let the machine stand."
+        )
+    met = conditions(loop, elements, anti_windup, finer, None if positions else moving, time)
     numbers = _run_numbers(runs)
     given = _given(plant, reference, disturbance, time, 0 if runs is None else len(numbers))
     silent = plant if flag(noise, "noise") else plant.replace(asd={})
@@ -152,7 +161,12 @@ def simulate(
     # products this small run slower on two threads than on one (5 times, on a busy machine)
     overflow = np.errstate(over="ignore", invalid="ignore")
     with one_thread(), overflow:
-        runner = make_runner(loop, white, given.reshape(-1, len(plant.w)), grows=grows, met=met)
+        runner: Any
+        if positions:
+            path = trajectory(plant, positions, time)
+            runner = MovingMachine(loop, path, noise=noise)
+        else:
+            runner = make_runner(loop, white, given.reshape(-1, len(plant.w)), grows=grows, met=met)
         groups = [slice(i, i + runner.abreast) for i in range(0, len(numbers), runner.abreast)]
         total = len(groups) * -(-steps // runner.stretch)
         with Progress(total, "simulate", progress=progress) as bar:
@@ -170,6 +184,14 @@ def simulate(
                     bar.advance()
     drawn = seed_of(seed) if white.factor.size or white.columns.size else None
     return Response(time, data[0] if runs is None else data, shown, loop.units, drawn)
+
+
+def _positions(plant: StandardPlant, moving: Any) -> dict[str, Any]:
+    """Return what moves of the plant's positions."""
+    if not isinstance(moving, Mapping) or not plant.is_assembled:
+        return {}
+    known = [one.name for one in plant.assembled.ports.positions]
+    return {name: path for name, path in moving.items() if name in known}
 
 
 def _check_sampled(loop: ClosedLoop) -> None:

@@ -1,0 +1,363 @@
+"""A machine whose ports move with its position: exact within each sample.
+
+``x+ = A x + sum_i int e^(A (T - s)) b_i(p(s)) f_i(s) ds``: the modes do not depend on the position,
+only where forces act and motions are seen. The integrals are taken by Gauss's rule, to rounding,
+with b_i quadratic in time over a sample through its ends and its middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..checks import FloatArray, real_array
+from ..errors import ModelError, require_known
+from ..loop import ClosedLoop
+from ..loop.budget import WhiteNoise, continuous_factor, white_noise
+from ..lti.discretisation import pair_expm
+from ..plant import Actuator, Poi, StandardPlant
+from ..plant.scheduling import Position
+from ..tolerances import SAME
+from .motion import SetPoint
+
+#: nodes of Gauss's rule in a sample, beyond one for each radian of the fastest mode
+_NODES = 12
+#: samples of a stretch, and runs side by side
+_STRETCH, _ABREAST = 128, 16
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Values of the positions as functions of time, within their ranges."""
+
+    positions: tuple[Position, ...]
+    paths: Mapping[str, Callable[[FloatArray], FloatArray]]
+    standing: Mapping[str, float]
+
+    def at(self, time: FloatArray) -> dict[str, FloatArray]:
+        """Return the values (n,) of each position at times (n,)."""
+        still = {name: np.full(time.size, value) for name, value in self.standing.items()}
+        return still | {name: path(time) for name, path in self.paths.items()}
+
+
+def trajectory(plant: StandardPlant, moving: Mapping[str, Any], time: FloatArray) -> Trajectory:
+    """Return how positions move that were given: SetPoints, functions, or a value a sample."""
+    ports = plant.assembled.ports
+    known = {one.name: one for one in ports.positions}
+    require_known("position to move", moving, known)
+    dt = float(plant.dt)
+    # the end of the last sample counts too
+    ends = np.append(time, time[-1] + dt)
+    paths: dict[str, Callable[[FloatArray], FloatArray]] = {}
+    for name, path in moving.items():
+        paths[name] = _path(name, path, time)
+        for value in (paths[name](ends).min(), paths[name](ends).max()):
+            known[name].within(value)
+    return Trajectory(tuple(ports.positions), paths, ports.values)
+
+
+def _path(name: str, path: Any, time: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return a position as a function of time; a value a sample is smooth between them."""
+    if isinstance(path, SetPoint):
+        return lambda t: np.asarray(path.at(t).position)
+    if callable(path):
+        return lambda t: real_array(path(t), f"position {name!r} over time", (t.size,))
+    values = real_array(path, f"position {name!r} over time", (time.size,))
+    if time.size < 4:
+        raise ModelError(
+            f"position {name!r} has {time.size} values: give four samples or more, a "
+            "function or a SetPoint."
+        )
+    from scipy.interpolate import CubicSpline
+
+    spline = CubicSpline(time, values)
+    return lambda t: np.asarray(spline(np.minimum(t, time[-1])))
+
+
+class _Force(NamedTuple):
+    """A force that moves: whole samples and the fraction of one by which it is late."""
+
+    port: Any
+    whole: int
+    fraction: float
+    asd: float
+
+
+class MovingMachine:
+    """Runs of a closed loop along a trajectory of positions, sample by sample."""
+
+    abreast, stretch = _ABREAST, _STRETCH
+
+    def __init__(self, loop: ClosedLoop, path: Trajectory, *, noise: bool) -> None:
+        plant = self.plant = loop.plant
+        self.loop, self.path = loop, path
+        own = self.realisation = plant.assembled.realisation
+        self.modal = plant.modal_states
+        ports = plant.assembled.ports
+        names = set(path.paths)
+        every: tuple[Any, ...] = (*ports.forces, *ports.z, *ports.y)
+        moves = [
+            port for port in every
+            if getattr(port, "moves", None) is not None and names & set(port.moves.names)
+        ]  # fmt: skip
+        _require_plain(plant, moves)
+        moving = {id(port) for port in moves}
+        h = float(plant.dt)
+        self.forces = [_late(plant, port, noise) for port in ports.forces if id(port) in moving]
+        sensors: tuple[Any, ...] = tuple(ports.y)
+        self.seen = [(s, s.direction, [plant.y.index(s.name)]) for s in sensors if id(s) in moving]
+        self.shown = [
+            (poi, axis, _rows(plant, poi, axis)) for poi in ports.z if id(poi) in moving
+            for axis in poi.axes
+        ]  # fmt: skip
+        self.rule = _Rule(own.pairs, h)
+        self._fixed(noise)
+
+    def _fixed(self, noise: bool) -> None:
+        """Take what moves out of the matrices of the sampled plant."""
+        g, plant = self.plant.system, self.plant
+        A, B, C = np.array(g.A), np.array(g.B), np.array(g.C)
+        #: the state or input that holds the new, and the old, sample of each force
+        self.new: list[tuple[bool, int]] = []
+        self.old: list[tuple[bool, int]] = []
+        for force in self.forces:
+            name, m = force.port.name, force.whole
+            lines = [f"{name}:delay{age}" for age in (m, m + 1)]
+            for kept, age, line in zip((self.new, self.old), (m, m + 1), lines, strict=True):
+                if not age:
+                    i = int(g.input_index([name])[0])
+                    kept.append((False, i))
+                    B[self.modal, i] = 0.0
+                elif line in g.states:
+                    i = g.states.index(line)
+                    kept.append((True, i))
+                    A[self.modal, i] = 0.0
+                else:
+                    kept.append((False, -1))
+            for i in g.input_index([n for n in (f"{name}:disturbance",) if n in g.inputs]):
+                B[self.modal, i] = 0.0
+        rows = [*(i for *_, at in self.shown for i, _ in at)]
+        rows += [len(plant.z) + at[0] for *_, at in self.seen]
+        C[np.ix_(np.array(rows, dtype=np.int64), self.modal)] = 0.0
+        nw = len(plant.w)
+        self.u = nw + np.array([plant.u.index(n) for n in self.loop.driven], dtype=np.int64)
+        self.A, self.B, self.C, self.D = A, B, C, g.D
+        loud = plant if noise else plant.replace(asd={})
+        self.noise = _noise_without(loud, {force.port.name for force in self.forces})
+
+    def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
+        """Put all runs at a state of plant and controller; each draws from its generator."""
+        n, count = self.plant.system.n_states, len(generators)
+        self.generators, self.first = generators, 0
+        self.x, self.c = np.tile(start[:n], (count, 1)), np.tile(start[n:], (count, 1))
+
+    def fill(self, given: FloatArray, data: FloatArray) -> bool:
+        """Run one stretch: w as `given` (k, nw) or (runs, k, nw) plus noise; return if finite."""
+        k, plant, runs = given.shape[-2], self.plant, len(self.x)
+        nz, nw, nu = len(plant.z), len(plant.w), len(self.loop.driven)
+        B, rows = self._columns(k), self._seen(k)
+        new, old = self._acting(B)
+        w = np.broadcast_to(given, (runs, k, nw)).copy()
+        state_noise = self._drawn(w, B, k)
+        inputs = np.zeros((runs, nw + len(plant.u)))
+        for i in range(k):
+            x = self.x
+            inputs[:, :nw] = w[:, i]
+            shown = x @ self.C.T
+            for at, row in rows:
+                shown[:, [j for j, _ in at]] = (x[:, self.modal] @ row[i])[:, None] * [
+                    sign for _, sign in at
+                ]
+            y = shown[:, nz:] + inputs @ self.D[nz:].T
+            both = np.hstack([self.c, y])
+            self.c, out = both @ self._law[0].T, both @ self._law[1].T
+            inputs[:, self.u] = out[:, :nu]
+            z = shown[:, :nz] + inputs @ self.D[:nz].T
+            following = x @ self.A.T + inputs @ self.B.T + state_noise[:, i]
+            for f in range(len(self.forces)):
+                push = self._held(self.new[f], x, inputs)[:, None] * new[f][i]
+                push += self._held(self.old[f], x, inputs)[:, None] * old[f][i]
+                following[:, self.modal] += push
+            self.x = following
+            data[:, :, i] = np.hstack([z, y, out])
+        self.first += k
+        return bool(np.all(np.isfinite(self.x)))
+
+    @cached_property
+    def _law(self) -> tuple[FloatArray, FloatArray]:
+        """The controller over its states and y."""
+        law = self.loop.controller
+        return np.hstack([law.A, law.B]), np.hstack([law.C, law.D])
+
+    @staticmethod
+    def _held(place: tuple[bool, int], x: FloatArray, inputs: FloatArray) -> FloatArray:
+        is_state, i = place
+        return x[:, i] if is_state else inputs[:, i] if i >= 0 else np.zeros(len(x))
+
+    def _columns(self, k: int) -> list[FloatArray]:
+        """Return each force's columns (k, 3, 2 b) at the begin, the middle and the end."""
+        h = float(self.plant.dt)
+        time = np.asarray((self.first + 0.5 * np.arange(2 * k + 1)) * h, dtype=np.float64)
+        values = self.path.at(time)
+        found = []
+        for force in self.forces:
+            rows = _motions(self.realisation, force.port, force.port.direction, values)
+            columns = rows @ self.realisation.inputs
+            found.append(np.stack([columns[:-2:2], columns[1:-1:2], columns[2::2]], axis=1))
+        return found
+
+    def _acting(self, B: list[FloatArray]) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return the effects (k, 2 b) of each force's new and old sample."""
+        h, new, old = float(self.plant.dt), [], []
+        for force, columns in zip(self.forces, B, strict=True):
+            new.append(self.rule.pushed(columns, force.fraction, h))
+            old.append(self.rule.pushed(columns, 0.0, force.fraction))
+        return new, old
+
+    def _seen(self, k: int) -> list[tuple[list[tuple[int, float]], FloatArray]]:
+        """Return where rows go, with which sign, and the rows (k, 2 b) at each sample."""
+        time = np.asarray((self.first + np.arange(k)) * float(self.plant.dt), dtype=np.float64)
+        values = self.path.at(time)
+        nz, found = len(self.plant.z), []
+        for port, axis, at in self.shown:
+            rows = _motions(self.realisation, port, axis, values) @ self.realisation.outputs
+            found.append((at, rows))
+        for sensor, axis, places in self.seen:
+            rows = _motions(self.realisation, sensor, axis, values) @ self.realisation.outputs
+            found.append(([(nz + places[0], 1.0)], rows))
+        return found
+
+    def _drawn(self, w: FloatArray, B: list[FloatArray], k: int) -> FloatArray:
+        """Add noises to w, and return what white forces add to the states (runs, k, n)."""
+        runs, noise = len(self.x), self.noise
+        found = np.zeros((runs, k, self.plant.system.n_states))
+        loud = [(f, c) for f, c in zip(self.forces, B, strict=True) if f.asd > 0]
+        kicks = [self.rule.kicks(c) * (f.asd / np.sqrt(2.0)) for f, c in loud]
+        for r, generator in enumerate(self.generators):
+            # a whole stretch, so that a longer run begins with the shorter one
+            single = generator.standard_normal((self.stretch, noise.columns.size))[:k]
+            w[r][:, noise.columns] += single * noise.deviation
+            found[r] = (
+                generator.standard_normal((self.stretch, noise.factor.shape[1]))[:k]
+                @ noise.factor.T
+            )
+            for kick in kicks:
+                white = generator.standard_normal((self.stretch, kick.shape[1]))[:k]
+                found[r][:, self.modal] += np.einsum("kq,kqn->kn", white, kick)
+        return found
+
+
+class _Rule:
+    """Integrals over a sample of ``e^(A (T - s)) b(s)``, b quadratic through three columns."""
+
+    def __init__(self, pairs: FloatArray, h: float) -> None:
+        self.pairs, self.h = pairs, h
+        fastest = float(np.abs(pairs).sum(axis=2).max(initial=0.0))
+        self.nodes, self.weights = np.polynomial.legendre.leggauss(
+            _NODES + int(np.ceil(fastest * h))
+        )
+
+    def _at(self, start: float, end: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return weights (q,), the columns' shares (q, 3) and e^(A (T - s)) (q, b, 2, 2)."""
+        s = start + 0.5 * (end - start) * (1.0 + self.nodes)
+        t = s / self.h
+        share = np.stack([(1 - t) * (1 - 2 * t), 4 * t * (1 - t), t * (2 * t - 1)], axis=1)
+        flow = np.array([pair_expm(self.pairs, self.h - one) for one in s.tolist()])
+        return 0.5 * (end - start) * self.weights, share, flow
+
+    def pushed(self, columns: FloatArray, start: float, end: float) -> FloatArray:
+        """Return the effect (k, 2 b) of a unit force from start to end of a sample."""
+        if end - start <= 0.0:
+            return np.zeros((len(columns), columns.shape[2]))
+        weight, share, flow = self._at(start, end)
+        W = np.einsum("q,qj,qbcd->jbcd", weight, share, flow)
+        found = np.einsum("jbcd,kjbd->kbc", W, columns.reshape(*columns.shape[:2], -1, 2))
+        return np.asarray(found.reshape(len(columns), -1))
+
+    def kicks(self, columns: FloatArray) -> FloatArray:
+        """Return what unit white samples (q) at the nodes add to the states, (k, q, 2 b)."""
+        weight, share, flow = self._at(0.0, self.h)
+        b = np.einsum("qj,kjbd->kqbd", share, columns.reshape(*columns.shape[:2], -1, 2))
+        found = np.einsum("q,qbcd,kqbd->kqbc", np.sqrt(weight), flow, b)
+        return np.asarray(found.reshape(len(columns), weight.size, -1))
+
+
+def _motions(
+    realisation: Any, port: Any, axis: str, values: Mapping[str, FloatArray]
+) -> FloatArray:
+    """Return rows (n, DOFs) of a port's place along an axis at values (n,) of the positions."""
+    terms = port.moves.points(values)
+    return np.asarray(sum(weight * realisation.model.rows(at, axis) for weight, at in terms))
+
+
+def _rows(plant: StandardPlant, poi: Poi, axis: str) -> list[tuple[int, float]]:
+    """Return the channels of z that show an axis of a POI, with their sign."""
+    found = [(plant.z.index(poi.channel(axis)), 1.0)]
+    error = poi.derived(axis, "error")
+    return [*found, (plant.z.index(error), -1.0)] if error in plant.z else found
+
+
+def _late(plant: StandardPlant, port: Any, noise: bool) -> _Force:
+    """Return a force that moves, with its delay."""
+    is_actuator = isinstance(port, Actuator)
+    samples = plant.delay + port.latency / plant.dt if is_actuator else 0.0
+    near = round(samples)
+    samples = float(near) if abs(samples - near) < SAME * max(near, 1) else float(samples)
+    whole = int(samples)
+    name = f"{port.name}:disturbance" if is_actuator else port.name
+    asd = float(plant.asd.get(name, 0.0)) if noise else 0.0
+    return _Force(port, whole, (samples - whole) * float(plant.dt), asd)
+
+
+def _noise_without(plant: StandardPlant, moving: set[str]) -> WhiteNoise:
+    """Return the white noises of a plant without those of forces that move."""
+    noise = white_noise(plant)
+    if not moving or not noise.factor.size:
+        return noise
+    ports = plant.assembled.ports
+    quiet = plant.with_ports(
+        ports.replace(
+            w=[p.replace(asd=0.0) if p.name in moving else p for p in ports.w],
+            u=[p.replace(asd=0.0) if p.name in moving else p for p in ports.u],
+        )
+    )
+    return noise._replace(factor=continuous_factor(quiet))
+
+
+def _require_plain(plant: StandardPlant, moves: list[Any]) -> None:
+    """Refuse what is not exact: filters and late sensors that move, motions that follow at once."""
+    own = plant.assembled.realisation
+    if own.coupling is not None or own.static_outputs.size:
+        raise ModelError(
+            f"the plant's modes are in the form {own.form!r}, or residual vectors answer at once: "
+            "a moving machine needs modes by themselves. Take proportional or modal damping, and "
+            "residual=FastStates()."
+        )
+    if plant.modal_states[0] and any(hasattr(port, "push") for port in moves):
+        raise ModelError(
+            f"forces move, and {plant.system.states[0]!r} of a sensor answers them within a "
+            "sample: that is not computed along a trajectory. Take dynamics and latencies of "
+            "sensors into the controller's blocks, or let forces stay."
+        )
+    for port in moves:
+        why = ""
+        if getattr(port, "filter", None) is not None:
+            why = "has dynamics"
+        elif getattr(port, "quantity", "displacement") != "displacement":
+            why = f"measures {port.quantity}"
+        elif not isinstance(port, Actuator) and bool(getattr(port, "latency", None)):
+            why = "is late"
+        elif getattr(port, "held", False):
+            why = "is held over samples"
+        elif bool(getattr(port, "absolute", None)):
+            why = "is absolute"
+        if why:
+            raise ModelError(
+                f"{port.name!r} moves and {why}: what it does within a sample is not computed "
+                "along a trajectory. Leave that out of ports that move, or put its dynamics into "
+                "the controller's blocks."
+            )
