@@ -38,12 +38,13 @@ def words(tree):
 
 @pytest.fixture(scope="module")
 def design():
-    plant = fx.assemble_plant(reduced(), ports()).discretized(RATE, delay=1)
+    channels = ports(references=[fx.Reference("die", axes=("z", "rx", "ry"))])
+    plant = fx.assemble_plant(reduced(), channels).discretized(RATE, delay=1)
     observer = fx.design_static(plant)
     servo = fx.design_servo(plant, bandwidth=40.0, observer=observer, larger=full())
     loop = fx.close_loop(plant, observer, servo, larger=full())
     move = fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0)
-    run = fx.simulate(loop, reference=move, duration=0.1, rng=7)
+    run = fx.simulate(loop, reference={"die:ref": move}, duration=0.1, rng=7)
     sensors = tuple(ports().y)
     placement = fx.Placement(("y1", "y2"), 2.0, 1.0, 3, ((2.0,),), "anything", sensors[:2], "y")
     return [loop, plant, {HOSTILE: servo, "run": run}, placement, observer, some_modes()]
@@ -100,6 +101,24 @@ def test_it_begins_with_the_result_and_ends_with_versions(text, design):
         assert part in said
     drawn = [one for one in tree.iter("figure") if one.get("class") == "picture"]
     assert len(drawn) >= 8 and all(one.find(".//path") is not None for one in drawn)
+    captions = [words(one.find("figcaption")) for one in drawn]
+    for part in (
+        "Where the error of die:error comes from",
+        "Where die:rx:error comes from",
+        "Where die:ry:error comes from",
+        "sensitivity |S| of each axis, from its reference to its error",
+        "Sensors, actuators and POIs",
+        "The plant, from forces along each axis to the POI",
+    ):
+        assert any(part in one for one in captions), part
+
+
+@pytest.mark.slow
+def test_pictures_can_be_read_in_a_column(text):
+    """Of 10 points, text on 474 pixels (a telephone of 500) is at least 10 pixels high."""
+    widths = [float(one) for one in re.findall(r'viewBox="0 0 ([\d.]+) [\d.]+"', text)]
+    assert len(widths) >= 8
+    assert max(widths) < 474.0
 
 
 @pytest.mark.slow

@@ -108,8 +108,9 @@ class ErrorBudget(Value):
         for i in order:
             name, rms = self.names[i], factor * np.sqrt(self.variances[i])
             below = f"{self.half_below(name):.4g} Hz"
-            lines.append(f"{name:{width}s}{rms:12.5g}{self.shares[i]:9.1%}{below:>14s}")
-        lines.append(f"{'total':{width}s}{factor * self.rms:12.5g}{1:9.1%}")
+            shown = f"{rms:.3f}" if rms >= 5e-4 or not rms else "< 0.001"
+            lines.append(f"{name:{width}s}{shown:>12s}{self.shares[i]:9.1%}{below:>14s}")
+        lines.append(f"{'total':{width}s}{factor * self.rms:12.3f}{1:9.1%}")
         if np.isinf(self.left_out):
             lines.append("with the modes left out of the model the loop is unstable")
         elif np.isnan(self.left_out):

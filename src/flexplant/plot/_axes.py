@@ -11,6 +11,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_hex
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from ..checks import ComplexArray, FloatArray, in_unit, short
@@ -46,15 +49,45 @@ def axes(ax: Axes | None, **figure: Any) -> Axes:
     return drawn
 
 
-def panel_axes(ax: Axes | None, count: int) -> list[Axes]:
-    """Return the given axes, or `count` new ones, one above the other with the same abscissa."""
+#: lines of one axes that can be told apart where they lie on each other, and by their look
+TOGETHER, _LEGEND = 4, 6
+
+
+def panel_axes(
+    ax: Axes | None, count: int, *, columns: int | None = None, **options: Any
+) -> list[Axes]:
+    """Return the given axes, or `count` new ones with the same abscissa.
+
+    Few are one above the other; more than fit there are small multiples in two columns.
+    """
     if ax is not None:
-        return [ax]
-    height = 4.0 if count == 1 else 1.2 + 2.2 * count
-    _, drawn = plt.subplots(
-        count, 1, sharex=True, squeeze=False, layout="constrained", figsize=(8.0, height)
-    )
-    return list(drawn[:, 0])
+        return [ax] * count
+    wide = columns or (1 if count <= TOGETHER else 2)
+    rows = -(-count // wide)
+    height = 4.0 if count == 1 else 1.2 + (2.2 if wide == 1 else 1.7) * rows
+    options = dict[str, Any](sharex=True, figsize=(8.0, height)) | options
+    grid = plt.subplots(rows, wide, squeeze=False, layout="constrained", **options)[1]
+    drawn: list[Axes] = list(grid.ravel())
+    for spare in drawn[count:]:
+        spare.remove()
+    for panel in drawn[:count][-wide:]:
+        panel.tick_params(labelbottom=True)
+    return drawn[:count]
+
+
+def name_panel(ax: Axes, name: str) -> None:
+    """Name the only line of a panel above it, in place of a legend."""
+    if shown := ax.get_legend():
+        shown.remove()
+    ax.set_title(name, loc="left", fontsize="medium", pad=3.0)
+
+
+def bottom_only(panels: Sequence[Axes]) -> None:
+    """Leave the label of the abscissa to the lowest panel of each column."""
+    lowest = {round(ax.get_position().x0, 3): ax for ax in panels}
+    for ax in panels:
+        if ax not in lowest.values():
+            ax.set_xlabel("")
 
 
 def quantity_of(unit: str | None) -> str:
@@ -113,16 +146,23 @@ def solid_axes(xyz: FloatArray, ax: Any, *, beyond: float = 0.0) -> Any:
 def legend_below(ax: Axes) -> None:
     """Draw the legend under a view from above."""
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
+        ax.legend(
+            loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.5, ncols=3, frameon=False
+        )
 
 
 def legend(ax: Axes, *, given: bool) -> None:
     """Draw the legend where it covers nothing: beside new axes, in a given one's emptiest corner.
 
     Beside is empty whatever part of the lines is shown later. Where no corner is empty, the
-    ordinate of a given one reaches further up.
+    ordinate of a given one reaches further up. More lines than a legend tells apart are named at
+    their ends.
     """
-    if not ax.get_legend_handles_labels()[0]:
+    handles = ax.get_legend_handles_labels()[0]
+    if not handles:
+        return
+    if len(handles) > _LEGEND and all(isinstance(one, Line2D) for one in handles):
+        _name_ends(ax)
         return
     if not given:
         ax.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -142,6 +182,32 @@ def legend(ax: Axes, *, given: bool) -> None:
         side = points[across[emptiest.split()[1]], 1]
         _raise_top(ax, float(side[side <= 1.0].max(initial=0.0)) / (1.0 - min(height, 0.7)))
     ax.legend(frameon=False, loc=emptiest)
+
+
+def _name_ends(ax: Axes) -> None:
+    """Name each line at its right end, names in the order of the ends and none upon another."""
+    to_axes = ax.transAxes.inverted()
+    found, labels = ax.get_legend_handles_labels()
+    handles = [one for one in found if isinstance(one, Line2D)]
+    right = ax.get_xlim()[1]
+    ends = []
+    for line in handles:
+        points = np.asarray(line.get_xydata(), dtype=np.float64)
+        seen = points[np.isfinite(points).all(axis=1) & (points[:, 0] <= right * (1 + 1e-9))]
+        ends.append(seen[-1] if len(seen) else (right, np.nan))
+    height = np.array([to_axes.transform(ax.transData.transform(end))[1] for end in ends])
+    order = np.argsort(np.nan_to_num(height, nan=0.0), kind="stable")
+    step = 1.25 * 10.0 / max(ax.get_window_extent().height * 72.0 / ax.figure.dpi, 1.0)
+    place = np.clip(np.nan_to_num(height[order]), 0.0, 1.0)
+    for k in range(1, len(place)):
+        place[k] = max(place[k], place[k - 1] + step)
+    place -= max(0.0, 0.5 * (place[-1] + place[0] - 1.0)) if place[-1] > 1.0 else 0.0
+    for y, k in zip(place, order, strict=True):
+        ax.annotate(
+            labels[k], ends[k], (1.04, float(y)), "data", ax.transAxes, va="center",
+            color=handles[k].get_color(), fontsize="small", annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": handles[k].get_color(), "linewidth": 0.6},
+        )  # fmt: skip
 
 
 def _raise_top(ax: Axes, top: float) -> None:
@@ -221,6 +287,78 @@ PORTS: Mapping[str, Style] = {
     "actuators": {"marker": "^", "color": RED, "markeredgecolor": "white", "markersize": 11},
     "POI": {"marker": "o", "color": RED, "fillstyle": "none", "markersize": 12},
 }
+#: how far an arrow of a direction reaches, of the size of a view from above
+_ARROW = 0.07
+
+
+class Device(NamedTuple):
+    """A port in a view of a structure: its name, x to rz or "" of its direction, its place [m]."""
+
+    name: str
+    direction: str
+    place: FloatArray
+
+    @classmethod
+    def of(cls, port: Any, place: FloatArray) -> Device:
+        """Return the device of a port at a place; of a POI no direction."""
+        own = getattr(port, "direction", None)
+        label = port.at.rpartition(":")[2] if isinstance(port.at, str) else None
+        return cls(port.name, "" if hasattr(port, "axes") else label or own or "", place)
+
+    @property
+    def along(self) -> FloatArray | None:
+        """The unit vector of the direction; None of rotations and POIs."""
+        known = self.direction and self.direction in "xyz"
+        return np.eye(3)["xyz".index(self.direction)] if known else None
+
+
+def differ(kinds: Mapping[str, Sequence[Device]]) -> bool:
+    """Return whether devices have different directions."""
+    return len({one.direction for listed in kinds.values() for one in listed} - {""}) > 1
+
+
+def mark_devices(
+    ax: Axes, factor: float, kinds: Mapping[str, Sequence[Device]], *, various: bool | None = None
+) -> None:
+    """Mark and name devices by kind in a view from above, in x and y with arrows.
+
+    Directions that no arrow shows stand beside the names where they are various.
+    """
+    various = differ(kinds) if various is None else various
+    extent = np.ptp(ax.dataLim.get_points(), axis=0).max() or 1.0
+    names: dict[tuple[float, ...], list[str]] = {}
+    beside: set[tuple[float, ...]] = set()
+    for kind, listed in kinds.items():
+        if not listed:
+            continue
+        at = np.array([one.place for one in listed]) / factor
+        over: dict[str, Any] = {"linestyle": "", "zorder": 4, "clip_on": False}
+        ax.plot(at[:, 0], at[:, 1], label=kind, **over, **PORTS[kind])
+        for one, point in zip(listed, at, strict=True):
+            arrow = one.direction in ("x", "y")
+            text = one.name if arrow or not various or not one.direction else (
+                f"{one.name} ({one.direction})")  # fmt: skip
+            spot = tuple(np.round(point[:2] / extent, 2))
+            names.setdefault(spot, []).append(text)
+            if various and one.direction == "y":
+                beside.add(spot)
+            if various and arrow:
+                turned = np.array(one.along)[:2] * _ARROW * extent
+                look = {"arrowstyle": "-|>", "color": PORTS[kind]["color"], "linewidth": 1.4}
+                ax.annotate(
+                    "", tuple(point[:2] + turned), tuple(point[:2]), arrowprops=look, zorder=3.9
+                )
+    for spot, texts in names.items():
+        place: Any = {"xytext": (0, 9), "ha": "center", "va": "bottom"}
+        if spot in beside:  # above is the arrow
+            place = {"xytext": (9, 0), "ha": "left", "va": "center"}
+        shown = ax.annotate(
+            ", ".join(texts), (spot[0] * extent, spot[1] * extent), textcoords="offset points",
+            fontsize="small", zorder=5, annotation_clip=False, **place,
+        )  # fmt: skip
+        shown.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
+
+
 #: a measurement beside models over frequency: points, none of which hides a line
 POINTS: Style = {
     "color": BLACK, "linestyle": "none", "marker": ".", "markersize": 3.0, "zorder": 1.8,
@@ -234,17 +372,28 @@ def role_of(label: str) -> str | None:
     return role if role in STYLES else None
 
 
+def apart(ax: Axes | None, labels: Iterable[str]) -> bool:
+    """Return whether lines need panels of their own: many that name no role of `STYLES`."""
+    return ax is None and sum(role_of(label) is None for label in labels) > TOGETHER
+
+
 def styles(
     labels: Iterable[str], colors: Mapping[str, str] | None = None, *, taken: int = 0
 ) -> list[Style]:
     """Return the styles of lines by their labels; those that name nothing follow the cycle.
 
-    So many lines are there already.
+    So many lines are there already. More than the cycle holds are solid, each of its own colour.
     """
     found, others = [], taken
+    labels = list(labels)
+    plain = sum(role_of(label) is None for label in labels)
+    shades = plt.get_cmap("turbo")(np.linspace(0.05, 0.95, plain)) if plain > len(CYCLE) else None
     for label in labels:
         role = role_of(label)
         style = dict(STYLES[role] if role else CYCLE[others % len(CYCLE)])
+        if role is None and shades is not None:
+            shade = to_hex(shades[others - taken])
+            style = {"color": shade, "linestyle": "-", "linewidth": 1.4}
         others += role is None
         if colors and label in colors:
             style["color"] = colors[label]

@@ -10,10 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
 
-from ..checks import FloatArray, name_list, real_array, short
-from ..errors import ModelError, unknown_label
+from ..checks import ComplexArray, FloatArray, name_list, real_array, short
+from ..errors import ModelError, require_known, unknown_label
 from ..lti.frequency import Frf
 from ._axes import (
+    GREY,
     STYLES,
     Curve,
     axes,
@@ -22,6 +23,7 @@ from ._axes import (
     finish,
     gain_label,
     legend,
+    panel_axes,
     readable,
     role_of,
     shared_reference,
@@ -37,12 +39,14 @@ def bode(
     outputs: Sequence[str] | str | None = None,
     inputs: Sequence[str] | str | None = None,
     freq: FloatArray | None = None,
+    wrap: bool = False,
     ax: Sequence[Axes] | None = None,
 ) -> Axes:
     """Draw magnitude [dB] and phase [deg] over frequency, a pair of panels for each channel.
 
     Phases of systems are continuous over frequency; those of measurements, drawn as points, follow
     the first system by whole turns, or lie between -180 and 180 degrees where there is none.
+    With ``wrap=True`` all lie between -180 and 180 degrees, as a dynamic analyser draws them.
 
     Parameters
     ----------
@@ -52,6 +56,8 @@ def bode(
         Channels of the first one; all when not given. Others are drawn by the same names.
     freq : (n_freq,) array [Hz], optional
         Where systems are evaluated; a grid of each, refined at resonances, when not given.
+    wrap : bool
+        Whether phases are drawn within half a turn of 0.
     ax : pair of Axes, optional
         For magnitude and phase, where one channel is drawn.
 
@@ -83,7 +89,7 @@ def bode(
             pair = panels[2 * i, j], panels[2 * i + 1, j]
             continuous: tuple[FloatArray, FloatArray] | None = None
             for curve in sorted(drawn, key=lambda curve: "marker" in curve.line):
-                continuous = _draw_channel(pair, curve, output, name, continuous)
+                continuous = _draw_channel(pair, curve, output, name, continuous, wrap)
             readable(pair[0])
             _whole_turns(pair[1])
             finish(pair[0], x="", y=gain_label(output, name, first.unit(output, name)))
@@ -126,6 +132,7 @@ def _draw_channel(
     output: str,
     name: str,
     continuous: tuple[FloatArray, FloatArray] | None,
+    wrap: bool,
 ) -> tuple[FloatArray, FloatArray] | None:
     """Draw a channel; return the phase of the first system, which measurements follow."""
     response = curve.response
@@ -133,7 +140,9 @@ def _draw_channel(
         raise unknown_label("channel", f"{output}, {name}", [f"{a}, {b}" for a, b in response])
     values = response[output, name]
     phase = np.degrees(np.angle(values))
-    if "marker" not in curve.line:
+    if wrap:
+        phase = _half_turns(values, dots="marker" in curve.line)
+    elif "marker" not in curve.line:
         phase = np.unwrap(phase, period=360.0)
         # the branch that begins between -360 and 0 degrees: free masses begin at -180
         phase = phase - 360.0 * np.ceil((phase[:1] - 1e-6) / 360.0)
@@ -216,6 +225,7 @@ def frf(
     reference: str | None = None,
     band: tuple[float, float] | None = None,
     freq: FloatArray | None = None,
+    also: Sequence[str] | str = (),
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the magnitude of one channel of several responses (paper, Figs. 4, 10 and 11).
@@ -240,16 +250,24 @@ def frf(
         The frequencies to draw; all when not given.
     freq : (n_freq,) array [Hz], optional
         Where systems are evaluated; a grid of each, refined at resonances, when not given.
+    also : sequence of str, optional
+        "phase" [deg, within half a turn of 0] and "coherence", each in a panel below;
+        "deviation", the standard deviation of measurements, as a line below them.
     ax : Axes, optional
-        Where to draw.
+        Where to draw, without phase and coherence.
+
+    Returns
+    -------
+    Axes
+        Of the magnitude; `.figure.axes` are all.
 
     Raises
     ------
     LabelError
-        When there is no such reference or channel.
+        When there is no such reference or channel, or `also` names something else.
     ModelError
-        When there is no such mapping, the responses are of different units, or nothing of one is
-        in the band.
+        When there is no such mapping, the responses are of different units, nothing of one is in
+        the band, or none has the coherence or variance that is asked for.
 
     Examples
     --------
@@ -274,12 +292,23 @@ def frf(
         )
     if reference is not None and reference not in found:
         raise unknown_label("response", reference, found)
-    given, ax = ax is not None, axes(ax, figsize=(9.0, 4.5))
+    more = name_list(also, "also")
+    require_known("part of the picture", more, _ALSO)
+    below = [part for part in _ALSO if part in more and part != "deviation"]
+    if ax is not None and below:
+        raise ModelError(f"{' and '.join(below)} take panels of their own: leave ax out.")
+    given, panels = ax is not None, _stacked(ax, len(below))
+    ax = panels[0]
     plain = role_of(drawn[0].label) is None and "marker" not in drawn[0].line
     wide = {"linewidth": 3.2, "alpha": 0.5} if len(drawn) > 1 and plain else {}
     for i, (label, response, line) in enumerate(drawn):
         look = line | wide if i == 0 else line
         ax.semilogx(response.freq, decibel(response[output, input]), label=label, **look)
+        if "deviation" in more and response.variance is not None:
+            variance = _entry(response, response.variance, output, input)
+            text = f"standard deviation of {label}"
+            look = {"color": GREY, "linewidth": 1.2, "linestyle": "--", "zorder": 1.7}
+            ax.semilogx(response.freq, 0.5 * decibel(variance), label=text, **look)
     for curve, base in ((c, b) for b in drawn if b.label == reference for c in drawn if c is not b):
         if np.array_equal(base.response.freq, curve.response.freq):
             error = curve.response[output, input] - base.response[output, input]
@@ -288,10 +317,63 @@ def frf(
                 look["color"] = curve.line["color"]
             text = f"{curve.label} less {reference}"
             ax.semilogx(curve.response.freq, decibel(error), label=text, **look)
+    _require_measured(drawn, more)
     readable(ax)
     legend(ax, given=given)
     gain = known.pop() if known else None
-    return finish(ax, x="frequency [Hz]", y=gain_label(output, input, gain))
+    finish(ax, x="" if below else "frequency [Hz]", y=gain_label(output, input, gain))
+    for part, panel in zip(below, panels[1:], strict=True):
+        for _, response, line in drawn:
+            if part == "phase":
+                phase = _half_turns(response[output, input], dots="marker" in line)
+                panel.semilogx(response.freq, phase, **line)
+            elif response.coherence is not None:
+                shown = _entry(response, response.coherence, output, input)
+                panel.semilogx(response.freq, shown, **line)
+        y = "phase [deg]" if part == "phase" else "coherence [-]"
+        finish(panel, x="frequency [Hz]" if panel is panels[-1] else "", y=y)
+        if part == "phase":
+            panel.set_ylim(-190.0, 190.0)
+            panel.yaxis.set_major_locator(MultipleLocator(90.0))
+        else:
+            panel.set_ylim(0.0, 1.05)
+    return ax
+
+
+#: what can be drawn beside a magnitude
+_ALSO = ("phase", "coherence", "deviation")
+
+
+def _stacked(ax: Axes | None, count: int) -> list[Axes]:
+    """Return axes for a magnitude and so many lower panels below it."""
+    if ax is not None or not count:
+        return [axes(ax, figsize=(9.0, 4.5))]
+    size, ratios = (9.0, 4.5 + 1.8 * count), [2.5] + count * [1.0]
+    return panel_axes(None, 1 + count, columns=1, figsize=size, height_ratios=ratios)
+
+
+def _entry(response: Frf, values: FloatArray, output: str, input: str) -> FloatArray:
+    place = list(response.outputs).index(output), list(response.inputs).index(input)
+    return np.asarray(values[place])
+
+
+def _require_measured(drawn: Sequence[Curve], parts: Sequence[str]) -> None:
+    """Raise ModelError when no response has the coherence or variance that is asked for."""
+    for part, kind in (("coherence", "coherence"), ("deviation", "variance")):
+        if part in parts and all(getattr(one.response, kind) is None for one in drawn):
+            listed = ", ".join(one.label for one in drawn)
+            raise ModelError(
+                f"none of the responses has a {kind}: {listed}. Estimate them from records by "
+                "estimate_frf, or leave it out of also=."
+            )
+
+
+def _half_turns(values: ComplexArray, *, dots: bool) -> FloatArray:
+    """Return phases [deg] within half a turn of 0; lines are broken where they come in again."""
+    phase = np.degrees(np.angle(values))
+    if not dots:
+        phase[1:][np.abs(np.diff(phase)) > 180.0] = np.nan
+    return np.asarray(phase)
 
 
 def _within_band(curve: Curve, band: tuple[float, float] | None) -> Curve:
@@ -308,5 +390,10 @@ def _within_band(curve: Curve, band: tuple[float, float] | None) -> Curve:
         )
     whole = curve.response
     data, units = whole.data[:, :, inside], whole.channel_units
-    shown = Frf(freq[inside], data, whole.inputs, whole.outputs, units=units)
+    measured = {
+        kind: values[:, :, inside]
+        for kind in ("coherence", "variance")
+        if (values := getattr(whole, kind)) is not None
+    }
+    shown = Frf(freq[inside], data, whole.inputs, whole.outputs, units=units, **measured)
     return curve._replace(response=shown)

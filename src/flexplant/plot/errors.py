@@ -190,7 +190,8 @@ def exposures(
     """Draw an error with its moving average (MA) and moving standard deviation (MSD).
 
     The windows in which the figures of `exposure_errors` are taken are shaded; those figures are
-    in the legend. Of several runs the first is drawn, and the figures are of all.
+    in the legend. The picture begins shortly before the first. Of several runs the first is drawn,
+    and the figures are of all.
 
     Parameters
     ----------
@@ -265,6 +266,8 @@ def exposures(
     limit = 1.25 * float(np.max(np.abs(signal[inside]))) / factor
     if limit:
         ax.set_ylim(-limit, limit)
+    begin, end = float(np.min(parts)), float(np.max(parts))
+    ax.set_xlim((begin - 0.05 * (end - begin)) / second, (end + 0.02 * (end - begin)) / second)
     legend(ax, given=given)
     text = f"moving windows of {with_unit(found.window, 's')}"
     return finish(ax, x=named("time", time), y=named("error", shown), title=text)

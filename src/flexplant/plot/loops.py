@@ -21,17 +21,22 @@ from ..lti.responses import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
 from ..tolerances import SAME, SPLIT
 from ._axes import (
+    BLUE,
     GREY,
     RED,
     STYLES,
     Style,
+    apart,
     axes,
+    bottom_only,
     by_label,
     curves,
     decibel,
     finish,
     labelled,
     legend,
+    name_panel,
+    panel_axes,
     readable,
     shared_reference,
     styles,
@@ -51,6 +56,8 @@ def nyquist(
     ax: Axes | None = None,
 ) -> Axes:
     """Draw loop gains L in the complex plane, with -1 and the circle in which ``|S| > modulus``.
+
+    Of more than four each has a panel of its own.
 
     ``S = 1 / (1 + L)``: its size is the inverse of the distance from -1. Frequencies are positive;
     the mirror image is not drawn. Where a measured gain steps over a resonance the curve follows
@@ -86,9 +93,18 @@ def nyquist(
     >>> ax.get_legend().get_texts()[0].get_text()
     'L: |S| up to 8.7 dB, at 0.8221 Hz'
     """
-    given, ax = ax is not None, axes(ax, figsize=(9.0, 5.0))
+    level = 20.0 * np.log10(positive(modulus, "modulus"))
+    limit = positive(reach, "reach")
     measured = [name for name, one in labelled(loop_gains).items() if isinstance(one, Frf)]
-    for curve in curves(_opened(loop_gains, freq), freq):
+    drawn = curves(_opened(loop_gains, freq), freq)
+    alone = apart(ax, [curve.label for curve in drawn])
+    if alone:
+        rows = -(-len(drawn) // 2)
+        height = 0.8 + 3.2 * rows
+        panels = panel_axes(None, len(drawn), figsize=(7.0, height), sharey=True)
+    else:
+        panels = [axes(ax, figsize=(9.0, 5.0))] * len(drawn)
+    for curve, panel in zip(drawn, panels, strict=True):
         known = list(curve.response)
         if channel is None and len(known) > 1:
             raise ModelError(
@@ -105,33 +121,26 @@ def nyquist(
         size = -20.0 * np.log10(abs(1.0 + values[nearest]))
         text = f"|S| up to {size:.1f} dB, at {lines[nearest]:.4g} Hz"
         label = f"{curve.label}: {text}" if curve.label else text
-        ax.plot(values.real, values.imag, label=label, **curve.line)
+        look = curve.line | ({"color": BLUE, "linestyle": "-"} if alone else {})
+        panel.plot(values.real, values.imag, label=label, **look)
         near = values[nearest]
-        ax.plot(near.real, near.imag, "o", color=curve.line["color"], markersize=5)
-    level = 20.0 * np.log10(positive(modulus, "modulus"))
-    ax.add_patch(
-        Circle(
-            (-1, 0),
-            1.0 / modulus,
-            fill=True,
-            alpha=0.15,
-            color=RED,
-            linewidth=0,
-        )
-    )
-    ax.add_patch(Circle((0, 0), 1.0, fill=False, color=GREY, linestyle=":", linewidth=0.9))
-    ax.plot(
-        -1,
-        0,
-        "+",
-        color=RED,
-        markersize=10,
-        label=f"-1, with |S| = {level:.1f} dB about it",
-    )
-    limit = positive(reach, "reach")
-    ax.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
-    legend(ax, given=given)
-    return finish(ax, x="real part of L", y="imaginary part of L")
+        panel.plot(near.real, near.imag, "o", color=look["color"], markersize=5)
+        if alone:
+            name_panel(panel, f"{curve.label}: {text.removeprefix('|S| ')}")
+    about = f"-1, with |S| = {level:.1f} dB about it"
+    for panel in dict.fromkeys(panels):
+        shaded = {"alpha": 0.15, "color": RED, "linewidth": 0}
+        panel.add_patch(Circle((-1, 0), 1.0 / modulus, **shaded))
+        panel.add_patch(Circle((0, 0), 1.0, fill=False, color=GREY, linestyle=":", linewidth=0.9))
+        panel.plot(-1, 0, "+", color=RED, markersize=10, label=about)
+        panel.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
+        finish(panel, x="real part of L", y="imaginary part of L")
+    if alone:
+        bottom_only(panels)
+        panels[0].figure.suptitle(f"|S|; shaded: above {level:.1f} dB", fontsize="medium")
+    else:
+        legend(panels[0], given=ax is not None)
+    return panels[0]
 
 
 def _refine_loop_gain(freq: FloatArray, L: ComplexArray) -> tuple[FloatArray, ComplexArray]:
@@ -269,6 +278,8 @@ def sensitivity(
 ) -> Axes:
     """Draw the size of sensitivities over frequency, with lines at 0 and 6 dB.
 
+    Of more than four each has a panel of its own.
+
     Parameters
     ----------
     curves : ClosedLoop, Frf, (plant, controller), (freq [Hz], size), or mapping {label: of these}
@@ -304,19 +315,33 @@ def sensitivity(
     'frequency [Hz]'
     """
     lines = {label: _sensitivity_size(one, freq) for label, one in by_label(curves).items()}
-    given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
-    for (label, line), style in zip(lines.items(), styles(lines, colors), strict=True):
+    alone = apart(ax, lines) and not dashed
+    if alone:
+        panels = panel_axes(None, len(lines), sharey=True)
+    else:
+        panels = [axes(ax, figsize=(8.0, 4.5))] * len(lines)
+    looks = [{"color": BLUE}] * len(lines) if alone else styles(lines, colors)
+    for (label, line), style, panel in zip(lines.items(), looks, panels, strict=True):
         if label in dashed:
             style |= {"linestyle": "--", "linewidth": 1.2, "zorder": 2.5}
         elif dashed:
             style |= {"linestyle": "-", "linewidth": 2.6, "alpha": 0.7}
-        ax.semilogx(line[0], decibel(line[1]), label=label or None, **style)
-    _limit(ax, weight, "S", list(lines.values()))
-    if not given:
-        _from_where_it_rises(ax, list(lines.values()))
-    _draw_levels(ax)
-    legend(ax, given=given)
-    return finish(ax, x="frequency [Hz]", y="|S| [dB]")
+        panel.semilogx(line[0], decibel(line[1]), label=label or None, **style)
+        if alone:
+            at = int(np.argmax(line[1]))
+            text = f"{label}: up to {decibel(line[1][at]):.1f} dB, at {line[0][at]:.4g} Hz"
+            name_panel(panel, text)
+    for panel in dict.fromkeys(panels):
+        _limit(panel, weight, "S", list(lines.values()))
+        if ax is None:
+            _from_where_it_rises(panel, list(lines.values()))
+        _draw_levels(panel)
+        finish(panel, x="frequency [Hz]", y="|S| [dB]")
+    if alone:
+        bottom_only(panels)
+    else:
+        legend(panels[0], given=ax is not None)
+    return panels[0]
 
 
 def sensitivities(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,14 +10,29 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Patch
 from matplotlib.patches import Rectangle as Box
 
-from ..checks import FloatArray, in_unit, instance, whole
+from ..checks import FloatArray, IntArray, in_unit, instance, whole
 from ..errors import ModelError
 from ..placement import ParetoCurve, SensorMap
 from ..placement.candidates import Zone, places_of
 from ..placement.gramian import shapes_of
 from ..plant import Ports, StandardPlant
 from ..structure import Disc
-from ._axes import BLUE, LIGHT, PORTS, RED, STYLES, axes, finish, legend, legend_below, named, plan
+from ._axes import (
+    BLUE,
+    LIGHT,
+    RED,
+    STYLES,
+    Device,
+    axes,
+    differ,
+    finish,
+    legend,
+    legend_below,
+    mark_devices,
+    named,
+    panel_axes,
+    plan,
+)
 
 
 def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None = None) -> Axes:
@@ -70,8 +85,11 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
         label = "no sensor possible" if i == 0 else None
         ax.add_patch(_patch(zone, factor, label=label, **style))
     if ports is not None:
-        _devices(ax, factor, ports.y, ports.u)
-        _pois(ax, factor, [np.asarray(poi.at) for poi in ports.z if isinstance(poi.at, tuple)])
+        kinds: dict[str, Any] = {"sensors": ports.y, "actuators": ports.u, "POI": ports.z}
+        mark_devices(ax, factor, {
+            kind: [Device.of(one, np.array(one.at)) for one in listed if isinstance(one.at, tuple)]
+            for kind, listed in kinds.items()
+        })  # fmt: skip
     ax.plot(
         *(found.best[:2] / factor), "*", color=RED, markersize=14, label="best place", clip_on=False
     )
@@ -137,6 +155,9 @@ def placed(
 ) -> Axes:
     """Draw the sensors, actuators and POIs of a plant on its structure, seen from above.
 
+    Each is named; arrows show along what those in x and y act and measure. Of a solid with devices
+    in its lower half these are drawn beside it, seen from below.
+
     Parameters
     ----------
     plant : StandardPlant
@@ -147,7 +168,12 @@ def placed(
     zones : sequence of Rectangle or Disc
         Where nothing may be, hatched.
     ax : Axes, optional
-        Where to draw.
+        Where to draw the view from above, with all devices in it.
+
+    Returns
+    -------
+    Axes
+        From above; `.figure.axes` are all.
 
     Raises
     ------
@@ -171,62 +197,84 @@ def placed(
     'mode 4, 851.5 Hz'
     """
     own = instance(plant, StandardPlant, "plant", "Pass placement.on(plant).").assembled
-    ax = axes(ax, figsize=(6.4, 5.4))
     model: Any = own.realisation.model
     dofs = model.dofs
     rows = np.flatnonzero(np.array(dofs.directions) == "z")
     if rows.size < 3:
         raise ModelError("a picture from above needs at least three DOFs in z: the model has less.")
-    factor = plan(ax, dofs.xyz[rows])
-    x, y = dofs.xyz[rows, :2].T / factor
-    ax.plot(x, y, ".", color=LIGHT, markersize=2)
-    title = ""
+    shape, title = None, ""
     if mode is not None:
         shapes = shapes_of(plant, ())
         whole(mode, "mode", maximum=shapes.omega.size)
-        shape = shapes.full[rows, mode - 1]
-        size = float(np.max(np.abs(shape)))
-        levels = np.linspace(-1.0, 1.0, 21)
-        filled = ax.tricontourf(x, y, shape / size, levels=levels, cmap="RdBu_r", alpha=0.8)
-        ax.figure.colorbar(filled, ax=ax, label="motion in z, largest 1 [-]")
-        if shape.min() < 0.0 < shape.max():
-            ax.tricontour(x, y, shape / size, levels=[0.0], colors="black", linewidths=0.8)
+        shape = shapes.full[:, mode - 1]
+        shape = shape / float(np.max(np.abs(shape[rows])))
         title = f"mode {mode}, {shapes.omega[mode - 1] / 2 / np.pi:.4g} Hz"
+    where = places_of(plant, (*own.ports.y, *own.ports.u))
+    kinds = {
+        "sensors": _devices(own.ports.y, where.points),
+        "actuators": _devices(own.ports.u, where.points[len(own.ports.y) :]),
+        "POI": _devices(own.ports.z, [points.mean(axis=0)[None] for points in where.pois]),
+    }
+    height = dofs.xyz[rows, 2]
+    middle = 0.5 * float(height.min() + height.max())
+    low = height < middle - _LAYER * float(np.ptp(dofs.xyz[rows], axis=0).max())
+    below = {k: [one for one in v if _is_below(one, middle, dofs.xyz)] for k, v in kinds.items()}
+    if ax is not None or not low.any() or not any(below.values()):
+        ax = axes(ax, figsize=(6.4, 5.4))
+        top = rows[height >= height.max() - (1e-9 if low.any() else np.inf)]
+        _view(ax, dofs.xyz, top, shape, kinds, zones)
+        ax.set_title(title)
+        return ax
+    above = {k: [one for one in v if one not in below[k]] for k, v in kinds.items()}
+    upper, lower = panel_axes(None, 2, columns=1, figsize=(6.4, 9.0), sharex=False)
+    for panel, end, shown in ((upper, height.max(), above), (lower, height.min(), below)):
+        _view(panel, dofs.xyz, rows[height == end], shape, shown, zones, various=differ(kinds))
+    lower.invert_xaxis()
+    for panel, side in ((upper, "from above"), (lower, "lower half, from below")):
+        panel.set_title(f"{title}, {side}" if title else side)
+    return upper
+
+
+#: of the largest dimension: nodes that lie lower than this below the middle are another layer
+_LAYER = 1e-3
+
+
+def _devices(ports: Sequence[Any], points: Sequence[FloatArray]) -> list[Device]:
+    """Return the devices of ports, each of its points one."""
+    pairs = zip(ports, points, strict=False)
+    return [Device.of(port, point) for port, listed in pairs for point in listed]
+
+
+def _is_below(one: Device, middle: float, xyz: FloatArray) -> bool:
+    return bool(one.place[2] < middle - _LAYER * float(np.ptp(xyz, axis=0).max()))
+
+
+def _view(
+    ax: Axes,
+    xyz: FloatArray,
+    rows: IntArray,
+    shape: FloatArray | None,
+    kinds: Mapping[str, Sequence[Device]],
+    zones: Sequence[Zone],
+    *,
+    various: bool | None = None,
+) -> None:
+    """Draw one layer of nodes with devices, and its motion in z where a mode's shape is given."""
+    factor = plan(ax, xyz)
+    x, y = xyz[rows, :2].T / factor
+    ax.plot(x, y, ".", color=LIGHT, markersize=2)
+    if shape is not None:
+        levels = np.linspace(-1.0, 1.0, 21)
+        filled = ax.tricontourf(x, y, shape[rows], levels=levels, cmap="RdBu_r", alpha=0.8)
+        ax.figure.colorbar(filled, ax=ax, label="motion in z, largest 1 [-]")
+        if shape[rows].min() < 0.0 < shape[rows].max():
+            ax.tricontour(x, y, shape[rows], levels=[0.0], colors="black", linewidths=0.8)
     for zone in zones:
         hatched = {"facecolor": "none", "edgecolor": "0.3", "hatch": "///", "zorder": 2.5}
         ax.add_patch(_patch(zone, factor, **hatched))
-    where = places_of(plant, (*own.ports.y, *own.ports.u))
-    _devices(ax, factor, own.ports.y, own.ports.u, where.points)
-    _pois(ax, factor, [points.mean(axis=0) for points in where.pois])
+    mark_devices(ax, factor, kinds, various=various)
+    ax.margins(0.1)  # for the names of what is at an edge
     legend_below(ax)
-    ax.set_title(title)
-    return ax
-
-
-def _devices(
-    ax: Axes,
-    factor: float,
-    sensors: Sequence[Any],
-    actuators: Sequence[Any],
-    points: Sequence[FloatArray] = (),
-) -> None:
-    """Mark sensors and actuators; those whose place is no point only where points are given."""
-    listed = points or [
-        np.array([port.at] if isinstance(port.at, tuple) else np.zeros((0, 3)))
-        for port in (*sensors, *actuators)
-    ]
-    kinds = ("sensors", listed[: len(sensors)]), ("actuators", listed[len(sensors) :])
-    for label, parts in kinds:
-        if parts and len(found := np.vstack(parts) / factor):
-            over: dict[str, Any] = {"linestyle": "", "zorder": 4, "clip_on": False}
-            ax.plot(found[:, 0], found[:, 1], label=label, **over, **PORTS[label])
-
-
-def _pois(ax: Axes, factor: float, points: Sequence[FloatArray]) -> None:
-    """Mark POIs."""
-    if points:
-        at = np.array(points) / factor
-        ax.plot(at[:, 0], at[:, 1], linestyle="", zorder=4, label="POI", **PORTS["POI"])
 
 
 def _patch(zone: Zone, factor: float, **style: Any) -> Patch:

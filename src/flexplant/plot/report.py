@@ -12,15 +12,16 @@ import numpy as np
 
 from ..certificates import Certificate, figure
 from ..checks import FloatArray, IntArray, short, with_unit
+from ..errors import FlexplantError
 from ..estimation import LagReport, consistency
 from ..identification import StabilisationDiagram
 from ..loop import ClosedLoop, ErrorBudget
-from ..lti.frequency import Frf
+from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..placement import ParetoCurve, Placement, SensorMap
 from ..placement.criterion import in_words
-from ..plant import StandardPlant
+from ..plant import StandardPlant, decouple
 from ..reduction import ReducedModel
 from ..simulation import ErrorMap, ExposureErrors, Response, Verdict
 from ..store import written
@@ -28,6 +29,7 @@ from ..synthesis import Controller
 from ..tolerances import divisor
 from ..updating import Localisation, UpdateResult
 from ..versions import versions
+from ._axes import STYLES, bottom_only, decibel, finish, name_panel, panel_axes, readable
 from .bode import bode, singular_values
 from .errors import budget, error_map
 from .estimation import lag_report
@@ -58,6 +60,10 @@ _WORDS = {
     "difference": "difference between two ways to the variances",
     "left_out": "modes left out, counted as noise",
     "unresolved": "share of a variance from modes the mesh hardly resolves",
+    "residual": "residual of the equation that was solved, relative",
+    "orthonormality": "shapes less orthonormal in the mass matrix",
+    "rigid_residual": "force that rigid-body motions take, relative",
+    "rigid_rounding": "what rounding could hide of rigid-body frequencies, Hz",
 }
 
 Picture = tuple[str, Callable[[], Any]]
@@ -112,7 +118,11 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
     if isinstance(value, Response):
         return _of_run(name, value)
     if isinstance(value, StandardPlant) and value.is_assembled:
-        return [("Sensors, actuators and POIs from above", lambda: placed(value))]
+        said = "Sensors, actuators and POIs; arrows: along what they act and measure"
+        return [
+            (said, lambda: placed(value)),
+            ("The plant, from forces along each axis to the POI", lambda: _axis_responses(value)),
+        ]
     if isinstance(value, Placement):
         plant = design.plant
         if plant is None or not plant.is_assembled:
@@ -143,6 +153,30 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
         for kind, (said, draw) in simple.items()
         if isinstance(value, kind)
     ]
+
+
+def _axis_responses(plant: StandardPlant) -> None:
+    """Draw the plant from a force at the centre of gravity to the POI, along each axis.
+
+    Where its rigid-body motions cannot be decoupled, the singular values from u to y.
+    """
+    pois = plant.assembled.ports.z
+    try:
+        axes = decouple(plant, axes=pois[0].axes)
+    except (FlexplantError, IndexError):
+        singular_values(plant.Gyu)
+        return
+    channels = [pois[0].channel(axis) for axis in axes.axes]
+    P = frequency_response(plant.system.select(channels, plant.u))
+    data = np.einsum("kuf,uk->kf", P.data, axes.T_u)
+    panels = panel_axes(None, len(channels))
+    for panel, name, row in zip(panels, channels, data, strict=True):
+        panel.semilogx(P.freq, decibel(row), **STYLES["model"])
+        unit = "rad/(N m)" if plant.units.get(name) == "rad" else "m/N"
+        name_panel(panel, name)
+        readable(panel)
+        finish(panel, x="frequency [Hz]", y=f"[dB, 0 dB = 1 {unit}]")
+    bottom_only(panels)
 
 
 def _of_run(name: str, run: Response) -> list[Picture]:

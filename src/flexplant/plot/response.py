@@ -20,7 +20,21 @@ from ..lti.responses import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
 from ..simulation import Response
 from ..tolerances import SPLIT
-from ._axes import GREY, finish, labelled, legend, named, panel_axes, quantity_of, shown_in, styles
+from ._axes import (
+    BLUE,
+    GREY,
+    apart,
+    bottom_only,
+    finish,
+    labelled,
+    legend,
+    name_panel,
+    named,
+    panel_axes,
+    quantity_of,
+    shown_in,
+    styles,
+)
 
 
 def response(
@@ -35,6 +49,8 @@ def response(
     ax: Axes | None = None,
 ) -> Axes:
     """Draw channels of a run over time, one panel for each unit; of several runs the first.
+
+    Of more than four channels each has a panel and a scale of its own: they would hide each other.
 
     Parameters
     ----------
@@ -82,24 +98,30 @@ def response(
     run = run if span is None else _within_span(run, span)
     chosen = None if channels is None else name_list(channels, "channels")
     names = list(chosen or [n for n in run if n.endswith(":error")] or list(run)[:1])
-    panels: dict[str | None, list[str]] = {}
+    units: dict[str | None, list[str]] = {}
     require_known("channel", names, run)
     for name in names:
-        panels.setdefault(run.units.get(name, unit), []).append(name)
-    if ax is not None and len(panels) > 1:
-        listed = "; ".join(f"{', '.join(group)} [{u or '?'}]" for u, group in panels.items())
+        units.setdefault(run.units.get(name, unit), []).append(name)
+    if ax is not None and len(units) > 1:
+        listed = "; ".join(f"{', '.join(group)} [{u or '?'}]" for u, group in units.items())
         raise ModelError(
             f"one axes holds one unit, got {listed}. Leave ax out, which gives each unit a panel, "
             "or draw them one after the other."
         )
+    panels = [
+        (own, part)
+        for own, group in units.items()
+        for part in ([[n] for n in group] if apart(ax, names) else [group])
+    ]
     drawn = panel_axes(ax, len(panels))
-    for (own, group), panel in zip(panels.items(), drawn, strict=True):
+    for (own, group), panel in zip(panels, drawn, strict=True):
         if exposures is not None:
             shade(panel, exposures, run)
         _panel(panel, run, group, own, names, label=label, color=color, given=ax is not None)
-    if len(drawn) > 1:
-        for panel in drawn[:-1]:
-            panel.set_xlabel("")
+        if len(panels) > len(units) and label is None:
+            name_panel(panel, group[0])
+            panel.get_lines()[-1].set(color=color or BLUE, linestyle="-")
+    bottom_only(drawn)
     return drawn[0]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -10,6 +10,7 @@ from matplotlib.animation import FuncAnimation
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
+from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from ..checks import ComplexArray, FloatArray, IntArray, in_unit, instance, positive, whole
@@ -18,7 +19,19 @@ from ..labels import DofSet
 from ..modes import Modes
 from ..plant import Ports
 from ..tolerances import divisor
-from ._axes import BLACK, GREY, LIGHT, PORTS, PURPLE, Style, axes, legend_below, plan, solid_axes
+from ._axes import (
+    BLACK,
+    GREY,
+    LIGHT,
+    PORTS,
+    PURPLE,
+    Device,
+    axes,
+    legend_below,
+    mark_devices,
+    plan,
+    solid_axes,
+)
 
 _COLOURS = "viridis"
 #: triangles that are drawn quickly; of a coarse mesh each is drawn in parts, whose colours differ
@@ -394,9 +407,7 @@ def layout(
         xyz = dofs.xyz[dofs.indices(wanted)] / factor
         text = counted(len(wanted), "desired DOF")
         ax.plot(xyz[:, 0], xyz[:, 1], "x", color=PURPLE, label=text)
-    if ports is not None:
-        for kind, listed, look in _kinds(ports):
-            _mark(ax, dofs, factor, kind, listed, **look)
+    mark_devices(ax, factor, _devices(dofs, ports))
     for text, place in (marked or {}).items():
         point = _point(dofs, place) / factor
         ax.plot(point[0], point[1], "s", color=BLACK, fillstyle="none", markersize=11)
@@ -406,13 +417,15 @@ def layout(
     return ax
 
 
-def _kinds(ports: Ports) -> tuple[tuple[str, Sequence[Any], Style], ...]:
-    """Return what is marked, and how."""
-    return (
-        ("sensors", ports.y, dict(PORTS["sensors"])),
-        ("actuators", ports.u, dict(PORTS["actuators"])),
-        ("POI", ports.z, dict(PORTS["POI"])),
-    )
+def _devices(dofs: DofSet, ports: Ports | None) -> dict[str, list[Device]]:
+    """Return what is marked, by kind."""
+    if ports is None:
+        return {}
+    kinds: dict[str, Any] = {"sensors": ports.y, "actuators": ports.u, "POI": ports.z}
+    return {
+        kind: [Device.of(port, _point(dofs, port.at)) for port in listed]
+        for kind, listed in kinds.items()
+    }
 
 
 def _solid(
@@ -435,17 +448,19 @@ def _solid(
     if wanted:
         xyz = dofs.xyz[dofs.indices(wanted)] / factor
         ax.plot(*xyz.T, "x", color=PURPLE, label=counted(len(wanted), "desired DOF"))
-    for kind, listed, look in _kinds(ports) if ports is not None else ():
-        points = [_point(dofs, port.at) / factor for port in listed]
-        if not points:
+    for kind, listed in _devices(dofs, ports).items():
+        if not listed:
             continue
-        ax.plot(*np.array(points).T, linestyle="", label=kind, zorder=3, **look)
-        for port, point in zip(listed, points, strict=True):
-            ax.text(*point, f"  {port.name}")
-            along = _along(port)
-            if along is not None:
-                length = 0.12 * skin.extent / factor
-                ax.quiver(*point, *along, length=length, color=look["color"])
+        points, length = np.array([one.place for one in listed]) / factor, 0.12 * skin.extent
+        ax.plot(*points.T, linestyle="", label=kind, zorder=3, **PORTS[kind])
+        for one, point in zip(listed, points, strict=True):
+            # at the tip of its arrow, where no mark is
+            tip = np.zeros(3) if one.along is None else 1.15 * length / factor * one.along
+            if one.along is not None:
+                arrow = {"length": length / factor, "color": PORTS[kind]["color"]}
+                ax.quiver(*point, *one.along, **arrow)
+            text = ax.text(*(point + tip), f" {one.name}" if np.any(tip) else f"    {one.name}")
+            text.set_path_effects([withStroke(linewidth=2.0, foreground="white")])
     for text, place in marked.items():
         point = _point(dofs, place) / factor
         ax.plot(*point[:, None], "s", color=BLACK, fillstyle="none", markersize=11)
@@ -453,26 +468,6 @@ def _solid(
     if ax.get_legend_handles_labels()[0]:
         ax.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, 1.08), ncols=3)
     return ax
-
-
-def _along(port: Any) -> FloatArray | None:
-    """Return the unit vector that a port acts or measures along; None of rotations and POIs."""
-    direction = getattr(port, "direction", None)
-    if isinstance(port.at, str):
-        direction = port.at.rpartition(":")[2]
-    return np.eye(3)["xyz".index(direction)] if direction in ("x", "y", "z") else None
-
-
-def _mark(
-    ax: Axes, dofs: DofSet, factor: float, kind: str, listed: Sequence[Any], **style: Any
-) -> None:
-    """Draw and name the ports of one kind."""
-    points = [_point(dofs, port.at) / factor for port in listed]
-    if not points:
-        return
-    ax.plot(*np.array(points).T[:2], linestyle="", label=kind, **style)
-    for port, point in zip(listed, points, strict=True):
-        ax.annotate(port.name, (point[0], point[1]), (7, 7), textcoords="offset points")
 
 
 def _point(dofs: DofSet, at: Any) -> Any:

@@ -26,11 +26,14 @@ from ._axes import (
     POINTS,
     RED,
     STYLES,
+    TOGETHER,
     axes,
+    bottom_only,
     finish,
     legend,
     legend_below,
     named,
+    panel_axes,
     plan,
     shown_in,
 )
@@ -254,7 +257,8 @@ def _errors(ax: Axes, seen: Correlation, old: FloatArray, new: FloatArray, what:
     place = np.arange(len(seen.modes))
     unit = 100.0
     ax.bar(place - 0.2, unit * old, 0.38, color=GREY, label="before")
-    ax.bar(place + 0.2, unit * new, 0.38, color=BLUE, label="after")
+    # a bar as low as the line at 0 is seen by its edge
+    ax.bar(place + 0.2, unit * new, 0.38, color=BLUE, edgecolor=BLUE, linewidth=2.0, label="after")
     for x, value in zip(place + 0.2, unit * new, strict=True):
         above = value >= 0
         ax.annotate(
@@ -450,7 +454,7 @@ def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
 def parameters(
     fit: UpdateResult, *, truth: dict[str, float] | None = None, axs: list[Axes] | None = None
 ) -> list[Axes]:
-    """Draw the parameters over iterations (paper, Fig. 9), one axes each.
+    """Draw the parameters over iterations (paper, Fig. 9), one axes each, in one figure.
 
     Parameters
     ----------
@@ -472,20 +476,23 @@ def parameters(
     >>> len(axs)
     1
     """
-    drawn = []
+    panels = panel_axes(None, len(fit.parameters)) if axs is None else axs
+    many = axs is None and len(fit.parameters) > TOGETHER
     steps = np.arange(len(fit.history) + 1)
-    for i, name in enumerate(fit.parameters):
-        ax = axes(None if axs is None else axs[i], figsize=(6.0, 3.5))
-        values, given = fit.history.parameters[:, i], axs is not None
+    for i, (name, ax) in enumerate(zip(fit.parameters, panels, strict=False)):
+        values = fit.history.parameters[:, i]
         factor, unit = shown_in(ax.yaxis, float(np.max(np.abs(values))), fit.units[i])
         if truth is not None and name in truth:
             ax.axhline(truth[name] / factor, label="true value", **STYLES["truth"])
         ax.plot(steps, values / factor, "o-", color=BLUE, label="estimate")
-        ax.set_xticks(steps)
-        if truth is not None:
-            legend(ax, given=given)
-        drawn.append(finish(ax, x="iteration", y=named(name, unit)))
-    return drawn
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        finish(ax, x="iteration", y=f"[{unit}]" if many else named(name, unit))
+        if truth is not None and (i == 0 or not many):
+            legend(ax, given=axs is not None or many)
+        if many:  # a name does not fit beside a low panel
+            ax.set_title(name, loc="left", fontsize="medium", pad=3.0)
+    bottom_only(panels if axs is None else [])
+    return panels
 
 
 def error_label(fit: UpdateResult) -> str:

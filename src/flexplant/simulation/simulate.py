@@ -250,8 +250,12 @@ def _given(
     elif not isinstance(reference, Mapping):
         if len(own) != 1:
             raise LabelError(
-                f"the plant has {len(own)} references {own}: say which one is meant, "
-                "reference={name: signal}; Ports(references=[Reference(poi)]) adds one."
+                f"the plant has {len(own)} references {own}: "
+                + (
+                    f"say which one is meant, reference={{{own[0]!r}: signal}}."
+                    if own
+                    else "Ports(references=[Reference(poi)]) adds one."
+                )
             )
         reference = {own[0]: reference}
     if disturbance is not None and not isinstance(disturbance, Mapping):

@@ -138,11 +138,41 @@ class Gallery:
             try:
                 draw()
                 new = [n for n in plt.get_fignums() if n not in open_before]
+                for n in new:
+                    _fit_page(plt.figure(n))
                 parts = [_picture_html(plt.figure(n), prefix, caption) for n in new]
             finally:
                 for n in set(plt.get_fignums()) - open_before:
                     plt.close(n)
         return "".join(parts)
+
+
+#: width [inch] at which text of 10 points can be read in a column of 30 rem, or on 500 pixels
+_COLUMN = 5.6
+#: height that a label beside the axes takes, with a legend below them
+_LOWEST = 4.2
+
+
+def _fit_page(figure: Figure) -> None:
+    """Make a wide figure as narrow as a column, its legends below: its text grows as it is fit."""
+    width, height = figure.get_size_inches()
+    if width <= _COLUMN:
+        return
+    specs = [spec for ax in figure.axes if (spec := ax.get_subplotspec()) is not None]
+    if len({spec.colspan.start for spec in specs}) <= 1:
+        figure.set_size_inches(_COLUMN, max(height * _COLUMN / width + 0.1 * height, _LOWEST))
+    else:
+        figure.set_size_inches(1.15 * _COLUMN, height)
+    for ax in figure.axes:
+        shown = ax.get_legend()
+        if shown is None or shown.get_window_extent().x0 < ax.get_window_extent().x1:
+            continue  # not beside the axes
+        texts = [text.get_text() for text in shown.get_texts()]
+        across = 1 if max(map(len, texts)) > 30 else 2
+        # a fixed distance below the axes, for the label of the abscissa
+        place: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "borderaxespad": 4.8}
+        handles: Any = shown.legend_handles
+        ax.legend(handles, texts, frameon=False, ncols=across, fontsize="small", **place)
 
 
 def _picture_html(figure: Figure, prefix: str, caption: str) -> str:

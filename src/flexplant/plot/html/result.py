@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from html import escape
 from typing import Any, TypeVar
@@ -12,6 +13,8 @@ from ...certificates import in_words, stability_name
 from ...checks import Value, short, with_unit
 from ...errors import FlexplantError, ModelError, counted
 from ...loop import ClosedLoop, ErrorBudget, LoopFigures, compare_loops, report_loops
+from ...loop.blocks import references
+from ...loop.comparison import error_sensitivity
 from ...plant import StandardPlant
 from ...simulation import ExposureErrors, Verdict
 from ..errors import budget
@@ -44,13 +47,27 @@ def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | N
         return Chapter("Result", "".join([*parts, note(why, "bad")]))
     caption = f"Where the error of {main} comes from, by frequency and source"
     picture = gallery.picture(lambda: budget(found), caption)
-    rows = [[n, with_unit(loop.rms(n), loop.units.get(n))] for n in loop.plant.z]
+    # without reference an error is as large as the motion
+    errors = [n for n in loop.plant.z if n.endswith(":error")] if loop.plant.is_assembled else []
+    followed = loop.plant.assembled.ports.followed if errors else ()
+    twice = {poi.channel(axis) for poi, axis in followed}
+    shown = [n for n in loop.plant.z if n not in twice]
+    rows = [[n, with_unit(loop.rms(n), loop.units.get(n))] for n in shown]
     motions = table(["channel", "rms under all noises"], rows)
     parts.append(
         f"<h3>Error budget of {escape(main)}</h3>"
         f'<div class="pictures">{picture}<div>{found._repr_html_()}{motions}</div></div>'
     )
+    others = [n for n in loop.plant.z if n != main and n.endswith(":error")]
+    drawn = "".join(attempted(lambda n=n: _other_budget(loop, n, gallery)) for n in others)  # type: ignore[misc]
+    if drawn:
+        parts.append(f'<h3>Error budgets of the other axes</h3><div class="pictures">{drawn}</div>')
     return Chapter("Result", "".join(parts))
+
+
+def _other_budget(loop: ClosedLoop, channel: str, gallery: Gallery) -> str:
+    found = loop.budget(channel)
+    return gallery.picture(lambda: budget(found, most=3), f"Where {channel} comes from")
 
 
 def loops_section(design: Design, gallery: Gallery) -> Chapter | None:
@@ -62,9 +79,14 @@ def loops_section(design: Design, gallery: Gallery) -> Chapter | None:
     compared = compare_loops(loops)
     stable = {name: loop for name, loop in loops.items() if compared.rows[name].stable}
     if compared.channel and stable:
-        caption = f"Sensitivity |S|, {compared.channel}"
-        drawn = gallery.picture(lambda: sensitivity(stable), caption)
         name, first = next(iter(stable.items()))
+        axes = _axis_sensitivities(first)
+        caption, drawn = f"Sensitivity |S|, {compared.channel}", ""
+        if len(axes) < 2 or len(stable) > 1:
+            drawn = gallery.picture(lambda: sensitivity(stable), caption)
+        if len(axes) > 1:
+            caption = f"{name}: sensitivity |S| of each axis, from its reference to its error"
+            drawn += gallery.picture(lambda: sensitivity(axes), caption)
         caption = f"{name}: each loop broken at its actuator while the others stay closed"
         drawn += gallery.picture(lambda: nyquist(first), caption)
         parts.append(f'<div class="pictures">{drawn}</div>')
@@ -72,6 +94,16 @@ def loops_section(design: Design, gallery: Gallery) -> Chapter | None:
         parts += [f"<h3>{escape(name)}</h3>", loop._repr_html_()]
         parts.append(attempted(lambda loop=loop: _margin_table(loop)))  # type: ignore[misc]
     return Chapter("Loop", "".join(parts))
+
+
+def _axis_sensitivities(loop: ClosedLoop) -> dict[str, Any]:
+    """Return |S| of each axis that has a reference, by its name."""
+    pairs = {name: f"{name.removesuffix(':ref')}:error" for name in references(loop.plant)}
+    return {
+        error.removesuffix(":error"): error_sensitivity(loop, ref, error)
+        for ref, error in pairs.items()
+        if error in loop.plant.z
+    }
 
 
 def attempted(make: Callable[[], str]) -> str:
@@ -197,5 +229,6 @@ def _named_parts(parts: Sequence[Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _free_name(name: str, taken: Mapping[str, Any]) -> str:
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).capitalize()
     numbers = (f" {i}" if i > 1 else "" for i in range(1, len(taken) + 2))
     return next(f"{name}{number}" for number in numbers if f"{name}{number}" not in taken)
