@@ -199,14 +199,16 @@ def _name_ends(ax: Axes) -> None:
     order = np.argsort(np.nan_to_num(height, nan=0.0), kind="stable")
     step = 1.25 * 10.0 / max(ax.get_window_extent().height * 72.0 / ax.figure.dpi, 1.0)
     place = np.clip(np.nan_to_num(height[order]), 0.0, 1.0)
-    for k in range(1, len(place)):
-        place[k] = max(place[k], place[k - 1] + step)
-    place -= max(0.0, 0.5 * (place[-1] + place[0] - 1.0)) if place[-1] > 1.0 else 0.0
-    for y, k in zip(place, order, strict=True):
+    for _ in range(4 * len(place)):  # neighbours that are too near move apart, both alike
+        near = np.maximum(step - np.diff(place), 0.0)
+        place[1:] += 0.5 * near
+        place[:-1] -= 0.5 * near
+    for y, k in zip(place.tolist(), order.tolist(), strict=True):
+        color = handles[k].get_color()
+        leader = {"arrowstyle": "-", "color": color, "linewidth": 0.6, "relpos": (0.0, 0.5)}
         ax.annotate(
-            labels[k], ends[k], (1.04, float(y)), "data", ax.transAxes, va="center",
-            color=handles[k].get_color(), fontsize="small", annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": handles[k].get_color(), "linewidth": 0.6},
+            labels[k], ends[k], (1.04, y), "data", ax.transAxes, va="center", color=color,
+            fontsize="small", annotation_clip=False, arrowprops=leader,
         )  # fmt: skip
 
 

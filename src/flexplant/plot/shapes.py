@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -11,7 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.patheffects import withStroke
+from matplotlib.transforms import ScaledTranslation
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 from ..checks import ComplexArray, FloatArray, IntArray, in_unit, instance, positive, whole
 from ..errors import ModelError, counted
@@ -448,19 +450,16 @@ def _solid(
     if wanted:
         xyz = dofs.xyz[dofs.indices(wanted)] / factor
         ax.plot(*xyz.T, "x", color=PURPLE, label=counted(len(wanted), "desired DOF"))
-    for kind, listed in _devices(dofs, ports).items():
+    found, length = _devices(dofs, ports), 0.12 * skin.extent / factor
+    for kind, listed in found.items():
         if not listed:
             continue
-        points, length = np.array([one.place for one in listed]) / factor, 0.12 * skin.extent
+        points = np.array([one.place for one in listed]) / factor
         ax.plot(*points.T, linestyle="", label=kind, zorder=3, **PORTS[kind])
         for one, point in zip(listed, points, strict=True):
-            # at the tip of its arrow, where no mark is
-            tip = np.zeros(3) if one.along is None else 1.15 * length / factor * one.along
             if one.along is not None:
-                arrow = {"length": length / factor, "color": PORTS[kind]["color"]}
-                ax.quiver(*point, *one.along, **arrow)
-            text = ax.text(*(point + tip), f" {one.name}" if np.any(tip) else f"    {one.name}")
-            text.set_path_effects([withStroke(linewidth=2.0, foreground="white")])
+                ax.quiver(*point, *one.along, length=length, color=PORTS[kind]["color"])
+    _name_devices(ax, [one for listed in found.values() for one in listed], factor, length)
     for text, place in marked.items():
         point = _point(dofs, place) / factor
         ax.plot(*point[:, None], "s", color=BLACK, fillstyle="none", markersize=11)
@@ -468,6 +467,34 @@ def _solid(
     if ax.get_legend_handles_labels()[0]:
         ax.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, 1.08), ncols=3)
     return ax
+
+
+#: sides of a mark where its name may stand, and how far away [points]
+_SIDES, _AWAY = np.exp(0.25j * np.pi * np.arange(8)), 15.0
+
+
+def _name_devices(ax: Any, listed: Sequence[Device], factor: float, length: float) -> None:
+    """Name devices in three dimensions, each on the side farthest from marks, arrows and names."""
+    if not listed:
+        return
+    marks = np.array([one.place for one in listed]) / factor
+    along = np.array([np.zeros(3) if one.along is None else one.along for one in listed])
+    taken = np.vstack([marks + part * length * along for part in (0.0, 0.5, 1.0)])
+
+    def on_paper(xyz: FloatArray) -> FloatArray:
+        x, y, _ = proj_transform(*xyz.T, ax.get_proj())
+        return np.asarray(ax.transData.transform(np.column_stack([x, y])) * 72.0 / ax.figure.dpi)
+
+    occupied, spots = on_paper(taken), on_paper(marks)
+    sides = _AWAY * np.column_stack([_SIDES.real, _SIDES.imag])
+    for one, mark, spot in zip(listed, marks, spots, strict=True):
+        away = np.linalg.norm(spot + sides[:, None] - occupied, axis=2)
+        side = sides[int(np.argmax(away.min(axis=1)))]
+        shift = ScaledTranslation(*(side / 72.0), ax.figure.dpi_scale_trans)
+        look = {"ha": "center", "va": "center", "fontsize": "small", "zorder": 6}
+        text = ax.text(*mark, one.name, transform=ax.transData + shift, **look)
+        text.set_path_effects([withStroke(linewidth=2.0, foreground="white")])
+        occupied = np.vstack([occupied, spot + side])
 
 
 def _point(dofs: DofSet, at: Any) -> Any:
