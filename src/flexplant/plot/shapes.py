@@ -490,7 +490,7 @@ def _name_devices(ax: Any, listed: Sequence[Device], factor: float, length: floa
     for one, mark, spot in zip(listed, marks, spots, strict=True):
         away = np.linalg.norm(spot + sides[:, None] - occupied, axis=2)
         side = sides[int(np.argmax(away.min(axis=1)))]
-        shift = ScaledTranslation(*(side / 72.0), ax.figure.dpi_scale_trans)
+        shift = ScaledTranslation(side[0] / 72.0, side[1] / 72.0, ax.figure.dpi_scale_trans)
         look = {"ha": "center", "va": "center", "fontsize": "small", "zorder": 6}
         text = ax.text(*mark, one.name, transform=ax.transData + shift, **look)
         text.set_path_effects([withStroke(linewidth=2.0, foreground="white")])
