@@ -164,7 +164,7 @@ def test_refusals(modes, loop):
         fx.simulate(loop, duration=0.01, moving={"w": np.zeros(100)})
     with pytest.raises(ModelError, match="outside its range"):
         fx.simulate(loop, duration=0.01, moving={"x": np.linspace(0, 0.2, 100)})
-    with pytest.raises(ModelError, match="without elements"):
+    with pytest.raises(ModelError, match="without finer samples"):
         fx.simulate(loop, duration=0.01, moving={"x": np.zeros(100)}, finer=2)
     plant = fx.assemble_plant(modes, ports(dynamics=fx.lowpass(4e3))).discretized(1 / H, delay=1)
     observer = fx.design_kalman(plant)
@@ -178,3 +178,48 @@ def test_refusals(modes, loop):
     other = fx.close_loop(plant, fx.design_kalman(plant), servo)
     with pytest.raises(ModelError, match=r"'slow:late1' of a sensor answers them"):
         fx.simulate(other, duration=0.01, moving={"x": np.zeros(100)})
+    limits = {"u0": fx.simulation.Saturation(1.0)}
+    with pytest.raises(ModelError, match="'u0' has an element"):
+        fx.simulate(loop, duration=0.01, moving={"x": np.zeros(100)}, elements=limits)
+
+
+def test_sensors_with_steps(loop):
+    rounded = {"y0": fx.simulation.Quantiser(1e-9)}
+    moving = {"x": lambda t: where(t)[0]}
+    options = {"duration": 0.02, "reference": 1e-6, "noise": False, "moving": moving}
+    run = fx.simulate(loop, elements=rounded, **options)
+    np.testing.assert_allclose(run["y0"] * 1e9, np.rint(run["y0"] * 1e9), atol=1e-6)
+    assert np.abs(run["y0"] - fx.simulate(loop, **options)["y0"]).max() > 1e-10
+
+
+def test_predicted_rms_of_a_machine_that_stands_is_its_budget(loop):
+    found = fx.simulation.rms_along(loop, moving={"x": np.full(10, 0.05)}, duration=10 * H)
+    there = fx.close_loop(loop.plant.at(x=0.05), *loop.blocks)
+    for name in ("die:error", "die:rx", "u0:effort"):
+        np.testing.assert_allclose(found[name], there.budget(name).rms, rtol=1e-6)
+    again = fx.simulation.rms_along(
+        loop, moving={"x": np.full(10, 0.05)}, duration=10 * H, repeats=True
+    )
+    np.testing.assert_allclose(found.rms, again.rms, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_predicted_rms_of_a_repeated_scan_is_that_of_many_repetitions(loop):
+    """The periodic equation against repetitions from rest, and both against where it stands."""
+    scan = lambda t: 0.09 * np.sin(2 * np.pi * 25.0 * t)  # noqa: E731
+    once = fx.simulation.rms_along(loop, moving={"x": scan}, duration=0.04, repeats=True)
+    long = fx.simulation.rms_along(loop, moving={"x": scan}, duration=0.48)
+    np.testing.assert_allclose(long["die:error"][-400:], once["die:error"], rtol=1e-3)
+    centre = loop.budget("die:error").rms
+    assert np.ptp(once["die:error"]) > 0.02 * centre
+    assert "largest die:error" in repr(once)
+
+
+@pytest.mark.slow
+def test_predicted_rms_along_a_scan_is_that_of_runs(loop):
+    scan = lambda t: 0.09 * np.sin(2 * np.pi * 10.0 * t)  # noqa: E731
+    predicted = fx.simulation.rms_along(loop, moving={"x": scan}, duration=0.1, repeats=True)
+    runs = fx.simulate(loop, moving={"x": scan}, duration=0.8, rng=5, runs=24)["die:error"]
+    found = np.sqrt(np.mean(runs[:, 1000:] ** 2))
+    # some 1500 independent errors: 1.8 % of their rms
+    assert found == pytest.approx(np.sqrt(np.mean(predicted["die:error"] ** 2)), rel=0.045)

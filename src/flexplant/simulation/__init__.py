@@ -89,6 +89,8 @@ from .motion import setpoint as setpoint
 from .nonlinear_elements import Quantiser as Quantiser
 from .nonlinear_elements import Saturation as Saturation
 from .response import Response as Response
+from .rms_along import RmsAlong as RmsAlong
+from .rms_along import rms_along as rms_along
 from .simulate import simulate as simulate
 from .specification import Specification as Specification
 from .specification import Verdict as Verdict

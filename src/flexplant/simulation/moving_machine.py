@@ -7,7 +7,7 @@ with b_i quadratic in time over a sample through its ends and its middle.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -23,6 +23,7 @@ from ..plant import Actuator, Poi, StandardPlant
 from ..plant.scheduling import Position
 from ..tolerances import SAME
 from .motion import SetPoint
+from .nonlinear_elements import Acting
 
 #: nodes of Gauss's rule in a sample, beyond one for each radian of the fastest mode
 _NODES = 12
@@ -87,14 +88,25 @@ class _Force(NamedTuple):
     asd: float
 
 
+class Sample(NamedTuple):
+    """The plant in one sample: ``x+ = A x + B [w; u] + G n``, ``[z; y] = C x + D [w; u]``."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    G: FloatArray
+
+
 class MovingMachine:
     """Runs of a closed loop along a trajectory of positions, sample by sample."""
 
     abreast, stretch = _ABREAST, _STRETCH
 
-    def __init__(self, loop: ClosedLoop, path: Trajectory, *, noise: bool) -> None:
+    def __init__(
+        self, loop: ClosedLoop, path: Trajectory, *, noise: bool, sensed: Acting | None = None
+    ) -> None:
         plant = self.plant = loop.plant
-        self.loop, self.path = loop, path
+        self.loop, self.path, self.sensed = loop, path, sensed
         own = self.realisation = plant.assembled.realisation
         self.modal = plant.modal_states
         ports = plant.assembled.ports
@@ -154,6 +166,8 @@ class MovingMachine:
         n, count = self.plant.system.n_states, len(generators)
         self.generators, self.first = generators, 0
         self.x, self.c = np.tile(start[:n], (count, 1)), np.tile(start[n:], (count, 1))
+        if self.sensed is not None:
+            self.sensed.begin(count)
 
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
         """Run one stretch: w as `given` (k, nw) or (runs, k, nw) plus noise; return if finite."""
@@ -173,6 +187,8 @@ class MovingMachine:
                     sign for _, sign in at
                 ]
             y = shown[:, nz:] + inputs @ self.D[nz:].T
+            if self.sensed is not None:
+                self.sensed.apply(y)
             both = np.hstack([self.c, y])
             self.c, out = both @ self._law[0].T, both @ self._law[1].T
             inputs[:, self.u] = out[:, :nu]
@@ -186,6 +202,31 @@ class MovingMachine:
             data[:, :, i] = np.hstack([z, y, out])
         self.first += k
         return bool(np.all(np.isfinite(self.x)))
+
+    def each(self, count: int) -> Iterator[Sample]:
+        """Return the matrices of so many samples, from the first."""
+        self.first = 0
+        loud = [force.asd / np.sqrt(2.0) for force in self.forces]
+        while self.first < count:
+            k = min(self.stretch, count - self.first)
+            B, rows = self._columns(k), self._seen(k)
+            new, old = self._acting(B)
+            kicks = [self.rule.kicks(b) * size for b, size in zip(B, loud, strict=True) if size]
+            for i in range(k):
+                matrices = np.array(self.A), np.array(self.B)
+                for places, effects in ((self.new, new), (self.old, old)):
+                    for (is_state, j), effect in zip(places, effects, strict=True):
+                        if j >= 0:
+                            matrices[1 - is_state][self.modal, j] += effect[i]
+                C = np.array(self.C)
+                for at, row in rows:
+                    for j, sign in at:
+                        C[j, self.modal] = sign * row[i]
+                G = np.zeros((len(self.A), sum(kick.shape[1] for kick in kicks)))
+                if kicks:
+                    G[self.modal] = np.vstack([kick[i] for kick in kicks]).T
+                yield Sample(*matrices, C, np.hstack([self.noise.factor, G]))
+            self.first += k
 
     @cached_property
     def _law(self) -> tuple[FloatArray, FloatArray]:
@@ -234,20 +275,18 @@ class MovingMachine:
     def _drawn(self, w: FloatArray, B: list[FloatArray], k: int) -> FloatArray:
         """Add noises to w, and return what white forces add to the states (runs, k, n)."""
         runs, noise = len(self.x), self.noise
-        found = np.zeros((runs, k, self.plant.system.n_states))
         loud = [(f, c) for f, c in zip(self.forces, B, strict=True) if f.asd > 0]
         kicks = [self.rule.kicks(c) * (f.asd / np.sqrt(2.0)) for f, c in loud]
+        kick = np.concatenate([np.zeros((k, 0, self.modal.size)), *kicks], axis=1)
+        sizes = noise.columns.size, noise.factor.shape[1], kick.shape[1]
+        drawn = [np.zeros((k, runs, size)) for size in sizes]
         for r, generator in enumerate(self.generators):
             # a whole stretch, so that a longer run begins with the shorter one
-            single = generator.standard_normal((self.stretch, noise.columns.size))[:k]
-            w[r][:, noise.columns] += single * noise.deviation
-            found[r] = (
-                generator.standard_normal((self.stretch, noise.factor.shape[1]))[:k]
-                @ noise.factor.T
-            )
-            for kick in kicks:
-                white = generator.standard_normal((self.stretch, kick.shape[1]))[:k]
-                found[r][:, self.modal] += np.einsum("kq,kqn->kn", white, kick)
+            for white, size in zip(drawn, sizes, strict=True):
+                white[:, r] = generator.standard_normal((self.stretch, size))[:k]
+        w[:, :, noise.columns] += (drawn[0] * noise.deviation).swapaxes(0, 1)
+        found: FloatArray = (drawn[1] @ noise.factor.T).swapaxes(0, 1)
+        found[:, :, self.modal] += (drawn[2] @ kick).swapaxes(0, 1)
         return found
 
 
@@ -256,6 +295,7 @@ class _Rule:
 
     def __init__(self, pairs: FloatArray, h: float) -> None:
         self.pairs, self.h = pairs, h
+        self._known: dict[tuple[float, float], tuple[FloatArray, FloatArray, FloatArray]] = {}
         fastest = float(np.abs(pairs).sum(axis=2).max(initial=0.0))
         self.nodes, self.weights = np.polynomial.legendre.leggauss(
             _NODES + int(np.ceil(fastest * h))
@@ -263,11 +303,13 @@ class _Rule:
 
     def _at(self, start: float, end: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return weights (q,), the columns' shares (q, 3) and e^(A (T - s)) (q, b, 2, 2)."""
-        s = start + 0.5 * (end - start) * (1.0 + self.nodes)
-        t = s / self.h
-        share = np.stack([(1 - t) * (1 - 2 * t), 4 * t * (1 - t), t * (2 * t - 1)], axis=1)
-        flow = np.array([pair_expm(self.pairs, self.h - one) for one in s.tolist()])
-        return 0.5 * (end - start) * self.weights, share, flow
+        if (start, end) not in self._known:
+            s = start + 0.5 * (end - start) * (1.0 + self.nodes)
+            t = s / self.h
+            share = np.stack([(1 - t) * (1 - 2 * t), 4 * t * (1 - t), t * (2 * t - 1)], axis=1)
+            flow = np.array([pair_expm(self.pairs, self.h - one) for one in s.tolist()])
+            self._known[start, end] = 0.5 * (end - start) * self.weights, share, flow
+        return self._known[start, end]
 
     def pushed(self, columns: FloatArray, start: float, end: float) -> FloatArray:
         """Return the effect (k, 2 b) of a unit force from start to end of a sample."""
@@ -282,7 +324,7 @@ class _Rule:
         """Return what unit white samples (q) at the nodes add to the states, (k, q, 2 b)."""
         weight, share, flow = self._at(0.0, self.h)
         b = np.einsum("qj,kjbd->kqbd", share, columns.reshape(*columns.shape[:2], -1, 2))
-        found = np.einsum("q,qbcd,kqbd->kqbc", np.sqrt(weight), flow, b)
+        found = (np.sqrt(weight)[:, None, None, None] * flow) @ b[..., None]
         return np.asarray(found.reshape(len(columns), weight.size, -1))
 
 

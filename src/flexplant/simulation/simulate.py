@@ -28,7 +28,7 @@ from ..plant import StandardPlant
 from ..tolerances import SAME, TYPED
 from .motion import SetPoint
 from .moving_machine import MovingMachine, trajectory
-from .nonlinear_elements import Element, conditions, finer_loop
+from .nonlinear_elements import Acting, Element, conditions, finer_loop
 from .response import Response
 from .runs import make_runner
 
@@ -142,10 +142,10 @@ def simulate(
         )
     time: FloatArray = np.arange(steps, dtype=np.float64) * plant.dt
     positions = _positions(plant, moving)
-    if positions and (elements or finer > 1 or len(positions) < len(moving or {})):
+    if positions and (finer > 1 or len(positions) < len(moving or {})):
         raise ModelError(
-            "positions move in runs without elements, finer samples and paths of single POIs: "
-            "leave these out, or let the machine stand."
+            "positions move in runs without finer samples and without paths of single POIs: leave "
+            "these out, or let the machine stand."
         )
     met = conditions(loop, elements, anti_windup, finer, None if positions else moving, time)
     numbers = _run_numbers(runs)
@@ -164,7 +164,13 @@ def simulate(
         runner: Any
         if positions:
             path = trajectory(plant, positions, time)
-            runner = MovingMachine(loop, path, noise=noise)
+            if met.on_u:
+                raise ModelError(
+                    f"{next(iter(met.on_u))!r} has an element: commands are applied as they are "
+                    "where positions move. Leave it out, or let the machine stand."
+                )
+            sensed = Acting(plant.y, met.on_y, float(plant.dt)) if met.on_y else None
+            runner = MovingMachine(loop, path, noise=noise, sensed=sensed)
         else:
             runner = make_runner(loop, white, given.reshape(-1, len(plant.w)), grows=grows, met=met)
         groups = [slice(i, i + runner.abreast) for i in range(0, len(numbers), runner.abreast)]

@@ -304,6 +304,7 @@ class WaferStage(Value):
         reference: Any = None,
         rng: Any = None,
         runs: int | None = None,
+        moving: Any = None,
     ) -> Response:
         """Return what the machine does in closed loop; see `simulate`.
 
@@ -321,6 +322,8 @@ class WaferStage(Value):
             Of the noise.
         runs : int, optional
             Repetitions with independent noise.
+        moving : mapping {position: path}, optional
+            How it moves, for ports that do.
         """
         loop = self.loop(ports, *blocks)
         return simulate(
@@ -330,6 +333,7 @@ class WaferStage(Value):
             rng=rng,
             runs=runs,
             elements=self._steps(ports),
+            moving=moving,
         )
 
     @property
