@@ -1,12 +1,15 @@
 """Every public name says what it does, what it takes and what it raises."""
 
+import ast
 import inspect
 import re
+from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 import flexplant
+from flexplant.documentation import rooms
 from flexplant.errors import FlexplantError
 
 
@@ -198,3 +201,22 @@ def test_the_checks_can_fail():
     assert described("bad", bad) is None
     assert described("x", lambda: None) == "x has no docstring"
     assert [p.name for p in parameters(bad)] == ["first", "second", "rest"]
+
+
+#: names in errors that are not those of this package: of lists, of texts, of a room's own words
+ELSEWHERE = {"append", "split", "matched", "Filter", "LoopLimits"}
+
+
+def test_names_in_advice_are_at_the_front_or_have_their_room():
+    """`GroundSpring` in an error sends a reader to search; `fx.plant.GroundSpring` does not."""
+    homes = {n: room for room, where in rooms().items() for n in dir(where) if room != "errors"}
+    hidden = set(homes) - set(dir(flexplant)) - ELSEWHERE
+    bare = []
+    for path in Path(flexplant.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Raise):
+                texts = (c.value for c in ast.walk(node) if isinstance(c, ast.Constant))
+                advice = " ".join(text for text in texts if isinstance(text, str))
+                found = set(re.findall(r"(?<![\w.'])([A-Za-z_]\w+)\(", advice)) & hidden
+                bare += [f"{path.name}:{node.lineno}: {homes[n]}.{n}" for n in sorted(found)]
+    assert not bare

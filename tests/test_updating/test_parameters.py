@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
+import flexplant as fx
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.store import load
 from flexplant.updating import AddedDamping, AddedMass, AddedStiffness
@@ -76,3 +77,46 @@ def test_bad_places_are_refused(kind, plate):
         kind((0.7, 0.1, 0.0)).matrices(rom)
     with pytest.raises(ModelError, match="acts on nothing"):
         kind({plate.z8: 0.0}).matrices(rom)
+
+
+def test_a_mass_rides_on_all_translations_as_a_point_mass_does():
+    """A rigid body gains the whole mass along x, y and z, and what a PointMass adds to M."""
+    sides = {"size": (0.4, 0.3, 0.05), "elements": (3, 2, 1)}
+    block = fx.solid_block(**sides, density=2700, youngs_modulus=70e9, poisson_ratio=0.33)
+    place = (0.31, 0.12, 0.05)
+    added = AddedMass(place, direction="xyz")
+    dM, dD, dK = added.matrices(block)
+    assert sp.issparse(dM) and dD is None and dK is None
+    heavier = block.with_parts(fx.PointMass(place, 0.7))
+    np.testing.assert_allclose((0.7 * dM).toarray(), (heavier.M - block.M).toarray(), atol=1e-12)
+    for axis in "xyz":
+        moved = np.array([float(d == axis) for d in block.dofs.directions])
+        assert moved @ dM @ moved == pytest.approx(1.0)
+    rom = fx.reduce(fx.solve_modes(block, count=12), fx.ModalTruncation(count=12))
+    reduced = added.matrices(rom)[0]
+    assert np.linalg.matrix_rank(reduced) == 3
+    np.testing.assert_allclose(reduced, rom.T.T @ dM @ rom.T, atol=1e-12)
+    assert added.name == "mass at (0.31, 0.12, 0.05) xyz"
+    for at in ("14:z", {"14:z": 1.0}):
+        with pytest.raises(LabelError, match="names one motion: give a point"):
+            AddedMass(at, direction="xyz")
+    with pytest.raises(LabelError, match="direction"):
+        AddedStiffness(place, direction="xyz")
+
+
+def test_a_mass_in_three_directions_is_found():
+    """On a machine with such a mass; one along z alone leaves the motions in the plane as drawn."""
+    sides = {"size": (0.4, 0.3, 0.05), "elements": (3, 2, 1)}
+    block = fx.solid_block(**sides, density=2700, youngs_modulus=70e9, poisson_ratio=0.33)
+    place = (0.4, 0.3, 0.05)
+    truth = fx.solve_modes(block.with_parts(fx.PointMass(place, 0.8)), count=12)
+    numbers = [7, 8, 9, 10, 11]
+    poles = [1j * truth.omega[k - 1] for k in numbers]
+    measured = fx.Eigenvalues(fx.MeasuredModes(poles=poles, modes=numbers))
+    rom = fx.reduce(fx.solve_modes(block, count=40), fx.ModalTruncation(count=40))
+    fits = {
+        d: fx.update(rom, [AddedMass(place, direction=d)], [measured], full=block)
+        for d in ("xyz", "z")
+    }
+    assert fits["xyz"].values[0] == pytest.approx(0.8, rel=1e-3)
+    assert fits["xyz"].history.error[-1] < 1e-4 * fits["z"].history.error[-1]

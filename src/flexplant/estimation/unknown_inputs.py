@@ -139,7 +139,12 @@ def design_input_estimator(
     >>> found.inputs
     ('amp',)
     """
-    instance(method, Unbiased | Augmented, "method", "Pass Unbiased() or Augmented(drift).")
+    instance(
+        method,
+        Unbiased | Augmented,
+        "method",
+        "Pass estimation.Unbiased() or estimation.Augmented(drift).",
+    )
     plant = checked_plant(plant)
     names = unknown_names(plant, inputs)
     quiet = _without(plant, names)
@@ -166,13 +171,14 @@ def _unbiased(model: FilterModel, d: InputEntry, found: Invertibility) -> _Input
     if not found.holds:
         raise AssumptionError(
             f"the unknown inputs are not determined by the sensors: {found.text}. Add a sensor, or "
-            "use Augmented(drift=...), which assumes how fast they change."
+            "use estimation.Augmented(drift=...), which assumes how fast they change."
         )
     late = found.delay == 1
     if late and (np.any(model.S) or np.any(d.at_pois)):
         raise AssumptionError(
             "inputs that the sensors show one sample late cannot be combined with noise that "
-            "reaches a sensor, or inputs that reach a POI, at once. Use Augmented(drift=...)."
+            "reaches a sensor, or inputs that reach a POI, at once. Use "
+            "estimation.Augmented(drift=...)."
         )
     gains = _late_gains if late else _direct_gains
     P = _first(model, d, late)
@@ -186,7 +192,7 @@ def _unbiased(model: FilterModel, d: InputEntry, found: Invertibility) -> _Input
         raise AssumptionError(
             f"no unbiased filter is stable to working precision: {error} A zero from "
             f"{', '.join(found.inputs)} to the sensors lies too close to the unit circle. Add a "
-            "sensor, or use Augmented(drift=...)."
+            "sensor, or use estimation.Augmented(drift=...)."
         ) from error
     return _judged(model, found_gains, last, P)
 
@@ -306,7 +312,7 @@ def _check(found: InputCertificate) -> None:
             f"the estimator of unknown inputs fails its check: spectral radius "
             f"{found.spectral_radius:.9f}, bias {found.bias:.1e}, variances differ by "
             f"{found.difference:.1e} (allowed {AGREEMENT:.0e}). The sensors hardly determine the "
-            "inputs. Add a sensor, or use Augmented(drift=...)."
+            "inputs. Add a sensor, or use estimation.Augmented(drift=...)."
         )
 
 

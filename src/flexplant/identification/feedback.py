@@ -107,5 +107,5 @@ def feedback_warned(found: Feedback | None) -> None:
         f"response, {found.deviations:.2g} times its noise, come before the input acts, which "
         "noise that returns through a controller does. The direct estimate S_yu/S_uu is biased "
         "there towards -1/K, by at least this share, and poles with it. Record the excitation or "
-        "set-point and pass reference=, or use whole periods, Periodic(...)."
+        "set-point and pass reference=, or use whole periods, identification.Periodic(...)."
     )

@@ -119,7 +119,8 @@ def estimate_frf(
         averages_advised(data.u if data.r is None else data.r, data.rate, method.window)
         return spectral_frf(data, method, quantity)
     raise ModelError(
-        "method is H1Estimator(...), H2Estimator(...), HvEstimator(...) or Periodic(...), got "
+        "method is identification.H1Estimator(...), identification.H2Estimator(...), "
+        "identification.HvEstimator(...) or identification.Periodic(...), got "
         f"{type(method).__name__}."
     )
 

@@ -344,7 +344,8 @@ def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: flo
             f"the inputs are not periodic: at half of the lines or more their power is "
             f"{10 * np.log10(ratio):.1f} dB of what lies between the lines, where periodic "
             "signals have nothing. Check period= and rate; random excitation needs "
-            "H1Estimator(...), blows of a hammer impact_frf(...), noise that comes back through a "
+            "identification.H1Estimator(...), blows of a hammer "
+            "identification.impact_frf(...), noise that comes back through a "
             "controller reference= or more periods."
         )
         return False
@@ -364,7 +365,8 @@ def averages_advised(x: FloatArray, rate: float, window: Any) -> None:
     if peaked.size and peaked.min() > PULSES:
         warn(
             "the inputs are pulses: segments of a fixed length cut the responses to blows "
-            "anywhere, which adds to their damping. Use impact_frf(force, response, rate, "
+            "anywhere, which adds to their damping. Use identification.impact_frf(force, "
+            "response, rate, "
             "segment=...), which finds the blows."
         )
         return
@@ -372,7 +374,8 @@ def averages_advised(x: FloatArray, rate: float, window: Any) -> None:
     if period and window != "boxcar":
         warn(
             f"the inputs repeat after {period / rate:.6g} s: windowed segments leak and smear "
-            f"resonances where whole periods do not. Use Periodic(period={period / rate:.6g})."
+            "resonances where whole periods do not. Use "
+            f"identification.Periodic(period={period / rate:.6g})."
         )
 
 

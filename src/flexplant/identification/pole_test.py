@@ -40,7 +40,7 @@ def supported(
             f"no resonance between {lines.freq[0]:.4g} and {lines.freq[-1]:.4g} Hz stands out of "
             "the noise: what the poles of the diagram explain could be chance. Move or widen the "
             "band, measure longer, or pick poles by hand with "
-            "stabilisation_diagram(frf).select(freq=[...])."
+            "identification.stabilisation_diagram(frf).select(freq=[...])."
         )
     return poles[kept], part[:, kept]
 

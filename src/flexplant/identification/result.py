@@ -256,7 +256,7 @@ def leakage_warned(frf: Frf, found: IdentifiedModes) -> None:
     warn(
         f"segments of {1 / frf.resolution:.3g} s are too short for the damping near "
         f"{listed}{more}: leakage widens a resonance {size}. Take segment= of at least "
-        f"{longer:.2g} s{other}, or excite with whole periods, Periodic(...)."
+        f"{longer:.2g} s{other}, or excite with whole periods, identification.Periodic(...)."
     )
 
 

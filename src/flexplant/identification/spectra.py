@@ -196,7 +196,7 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
         if type(method) is not H1Estimator:
             raise ModelError(
                 "with a reference the estimate is joint input-output, G = S_yr S_ur^-1: pass "
-                "method=H1Estimator(...) or Periodic(...)."
+                "method=identification.H1Estimator(...) or identification.Periodic(...)."
             )
         back = found.block("u", "r")
         weak_references_warned(found)
@@ -244,7 +244,8 @@ def weak_references_warned(found: Averages) -> None:
             f"at {weak.size} of {found.freq.size} lines, {weak[0]:.4g} .. {weak[-1]:.4g} Hz, the "
             "references are too weak in the inputs: noise and the controller make most of them, "
             "and S_yr S_ur^-1 divides by little. The variance is too small there. Leave these "
-            "lines out, band=, or excite more there, measure longer, or take Periodic(...)."
+            "lines out, band=, or excite more there, measure longer, or take "
+            "identification.Periodic(...)."
         )
 
 

@@ -123,8 +123,9 @@ def read_mat(path: str | Path, name: str | None = None) -> MatValue:
         return _value(next(iter(named.values())), repr(str(path)))
     if not _value_kind(content) and named:
         raise LabelError(
-            f"{str(path)!r} holds several values, {sorted(named)[:8]}. Say which: read_mat(path, "
-            f"{min(named)!r}), or read all: read_mat_values(path)."
+            f"{str(path)!r} holds several values, {sorted(named)[:8]}. Say which: "
+            "io.read_mat(path, "
+            f"{min(named)!r}), or read all: io.read_mat_values(path)."
         )
     return _value(content, repr(str(path)))
 
@@ -166,7 +167,7 @@ def read_mat_values(path: str | Path) -> dict[str, MatValue]:
     if not found:
         raise ModelError(
             f"{str(path)!r} holds no structures of values, but {sorted(content)[:8]}. One value in "
-            "plain variables is read by read_mat(path)."
+            "plain variables is read by io.read_mat(path)."
         )
     return {key: _value(item, f"{key!r} of {str(path)!r}") for key, item in found.items()}
 

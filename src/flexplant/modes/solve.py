@@ -126,7 +126,7 @@ def solve_modes(
         raise ModelError(
             "compliance_at needs a structure that is free or held: the static response on springs "
             "of negative stiffness is no measure of what modes leave out. Solve the free structure "
-            "with compliance_at, then suspend(modes, springs)."
+            "with compliance_at, then fx.plant.suspend(modes, springs)."
         )
     names = labels_of(at, model.dofs)
     # complex modes of a large model are found in a basis of more undamped ones

@@ -301,7 +301,8 @@ class BranchAndBound(Search):
             raise ModelError(
                 f"{problem.layouts.criterion!r} has no convex relaxation here, so nothing can be "
                 "bounded: it takes PoiVariance(own_modes=True), PoiLqr or ClosedLoopH2, "
-                "of ports without a filter or delay of their own. Use Exhaustive() or Exchange()."
+                "of ports without a filter or delay of their own. Use placement.Exhaustive() "
+                "or placement.Exchange()."
             )
         opened = 0
         chosen, history, evaluations = best_start(problem, self.starts, problem.relaxed(), work)

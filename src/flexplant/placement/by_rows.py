@@ -56,7 +56,9 @@ class ByRows(Search):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.driving_point and not isinstance(self.method, EffectiveIndependence):
-            raise ModelError("driving_point weights EffectiveIndependence(): leave one out.")
+            raise ModelError(
+                "driving_point weights reduction.EffectiveIndependence(): leave one out."
+            )
 
     def search(self, problem: Problem, work: Work) -> Found:
         """Return the choice, bounded by relaxation; see `Search.search`. Nothing is random.
@@ -72,7 +74,7 @@ class ByRows(Search):
         if not isinstance(scorer, ModeRows):
             raise ModelError(
                 f"{self!r} chooses by rows of mode shapes, {problem.layouts.criterion!r} has none. "
-                "Pass criterion=ModeInformation(), or search by Exchange()."
+                "Pass criterion=placement.ModeInformation(), or search by placement.Exchange()."
             )
         kept, pool = list(problem.required), list(problem.free)
         if self.driving_point:
@@ -91,7 +93,7 @@ class ByRows(Search):
         if not problem.rows.hold([found])[0]:
             raise InfeasibleError(
                 f"the choice by {self!r} does not satisfy the constraints: it only leaves out "
-                "candidates one by one. Use Exchange(), which satisfies all of them."
+                "candidates one by one. Use placement.Exchange(), which satisfies all of them."
             )
         value = float(problem.score([found])[0])
         return Found(found, value, min(problem.bound(), value), 1, ((value,),))

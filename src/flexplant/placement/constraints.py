@@ -392,13 +392,15 @@ def constraints_of(constraints: Any) -> tuple[Constraint, ...]:
     given = (constraints,) if isinstance(constraints, Constraint) else constraints
     if isinstance(given, str) or not isinstance(given, Sequence):
         raise ModelError(
-            f"constraints are a list of Excluded(...), MinimumDistance(...) and others, got "
+            "constraints are a list of placement.Excluded(...), "
+            "placement.MinimumDistance(...) and others, got "
             f"{short(given)}. Put them in a list."
         )
     for item in given:
         if not isinstance(item, Constraint):
             raise ModelError(
-                f"a constraint is Excluded(...), MinimumDistance(...) or another such value, got "
-                f"{short(item)}. Write Excluded(Disc((0.3, 0.3), radius=0.05)), say."
+                "a constraint is placement.Excluded(...), placement.MinimumDistance(...) or "
+                "another such value, got "
+                f"{short(item)}. Write placement.Excluded(Disc((0.3, 0.3), radius=0.05)), say."
             )
     return tuple(given)

@@ -186,7 +186,8 @@ def as_criterion(given: Any, side: str = "") -> Criterion:
     """Return a criterion of one side, made of any callable from plant to float."""
     if not callable(given):
         raise ModelError(
-            "a criterion is a value such as PoiVariance(...) or PoiLqr(...), or a callable from "
+            "a criterion is a value such as PoiVariance(...) or placement.PoiLqr(...), or a "
+            "callable from "
             f"plant to float, got {short(given)}. Pass one, or none for the usual."
         )
     criterion = given if isinstance(given, Criterion) else _Function(given)

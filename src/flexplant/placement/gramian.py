@@ -178,7 +178,7 @@ class KineticEnergy(ByShapes):
         if not isinstance(model, FEModel | ReducedModel):
             raise ModelError(
                 "the plant was assembled from modes, which have no mass matrix. Pass "
-                "KineticEnergy(model), the FEModel that they are of."
+                "placement.KineticEnergy(model), the FEModel that they are of."
             )
         if model.M.shape[0] != shapes.full.shape[0]:
             raise ModelError(

@@ -245,7 +245,12 @@ def _placed(
     layouts, ports = problem.layouts, problem.layouts.candidates
     if method is None:
         method = Exhaustive() if problem.subsets <= _FEW else Exchange()
-    instance(method, Search, "method", "Pass Exchange(...), BranchAndBound(...) or Exhaustive().")
+    instance(
+        method,
+        Search,
+        "method",
+        "Pass placement.Exchange(...), placement.BranchAndBound(...) or placement.Exhaustive().",
+    )
     header = {}
     if checkpoint is not None:
         parts = [plant, *ports, layouts.criterion, problem.count, problem.required, problem.rows]
@@ -306,7 +311,8 @@ class Exhaustive(Search):
         if problem.subsets > self.limit:
             raise ModelError(
                 f"there are {counted(problem.subsets, 'subset')}, more than "
-                f"Exhaustive(limit={self.limit}) allows. Use Exchange(), whose bound shows how far "
+                f"placement.Exhaustive(limit={self.limit}) allows. Use placement.Exchange(), "
+                "whose bound shows how far "
                 "from the optimum it can be, or a higher limit."
             )
         sets = list(problem.choices())

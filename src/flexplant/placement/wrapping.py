@@ -83,7 +83,8 @@ class LeftOutModes(Criterion):
         more = None if whole is None else shapes_of(whole, candidates)
         if more is None or more.omega.size <= kept.omega.size:
             raise AssumptionError(
-                "no modes left out of the plant are known: pass LeftOutModes(larger), the "
+                "no modes left out of the plant are known: pass "
+                "placement.LeftOutModes(larger), the "
                 "structure with more modes."
             )
         # modes are in order of their frequency: the plant has the first of them

@@ -132,7 +132,7 @@ def position_map(plant: Any, judge: Any, points: Any) -> PositionMap:
     if not positions:
         raise LabelError(
             "the plant has no positions: nothing of it moves. Give ports moves={'x': (-1, 0, 0)} "
-            "and Ports(..., positions=[Position('x', range=(-0.1, 0.1))])."
+            "and Ports(..., positions=[fx.plant.Position('x', range=(-0.1, 0.1))])."
         )
     judges = _judges(judge)
     grid = {one.name: _values(one, points) for one in positions}

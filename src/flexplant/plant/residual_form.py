@@ -86,7 +86,7 @@ class Feedthrough(ResidualForm):
             which = "attachment vectors" if self.above is None else f"modes above {self.above:g} Hz"
             raise ModelError(
                 f"the model has {'nothing but' if fast.any() else 'no'} {which}: "
-                "Feedthrough(above=...) says which modes become static, and "
+                "fx.plant.Feedthrough(above=...) says which modes become static, and "
                 "solve_modes(..., compliance_at=...) keeps the compliance of those left out."
             )
         n = realisation.outputs.shape[0]
@@ -116,7 +116,7 @@ def modes_of(
 ) -> ModalRealisation:
     """Return the modes of a structure as a plant takes them; FastStates where nothing is given."""
     way = FastStates() if residual is None else residual
-    instance(way, ResidualForm, "residual", "Pass FastStates() or Feedthrough().")
+    instance(way, ResidualForm, "residual", "Pass fx.plant.FastStates() or fx.plant.Feedthrough().")
     realisation = realised(model)
     if realisation.form != MODAL and realisation is not model:
         warn(

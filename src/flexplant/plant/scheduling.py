@@ -198,7 +198,7 @@ class Moves(Value):
         if isinstance(self.along, PlaceTable):
             raise LabelError(
                 "a port whose places are a table stands where the table says. Replace its table, "
-                "moves=PlaceTable(...)."
+                "moves=fx.plant.PlaceTable(...)."
             )
         pairs = [np.asarray(step) * values[name] for name, step in self.along.items()]
         return self.replace(start=shifted(place, -np.sum(pairs, axis=0)))
@@ -260,7 +260,7 @@ def require_positions(ports: Sequence[Any], positions: Sequence[Position]) -> No
                 raise LabelError(
                     f"{port.name!r} moves with {name!r}, which is none of the positions "
                     f"({', '.join(known) or 'there are none'}). Name it and its range: "
-                    f"Ports(..., positions=[Position({name!r}, range=(-0.1, 0.1))])."
+                    f"Ports(..., positions=[fx.plant.Position({name!r}, range=(-0.1, 0.1))])."
                 )
         for name in moves.names:
             if isinstance(moves.along, PlaceTable) and not moves.along.covers(known[name]):

@@ -50,7 +50,7 @@ def _mapping(weights: Any, side: str) -> dict[str, Any]:
     if weights is None:
         return {}
     instance(
-        weights, Mapping, f"weights of {side}", "{'die:error': inverse_sensitivity(30.0)}, say."
+        weights, Mapping, f"weights of {side}", "{'die:error': lti.inverse_sensitivity(30.0)}, say."
     )
     return {
         name: None if weight is None else as_statespace(weight) for name, weight in weights.items()

@@ -163,6 +163,8 @@ def _xy(parameter: PointParameter, dofs: DofSet) -> FloatArray:
     at = parameter.at
     if isinstance(at, str):
         return np.asarray(dofs.location(at)[:2])
+    if isinstance(at, tuple):
+        return np.asarray(at[:2])
     row = np.abs(dofs.row(at, parameter.direction))
     return np.asarray(row @ dofs.xyz[:, :2] / row.sum())
 

@@ -289,7 +289,9 @@ def select_dofs(
     """
     instance(modes, Modes, "modes", "Pass solve_modes(model, count=24).")
     rule = PivotedQr() if criterion is None else criterion
-    instance(rule, SelectionCriterion, "criterion", "Pass PivotedQr() or Greedy().")
+    instance(
+        rule, SelectionCriterion, "criterion", "Pass reduction.PivotedQr() or reduction.Greedy()."
+    )
     basis = modes.basis
     kept = list(name_list(required, "required DOFs"))
     if len(set(kept)) != len(kept):

@@ -92,7 +92,8 @@ class Feedforward(Value):
         if len(self.gains) != 1:
             raise ModelError(
                 f"gains that depend on the place ({len(self.gains)} of them) are no constant "
-                "block: close the loop with known_forces(plant) and pass forces(move, time) to "
+                "block: close the loop with simulation.known_forces(plant) and pass "
+                "forces(move, time) to "
                 "simulate as references."
             )
         used = [m for m in range(5) if np.any(self.gains[0, :, m])] or [2]

@@ -377,7 +377,7 @@ def _require_plain(plant: StandardPlant, moves: list[Any]) -> None:
         raise ModelError(
             f"the plant's modes are in the form {own.form!r}, or residual vectors answer at once: "
             "a moving machine needs modes by themselves. Take proportional or modal damping, and "
-            "residual=FastStates()."
+            "residual=fx.plant.FastStates()."
         )
     if plant.modal_states[0] and any(hasattr(port, "push") for port in moves):
         raise ModelError(

@@ -149,7 +149,9 @@ def split_elements(
     """Return the elements on sensors and on actuators, by channel."""
     if elements is None:
         return {}, {}
-    instance(elements, Mapping, "elements", "Name the channel: {'u1': Saturation(10.0)}.")
+    instance(
+        elements, Mapping, "elements", "Name the channel: {'u1': simulation.Saturation(10.0)}."
+    )
     for name, element in elements.items():
         if name not in sensors and name not in driven:
             raise unknown_label("channel for an element", name, [*sensors, *driven])

@@ -221,5 +221,5 @@ def refuse_unstable(model: Any, what: str) -> None:
         raise ModelError(
             f"springs of negative stiffness make {counted(count, 'rigid-body motion')} of "
             f"this structure unstable: {what} is for structures that are free or held. Do it with "
-            "the free structure, then suspend the result: suspend(model, springs)."
+            "the free structure, then suspend the result: fx.plant.suspend(model, springs)."
         )

@@ -80,9 +80,7 @@ class FullBasis:
         loads = [full.dofs.row(place, direction) for place, direction in loaded]
         for q in parameters:
             if isinstance(q, PointParameter):
-                loads.append(full.dofs.row(q.at, q.direction))
-                if q.to is not None:
-                    loads.append(full.dofs.row(q.to, q.direction))
+                loads += q.rows(full)  # the force of p r r^T is along r
         try:
             for q in parameters:
                 q.matrices(full)

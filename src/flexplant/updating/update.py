@@ -156,7 +156,9 @@ def update(
     listed = checked_parameters(parameters)
     given = checked_residuals(residuals)
     if method is not None:
-        instance(method, UpdateMethod, "method", "Pass GaussNewton() or TrustRegion().")
+        instance(
+            method, UpdateMethod, "method", "Pass updating.GaussNewton() or updating.TrustRegion()."
+        )
     if max_iterations is not None:
         whole(max_iterations, "max_iterations")
     enough = positive(tolerance, "tolerance")
@@ -171,7 +173,7 @@ def update(
         method = Secured() if plain and not bounded else TrustRegion()
     if bounded and not method.keeps_bounds:
         raise ModelError(
-            f"{type(method).__name__} takes no bounds: use TrustRegion(), or drop bounds=."
+            f"{type(method).__name__} takes no bounds: use updating.TrustRegion(), or drop bounds=."
         )
     if plain and method.weighs_poles:
         given = tuple(r.replace(weights=r.W) for r in given if isinstance(r, Eigenvalues))

@@ -54,7 +54,7 @@ def _inertia_load(realisation: ModalRealisation, direction: str, about: FloatArr
             f"{direction!r} (they miss {missed:.2g} of it), so that its inertia against a base "
             "acceleration is not known: it is held, or has springs that were there before its "
             "modes were solved and that bend them. Pass the FEModel, more modes, or solve it free "
-            "and suspend(modes, springs)."
+            "and fx.plant.suspend(modes, springs)."
         )
     return np.asarray(-model.inertia(motion)[:, 0])
 
@@ -121,7 +121,7 @@ def refuse_lost(
             f"the channels have part in rigid-body axes that this model has no shapes for: they "
             f"miss {_listed(named)}, and {others}. Stiff springs that were there before the modes "
             "were solved bend them: keep more modes, or solve the free structure and "
-            f"suspend(modes, springs){do}."
+            f"fx.plant.suspend(modes, springs){do}."
         )
 
 

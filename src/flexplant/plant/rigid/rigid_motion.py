@@ -92,7 +92,8 @@ def rigid_modes_of(plant: Partition) -> RigidModes:
         raise AssumptionError(
             "the plant has no rigid-body modes and no suspension modes: it is constrained. This "
             "is for a free structure, assemble_plant(model, ports), or one on weak springs, "
-            "suspend(model, springs). Use design_hinf with weights of your own for a held one."
+            "fx.plant.suspend(model, springs). Use design_hinf with weights of your own for a "
+            "held one."
         )
     return motions
 

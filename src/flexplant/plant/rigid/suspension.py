@@ -184,7 +184,7 @@ def _full(model: FEModel, springs: list[GroundSpring]) -> FEModel:
             "the springs are so weak that rounding of the structure's matrices exceeds them: "
             f"they leave {counted(suspended.rigid_body.shape[1], 'rigid-body motion')}, not "
             f"{expected} as by geometry. Solve the modes of the free structure first and suspend "
-            "those: suspend(solve_modes(model), springs)."
+            "those: fx.plant.suspend(solve_modes(model), springs)."
         )
     return suspended
 

@@ -283,7 +283,8 @@ def controller_law(loop: ClosedLoop) -> StateSpace:
 def _check_sampled(dt: float, states: int) -> None:
     if not dt and states:
         raise ModelError(
-            "a computer runs a sampled controller: discretise_controller(plant, controller) first."
+            "a computer runs a sampled controller: synthesis.discretise_controller(plant, "
+            "controller) first."
         )
 
 

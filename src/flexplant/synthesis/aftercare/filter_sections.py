@@ -58,7 +58,8 @@ def second_order_sections(controller: Any) -> Mapping[tuple[str, str], FloatArra
     K = as_statespace(controller)
     if not K.dt and K.n_states:
         raise ModelError(
-            "sections are of a sampled controller: discretise_controller(plant, controller) first."
+            "sections are of a sampled controller: synthesis.discretise_controller(plant, "
+            "controller) first."
         )
     return {(output, name): _sections(K[output, name]) for output in K.outputs for name in K.inputs}
 

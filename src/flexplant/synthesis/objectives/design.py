@@ -152,7 +152,8 @@ def _checked(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) ->
     """Refuse specifications that do not fit."""
     if not isinstance(minimize, _KINDS) or minimize.below is not None:
         raise ModelError(
-            f"minimize takes H2(...), Hinf(...) or PeakGain(...) without below, got "
+            "minimize takes synthesis.H2(...), synthesis.Hinf(...) or synthesis.PeakGain(...) "
+            "without below, got "
             f"{short(minimize)}. Pass one norm; its bound is what is found."
         )
     if not isinstance(subject_to, Sequence) or isinstance(subject_to, str):

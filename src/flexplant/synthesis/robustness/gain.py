@@ -160,7 +160,8 @@ def worst_case_gain(
         raise AssumptionError(
             "machines of the uncertainty may be unstable (at "
             f"{loop.freq(float(found.frequencies[np.argmax(found.bounds)])):.5g} Hz), so that the "
-            "largest gain is infinite. See robust_stability(uncertain, ...): lower the bandwidth, "
+            "largest gain is infinite. See synthesis.robust_stability(uncertain, ...): lower "
+            "the bandwidth, "
             "notch the mode there, or measure it better."
         )
     upper = size * float(np.sqrt(found.level))

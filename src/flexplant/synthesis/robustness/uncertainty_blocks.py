@@ -82,7 +82,8 @@ def checked_blocks(blocks: Any, w: int, z: int) -> tuple[Block, ...]:
         not isinstance(block, RepeatedScalar | FullBlock) for block in blocks
     ):  # fmt: skip
         raise ModelError(
-            "blocks must be a list of RepeatedScalar(...) and FullBlock(...), got "
+            "blocks must be a list of synthesis.RepeatedScalar(...) and "
+            "synthesis.FullBlock(...), got "
             f"{short(blocks)}. Pass one for each uncertainty, in the order of the channels."
         )
     found = sum(block.w for block in blocks), sum(block.z for block in blocks)

@@ -147,7 +147,8 @@ def design_structured(
     if isinstance(structure, type) or not hasattr(structure, "family"):
         raise ModelError(
             "structure must be FixedOrder, TunedLaws, ObserverGains or Parametrised, got "
-            f"{short(structure)}. Pass one of them, such as TunedLaws(law) or FixedOrder(2)."
+            f"{short(structure)}. Pass one of them, such as synthesis.TunedLaws(law) or "
+            "synthesis.FixedOrder(2)."
         )
     starts, random = whole(starts, "starts"), generator(rng)
     evaluations = whole(evaluations, "evaluations")
@@ -242,7 +243,8 @@ def _objectives(given: Any) -> list[LoopObjective]:
     for one in every:
         if isinstance(one, type) or not hasattr(one, "judges"):
             raise ModelError(
-                f"objective must be Hinf(...), H2(...), PeakGain(...) or several of them, got "
+                "objective must be synthesis.Hinf(...), synthesis.H2(...), "
+                "synthesis.PeakGain(...) or several of them, got "
                 f"{short(one)}."
             )
         if len(every) > 1 and one.below is None:
@@ -296,7 +298,7 @@ def _require_no_feedthrough(
             raise AssumptionError(
                 "the structure has a feedthrough from y to u, through which white noise of a "
                 "continuous plant passes at once: the H2 norm is infinite. Take "
-                "FixedOrder(n, direct=False), laws with a LowPass, or sample the plant."
+                "synthesis.FixedOrder(n, direct=False), laws with a LowPass, or sample the plant."
             )
 
 

@@ -81,7 +81,7 @@ class Parameter(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointParameter(Parameter):
-    """A parameter p r r^T of one of the matrices, ``r = row(at) - row(to)``."""
+    """A parameter p r r^T of one of the matrices, ``r = row(at) - row(to)``, along each motion."""
 
     at: Place
     direction: str = field(default="z", kw_only=True)
@@ -92,10 +92,16 @@ class PointParameter(Parameter):
 
     quantity: ClassVar[str] = ""
     acts_on: ClassVar[int] = 0
+    #: directions that stand for several
+    together: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        require_known("direction", [self.direction], DIRECTIONS)
+        require_known("direction", [self.direction], (*DIRECTIONS, *self.together))
         place, text = checked_place(self.at, self.direction)
+        if self.direction in self.together and not isinstance(place, tuple):
+            raise LabelError(
+                f"{text} names one motion: give a point (x, y, z) for direction={self.direction!r}."
+            )
         other = self.to
         if other is not None:
             other, end = checked_place(other, self.direction, "to")
@@ -109,21 +115,28 @@ class PointParameter(Parameter):
 
     def matrices(self, model: Any) -> Derivatives:
         """Return (dM, dD, dK) of the model: r r^T in one of them, sparse where M is."""
-        rows = model if hasattr(model, "row") else model.dofs
-        row = np.asarray(rows.row(self.at, self.direction), dtype=np.float64)
-        if self.to is not None:
-            row = row - np.asarray(rows.row(self.to, self.direction), dtype=np.float64)
-        if not np.any(row):
+        found = np.array(self.rows(model)).T
+        if not np.any(found):
             raise ModelError(
                 f"{self.name} acts on nothing: its weights are all zero. Give a place with motion."
             )
+        columns = sp.csc_array(found) if sp.issparse(model.M) else found
         parts: list[Matrix | None] = [None, None, None]
-        if sp.issparse(model.M):
-            column = sp.csc_array(row[:, None])
-            parts[self.acts_on] = sp.csc_array(column @ column.T)
-        else:
-            parts[self.acts_on] = np.outer(row, row)
+        parts[self.acts_on] = columns @ columns.T
         return parts[0], parts[1], parts[2]
+
+    def rows(self, model: Any) -> list[FloatArray]:
+        """Return r of each motion it acts along, of those together the ones the model has."""
+        of = model if hasattr(model, "row") else model.dofs
+        along: tuple[str, ...] = (self.direction,)
+        if self.direction in self.together:
+            known = getattr(model, "full_dofs", None) or model.dofs
+            along = tuple(one for one in self.direction if one in known.directions)
+        rows = [np.asarray(of.row(self.at, one), dtype=np.float64) for one in along]
+        if self.to is not None:
+            ends = (np.asarray(of.row(self.to, one), dtype=np.float64) for one in along)
+            rows = [row - end for row, end in zip(rows, ends, strict=True)]
+        return rows
 
 
 class AddedMass(PointParameter):
@@ -135,7 +148,8 @@ class AddedMass(PointParameter):
         DOF label, point (interpolated between nodes) or {label: weight}; the mass moves in this
         direction only.
     direction : str
-        Of the motion at a point; labels carry their own.
+        Of the motion at a point; labels carry their own. "xyz": a mass that rides on all three
+        translations, as a `PointMass` does; of a plate in bending on z alone.
     name : str, optional
         For results; made from the place when not given.
     to : str, (3,) array [m] or mapping, optional
@@ -149,11 +163,14 @@ class AddedMass(PointParameter):
     --------
     >>> AddedMass("14:z")
     <AddedMass: mass at 14:z [kg]>
+    >>> AddedMass((0.3, 0.2, 0.05), direction="xyz", name="chuck")
+    <AddedMass: chuck [kg]>
     """
 
     quantity = "mass"
     unit = "kg"
     acts_on = 0
+    together = ("xyz",)
 
 
 class AddedDamping(PointParameter):

@@ -140,7 +140,8 @@ def _step(
             f"{', '.join(together)} cannot be distinguished by {objective.text} ({r.size} real "
             f"equations, {counted(len(names), 'unknown')}, S is singular): some combination of "
             "them changes nothing. Measure more modes, drop one of them, give priors, begin "
-            "elsewhere (start=) or cut it off, GaussNewton(truncate=1e-3). identifiability(...) "
+            "elsewhere (start=) or cut it off, updating.GaussNewton(truncate=1e-3). "
+            "identifiability(...) "
             "shows which."
         )
     step = -(Vt[keep].T @ ((U[:, keep].T @ r) / s[keep])) / length
