@@ -176,7 +176,7 @@ def test_refusals():
     (A, G, C, H), plant = random_plant(False)
     with pytest.raises(LabelError, match="disturbance of w"):
         invertibility(plant, ["d3"])
-    with pytest.raises(ModelError, match=r"Unbiased\(\) or Augmented"):
+    with pytest.raises(ModelError, match=r"Unbiased\(\) or estimation\.Augmented"):
         design_input_estimator(plant, ["d1"], "kalman")
     with pytest.raises(AssumptionError, match="need as many sensors"):
         design_input_estimator(by_hand(A, G, C[:1], H[:1]), ["d1", "d2"])

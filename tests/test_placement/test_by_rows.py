@@ -54,7 +54,7 @@ def test_searches_by_rows_differ_and_are_bounded(make):
     assert {"s0", "s2"} <= set(kept.chosen)
     fewer = place_sensors(plant, sensors, 10, ModeInformation(elastic=True), method=searches[0])
     assert len(fewer.chosen) == 10
-    with pytest.raises(ModelError, match=r"has none\. Pass criterion=ModeInformation"):
+    with pytest.raises(ModelError, match=r"has none\. Pass criterion=placement\.ModeInformation"):
         place_sensors(plant, sensors, 9, method=ByRows(PivotedQr()))
 
 

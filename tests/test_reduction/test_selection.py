@@ -98,7 +98,7 @@ def test_refusals(modes):
         select_dofs(few, 4, candidates=line)
     with pytest.raises(ModelError, match="whole number"):
         select_dofs(few, "a")
-    with pytest.raises(ModelError, match=r"PivotedQr\(\) or Greedy"):
+    with pytest.raises(ModelError, match=r"PivotedQr\(\) or reduction\.Greedy"):
         select_dofs(few, 3, criterion="qr")
     with pytest.raises(ModelError, match="got str"):
         select_dofs("modes", 3)

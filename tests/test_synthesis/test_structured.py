@@ -254,7 +254,9 @@ def test_what_cannot_be_stabilised_says_which_pole():
         design_structured(plant, FixedOrder(0), starts=2)
     with pytest.raises(InfeasibleError, match="of 1 starts"):
         design_structured(plant, FixedOrder(0), evaluations=1)
-    with pytest.raises(ModelError, match=r"got <class .*FixedOrder.*such as TunedLaws\(law\)"):
+    with pytest.raises(
+        ModelError, match=r"got <class .*FixedOrder.*such as synthesis\.TunedLaws\(law\)"
+    ):
         design_structured(plant, FixedOrder)
     with pytest.raises(LabelError, match="no number of an element 'gain'"):
         TunedLaws(law(), free=("gain",))

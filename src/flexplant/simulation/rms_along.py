@@ -137,7 +137,7 @@ def rms_along(
     if not plant.dt or not plant.is_assembled or not plant.assembled.ports.positions:
         raise ModelError(
             "errors along a trajectory need a sampled plant whose ports move: Ports(..., "
-            "positions=[Position('x', range=...)]) and plant.discretized(rate)."
+            "positions=[fx.plant.Position('x', range=...)]) and plant.discretized(rate)."
         )
     steps = round(positive(duration, "duration") / plant.dt)
     time = np.arange(steps) * float(plant.dt)

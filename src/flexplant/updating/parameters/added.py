@@ -120,7 +120,7 @@ class PointParameter(Parameter):
             raise ModelError(
                 f"{self.name} acts on nothing: its weights are all zero. Give a place with motion."
             )
-        columns = sp.csc_array(found) if sp.issparse(model.M) else found
+        columns: Any = sp.csc_array(found) if sp.issparse(model.M) else found
         parts: list[Matrix | None] = [None, None, None]
         parts[self.acts_on] = columns @ columns.T
         return parts[0], parts[1], parts[2]
