@@ -78,6 +78,9 @@ from .feedforward import Feedforward as Feedforward
 from .feedforward import design_feedforward as design_feedforward
 from .feedforward import inverse_forces as inverse_forces
 from .feedforward import known_forces as known_forces
+from .filters_along import FiltersAlong as FiltersAlong
+from .filters_along import estimate_along as estimate_along
+from .filters_along import filters_along as filters_along
 from .learning import LearnedFeedforward as LearnedFeedforward
 from .learning import learn_feedforward as learn_feedforward
 from .machine_pipeline import MachinePipeline as MachinePipeline

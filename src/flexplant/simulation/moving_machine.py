@@ -97,16 +97,13 @@ class Sample(NamedTuple):
     G: FloatArray
 
 
-class MovingMachine:
-    """Runs of a closed loop along a trajectory of positions, sample by sample."""
+class MovingPlant:
+    """A sampled plant along a trajectory of positions."""
 
-    abreast, stretch = _ABREAST, _STRETCH
+    stretch = _STRETCH
 
-    def __init__(
-        self, loop: ClosedLoop, path: Trajectory, *, noise: bool, sensed: Acting | None = None
-    ) -> None:
-        plant = self.plant = loop.plant
-        self.loop, self.path, self.sensed = loop, path, sensed
+    def __init__(self, plant: StandardPlant, path: Trajectory, *, noise: bool = True) -> None:
+        self.plant, self.path, self.first = plant, path, 0
         own = self.realisation = plant.assembled.realisation
         self.modal = plant.modal_states
         ports = plant.assembled.ports
@@ -155,11 +152,81 @@ class MovingMachine:
         rows = [*(i for *_, at in self.shown for i, _ in at)]
         rows += [len(plant.z) + at[0] for *_, at in self.seen]
         C[np.ix_(np.array(rows, dtype=np.int64), self.modal)] = 0.0
-        nw = len(plant.w)
-        self.u = nw + np.array([plant.u.index(n) for n in self.loop.driven], dtype=np.int64)
         self.A, self.B, self.C, self.D = A, B, C, g.D
         loud = plant if noise else plant.replace(asd={})
         self.noise = _noise_without(loud, {force.port.name for force in self.forces})
+
+    def each(self, count: int) -> Iterator[Sample]:
+        """Return the matrices of so many samples, from the first."""
+        self.first = 0
+        loud = [force.asd / np.sqrt(2.0) for force in self.forces]
+        while self.first < count:
+            k = min(self.stretch, count - self.first)
+            B, rows = self._columns(k), self._seen(k)
+            new, old = self._acting(B)
+            kicks = [self.rule.kicks(b) * size for b, size in zip(B, loud, strict=True) if size]
+            for i in range(k):
+                matrices = np.array(self.A), np.array(self.B)
+                for places, effects in ((self.new, new), (self.old, old)):
+                    for (is_state, j), effect in zip(places, effects, strict=True):
+                        if j >= 0:
+                            matrices[1 - is_state][self.modal, j] += effect[i]
+                C = np.array(self.C)
+                for at, row in rows:
+                    for j, sign in at:
+                        C[j, self.modal] = sign * row[i]
+                G = np.zeros((len(self.A), sum(kick.shape[1] for kick in kicks)))
+                if kicks:
+                    G[self.modal] = np.vstack([kick[i] for kick in kicks]).T
+                yield Sample(*matrices, C, np.hstack([self.noise.factor, G]))
+            self.first += k
+
+    def _columns(self, k: int) -> list[FloatArray]:
+        """Return each force's columns (k, 3, 2 b) at the begin, the middle and the end."""
+        h = float(self.plant.dt)
+        time = np.asarray((self.first + 0.5 * np.arange(2 * k + 1)) * h, dtype=np.float64)
+        values = self.path.at(time)
+        found = []
+        for force in self.forces:
+            rows = _motions(self.realisation, force.port, force.port.direction, values)
+            columns = rows @ self.realisation.inputs
+            found.append(np.stack([columns[:-2:2], columns[1:-1:2], columns[2::2]], axis=1))
+        return found
+
+    def _acting(self, B: list[FloatArray]) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return the effects (k, 2 b) of each force's new and old sample."""
+        h, new, old = float(self.plant.dt), [], []
+        for force, columns in zip(self.forces, B, strict=True):
+            new.append(self.rule.pushed(columns, force.fraction, h))
+            old.append(self.rule.pushed(columns, 0.0, force.fraction))
+        return new, old
+
+    def _seen(self, k: int) -> list[tuple[list[tuple[int, float]], FloatArray]]:
+        """Return where rows go, with which sign, and the rows (k, 2 b) at each sample."""
+        time = np.asarray((self.first + np.arange(k)) * float(self.plant.dt), dtype=np.float64)
+        values = self.path.at(time)
+        nz, found = len(self.plant.z), []
+        for port, axis, at in self.shown:
+            rows = _motions(self.realisation, port, axis, values) @ self.realisation.outputs
+            found.append((at, rows))
+        for sensor, axis, places in self.seen:
+            rows = _motions(self.realisation, sensor, axis, values) @ self.realisation.outputs
+            found.append(([(nz + places[0], 1.0)], rows))
+        return found
+
+
+class MovingMachine(MovingPlant):
+    """Runs of a closed loop along a trajectory of positions, sample by sample."""
+
+    abreast = _ABREAST
+
+    def __init__(
+        self, loop: ClosedLoop, path: Trajectory, *, noise: bool, sensed: Acting | None = None
+    ) -> None:
+        super().__init__(loop.plant, path, noise=noise)
+        self.loop, self.sensed = loop, sensed
+        u = [self.plant.u.index(name) for name in loop.driven]
+        self.u = len(self.plant.w) + np.array(u, dtype=np.int64)
 
     def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
         """Put all runs at a state of plant and controller; each draws from its generator."""
@@ -203,31 +270,6 @@ class MovingMachine:
         self.first += k
         return bool(np.all(np.isfinite(self.x)))
 
-    def each(self, count: int) -> Iterator[Sample]:
-        """Return the matrices of so many samples, from the first."""
-        self.first = 0
-        loud = [force.asd / np.sqrt(2.0) for force in self.forces]
-        while self.first < count:
-            k = min(self.stretch, count - self.first)
-            B, rows = self._columns(k), self._seen(k)
-            new, old = self._acting(B)
-            kicks = [self.rule.kicks(b) * size for b, size in zip(B, loud, strict=True) if size]
-            for i in range(k):
-                matrices = np.array(self.A), np.array(self.B)
-                for places, effects in ((self.new, new), (self.old, old)):
-                    for (is_state, j), effect in zip(places, effects, strict=True):
-                        if j >= 0:
-                            matrices[1 - is_state][self.modal, j] += effect[i]
-                C = np.array(self.C)
-                for at, row in rows:
-                    for j, sign in at:
-                        C[j, self.modal] = sign * row[i]
-                G = np.zeros((len(self.A), sum(kick.shape[1] for kick in kicks)))
-                if kicks:
-                    G[self.modal] = np.vstack([kick[i] for kick in kicks]).T
-                yield Sample(*matrices, C, np.hstack([self.noise.factor, G]))
-            self.first += k
-
     @cached_property
     def _law(self) -> tuple[FloatArray, FloatArray]:
         """The controller over its states and y."""
@@ -238,39 +280,6 @@ class MovingMachine:
     def _held(place: tuple[bool, int], x: FloatArray, inputs: FloatArray) -> FloatArray:
         is_state, i = place
         return x[:, i] if is_state else inputs[:, i] if i >= 0 else np.zeros(len(x))
-
-    def _columns(self, k: int) -> list[FloatArray]:
-        """Return each force's columns (k, 3, 2 b) at the begin, the middle and the end."""
-        h = float(self.plant.dt)
-        time = np.asarray((self.first + 0.5 * np.arange(2 * k + 1)) * h, dtype=np.float64)
-        values = self.path.at(time)
-        found = []
-        for force in self.forces:
-            rows = _motions(self.realisation, force.port, force.port.direction, values)
-            columns = rows @ self.realisation.inputs
-            found.append(np.stack([columns[:-2:2], columns[1:-1:2], columns[2::2]], axis=1))
-        return found
-
-    def _acting(self, B: list[FloatArray]) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Return the effects (k, 2 b) of each force's new and old sample."""
-        h, new, old = float(self.plant.dt), [], []
-        for force, columns in zip(self.forces, B, strict=True):
-            new.append(self.rule.pushed(columns, force.fraction, h))
-            old.append(self.rule.pushed(columns, 0.0, force.fraction))
-        return new, old
-
-    def _seen(self, k: int) -> list[tuple[list[tuple[int, float]], FloatArray]]:
-        """Return where rows go, with which sign, and the rows (k, 2 b) at each sample."""
-        time = np.asarray((self.first + np.arange(k)) * float(self.plant.dt), dtype=np.float64)
-        values = self.path.at(time)
-        nz, found = len(self.plant.z), []
-        for port, axis, at in self.shown:
-            rows = _motions(self.realisation, port, axis, values) @ self.realisation.outputs
-            found.append((at, rows))
-        for sensor, axis, places in self.seen:
-            rows = _motions(self.realisation, sensor, axis, values) @ self.realisation.outputs
-            found.append(([(nz + places[0], 1.0)], rows))
-        return found
 
     def _drawn(self, w: FloatArray, B: list[FloatArray], k: int) -> FloatArray:
         """Add noises to w, and return what white forces add to the states (runs, k, n)."""
