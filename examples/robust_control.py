@@ -162,8 +162,9 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
     ):
         axs[0].loglog(one.frequencies, one.bounds, ".", ms=4, color=color)
         axs[0].axhline(one.upper, color=color)
-        said = f"{name}: at most {one.upper:.2g} at any frequency"
-        axs[0].annotate(said, (85.0, one.upper), (0, 4), textcoords="offset points", color=color)
+        said = f"{name}: at most {one.upper:.3g} at any frequency"
+        away = {"xytext": (0, -13 if one is robust else 4), "textcoords": "offset points"}
+        axs[0].annotate(said, (85.0, one.upper), color=color, **away)
     axs[0].axhline(1.0, **fx.plot.STYLES["bound"])
     axs[0].annotate("above 1 a machine may be unstable", (85.0, 1.0), (0, 4), color="0.3",
                     textcoords="offset points")  # fmt: skip

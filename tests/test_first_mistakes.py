@@ -1,12 +1,16 @@
 """Mistakes of a first hour: the message says which one it was."""
 
+import ast
 import pickle
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 
 import flexplant as fx
+from flexplant import errors
 from flexplant.errors import (
     CertificateError,
     FlexplantWarning,
@@ -17,6 +21,7 @@ from flexplant.errors import (
     attempted,
 )
 from flexplant.foreign_names import OURS
+from flexplant.structure import precision
 
 
 def test_records_with_time_as_first_axis():
@@ -109,3 +114,44 @@ def test_a_failed_certificate_says_what_to_report():
     assert str(error) == "the norm is 2, claimed was 1"
     assert "flexplant.show_versions()" in error.__notes__[0]
     assert pickle.loads(pickle.dumps(error)).args == error.args
+
+
+#: where an exception is the answer itself (no solution at this level, no choice of this size, a
+#: candidate of no use) and nothing is dropped that a reader of a log would want to know
+ANSWERS = {
+    "hand_design.py", "hinf_riccati.py", "lower_bound.py", "loops.py", "posterior.py",
+    "robust_filter.py", "search.py", "update_result.py", "wrapping.py", "searching.py",
+}  # fmt: skip
+
+
+def test_nothing_is_dropped_without_a_word():
+    """An error of ours that is caught and followed by None, continue or pass goes into the log."""
+    ours = {n for n, item in vars(errors).items() if isinstance(item, type)}
+    silent = []
+    for path in Path(fx.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ExceptHandler) or len(node.body) != 1 or node.type is None:
+                continue
+            kinds = {one.id for one in ast.walk(node.type) if isinstance(one, ast.Name)}
+            (does,) = node.body
+            empty = isinstance(does, ast.Pass | ast.Continue | ast.Break) or (
+                isinstance(does, ast.Return)
+                and (does.value is None or getattr(does.value, "value", 1) is None)
+            )
+            if kinds & ours and empty and path.name not in ANSWERS:
+                silent.append(f"{path.name}:{node.lineno}")
+    assert not silent
+
+
+def test_a_check_that_fails_itself_is_in_the_log(caplog, monkeypatch):
+    """What would have warned of few digits of K is no reason to refuse the model."""
+
+    def failing(*_, **__):
+        raise SolverError("no convergence")
+
+    monkeypatch.setattr(precision, "lowest_modes", failing)
+    one = sp.csc_array(np.eye(2))
+    with caplog.at_level("INFO", logger="flexplant"):
+        assert precision.endangered(one, one, 6) is None
+    said = "the check of the digits of K by its lowest modes failed and is dropped: no convergence"
+    assert caplog.messages == [said]

@@ -94,7 +94,9 @@ def counted(number: int, noun: str) -> str:
 
 
 @contextmanager
-def attempted(what: str, kind: type[FlexplantError] = FlexplantError) -> Iterator[None]:
+def attempted(
+    what: str, kind: type[Exception] | tuple[type[Exception], ...] = FlexplantError
+) -> Iterator[None]:
     """Let fail what has something else behind it; the log of "flexplant" says that it was dropped.
 
     Examples

@@ -256,7 +256,7 @@ def test_averages_and_periods_advise_each_other():
     x = x + 1e-3 * rng.normal(size=x.shape)
     noise = 0.01 * rng.normal(size=x.shape)
     _, said = said_of(lambda: estimate_frf(x, x + noise, 1000.0, method=H1Estimator(segment=0.5)))
-    assert len(said) == 1 and "Use Periodic(period=0.5)" in said[0]
+    assert len(said) == 1 and "Use identification.Periodic(period=0.5)" in said[0]
     whole = H1Estimator(segment=0.5, window="boxcar")
     for method in (Periodic(period=0.5), whole):
         assert not said_of(lambda m=method: estimate_frf(x, x + noise, 1000.0, method=m))[1]

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, IntArray
-from ..errors import SolverError
+from ..errors import SolverError, attempted
 from ..tolerances import RANK, TINY
 from .model_error import ALIKE, mac, strength, twin
 from .pole_test import pole_price, shared, unit
@@ -121,11 +121,10 @@ def _shared(
 ) -> bool:
     """Return whether the outputs share a pole of the fit, true where there is no fit without it."""
     rest = np.delete(np.arange(fit.poles.size), place)
-    try:
+    with attempted("a fit without one of its poles", SolverError):
         less = fitted(fit.poles[rest], fit.participation[:, rest])
-    except SolverError:
-        return True
-    return shared(lines, less, fit, pole_price(lines) * unit(lines, fit))
+        return shared(lines, less, fit, pole_price(lines) * unit(lines, fit))
+    return True
 
 
 def _deviations(lines: Lines, fit: Fit) -> FloatArray:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray
-from ..errors import SolverError, warn
+from ..errors import SolverError, attempted, warn
 from ..tolerances import RANK
 from .model_error import coherence, own_cost, twin
 from .refine import Fit, Lines, refined
@@ -188,9 +188,10 @@ def _accepted(lines: Lines, fit: Fit, trial: Trial, steps: int) -> tuple[Lines, 
         return None
     below = fit.cost - trial.least
     start = trial.poles, trial.participation
-    try:
+    more = None
+    with attempted(f"a fit with {trial.poles.size} poles", SolverError):
         more = refined(trial.lines, *start, steps=steps, strict=more_poles, below=below)
-    except SolverError:
+    if more is None:
         return None
     zeta, before = (-each.poles.real / np.abs(each.poles) for each in (more, fit))
     if more.cost >= below or zeta.max() >= max(BROADEST, BROADER * before.max(initial=0.0)):
@@ -226,11 +227,13 @@ def shared(lines: Lines, fit: Fit, more: Fit, least: float) -> bool:
 
 def _proven(fit: Fit, more: Fit, least: float) -> bool:
     """Return whether a few outputs, with poles of their own, prove the pole more already."""
-    found, gain = [], 0.0
+    found: list[Any] = []
+    gain = 0.0
     for o, own in enumerate(more.own):
-        try:
+        size = len(found)
+        with attempted(f"a fit of output {o + 1} alone", SolverError):
             found.append(fit.of_output(o, below=own.cost + least - gain))
-        except SolverError:
+        if len(found) == size:
             return True
         gain += found[-1].cost - own.cost
         if gain > least:

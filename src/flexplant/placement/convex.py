@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray
-from ..errors import SolverError
+from ..errors import SolverError, attempted
 from ..tolerances import TINY
 from .criterion import Scorer
 from .rows import Branch, ascended
@@ -115,10 +115,9 @@ class Convex(Scorer):
 
         A weight of zero has no part in the cost: a rigid-body mode might be missed.
         """
-        try:
+        with attempted("a tangent within the branch", SolverError):
             return self.tangent(0.98 * weights + 0.02 * branch.centre(weights.size))
-        except SolverError:
-            return None
+        return None
 
     def bound(self, count: int, required: Sequence[int]) -> float:
         """Return a lower bound over all choices of `count` candidates: tangent after tangent."""

@@ -12,7 +12,14 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..checks import FloatArray, Matrix, Value, checked, instance, name_list
-from ..errors import FlexplantError, LabelError, ModelError, ShapeError, SolverError, counted
+from ..errors import (
+    LabelError,
+    ModelError,
+    ShapeError,
+    SolverError,
+    attempted,
+    counted,
+)
 from ..labels import DofSet, Place
 from ..modes.attachment_vectors import places
 from ..modes.modes import Modes
@@ -344,10 +351,11 @@ def _proposal(dofs: DofSet, basis: FloatArray, labels: tuple[str, ...]) -> str:
     pool = [label for label in dofs.labels if label not in set(labels)]
     straight = [label for label in pool if ":r" not in label]
     for candidates in (straight, pool):
-        try:
+        taken = None
+        with attempted(f"a choice of {k - len(kept)} of {len(candidates)} DOFs"):
             held, free = basis[dofs.indices(kept)], basis[dofs.indices(candidates)]
             taken = PivotedQr().chosen(held, free, k - len(kept))
-        except FlexplantError:
+        if taken is None:
             continue
         fresh = [candidates[i] for i in taken]
         values = la.svdvals(basis[dofs.indices([*kept, *fresh])])

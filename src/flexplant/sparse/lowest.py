@@ -69,11 +69,10 @@ def multifrontal_inertia(
 
 def signed_factor(matrix: Any, dissection: Dissection) -> SignedFactor | None:
     """Return a factor in single precision that counts; None where rounding may change a sign."""
-    try:
+    with attempted("a factor in single precision", SolverError):
         factor = SignedFactor(matrix, dissection)
-    except SolverError:
-        return None
-    return factor if factor.error_radius(matrix) < _RADIUS else None
+        return factor if factor.error_radius(matrix) < _RADIUS else None
+    return None
 
 
 class SignedFactor:
@@ -425,9 +424,8 @@ def _count_below(
     if not positive.size:
         return None
     shifted = sp.csc_array(K - 0.5 * positive[0] * M)
-    try:
+    with attempted("a count of the eigenvalues below the first positive one", SolverError):
         if order is not None:
             return multifrontal_inertia(shifted, order)
         return negative_pivots(symmetric_lu(shifted))
-    except SolverError:
-        return None
+    return None

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..checks import FloatArray
-from ..errors import SolverError
+from ..errors import SolverError, attempted
 from ..labels import DofSet
 from ..sparse.lowest import Lowest, lowest_modes
 from .rigid import force_free
@@ -100,11 +100,10 @@ def endangered(K: Any, M: Any, digits: int) -> str | None:
     """Return what to say when the digits of K endanger the first elastic eigenvalue."""
     if digits >= _ALL_DIGITS:
         return None
-    try:
+    with attempted("the check of the digits of K by its lowest modes", SolverError):
         found = lowest_modes(K, M, 8, rounding=10.0**-digits)
-    except SolverError:
-        return None
-    return verdict(loss(found, digits), digits)
+        return verdict(loss(found, digits), digits)
+    return None
 
 
 def verdict(error: float | None, digits: int) -> str | None:

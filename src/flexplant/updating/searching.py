@@ -8,7 +8,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 
 from ..checks import FloatArray, Rng, generator, real_array, whole
-from ..errors import FlexplantError, LabelError, ModelError, ShapeError, SolverError
+from ..errors import FlexplantError, LabelError, ModelError, ShapeError, SolverError, attempted
 from ..tolerances import TINY, divisor
 from .judgement.goodness import chance, chi_square, is_bad
 from .parameters.added import PointParameter
@@ -51,7 +51,7 @@ def _approach(
         family=objective.family,
     )
     trail, near = Trail(), max(tolerance, ENOUGH)
-    try:
+    with attempted("poles first, before shapes and responses"):
         found = TrustRegion().search(stage, begin, most=most, tolerance=near)
         path = [begin, *found.trail.p[1:]]
         # the modes are numbered at the start, and followed from there
@@ -59,10 +59,9 @@ def _approach(
         for p in path:
             objective.at(p, refer=True)
             trail.add(objective, p, 1.0 if trail.p else 0.0)
-    except FlexplantError:
-        return None
-    objective.path = path[:-1]
-    return trail if len(path) > 1 else None
+        objective.path = path[:-1]
+        return trail if len(path) > 1 else None
+    return None
 
 
 def _easier(residuals: Sequence[Residual]) -> list[Residual] | None:

@@ -20,7 +20,7 @@ from ..checks import (
     whole,
     with_deviation,
 )
-from ..errors import ModelError, counted, require_known, warn
+from ..errors import ModelError, attempted, counted, require_known, warn
 from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
 from ..modes.normal_form import RIGID_DRAG
@@ -560,9 +560,10 @@ def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
     D = changes["D"]
     if D is None or not model.rigid_body.shape[1]:
         return None
-    try:
+    held = None
+    with attempted("the updated model without its damping", ModelError):
         held = model.replace(M=changes["M"], K=changes["K"], D=None)
-    except ModelError:
+    if held is None:
         return None
     rigid = held.rigid_body
     drag = float(np.abs(np.linalg.eigvalsh(rigid.T @ np.asarray(D @ rigid))).max())

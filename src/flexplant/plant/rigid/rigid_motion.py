@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...checks import FloatArray, IntArray
-from ...errors import AssumptionError, FlexplantError, require_known
+from ...errors import AssumptionError, attempted, require_known
 from ...structure.definite import signed_root
 from ..partition import Partition
 from ..realisation import ModalRealisation
@@ -70,10 +70,9 @@ def rigid_modes(realisation: ModalRealisation, body: RigidBody | None) -> RigidM
 
 def body_of(realisation: ModalRealisation) -> RigidBody | None:
     """Return the rigid body; None of a structure that is held or has no geometry."""
-    try:
+    with attempted("the rigid body of the modes"):  # no such motion but modes at 0 Hz
         return rigid_body_of(realisation)
-    except FlexplantError:  # no rigid-body motion but modes at 0 Hz
-        return None
+    return None
 
 
 def rigid_modes_of(plant: Partition) -> RigidModes:

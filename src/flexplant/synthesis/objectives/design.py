@@ -10,10 +10,10 @@ import numpy as np
 from ...checks import positive, short, whole
 from ...errors import (
     CertificateError,
-    FlexplantError,
     InfeasibleError,
     ModelError,
     SolverError,
+    attempted,
 )
 from ...lti.equations import mean_speed, state_scale
 from ...lti.interconnection import lft
@@ -283,9 +283,10 @@ def require_reachable(plant: StandardPlant, subject_to: Sequence[Any]) -> None:
         alone = StandardPlant.from_statespace(
             plant.system.select([*z, *plant.y], [*w, *plant.u]), u=plant.u, y=plant.y
         )
-        try:
+        best = None
+        with attempted(f"the best controller for {spec!r} alone"):
             best = design_h2(alone) if isinstance(spec, H2) else design_hinf(alone, Riccati())
-        except FlexplantError:
+        if best is None:
             continue
         gamma = float(best.gamma or 0.0)
         # a singular H2 problem has an infimum, which noise and effort added miss by a few per cent

@@ -8,7 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...checks import FloatArray
-from ...errors import AssumptionError, CertificateError, FlexplantError, SolverError, counted
+from ...errors import (
+    AssumptionError,
+    CertificateError,
+    SolverError,
+    attempted,
+    counted,
+)
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import lft
 from ...lti.preparation import prepared
@@ -58,9 +64,10 @@ def by_mode_channels(
     """
     plant = uncertain.plant
     weighted = _weighted(plant, w, z)
-    try:
+    stated = None
+    with attempted("mode by mode", AssumptionError):  # no disturbance moves them: no D to begin
         stated = mode_channels(weighted, uncertain)
-    except AssumptionError:  # no disturbance moves them: nothing says how D begins
+    if stated is None:
         return None
     best: _Step | None = None
     found: list[float] = []
@@ -69,9 +76,10 @@ def by_mode_channels(
     with Progress(most, "steps of D-K", progress=progress) as bar:
         for number in range(most):
             bar.advance(int(number > 0))
-            try:
+            step = None
+            with attempted(f"step {number + 1} of the D-K iteration"):
                 step = _step(weighted, channels, level, method)
-            except FlexplantError:
+            if step is None:
                 break
             found.append(step.mu)
             settled = best is not None and step.mu > (1.0 - _SETTLED) * best.mu
