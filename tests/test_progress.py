@@ -189,6 +189,21 @@ def test_where_nobody_looks_one_line_says_how_long(monkeypatch, capsys):
     assert capsys.readouterr() == ("", "")
 
 
+def test_a_long_first_item_and_a_long_rest(monkeypatch, capsys):
+    """As soon as one is done it is said how long all take; of much, what would make it less."""
+    monkeypatch.setattr(progress, "PATIENCE", 0.05)
+    for most, more in ((20.0, ""), (0.0, r"\. Take fewer\.")):
+        monkeypatch.setattr(progress, "LONG", most)
+        with Progress(4, "machines", advice="Take fewer.") as bar:
+            time.sleep(0.2)
+            bar.advance()
+            time.sleep(0.3)
+            bar.advance()
+        said = capsys.readouterr().err.splitlines()
+        assert len(said) == 2 and said[0] == "machines: 0 s"
+        assert re.fullmatch(r"machines: 0 s, 1 of 4 done, some 1 s more" + more, said[1])
+
+
 def test_the_outermost_work_has_the_bar(monkeypatch, capsys):
     """Also for what runs in the threads of a pool; a tick counts for its own work only."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)

@@ -110,6 +110,7 @@ def mapped(
     progress: bool | None = None,
     rng: int | np.random.SeedSequence | np.random.Generator | None = None,
     description: str = "items",
+    advice: str = "",
     known: Mapping[int, Result] | None = None,
     each: Callable[[int, Result], None] | None = None,
 ) -> list[Result]:
@@ -134,7 +135,7 @@ def mapped(
             each(number, result)
         bar.advance()
 
-    with one_thread(), Progress(len(calls), description, progress=progress) as bar:
+    with one_thread(), Progress(len(calls), description, progress=progress, advice=advice) as bar:
         bar.advance(len(results))
         start = perf_counter()
         for done, (number, call) in enumerate(left):
@@ -367,6 +368,8 @@ def _started(*_functions: Any) -> None:
 PATIENCE = 2.0
 #: a bar that nothing advances is drawn anew after this long, for the time it shows [s]
 _AGAIN = 1.0
+#: with more than this left to do, advice on how to have less is worth its words [s]
+LONG = 20.0
 #: the bars that a thread is inside of
 _open = threading.local()
 
@@ -375,18 +378,25 @@ class Progress:
     """A bar for long work: after two seconds, on a terminal or in a notebook, unless forced.
 
     Elsewhere (pipes, files of a cluster) one line on the standard error says after two seconds what
-    runs, and how long it will take where that can be said; `progress=False` is silent.
+    runs, and how long it will take where that can be said; where the first of several items takes
+    longer, a second line says so when it is done. `advice` follows where more than 20 seconds are
+    left. `progress=False` is silent.
 
     Work inside of other work shows none of its own, neither here nor in the process of a pool.
     """
 
     def __init__(
-        self, total: int | None, description: str, *, progress: bool | None = None
+        self,
+        total: int | None,
+        description: str,
+        *,
+        progress: bool | None = None,
+        advice: str = "",
     ) -> None:
         self.bar: Any = None
         #: items counted
         self.done = 0
-        self.description = description
+        self.description, self.advice = description, advice
         self._over = threading.Event()
         self._forced = bool(progress)
         self._total = total
@@ -454,14 +464,24 @@ class Progress:
             wait = _AGAIN
 
     def _said(self) -> None:
-        """Say once, in a line, what runs and how long it will take."""
+        """Say what runs, and how long it will take, as soon as one item of several is done."""
         begin = monotonic()
         if self._over.wait(PATIENCE):
             return
-        spent, text = monotonic() - begin, ""
+        self._say(monotonic() - begin)
+        if self._total and not self.done:
+            while not self.done:
+                if self._over.wait(min(PATIENCE, _AGAIN)):
+                    return
+            self._say(monotonic() - begin)
+
+    def _say(self, spent: float) -> None:
+        text = ""
         if self._total and self.done:
-            left = spent * (self._total - self.done) / self.done
-            text = f", {self.done} of {self._total} done, some {max(left, 0.0):.0f} s more"
+            left = max(spent * (self._total - self.done) / self.done, 0.0)
+            text = f", {self.done} of {self._total} done, some {left:.0f} s more"
+            if left > LONG and self.advice:
+                text += f". {self.advice}"
         with suppress(OSError, ValueError):  # a closed stream
             sys.stderr.write(f"{self.description.rstrip(':')}: {spent:.0f} s{text}\n")
 

@@ -73,6 +73,7 @@ class Work:
         *,
         rng: Rng = None,
         description: str = "items",
+        advice: str = "",
         progress: bool | None = None,
         restored: Callable[[Any], Result] | None = None,
     ) -> list[Result]:
@@ -88,6 +89,7 @@ class Work:
             progress=self.progress if progress is None else progress,
             rng=rng,
             description=description,
+            advice=advice,
             known=known,
             each=lambda i, result: self._log.add(first + i, result),
         )

@@ -325,7 +325,8 @@ def _identified(
     costly = work > CHEAP
     shown = True if refine and costly and progress is None else progress
     name = f"modes, {work:.1e} operations a step" if costly else "modes"
-    with Progress(STAGES, name, progress=shown) as bar:
+    advice = "Fewer lines (band=), fewer channels or refine=False take less."
+    with Progress(STAGES, name, progress=shown, advice=advice) as bar:
         bar.advance()
         lines = lines_of(ready)
         fit, reason = _first(lines, chosen, alone), ""

@@ -48,7 +48,10 @@ class Layouts:
     ) -> FloatArray:
         """Return the scores (n,) of many choices, computed on an executor."""
         blocks = [sets[i : i + _BLOCK] for i in range(0, len(sets), _BLOCK)]
-        found = work.mapped(self.score, blocks, description=description, restored=_floats)
+        advice = "Fewer candidates, fewer starts or executor=ProcessPoolExecutor() help."
+        found = work.mapped(
+            self.score, blocks, description=description, restored=_floats, advice=advice
+        )
         return np.concatenate(found) if found else np.zeros(0)
 
     def missing(self, chosen: Sequence[int]) -> int:

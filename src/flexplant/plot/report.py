@@ -19,6 +19,7 @@ from ..loop import ClosedLoop, ErrorBudget
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import StateSpace
 from ..modes import Modes
+from ..parallel import Progress
 from ..placement import ParetoCurve, Placement, SensorMap
 from ..placement.criterion import in_words
 from ..plant import StandardPlant, decouple
@@ -426,13 +427,14 @@ def report(
     design, gallery = Design(parts), Gallery()
     runs = design.of(Response).items()
     noisy = {name: run.seed for name, run in runs if run.seed is not None}
-    found = [
-        result(design, gallery, channel),
-        loops_section(design, gallery),
-        *sections(design, gallery),
-        certificates(design),
-        _origin({**noisy, **(seeds or {})}),
-    ]
+    with Progress(0, "report"):
+        found = [
+            result(design, gallery, channel),
+            loops_section(design, gallery),
+            *sections(design, gallery),
+            certificates(design),
+            _origin({**noisy, **(seeds or {})}),
+        ]
     text = page(str(title), str(subtitle), [one for one in found if one is not None])
     with written(path) as file:
         file.write(text.encode("utf-8"))

@@ -110,7 +110,7 @@ def study(
     free = ("rng",) if isinstance(rng, np.random.Generator) else ()
     with (
         Checkpoint(checkpoint, "study", header, free) as log,
-        Progress(len(items), "machines", progress=progress) as bar,
+        Progress(len(items), "machines", progress=progress, advice=_ADVICE) as bar,
     ):
         seeds: list[Any] = [None] * len(items)
         if log.header["rng"] is not None:
@@ -123,6 +123,11 @@ def study(
             log.add(number, _kept(outcome, number))
             bar.advance()
         return tabled([log.rows[i] for i in range(len(items))])
+
+
+_ADVICE = "Fewer machines or executor=ProcessPoolExecutor() help; checkpoint= keeps the rows."
+    "Fewer machines at first, or executor=ProcessPoolExecutor(), help; checkpoint= keeps rows."
+)
 
 
 def _outcomes(
