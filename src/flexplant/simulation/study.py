@@ -126,8 +126,6 @@ def study(
 
 
 _ADVICE = "Fewer machines or executor=ProcessPoolExecutor() help; checkpoint= keeps the rows."
-    "Fewer machines at first, or executor=ProcessPoolExecutor(), help; checkpoint= keeps rows."
-)
 
 
 def _outcomes(
