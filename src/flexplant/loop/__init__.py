@@ -38,6 +38,8 @@ from .mode_tolerance import ModeTolerances as ModeTolerances
 from .report import LoopMargins as LoopMargins
 from .report import LoopReport as LoopReport
 from .report import report_loops as report_loops
+from .scheduled import ScheduledLoop as ScheduledLoop
+from .scheduled import schedule_loops as schedule_loops
 from .sensitivity import bandwidth as bandwidth
 from .sensitivity import complementary_sensitivity as complementary_sensitivity
 from .sensitivity import control_sensitivity as control_sensitivity

@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from ..checks import FloatArray, Value, real_array
 from ..errors import LabelError, ModelError, unknown_label
-from .building import rebuilt
+from .building import P, rebuilt, wired
 from .forces import Actuator, Disturbance
 from .partition import Partition
-from .ports import Poi, Ports
+from .ports import Poi, Ports, Sensor
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -79,6 +79,42 @@ def _put(port: Any, place: Any, ports: Ports) -> Any:
         return port.replace(at=place)
     new = port.replace(at=place, moves=None)
     return new.replace(moves=moves.starting(new.at, ports.values))
+
+
+def seen_elsewhere(plant: P, ports: Ports) -> P | None:
+    """Return a plant whose sensors and POIs alone are elsewhere: rows of C; None where more is."""
+    own = plant.assembled
+    sides = [(getattr(own.ports, side), getattr(ports, side)) for side in "wuzy"]
+    pairs = [pair for old, new in sides for pair in zip(old, new, strict=True)]
+    moves = [new for old, new in pairs if getattr(old, "at", None) != getattr(new, "at", None)]
+    grounds = any(np.any(port.ground) for port in ports.w)
+    if not moves or grounds or own.realisation.static_outputs.size or not all(map(_plain, moves)):
+        return None
+    rows: dict[str, FloatArray] = {}
+    for port in moves:
+        if isinstance(port, Poi):
+            seen = {port.channel(axis): port.see(own.realisation, axis) for axis in port.axes}
+        else:
+            seen = {port.name: port.see(own.realisation)}
+        rows |= {name: one.row for name, one in seen.items()}
+    outputs, names = own.physical.output_index(list(rows)), own.realisation.names
+    if np.any(own.physical.D[outputs]):
+        return None  # what follows a force at once depends on the place too
+    C = np.array(own.physical.C)
+    at = np.ix_(outputs, own.physical.states.index(names[0]) + np.arange(len(names)))
+    C[at] = np.array(list(rows.values()))
+    before = own.continuous
+    whole = None if before is None else seen_elsewhere(before, ports)
+    physical = own.physical.replace(C=C)
+    return wired(type(plant), own.replace(ports=ports, physical=physical, continuous=whole))
+
+
+def _plain(port: Any) -> bool:
+    """Return whether a port is a row of C and nothing else."""
+    if isinstance(port, Poi):
+        return True
+    is_sensor = isinstance(port, Sensor) and not port.order
+    return is_sensor and port.filter is None and not port.latency
 
 
 def along(plant: Partition, name: str, points: npt.ArrayLike) -> Along:

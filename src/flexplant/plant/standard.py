@@ -15,7 +15,7 @@ from ..labels import Place
 from ..lti.statespace import System
 from .assumptions import AssumptionReport
 from .building import continuous_plant, rebuilt, sampled
-from .moving import Along, along, moved
+from .moving import Along, along, moved, seen_elsewhere
 from .partition import Partition
 from .ports import Ports
 from .position_map import PositionMap, position_map
@@ -216,7 +216,8 @@ class StandardPlant(Partition):
         ports = self.assembled.ports
         if positions:
             ports = ports.at(positions)
-        return self.with_ports(ports if poi is None else moved(ports, poi))
+        there = ports if poi is None else moved(ports, poi)
+        return seen_elsewhere(self, there) or self.with_ports(there)
 
     def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
         """Return what the position does: decoupling, modes seen and reached, figures of one's own.

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..checks import FloatArray, real_array
 from ..errors import ModelError, require_known
-from ..loop import ClosedLoop
+from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.budget import WhiteNoise, continuous_factor, white_noise
 from ..lti.discretisation import pair_expm
 from ..plant import Actuator, Poi, StandardPlant
@@ -221,10 +220,18 @@ class MovingMachine(MovingPlant):
     abreast = _ABREAST
 
     def __init__(
-        self, loop: ClosedLoop, path: Trajectory, *, noise: bool, sensed: Acting | None = None
+        self,
+        loop: ClosedLoop,
+        path: Trajectory,
+        *,
+        noise: bool,
+        schedule: ScheduledLoop | None = None,
+        sensed: Acting | None = None,
     ) -> None:
         super().__init__(loop.plant, path, noise=noise)
-        self.loop, self.sensed = loop, sensed
+        self.loop, self.schedule, self.sensed = loop, schedule, sensed
+        if schedule is not None:
+            require_known("position that schedules", [schedule.position], path.paths)
         u = [self.plant.u.index(name) for name in loop.driven]
         self.u = len(self.plant.w) + np.array(u, dtype=np.int64)
 
@@ -256,8 +263,9 @@ class MovingMachine(MovingPlant):
             y = shown[:, nz:] + inputs @ self.D[nz:].T
             if self.sensed is not None:
                 self.sensed.apply(y)
-            both = np.hstack([self.c, y])
-            self.c, out = both @ self._law[0].T, both @ self._law[1].T
+            A, law_B, law_C, law_D = self.law_at(self.first + i)
+            out = self.c @ law_C.T + y @ law_D.T
+            self.c = self.c @ A.T + y @ law_B.T
             inputs[:, self.u] = out[:, :nu]
             z = shown[:, :nz] + inputs @ self.D[:nz].T
             following = x @ self.A.T + inputs @ self.B.T + state_noise[:, i]
@@ -270,11 +278,13 @@ class MovingMachine(MovingPlant):
         self.first += k
         return bool(np.all(np.isfinite(self.x)))
 
-    @cached_property
-    def _law(self) -> tuple[FloatArray, FloatArray]:
-        """The controller over its states and y."""
-        law = self.loop.controller
-        return np.hstack([law.A, law.B]), np.hstack([law.C, law.D])
+    def law_at(self, k: int) -> tuple[FloatArray, ...]:
+        """Return A, B, C and D of the controller in a sample."""
+        if self.schedule is None:
+            law = self.loop.controller
+            return law.A, law.B, law.C, law.D
+        at = self.path.at(np.array([k * float(self.plant.dt)]))
+        return self.schedule.matrices(float(at[self.schedule.position][0]))
 
     @staticmethod
     def _held(place: tuple[bool, int], x: FloatArray, inputs: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..checks import FloatArray, Value, flag, instance, positive, real_array, sizes_of
 from ..errors import AssumptionError, ModelError, require_known
-from ..loop import ClosedLoop
+from ..loop import ClosedLoop, ScheduledLoop
 from ..lti.lyapunov import solve_stein
 from ..parallel import one_thread
 from .moving_machine import MovingMachine, Sample, trajectory
@@ -70,17 +70,21 @@ class RmsAlong(Value):
 
 @one_thread()
 def rms_along(
-    loop: ClosedLoop, *, moving: Mapping[str, Any], duration: float, repeats: bool = False
+    loop: ClosedLoop | ScheduledLoop,
+    *,
+    moving: Mapping[str, Any],
+    duration: float,
+    repeats: bool = False,
 ) -> RmsAlong:
     """Return the standard deviation of every channel of a loop whose machine moves.
 
     ``P[k + 1] = A[k] P[k] A[k]' + G[k] G[k]'`` of plant and controller together, with the matrices
     of each sample of the moving machine: what the white noises of the plant cause, exactly. The
-    controller stays as it was designed, observer included.
+    controller stays as it was designed, observer included, or follows its schedule.
 
     Parameters
     ----------
-    loop : ClosedLoop
+    loop : ClosedLoop or ScheduledLoop
         Around a sampled plant with positions.
     moving : mapping {position: path}
         As for `simulate`: SetPoints, functions of time, or a value for each sample.
@@ -133,6 +137,8 @@ def rms_along(
     >>> found["die:error"].shape
     (500,)
     """
+    schedule = loop if isinstance(loop, ScheduledLoop) else None
+    loop = loop.standing if isinstance(loop, ScheduledLoop) else loop
     plant = instance(loop, ClosedLoop, "loop", "Pass close_loop(plant, *blocks).").plant
     if not plant.dt or not plant.is_assembled or not plant.assembled.ports.positions:
         raise ModelError(
@@ -141,10 +147,13 @@ def rms_along(
         )
     steps = round(positive(duration, "duration") / plant.dt)
     time = np.arange(steps) * float(plant.dt)
-    machine = MovingMachine(loop, trajectory(plant, moving, time), noise=True)
+    path = trajectory(plant, moving, time)
+    machine = MovingMachine(loop, path, noise=True, schedule=schedule)
     P = _periodic(machine, steps) if flag(repeats, "repeats") else _standing(machine)
     rms = np.zeros((len(plant.z) + len(plant.y) + len(loop.controller.outputs), steps))
-    for k, (A, G, C, D) in enumerate(map(_Closed(machine), machine.each(steps))):
+    closed = _Closed(machine)
+    for k, sample in enumerate(machine.each(steps)):
+        A, G, C, D = closed(k, sample)
         rms[:, k] = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", C, P, C) + np.sum(D**2, axis=1), 0))
         P = A @ P @ A.T + G @ G.T
     names = (*plant.z, *plant.y, *loop.driven, *loop.watched)
@@ -159,9 +168,10 @@ class _Closed:
         plant = machine.plant
         self.nw, self.nz = len(plant.w), len(plant.z)
 
-    def __call__(self, sample: Sample) -> tuple[FloatArray, ...]:
-        """Return A, G, C and D of a sample."""
-        m, law, nz = self.machine, self.machine.loop.controller, self.nz
+    def __call__(self, k: int, sample: Sample) -> tuple[FloatArray, ...]:
+        """Return A, G, C and D of sample k."""
+        m, nz = self.machine, self.nz
+        law_A, law_B, law_C, law_D = m.law_at(k)
         nu = len(m.loop.driven)
         u, columns = m.u, m.noise.columns
         sized = np.zeros((self.nw, columns.size))
@@ -169,26 +179,26 @@ class _Closed:
         W = np.vstack([sized, np.zeros((sample.B.shape[1] - self.nw, columns.size))])
         C2, D2 = sample.C[nz:], m.D[nz:] @ W
         # commands and what is watched, over x, c and the noises of sensors
-        seen = law.D @ C2, law.C, law.D @ D2
+        seen = law_D @ C2, law_C, law_D @ D2
         B_u, D_u = sample.B[:, u], m.D[:nz][:, u]
         command = [part[:nu] for part in seen]
         A = np.block(
             [
                 [sample.A + B_u @ command[0], B_u @ command[1]],
-                [law.B @ C2, law.A],
+                [law_B @ C2, law_A],
             ]
         )
         r = sample.G.shape[1]
         G = np.block(
             [
                 [sample.G, sample.B @ W + B_u @ command[2]],
-                [np.zeros((law.n_states, r)), law.B @ D2],
+                [np.zeros((len(law_A), r)), law_B @ D2],
             ]
         )
         C = np.block(
             [
                 [sample.C[:nz] + D_u @ command[0], D_u @ command[1]],
-                [C2, np.zeros((len(C2), law.n_states))],
+                [C2, np.zeros((len(C2), len(law_A)))],
                 [seen[0], seen[1]],
             ]
         )
@@ -198,7 +208,7 @@ class _Closed:
 
 def _standing(machine: MovingMachine) -> FloatArray:
     """Return the covariance of the loop that has stood where it is for a long time."""
-    A, G, _, _ = _Closed(machine)(next(machine.each(1)))
+    A, G, _, _ = _Closed(machine)(0, next(machine.each(1)))
     if np.abs(np.linalg.eigvals(A)).max(initial=0.0) >= 1.0:
         raise AssumptionError(
             "the loop is not stable where the trajectory begins: it has no variance there. Design "
@@ -211,7 +221,9 @@ def _periodic(machine: MovingMachine, steps: int) -> FloatArray:
     """Return the covariance at the beginning of a trajectory that repeats for ever."""
     Phi = np.eye(machine.plant.system.n_states + machine.loop.controller.n_states)
     P = np.zeros_like(Phi)
-    for A, G, _, _ in map(_Closed(machine), machine.each(steps)):
+    closed = _Closed(machine)
+    for k, sample in enumerate(machine.each(steps)):
+        A, G, _, _ = closed(k, sample)
         Phi, P = A @ Phi, A @ P @ A.T + G @ G.T
     radius = float(np.abs(np.linalg.eigvals(Phi)).max(initial=0.0))
     if radius >= 1.0:

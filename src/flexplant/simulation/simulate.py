@@ -20,7 +20,7 @@ from ..checks import (
     whole,
 )
 from ..errors import AssumptionError, LabelError, ModelError, require_known, warn
-from ..loop import ClosedLoop
+from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.blocks import DERIVATIVES, references
 from ..loop.budget import white_noise
 from ..parallel import Progress, one_thread
@@ -37,7 +37,7 @@ Signal: TypeAlias = "SetPoint | npt.ArrayLike | Callable[[FloatArray], npt.Array
 
 
 def simulate(
-    loop: ClosedLoop,
+    loop: ClosedLoop | ScheduledLoop,
     *,
     duration: float,
     reference: Signal | Mapping[str, Signal] | None = None,
@@ -61,7 +61,7 @@ def simulate(
 
     Parameters
     ----------
-    loop : ClosedLoop
+    loop : ClosedLoop or ScheduledLoop
         Around a sampled plant. An unstable one is run all the same, with a warning that names
         its spectral radius and by how much it grows in the run.
     duration : float [s]
@@ -131,6 +131,8 @@ def simulate(
     >>> simulate(close_loop(plant, law), reference=1.0, duration=0.5)["e"]
     array([1.    , 0.5   , 0.25  , 0.125 , 0.0625])
     """
+    schedule = loop if isinstance(loop, ScheduledLoop) else None
+    loop = loop.standing if isinstance(loop, ScheduledLoop) else loop
     instance(loop, ClosedLoop, "loop", "Pass close_loop(plant, *blocks).")
     _check_sampled(loop)
     closed, loop = loop, finer_loop(loop, finer)
@@ -170,7 +172,7 @@ def simulate(
                     "where positions move. Leave it out, or let the machine stand."
                 )
             sensed = Acting(plant.y, met.on_y, float(plant.dt)) if met.on_y else None
-            runner = MovingMachine(loop, path, noise=noise, sensed=sensed)
+            runner = MovingMachine(loop, path, noise=noise, schedule=schedule, sensed=sensed)
         else:
             runner = make_runner(loop, white, given.reshape(-1, len(plant.w)), grows=grows, met=met)
         groups = [slice(i, i + runner.abreast) for i in range(0, len(numbers), runner.abreast)]

@@ -14,7 +14,7 @@ from ..errors import ModelError, unknown_label
 from ..estimation import design_static
 from ..identification import MeasuredModes
 from ..identification.periodic import frf_of_periods, line_spectra, offsets
-from ..loop import ClosedLoop, close_loop
+from ..loop import ClosedLoop, ScheduledLoop, close_loop
 from ..lti.frequency import Frf
 from ..plant import Disturbance, GroundSpring, Poi, Ports, StandardPlant, assemble_plant, suspend
 from ..plant.realisation import ModalRealisation, realised
@@ -296,6 +296,18 @@ class WaferStage(Value):
         """
         return close_loop(self._plant(ports), *blocks)
 
+    def scheduled(self, ports: Ports, schedule: ScheduledLoop) -> ScheduledLoop:
+        """Return the machine's own loops with controllers that follow its position.
+
+        Parameters
+        ----------
+        ports : Ports
+            Its channels, with positions.
+        schedule : ScheduledLoop
+            Of a model: its controllers run on the machine.
+        """
+        return schedule.around(self._plant(ports))
+
     def run(
         self,
         ports: Ports,
@@ -312,7 +324,7 @@ class WaferStage(Value):
         ----------
         ports : Ports
             Its channels, with the noise that acts.
-        *blocks : StateSpace, KalmanEstimator or Controller
+        *blocks : StateSpace, KalmanEstimator or Controller; or one ScheduledLoop
             What runs on it.
         duration : float [s]
             Length of the run.
@@ -325,9 +337,10 @@ class WaferStage(Value):
         moving : mapping {position: path}, optional
             How it moves, for ports that do.
         """
-        loop = self.loop(ports, *blocks)
+        schedule = blocks[0] if blocks and isinstance(blocks[0], ScheduledLoop) else None
+        own = self.loop(ports, *blocks) if schedule is None else self.scheduled(ports, schedule)
         return simulate(
-            loop,
+            own,
             reference=reference,
             duration=duration,
             rng=rng,
