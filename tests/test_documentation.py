@@ -29,7 +29,7 @@ def test_links_that_lead_nowhere_are_found(tmp_path):
 
 
 def test_every_room_has_a_page():
-    assert set(rooms()) == ROOMS | {"bibliography"}
+    assert set(rooms()) == ROOMS | {"bibliography", "algorithms"}
 
 
 def test_what_pdoc_does_not_read_is_put_in_its_words():
@@ -66,7 +66,11 @@ def test_the_site(tmp_path):
     assert "links that lead somewhere" in answer.stdout
     for name in rooms():
         page = (tmp_path / "flexplant" / f"{name}.html").read_text(encoding="utf-8")
-        shown = {n for n in dir(getattr(flexplant, name)) if name not in ("errors", "bibliography")}
+        shown = {
+            n
+            for n in dir(getattr(flexplant, name))
+            if name not in ("errors", "bibliography", "algorithms")
+        }
         assert not {n for n in shown if f'id="{n}"' not in page}
         assert "_public_names" not in page
     for path in (ROOT / "examples").glob("*.py"):

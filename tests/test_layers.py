@@ -15,7 +15,7 @@ ROOMS = (
     (
         *("errors", "rooms", "checks", "store", "certificates", "versions", "parallel"),
         *("tolerances", "fingerprint", "work", "dof_columns", "labels", "bibliography"),
-        "foreign_names",
+        *("foreign_names", "algorithms"),
     ),
     "lti",
     "sparse",

@@ -1,6 +1,7 @@
 """Every public name says what it does, what it takes and what it raises."""
 
 import ast
+import dataclasses
 import inspect
 import re
 from pathlib import Path
@@ -9,6 +10,7 @@ from types import ModuleType
 import pytest
 
 import flexplant
+from flexplant import algorithms
 from flexplant.documentation import rooms
 from flexplant.errors import FlexplantError
 
@@ -220,3 +222,22 @@ def test_names_in_advice_are_at_the_front_or_have_their_room():
                 found = set(re.findall(r"(?<![\w.'])([A-Za-z_]\w+)\(", advice)) & hidden
                 bare += [f"{path.name}:{node.lineno}: {homes[n]}.{n}" for n in sorted(found)]
     assert not bare
+
+
+@pytest.mark.parametrize(
+    "verb", ["identify_modes", "localise", "update", "design_hinf", "tune_loops"]
+)
+def test_the_first_lines_let_one_use_it(verb):
+    """A call and what it gives back, in at most a dozen lines; how it works is on a page."""
+    said = inspect.getdoc(getattr(flexplant, verb))
+    opening = said[: said.index("\nParameters\n")]
+    assert len(opening.splitlines()) <= 12
+    assert f"fx.{verb}(" in opening and "`algorithms`" in opening
+    assert f"**{verb}.**" in algorithms.__doc__
+    # names of the answer that are promised are there
+    call = re.search(rf"``(\w+) = fx\.{verb}\(", " ".join(opening.split()))
+    answer = inspect.signature(getattr(flexplant, verb)).return_annotation
+    kinds = {n: item for room in rooms().values() for n, item in vars(room).items()}
+    fields = {field.name for field in dataclasses.fields(kinds[answer])} | set(dir(kinds[answer]))
+    for name in re.findall(rf"`{call[1]}\.(\w+)", opening):
+        assert name in fields, name

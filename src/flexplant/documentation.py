@@ -25,7 +25,7 @@ from .errors import CertificateError, FlexplantError, SolverError, counted
 _ROOT = Path(__file__).parents[2]
 _EXAMPLES = _ROOT / "examples"
 #: pages that are no rooms; only sources and what can be raised are read there
-_MORE = ("bibliography", "errors")
+_MORE = ("bibliography", "errors", "algorithms")
 _COLON = "\ue000"  # stands for a colon that pdoc would take for the one before the type
 
 _PAGE = """{% extends "default/module.html.jinja2" %}

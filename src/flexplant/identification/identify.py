@@ -145,34 +145,16 @@ def identify_modes(
     max_iterations: int = 150,
     progress: bool | None = None,
 ) -> IdentifiedModes:
-    r"""Return poles, mode shapes and their covariance from measured FRFs.
+    """Return poles, mode shapes and their covariance from measured FRFs.
 
-    The poles that stay over the orders of a stabilisation diagram are the first answer, with the
-    shapes and residual terms of least squares. They start a maximum likelihood fit (`refine`) of
-
-    .. math:: H(s) = \sum_k \frac{\psi_k l_k^T}{s - \lambda_k} +
-        \frac{\bar\psi_k \bar l_k^T}{s - \bar\lambda_k}
-        + \sum_{p=1}^{lower} \frac{E_{-p}}{s^p} + \sum_{p=0}^{upper-1} E_p s^p
-
-    with residues of rank one, so that close and repeated modes are distinguished by several inputs
-    and outputs. Rigid-body modes and modes below the band are in 1/s and 1/s^2, those above in
-    the powers of s. Chosen poles that noise alone would produce once in 1000 times are left out;
-    where more than noise is left a pole is added. With `start` neither is done. What then is
-    still not explained is warned of, with its frequency. A pole with another at the same place
-    (repeated, or too close for the diagram) is taken apart where that lowers chi-square by more
-    than noise does.
-
-    Measurements that no linear machine explains: a pole is added only for what the outputs share,
-    beyond poles of their own at each of them, and misfit that is correlated over neighbouring lines
-    counts as so much less. Of two poles within a bandwidth with the same shape and participation
-    one remains. Where outputs disagree on the poles (a roving sensor), they are warned of: poles
-    are then means of each output's own, with the deviations of random effects. Poles whose
-    deviation of frequency or damping exceeds it, mains multiples narrower than half a line and
-    poles at the edge of the band are not reported, but listed with the reason in `rejected`.
-
-    Lines of Hann-windowed segments show a resonance widened by the window: where that explains them
-    better (H1 of random excitation), each term ``1/(s - lambda)`` is fitted as such lines show it,
-    so that damping is that of the machine down to resonances of half a line.
+    Give the FRF and the band that holds the modes: ``found = fx.identify_modes(frf, band=(50.0,
+    800.0), dofs={"y1": "41:z"})``. `found.freq` [Hz], `found.zeta` and `found.shapes` are the
+    answer, `found.rejected` says which poles were left out and why, and `fx.plot.identified`
+    draws it beside the measurement. ``fx.Eigenvalues(fx.numbered(found, drawing))`` is what
+    `update` takes. Modes outside the band are accounted for. Poles come from a stabilisation
+    diagram and a maximum likelihood fit, without choices to make; `start=` takes poles picked by
+    eye (`fx.plot.PolePicker`), `refine=False` takes a second. What the fit does not explain is
+    warned of, with its frequency. How it works: `algorithms`.
 
     Parameters
     ----------

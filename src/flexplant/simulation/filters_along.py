@@ -195,7 +195,7 @@ class _Filters:
         if not plant.dt or not plant.is_assembled or not plant.assembled.ports.positions:
             raise ModelError(
                 "filters along a trajectory need a sampled plant whose ports move: Ports(..., "
-                "positions=[Position('x', range=...)]) and plant.discretized(rate)."
+                "positions=[fx.plant.Position('x', range=...)]) and plant.discretized(rate)."
             )
         self.plant = plant
         self.steps = round(positive(duration, "duration") / plant.dt)

@@ -49,21 +49,14 @@ def update(
 ) -> UpdateResult:
     """Find the parameters with which the model reproduces the measurement.
 
-    With eigenvalues alone, without bounds and priors: the paper's (13) and (14), Gauss-Newton with
-    real unknowns in complex equations::
-
-        Re[S^H W S] dp = Re[S^H W d lambda],    p <- p + dp
-
-    Otherwise ``1/2 |r(p)|^2 + 1/2 |(p - mean)/std|^2``, r the whitened residuals of all kinds, in a
-    trust region within the bounds. The second term, of the parameters with a prior, takes part
-    where the noise of every residual is known (the answer is then the maximum a posteriori).
-
-    Modes are found by their number in the model at `start` and followed by shape (see
-    `flexplant.updating.point_model`), so they may swap order on the way; those with measured shapes
-    are assigned by MAC at each step. Modes that are exactly
-    repeated there are first turned to the vectors in which the step splits them, the lower mode
-    number going to the lower frequency. Steps are shortened while M or K would become indefinite,
-    a measured mode would cease to oscillate, or the error (12) would grow.
+    Give the model, what may differ and what was measured: ``fit = fx.update(drawing,
+    [fx.AddedMass("3:x")], [fx.Eigenvalues(found)])``. `fit.values`, `fit.std` and
+    `fit.parameters` are the answer, `fit.model` the updated model for `assemble_plant`,
+    `fit.applied_to(full)` the full one, and `fx.plot.update` draws all of it. Start with poles
+    (`Eigenvalues`), then add `ModeShapes` or `FrfResidual`. Parameters with bounds or a prior
+    keep to them; which ones the data determine, `identifiability` says, and where to look first,
+    `localise`. Modes are followed by number and shape, so they may swap order. How it works:
+    `algorithms`.
 
     Parameters
     ----------

@@ -66,9 +66,12 @@ def design_hinf(
 ) -> Controller:
     """Return a controller ``u = K y`` that keeps the H-infinity norm of w -> z small.
 
-    The plant is prepared (scaled, balanced; a sampled one is mapped to continuous time with its
-    norms kept), solved by the method, and the controller is brought back to the user's channels
-    and units. It is then judged by its own closed loop: stability, and the norm by two routes.
+    Weights say what small is. For a stage they follow from a bandwidth: ``weights =
+    fx.stage_weights(plant, 60.0)``, then ``K = fx.design_hinf(plant.weighted(z=weights.z,
+    w=weights.w))``; below a `K.gamma` of 1 all that they ask for holds. (`design_stage` does both
+    and searches the bandwidth.) `mixed_sensitivity` builds a plant from weights of S, KS and T.
+    The controller is judged by its own closed loop, on the user's channels: stability, and the
+    norm by two routes; ``fx.close_loop(plant, K)`` closes it. How it works: `algorithms`.
 
     Parameters
     ----------

@@ -45,25 +45,13 @@ def tune_loops(
 ) -> DesignedLoops:
     """Return the laws of highest bandwidth that keep |S| below a peak, all axes together.
 
-    Each axis gets ``k (1 + w_i / s) (1 + a s / w_b) / (1 + s / (b w_b)) F(s)`` with a low-pass and
-    notches in F. w_b, where the loop of the rigid body alone crosses 1, is made as large as
-    ``|1 + L| >= 1 / peak`` allows, beyond resonances too; a, b, the corner of the low-pass and
-    frequency, depth and width of the notches are found on the way, from many starts: the best of
-    them, without proof that no other law does better. w_i is w_b / 10, no zero lies below it, no
-    corner above 0.45 of the rate or the last line.
-
-    Where the laws found for each axis alone do not hold the peak together, those of all axes are
-    changed together until they do, for the highest geometric mean of their bandwidths: |S| of each
-    axis with the others closed, and the largest singular value of S at u and of S at y, where the
-    channels of a side have one unit; with the modes left out too, where these are known. Laws that
-    come closest to the peak are returned with a warning that says what ended the search.
-
-    No model is needed: the plant may be an Frf. A line is taken to lie anywhere within two standard
-    deviations, by its variance, else its coherence (averages by `freedom`; unless given as if of
-    two), else by how lines scatter. Where a resonance turns between two lines, the circle through
-    its neighbours is followed; where lines do not resolve it, the loop gain has to be small there.
-    Peaks that fall between two lines unseen are not known: the lines have to be closer than a
-    mode is wide. Above the last line the plant is unknown, and the loop gain there at most 0.1.
+    Give a plant or a measured FRF: ``design = fx.tune_loops(frf, rate=10e3)``. `design.laws`
+    holds a law of each axis (PID, low-pass and notches), `design.report` its margins,
+    `design.system` is what `close_loop` takes and `write_c` exports. With several axes
+    ``before=`` and ``after=`` decouple them, as `decouple` finds. Lines that do not resolve a
+    resonance, and their variance, are on the safe side: the loop gain is kept small there. The
+    best of many starts is returned, without proof that no other law does better, and with a
+    warning where the peak is not kept. How: `algorithms`.
 
     Parameters
     ----------

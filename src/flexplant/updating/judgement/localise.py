@@ -39,24 +39,13 @@ def localise(
 ) -> Localisation:
     """Find which of many candidate changes explains a measurement.
 
-    All candidates are screened together, each alone, by linearisation (one rank-one change each,
-    in one product); the best `screen` of them are fitted. Then subsets of up to `most`
-    candidates grow: all candidates are screened again on what the best subsets leave, all pairs
-    to first order, and members are exchanged while that helps; a candidate that explains, to first
-    order, less than a quarter of what would lower the criterion does not join. Where modes are
-    compared and candidates are of low rank (masses, springs, dampers), each fit is made in few
-    coordinates, the modes of the band and how the others follow the candidate's force, with its
-    error corrected to second order; the chosen subset is fitted again in all. The least extended
-    Bayesian
-    information criterion ``chi^2 + k ln n + 2 ln C(c, k)`` (``n ln(e/n)`` for ``chi^2`` where the
-    noise is not known) chooses; its last term counts in how many ways k of c places can be chosen,
-    so that c places without a change name none. To find what stands out, give more data than
-    `most` unknowns.
-
-    What is wrong everywhere (Young's modulus, damping) hides what is wrong in one place: as
-    `nuisance` it is fitted anew with every candidate and with none at all, so that a candidate is
-    scored by what only it explains: ``(J_c^T r)^2 / (J_c^T J_c)`` with r and J_c free of what the
-    nuisance explains, before the exact fits.
+    Arguments are as for `update`: ``found = fx.localise(drawing, candidates, residuals)``, with a
+    candidate for every place, ``[fx.AddedMass(at) for at in drawing.dofs.labels]`` say.
+    `found.chosen` names up to `most` of them, `found.ranking` all by what each explains alone,
+    `found.alike` those that the sensors cannot distinguish: pass the candidates of these names to
+    `update`. Where nothing is wrong it names none. What is wrong everywhere (Young's modulus,
+    damping) goes into `nuisance`. To find what stands out, give more data than `most` unknowns.
+    How it works: `algorithms`.
 
     Parameters
     ----------
