@@ -30,7 +30,8 @@
 
 Seen from above, sensors are black crosses, actuators triangles, POIs circles. Axes carry SI units
 with the prefix that brings the largest value to 1 .. 1000 (mm, ms, nm, g); what is drawn into them
-later keeps it. Frequencies are in Hz, gains in dB with what 0 dB is.
+later keeps it. Frequencies are in Hz, gains in dB with what 0 dB is. Of more than four lines that
+would hide each other each has a panel; more than six in one are named at their ends.
 
 Names elsewhere: ``bode``, ``sigma``, ``nyquist``, ``pzmap``, ``step`` of MATLAB: `bode`,
 `singular_values`, `nyquist`, `pole_map`, `step`.
