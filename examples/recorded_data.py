@@ -5,6 +5,11 @@ Run it: ``python examples/recorded_data.py``, or with a CSV file of your own who
 virtual stage whose amplifiers are three times noisier than their data sheet says, and loses 0.1 s
 of one sensor. A filter made with the data sheet states errors that are too small; the record shows
 it, and gives the densities with which they are right.
+
+Machine and model are one mesh here on purpose: only then are the densities of the record those that
+it was made with. On a machine with all its modes (`fx.testbeds.wafer_stage`, all poles below half
+the rate in the model) modes above that fold into the record: the verdict names them, and the
+sensors' densities come out four times too large, since they stand for these modes.
 """
 
 # %% Names and numbers

@@ -49,11 +49,11 @@ def meshed(size, thickness, elements, stiffer=0.0):
     )
 
 
-def models(machine, size, thickness, elements, seed):
+def models(machine, size, thickness, elements, seed, zeta=ZETA):
     """The calibrated model, the one with the modes left out, and what is not known."""
     drawing = meshed(size, thickness, elements)
     place = (size[0] / 2, size[1] / 4, 0.0)
-    at, low = drawing.dofs.nearest(place, "z"), fx.ModalDamping(ZETA)
+    at, low = drawing.dofs.nearest(place, "z"), fx.ModalDamping(zeta)
     modes = fx.solve_modes(drawing, count=24, damping=low, compliance_at=[at])
     rom = fx.reduce(modes, fx.DesiredDofs(fx.select_dofs(modes, 25, required=[at]).labels))
     poles = machine.poles(range(4, 14), deviation=1e-5, rng=seed)

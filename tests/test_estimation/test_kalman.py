@@ -1,4 +1,8 @@
-"""The Kalman filter of the POI on the paper's plate: prediction, closed form, a run, refusals."""
+"""The Kalman filter of the POI on the paper's plate: prediction, closed form, a run, refusals.
+
+Machine and model are one mesh: the filter of a given plant is exact algebra. Other machines are in
+`test_unseen_machines_benchmarks`.
+"""
 
 import pickle
 from functools import cache

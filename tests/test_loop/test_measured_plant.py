@@ -1,4 +1,7 @@
-"""Loop quantities of a measured plant: the controller is closed on the FRF first."""
+"""Loop quantities of a measured plant: the controller is closed on the FRF first.
+
+Model and machine are one mesh: the exact response of the machine is the oracle of what is measured.
+"""
 
 from functools import cache
 

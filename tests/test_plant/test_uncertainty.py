@@ -1,4 +1,8 @@
-"""Uncertain plants against modal sums, dense eigenvalues and Monte-Carlo error."""
+"""Uncertain plants against modal sums, dense eigenvalues and Monte-Carlo error.
+
+Poles of the same mesh: the algebra of a given uncertainty. Whether it contains other machines is in
+`test_discrepancy`.
+"""
 
 from functools import cache
 

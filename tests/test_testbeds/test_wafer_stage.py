@@ -1,7 +1,8 @@
 """The virtual machine: what it answers, against dense oracles; designs see nothing but answers.
 
 Machine and loops of the oracles come from oracles_plant: M, D, K by Gauss points, exponentials,
-noise by doubling, loops closed by hand, scipy.linalg.solve_discrete_lyapunov.
+noise by doubling, loops closed by hand, scipy.linalg.solve_discrete_lyapunov. They are of the mesh
+(8, 8), of which the machine asked for is one; another formulation: test_another_formulation.
 """
 
 from functools import cache

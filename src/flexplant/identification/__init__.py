@@ -8,7 +8,7 @@
   `identify_output_only` where forces are unknown; `impact_frf` of hammer tests.
 
 >>> import flexplant as fx
->>> machine = fx.testbeds.wafer_stage(elements=(8, 8))
+>>> machine = fx.testbeds.wafer_stage()
 >>> ports = fx.Ports(
 ...     u=[fx.Actuator("u1", at=(0.15, 0.15, 0.0))],
 ...     y=[fx.Sensor("y1", at=(0.0, 0.0, 0.0), asd=1e-12)],
@@ -17,7 +17,7 @@
 >>> frf = fx.frequency_response(plant.Gyu, [200.0 + 0.5 * i for i in range(600)])
 >>> found = fx.identify_modes(frf)
 >>> print(found)
-<IdentifiedModes: 3 poles at 245.8, 357.7, 459.0 Hz, with covariance; refined>
+<IdentifiedModes: 3 poles at 244.7, 355.3, 455.1 Hz, with covariance; refined>
 
 Names elsewhere: ``tfestimate``, ``modalfrf``, ``modalfit`` (MATLAB), PolyMAX (Simcenter),
 sdypy-EMA, vector fitting (scikit-rf). Files: `fx.io.read_frf_uff`, `fx.io.read_frf_csv`.
