@@ -9,7 +9,7 @@ it, and gives the densities with which they are right.
 Machine and model are one mesh here on purpose: only then are the densities of the record those that
 it was made with. On a machine with all its modes (`fx.testbeds.wafer_stage`, all poles below half
 the rate in the model) modes above that fold into the record: the verdict names them, and the
-sensors' densities come out four times too large, since they stand for these modes.
+sensors' densities come out nearly four times too large, since they stand for these modes.
 """
 
 # %% Names and numbers
