@@ -99,15 +99,19 @@ def one_published_mode():
     return frf, np.array([212.09]), None
 
 
-def stage_of_56():
-    rng, freq = np.random.default_rng(3), np.linspace(20.0, 400.0, 950)
+def stage_of_56(n_out=14, n_in=4, lines=950):
+    rng, freq = np.random.default_rng(3), np.linspace(20.0, 400.0, lines)
     truth = np.array([41.0, 66.0, 93.0, 118.0, 152.0, 187.0, 224.0, 268.0, 311.0, 359.0])
-    phi = rng.normal(size=(14, 10))
-    H = modal_frf(freq, pole(truth, np.full(10, 0.01)), phi, phi[:4])
+    phi = rng.normal(size=(n_out, 10))
+    H = modal_frf(freq, pole(truth, np.full(10, 0.01)), phi, phi[:n_in])
     return Frf(freq, noisy(H, 1e-3 * np.sqrt(np.mean(np.abs(H) ** 2)), rng)), truth, 0.01
 
 
-@pytest.mark.parametrize("case", [ruler_lines, one_published_mode, stage_of_56])
+def machine_of_60():
+    return stage_of_56(20, 3, 1000)
+
+
+@pytest.mark.parametrize("case", [ruler_lines, one_published_mode, stage_of_56, machine_of_60])
 def test_poles_damping_and_time_beside_a_quick_peer(case):
     """Poles of the peer are picked at the true frequencies, ours by nobody."""
     EMA = pytest.importorskip("sdypy.EMA")

@@ -49,13 +49,30 @@ def test_residual_terms_are_powers_and_held_integrators():
 
 def test_a_fraction_of_high_enough_order_finds_every_pole():
     H = modal_frf(FREQ, POLES, PHI, PHI[:2])
-    found = Moments(FREQ, H, np.ones((4, FREQ.size)), 16).solve(16)
+    found = Moments(FREQ, H, np.ones((4, FREQ.size)), 16).solve(16, np.isfinite)
     for k, p in enumerate(POLES):
         place = np.argmin(np.abs(found.poles - p))
         assert abs(found.poles[place] / p - 1) < 1e-5
         for shape, want in ((found.shapes, PHI[:, k]), (found.participation, PHI[:2, k])):
             unit = shape[:, place] / np.linalg.norm(shape[:, place])
             assert abs(unit.conj() @ want) / np.linalg.norm(want) == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize("order", [1, 6])
+def test_a_repeated_pole_of_a_fraction_has_two_participations(order):
+    """``R / (z - z_0)`` with R of rank two, z over 0.9 of the circle; other poles are not made."""
+    step = 0.9 / (FREQ[-1] - FREQ[0])
+    z = np.exp(2j * np.pi * (FREQ - FREQ.mean()) * step)
+    R = PHI[:, :2] @ PHI[:2, :2].T
+    H = R[:, :, None] / (z - 0.98)
+    double = np.log(0.98) / step + 2j * np.pi * FREQ.mean()
+    moments = Moments(FREQ, H, np.ones((4, FREQ.size)), order)
+    found = moments.solve(order, lambda poles: np.abs(poles / double - 1) < 1e-6)
+    assert found.poles.size == 2
+    assert np.linalg.svd(found.participation, compute_uv=False)[-1] > 0.1
+    left = found.shapes - R @ np.linalg.lstsq(R, found.shapes)[0]
+    assert np.linalg.norm(left) < 1e-6
+    assert moments.solve(order, lambda poles: poles.imag < 0).poles.size == 0
 
 
 def test_an_frf_carries_its_doubt(tmp_path):

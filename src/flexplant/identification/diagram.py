@@ -5,14 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, between, real_array
+from ..checks import BoolArray, ComplexArray, FloatArray, IntArray, Value, between, real_array
 from ..errors import ModelError, ShapeError, SolverError, counted
 from ..modes.matching import assigned, in_span
 from ..tolerances import TINY
@@ -268,6 +268,9 @@ def _followed(
 
 #: part of the unit circle that the band is laid around; the rest separates its two ends
 ARC = 0.9
+#: poles on the circle this near to each other are one that is repeated; the reciprocal condition
+#: from which normal equations are solved as they are
+REPEATED, REGULAR = 1e-9, 1e-11
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,15 +307,40 @@ class Moments:
         powers = z[:, None] ** lags[None, :]
         squares = weight**2
         self.n_out, self.n_in = data.shape[:2]
-        self.R = squares @ powers
-        self.S = np.einsum("of,oif,fk->oik", squares, -data, powers, optimize=True)
-        self.T = np.einsum("of,oif,ojf,fk->ijk", squares, data.conj(), data, powers, optimize=True)
-        self.order = order
+        R = squares @ powers
+        S = np.einsum("of,oif,fk->oik", squares, -data, powers, optimize=True)
+        T = np.einsum("of,oif,ojf,fk->ijk", squares, data.conj(), data, powers, optimize=True)
+        n, m = order + 1, self.n_in
+        toeplitz = np.arange(n)[None, :] - np.arange(n)[:, None] + order
+        #: of A alone; columns, of what follows too: coefficient r of A, channel i
+        self.big = T[:, :, toeplitz].transpose(2, 0, 3, 1).reshape(n * m, n * m)
+        # powers of z on most of the circle: well conditioned, whatever the data. Lower orders are
+        # leading blocks, of a triangle's inverse too
+        triangles = np.linalg.cholesky(R[:, toeplitz])
+        self.inverse = np.array([la.solve_triangular(L, np.eye(n), lower=True) for L in triangles])
+        coupled = S[:, :, toeplitz].transpose(0, 2, 3, 1).reshape(self.n_out, n, n * m)
+        #: per output L^{-1} S, with which B is eliminated
+        self.taken = self.inverse @ coupled
 
-    def solve(self, order: int) -> OrderPoles:
-        """Return the poles of one order."""
+    def solve(self, order: int, wanted: Callable[[ComplexArray], BoolArray]) -> OrderPoles:
+        """Return the poles of one order that are wanted; shapes are made of these alone."""
         A, B = self.fraction(order)
-        return self._poles(order, A, B)
+        # in v = 1/z the polynomial is monic: its companion matrix needs no inverse
+        m = self.n_in
+        companion = np.eye(order * m, k=-m, dtype=np.complex128)
+        companion[:m] = -A[1:].transpose(1, 0, 2).reshape(m, order * m)
+        v = np.linalg.eigvals(companion)
+        # poles at zero: the leading coefficient is singular but for rounding
+        z = 1.0 / v[np.abs(v) > 1e-8]
+        poles = np.log(z) / self.step + 1j * self.centre
+        keep = wanted(poles)
+        z, poles = z[keep], poles[keep]
+        powers = z[:, None] ** np.arange(order + 1)
+        left, right = _null_vectors(z, np.tensordot(powers, A, axes=1))
+        values = np.einsum("kom,km->ok", np.tensordot(powers, B, axes=(1, 1)), right)
+        size = np.linalg.norm(values, axis=0)
+        seen = size > 0
+        return OrderPoles(order, poles[seen], values[:, seen] / size[seen], left[seen].T)
 
     def response(self, order: int, freq: FloatArray) -> ComplexArray:
         """Return the response (n_out, n_in, n_freq) of the matrix fraction of one order."""
@@ -330,46 +358,31 @@ class Moments:
         stable, which is what makes the stabilisation diagram clear [Cauberghe2004]_.
         """
         n, m = order + 1, self.n_in
-        toeplitz = np.arange(n)[None, :] - np.arange(n)[:, None] + self.order
-        big = self.T[:, :, toeplitz].transpose(2, 0, 3, 1).reshape(n * m, n * m)
-        numerators = []
-        for o in range(self.n_out):
-            R = self.R[o][toeplitz]
-            # columns: coefficient r of A, channel i
-            S = self.S[o][:, toeplitz].transpose(1, 2, 0).reshape(n, n * m)
-            # powers of z on most of the circle: well conditioned, whatever the data
-            solved = la.solve(R, S, assume_a="pos")
-            big = big - S.conj().T @ solved
-            numerators.append(-solved)
+        taken = self.taken[:, :n, : n * m]
+        rows = taken.reshape(-1, n * m)
+        big = self.big[: n * m, : n * m] - rows.conj().T @ rows
         free: Any = -_solved(big[m:, m:], big[m:, :m])
         A = np.concatenate([np.eye(m, dtype=np.complex128), free])
-        B = np.array([part @ A for part in numerators])
+        B = -self.inverse[:, :n, :n].conj().swapaxes(1, 2) @ (taken @ A)
         return A.reshape(n, m, m), B
 
-    def _poles(self, order: int, A: ComplexArray, B: ComplexArray) -> OrderPoles:
-        # in v = 1/z the polynomial is monic: its companion matrix needs no inverse
-        m = self.n_in
-        companion = np.eye(order * m, k=-m, dtype=np.complex128)
-        companion[:m] = -A[1:].transpose(1, 0, 2).reshape(m, order * m)
-        solved: Any = la.eig(companion, left=True, right=True)
-        v, left, right = solved
-        # poles at zero: the leading coefficient is singular but for rounding
-        keep = np.abs(v) > 1e-8
-        v, left, right = v[keep], left[:m, keep].conj(), right[-m:, keep]
-        z = 1.0 / v
-        powers = z[None, :] ** np.arange(order + 1)[:, None]
-        values = np.einsum("orm,rk,mk->ok", B, powers, right)
-        poles = np.log(z) / self.step + 1j * self.centre
-        size = np.linalg.norm(values, axis=0)
-        seen = size > 0
-        return OrderPoles(
-            order,
-            poles[seen],
-            values[:, seen] / size[seen],
-            left[:, seen] / np.linalg.norm(left[:, seen], axis=0),
-        )
+
+def _null_vectors(z: ComplexArray, matrices: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """Return (n, m) left and right null vectors l, r of A(z) (n, m, m): l A = 0, A r = 0.
+
+    Those of a pole that is repeated but for rounding are independent.
+    """
+    U, _, Vh = np.linalg.svd(matrices)
+    alike = np.abs(z[:, None] - z) < REPEATED
+    first = np.sum(np.cumsum(alike, axis=1) == 0, axis=1)
+    number = np.sum(np.tril(alike, -1), axis=1)
+    place = np.maximum(U.shape[1] - 1 - number, 0)
+    return U[first, :, place].conj(), Vh[first, place].conj()
 
 
 def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray:
+    factor, info = la.lapack.zpotrf(matrix)
+    if info == 0 and la.lapack.zpocon(factor, np.linalg.norm(matrix, 1))[0] > REGULAR:
+        return np.asarray(la.lapack.zpotrs(factor, right)[0])
     # data without noise leave orders above the true one undetermined: the smallest solution then
     return np.asarray(la.lstsq(matrix, right, cond=1e-13, lapack_driver="gelsd")[0])

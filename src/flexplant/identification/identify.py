@@ -4,12 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, between, instance, positive, real_array, short, whole
+from ..checks import (
+    BoolArray,
+    ComplexArray,
+    FloatArray,
+    between,
+    instance,
+    positive,
+    real_array,
+    short,
+    whole,
+)
 from ..errors import (
     LabelError,
     ModelError,
@@ -22,7 +33,7 @@ from ..errors import (
 from ..lti.frequency import Frf
 from ..parallel import Progress, one_thread
 from ..tolerances import ROUNDING, TINY
-from .diagram import Moments, OrderPoles, PoleSelection, StabilisationDiagram, built_diagram
+from .diagram import Moments, PoleSelection, StabilisationDiagram, built_diagram
 from .gate import gated, steady
 from .line_weights import PreparedLines, prepared
 from .model_error import disagreement, outputs_disagree
@@ -511,10 +522,8 @@ def diagram_of(
     for window in windows(ready):
         freq = ready.freq[window.seen]
         moments = _moments(ready, window, orders[-1])
-        results = [
-            _inside(moments.solve(order), (float(freq[0]), float(freq[-1])), max_zeta)
-            for order in orders
-        ]
+        inside = partial(_inside, band=(float(freq[0]), float(freq[-1])), max_zeta=max_zeta)
+        results = [moments.solve(order, inside) for order in orders]
         diagram = built_diagram(results, np.array([low, high]), tolerances)
         ends = (
             low - edge if window.first == 0 else ready.freq[window.first],
@@ -559,12 +568,10 @@ def _moments(ready: PreparedLines, window: Window, order: int) -> Moments:
     return Moments(ready.freq[seen], ready.data[:, :, seen], ready.line_weight[:, seen], order)
 
 
-def _inside(found: OrderPoles, band: tuple[float, float], max_zeta: float) -> OrderPoles:
-    freq = np.abs(found.poles) / (2 * np.pi)
-    zeta = -found.poles.real / np.abs(found.poles)
+def _inside(poles: ComplexArray, band: tuple[float, float], max_zeta: float) -> BoolArray:
+    """Return which poles count in a part of the band."""
+    freq = np.abs(poles) / (2 * np.pi)
+    zeta = -poles.real / np.abs(poles)
     edge = MARGIN * (band[1] - band[0])
     keep = (freq > max(band[0] - edge, 0.5 * band[0])) & (freq < band[1] + edge)
-    keep &= (zeta > 0) & (zeta < max_zeta) & (found.poles.imag > 0)
-    return OrderPoles(
-        found.order, found.poles[keep], found.shapes[:, keep], found.participation[:, keep]
-    )
+    return np.asarray(keep & (zeta > 0) & (zeta < max_zeta) & (poles.imag > 0))
