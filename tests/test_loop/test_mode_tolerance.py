@@ -208,6 +208,26 @@ def test_draws_are_loops_around_machines_by_hand():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the loop hangs on", "ignore:.*modes that the plant left out")
+def test_modes_left_out_are_off_too_on_machines_drawn():
+    """The plant has 12 of 15 modes: the poles of machines with all 15 off, by hand, judge."""
+    few = sampled(some_modes(ZETA, 12, attached=False), ports(asd=1e-2))
+    known = few.uncertain(frequency=0.002)
+    short = fx.close_loop(few, *loop().blocks, larger=plant())
+    found = short.mode_tolerances(known=known, draws=12, rng=3).draws
+    stable, g = [], plant().continuous.system
+    for own in np.random.default_rng(3).spawn(12):
+        A = g.A.copy()
+        off = [*own.standard_normal(9), *own.standard_normal(3)]
+        for mode, value in enumerate(off, 4):
+            rows = [g.states.index(f"mode{mode}:{part}") for part in "qv"]
+            A[rows[1], rows[0]] *= 1.0 + 0.002 * value  # at two deviations 0.2 % of frequency
+        stable.append(closed_radius(A) < 1.0)
+    assert np.array_equal(found.margins > 0, stable)
+    assert 0 < found.stable < 1
+
+
+@pytest.mark.slow
 def test_designs_say_what_their_modes_hold_to():
     own = sampled(some_modes(ZETA, 6, attached=False), ports(asd=1e-2))
     P = own.uncertain(frequency=1e-4)

@@ -111,6 +111,39 @@ def test_a_bandwidth_that_cannot_be_kept_is_refused_with_what_was_tried():
         fx.design_stage(plant(), margin=1.2)
 
 
+PROMISED = "least modulus margin of 20 machines drawn"
+
+
+@pytest.mark.slow
+def test_what_fails_on_machines_drawn_is_not_promised(monkeypatch):
+    """Shapes that mix by 10 %: each frequency alone may be off, and no loop holds on all."""
+    small = sampled(some_modes(ZETA, 8, attached=False), CHANNELS)
+    uncertain = small.uncertain(frequency=0.001)
+    held = fx.design_stage(uncertain, bandwidth=60.0)
+    assert held.certificate[PROMISED] >= 0.35
+    assert PROMISED in repr(held)
+    monkeypatch.setattr("flexplant.synthesis.hinf.stage_design._SHAPES", 0.1)
+    with pytest.raises(InfeasibleError, match="on machines drawn"):
+        fx.design_stage(uncertain, bandwidth=60.0)
+
+
+@pytest.mark.slow
+def test_what_is_promised_holds_where_shapes_are_mixed_by_hand():
+    """A mass of 20 g anywhere, of 26.5 kg: shapes of all modes differ, frequencies do too."""
+    uncertain = plant().uncertain(frequency=SHARE)
+    found = fx.design_stage(uncertain, bandwidth=60.0)
+    promised = found.certificate[PROMISED]
+    model, rng = make_plate(), np.random.default_rng(4)
+    for _ in range(3):
+        M = model.M.toarray()
+        row = model.dofs.row((*(0.6 * rng.random(2)), 0.0), "z")
+        heavier = FEModel(M + 0.02 * np.outer(row, row), model.K, dofs=model.dofs)
+        modes = solve_modes(heavier, count=COUNT, damping=ModalDamping(ZETA))
+        loop = fx.close_loop(sampled(modes, CHANNELS), found)
+        assert loop.is_stable
+        assert loop.modulus_margin > promised - 0.03
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the loop hangs on")
 def test_an_uncertain_plant_is_designed_for_by_default():

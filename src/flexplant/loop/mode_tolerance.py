@@ -8,7 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import BoolArray, ComplexArray, FloatArray, IntArray, Value, positive, whole
+from ..checks import (
+    BoolArray,
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    Value,
+    generator,
+    positive,
+    whole,
+)
 from ..errors import AssumptionError, ModelError, counted, warn
 from ..lti.responses import Responder, points, responder
 from ..lti.statespace import StateSpace
@@ -19,6 +28,7 @@ from ..plant.uncertainty.uncertain_plant import (
     modal_realisation,
     with_changes,
 )
+from ..plant.uncertainty.whole_machines import draws_with_left_out
 from ..tolerances import SETTLED, TINY
 from .broken import BrokenLoop, inverted
 from .spill_over import MachineDraws
@@ -255,13 +265,22 @@ def mode_tolerances(
 def machine_draws(
     loop: Any, uncertain: object, margin: float, count: int, rng: Any = 0
 ) -> MachineDraws:
-    """Return the margins of a closed loop's controller on machines of an uncertain plant."""
+    """Return the margins of a closed loop's controller on machines of an uncertain plant.
+
+    With the modes left out, whose frequencies are off too, where these are known.
+    """
     if not isinstance(uncertain, UncertainPlant):
         raise ModelError(
             "machines are drawn from an UncertainPlant: close the loop on "
             "plant.uncertain(frequency=...), or pass it as known=."
         )
-    loops = map(loop.around, uncertain.sample(rng, whole(count, "draws")))
+    number, chance = whole(count, "draws"), generator(rng)
+    around, machines = loop.completed or loop, None
+    if loop.completed is not None:
+        machines = draws_with_left_out(uncertain, around.plant, chance, number)
+    if machines is None:  # what is uncertain is no property of the larger plant's modes
+        around, machines = loop, iter(uncertain.sample(chance, number))
+    loops = map(around.around, machines)
     margins = [one.modulus_margin if one.is_stable else 0.0 for one in loops]
     return MachineDraws(np.array(margins), margin)
 
