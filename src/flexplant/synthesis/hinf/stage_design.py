@@ -31,10 +31,10 @@ _FIRST = 1.0 / 3.0
 _STEP, _MOST, _HALVINGS = 1.3, 8, 2
 #: modulus margin that is kept with any one mode off, as a part of that of the plant itself
 _KEPT = 0.875
-#: modes below so many times the bandwidth of the weights are damped, not only tolerated: first
-#: more of them, for a tolerated mode may hang on its shape (0.43 became 0.29 on a machine by 1 %
-#: of other shapes in one mode's), then fewer, where damping them costs the margin
-_DAMPED = (6.0, 3.5)
+#: modes below so many times the bandwidth of the weights are damped, not only tolerated; more of
+#: them where the loop does not hold on machines drawn: a mode that is tolerated may hang on its
+#: shape (a margin of 0.43 became 0.33 on a machine by 1 % of other shapes in one mode's)
+_DAMPED = (3.5, 6.0)
 #: machines drawn before a loop is promised, and by how much their shapes mix (std of E_ij; 0.1 to
 #: 1 % in modes that matter on machines of another formulation)
 _DRAWS, _SHAPES = 20, 0.003
