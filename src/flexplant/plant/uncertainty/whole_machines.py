@@ -89,7 +89,7 @@ def _mixed(
     part[:, ~real], part[~real] = 0.0, 0.0
     inputs, outputs = np.array(realisation.inputs), np.array(realisation.outputs)
     s: FloatArray = realisation.pairs[:, 0, 1]
-    phi = inputs[:, 1::2]
+    phi = inputs[:, 1::2].copy()
     changed = phi + phi @ part.T
     inputs[:, 1::2] = changed
     outputs[:, ::2] += (changed - phi) / s
