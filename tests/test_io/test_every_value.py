@@ -151,6 +151,7 @@ def made():
     yield from (placement.ClosedLoopH2("die"), placement.HinfLevel({"die:z": 1e6}))
     yield placement.ByRows(fx.reduction.PivotedQr())
     yield from (placement.OverMachines(loss, [small]), placement.Among(["a", "b"], at_most=1))
+    yield placement.OverPositions(loss, 3, measure="mean")
     curve = placement.pareto_curve(small, candidates, [4, 5])
     yield from (placement.PlantChannel("y1", "y"), curve, placement.Screened(loss, keep=3))
     yield placement.device_worth(small, sensors)

@@ -50,6 +50,7 @@ from .gramian import KineticEnergy as KineticEnergy
 from .gramian import ModalControllability as ModalControllability
 from .gramian import ModalObservability as ModalObservability
 from .gramian import SensorIndices as SensorIndices
+from .over_positions import OverPositions as OverPositions
 from .poi_variance import PoiVariance as PoiVariance
 from .problem import Found as Found
 from .problem import Placement as Placement

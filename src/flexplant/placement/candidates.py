@@ -11,6 +11,7 @@ import numpy as np
 from ..checks import FloatArray, Value, short
 from ..errors import LabelError, ModelError, require_known, unknown_label
 from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
+from ..plant.scheduling import placed, require_positions
 from ..structure import Disc, Rectangle
 
 
@@ -120,6 +121,10 @@ def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> d
                 f"candidates are {_NAME[side]}s or names of the plant's, got "
                 f"{short(port)}. Pass {_NAME[side]}(name, at=...)."
             )
+        if plant.is_assembled:  # one that moves is where the machine stands
+            ports = plant.assembled.ports
+            require_positions([port], ports.positions)
+            port = placed(port, ports.values)
         other = found.setdefault(port.name, port)
         if other is not port and other._fields() != port._fields():
             raise LabelError(

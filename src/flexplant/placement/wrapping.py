@@ -177,7 +177,7 @@ def _worth(shapes: Shapes, which: npt.NDArray[np.bool_]) -> FloatArray:
     return np.asarray(np.sum(shapes.phi[:, which] ** 2 / (4.0 * zeta * omega**3), axis=1))
 
 
-_MEASURES = ("worst", "mean")
+MEASURES = ("worst", "mean")
 
 
 def _checked_machines(machines: Any, name: str) -> tuple[StandardPlant, ...]:
@@ -199,17 +199,17 @@ class ManyScores(Scorer):
 
     def value(self, chosen: Sequence[int]) -> float:
         """Return it for one choice."""
-        return float(_over(self.measure, [part.value(chosen) for part in self.parts]))
+        return float(over(self.measure, [part.value(chosen) for part in self.parts]))
 
     def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
         """Return it for several choices."""
         found = np.array([part.score(sets) for part in self.parts])
-        return np.asarray(_over(self.measure, found))
+        return np.asarray(over(self.measure, found))
 
     def bound(self, count: int, required: Sequence[int]) -> float:
         """Return the worst or the mean of the bounds."""
         bounds = [part.bound(count, required) for part in self.parts]
-        return float(_over(self.measure, bounds))
+        return float(over(self.measure, bounds))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -237,7 +237,7 @@ class OverMachines(Wrapping):
     """
 
     machines: Sequence[StandardPlant] = field(metadata=checked(_checked_machines))
-    measure: str = field(default="worst", kw_only=True, metadata=checked(one_of, choices=_MEASURES))
+    measure: str = field(default="worst", kw_only=True, metadata=checked(one_of, choices=MEASURES))
 
     def __repr__(self) -> str:
         return f"OverMachines({self.criterion!r}, {len(self.machines)} machines, {self.measure!r})"
@@ -246,7 +246,7 @@ class OverMachines(Wrapping):
         """Return it with the devices of a plant."""
         ports = plant.assembled.ports
         values = [self.criterion(machine.with_ports(ports)) for machine in self.machines]
-        return float(_over(self.measure, values))
+        return float(over(self.measure, values))
 
     def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
         """Check the criterion on every machine."""
@@ -277,7 +277,7 @@ class LossScores(Scorer):
         lists = [[j for j in chosen if j != i] for i in chosen if self.losable[i]]
         if not lists or np.any(self.rigid.all_missing(lists)):
             return np.inf
-        return float(_over(self.measure, self.inner.score(lists)))
+        return float(over(self.measure, self.inner.score(lists)))
 
     def bound(self, count: int, required: Sequence[int]) -> float:
         """Return the bound of choices of one less: what is left is one of them."""
@@ -311,7 +311,7 @@ class AfterLoss(Wrapping):
     """
 
     of: str = field(default="sensors", kw_only=True, metadata=checked(one_of, choices=SIDES))
-    measure: str = field(default="worst", kw_only=True, metadata=checked(one_of, choices=_MEASURES))
+    measure: str = field(default="worst", kw_only=True, metadata=checked(one_of, choices=MEASURES))
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return it for the devices of a plant: infinite where the others do not suffice."""
@@ -324,7 +324,7 @@ class AfterLoss(Wrapping):
                 values.append(self.criterion(left))
             except FlexplantError:
                 return np.inf
-        return float(_over(self.measure, values))
+        return float(over(self.measure, values))
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the scores by those of choices of one less."""
@@ -334,6 +334,6 @@ class AfterLoss(Wrapping):
         return LossScores(inner, rigid, losable, self.measure)
 
 
-def _over(measure: str, values: Any) -> Any:
+def over(measure: str, values: Any) -> Any:
     """Return the largest or the mean along the first axis."""
     return np.max(values, axis=0) if measure == "worst" else np.mean(values, axis=0)

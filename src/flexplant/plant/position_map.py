@@ -11,18 +11,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, Value, function, number, real_array, whole
+from ..checks import FloatArray, Value, function, number, real_array
 from ..errors import AssumptionError, LabelError, ModelError
 from .assumptions import WEAK, mode_visibility
 from .partition import Partition
 from .rigid.decoupling import Decoupling, decouple
 from .rigid.rigid_body import rigid_body_of
 from .rigid.rigid_motion import projected
+from .scheduling import values_over
 
 logger = logging.getLogger(__name__)
-
-#: points of a position where none are given
-_POINTS = 21
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,7 +133,7 @@ def position_map(plant: Any, judge: Any, points: Any) -> PositionMap:
             "and Ports(..., positions=[fx.plant.Position('x', range=(-0.1, 0.1))])."
         )
     judges = _judges(judge)
-    grid = {one.name: _values(one, points) for one in positions}
+    grid = values_over(positions, points)
     own = _decoupled(plant)
     rows: list[tuple[Any, ...]] = []
     modes: tuple[str, ...] = ()
@@ -181,16 +179,6 @@ def _judged(
             yield number(one(plant), name)
         except ModelError as error:
             raise ModelError(f"{name!r} at {plant.assembled.ports.standing}: {error}") from error
-
-
-def _values(position: Any, points: Any) -> FloatArray:
-    """Return the values of a position: given ones, or so many over its range."""
-    given = points.get(position.name, _POINTS) if isinstance(points, Mapping) else points
-    if np.ndim(given):
-        own = real_array(given, f"points of {position.name!r}", (None,))
-        return np.array([position.within(value) for value in own.tolist()])
-    low, high = position.range
-    return np.linspace(low, high, whole(given, "points", minimum=2))
 
 
 def _decoupled(plant: Any) -> Decoupling | None:

@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Value, instance, number, real_array, short
-from ..errors import LabelError, ModelError
+from ..checks import FloatArray, Value, instance, number, real_array, short, whole
+from ..errors import LabelError, ModelError, require_known
 from ..labels import Place
 
 #: relative to a range: a position this little beyond its end is rounding
 _BEYOND = 1e-9
+#: points of a position that a mapping of them does not name
+_POINTS = 21
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +86,22 @@ class Position(Value):
                 "nothing is known of the machine there. Stay inside, or widen its range."
             )
         return found
+
+
+def values_over(positions: Sequence[Position], points: Any) -> dict[str, FloatArray]:
+    """Return the values of each position: given ones, or so many over its range."""
+    if isinstance(points, Mapping):
+        require_known("position", points, [one.name for one in positions])
+    return {one.name: _values(one, points) for one in positions}
+
+
+def _values(position: Position, points: Any) -> FloatArray:
+    given = points.get(position.name, _POINTS) if isinstance(points, Mapping) else points
+    if np.ndim(given):
+        own = real_array(given, f"points of {position.name!r}", (None,))
+        return np.array([position.within(value) for value in own.tolist()])
+    low, high = position.range
+    return np.linspace(low, high, whole(given, "points", minimum=2))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
