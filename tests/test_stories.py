@@ -99,6 +99,24 @@ def test_moving_poi(example, tmp_path):
 
 
 @pytest.mark.slow
+def test_scanning_stage_with_one_short_run(example, tmp_path, monkeypatch):
+    """Designs that follow keep their margin and their estimate on a machine of another kind."""
+    story = example("scanning_stage")
+    for name, value in (("OUT", tmp_path), ("RUNS", 1), ("DURATION", 0.1)):
+        monkeypatch.setattr(story, name, value)
+    result = story.main()
+    margins = {name: result["maps"]["machine"].figures[name] for name in ("fixed", "following")}
+    np.testing.assert_allclose(
+        [margins["fixed"].min(), margins["following"].min()], [0.448, 0.586], atol=5e-3
+    )
+    rows = result["rows"]
+    assert rows["following"]["estimate"] < 0.4 * rows["fixed"]["estimate"]
+    filters = result["filters"]
+    assert np.all(filters.price("scheduled")["die:z"] < 0.02 * filters.exact[0])
+    assert np.ptp(image.imread(tmp_path / "scanning_stage.png")[..., :3]) > 0.5
+
+
+@pytest.mark.slow
 def test_million_dofs_with_fewer(example):
     story = example("million_dofs")
     result = story.main(3000)

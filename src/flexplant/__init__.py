@@ -62,7 +62,8 @@ room below has its own page, ``help(fx.plant)``: what it is for, an example, its
 - identify and update: `examples/measured_frf.py`; a real record: `examples/ruler.py`; the paper's
   numbers and figures: `examples/paper_plate.py`
 - estimate from records: `examples/recorded_data.py`; a POI that moves: `examples/moving_poi.py`
-- control six axes: `examples/maglev.py`
+- control six axes: `examples/maglev.py`; a stage that scans below sensors on its frame:
+  `examples/scanning_stage.py`
 - shape loops by hand in a browser, on measured responses: `examples/workbench.py`
 - follow set-points: `examples/feedforward.py`
 - guarantee robustness: `examples/robust_control.py`

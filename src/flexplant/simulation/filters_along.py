@@ -25,6 +25,8 @@ from .moving_machine import MovingPlant, Sample, Trajectory, trajectory
 _REPEATED, _SETTLED = 100, 1e-6
 #: times the least error at which a filter with a steady gain is of no use any more
 _DIVERGED = 100.0
+#: times the first error from which on an unstable filter is not followed
+_LOST = 1e6
 #: the gains, in the order of their columns
 GAINS = ("exact", "scheduled", "frozen")
 
@@ -278,6 +280,9 @@ class _Filters:
             P = left @ P @ left.T + M @ self.R @ M.T
             shown = sample.C[self.z]
             rms[:, k] = np.sqrt(np.einsum("ij,jk,ik->i", shown, P, shown))
+            if np.any(rms[:, k] > _LOST * rms[:, 0]):
+                rms[:, k:] = rms[:, k : k + 1]  # grows for ever: soon beyond all numbers
+                break
             P = symmetrised(sample.A @ P @ sample.A.T + sample.G @ sample.G.T)
         return rms, P
 

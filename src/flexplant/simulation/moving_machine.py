@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 
 from ..checks import FloatArray, real_array
 from ..errors import ModelError, require_known
@@ -28,6 +30,8 @@ from .nonlinear_elements import Acting
 _NODES = 12
 #: samples of a stretch, and runs side by side
 _STRETCH, _ABREAST = 128, 16
+#: part of the largest noise that is rounding: its square is that of a covariance
+_NO_NOISE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -252,6 +256,7 @@ class MovingMachine(MovingPlant):
         w = np.broadcast_to(given, (runs, k, nw)).copy()
         state_noise = self._drawn(w, B, k)
         inputs = np.zeros((runs, nw + len(plant.u)))
+        flow = sp.csr_array(self.A)  # modes see themselves alone
         for i in range(k):
             x = self.x
             inputs[:, :nw] = w[:, i]
@@ -268,7 +273,7 @@ class MovingMachine(MovingPlant):
             self.c = self.c @ A.T + y @ law_B.T
             inputs[:, self.u] = out[:, :nu]
             z = shown[:, :nz] + inputs @ self.D[:nz].T
-            following = x @ self.A.T + inputs @ self.B.T + state_noise[:, i]
+            following = (flow @ x.T).T + inputs @ self.B.T + state_noise[:, i]
             for f in range(len(self.forces)):
                 push = self._held(self.new[f], x, inputs)[:, None] * new[f][i]
                 push += self._held(self.old[f], x, inputs)[:, None] * old[f][i]
@@ -297,7 +302,9 @@ class MovingMachine(MovingPlant):
         loud = [(f, c) for f, c in zip(self.forces, B, strict=True) if f.asd > 0]
         kicks = [self.rule.kicks(c) * (f.asd / np.sqrt(2.0)) for f, c in loud]
         kick = np.concatenate([np.zeros((k, 0, self.modal.size)), *kicks], axis=1)
-        sizes = noise.columns.size, noise.factor.shape[1], kick.shape[1]
+        mixing = self.rule.white[0] if kicks else np.zeros((0, 0))
+        nodes = len(mixing)
+        sizes = noise.columns.size, noise.factor.shape[1], nodes * len(kicks)
         drawn = [np.zeros((k, runs, size)) for size in sizes]
         for r, generator in enumerate(self.generators):
             # a whole stretch, so that a longer run begins with the shorter one
@@ -305,7 +312,8 @@ class MovingMachine(MovingPlant):
                 white[:, r] = generator.standard_normal((self.stretch, size))[:k]
         w[:, :, noise.columns] += (drawn[0] * noise.deviation).swapaxes(0, 1)
         found: FloatArray = (drawn[1] @ noise.factor.T).swapaxes(0, 1)
-        found[:, :, self.modal] += (drawn[2] @ kick).swapaxes(0, 1)
+        white = drawn[2].reshape(k, runs, len(kicks), nodes) @ mixing
+        found[:, :, self.modal] += (white.reshape(k, runs, -1) @ kick).swapaxes(0, 1)
         return found
 
 
@@ -339,12 +347,30 @@ class _Rule:
         found = np.einsum("jbcd,kjbd->kbc", W, columns.reshape(*columns.shape[:2], -1, 2))
         return np.asarray(found.reshape(len(columns), -1))
 
-    def kicks(self, columns: FloatArray) -> FloatArray:
-        """Return what unit white samples (q) at the nodes add to the states, (k, q, 2 b)."""
+    @cached_property
+    def white(self) -> tuple[FloatArray, FloatArray]:
+        """Mixing (q, r) of white samples at the nodes, and what r of them add (b, 2 r, 6).
+
+        Over the states of each mode, for three columns of two entries: nodes for the fastest mode
+        are many, the singular values of what they add to all modes fall fast.
+        """
         weight, share, flow = self._at(0.0, self.h)
-        b = np.einsum("qj,kjbd->kqbd", share, columns.reshape(*columns.shape[:2], -1, 2))
-        found = (np.sqrt(weight)[:, None, None, None] * flow) @ b[..., None]
-        return np.asarray(found.reshape(len(columns), weight.size, -1))
+        parts = np.einsum("q,qj,qbcd->qbcjd", np.sqrt(weight), share, flow)
+        full = parts.reshape(weight.size, -1)
+        U, s, V = np.linalg.svd(full, full_matrices=False)
+        kept = int(np.count_nonzero(s > _NO_NOISE * s.max(initial=0.0)))
+        found = (s[:kept, None] * V[:kept]).reshape(kept, len(self.pairs), 2, 6)
+        ordered = found.transpose(1, 2, 0, 3).reshape(len(self.pairs), 2 * kept, 6)
+        return U[:, :kept], np.ascontiguousarray(ordered)
+
+    def kicks(self, columns: FloatArray) -> FloatArray:
+        """Return what r white samples, mixed as `white` says, add to the states (k, r, 2 b)."""
+        k, b = len(columns), len(self.pairs)
+        sides = columns.reshape(k, 3, b, 2).transpose(2, 1, 3, 0).reshape(b, 6, k)
+        found = self.white[1] @ sides  # (b, 2 r, k)
+        return np.ascontiguousarray(found.reshape(b, 2, -1, k).transpose(3, 2, 0, 1)).reshape(
+            k, -1, 2 * b
+        )
 
 
 def _motions(
