@@ -166,9 +166,29 @@ def made():
     yield from (plants.RandomWalk(1e-3), plants.RigidForce("drag", asd=1e-3))
     yield from (plants.Feedthrough(), plants.OutputDisturbance("hum", "y1", asd=1e-12))
     yield from (plants.BaseAcceleration("floor", asd=1e-3), plant.along("die", CORNERS))
+    yield from of_positions(modes)
     yield structure.interpolated(modes.dofs).interpolation
     yield from (g, fx.frequency_response(g, np.array([1.0, 2.0])))
     yield from of_structures()
+
+
+def of_positions(modes):
+    """A stage that moves, and what is said of it."""
+    x = plants.Position("x", range=(-0.1, 0.1))
+    places = [(0.2, 0.3, 0.0), (0.1, 0.3, 0.0)]
+    table = plants.PlaceTable({"x": [-0.1, 0.1]}, places)
+    given = ports()
+    moving = given.replace(
+        y=[*given.y, fx.Sensor("head", at=places[0], asd=1e-12, moves=table)], positions=[x]
+    )
+    plant = fx.assemble_plant(modes, moving).discretized(RATE, delay=1)
+    yield from (x, table, moving.y[-1].moves, plant.map(points=2))
+    servo = fx.design_servo(plant, bandwidth=20.0, notches=[])
+    loops = [fx.close_loop(plant.at(x=v), fx.design_static(plant.at(x=v)), servo) for v in (0, 0.1)]
+    yield fx.loop.ScheduledLoop("x", [0.0, 0.1], loops)
+    yield fx.simulation.RmsAlong([0.0], [[1e-9]], ["die:error"], {"die:error": "m"})
+    one = np.ones((1, 1))
+    yield fx.simulation.FiltersAlong([0.0], ["die:z"], one, one, one, {"die:z": "m"})
 
 
 def of_estimators(plant, small):

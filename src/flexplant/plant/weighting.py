@@ -35,14 +35,13 @@ def weighted(plant: P, z: Any, w: Any) -> P:
         *(_weight(plant, z.get(name, 1.0), name) for name in keep_z), _through(plant, plant.y)
     )
     system = series(series(before, inner), after)
+    step = tuple(z.items()), tuple(w.items())
     return plant.replace(
         system=system.replace(name=plant.system.name),
         w=tuple(keep_w),
         z=tuple(keep_z),
         asd={},
-        origin=Weighted(
-            plant.unweighted, plant.origin.reading, True, (*plant.origin.steps, (z, w))
-        ),
+        origin=Weighted(plant.unweighted, plant.origin.reading, True, (*plant.origin.steps, step)),
     )
 
 
@@ -75,7 +74,10 @@ def measured_through(plant: P, block: System) -> P:
 def altered_like(plant: P, plain: P) -> P:
     """Return a plain plant with the weights and blocks of another one, in their order."""
     for step in plant.origin.steps:
-        plain = weighted(plain, *step) if isinstance(step, tuple) else measured_through(plain, step)
+        if isinstance(step, StateSpace):
+            plain = measured_through(plain, step)
+        else:
+            plain = weighted(plain, *map(dict, step))
     return plain
 
 
