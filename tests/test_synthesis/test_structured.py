@@ -44,11 +44,11 @@ def coprime(A, B, C):
     return named(*parts, B.shape[1], C.shape[0]), best
 
 
-def machine(freq=30.0, rate=500.0, stiff=0.0):
+def machine(freq=30.0, rate=500.0, stiff=0.0, sight=0.4):
     """A mass with a mode in a tracking problem: z = [w1 (r - y), w2 u], sampled and late."""
     w = 2 * np.pi * freq
     A = la.block_diag([[0, 1], [-stiff, 0]], [[0, 1], [-(w**2), -0.02 * w]])
-    B, C = np.array([[0.0], [1], [0], [1]]), np.array([[1.0, 0, 0.4, 0]])
+    B, C = np.array([[0.0], [1], [0], [1]]), np.array([[1.0, 0, sight, 0]])
     G = StateSpace(A, B, C, [[0.0]])
     G = discretized(G, rate, delay=1) if rate else G
     n, k = G.n_states, 2 * np.pi * 3.0

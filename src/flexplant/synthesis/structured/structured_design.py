@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
@@ -23,6 +23,7 @@ from ..objectives.specifications import H2, Hinf
 from ..reach import require_stabilisable
 from .judges import GainJudge, Judge, LoopObjective
 from .nonsmooth import Pieces, bfgs, decrease_left, joined, minimax
+from .plant_range import PlantRange
 from .scaled_loop import DECAY, ScaledLoop
 from .structures import ControllerFamily, ControllerStructure, as_system
 
@@ -59,7 +60,7 @@ _NOTHING = np.finfo(float).tiny
 
 @one_thread()
 def design_structured(
-    plant: StandardPlant | System | Sequence[StandardPlant],
+    plant: StandardPlant | System | Sequence[StandardPlant] | Mapping[float, StandardPlant],
     structure: ControllerStructure,
     *,
     objective: LoopObjective | Sequence[LoopObjective] = Hinf(),  # noqa: B008 - a frozen value
@@ -82,9 +83,10 @@ def design_structured(
 
     Parameters
     ----------
-    plant : StandardPlant, or sequence of StandardPlant
-        Continuous or sampled; one controller for several plants, such as the plant at several POI
-        positions, with the same u, y and rate. A labelled StateSpace serves too.
+    plant : StandardPlant, sequence of StandardPlant, or mapping {position: StandardPlant}
+        Continuous or sampled; one controller for several plants with the same u, y and rate. By
+        position: the plant of a moving stage, the controller then judged half way between these
+        positions too (rows and columns of the plant linear there). A labelled StateSpace serves.
     structure : FixedOrder, TunedLaws, ObserverGains or Parametrised
         What the controller looks like, and where the search begins.
     objective : Hinf, H2, PeakGain, or sequence of these
@@ -110,7 +112,7 @@ def design_structured(
         `structure` is the one given with the numbers found, of `TunedLaws` the laws; a further
         design can begin there. `gamma` is the largest verified norm (over `below`), `tried` holds
         what each start reached. The certificate holds the norm of each plant, what each objective
-        is, and of the local minimum
+        is, by position the worst of these, between them too, and of the local minimum
         `slope`, the norm of the smallest convex combination of the gradients (of log gamma, by the
         parameters), and `decrease left`, what a step of the length `radius` would still lower gamma
         by to first order, relative to it.
@@ -122,7 +124,8 @@ def design_structured(
     InfeasibleError
         When no start is stabilised; with the frequency of the pole that stays unstable.
     CertificateError
-        When the norm of a loop is not the one that the search claims.
+        When the norm of a loop is not the one that the search claims, or the loop is unstable
+        between positions.
     ModelError, ShapeError, LabelError
         When plants and structure do not go together.
 
@@ -143,7 +146,8 @@ def design_structured(
     >>> found.system.n_states, found.gamma < 1
     (0, True)
     """
-    plants = _plants(plant, u, y)
+    moving = PlantRange.of(plant) if isinstance(plant, Mapping) else None
+    plants = _plants(plant if moving is None else moving.plants, u, y)
     if isinstance(structure, type) or not hasattr(structure, "family"):
         raise ModelError(
             "structure must be FixedOrder, TunedLaws, ObserverGains or Parametrised, got "
@@ -188,8 +192,11 @@ def design_structured(
         "radius": radius,
         "decrease left": decrease,
     }
-    if len(plants) > 1:
-        certificate |= {f"norm of plant {i}": one["norm"] for i, one in enumerate(each, 1)}
+    norms = [one["norm"] for one in each]
+    if moving is not None:
+        certificate |= _over_positions(moving, K, objectives, norms)
+    elif len(plants) > 1:
+        certificate |= {f"norm of plant {i}": norm for i, norm in enumerate(norms, 1)}
     notes = search.notes
     if decrease > _SHORT:
         notes += ("not yet a local minimum (decrease left): more evaluations or another order",)
@@ -320,6 +327,28 @@ def _verified(
         found[repr(one)] = one.measured(loop.select(z, w))
         norm = max(norm, found[repr(one)] / (one.below or 1.0))
     return {"norm": norm, stability_name(loop.dt): least, "claim": claim} | found
+
+
+def _over_positions(
+    moving: PlantRange, K: StateSpace, objectives: Sequence[LoopObjective], norms: Sequence[float]
+) -> dict[str, float]:
+    """Return the norm at each position, the worst one, and the worst half way between two."""
+    found = {f"norm at {x:.6g}": norm for x, norm in zip(moving.places, norms, strict=True)}
+    found["worst position"] = float(moving.places[int(np.argmax(norms))])
+    worst = (0.0, np.nan)
+    for x in moving.middles.tolist():
+        plant = moving.at(x)
+        try:
+            norm = _verified(plant, lft(plant.system, K), objectives, np.inf)["norm"]
+        except CertificateError as error:
+            raise CertificateError(
+                f"at {x:.6g}, between the positions designed for: {error} Give plants at more "
+                "positions."
+            ) from error
+        worst = max(worst, (norm, x))
+    if moving.middles.size:
+        found |= {"norm between positions": worst[0], "worst position between": worst[1]}
+    return found
 
 
 class _End(NamedTuple):
