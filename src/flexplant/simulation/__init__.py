@@ -5,6 +5,7 @@
 - `setpoint`, `scan`: moves of bounded velocity, acceleration and jerk.
 - `design_feedforward`, `learn_feedforward`: forces for a move.
 - `Specification`: what is required of margins and errors; a verdict says what is reached.
+- `certify_speed(loop)`: how fast a machine may move, proven; `rms_along`: its errors on a path.
 - `study(machines, pipeline, executor=)`: one pipeline for many machines, resumed where stopped.
 
 >>> import flexplant as fx
@@ -97,6 +98,8 @@ from .rms_along import rms_along as rms_along
 from .simulate import simulate as simulate
 from .specification import Specification as Specification
 from .specification import Verdict as Verdict
+from .speed_certificate import SpeedCertificate as SpeedCertificate
+from .speed_certificate import certify_speed as certify_speed
 from .study import StudyTable as StudyTable
 from .study import study as study
 

@@ -151,7 +151,7 @@ def rms_along(
     machine = MovingMachine(loop, path, noise=True, schedule=schedule)
     P = _periodic(machine, steps) if flag(repeats, "repeats") else _standing(machine)
     rms = np.zeros((len(plant.z) + len(plant.y) + len(loop.controller.outputs), steps))
-    closed = _Closed(machine)
+    closed = ClosedAlong(machine)
     for k, sample in enumerate(machine.each(steps)):
         A, G, C, D = closed(k, sample)
         rms[:, k] = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", C, P, C) + np.sum(D**2, axis=1), 0))
@@ -160,7 +160,7 @@ def rms_along(
     return RmsAlong(time, rms, names, {n: u for n, u in loop.units.items() if n in names})
 
 
-class _Closed:
+class ClosedAlong:
     """The closed loop of one sample: ``X+ = A X + G n``, what is shown ``C X + D n``."""
 
     def __init__(self, machine: MovingMachine) -> None:
@@ -208,7 +208,7 @@ class _Closed:
 
 def _standing(machine: MovingMachine) -> FloatArray:
     """Return the covariance of the loop that has stood where it is for a long time."""
-    A, G, _, _ = _Closed(machine)(0, next(machine.each(1)))
+    A, G, _, _ = ClosedAlong(machine)(0, next(machine.each(1)))
     if np.abs(np.linalg.eigvals(A)).max(initial=0.0) >= 1.0:
         raise AssumptionError(
             "the loop is not stable where the trajectory begins: it has no variance there. Design "
@@ -221,7 +221,7 @@ def _periodic(machine: MovingMachine, steps: int) -> FloatArray:
     """Return the covariance at the beginning of a trajectory that repeats for ever."""
     Phi = np.eye(machine.plant.system.n_states + machine.loop.controller.n_states)
     P = np.zeros_like(Phi)
-    closed = _Closed(machine)
+    closed = ClosedAlong(machine)
     for k, sample in enumerate(machine.each(steps)):
         A, G, _, _ = closed(k, sample)
         Phi, P = A @ Phi, A @ P @ A.T + G @ G.T
