@@ -323,6 +323,53 @@ def test_a_schedule_interpolates_the_outputs(tmp_path):
         write_c({0.0: law(1.0), 1.0: law(2.0)}, tmp_path / "a.c", schedule="y")
 
 
+@compiles
+def test_a_controller_that_follows_its_machine_on_a_path(tmp_path):
+    """The commands of `simulate` along a path, from its readings and positions; to the last digit
+    in double precision, to six in single."""
+    plate = fx.kirchhoff_plate(
+        size=(0.6, 0.6), thickness=0.0272, elements=(4, 4), density=2702, youngs_modulus=70e9,
+        poisson_ratio=0.35,
+    )  # fmt: skip
+    corners = [(x, y, 0.0) for y in (0.1, 0.5) for x in (0.2, 0.4)]
+    ports = fx.Ports(
+        u=[fx.Actuator(f"u{i}", at=p, asd=1e-3) for i, p in enumerate(corners)],
+        z=[fx.Poi("die", at=(0.3, 0.3, 0.0), axes=("z", "rx", "ry"), moves={"x": (-1, 0, 0)})],
+        y=[
+            fx.Sensor(f"y{i}", at=p, asd=1e-12, moves={"x": (-1, 0, 0)})
+            for i, p in enumerate(corners)
+        ],
+        references=[fx.Reference("die")],
+        positions=[fx.plant.Position("x", range=(-0.1, 0.1))],
+    )
+    modes = fx.solve_modes(plate, count=5, damping=fx.ModalDamping(0.01))
+    moving = fx.assemble_plant(modes, ports).discretized(4e3, delay=1)
+
+    def design(there):
+        return fx.design_kalman(there), fx.design_servo(there, bandwidth=20.0, notches=[])
+
+    schedule = fx.loop.schedule_loops(moving, design, places=np.linspace(-0.1, 0.1, 5))
+    move = fx.setpoint(0.1, velocity=0.8, acceleration=20.0, jerk=4e3)
+    run = fx.simulate(schedule, duration=0.1, moving={"x": move}, rng=1)
+    law = schedule.loops[0].controller
+    given = [run[name] if name in run.names else np.zeros(run.time.size) for name in law.inputs]
+    readings = np.array([*given, move.at(run.time).position]).T
+    wanted = np.array([run[name] for name in schedule.loops[0].driven]).T
+    for single, rtol in ((False, 1e-9), (True, 1e-3)):
+        code = Compiled(tmp_path, schedule, single=single)
+        got = np.array([code(row)[:4] for row in readings])
+        np.testing.assert_allclose(got, wanted, rtol=0, atol=rtol * np.abs(wanted).max())
+    frozen = Compiled(tmp_path, schedule)
+    off = np.array([frozen([*row[:-1], 0.0])[:4] for row in readings])
+    assert np.abs(off - wanted).max() > 0.01 * np.abs(wanted).max()
+    frozen.start(readings[0], wanted[40])  # bumpless: what acts now goes on
+    np.testing.assert_allclose(
+        frozen(readings[0])[:4], wanted[40], rtol=0, atol=1e-6 * np.abs(wanted[40]).max()
+    )
+    with pytest.raises(ModelError, match="saturate outside"):
+        write_c(schedule, tmp_path / "limited.c", limits=2.0)
+
+
 def test_refusals_of_the_c_export(tmp_path):
     slow = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01, inputs=["s"], outputs=["f"])
     reads = StateSpace([[0.5]], [[1.0, 0.0]], [[1.0]], [[0.0, 1.0]], 0.01,

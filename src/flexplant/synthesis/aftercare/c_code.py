@@ -12,12 +12,12 @@ import numpy as np
 
 from ...checks import FloatArray, flag, number, positive, short
 from ...errors import AssumptionError, LabelError, ModelError, require_known
-from ...loop import ClosedLoop
+from ...loop import ClosedLoop, ScheduledLoop
 from ...loop.applied import applied_law
 from ...lti.statespace import StateSpace, as_statespace
 from ...tolerances import SAME
 from .c_text import CText
-from .two_state import TwoStateForm, two_state_form
+from .two_state import TwoStateForm, scheduled_form, two_state_form
 from .windup import back_gain
 
 #: words of C, and what its library has with the ending _t
@@ -51,12 +51,13 @@ def write_c(
 
     Parameters
     ----------
-    controller : StateSpace, Controller, ClosedLoop, or mapping {place: one of these}
+    controller : StateSpace, Controller, ClosedLoop, ScheduledLoop, or mapping {place: one of these}
         Sampled. Of a ClosedLoop all blocks (observer, servo, feedforward) go to one file: in are
         the channels of `plant.y`, out the driven actuators, then the monitored outputs. Inputs
         that have the name of an output (observer, `anti_windup_form`) are fed what is applied,
         in the file. A mapping is of controllers whose outputs alone differ (feedforward,
-        decoupling, gains after the states), interpolated linearly between places.
+        decoupling, gains after the states), interpolated linearly between places. Of a ScheduledLoop
+        all matrices are, as it does; its position is the last input.
     path : path
         Of the source; the header stands beside it.
     name : str, optional
@@ -175,6 +176,14 @@ def c_program(
 ) -> CProgram:
     """Return the C text of a sampled controller, or of a system without commands (a plant)."""
     recovery = None if anti_windup is None else positive(anti_windup, "anti_windup")
+    if isinstance(controller, ScheduledLoop):
+        if schedule is not None or limits is not None or recovery is not None:
+            raise ModelError(
+                "a ScheduledLoop brings its position as its last input, and its states under "
+                "limits would be of no design: leave out schedule=, limits= and anti_windup=, and "
+                "saturate outside."
+            )
+        return _following(controller, name, flag(single, "single"))
     places, laws = _scheduled(controller, schedule, recovery, limits is not None, driven)
     law = laws[0]
     K, p, m = law.system, len(law.system.outputs), len(law.system.inputs)
@@ -196,6 +205,20 @@ def c_program(
     form = two_state_form(whole, driven=groups, inputs=m, single=flag(single, "single"))
     at = K.inputs.index(str(schedule)) if len(laws) > 1 else 0
     text = CText(name, K, form, law.driven, ends, places, at, single)
+    return CProgram(K, form, text.header, text.source)
+
+
+def _following(loop: ScheduledLoop, name: str, single: bool) -> CProgram:
+    """Return the C text of a loop whose controller follows a position, its last input."""
+    laws = []
+    for one in loop.loops:
+        K = one.controller
+        B, D = (np.hstack([part, np.zeros((len(part), 1))]) for part in (K.B, K.D))
+        laws.append(K.replace(B=B, D=D, inputs=[*K.inputs, loop.position], units={}))
+    K, driven = laws[0], len(loop.loops[0].driven)
+    _check_sampled(K.dt, K.n_states)
+    form = scheduled_form(laws, driven=driven, single=single)
+    text = CText(name, K, form, driven, None, loop.places, len(K.inputs) - 1, single)
     return CProgram(K, form, text.header, text.source)
 
 

@@ -176,6 +176,36 @@ _REST = """\
     }}
 """
 
+#: both places' matrices, entry by entry linear between them
+_MOVING = """\
+static void advance({real} *restrict x, const {real} *restrict in, int q, {real} part)
+{{
+    {real} move[{R}] = {{{zero}}};
+    int j, k;
+    for (j = 0; j < {R}; ++j) {{
+        for (k = 0; k < {R}; ++k) {{
+            move[k] += (rest[q][j][k] + part * (rest[q + 1][j][k] - rest[q][j][k])) * x[j];
+        }}
+    }}
+    for (j = 0; j < {m}; ++j) {{
+        for (k = 0; k < {R}; ++k) {{
+            move[k] += (B[q][j][k] + part * (B[q + 1][j][k] - B[q][j][k])) * in[j];
+        }}
+    }}
+    for (k = 0; k < {R}; ++k) {{
+        x[k] += move[k];
+    }}
+}}
+"""
+
+_MOVED = """\
+    {{
+        {real} part;
+        const int q = place_of(in[{at}], &part);
+        advance(self->x, in, q, part);
+    }}
+"""
+
 _BACK = """\
     {{
         int j, k;
@@ -266,7 +296,9 @@ class CText:
         single: bool,
     ) -> None:
         self.form, self.single, self.limits = form, single, limits
-        states, self.m, self.p = len(form.B), len(K.inputs), len(K.outputs)
+        states, self.m, self.p = form.B.shape[-2], len(K.inputs), len(K.outputs)
+        #: whether A and B follow the place too
+        self.moving = form.rest.ndim == 3
         self.states, self.places, self.count = states, places, max(places.size, 1)
         error = f"blocks within {form.error:.1e} of the largest gain of each channel"
         kept = f"in {'single' if single else 'double'} precision, {error}"
@@ -277,7 +309,7 @@ class CText:
             "u_room": max(driven, 1), "inputs": _ascii(", ".join(K.inputs)),
             "outputs": _ascii(", ".join(K.outputs)), "real": "float" if single else "double",
             "zero": self.number(0.0), "one": self.number(1.0), "N": form.lanes,
-            "pairs": form.lanes, "rest": len(form.rest), "R": len(form.rest),
+            "pairs": form.lanes, "rest": form.rest.shape[-1], "R": form.rest.shape[-1],
             "before": 2 * form.lanes, "lanes": LANES, "at": at, "last": self.count - 2,
         }  # fmt: skip
         self.driven = driven
@@ -326,9 +358,10 @@ class CText:
             functions.append(self.filled(_PLACE))
         if self.states:
             functions.append(self._advance())
-        back = form.B.shape[1] > self.m and self.states
+        back = form.B.shape[-1] > self.m and self.states
         clamp = _CLAMP if self.limits is not None else ""
         update = "    advance(self->x, in);\n" if self.states else "    (void)in;\n"
+        update = self.filled(_MOVED) if self.moving else update
         return self.filled(
             _SOURCE,
             tables=self._tables(),
@@ -348,9 +381,9 @@ class CText:
                 self.table(name, form.pairs[i, j])
                 for name, i, j in (("aa", 0, 0), ("ab", 0, 1), ("ba", 1, 0), ("bb", 1, 1))
             ),
-            self.table("rest", form.rest.T),
-            self.table("B", form.B[:, :m].T),
-            self.table("back", form.B[:, m:].T),
+            self.table("rest", form.rest.swapaxes(-1, -2)),
+            self.table("B", form.B[..., :m].swapaxes(-1, -2)),
+            self.table("back", form.B[..., m:].swapaxes(-1, -2)),
             self.table("C", form.C),
             self.table("D", form.D[:, :m]),
             self.table("place", self.places),
@@ -378,6 +411,8 @@ class CText:
         )
 
     def _advance(self) -> str:
+        if self.moving:
+            return self.filled(_MOVING)
         real, N, m = self.fields["real"], self.form.lanes, self.m
         values = "".join(f"    const {real} v{j} = in[{j}];\n" for j in range(m))
 

@@ -44,9 +44,9 @@ class TwoStateForm(NamedTuple):
     """
 
     pairs: FloatArray  # (2, 2, N): entry i, j of each block of A - I
-    rest: FloatArray  # (R, R): of A - I
-    B: FloatArray  # (2 N + R, m)
-    C: FloatArray  # (p, 2 N + R)
+    rest: FloatArray  # (R, R): of A - I; (places, R, R) where A follows a place
+    B: FloatArray  # (2 N + R, m); (places, R, m)
+    C: FloatArray  # (p, 2 N + R); p of each place below each other
     D: FloatArray
     start: FloatArray  # (groups, 2 N + R, m + driven): steady states with given commands
     error: float  # of the response, relative to its largest gain
@@ -105,6 +105,35 @@ def two_state_form(
         f"the blocks of two states differ from the system by {error:.1e} of its largest gain: "
         f"rounding of {K.n_states} states is too much. {cure}"
     )
+
+
+def scheduled_form(
+    laws: Sequence[StateSpace], *, driven: int, single: bool = False
+) -> TwoStateForm:
+    """Return systems that differ in A too, one for each place, as full matrices.
+
+    Between places their entries are linear: no coordinates but the systems' own keep them so, up
+    to a scale for each state.
+    """
+    sizes = [state_scale(K.A, K.B, K.C) for K in laws]
+    d = np.exp(np.mean(np.log(sizes), axis=0))
+    found, error = [], 0.0
+    for K in laws:
+        K = K.replace(A=K.A * d / d[:, None], B=K.B / d[:, None], C=K.C * d, blocks=None)
+        own = _arranged(K, [K.n_states], [slice(driven)], None)
+        own = _rounded(own) if single else own
+        error = max(error, _difference(K, own))
+        found.append(own)
+    if error > (most := _SINGLE if single else _DOUBLE):
+        raise CertificateError(
+            f"{'single' if single else 'double'} precision moves the response at a place by "
+            f"{error:.1e} of its largest gain, more than {most:g}. Write it in double precision, "
+            "or reduce the controllers."
+        )
+    rest, B, start = (np.array([getattr(one, part) for one in found])
+                      for part in ("rest", "B", "start"))  # fmt: skip
+    C, D = (np.vstack([getattr(one, part) for one in found]) for part in "CD")
+    return TwoStateForm(found[0].pairs, rest, B, C, D, start[:, 0], error)
 
 
 def _blocks(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
