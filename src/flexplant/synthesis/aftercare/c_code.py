@@ -51,13 +51,13 @@ def write_c(
 
     Parameters
     ----------
-    controller : StateSpace, Controller, ClosedLoop, ScheduledLoop, or mapping {place: one of these}
+    controller : StateSpace, Controller, ClosedLoop, ScheduledLoop, or {place: one of these}
         Sampled. Of a ClosedLoop all blocks (observer, servo, feedforward) go to one file: in are
         the channels of `plant.y`, out the driven actuators, then the monitored outputs. Inputs
         that have the name of an output (observer, `anti_windup_form`) are fed what is applied,
         in the file. A mapping is of controllers whose outputs alone differ (feedforward,
-        decoupling, gains after the states), interpolated linearly between places. Of a ScheduledLoop
-        all matrices are, as it does; its position is the last input.
+        decoupling, gains after the states), interpolated linearly between places. Of a
+        ScheduledLoop all matrices are, as it does; its position is the last input.
     path : path
         Of the source; the header stands beside it.
     name : str, optional

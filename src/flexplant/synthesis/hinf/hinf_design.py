@@ -41,6 +41,7 @@ from .central import require_shown
 from .hinf_riccati import Riccati
 from .lower_bound import pointwise_bound, raised_bound
 from .mode_channels import mode_channels, rebalanced, tolerated, with_channels
+from .over_positions import over_positions
 from .singular import ADDED
 
 #: A beside its poles, from which on coordinates are blamed for a failure
@@ -53,7 +54,7 @@ _SENSITIVE, _DRAWS = 2e-4, 3
 
 @one_thread()
 def design_hinf(
-    plant: StandardPlant | UncertainPlant[Any] | System,
+    plant: StandardPlant | UncertainPlant[Any] | System | Mapping[float, StandardPlant],
     method: SynthesisMethod | None = None,
     *,
     bandwidth: float | None = None,
@@ -75,9 +76,12 @@ def design_hinf(
 
     Parameters
     ----------
-    plant : StandardPlant or UncertainPlant
-        Usually weighted; continuous or sampled. A labelled StateSpace (ours or python-control's)
-        serves too: by the names of its channels, or with u and y named.
+    plant : StandardPlant, UncertainPlant or mapping {position: StandardPlant}
+        Usually weighted; continuous or sampled. By position, of a machine that moves
+        (``{x: plant.at(x=x) for x in places}``): one controller for all, the mean plant with
+        channels that tolerate the motion; `gamma` is then the worst norm, the certificate has
+        those of all positions and half way between. A labelled StateSpace (ours or
+        python-control's) serves too: by the names of its channels, or with u and y named.
     method : Riccati or Lmi, optional
         Unless given `Riccati()`, which adds a little noise and effort where D12 or D21 is singular;
         where what it finds is not close to its lower bound the better of it and
@@ -155,6 +159,18 @@ def design_hinf(
         raise ModelError(
             f"method must be Riccati(...) or Lmi(...), got {short(method)}. Pass one, or none."
         )
+    if isinstance(plant, Mapping):
+        if uncertain is not None or larger is not None:
+            raise ModelError(
+                "plants by position are designed for as they are: leave out uncertain= and "
+                "larger=, and check the loop at each position."
+            )
+        posed_at = {x: posed(one, u, y, "H-infinity synthesis") for x, one in plant.items()}
+        if bandwidth is not None and posed_at:
+            middle = list(posed_at.values())[len(posed_at) // 2]
+            weights = stage_weights(middle, bandwidth)
+            posed_at = {x: one.weighted(weights) for x, one in posed_at.items()}
+        return over_positions(posed_at, lambda one: _designed(one, method, progress))
     plant = posed(plant, u, y, "H-infinity synthesis")
     if bandwidth is not None:
         plant = plant.weighted(stage_weights(plant, bandwidth, uncertainty=uncertain))

@@ -20,10 +20,10 @@ from ...plant import StandardPlant, standard_plant
 from ...tolerances import SAME
 from ..controller import Controller, certified_norm, reached_norms, with_left_out
 from ..objectives.specifications import H2, Hinf
+from ..plant_range import PlantRange
 from ..reach import require_stabilisable
 from .judges import GainJudge, Judge, LoopObjective
 from .nonsmooth import Pieces, bfgs, decrease_left, joined, minimax
-from .plant_range import PlantRange
 from .scaled_loop import DECAY, ScaledLoop
 from .structures import ControllerFamily, ControllerStructure, as_system
 
@@ -194,7 +194,9 @@ def design_structured(
     }
     norms = [one["norm"] for one in each]
     if moving is not None:
-        certificate |= _over_positions(moving, K, objectives, norms)
+        certificate |= moving.certified(
+            lambda one: _verified(one, lft(one.system, K), objectives, np.inf)["norm"], norms
+        )
     elif len(plants) > 1:
         certificate |= {f"norm of plant {i}": norm for i, norm in enumerate(norms, 1)}
     notes = search.notes
@@ -327,28 +329,6 @@ def _verified(
         found[repr(one)] = one.measured(loop.select(z, w))
         norm = max(norm, found[repr(one)] / (one.below or 1.0))
     return {"norm": norm, stability_name(loop.dt): least, "claim": claim} | found
-
-
-def _over_positions(
-    moving: PlantRange, K: StateSpace, objectives: Sequence[LoopObjective], norms: Sequence[float]
-) -> dict[str, float]:
-    """Return the norm at each position, the worst one, and the worst half way between two."""
-    found = {f"norm at {x:.6g}": norm for x, norm in zip(moving.places, norms, strict=True)}
-    found["worst position"] = float(moving.places[int(np.argmax(norms))])
-    worst = (0.0, np.nan)
-    for x in moving.middles.tolist():
-        plant = moving.at(x)
-        try:
-            norm = _verified(plant, lft(plant.system, K), objectives, np.inf)["norm"]
-        except CertificateError as error:
-            raise CertificateError(
-                f"at {x:.6g}, between the positions designed for: {error} Give plants at more "
-                "positions."
-            ) from error
-        worst = max(worst, (norm, x))
-    if moving.middles.size:
-        found |= {"norm between positions": worst[0], "worst position between": worst[1]}
-    return found
 
 
 class _End(NamedTuple):

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, mapping, number
-from ...errors import ModelError
-from ...lti.statespace import StateSpace
-from ...plant import StandardPlant, standard_plant
-from ...tolerances import SAME
+from ..checks import FloatArray, mapping, number
+from ..errors import CertificateError, ModelError
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant, standard_plant
+from ..tolerances import SAME
 
 _HINT = "Pass {0.0: plant, 0.1: other}, the same model with its ports at each position."
 
@@ -81,6 +81,25 @@ class PlantRange:
         found = between([one.system for one in self.plants], self.places, x)
         sides = {side: getattr(first, side) for side in "wuzy"}
         return StandardPlant.from_statespace(found, **sides)
+
+    def certified(
+        self, norm_of: Callable[[StandardPlant], float], norms: Sequence[float]
+    ) -> dict[str, float]:
+        """Return the norm at each position, the worst one, and the worst half way between two."""
+        found = {f"norm at {x:.6g}": norm for x, norm in zip(self.places, norms, strict=True)}
+        found["worst position"] = float(self.places[int(np.argmax(norms))])
+        worst = (0.0, np.nan)
+        for x in self.middles.tolist():
+            try:
+                worst = max(worst, (norm_of(self.at(x)), x))
+            except CertificateError as error:
+                raise CertificateError(
+                    f"at {x:.6g}, between the positions designed for: {error} Give plants at more "
+                    "positions."
+                ) from error
+        if self.middles.size:
+            found |= {"norm between positions": worst[0], "worst position between": worst[1]}
+        return found
 
     @property
     def middles(self) -> FloatArray:

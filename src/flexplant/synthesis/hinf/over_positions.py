@@ -1,0 +1,221 @@
+"""One H-infinity controller for all positions of a machine that moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ...checks import FloatArray
+from ...errors import CertificateError, FlexplantError, SolverError, attempted, counted
+from ...lti.frequency import frequency_response
+from ...lti.frequency_sweep import resonance_grid
+from ...lti.interconnection import lft
+from ...lti.norms import hinf_norm
+from ...lti.preparation import prepared
+from ...lti.statespace import StateSpace
+from ...plant import StandardPlant
+from ..controller import Controller
+from ..plant_range import PlantRange
+from .lower_bound import pointwise_bound
+
+#: size of the channels beside the whole motion, where the search begins: they are for complex
+#: deltas, which allow for more than a real position
+_SIZE = 0.1
+#: halvings or doublings of a size or a scale, while they help
+_STEPS = 4
+#: rows and columns that change by less, relative to the largest, do not move
+_STILL = 1e-9
+
+
+def over_positions(
+    given: Mapping[float, Any], design: Callable[[StandardPlant], Controller]
+) -> Controller:
+    """Return the controller whose worst norm over the positions is least of those tried.
+
+    Tried are the mean plant and those at the ends and in the middle, each by itself; then the mean
+    plant with a channel for each row and column that moves, ``y = (C + delta dC) x`` and ``x+ =
+    ... + (B + delta dB) u``, whose size and scale are searched.
+    """
+    moving = PlantRange.of(given)
+    search = _Search(moving, design)
+    mean = _mean(moving)
+    motion = _Motion(moving, mean)
+    first = search.tried_with("the mean plant", mean)
+    middle = len(moving.plants) // 2
+    for i in sorted({0, middle, len(moving.plants) - 1}):
+        search.tried_with(f"the plant at {moving.places[i]:.4g}", moving.plants[i])
+    if motion.moves and first is not None:
+        motion.even(first.system)
+        search.over_channels(motion)
+    return search.answer()
+
+
+class _Search:
+    """Designs for one plant or another, each judged by its loops at all positions."""
+
+    def __init__(self, moving: PlantRange, design: Callable[[StandardPlant], Controller]) -> None:
+        self.moving, self.design = moving, design
+        self.tried: dict[str, float] = {}
+        self.best: Controller | None = None
+
+    @property
+    def least(self) -> float:
+        """The smallest worst norm so far."""
+        return min(self.tried.values(), default=np.inf)
+
+    def tried_with(self, name: str, plant: StandardPlant) -> Controller | None:
+        """Design for a plant, judge, and keep what is best."""
+        found, worst = None, np.inf
+        with attempted(f"the design for {name}"):
+            found = self.design(plant)
+            worst = max(_norms(self.moving, found.system, self.least))
+            if worst < self.least:
+                self.best = found
+        self.tried[name] = worst
+        return found
+
+    def over_channels(self, motion: _Motion) -> None:
+        """Halve or double the scale of the channels, then their size, while that helps."""
+        point = (1.0, _SIZE)
+        value = self._at(motion, point)
+        for axis in (0, 1):
+            for factor in (0.5, 2.0):
+                start = point
+                for _ in range(_STEPS):
+                    new = (point[0] * factor, point[1]) if axis == 0 else (
+                        point[0], point[1] * factor)  # fmt: skip
+                    reached = self._at(motion, new)
+                    if not reached < value:
+                        break
+                    point, value = new, reached
+                if point != start:
+                    break
+
+    def _at(self, motion: _Motion, point: tuple[float, float]) -> float:
+        name = f"motion of {point[1]:g}, scale {point[0]:g}"
+        if name not in self.tried:
+            self.tried_with(name, motion.channels(*point))
+        return self.tried[name]
+
+    def answer(self) -> Controller:
+        """Return the best, with the norms of all positions."""
+        moving = self.moving
+        if self.best is None:
+            raise SolverError(
+                "no controller was found that is stable at all "
+                f"{counted(len(moving.plants), 'position')} from {moving.places[0]:g} to "
+                f"{moving.places[-1]:g} (tried: {', '.join(self.tried)}). Ask for less bandwidth, "
+                "a shorter range, or schedule the design (loop.schedule_loops)."
+            )
+        K = self.best.system
+        norms = [_norm(one, K) for one in moving.plants]
+        certificate = moving.certified(lambda one: _norm(one, K), norms)
+        bounds = [pointwise_bound(prepared(one.system, one.u, one.y)) for one in moving.plants]
+        worst = certificate["worst position"]
+        return self.best.replace(
+            gamma=max(norms),
+            lower=max(bounds),
+            certificate=certificate,
+            reached={},
+            tried=self.tried,
+            notes=(f"one controller for {counted(len(norms), 'position')}; worst at {worst:g}",),
+        )
+
+
+def _mean(moving: PlantRange) -> StandardPlant:
+    """Return the plant with the mean matrices."""
+    systems = [one.system for one in moving.plants]
+    mixed = {m: np.mean([getattr(g, m) for g in systems], axis=0) for m in "ABCD"}
+    first = moving.plants[0]
+    sides = {side: getattr(first, side) for side in "wuzy"}
+    return StandardPlant.from_statespace(systems[0].replace(**mixed, blocks=None), **sides)
+
+
+class _Motion:
+    """How rows and columns of the plant change over the range, and channels for it."""
+
+    def __init__(self, moving: PlantRange, mean: StandardPlant) -> None:
+        self.mean = mean
+        x = moving.places - 0.5 * (moving.places[0] + moving.places[-1])
+        x = x / (np.abs(x).max() or 1.0)
+        g = mean.system
+        power = float(x @ x) or 1.0
+        dC, dB = (
+            np.sum([t * (getattr(one.system, m) - getattr(g, m))
+                    for t, one in zip(x, moving.plants, strict=True)], axis=0) / power
+            for m in "CB"
+        )  # fmt: skip
+        self.rows, self.columns = _moved(dC, g.C), _moved(dB.T, g.B.T)
+        self.dC, self.dB = dC[self.rows], dB[:, self.columns]
+        self.scales = np.ones(self.rows.size + self.columns.size)
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything does."""
+        return self.scales.size > 0
+
+    def channels(self, scale: float, size: float) -> StandardPlant:
+        """Return the mean plant with a disturbance and an output for each row and column."""
+        g, r, c = self.mean.system, self.rows.size, self.columns.size
+        D = scale * self.scales
+        n, k = g.n_states, r + c
+        into = np.zeros((g.D.shape[0], k))
+        into[self.rows, np.arange(r)] = D[:r]
+        seen = np.zeros((k, g.D.shape[1]))
+        seen[r + np.arange(c), self.columns] = size / D[r:]
+        pushed = np.hstack([np.zeros((n, r)), self.dB * D[r:]])
+        C = np.vstack([size * self.dC / D[:r, None], np.zeros((c, n)), g.C])
+        names = [f"moves{i}" for i in range(1, k + 1)]
+        w, z = [f"{one}:d" for one in names], [f"{one}:q" for one in names]
+        system = StateSpace(
+            g.A, np.hstack([pushed, g.B]), C, np.block([[np.zeros((k, k)), seen], [into, g.D]]),
+            g.dt, inputs=[*w, *g.inputs], outputs=[*z, *g.outputs],
+        )  # fmt: skip
+        own = self.mean
+        return StandardPlant.from_statespace(
+            system, w=[*w, *own.w], u=own.u, z=[*z, *own.z], y=own.y
+        )
+
+    def even(self, K: StateSpace) -> None:
+        """Scale each channel so that, in closed loop, w reaches it as it reaches z."""
+        k = self.scales.size
+        if not k:
+            return
+        loop = lft(self.channels(1.0, 1.0).system, K)
+        freq = resonance_grid(loop.poles(), loop.dt, points=300)
+        T = frequency_response(loop, freq).data
+        out = np.linalg.norm(T[k:, :k], axis=0).max(axis=1)
+        into = np.linalg.norm(T[:k, k:], axis=1).max(axis=1)
+        both = (out > 0) & (into > 0)
+        self.scales = np.where(both, np.sqrt(into / np.where(both, out, 1.0)), 1.0)
+
+
+def _moved(change: FloatArray, rows: FloatArray) -> Any:
+    """Return which rows change at all, each beside its own size."""
+    size = np.abs(change).max(axis=1, initial=0.0)
+    return np.flatnonzero(size > _STILL * np.abs(rows).max(axis=1, initial=0.0))
+
+
+def _norms(moving: PlantRange, K: StateSpace, least: float) -> list[float]:
+    """Return norms at the positions, the ends first, until one is above what is known."""
+    order = sorted(range(len(moving.plants)), key=lambda i: -abs(2 * i - len(moving.plants) + 1))
+    plants = [moving.plants[i] for i in order] + [moving.at(x) for x in moving.middles.tolist()]
+    found: list[float] = []
+    for one in plants:
+        try:
+            found.append(_norm(one, K))
+        except FlexplantError:
+            found.append(np.inf)
+        if found[-1] > least:
+            break
+    return found
+
+
+def _norm(plant: StandardPlant, K: StateSpace) -> float:
+    """Return the norm of the loop of one position."""
+    loop = lft(plant.system, K)
+    if not loop.is_stable:
+        raise CertificateError("the loop is not stable.")
+    return float(hinf_norm(loop))
