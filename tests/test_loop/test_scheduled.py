@@ -78,6 +78,37 @@ def test_around_another_machine(schedule):
     assert np.all(np.isfinite(run["die:error"]))
 
 
+@pytest.mark.slow
+def test_feedforward_follows_the_path(plant):
+    """Forces for a place lift another one askew: the lever arms have moved by 80 mm."""
+    ports = plant.assembled.ports
+    coils = [
+        fx.Actuator(one.name, at=one.at, asd=1e-3, moves=MOVES) for one in ports.u
+    ]  # fmt: skip
+    plant = plant.with_ports(ports.replace(u=coils))
+    frozen = fx.design_feedforward(plant)
+
+    def following(there):
+        return *design(there), fx.design_feedforward(there)
+
+    scan = fx.setpoint(0.15, velocity=0.8, acceleration=20.0, jerk=4e3, rate=1e4)
+    lift = fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=50.0, snap=1e4, rate=1e4)
+    worst = {}
+    for name, blocks in (
+        ("following", following), ("frozen", lambda there: (*design(there), frozen)),
+    ):  # fmt: skip
+        run = fx.simulate(
+            schedule_loops(plant, blocks, places=PLACES),
+            reference=lift,
+            duration=0.25,
+            moving={"x": lambda t: -0.08 + scan.at(t).position},
+            noise=False,
+        )
+        worst[name] = np.abs(run["die:error"]).max()
+    assert worst["frozen"] > 1e-6
+    assert worst["following"] < 0.02 * worst["frozen"]
+
+
 def test_refusals(plant):
     with pytest.raises(AssumptionError, match="where the controller lies between two designs"):
         schedule_loops(plant, design, places=[-0.1, 0.1])

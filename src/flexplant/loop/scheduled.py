@@ -14,6 +14,7 @@ from ..checks import FloatArray, Value, function, instance, members, real_array
 from ..errors import AssumptionError, LabelError, ModelError, counted, require_known
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from .blocks import with_known
 from .closed import ClosedLoop, close_loop
 
 
@@ -114,7 +115,8 @@ class ScheduledLoop(Value):
             When the position is out of the plant's range.
         """
         loop = self.loops[0]
-        plant = loop.plant.at(None, **{self.position: x})
+        # the references that its blocks know derivatives of are read there too
+        plant = with_known(loop.plant.at(None, **{self.position: x}), loop.blocks)
         own = loop.controller
         A, B, C, D = self.matrices(float(x))
         law = StateSpace(
@@ -146,9 +148,9 @@ def schedule_loops(
     plant : StandardPlant
         With positions (`Ports(positions=[...])`).
     design : callable
-        Of the plant at a position, to the block or blocks that run there: a Kalman filter and a
-        servo, say. All must have the same channels and states: fix what a design would choose by
-        itself, such as notches.
+        Of the plant at a position, to the block or blocks that run there: a Kalman filter, a servo
+        and a feedforward, say. All must have the same channels and states: fix what a design would
+        choose by itself, such as notches.
     position : str, optional
         The scheduling variable; the only one when not given.
     places : (k,) array [m or rad]
