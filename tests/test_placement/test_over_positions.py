@@ -7,7 +7,14 @@ import pytest
 
 from flexplant.errors import AssumptionError, LabelError, ModelError
 from flexplant.estimation import design_kalman
-from flexplant.placement import OverPositions, PoiVariance, place_sensors, score_sensors
+from flexplant.placement import (
+    BranchAndBound,
+    Exchange,
+    OverPositions,
+    PoiVariance,
+    place_sensors,
+    score_sensors,
+)
 from flexplant.plant import Disturbance, Poi, Ports, Position, Sensor, assemble_plant
 from placement_plate import plate_modes
 
@@ -51,6 +58,14 @@ def test_the_best_over_positions_is_that_of_plants_by_hand(measure):
     assert found.value == pytest.approx(min(values), rel=1e-6, abs=0.0)
     assert found.chosen == tuple(f"s{i}" for i in choices[int(np.argmin(values))])
     assert found.proven
+    # the same with bounds alone, and a bound that holds with no branch opened
+    sought = place_sensors(
+        plant, heads, 4, criterion, method=BranchAndBound(starts=1), rng=0
+    )  # fmt: skip
+    assert sought.proven
+    assert sought.chosen == found.chosen
+    some = place_sensors(plant, heads, 4, criterion, method=Exchange(starts=1), rng=0)
+    assert 0.5 * min(values) < some.bound <= min(values)
     # what is best at the centre alone is worse than this at another place
     alone = place_sensors(plant, heads, 4, PoiVariance("die"))
     assert alone.chosen != found.chosen

@@ -252,11 +252,16 @@ def test_from_the_shell_until_ctrl_c(tmp_path):
     with subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONPATH": source},
+        # where this runs in the background of a shell, it was started with SIGINT ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:  # fmt: skip
-        line = process.stdout.readline()
-        assert line.startswith("flexplant workbench at http://127.0.0.1:")
-        process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0
+        try:
+            line = process.stdout.readline()
+            assert line.startswith("flexplant workbench at http://127.0.0.1:")
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0
+        finally:
+            process.kill()
 
 
 def test_a_fleet_of_coupled_axes(browser):

@@ -64,24 +64,11 @@ class Tangent(Below):
         return _safe(np.einsum("ij,mij->m", self.face, solved) + self.constant)
 
     def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
-        """Return a number below the cost of all choices of a branch, and weights near the least.
+        """Return a number below the cost of all choices of a branch, and weights near the least."""
+        return least_sum([self], np.ones(1), branch, start)
 
-        ``h = 1 / (cost - constant)`` is concave in w: a harmonic sum of concave information.
-        """
-        size = abs(self.constant)
-        most, weights = ascended(
-            self._inverse,
-            branch,
-            start,
-            steps=_CUTS,
-            close=lambda h, most: 1.0 / h - 1.0 / most <= _GAP * (1.0 / h + size),
-        )
-        if not np.isfinite(most):
-            return -np.inf, weights
-        return float(_safe(np.array(1.0 / most + self.constant))), weights
-
-    def _inverse(self, weights: FloatArray) -> tuple[float, FloatArray] | None:
-        """Return one over the cost, without the constant, and its gradient."""
+    def fall(self, weights: FloatArray) -> tuple[float, FloatArray] | None:
+        """Return the cost without the constant, and how fast it falls with each weight."""
         try:
             solved = np.linalg.solve(self._information(weights[None])[0], self.face)
         except np.linalg.LinAlgError:
@@ -89,14 +76,44 @@ class Tangent(Below):
         cost = float(np.sum(self.face * solved))
         if not cost > 0.0:
             return None
-        rise = np.einsum("ik,nij,jk->n", solved, self.slopes, solved, optimize=True) / cost**2
-        return 1.0 / cost, rise
+        return cost, np.einsum("ik,nij,jk->n", solved, self.slopes, solved, optimize=True)
 
     def _information(self, weights: FloatArray) -> FloatArray:
         """Return ``I + sum_i (w_i - v_i) Z_i`` for rows of weights (m, N)."""
         total, n = self.slopes.shape[:2]
         added = (weights - self.at) @ self.slopes.reshape(total, n * n)
         return np.asarray(added.reshape(-1, n, n) + np.eye(n))
+
+
+def least_sum(
+    parts: Sequence[Tangent], shares: FloatArray, branch: Branch, start: FloatArray
+) -> tuple[float, FloatArray]:
+    """Return a number below ``sum_p share_p cost_p`` in a branch, and weights near the least.
+
+    ``h = 1 / sum_p share_p (cost_p - constant_p)`` is concave in w: a harmonic sum of information
+    that is concave, block by block.
+    """
+    constant = float(shares @ [part.constant for part in parts])
+
+    def inverse(weights: FloatArray) -> tuple[float, FloatArray] | None:
+        found = [part.fall(weights) for part in parts]
+        if any(one is None for one in found):
+            return None
+        costs, falls = zip(*(one for one in found if one is not None), strict=True)
+        cost = float(shares @ costs)
+        return 1.0 / cost, shares @ np.array(falls) / cost**2
+
+    size = abs(constant)
+    most, weights = ascended(
+        inverse,
+        branch,
+        start,
+        steps=_CUTS,
+        close=lambda h, most: 1.0 / h - 1.0 / most <= _GAP * (1.0 / h + size),
+    )
+    if not np.isfinite(most):
+        return -np.inf, weights
+    return float(_safe(np.array(1.0 / most + constant))), weights
 
 
 class Convex(Scorer):

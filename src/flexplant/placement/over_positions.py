@@ -7,46 +7,14 @@ from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
-import numpy as np
-
-from ..checks import FloatArray, checked, one_of
+from ..checks import checked, one_of
 from ..errors import AssumptionError, LabelError, counted
 from ..plant import StandardPlant
 from ..plant.scheduling import values_over
 from .candidates import Port, side_of, sides_of, with_side
 from .criterion import Scorer, Wrapping
 from .layouts import RigidPart
-from .wrapping import MEASURES, ManyScores, over
-
-
-@dataclass(frozen=True, eq=False)
-class AtPositions(Scorer):
-    """The worst or the mean score over positions; infinite where one misses a rigid-body mode."""
-
-    many: ManyScores
-    rigid: tuple[RigidPart, ...]
-
-    def value(self, chosen: Sequence[int]) -> float:
-        """Return it for one choice."""
-        missed = [i for i, part in enumerate(self.rigid) if part.missing(chosen)]
-        if missed:
-            raise AssumptionError(
-                f"It misses a rigid-body mode at {len(missed)} of {len(self.rigid)} positions."
-            )
-        return self.many.value(chosen)
-
-    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
-        """Return it for several choices."""
-        missed = np.any([part.all_missing(sets) for part in self.rigid], axis=0)
-        values = np.full(len(sets), np.inf)
-        kept = np.flatnonzero(~missed).tolist()
-        if kept:
-            values[kept] = self.many.score([sets[i] for i in kept])
-        return values
-
-    def bound(self, count: int, required: Sequence[int]) -> float:
-        """Return the worst or the mean of the bounds."""
-        return self.many.bound(count, required)
+from .many import MEASURES, many_scores, over
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -116,7 +84,7 @@ class OverPositions(Wrapping):
         for there, ports in self._there(plant, candidates):
             rigid.append(RigidPart.of(there, side, ports))
             parts.append(inner.scorer(there, ports))
-        return AtPositions(ManyScores(tuple(parts), self.measure), tuple(rigid))
+        return many_scores(parts, self.measure, rigid)
 
     def _plants(self, plant: StandardPlant) -> Iterator[StandardPlant]:
         """Yield the plant at each position."""

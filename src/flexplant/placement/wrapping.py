@@ -17,6 +17,7 @@ from .candidates import SIDES, Port, checked_plant, side_of, sides_of, with_side
 from .criterion import Criterion, Scorer, Wrapping, as_criterion
 from .gramian import Shapes, shapes_of
 from .layouts import RigidPart
+from .many import MEASURES, many_scores, over
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,9 +178,6 @@ def _worth(shapes: Shapes, which: npt.NDArray[np.bool_]) -> FloatArray:
     return np.asarray(np.sum(shapes.phi[:, which] ** 2 / (4.0 * zeta * omega**3), axis=1))
 
 
-MEASURES = ("worst", "mean")
-
-
 def _checked_machines(machines: Any, name: str) -> tuple[StandardPlant, ...]:
     """Return the machines of a criterion, one at least."""
     if isinstance(machines, str) or not isinstance(machines, Sequence) or not machines:
@@ -188,28 +186,6 @@ def _checked_machines(machines: Any, name: str) -> tuple[StandardPlant, ...]:
             "plant.uncertain(fit).sample(rng, 20), say."
         )
     return tuple(checked_plant(machine) for machine in machines)
-
-
-@dataclass(frozen=True, eq=False)
-class ManyScores(Scorer):
-    """The worst or the mean of several scores of the same choice."""
-
-    parts: tuple[Scorer, ...]
-    measure: str
-
-    def value(self, chosen: Sequence[int]) -> float:
-        """Return it for one choice."""
-        return float(over(self.measure, [part.value(chosen) for part in self.parts]))
-
-    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
-        """Return it for several choices."""
-        found = np.array([part.score(sets) for part in self.parts])
-        return np.asarray(over(self.measure, found))
-
-    def bound(self, count: int, required: Sequence[int]) -> float:
-        """Return the worst or the mean of the bounds."""
-        bounds = [part.bound(count, required) for part in self.parts]
-        return float(over(self.measure, bounds))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -257,7 +233,7 @@ class OverMachines(Wrapping):
         """Return the scores by those on each machine."""
         inner = self.inner
         parts = tuple(inner.scorer(machine, candidates) for machine in self._with(plant))
-        return ManyScores(parts, self.measure)
+        return many_scores(parts, self.measure)
 
     def _with(self, plant: StandardPlant) -> list[StandardPlant]:
         return [machine.with_ports(plant.assembled.ports) for machine in self.machines]
@@ -332,8 +308,3 @@ class AfterLoss(Wrapping):
         losable = tuple(side_of(port) == SIDES[self.of] for port in candidates)
         rigid = RigidPart.of(plant, sides_of(candidates), candidates)
         return LossScores(inner, rigid, losable, self.measure)
-
-
-def over(measure: str, values: Any) -> Any:
-    """Return the largest or the mean along the first axis."""
-    return np.max(values, axis=0) if measure == "worst" else np.mean(values, axis=0)
