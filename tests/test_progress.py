@@ -10,12 +10,16 @@ import threading
 import time
 import types
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import flexplant as fx
 from flexplant import parallel as progress
-from flexplant.parallel import Progress, interruptible, mapped, tick
+from flexplant.parallel import Progress, expect, interruptible, mapped, tick
+from stages import RATE, ports, some_modes
 
 HERE = Path(__file__).parent
 
@@ -103,7 +107,11 @@ def test_bars_on_a_terminal_and_a_line_each_in_a_pipe():
     assert out == b"done\n"
     lines = said.decode().splitlines()
     assert len(lines) > 4, "a line each, where they run at once"
-    assert not [line for line in lines if not re.search(r": 0 s(, \d+ of \d+ done, .*)?$", line)]
+    assert not [
+        line
+        for line in lines
+        if not re.search(r": 0 s(, \d+ of \d+ done, .*)?$|: some .* s expected$", line)
+    ]
 
 
 INTERRUPTED = """
@@ -202,6 +210,85 @@ def test_a_long_first_item_and_a_long_rest(monkeypatch, capsys):
         said = capsys.readouterr().err.splitlines()
         assert len(said) == 2 and said[0] == "machines: 0 s"
         assert re.fullmatch(r"machines: 0 s, 1 of 4 done, some 1 s more" + more, said[1])
+
+
+def test_what_is_known_before_is_said_before(monkeypatch, capsys):
+    """Once, with the advice where it is long; what a checkpoint has does not count as quick."""
+    for seconds, line in ((4.4, "some 4 s expected"), (444.0, "some 400 s expected. Take fewer.")):
+        with Progress(None, "machines", advice="Take fewer."), Progress(None, "inside"):
+            expect(seconds=1.9)
+            assert not capsys.readouterr().err
+            expect(seconds=seconds)
+            assert capsys.readouterr().err == f"machines: {line}\n"
+            expect(seconds=1e4)
+            assert not capsys.readouterr().err
+    with Progress(None, "machines", progress=False):
+        expect(seconds=1e4)
+    expect(seconds=1e4)  # of no work
+    assert not capsys.readouterr().err
+    monkeypatch.setattr(progress, "PATIENCE", 0.05)
+    with Progress(100, "machines") as bar:
+        bar.advance(90, known=True)
+        bar.advance()
+        time.sleep(0.3)
+    assert "91 of 100 done" in capsys.readouterr().err
+    assert 2.5 < bar._left() < 10.0, "nine more, each as long as the one"
+
+
+def test_advice_on_a_terminal(monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(progress, "PATIENCE", 0.02)
+    monkeypatch.setattr(progress, "LONG", 0.0)
+    with Progress(1000, "machines", advice="Take fewer.") as bar:
+        bar.advance()
+        time.sleep(0.2)
+    assert capsys.readouterr().err.count("s more. Take fewer.\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["modes", "identification", "placement", "response"])
+def test_estimates_before_the_start_hold_to_a_factor(name, monkeypatch, capsys):
+    """What is said before is right within five times, whatever the machine."""
+    monkeypatch.setattr(progress, "PATIENCE", 0.1)
+    rng = np.random.default_rng(0)
+    if name == "modes":
+        block = fx.solid_block(
+            size=(0.4, 0.4, 0.1),
+            elements=(14, 14, 5),
+            density=2700,
+            youngs_modulus=70e9,
+            poisson_ratio=0.33,
+        )
+        work = partial(fx.solve_modes, block, count=30)
+    elif name == "identification":
+        plant = fx.assemble_plant(some_modes(count=12, attached=False), ports())
+        frf = fx.frequency_response(plant.Gyu, np.linspace(100.0, 900.0, 800))
+        size = 1e-3 * float(np.median(abs(frf.data)))
+        noise = rng.standard_normal((2, *frf.data.shape)) * size
+        data = frf.data + noise[0] + 1j * noise[1]
+        work = partial(
+            fx.identify_modes, frf.replace(data=data, variance=np.full(data.shape, 2 * size**2))
+        )
+    elif name == "placement":
+        plant = fx.assemble_plant(some_modes(count=12, attached=False), ports())
+        grid = [(x, y, 0.0) for x in np.linspace(0, 0.6, 6) for y in np.linspace(0, 0.6, 6)]
+        sensors = [fx.Sensor(f"s{i}", at=place, asd=1e-11) for i, place in enumerate(grid)]
+        work = partial(fx.place_sensors, plant.discretized(rate=RATE), sensors, 4, rng=0)
+    else:
+        A = rng.standard_normal((700, 700)) / 30 - 1.5 * np.eye(700)
+        B = rng.standard_normal((700, 4))
+        work = partial(
+            fx.frequency_response,
+            fx.StateSpace(A, B, B.T, np.zeros((4, 4))),
+            np.linspace(1.0, 2.0, 500),
+        )
+    begin = time.perf_counter()
+    work()
+    spent = time.perf_counter() - begin
+    said = capsys.readouterr().err.splitlines()
+    seconds = float(re.search(r": some ([\d.e-]+) s expected", said[0])[1])
+    assert spent / 5 < seconds < spent * 5, (name, spent, said)
+    assert all("expected" not in line for line in said[1:])
 
 
 def test_the_outermost_work_has_the_bar(monkeypatch, capsys):

@@ -136,7 +136,7 @@ def mapped(
         bar.advance()
 
     with one_thread(), Progress(len(calls), description, progress=progress, advice=advice) as bar:
-        bar.advance(len(results))
+        bar.advance(len(results), known=True)
         start = perf_counter()
         for done, (number, call) in enumerate(left):
             if executor is not None and done and perf_counter() - start > PROBE:
@@ -379,8 +379,8 @@ class Progress:
 
     Elsewhere (pipes, files of a cluster) one line on the standard error says after two seconds what
     runs, and how long it will take where that can be said; where the first of several items takes
-    longer, a second line says so when it is done. `advice` follows where more than 20 seconds are
-    left. `progress=False` is silent.
+    longer, a second line says so when it is done. What `expect` knows before is said before.
+    `advice` follows where more than 20 seconds are left. `progress=False` is silent.
 
     Work inside of other work shows none of its own, neither here nor in the process of a pool.
     """
@@ -394,17 +394,17 @@ class Progress:
         advice: str = "",
     ) -> None:
         self.bar: Any = None
-        #: items counted
-        self.done = 0
+        #: items counted, of these what was known before, and the seconds expected in all
+        self.done, self._known, self._expected = 0, 0, 0.0
         self.description, self.advice = description, advice
         self._over = threading.Event()
         self._forced = bool(progress)
         self._total = total
         outermost = progress is None and not _open_bars()
-        stream = watched() if outermost else None
-        self._unseen = outermost and stream is None and sys.stderr is not None
+        self._stream = watched() if outermost else None
+        self._unseen = outermost and self._stream is None and sys.stderr is not None
         self._thread: threading.Thread | None = None
-        if progress or stream is not None:
+        if progress or self._stream is not None:
             from tqdm import tqdm
 
             self.bar = tqdm(
@@ -413,12 +413,13 @@ class Progress:
                 bar_format=None if total != 0 else "{desc}: {elapsed}",
                 delay=0.0 if progress else PATIENCE,
                 leave=bool(progress),
-                file=stream or sys.stderr,
+                file=self._stream or sys.stderr,
             )
 
     def __enter__(self) -> Self:
         try:
             _open_bars().append(self)
+            self._begin = monotonic()
             if (self.bar is not None and not self._forced) or self._unseen:
                 work = self._said if self._unseen else self._shown
                 self._thread = threading.Thread(target=work, daemon=True)
@@ -450,40 +451,93 @@ class Progress:
         elif self._thread is not None and self._thread.ident is not None:
             self._thread.join()
 
-    def advance(self, items: int = 1) -> None:
-        """Count some items as done."""
+    def advance(self, items: int = 1, *, known: bool = False) -> None:
+        """Count some items as done; `known` ones took no time, as those of a checkpoint."""
         self.done += items
+        self._known += items if known else 0
         if self.bar is not None:
             self.bar.update(items)
 
+    def expects(self, seconds: float) -> None:
+        """Say at once how long all of it will take, the first time that this is two seconds."""
+        if self._expected or seconds < PATIENCE or not (self._unseen or self.bar is not None):
+            return
+        self._expected = seconds
+        self._write(f"some {float(f'{seconds:.1g}'):g} s expected", seconds)
+
     def _shown(self) -> None:
         """Draw the bar while the first item, or any later one, takes its time."""
-        wait = PATIENCE
+        wait, advised = PATIENCE, not self.advice
         while not self._over.wait(wait):
+            left = self._left()
+            if not advised and left > LONG:
+                advised = True
+                if not self._expected:
+                    self._write(f"some {left:.0f} s more", left)
             self.bar.refresh()
             wait = _AGAIN
 
     def _said(self) -> None:
         """Say what runs, and how long it will take, as soon as one item of several is done."""
-        begin = monotonic()
         if self._over.wait(PATIENCE):
             return
-        self._say(monotonic() - begin)
-        if self._total and not self.done:
-            while not self.done:
+        if self._left() or not self._expected:
+            self._say()
+        if self._total and not self._left():
+            while not self._left():
                 if self._over.wait(min(PATIENCE, _AGAIN)):
                     return
-            self._say(monotonic() - begin)
+            self._say()
 
-    def _say(self, spent: float) -> None:
-        text = ""
-        if self._total and self.done:
-            left = max(spent * (self._total - self.done) / self.done, 0.0)
-            text = f", {self.done} of {self._total} done, some {left:.0f} s more"
-            if left > LONG and self.advice:
-                text += f". {self.advice}"
+    def _left(self) -> float:
+        """Return the seconds that what is not done will take, by what is; 0 where unknown."""
+        own = self.done - self._known
+        if not self._total or own <= 0:
+            return 0.0
+        return max((monotonic() - self._begin) * (self._total - self.done) / own, 1e-9)
+
+    def _say(self) -> None:
+        left, text = self._left(), f"{monotonic() - self._begin:.0f} s"
+        if left:
+            text += f", {self.done} of {self._total} done, some {left:.0f} s more"
+        self._write(text, left)
+
+    def _write(self, text: str, left: float) -> None:
+        """Write a line, with the advice where much is left."""
+        line = f"{self.description.rstrip(':')}: {text}"
+        line += f". {self.advice}" if left > LONG and self.advice else ""
         with suppress(OSError, ValueError):  # a closed stream
-            sys.stderr.write(f"{self.description.rstrip(':')}: {spent:.0f} s{text}\n")
+            if self.bar is not None:
+                self.bar.write(line, file=self._stream or sys.stderr)
+            else:
+                sys.stderr.write(line + "\n")
+
+
+@cache
+def _seconds_each() -> float:
+    """Return the seconds of one multiplication here, in products of matrices."""
+    square = np.ones((256, 256))
+    with one_thread():
+        square @ square
+        start = perf_counter()
+        square @ square
+        return (perf_counter() - start) / 256**3
+
+
+#: no processor does a multiplication in less [s]: shorter work is not worth measuring
+_LEAST = 1e-12
+
+
+def expect(multiplications: float = 0.0, *, seconds: float = 0.0) -> None:
+    """Say how long the outermost work under way takes in all, where that is long.
+
+    `multiplications` are those of products of matrices that take as long.
+    """
+    bars = _open_bars()
+    if bars:
+        if multiplications * _LEAST > PATIENCE * 1e-2:
+            seconds += multiplications * _seconds_each()
+        bars[0].expects(seconds)
 
 
 def tick(description: str) -> None:

@@ -31,7 +31,7 @@ from ..errors import (
     warn,
 )
 from ..lti.frequency import Frf
-from ..parallel import Progress, one_thread
+from ..parallel import Progress, expect, one_thread
 from ..tolerances import ROUNDING, TINY
 from .diagram import Moments, PoleSelection, StabilisationDiagram, built_diagram
 from .gate import gated, steady
@@ -69,6 +69,8 @@ REGION = 20
 CHEAP = 5e7
 #: products that a refinement without a request may take in all, a minute or two
 BUDGET = 5e10
+#: multiplications of a whole fit and of a first answer for those of a step, on average
+_REFINED, _FIRST = 6e3, 200.0
 #: steps of the first answer: the diagram's poles are off by more than noise makes them
 QUICK = 2
 
@@ -321,6 +323,7 @@ def _identified(
     advice = "Fewer lines (band=), fewer channels or refine=False take less."
     with Progress(STAGES, name, progress=shown, advice=advice) as bar:
         bar.advance()
+        expect(work * (_REFINED if refine or (refine is None and not costly) else _FIRST))
         lines = lines_of(ready)
         fit, reason = _first(lines, chosen, alone), ""
         differ = refine is None and alone and outputs_disagree(fit)

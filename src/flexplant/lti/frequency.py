@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,6 +25,7 @@ from ..checks import (
     signal_names,
 )
 from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
+from ..parallel import Progress, expect
 from ..tolerances import SAME
 from .frequency_sweep import checked_freq as checked_freq
 from .frequency_sweep import default_freq as default_freq
@@ -33,6 +35,8 @@ from .measured_lines import checked_correlation, checked_overlap, checked_window
 from .responses import responses
 from .statespace import System, as_statespace
 
+#: multiplications below which a response takes no time
+_LONG = 1e9
 _NUMBERS = (int, float, complex, np.number)
 
 
@@ -537,7 +541,13 @@ def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
     if freq is None:
         freq = default_freq(g)
     freq = sampled_freq(freq, g.dt)
-    data = responses(g, freq)
+    work = g.C.size * g.B.shape[1] * freq.size * 10.0
+    work += 20.0 * len(g.A) ** 3 if g.blocks is None else 0.0
+    long = work > _LONG
+    advice = "Fewer lines or states take less."
+    with Progress(0, "frequency response", advice=advice) if long else nullcontext():
+        expect(work)
+        data = responses(g, freq)
     # the checks of Frf hold already: its copy and its look at every entry cost twice the response
     for array in (freq, data):
         array.flags.writeable = False

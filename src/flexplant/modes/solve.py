@@ -132,7 +132,7 @@ def solve_modes(
     # complex modes of a large model are found in a basis of more undamped ones
     perhaps = damping is None and model.D is not None and _is_large(model)
     more = wider(kept, top, model.n_dof) if perhaps and not is_rayleigh(model) else (kept, top)
-    with Progress(None, STEPS, progress=progress):
+    with Progress(None, STEPS, progress=progress, advice="Fewer modes (count=, below=) take less."):
         # one factor for the modes and for the attachment vectors, while it is held here
         factored = stiffness_factor(model, factor) if at and _is_large(model) else None
         omega, phi, certificate = _undamped(model, *more, factor)

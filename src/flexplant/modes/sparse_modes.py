@@ -11,7 +11,7 @@ import scipy.linalg as la
 
 from ..checks import FloatArray, IntArray, Matrix, Rng
 from ..errors import ModelError, SolverError, counted
-from ..parallel import one_thread, tick
+from ..parallel import expect, one_thread, tick
 from ..sparse.factor import by_rows
 from ..sparse.lanczos import (
     BLOCK,
@@ -35,6 +35,7 @@ from .shifted import (
     CountingFactor,
     StiffnessFactor,
     counting_factor,
+    dissection_of,
     modes_below,
     search_factor,
     stiffness_factor,
@@ -46,6 +47,9 @@ _EXTRA = 4
 _GAP, _GAP_ROUNDINGS = SAME, 4.0
 #: more modes than this are not looked for: their shapes and the basis fill the memory
 _MOST = 2000
+#: multiplications for each mode that take as long, by DOFs and by entries of the factor: measured
+#: on solids and plates of 6 615 to 22 326 DOFs, which memory slows down
+_EACH_DOF, _EACH_ENTRY = 5e4, 40.0
 #: searches with what is found locked, before giving up
 _SEARCHES = 8
 #: residuals, relative to ||K phi||, beyond which Lanczos goes on, unless they are rounding
@@ -92,6 +96,8 @@ def _counted(
                 f"elastic modes: more than {_MOST} are not solved for at once. Choose a lower "
                 "frequency, or for the lowest ones with count=."
             )
+    order = dissection_of(model)
+    expect(2 * order.multiplications + count * (_EACH_DOF * n + _EACH_ENTRY * order.n_factor))
     squares, phi = np.zeros(0), np.zeros((n, 0))
     counted, sure, shift = 0, 0, 0.0
     missing = min(count + _EXTRA, n - r)

@@ -6,16 +6,17 @@ import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..checks import FloatArray, between, checked, function, whole
 from ..errors import ModelError, warn
-from ..parallel import Progress
+from ..parallel import Progress, expect
 from ..work import Work
 from .convex import Below, Convex
-from .layouts import layouts_of
+from .layouts import ADVICE, layouts_of
 from .problem import Found, Problem, Search
 from .quadratic import Quadratic
 from .rows import Branch, Groups
@@ -67,10 +68,11 @@ def best_start(
     """Return the best choice of several starts, the values on the way of each, evaluations."""
     rounded = None if relaxed is None else problem.rounded(relaxed[1])
     runs = work.mapped(
-        partial(_run, problem),
+        partial(_run, problem, starts),
         ["greedy", *["random"] * (starts - 1), *([] if rounded is None else [rounded])],
         rng=work.rng,
         description="starts",
+        advice=ADVICE,
         restored=lambda row: (tuple(row[0]), tuple(row[1]), row[2]),
     )
     chosen, _, _ = min(runs, key=lambda run: run[1][-1])
@@ -78,9 +80,9 @@ def best_start(
 
 
 def _run(
-    problem: Problem, first: tuple[int, ...] | str, rng: np.random.Generator
+    problem: Problem, starts: int, first: tuple[int, ...] | str, rng: np.random.Generator
 ) -> tuple[tuple[int, ...], tuple[float, ...], int]:
-    run = _Run(problem)
+    run = _Run(problem, starts)
     if isinstance(first, str):
         return run.exchanged(run.greedy() if first == "greedy" else run.drawn(rng))
     return run.exchanged(first)
@@ -89,8 +91,8 @@ def _run(
 class _Run:
     """Exchanges from a first choice; scores that are known are not computed again."""
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+    def __init__(self, problem: Problem, starts: int) -> None:
+        self.problem, self.starts = problem, starts
         self.seen: dict[tuple[int, ...], float] = {}
         self.tangent: tuple[tuple[int, ...], Below | None] | None = None
 
@@ -149,7 +151,11 @@ class _Run:
         chosen = list(self.problem.start(None))
         rest = [i for i in self.problem.free if i not in chosen]
         while len(chosen) < self.problem.count:
+            begin = perf_counter()
             best = int(np.argmin(self._values([[*chosen, i] for i in rest])))
+            # of all starts; said once, so that the first scores decide
+            scores = 1 + _SCORES * self.starts
+            expect(seconds=(perf_counter() - begin) * self.problem.count * scores)
             chosen.append(rest.pop(best))
         return chosen
 
@@ -174,6 +180,8 @@ def _flat(units: Sequence[tuple[int, ...]]) -> list[int]:
     return [i for unit in units for i in unit]
 
 
+#: scores of a start beside candidates times count, on average (bounds leave most out)
+_SCORES = 0.45
 #: up to so many choices are all scored by the fast criterion
 _ALL = 20_000
 

@@ -20,6 +20,7 @@ from .criterion import AGREEMENT, Criterion, OnPlant, Scorer, as_criterion
 from .poi_variance import PoiVariance
 
 ASSUMPTION = {"y": "detectable", "u": "stabilisable"}
+ADVICE = "Fewer candidates, fewer starts or executor=ProcessPoolExecutor() help."
 #: choices that are scored at once: always as many, so that rounding does not depend on the executor
 _BLOCK = 64
 
@@ -48,9 +49,8 @@ class Layouts:
     ) -> FloatArray:
         """Return the scores (n,) of many choices, computed on an executor."""
         blocks = [sets[i : i + _BLOCK] for i in range(0, len(sets), _BLOCK)]
-        advice = "Fewer candidates, fewer starts or executor=ProcessPoolExecutor() help."
         found = work.mapped(
-            self.score, blocks, description=description, restored=_floats, advice=advice
+            self.score, blocks, description=description, restored=_floats, advice=ADVICE
         )
         return np.concatenate(found) if found else np.zeros(0)
 

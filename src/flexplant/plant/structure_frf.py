@@ -203,7 +203,8 @@ def frequency_response(
         return through.frf(grid, data, route=route)
     limit, most = positive(tolerance, "tolerance"), whole(checks, "checks", minimum=0)
     rows, loads = through.rows, through.loads
-    with Progress(0, "frequency response"):
+    advice = "A lower last frequency needs fewer modes; those that you hold are used again."
+    with Progress(0, "frequency response", advice=advice):
         modes = modes_reaching(model, float(grid.max(initial=0.0)))
         factor = held_factor(model)  # one for the static shapes and the check
         basis = DynamicBasis(model, modes, np.hstack([loads, rows.T]), damping)

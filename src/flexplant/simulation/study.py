@@ -118,7 +118,7 @@ def study(
             seeds = list(np.random.SeedSequence(entropy, spawn_key=tuple(key)).spawn(len(items)))
         left = [i for i in range(len(items)) if i not in log.rows]
         calls = {i: (pipeline, items[i], seeds[i]) for i in left}
-        bar.advance(len(log.rows))
+        bar.advance(len(log.rows), known=True)
         for number, outcome in _outcomes(calls, executor, timeout):
             log.add(number, _kept(outcome, number))
             bar.advance()

@@ -58,14 +58,18 @@ class Dissection:
         return int(sum((f.last - f.first) * (f.last - f.first + f.rows.size) for f in self.fronts))
 
     @property
+    def multiplications(self) -> float:
+        """Of one factorisation."""
+        sizes = ((float(f.last - f.first), float(f.rows.size)) for f in self.fronts)
+        return sum(p * (p * p / 6 + q * (p + q) / 2) for p, q in sizes)
+
+    @property
     def is_costly(self) -> bool:
         """Whether single precision pays: a factorisation costs far more than solutions with it.
 
         So it is for bulky structures, whose modes are also not lost in its rounding.
         """
-        sizes = ((float(f.last - f.first), float(f.rows.size)) for f in self.fronts)
-        work = sum(p * (p * p / 6 + q * (p + q) / 2) for p, q in sizes)
-        return work > _COSTLY * self.n_factor
+        return self.multiplications > _COSTLY * self.n_factor
 
 
 def dissect(
