@@ -16,7 +16,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.checks import with_unit
-from flexplant.errors import FlexplantWarning, ModelError
+from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.plot.report import neighbours
 from stages import RATE, full, ports, reduced, some_modes
 
@@ -111,6 +111,24 @@ def test_it_begins_with_the_result_and_ends_with_versions(text, design):
         "The plant, from forces along each axis to the POI",
     ):
         assert any(part in one for one in captions), part
+
+
+@pytest.mark.slow
+def test_of_several_references_none_is_taken_silently(design):
+    loop = design[0]
+    with pytest.raises(LabelError, match=r"3 references .*reference='die:ref'"):
+        fx.compare_loops({"servo": loop})
+    pairs = {"die": "die", "die:rx": "die:rx", "die:ry": "die:ry"}
+    drawn = {line.get_label(): line for line in fx.plot.sensitivity(loop).get_lines()}
+    named = fx.plot.sensitivity({"servo": loop}).get_legend_handles_labels()[1]
+    assert named[:3] == ["servo die", "servo die:rx", "servo die:ry"]
+    for label, axis in pairs.items():
+        freq, size = drawn[label].get_data()
+        point = freq.size // 2
+        found = loop.frequency_response(freq[[point]])[f"{axis}:error", f"{axis}:ref"]
+        assert size[point] == pytest.approx(20 * np.log10(abs(found[0])), abs=1e-6)
+        row = fx.compare_loops({"servo": loop}, reference=f"{axis}:ref")["servo"]
+        assert row.peak == pytest.approx(10 ** (max(size) / 20), rel=1e-6)
 
 
 @pytest.mark.slow

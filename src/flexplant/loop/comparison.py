@@ -10,6 +10,7 @@ import numpy as np
 from ..checks import FloatArray, Value, short
 from ..errors import LabelError, ModelError, require_known
 from ..lti.frequency_sweep import climbed
+from .blocks import references
 from .closed import ClosedLoop
 from .sensitivity import first_above
 
@@ -118,7 +119,7 @@ def compare_loops(
     loops : mapping {name: ClosedLoop}
         What to compare: designs on one machine, or one design on a model and the machine.
     reference : str, optional
-        The channel of w that S starts from; the first one named `...:ref` when not given.
+        The channel of w that S starts from, where there are several; `axis_sensitivities` has all.
     error : str, optional
         The channel of z that S ends at; that of the reference when not given.
 
@@ -132,7 +133,7 @@ def compare_loops(
     ModelError
         When there is no mapping of closed loops, or some are sampled and some continuous.
     LabelError
-        When a loop lacks the channels.
+        When a loop lacks the channels, or has several references and none is named.
 
     Examples
     --------
@@ -183,9 +184,15 @@ def compare_loops(
 def _channels(loop: ClosedLoop, reference: str | None, error: str | None) -> tuple[str, ...]:
     """Return reference and error, or nothing when the loop has no reference."""
     if reference is None:
-        reference = next((name for name in loop.plant.w if name.endswith(":ref")), None)
-        if reference is None:
+        known = [name for name in loop.plant.w if name.endswith(":ref")]
+        if len(known) > 1:
+            raise LabelError(
+                f"the loop has {len(known)} references {known}, each with an S of its own: say "
+                f"which, reference={known[0]!r}; fx.plot.sensitivity(loop) draws all."
+            )
+        if not known:
             return ()
+        reference = known[0]
     return reference, error if error is not None else f"{reference.removesuffix(':ref')}:error"
 
 
@@ -203,6 +210,16 @@ def error_sensitivity(
         reference, error = pair
     gain = loop.gain(reference, error)
     return climbed(lambda freq: np.abs(gain(freq)[0, 0]), loop.broken.grid, 4)
+
+
+def axis_sensitivities(loop: ClosedLoop) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return |S| of each axis that has a reference, by its name: frequencies [Hz] and sizes."""
+    pairs = {name: f"{name.removesuffix(':ref')}:error" for name in references(loop.plant)}
+    return {
+        error.removesuffix(":error"): error_sensitivity(loop, ref, error)
+        for ref, error in pairs.items()
+        if error in loop.plant.z
+    }
 
 
 def _bandwidth(curve: tuple[FloatArray, FloatArray] | None) -> float:

@@ -14,7 +14,8 @@ from ..checks import ComplexArray, FloatArray, positive, real_array, short
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..loop import ClosedLoop, complementary_sensitivity, control_sensitivity
 from ..loop import sensitivity as sensitivity_of
-from ..loop.comparison import error_sensitivity
+from ..loop.blocks import references
+from ..loop.comparison import axis_sensitivities, error_sensitivity
 from ..lti.frequency import Frf, frequency_response
 from ..lti.measured_lines import LINES, followed, steps_between
 from ..lti.responses import continuous_poles
@@ -283,7 +284,7 @@ def sensitivity(
     Parameters
     ----------
     curves : ClosedLoop, Frf, (plant, controller), (freq [Hz], size), or mapping {label: of these}
-        What to draw. Of a loop with a reference |S| from that to the error at the POI; of others,
+        What to draw. Of a loop |S| from each reference to the error of its axis; without any,
         and of `(plant, controller)`, the largest singular value of S at u; of an `Frf`, such as
         `sensitivity(loop)`, its largest singular value.
     colors : mapping {label: color}, optional
@@ -314,7 +315,11 @@ def sensitivity(
     >>> ax.get_xlabel()
     'frequency [Hz]'
     """
-    lines = {label: _sensitivity_size(one, freq) for label, one in by_label(curves).items()}
+    lines: dict[str, _Line] = {}
+    for label, one in by_label(curves).items():
+        several = isinstance(one, ClosedLoop) and len(references(one.plant)) > 1
+        found = axis_sensitivities(one) if several else {"": _sensitivity_size(one, freq)}
+        lines |= {" ".join(filter(None, (label, axis))): line for axis, line in found.items()}
     alone = apart(ax, lines) and not dashed
     if alone:
         panels = panel_axes(None, len(lines), sharey=True)

@@ -430,7 +430,7 @@ def report(
     with Progress(0, "report"):
         found = [
             result(design, gallery, channel),
-            loops_section(design, gallery),
+            loops_section(design, gallery, channel),
             *sections(design, gallery),
             certificates(design),
             _origin({**noisy, **(seeds or {})}),

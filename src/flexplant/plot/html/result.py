@@ -12,9 +12,16 @@ import numpy as np
 from ...certificates import in_words, stability_name
 from ...checks import Value, short, with_unit
 from ...errors import FlexplantError, ModelError, counted
-from ...loop import ClosedLoop, ErrorBudget, LoopFigures, compare_loops, report_loops
+from ...loop import (
+    ClosedLoop,
+    ErrorBudget,
+    LoopComparison,
+    LoopFigures,
+    compare_loops,
+    report_loops,
+)
 from ...loop.blocks import references
-from ...loop.comparison import error_sensitivity
+from ...loop.comparison import axis_sensitivities, error_sensitivity
 from ...plant import StandardPlant
 from ...simulation import ExposureErrors, Verdict
 from ..errors import budget
@@ -30,8 +37,8 @@ def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | N
     if not loops:
         return None
     name, loop = next(iter(loops.items()))
-    compared = compare_loops(loops)
-    main = channel or next((n for n in loop.plant.z if n.endswith(":error")), loop.plant.z[0])
+    main = _main(loop, channel)
+    compared = _compared(loops, main)
     found, why = _budget(loop, main)
     parts = [tiles([_error_tile(main, found), *_stability(loop), *_margins(compared.rows[name])])]
     for verdict in design.of(Verdict).values():
@@ -70,20 +77,27 @@ def _other_budget(loop: ClosedLoop, channel: str, gallery: Gallery) -> str:
     return gallery.picture(lambda: budget(found, most=3), f"Where {channel} comes from")
 
 
-def loops_section(design: Design, gallery: Gallery) -> Chapter | None:
+def _main(loop: ClosedLoop, channel: str | None) -> str:
+    """Return the channel that comes first: the one asked for, else the first error."""
+    return channel or next((n for n in loop.plant.z if n.endswith(":error")), loop.plant.z[0])
+
+
+def loops_section(design: Design, gallery: Gallery, channel: str | None) -> Chapter | None:
     """Return the section of margins, loop by loop, and of sensitivities; None without a loop."""
     loops = design.of(ClosedLoop)
     if not loops:
         return None
     parts = []
-    compared = compare_loops(loops)
+    compared = _compared(loops, _main(next(iter(loops.values())), channel))
     stable = {name: loop for name, loop in loops.items() if compared.rows[name].stable}
     if compared.channel and stable:
         name, first = next(iter(stable.items()))
-        axes = _axis_sensitivities(first)
+        axes = axis_sensitivities(first)
         caption, drawn = f"Sensitivity |S|, {compared.channel}", ""
         if len(axes) < 2 or len(stable) > 1:
-            drawn = gallery.picture(lambda: sensitivity(stable), caption)
+            pair = compared.channel.split(" to ")
+            lines = {label: error_sensitivity(one, *pair) for label, one in stable.items()}
+            drawn = gallery.picture(lambda: sensitivity(lines), caption)
         if len(axes) > 1:
             caption = f"{name}: sensitivity |S| of each axis, from its reference to its error"
             drawn += gallery.picture(lambda: sensitivity(axes), caption)
@@ -96,14 +110,11 @@ def loops_section(design: Design, gallery: Gallery) -> Chapter | None:
     return Chapter("Loop", "".join(parts))
 
 
-def _axis_sensitivities(loop: ClosedLoop) -> dict[str, Any]:
-    """Return |S| of each axis that has a reference, by its name."""
-    pairs = {name: f"{name.removesuffix(':ref')}:error" for name in references(loop.plant)}
-    return {
-        error.removesuffix(":error"): error_sensitivity(loop, ref, error)
-        for ref, error in pairs.items()
-        if error in loop.plant.z
-    }
+def _compared(loops: Mapping[str, ClosedLoop], channel: str) -> LoopComparison:
+    """Return the figures of loops, of S from the reference of an error, else from the first."""
+    known = references(next(iter(loops.values())).plant)
+    own = f"{channel.removesuffix(':error')}:ref"
+    return compare_loops(loops, reference=own if own in known else next(iter(known), None))
 
 
 def attempted(make: Callable[[], str]) -> str:
