@@ -104,15 +104,17 @@ def table(result: dict[str, Any]) -> str:
 
 
 def picture(result: dict[str, Any], folder: Path = stage.OUT) -> Path:
-    """Draw the error of both loops through the move."""
+    """Draw the error of both loops through the move, below without the term that hides others."""
     import matplotlib.pyplot as plt
 
-    figure, axs = plt.subplots(1, 2, figsize=(13, 4.5), layout="constrained")
-    for ax, (name, runs) in zip(axs, result["runs"].items(), strict=True):
-        for label in (*TERMS, "inverse"):
-            fx.plot.response(runs[label], ["die:error"], span=(0.04, 0.2), label=label, ax=ax)
+    figure, axs = plt.subplots(2, 2, figsize=(13, 8), sharex=True, layout="constrained")
+    for column, (name, runs) in zip(axs.T, result["runs"].items(), strict=True):
+        for ax, labels in zip(column, ([*TERMS, "inverse"], [*TERMS[1:], "inverse"]), strict=True):
+            for label in labels:
+                fx.plot.response(runs[label], ["die:error"], span=(0.04, 0.2), label=label, ax=ax)
         peak = figures(runs["none"])[0]
-        ax.set_title(f"{name}: error at the die ({1e-3 * peak:.1f} µm without feedforward)")
+        column[0].set(title=f"{name}: at most {1e-3 * peak:.1f} µm without feedforward", xlabel="")
+        column[1].set_title(f"{name}: without {TERMS[0]} alone")
     folder.mkdir(exist_ok=True)
     figure.savefig(folder / "feedforward.png", dpi=90)
     plt.close("all")

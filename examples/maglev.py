@@ -205,7 +205,7 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
         for i, axis in enumerate(kind):
             for what, style in (("loop", "-"), ("observer", "--")):
                 rms = [1e9 * case[what].rms(f"die:{axis}") for case in found["path"]]
-                label = axis if what == "loop" else f"{axis}, estimate"
+                label = axis if what == "loop" else f"{axis}, of its estimate"
                 color = fx.plot.CYCLE[i]["color"]
                 ax.plot(way, rms, style, color=color, marker="o^s"[i], markersize=4, label=label)
         ax.set(xlabel="distance of the POI from the middle [mm]", ylim=(0.0, None))

@@ -235,22 +235,22 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4.5), layout="constrained")
-    for name, label, line in (("late", "sample late", "-"), ("answer", "answer after", "--")):
+    for k, (name, label) in enumerate({"late": "sample late", "answer": "answer after"}.items()):
         values = np.sort(1e6 * result[name])
-        left.loglog(values, 1.0 - np.arange(values.size) / values.size, line, label=label)
-    left.axvline(1e6 / RATE, color="0.6", ls=":", label="one sample")
+        part = 1.0 - np.arange(values.size) / values.size
+        left.loglog(values, part, label=label, **fx.plot.CYCLE[k])
+    left.axvline(1e6 / RATE, label="one sample", **fx.plot.STYLES["bound"])
     left.set(xlabel="time [µs]", ylabel="part of samples above", title="Two processes at 10 kHz")
-    left.legend()
-    time, channels = 1e3 * result["wanted"].time, result["channels"]
-    right.plot(time, 1e9 * result["wanted"]["die:error"], color="0.7", lw=4, label="simulate")
-    right.plot(time, 1e9 * channels["die:error"], lw=1, label="the two processes")
+    left.legend(frameon=False)
+    left.grid(alpha=0.3)
+    wanted, name = result["wanted"], "die:error"
+    own = fx.Response(wanted.time, [result["channels"][name]], [name], {name: wanted.units[name]})
+    for label, run in {"simulate": wanted, "the two processes": own}.items():
+        fx.plot.response(run, [name], span=(0.0, 0.25), label=label, ax=right)
+        right.get_lines()[0].set(linewidth=4.0, alpha=0.4)  # where both are equal both show
     right.set(
-        xlim=(0.0, 250.0),
-        xlabel="time [ms]",
-        ylabel="error at the die [nm]",
-        title="A move of 100 µm",
+        title="A move of 100 µm", ylabel=right.get_ylabel().replace("error", "error at the die")
     )
-    right.legend()
     folder.mkdir(exist_ok=True)
     figure.savefig(folder / "real_time.png", dpi=90)
     plt.close("all")

@@ -168,8 +168,8 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
     axs[0].axhline(1.0, **fx.plot.STYLES["bound"])
     axs[0].annotate("above 1 a machine may be unstable", (85.0, 1.0), (0, 4), color="0.3",
                     textcoords="offset points")  # fmt: skip
-    axs[0].set(title="how much of the room for differences the data use up (mu)",
-               xlabel="frequency [Hz]", ylabel="share that is used [1], dots: at a resonance",
+    axs[0].set(title="mu of what is uncertain: lines bound it, dots are resonances",
+               xlabel="frequency [Hz]", ylabel="structured singular value mu [1]",
                xlim=(80.0, 5e3), ylim=(1e-3, 300.0))  # fmt: skip
     near = worst.freq * (1.0 + np.linspace(-2e-3, 2e-3, 201))  # a resonance of 0.1 % damping
     freq = np.union1d(np.geomspace(5.0, 4e3, 1500), near)

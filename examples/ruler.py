@@ -141,15 +141,18 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4.6), layout="constrained")
-    for (name, line), style in zip(result["lines"].items(), ("k", "C1--", "C0", "C2"), strict=True):
-        left.semilogy(result["frf"].freq, np.abs(line), style, label=name, linewidth=1.2)
-    left.set(xlabel="frequency [Hz]", ylabel="far end / hand [record's unit]")
+    names = {"inputs": ["hand"], "outputs": ["far:z"]}
+    lines = {
+        name: fx.Frf(result["frf"].freq, line[None, None], **names)
+        for name, line in result["lines"].items()
+    }
+    fx.plot.frf(lines, "far:z", "hand", ax=left)
+    left.set_ylabel("far end / hand [dB, 0 dB: record's unit]")
     left.set_title("a ruler: measured, synthesised, and in closed loop")
-    left.legend(fontsize=8)
     for name, run in result["runs"].items():
-        right.plot(run.time, run["far:z"], label=f"{name} control", linewidth=0.9)
-    right.set(xlabel="time [s]", ylabel="far end [record's unit]", title="after a hit at the end")
-    right.legend(fontsize=8)
+        own = run.replace(units={})  # of the record
+        fx.plot.response(own, ["far:z"], label=f"{name} control", ax=right)
+    right.set(ylabel="far end [record's unit]", title="after a hit at the end")
     folder.mkdir(exist_ok=True)
     figure.savefig(folder / "ruler.png", dpi=90)
     plt.close("all")

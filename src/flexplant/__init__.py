@@ -113,11 +113,12 @@ for ours compute residuals, bounds and norms by a second route.
 
 **Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy, python-control
 and threadpoolctl (BSD-3), cvxpy and Clarabel (Apache-2.0), filterpy (MIT), matplotlib (its own, of
-BSD kind), tqdm (MPL-2.0 and MIT). Extras, as in ``pip install -e '.[ansys]'``: ``hdf5`` is h5py
-(BSD-3), ``uff`` pyuff and ``ansys`` ansys-mapdl-reader (MIT), ``mkl`` Intel's own, ``docs`` pdoc
-(MIT-0). slycot (GPL-2) and other peers are used in tests only. Sources are cited by the keys of
-`flexplant.bibliography`; the method is that of [paper]_. Its text says 0.1 % modal damping while
-its printed eigenvalues have 1 %; `examples/paper_plate.py` shows both.
+BSD kind), tqdm (MPL-2.0 and MIT). Extras, as in ``pip install -e '.[ansys]'``: ``hdf5`` is h5py and
+``workbench`` panel (BSD-3), ``uff`` pyuff and ``ansys`` ansys-mapdl-reader (MIT), ``mkl`` Intel's
+own, ``docs`` pdoc (MIT-0). What these need in turn has licences of the same kinds. slycot (GPL-2)
+and other peers are used in tests only. Sources are cited by the keys of `flexplant.bibliography`;
+the method is that of [paper]_. Its text says 0.1 % modal damping while its printed eigenvalues have
+1 %; `examples/paper_plate.py` shows both.
 """
 
 from importlib import import_module as _import_module

@@ -1,5 +1,7 @@
 """One look for one thing, units with prefixes, and sensitivities of whatever one has."""
 
+from itertools import pairwise
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import flexplant as fx
 from flexplant.checks import in_unit
 from flexplant.errors import ModelError
 from flexplant.lti import inverse_sensitivity, tf
-from flexplant.plot._axes import CYCLE, STYLES
+from flexplant.plot._axes import CYCLE, STYLES, styles
 from stages import reduced, sampled
 
 PLANT = tf([1.0], [1.0, 1.0, 0.0])
@@ -65,7 +67,7 @@ def test_the_same_thing_looks_the_same_everywhere():
             "updated": STYLES["model"]["color"],
             "reduced": STYLES["reduced"]["color"],
             "truth": STYLES["truth"]["color"],
-            "other": CYCLE[0]["color"],
+            "other": CYCLE[3]["color"],  # the first that no name has
         }
         assert by_name["a stage"].get_marker() == "."
 
@@ -149,3 +151,23 @@ def test_up_to_half_the_rate_the_axes_stay_readable():
     panels = fx.plot.sensitivities(loop, freq=np.asarray(T.freq)).figure.axes
     assert panels[1].get_ylim()[0] > -140.0
     assert fx.plot.sensitivity(T).get_ylim()[0] > -140.0
+
+
+def test_what_is_named_keeps_its_colour_for_itself():
+    for labels in (["model", "servo"], ["full model", "Guyan", "Irs", "Rubin"], ["a", "b"]):
+        drawn = styles(labels)
+        assert len({one["color"] for one in drawn}) == len(labels), labels
+
+
+def test_decades_are_read_as_numbers():
+    """Ticks of 20 to 400 Hz have numbers that do not overlap; no powers of ten."""
+    freq = np.geomspace(20.0, 400.0, 50)
+    ax = fx.plot.sensitivity({"S": (freq, freq / 100.0)}, ax=plt.subplots(figsize=(6, 4))[1])
+    ax.set_xlim(20.0, 400.0)
+    ax.figure.canvas.draw()
+    shown = [one for one in ax.get_xticklabels(which="both") if one.get_text()]
+    places = sorted((float(one.get_text()), one.get_window_extent()) for one in shown)
+    inside = [(x, box) for x, box in places if 20.0 <= x <= 400.0]
+    assert {20.0, 100.0, 200.0, 400.0} <= {x for x, _ in inside}
+    for (_, left), (_, right) in pairwise(inside):
+        assert left.x1 < right.x0

@@ -14,7 +14,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogFormatter, MaxNLocator
 
 from ..checks import ComplexArray, FloatArray, in_unit, short
 from ..errors import FlexplantError, ModelError
@@ -239,12 +239,23 @@ def _resample_line(points: FloatArray) -> FloatArray:
     return np.column_stack([np.interp(at, np.arange(len(points)), values) for values in points.T])
 
 
+class _Decades(LogFormatter):
+    """Numbers of a logarithmic axis as they are read: 20 30 50 100; in powers they overlap."""
+
+    def __call__(self, x: float, pos: Any = None) -> str:
+        """Return the label of a tick, or nothing where there are too many."""
+        return f"{x:g}" if super().__call__(x, pos) else ""
+
+
 def finish(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
     """Label the axes, with units, and draw a light grid."""
     ax.set(xlabel=x, ylabel=y)
     if title:
         ax.set_title(title)
     ax.grid(True, which="both", alpha=0.25)
+    if ax.get_xscale() == "log":
+        ax.xaxis.set_major_formatter(_Decades())
+        ax.xaxis.set_minor_formatter(_Decades(minor_thresholds=(1.5, 0.4)))
     return ax
 
 
@@ -384,15 +395,19 @@ def styles(
 ) -> list[Style]:
     """Return the styles of lines by their labels; those that name nothing follow the cycle.
 
-    So many lines are there already. More than the cycle holds are solid, each of its own colour.
+    So many lines are there already. More than the cycle holds are solid, each of its own colour;
+    what is named keeps its colour for itself, where the cycle has enough others.
     """
     found, others = [], taken
     labels = list(labels)
+    used = {STYLES[role]["color"] for role in map(role_of, labels) if role}
+    free = [style for style in CYCLE if style["color"] not in used]
     plain = sum(role_of(label) is None for label in labels)
     shades = plt.get_cmap("turbo")(np.linspace(0.05, 0.95, plain)) if plain > len(CYCLE) else None
+    cycle = free if taken + plain <= len(free) else CYCLE
     for label in labels:
         role = role_of(label)
-        style = dict(STYLES[role] if role else CYCLE[others % len(CYCLE)])
+        style = dict(STYLES[role] if role else cycle[others % len(cycle)])
         if role is None and shades is not None:
             shade = to_hex(shades[others - taken])
             style = {"color": shade, "linestyle": "-", "linewidth": 1.4}
