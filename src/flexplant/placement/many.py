@@ -81,7 +81,7 @@ class ConvexScores(ManyScores, Convex):
 
     def tangent(self, weights: FloatArray) -> Below:
         """Return the worst or the mean of the tangents."""
-        return Together(tuple(part.tangent(weights) for part in self.parts), self.measure)
+        return BelowAll(tuple(part.tangent(weights) for part in self.parts), self.measure)
 
     def everything(self) -> float:
         """Return a number below the cost of all candidates together."""
@@ -98,7 +98,7 @@ class ConvexScores(ManyScores, Convex):
 
 
 @dataclass(frozen=True, eq=False)
-class Together(Below):
+class BelowAll(Below):
     """The worst or the mean of functions below costs: it lies below the worst or the mean."""
 
     parts: tuple[Below, ...]

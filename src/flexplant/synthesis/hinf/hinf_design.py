@@ -41,7 +41,7 @@ from .central import require_shown
 from .hinf_riccati import Riccati
 from .lower_bound import pointwise_bound, raised_bound
 from .mode_channels import mode_channels, rebalanced, tolerated, with_channels
-from .over_positions import over_positions
+from .moved_design import over_positions
 from .singular import ADDED
 
 #: A beside its poles, from which on coordinates are blamed for a failure

@@ -41,7 +41,7 @@ def over_positions(
     moving = PlantRange.of(given)
     search = _Search(moving, design)
     mean = _mean(moving)
-    motion = _Motion(moving, mean)
+    motion = _MotionChannels(moving, mean)
     first = search.tried_with("the mean plant", mean)
     middle = len(moving.plants) // 2
     for i in sorted({0, middle, len(moving.plants) - 1}):
@@ -76,7 +76,7 @@ class _Search:
         self.tried[name] = worst
         return found
 
-    def over_channels(self, motion: _Motion) -> None:
+    def over_channels(self, motion: _MotionChannels) -> None:
         """Halve or double the scale of the channels, then their size, while that helps."""
         point = (1.0, _SIZE)
         value = self._at(motion, point)
@@ -93,7 +93,7 @@ class _Search:
                 if point != start:
                     break
 
-    def _at(self, motion: _Motion, point: tuple[float, float]) -> float:
+    def _at(self, motion: _MotionChannels, point: tuple[float, float]) -> float:
         name = f"motion of {point[1]:g}, scale {point[0]:g}"
         if name not in self.tried:
             self.tried_with(name, motion.channels(*point))
@@ -133,7 +133,7 @@ def _mean(moving: PlantRange) -> StandardPlant:
     return StandardPlant.from_statespace(systems[0].replace(**mixed, blocks=None), **sides)
 
 
-class _Motion:
+class _MotionChannels:
     """How rows and columns of the plant change over the range, and channels for it."""
 
     def __init__(self, moving: PlantRange, mean: StandardPlant) -> None:
