@@ -8,6 +8,7 @@ import scipy.linalg as la
 
 import flexplant as fx
 from flexplant.errors import AssumptionError, FlexplantWarning, ModelError
+from flexplant.plant.uncertainty.uncertain_plant import Delta, with_changes
 from stages import RATE, ports, sampled, some_modes
 
 ZETA, COUNT = 1e-3, 15
@@ -113,14 +114,13 @@ def test_a_mode_without_a_tolerance_may_be_anywhere_in_the_range():
 
 
 def test_the_margin_falls_to_what_was_stated():
-    """At its grid the code sees a peak to 3 %."""
     found = tolerances()
     for row in np.argsort(found.least)[:3]:
         ends = found.within[row]
         assert np.isfinite(ends).all()
         for change in ends:
             least = margin(int(found.modes[row]), change, found.freq[row] * (1.0 + change))
-            assert least == pytest.approx(0.35, rel=0.03)
+            assert least == pytest.approx(0.35, rel=0.01)
 
 
 def test_what_is_known_of_a_mode_stands_beside_its_tolerance():
@@ -240,3 +240,41 @@ def test_designs_say_what_their_modes_hold_to():
         assert found.tolerances.summary in repr(found)
         assert found.tolerances.draws.margins.size == 20
     assert "stable of draws" in servo.certificate
+
+
+@cache
+def of_both_kinds():
+    """A loop around masses on springs, position and speed of one measured, 1.3 samples late."""
+    model = fx.chain(masses=[1.0, 0.5, 0.3, 0.2], stiffnesses=[4e5, 3e5, 2e5])
+    modes = fx.solve_modes(model, count=4, damping=fx.ModalDamping(0.004))
+    first, last = modes.dofs.labels[0], modes.dofs.labels[-1]
+    own = fx.Ports(
+        w=[fx.Disturbance("w", at=first, asd=1e-2)],
+        u=[fx.Actuator("u", at=first)],
+        z=[fx.Poi("tip", at=last, axes=("x",))],
+        y=[
+            fx.Sensor("q", at=first, asd=1e-9),
+            fx.Sensor("v", at=last, quantity="velocity", asd=1e-6),
+        ],
+    )
+    sampled_plant = fx.assemble_plant(modes, own).discretized(4e3, delay=1.3)
+    design = fx.design_h2(sampled_plant.weighted(z={"u:effort": 1e-6}))
+    return fx.close_loop(sampled_plant, design)
+
+
+def test_positions_and_speeds_measured_together_a_fraction_of_a_sample_late():
+    """Each machine is assembled and sampled anew: stable before, unstable behind a tolerance."""
+    closed = of_both_kinds()
+    found, seen = closed.mode_tolerances(), 0
+    for row, mode in enumerate(found.modes.tolist()):
+        for end in found.stable[row][np.isfinite(found.stable[row])]:
+            seen += 1
+            for part, holds in ((0.99, True), (1.01, False)):
+                moved = [(Delta("", mode, "freq", 1.0), (1.0 + part * end) ** 2 - 1.0)]
+                assert closed.around(with_changes(closed.plant, moved)).is_stable == holds
+        for end in found.within[row][np.isfinite(found.within[row])]:
+            seen += 1
+            moved = [(Delta("", mode, "freq", 1.0), (1.0 + end) ** 2 - 1.0)]
+            there = closed.around(with_changes(closed.plant, moved))
+            assert not there.is_stable or there.modulus_margin == pytest.approx(0.35, rel=0.02)
+    assert seen >= 3

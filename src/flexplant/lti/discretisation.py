@@ -91,8 +91,8 @@ def held_exactly(
     whole, fraction = divmod(positive(delay, "delay", zero=True), 1.0)
     if not late.size:
         whole = fraction = 0.0
-    rest = propagated(g, (1.0 - fraction) * h)
-    Ad, Bd = propagated(g, h)
+    Ad, Bd = whole_step = propagated(g, h)
+    rest = propagated(g, (1.0 - fraction) * h) if fraction else whole_step
     held, D = Bd.copy(), g.D.copy()
     # u[k - whole] holds for the last (1 - fraction) of the interval, its predecessor before that
     held[:, late] = rest.integral[:, late]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,6 +12,7 @@ from ..checks import FloatArray, Value, instance, positive
 from ..errors import ModelError
 from ..lti.discretisation import (
     acting,
+    block_diagonal,
     check_latency,
     check_rate,
     diagonal_pairs,
@@ -168,7 +169,7 @@ def sampled(plant: P, rate: float, delay: float) -> P:
     asd = np.array(
         [0.0 if name in held else plant.asd.get(name, 0.0) for name in origin.physical.inputs]
     )
-    if origin.ports.latencies or diagonal_pairs(origin.physical) is None:
+    if _has_other_states(origin):
         physical, factor = _with_own_delays(origin, rate, delay, asd)
     else:
         physical = held_exactly(origin.physical, rate, delay=delay, delayed=plant.u)
@@ -183,6 +184,37 @@ def sampled(plant: P, rate: float, delay: float) -> P:
             physical=physical, noise_factor=factor, delay=float(delay), continuous=plant
         ),
     )
+
+
+def _has_other_states(origin: Assembled) -> bool:
+    """Return whether ports have filters or delays of their own: modes are not all its states."""
+    return bool(origin.ports.latencies) or diagonal_pairs(origin.physical) is None
+
+
+def sampled_motions(
+    plant: Partition, blocks: Iterable[FloatArray], outputs: Sequence[str], inputs: Sequence[str]
+) -> list[StateSpace]:
+    """Return a plant from actuators to sensors, no more, for each set of its modes' (b, 2, 2).
+
+    Sampled like the plant; the states are some of the plant's.
+    """
+    origin = plant.continuous.assembled
+    g, found = origin.physical.select(outputs, inputs), []
+    where = [g.states.index(name) for name in origin.realisation.names]
+    for pairs in blocks:
+        A = np.array(g.A)
+        A[np.ix_(where, where)] = block_diagonal(pairs)
+        own = origin.replace(
+            physical=g.replace(A=A), realisation=origin.realisation.replace(pairs=pairs)
+        )
+        if not plant.dt:
+            found.append(own.physical)
+        elif _has_other_states(own):
+            silent = np.zeros(len(g.inputs))
+            found.append(_with_own_delays(own, 1.0 / plant.dt, plant.delay, silent)[0])
+        else:
+            found.append(held_exactly(own.physical, 1.0 / plant.dt, delay=plant.delay))
+    return found
 
 
 def _elastic(plant: Partition) -> FloatArray:

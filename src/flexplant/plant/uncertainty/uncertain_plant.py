@@ -88,12 +88,20 @@ def with_changes(plant: P, changes: Sequence[tuple[Delta, float]]) -> P:
     if all(delta.kind in ("gain", "delay") for delta, _ in changes):
         return _with_ports(plant, plant.assembled.realisation, changes)
     realisation = modal_realisation(plant)
-    pairs = np.array(realisation.pairs)
     for delta, amount in changes:
-        if delta.kind in ("gain", "delay"):
-            continue
         if delta.kind == "shape":
             realisation = reshaped(realisation, delta, amount)
+    pairs = changed_pairs(realisation, changes)
+    return _with_ports(plant, realisation.replace(pairs=pairs), changes)
+
+
+def changed_pairs(
+    realisation: ModalRealisation, changes: Sequence[tuple[Delta, float]]
+) -> FloatArray:
+    """Return the blocks (b, 2, 2) of modes with stiffness or damping of some changed."""
+    pairs = np.array(realisation.pairs)
+    for delta, amount in changes:
+        if delta.kind not in ("freq", "damping"):
             continue
         if not amount > -1:
             raise ModelError(
@@ -107,7 +115,7 @@ def with_changes(plant: P, changes: Sequence[tuple[Delta, float]]) -> P:
         else:
             row = -np.trace(nominal) * np.array([nominal[0, 0] / s, 1.0])
         pairs[delta.mode - 1, 1] -= amount * row
-    return _with_ports(plant, realisation.replace(pairs=pairs), changes)
+    return pairs
 
 
 def _with_ports(

@@ -1,0 +1,450 @@
+r"""Where a pole of a loop crosses the stability boundary when one of its modes changes.
+
+With all of the plant's other modes closed, ``S = (I - K P)^-1`` and X_i the response from u to the
+two states of mode i, which are fed by ``F_i u`` (through other states too) and seen in y as
+``c_i e_i``, the changed mode is the nominal one and ``T_i(z, delta) Y_i``, what is fed to it more:
+
+.. math:: \det H_i = 0, \quad H_i = z I - A_i(\delta) - T_i(\delta) Y_i q_i e_i, \quad
+    q_i = S K c_i
+
+has a pole at z, and ``S(delta) = S + q_i (I - g Y_i q_i)^-1 g Y_i S`` with ``g = e_i (z I -
+A_i(delta))^-1 T_i(delta)``. Everything is a row of numbers at each z: all modes at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..checks import BoolArray, ComplexArray, FloatArray, IntArray
+from ..errors import ModelError
+from ..lti.responses import Responder, points, responder
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
+from ..plant.building import sampled_motions
+from ..plant.uncertainty.uncertain_plant import Delta, changed_pairs
+from ..tolerances import SAME, SETTLED, TINY
+from .broken import BrokenLoop, inverted, largest
+
+#: largest relative change of a frequency whose polynomials are exact
+LIMIT = 0.05
+#: relative changes at which the sampled plant is computed; between them its matrices are
+#: polynomials of degree 4, whose error is (omega dt)^5 LIMIT^5: rounding
+_NODES: Mapping[str, tuple[float, ...]] = {
+    "freq": (-LIMIT, -0.5 * LIMIT, 0.5 * LIMIT, LIMIT),
+    "damping": (-0.9, -0.45, 1.0, 2.0),
+}
+#: times the range looked for that the first step of Newton's method may lead out of it
+_FIRST_STEP = 3.0
+#: points within an interval in which a pole crosses, and how often it is divided by them
+_WITHIN, _DIVISIONS = 6, 3
+#: of 1, at which |S| reaches the size looked for: a point further below it with the mode at both
+#: ends of its range, which the resonance does not pass, is not examined in between
+_NEAR = 0.25
+#: least relative change of a frequency that is of interest: poles are not measured better
+_LEAST = 1e-6
+#: changes tried for a margin before the first that fails is halved in, and halvings
+_TRIED, _HALVINGS = 16, 8
+#: points between the lines beside the highest one, where the top of a peak is
+_WITHIN_PEAK = 9
+
+
+class ModeChanges(NamedTuple):
+    """Some modes of a sampled plant as polynomials in a relative change: coefficients first.
+
+    A (k, modes, 2, 2), and what is fed more to each mode, T (k, modes, 2, 2 + r), of no power zero,
+    by its two states and by r sums of other states and of the loop's u.
+    """
+
+    A: FloatArray
+    T: FloatArray
+
+    def at(self, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return A and T of each mode for a change of each (modes,)."""
+        each = delta[:, None, None]
+        return _value(self.A, each), _value(self.T, each)
+
+
+@dataclass(frozen=True)
+class ModeLoops:
+    """A loop and the modes of its plant, at any frequencies.
+
+    `changes` of each kind, `own` states (modes, 2) of each mode, `fed` states that feed any,
+    `sums` (modes, r, states fed and u), `seen` c_i (modes, p, k) and e_i (modes, k, 2).
+    """
+
+    plant: StandardPlant
+    broken: BrokenLoop
+    states: Responder
+    changes: Mapping[str, ModeChanges]
+    own: IntArray
+    fed: IntArray
+    sums: FloatArray
+    seen: tuple[FloatArray, FloatArray]
+
+    @classmethod
+    def of(cls, plant: StandardPlant, broken: BrokenLoop, modes: IntArray) -> ModeLoops:
+        """Return a loop with modes (numbers from 1); all are changed at once, being uncoupled."""
+        if any(sensor.order == 2 for sensor in plant.assembled.ports.y if sensor.name in broken.y):
+            raise ModelError(
+                "a sensor of y sees accelerations, in which frequency and damping of a mode "
+                "appear: its tolerance is not computed. Leave accelerometers out of y."
+            )
+        g = plant.system
+        n, columns = g.n_states, g.input_index(broken.u)
+        to_states = StateSpace(
+            g.A, g.B[:, columns], np.eye(n), np.zeros((n, len(columns))), g.dt, blocks=g.blocks
+        )
+        own = plant.modal_states.reshape(-1, 2)[modes - 1]
+        raw = {kind: _polynomials(plant, broken, modes, kind) for kind in _NODES}
+        every = np.hstack([fed[1:].swapaxes(0, 1).reshape(len(modes), -1, fed.shape[-1])
+                           for _, fed in raw.values()])  # fmt: skip
+        used = np.any(every != 0.0, axis=(0, 1))
+        used[n:] = True
+        every = every[..., used]
+        sums = np.zeros((0,))
+        if modes.size:
+            size, rows = np.linalg.svd(every)[1:]
+            rank = int(np.max(np.sum(size > 1e-13 * size.max(initial=TINY), axis=1), initial=1))
+            sums = rows[:, :rank]
+        changes = {}
+        for kind, (A, fed) in raw.items():
+            T = np.concatenate([A, fed[..., used] @ sums.swapaxes(1, 2)], axis=-1)
+            T[0] = 0.0
+            changes[kind] = ModeChanges(A, T)
+        rows_y = g.C[g.output_index(broken.y)]
+        seen = np.stack([rows_y[:, pair] for pair in own])
+        left, size, right = np.linalg.svd(seen, full_matrices=False)
+        k = 1 + int(np.any(size[:, 1:] > SAME * size[:, :1]))
+        parts = left[..., :k] * size[:, None, :k], right[:, :k]
+        states = responder(to_states)
+        return cls(plant, broken, states, changes, own, np.flatnonzero(used[:n]), sums, parts)
+
+    def swept(self, freq: FloatArray) -> SweptLoop:
+        """Return the loop's responses at frequencies [Hz]."""
+        K, P = self.broken.respond(freq)
+        S = inverted(K @ P)
+        x = np.moveaxis(self.states(freq), 2, 0)
+        return SweptLoop(self, points(self.plant.system, freq), S, S @ K, x)
+
+
+class SweptLoop(NamedTuple):
+    """S, S K and the states' responses x (n, states, m) at points z of the stability boundary."""
+
+    loops: ModeLoops
+    z: ComplexArray
+    S: ComplexArray
+    SK: ComplexArray
+    x: ComplexArray
+
+    def swept_modes(self, at: IntArray, mode: IntArray) -> SweptModes:
+        """Return what a mode's equation is made of, for pairs of a point and a mode."""
+        loops = self.loops
+        m = self.S.shape[1]
+        others = np.concatenate(
+            [self.x[:, loops.fed], np.broadcast_to(np.eye(m), (self.z.size, m, m))], axis=1
+        )
+        Y = np.concatenate(
+            [self.x[at[:, None], loops.own[mode]], _real_times(loops.sums[mode], others[at])],
+            axis=1,
+        )
+        c, e = loops.seen
+        q = _times_real(self.SK[at], c[mode])
+        return SweptModes(loops, at, mode, self.z[at], Y, q, Y @ q, e[mode])
+
+
+def _real_times(real: FloatArray, other: ComplexArray) -> ComplexArray:
+    """Return real matrices times complex ones."""
+    return np.asarray(real.astype(np.complex128) @ other)
+
+
+def _times_real(one: ComplexArray, real: FloatArray) -> ComplexArray:
+    """Return complex matrices times real ones."""
+    return np.asarray(one @ real.astype(np.complex128))
+
+
+class SweptModes(NamedTuple):
+    """The equations of modes at points: Y (n, 2 + r, m), q (n, m, k), Y q and e (n, k, 2)."""
+
+    loops: ModeLoops
+    at: IntArray
+    mode: IntArray
+    z: ComplexArray
+    Y: ComplexArray
+    q: ComplexArray
+    Yq: ComplexArray
+    e: FloatArray
+
+    def changes(self, kind: str, limits: FloatArray | float) -> ComplexArray:
+        """Return the complex change (n,) at which there is a pole at each point, infinite far off.
+
+        By Newton's method from none: det H is a polynomial of twice the degree of H. The first
+        step is all that is done where it leads far beyond `limits` (n,).
+        """
+        A, T = self.loops.changes[kind]
+        Yqe = self.Yq @ self.e
+        first = -A[1][self.mode] - T[1][self.mode] @ Yqe
+        start = -A[0][self.mode].astype(np.complex128)
+        start[:, 0, 0] += self.z
+        start[:, 1, 1] += self.z
+        slope = (
+            start[:, 0, 0] * first[:, 1, 1]
+            + start[:, 1, 1] * first[:, 0, 0]
+            - start[:, 0, 1] * first[:, 1, 0]
+            - start[:, 1, 0] * first[:, 0, 1]
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = -_determinant(start) / slope
+        near = np.flatnonzero(np.abs(step) <= _FIRST_STEP * limits)
+        found = np.full(self.z.size, np.inf, dtype=np.complex128)
+        mode, rest = self.mode[near], Yqe[near]
+        H = -A[:, mode] - T[:, mode] @ rest
+        H[0] = start[near]
+        found[near] = _roots(H)
+        return found
+
+    def take(self, where: BoolArray) -> SweptModes:
+        """Return the equations at some of the pairs."""
+        at, mode, z = self.at[where], self.mode[where], self.z[where]
+        Y, q, Yq, e = self.Y[where], self.q[where], self.Yq[where], self.e[where]
+        return SweptModes(self.loops, at, mode, z, Y, q, Yq, e)
+
+    def share(self, kind: str, delta: FloatArray, bound: SizeBound) -> FloatArray:
+        """Return what is at least 1 where |S| reaches a size with the modes changed (modes,)."""
+        A, T = self.loops.changes[kind].at(delta)
+        A, T = A[self.mode], T[self.mode]
+        # g = e (z I - A)^-1 T by the adjugate
+        a, d = self.z - A[:, 1, 1], self.z - A[:, 0, 0]
+        det = a * d - A[:, 0, 1] * A[:, 1, 0]
+        e = self.e
+        u = (e[:, :, 0] * a[:, None] + e[:, :, 1] * A[:, 1, 0, None]) / det[:, None]
+        v = (e[:, :, 0] * A[:, 0, 1, None] + e[:, :, 1] * d[:, None]) / det[:, None]
+        g = u[..., None] * T[:, None, 0] + v[..., None] * T[:, None, 1]
+        return bound.share(g)
+
+
+class SizeBound(NamedTuple):
+    r"""Whether ``|S(delta)| < s`` where ``|S| < s``, without S(delta), at pairs of point and mode.
+
+    With ``W = (s^2 I - S S*)^{-1}``, ``a = s^2 q* W q``, ``b = I - s^2 g Y W q`` and ``c = g Y
+    (s^2 W - I) Y* g*``: as long as all eigenvalues of ``a b^-1 c b^-*`` are below 1 (by Schur's
+    complement of the Hermitian matrix [[s I, S(delta)], [S(delta)*, s I]]).
+    """
+
+    a: ComplexArray
+    y: ComplexArray
+    middle: ComplexArray
+
+    @classmethod
+    def of(cls, S: ComplexArray, modes: SweptModes, size: float) -> SizeBound:
+        """Return the bound of a size that S (n, m, m) at the points is below."""
+        eye = np.eye(S.shape[1])
+        W = np.linalg.inv(eye - (S @ S.conj().swapaxes(1, 2)) / size**2)[modes.at]
+        Wq = W @ modes.q
+        a = modes.q.conj().swapaxes(1, 2) @ Wq
+        YW = modes.Y @ W
+        Ys = modes.Y.conj().swapaxes(1, 2)
+        return cls(a, modes.Y @ Wq, YW @ Ys - modes.Y @ Ys)
+
+    def take(self, where: BoolArray) -> SizeBound:
+        """Return the bound at some of the pairs."""
+        return SizeBound(*(part[where] for part in self))
+
+    def share(self, g: ComplexArray) -> FloatArray:
+        """Return the largest eigenvalue, for rows g (n, k, 2 + r) of each pair."""
+        k = g.shape[1]
+        if k == 1:
+            row = g[:, 0]
+            b = 1.0 - np.sum(row * self.y[:, :, 0], axis=1)
+            c = np.sum(np.matmul(row[:, None], self.middle)[:, 0] * row.conj(), axis=1).real
+            return np.asarray(self.a[:, 0, 0].real * c / (b.real**2 + b.imag**2))
+        b = np.eye(k) - g @ self.y
+        c = g @ self.middle @ g.conj().swapaxes(1, 2)
+        inverse = np.linalg.inv(b)
+        product = self.a @ inverse @ c @ inverse.conj().swapaxes(1, 2)
+        return np.asarray(np.linalg.eigvals(product).real.max(axis=1))
+
+
+def _polynomials(
+    plant: StandardPlant, broken: BrokenLoop, modes: IntArray, kind: Any
+) -> tuple[FloatArray, FloatArray]:
+    """Return A (k, modes, 2, 2) and what feeds each mode (k, modes, 2, states and u) by power."""
+    nodes = np.array([0.0, *_NODES[kind]])
+    realisation = plant.assembled.realisation
+    names = [realisation.names[i] for mode in modes for i in (2 * mode - 2, 2 * mode - 1)]
+    n, m = plant.system.n_states, len(broken.u)
+    A, fed = np.zeros((nodes.size, len(modes), 2, 2)), np.zeros((nodes.size, len(modes), 2, n + m))
+    where = {name: j for j, name in enumerate(plant.system.states)}
+    deltas = [Delta("", int(mode), kind, 1.0) for mode in modes]
+    amounts = (1.0 + nodes) ** 2 - 1.0 if kind == "freq" else nodes
+    blocks = [changed_pairs(realisation, [(one, float(x)) for one in deltas]) for x in amounts]
+    for i, g in enumerate(sampled_motions(plant, blocks, broken.y, broken.u)):
+        columns = [where[name] for name in g.states]
+        rows = [g.states.index(name) for name in names]
+        own = np.reshape(rows, (-1, 2))
+        A[i] = g.A[own[:, :, None], own[:, None, :]]
+        others = g.A[rows].reshape(-1, 2, g.n_states).copy()
+        others[np.arange(len(modes))[:, None, None], [[0], [1]], own[:, None, :]] = 0.0
+        fed[i][..., columns] = others
+        fed[i][..., n:] = g.B[rows].reshape(-1, 2, m)
+    powers = np.linalg.inv(np.vander(nodes, increasing=True))
+    return np.tensordot(powers, A, 1), np.tensordot(powers, fed, 1)
+
+
+def _determinant(H: ComplexArray) -> ComplexArray:
+    return np.asarray(H[..., 0, 0] * H[..., 1, 1] - H[..., 0, 1] * H[..., 1, 0])
+
+
+def _roots(H: ComplexArray) -> ComplexArray:
+    """Return the change (n,) nearest to none at which det H, of H (k, n, 2, 2) by powers, is 0."""
+    powers = np.arange(2 * len(H) - 1)
+    det = np.zeros((powers.size, H.shape[1]), dtype=np.complex128)
+    for i, a in enumerate(H):
+        for j, b in enumerate(H):
+            det[i + j] += a[:, 0, 0] * b[:, 1, 1] - a[:, 0, 1] * b[:, 1, 0]
+    slope = powers[1:, None] * det[1:]
+    delta = np.zeros(det.shape[1], dtype=np.complex128)
+    for _ in range(12):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moved = _value(det, delta) / _value(slope, delta)
+        moved = np.where(np.isfinite(moved), moved, 0.0)
+        delta = delta - moved
+        if np.all(np.abs(moved) <= SETTLED * np.abs(delta)):
+            break
+        # far away the polynomials say nothing: it is not followed there
+        delta = np.where(np.abs(delta) < 3.0, delta, 3.0 * delta / np.maximum(abs(delta), TINY))
+    return delta
+
+
+def _value(polynomial: Any, at: Any) -> Any:
+    """Return a polynomial's value by Horner's rule, its coefficients along the first axis."""
+    found = polynomial[-1]
+    for coefficient in polynomial[-2::-1]:
+        found = found * at + coefficient
+    return found
+
+
+def crossings(
+    swept: SweptLoop, modes: SweptModes, freq: FloatArray, kind: str, ends: FloatArray
+) -> FloatArray:
+    """Return the real changes (modes, 2) next to none, down and up, at which a pole crosses.
+
+    `freq` [Hz] of each pair, rising within a mode; `ends` (modes, 2) of the changes looked for.
+    """
+    found = np.tile([-np.inf, np.inf], (len(ends), 1))
+    limits = np.abs(ends).max(axis=1)[modes.mode]
+    delta = modes.changes(kind, limits)
+    inside = (delta.real > ends[modes.mode, 0]) & (delta.real < ends[modes.mode, 1])
+    same = modes.mode[:-1] == modes.mode[1:]
+    low = np.flatnonzero(_turns(delta.imag) & inside[:-1] & inside[1:] & same)
+    edges, mode = np.stack([freq[low], freq[low + 1]], axis=1), modes.mode[low]
+    value = np.zeros(0)
+    for _ in range(_DIVISIONS):
+        if not mode.size:
+            break
+        fine = np.linspace(edges[:, 0], edges[:, 1], _WITHIN, axis=1)
+        each = swept.loops.swept(fine.ravel()).swept_modes(
+            np.arange(fine.size), np.repeat(mode, _WITHIN)
+        )
+        delta = each.changes(kind, np.repeat(np.abs(ends).max(axis=1)[mode], _WITHIN))
+        delta = delta.reshape(fine.shape)
+        good = (delta.real > ends[mode, :1]) & (delta.real < ends[mode, 1:])
+        turns = _turns(delta.imag) & good[:, :-1] & good[:, 1:]
+        real = np.any(turns, axis=1)
+        mode, fine, delta, k = mode[real], fine[real], delta[real], turns[real].argmax(axis=1)
+        row = np.arange(mode.size)
+        edges = np.stack([fine[row, k], fine[row, k + 1]], axis=1)
+        left, right = delta[row, k], delta[row, k + 1]
+        share = np.abs(left.imag) / np.maximum(np.abs(left.imag) + np.abs(right.imag), TINY)
+        value = left.real + share * (right.real - left.real)
+    for i, change in zip(mode, value, strict=True):
+        side = int(change > 0)
+        if abs(change) < abs(found[i, side]):
+            found[i, side] = change
+    return found
+
+
+def _turns(imag: FloatArray) -> BoolArray:
+    """Return between which neighbours along the last axis the sign changes."""
+    return np.asarray(np.sign(imag[..., :-1]) * np.sign(imag[..., 1:]) < 0)
+
+
+def size_reached(
+    swept: SweptLoop,
+    modes: SweptModes,
+    freq: FloatArray,
+    passed: BoolArray,
+    stable: FloatArray,
+    limits: FloatArray,
+    size: float,
+) -> FloatArray:
+    """Return the changes of frequency (modes, 2), down and up, at which |S| at u reaches a size.
+
+    Where the resonance does not pass, |S| changes little and one way: only points are examined
+    that come near the size at an end. `freq` [Hz] of each pair, rising within a mode.
+    """
+    count = len(limits)
+    high = largest(swept.S) >= size
+    every = _Sized(modes, SizeBound.of(np.where(high[:, None, None], 0.0, swept.S), modes, size))
+    ends = np.minimum(np.abs(stable), limits[:, None])
+    near = passed.copy()
+    for side, sign in enumerate((-1.0, 1.0)):
+        near |= every.share(sign * ends[:, side]) >= _NEAR
+    few, freq = every.take(near), freq[near]
+    found = np.array(stable)  # unless the margin is reached before, or the peak is too narrow
+    for side, sign in enumerate((-1.0, 1.0)):
+        start = np.minimum(_LEAST, 0.5 * ends[:, side])
+        steps = np.geomspace(start, ends[:, side], _TRIED)
+        reached = np.array([few.exceeds(sign * step, count) for step in steps])
+        first, each = np.argmax(reached, axis=0), np.arange(count)
+        below = np.where(first > 0, steps[first - 1, each], 0.0)
+        change = few.halved(below, steps[first, each], sign)
+        where = np.flatnonzero(np.any(reached, axis=0))
+        if not where.size:
+            continue
+        # the peak's top between the lines of the grid
+        share, tops = few.share(sign * change), []
+        for i in where:
+            own = np.flatnonzero(few.modes.mode == i)
+            k = int(np.argmax(share[own]))
+            beside = freq[own[max(k - 1, 0)]], freq[own[min(k + 1, own.size - 1)]]
+            tops.append(np.linspace(*beside, _WITHIN_PEAK))
+        fine = modes.loops.swept(np.ravel(tops))
+        mode = np.repeat(where, _WITHIN_PEAK)
+        at_tops = fine.swept_modes(np.arange(mode.size), mode)
+        top = _Sized(at_tops, SizeBound.of(fine.S, at_tops, size))
+        change = top.halved(0.5 * change, change, sign)
+        found[where, side] = sign * change[where]
+    found[np.bincount(modes.mode[high[modes.at]], minlength=count) > 0] = 0.0
+    return found
+
+
+class _Sized(NamedTuple):
+    """The equations of modes at points, and the bound of a size there."""
+
+    modes: SweptModes
+    bound: SizeBound
+
+    def take(self, where: BoolArray) -> _Sized:
+        """Return both at some of the pairs."""
+        return _Sized(self.modes.take(where), self.bound.take(where))
+
+    def share(self, delta: FloatArray) -> FloatArray:
+        """Return what is at least 1 where |S| reaches the size, frequencies changed (modes,)."""
+        return self.modes.share("freq", delta, self.bound)
+
+    def exceeds(self, delta: FloatArray, count: int) -> BoolArray:
+        """Return for which of the modes |S| reaches the size at any point."""
+        over = self.modes.mode[self.share(delta) >= 1.0]
+        return np.bincount(over, minlength=count) > 0
+
+    def halved(self, below: FloatArray, above: FloatArray, sign: float) -> FloatArray:
+        """Return the sizes of change (modes,) between two at which it is reached first."""
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (below + above)
+            over = self.exceeds(sign * middle, len(middle))
+            above, below = np.where(over, middle, above), np.where(over, below, middle)
+        return above
