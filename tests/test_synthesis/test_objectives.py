@@ -67,6 +67,8 @@ def test_mixed_h2_and_hinf(sampled):
     assert fx.h2_norm(loop) < fx.h2_norm(closed(given, fx.design_hinf(given)))
     assert set(found.reached) == {repr(H2()), repr(Hinf(below=bound))}
     assert "modulus margin" not in found.certificate
+    assert "of 1 that" not in repr(found), "the H2 norm has a unit, the bound is in the objective"
+    assert repr(found).count(repr(Hinf(below=bound))) == 1
 
 
 def test_channels_are_chosen_by_name():

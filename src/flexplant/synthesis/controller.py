@@ -41,7 +41,8 @@ class Controller(Value):
         Numbers computed after the design by another computation.
     reached : mapping {str: float}
         Of a weighted design: the norm from each group of w to each group of z, beside 1, which
-        is what the weights require. The largest is close to gamma.
+        is what the weights require; the largest is close to gamma. Of `design_lmi`: the norm of
+        each objective, in its own unit.
     left_out : SpillOver, optional
         How the loop stands on the plant with the modes left out, where these are known.
     tolerances : ModeTolerances, optional
@@ -91,7 +92,7 @@ class Controller(Value):
         if self.gamma is not None and self.lower is not None:
             gamma += f" (lower bound {self.lower:.4g})"
         lines = [f"<Controller {self.method}: {counted(self.system.n_states, 'state')}{gamma}>"]
-        if self.reached:
+        if self.reached and not self.reached.keys() <= (self.certificate or {}).keys():
             shown = ", ".join(f"{key} {value:.3g}" for key, value in self.reached.items())
             lines.append(f"  reached, of 1 that the weights require: {shown}")
         if self.certificate:
