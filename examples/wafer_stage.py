@@ -256,7 +256,7 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     figure, axs = plt.subplots(2, 3, figsize=(17, 9), layout="constrained")
     figure.suptitle("A virtual machine that no drawing resembles, with 0.1 % damping")
     shades = dict(zip(case["errors"][1e-3].names, SHADES, strict=True))
-    forces = [f"amplifiers\n{1e3 * f:g} mN/√Hz" for f in FORCES]
+    forces = [f"{1e3 * f:g} mN/√Hz" for f in FORCES]
     fx.plot.predictions(list(case["errors"].values()), colors=shades, cases=forces, ax=axs[0, 0])
     for (name, loop), color in zip(case["loops"].items(), COLORS, strict=True):
         run, held = loop["run"], loop["machine"].is_stable
@@ -270,6 +270,7 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
             colors |= {f"{name}, model": color, f"{name}, machine": "black"}
     fx.plot.sensitivity(shown, colors=colors, dashed=list(shown)[1::2], ax=axs[1, 1])
     fx.plot.sensor_map(result["placement"], ports=ports(), ax=axs[1, 2])
+    axs[0, 0].set_xlabel("rms error of die:z [nm], under three amounts of amplifier noise")
     axs[0, 1].set_title("error at the die through a move of 100 µm, machine")
     axs[0, 2].set(ylim=(-100.0, 100.0), title="error at the die after the move, machine")
     axs[1, 0].set(ylim=(-8.0, 8.0), title="force of actuator u1, machine")

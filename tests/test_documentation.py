@@ -1,5 +1,7 @@
 """The documentation has a page for every room and example, and links that lead somewhere."""
 
+import html
+import inspect
 import re
 import subprocess
 import sys
@@ -79,3 +81,10 @@ def test_the_site(tmp_path):
     front = (tmp_path / "flexplant.html").read_text(encoding="utf-8")
     assert 'src="pictures/wafer_stage.png"' in front
     assert "design_hinf" in (tmp_path / "search.js").read_text(encoding="utf-8")
+    verbs = html.unescape((tmp_path / "flexplant" / "algorithms.html").read_text(encoding="utf-8"))
+    assert 'id="stage_weights"' in verbs and 'href="#design_kalman"' in verbs, "in the contents too"
+    text = inspect.getdoc(flexplant.algorithms)
+    formulas = re.findall(r"^\.\. math:: (.*?)\n\n", text, re.MULTILINE | re.DOTALL)
+    assert len(formulas) == 2
+    for formula in formulas:
+        assert f"$${' '.join(formula.split())}$$" in verbs, formula

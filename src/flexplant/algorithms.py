@@ -87,4 +87,26 @@ two), else by how lines scatter. Where a resonance turns between two lines, the 
 neighbours is followed; where lines do not resolve it, the loop gain has to be small there. Peaks
 that fall between two lines unseen are not known: the lines have to be closer than a mode is wide.
 Above the last line the plant is unknown, and the loop gain there at most 0.1.
+
+**stage_weights.** In one length at the POI (1 m of reference) and in the force f0 that accelerates
+the rigid body by ``w_c^2`` times it, f_c being 1.6 times the bandwidth, the blocks are
+
+.. math:: \begin{bmatrix} W_S S & W_S P W_d \\ W_u K S & W_u K P W_d \end{bmatrix}
+
+with 1/W_S rising as f/f_c up to `peak`, W_u letting the efforts roll off from 6 f_c, and W_d =
+`disturbance` f0. K P W_d is the complementary sensitivity T at u, and the weights of z are divided
+by ``peak disturbance effort``, so that gamma = 1 requires |T| < peak at u: with the default ratios
+this block decides, and gamma is how far the loop is from it. The controller lists what each block
+reaches (`Controller.reached`).
+
+**design_kalman.** The noise model is that of `simulate`: `plant.process_noise` per sample into x
+and `plant.sensor_noise` on a sample of y; delays of u are known exactly. The Riccati equation is
+solved scaled inside, in any units (`flexplant.lti.solve_dare`). Modes left out add no states. Their
+motion under the disturbances is noise with covariances R_t at the sensors, V_t at the POIs and N_t
+between them, and they follow u by their static compliance::
+
+    S = C2 P C2' + R + R_t,   L = P C2' S^-1,   L_z = (C1 P C2' + N_t) S^-1
+
+with P of the Riccati equation of (A, C2, Q, R + R_t). Without any delay of u the static compliance
+is left out: it would close an algebraic loop from y to u to y.
 """

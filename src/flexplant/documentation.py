@@ -146,6 +146,9 @@ class _Site:
     def markdown(self, text: str) -> str:
         """Return a docstring with what pdoc does not know: tables, literal blocks, links."""
         text = re.sub(r"^(\S[^\n]*? : )([^\n]*:[^\n]*)$", _protected, text, flags=re.MULTILINE)
+        text = re.sub(
+            r"^( *)\.\. math::((?:.+\n| *\n(?=\1 +))+)", _formula, text, flags=re.MULTILINE
+        )
         text = re.sub(r"::$", ":", text, flags=re.MULTILINE)
         rule = r"^ *=+(?: +=+)+ *\n"
         text = re.sub(
@@ -277,6 +280,12 @@ def _as_written(space: Any) -> None:
             )
 
 
+def _formula(match: re.Match[str]) -> str:
+    """Return a formula in one line, which Markdown leaves as it is: no lists, no lost backslash."""
+    kept = re.sub(r"(?=[\\`*_{}\[\]()#+.!-])", r"\\", " ".join(match[2].split()))
+    return f"{match[1]}$${kept}$$\n"
+
+
 @contextmanager
 def _exporting(site: _Site) -> Iterator[None]:
     """Let pdoc see the public names of the rooms, for this run."""
@@ -354,6 +363,8 @@ def write_site(folder: str | Path) -> Links:
         for page in pages.values():
             _as_written(page)
         pages["flexplant"].docstring = site.front()
+        verbs = pages["flexplant.algorithms"]
+        verbs.docstring = re.sub(r"^\*\*(\w+)\.\*\* ", r"## \1\n\n", verbs.docstring, flags=re.M)
         pages["flexplant.bibliography"].docstring = site.bibliography()
         if site.stories:
             pages["examples"] = _page("examples", site.gallery(drawn))

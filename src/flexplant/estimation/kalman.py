@@ -40,18 +40,8 @@ def design_kalman(
     "die": ``observer.rms("die")`` is the error that is predicted, ``close_loop(plant, observer,
     servo)`` runs it in a loop, ``observer.estimate(records)`` on recorded data. Give `larger`, a
     model with the modes that the plant left out: their motion then counts as noise, and the
-    predicted error is as good as that model (how good: ``help(flexplant.estimation)``).
-
-    The noise model is that of `simulate`: `plant.process_noise` per sample into x and
-    `plant.sensor_noise` on a sample of y; delays of u are known exactly. The Riccati equation is
-    solved scaled inside, in any units (`flexplant.lti.solve_dare`). Modes left out add no states.
-    Their motion under the disturbances is noise with covariances R_t at the sensors, V_t at the
-    POIs and N_t between them (see `left_out`), and they follow u by their static compliance::
-
-        S = C2 P C2' + R + R_t,   L = P C2' S^-1,   L_z = (C1 P C2' + N_t) S^-1
-
-    with P of the Riccati equation of (A, C2, Q, R + R_t). Without any delay of u the static
-    compliance is left out: it would close an algebraic loop from y to u to y.
+    predicted error is as good as that model (how good: ``help(flexplant.estimation)``; the
+    equations: `algorithms`).
 
     Parameters
     ----------

@@ -156,16 +156,9 @@ def stage_weights(
 
     ``plant.weighted(z=weights.z, w=weights.w)`` is what `flexplant.design_hinf` then takes; a
     controller with one degree of freedom reads `reference_errors`. `design_stage` does all three,
-    and finds the largest bandwidth. What the numbers do is measured on one machine in a table of
-    ``help(flexplant.plant)``.
-
-    In one length at the POI (1 m of reference) and in the force f0 that accelerates the rigid body
-    by ``w_c^2`` times it, f_c being 1.6 times the bandwidth, the blocks are
-    ``[W_S S, W_S P W_d; W_u K S, W_u K P W_d]`` with 1/W_S rising as f/f_c up to peak, W_u letting
-    the efforts roll off from 6 f_c, W_d = disturbance f0. K P W_d is the complementary sensitivity
-    T at u, and the weights of z are divided by ``peak disturbance effort``, so that gamma = 1
-    requires |T| < peak at u: with the default ratios this block decides, and gamma is how far the
-    loop is from it. The controller lists what each block reaches (`Controller.reached`).
+    and finds the largest bandwidth. Below a gamma of 1 |T| at u is below `peak`. What the numbers
+    do is measured on one machine in a table of ``help(flexplant.plant)``. How it works:
+    `algorithms`.
 
     Parameters
     ----------
