@@ -87,12 +87,16 @@ def with_changes(plant: P, changes: Sequence[tuple[Delta, float]]) -> P:
     """
     if all(delta.kind in ("gain", "delay") for delta, _ in changes):
         return _with_ports(plant, plant.assembled.realisation, changes)
+    return _with_ports(plant, changed_modes(plant, changes), changes)
+
+
+def changed_modes(plant: Partition, changes: Sequence[tuple[Delta, float]]) -> ModalRealisation:
+    """Return the modes of a plant with stiffness, damping or shape changed."""
     realisation = modal_realisation(plant)
     for delta, amount in changes:
         if delta.kind == "shape":
             realisation = reshaped(realisation, delta, amount)
-    pairs = changed_pairs(realisation, changes)
-    return _with_ports(plant, realisation.replace(pairs=pairs), changes)
+    return realisation.replace(pairs=changed_pairs(realisation, changes))
 
 
 def changed_pairs(

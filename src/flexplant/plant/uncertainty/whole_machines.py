@@ -10,7 +10,7 @@ from ...checks import FloatArray
 from ..building import rebuilt
 from ..realisation import ModalRealisation
 from ..standard import StandardPlant
-from .uncertain_plant import Delta, UncertainPlant, modal_realisation, with_changes
+from .uncertain_plant import Delta, UncertainPlant, changed_modes, modal_realisation
 
 #: kinds of Deltas that say the same of the modes of a larger plant
 _OF_MODES = ("freq", "damping")
@@ -55,10 +55,8 @@ def draws_with_left_out(
         ])  # fmt: skip
         every = [*deltas, *left]
         changes = [(d, float(max(d.scale * x, -0.9))) for d, x in zip(every, amounts, strict=True)]
-        found = with_changes(whole, changes)
-        if not shapes:
-            return found
-        return rebuilt(found, realisation=_mixed(found.assembled.realisation, own_rng, shapes))
+        modes = changed_modes(whole, changes)
+        return rebuilt(whole, realisation=_mixed(modes, own_rng, shapes) if shapes else modes)
 
     return (one(each) for each in rng.spawn(count))
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from ...checks import FloatArray, generator, positive
 from ...errors import AssumptionError, FlexplantError, InfeasibleError, ModelError
 from ...loop import ClosedLoop, close_loop
 from ...lti.interconnection import series
+from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ...plant import (
     StandardPlant,
@@ -21,7 +23,8 @@ from ...plant import (
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...plant.uncertainty.whole_machines import draws_with_left_out
 from ..controller import Controller, with_left_out
-from .hinf_design import tolerant
+from .hinf_design import tolerant, tolerant_system
+from .hinf_riccati import Riccati
 
 #: |S| crosses 1 at about two thirds of the bandwidth of these weights, which bound the efforts
 _CROSSES = 2.0 / 3.0
@@ -149,7 +152,14 @@ class _StageTask:
         self.through = self.plant.through(self.errors)
         self.tried: dict[float, float] = {}
         self.failures: dict[float, FlexplantError] = {}
-        self.best: tuple[float, Controller] | None = None
+        self.best: _Design | None = None
+        known = self.plant.uncertain(frequency=self.ranges, modes=list(self.ranges))
+        loop_plant = self.plant if self.whole is None else self.whole
+        #: machines on which a loop must hold, made when they are first needed; the same for all
+        self.machines = _Drawn(
+            draws_with_left_out(known, loop_plant, generator(0), _DRAWS, shapes=_SHAPES)
+            or iter(known.sample(0, _DRAWS))
+        )
 
     def holds(self, bandwidth: float) -> bool:
         """Design for a bandwidth of the weights, and return whether the loop holds."""
@@ -167,63 +177,61 @@ class _StageTask:
             if now == damped:
                 break
             damped = now
-            margin = self._designed(weighted, bandwidth, factor * bandwidth)
-            self.tried[bandwidth] = max(self.tried[bandwidth], margin)
-            if margin >= self.margin:
+            one = _Design(bandwidth, weighted, factor * bandwidth)
+            system = self._designed(one)
+            if system is None:
+                continue
+            margin, drawn = self._judged(system)
+            if margin < self.margin:  # of the model itself: more damping is no cure
+                self.tried[bandwidth] = max(self.tried[bandwidth], margin)
+                break
+            if drawn >= _KEPT * self.margin:
+                self.tried[bandwidth] = margin
+                if self.best is None or bandwidth > self.best.bandwidth:
+                    self.best = one._replace(system=system, drawn=drawn)
                 return True
         return False
+
+    def _designed(self, one: _Design) -> StateSpace | None:
+        """Return a controller, from the other methods where the first finds none."""
+        try:
+            return tolerant_system(one.weighted, self.uncertain, one.damped_below)
+        except (AssumptionError, ModelError):
+            raise
+        except FlexplantError:
+            pass
+        try:
+            return tolerant(one.weighted, self.uncertain, damped_below=one.damped_below).system
+        except FlexplantError as error:
+            self.failures[one.bandwidth] = error
+            return None
 
     def _below(self, freq: float) -> int:
         """Return how many modes of uncertain frequency lie below one [Hz]."""
         return int(np.count_nonzero(self._frequencies < freq))
 
-    def _designed(self, weighted: StandardPlant, bandwidth: float, damped_below: float) -> float:
-        """Return the modulus margin of a design, 0 where its modes must not be off; keep it."""
-        try:
-            found = tolerant(weighted, self.uncertain, damped_below=damped_below)
-        except (AssumptionError, ModelError):
-            raise
-        except FlexplantError as error:
-            self.failures[bandwidth] = error
-            return 0.0
-        block = series(self.errors, found.system).replace(name="stage")
+    def _judged(self, system: StateSpace) -> tuple[float, float]:
+        """Return the modulus margin of a controller, and the least with its modes off.
+
+        The latter is 0 where a mode may not be off by itself. No further machine is drawn after one
+        on which the loop does not hold.
+        """
+        block = self._block(system)
         loop = close_loop(self.plant, block)
         wholes = [] if self.whole is None else [close_loop(self.whole, block)]
         margin = min(one.modulus_margin if one.is_stable else 0.0 for one in (loop, *wholes))
-        if margin < self.margin:
-            return margin
-        if not self._tolerates(loop):
-            return 0.0
-        drawn = self._drawn([loop, *wholes][-1])
-        if drawn < _KEPT * self.margin:
-            return 0.0
-        if self.best is None or bandwidth > self.best[0]:
-            certificate = dict(found.certificate or {})
-            certificate[f"least modulus margin of {_DRAWS} machines drawn"] = drawn
-            self.best = (
-                bandwidth,
-                found.replace(
-                    system=block, method="H-infinity of a stage", certificate=certificate
-                ),
-            )
-        return margin
-
-    def _drawn(self, loop: ClosedLoop) -> float:
-        """Return the least modulus margin of machines drawn, everything off at once.
-
-        No further machine is drawn after one on which the loop does not hold.
-        """
-        known = self.plant.uncertain(frequency=self.ranges, modes=list(self.ranges))
-        machines = draws_with_left_out(
-            known, loop.plant, generator(0), _DRAWS, shapes=_SHAPES
-        ) or iter(known.sample(0, _DRAWS))
+        if margin < self.margin or not self._tolerates(loop):
+            return margin, 0.0
         least = 1.0
-        for machine in machines:
+        for machine in self.machines:
             one = loop.around(machine)
             least = min(least, one.modulus_margin if one.is_stable else 0.0)
             if least < _KEPT * self.margin:
                 break
-        return least
+        return margin, least
+
+    def _block(self, system: StateSpace) -> StateSpace:
+        return series(self.errors, system).replace(name="stage")
 
     def _tolerates(self, loop: ClosedLoop) -> bool:
         """Return whether any one mode may be off as far as it is uncertain."""
@@ -243,7 +251,7 @@ class _StageTask:
             now = other
         if self.best is None:
             return
-        low, high = self.best[0], min(self.best[0] * _STEP, self.highest)
+        low, high = self.best.bandwidth, min(self.best.bandwidth * _STEP, self.highest)
         for _ in range(_HALVINGS):
             middle = float(np.sqrt(low * high))
             low, high = (middle, high) if self.holds(middle) else (low, middle)
@@ -274,6 +282,53 @@ class _StageTask:
                 "on machines drawn. Measure their poles, lower margin=, or move the actuators."
                 + (f" ({causes})" if causes else "")
             )
-        bandwidth, controller = self.best
-        certificate = dict(controller.certificate or {}) | {"weights for Hz": bandwidth}
-        return controller.replace(tried=tried, certificate=certificate, reached={})
+        best, drawn = self.best, self.best.drawn
+        options: dict[str, Any] = {"damped_below": best.damped_below}
+        found = tolerant(best.weighted, self.uncertain, **options)
+        if not _same(found.system, best.system):
+            # a better answer than that of one Riccati method: it must hold as well
+            margin, drawn = self._judged(found.system)
+            if margin < self.margin or drawn < _KEPT * self.margin:
+                found = tolerant(best.weighted, self.uncertain, Riccati(), **options)
+                drawn = best.drawn
+        certificate = dict(found.certificate or {}) | {
+            f"least modulus margin of {_DRAWS} machines drawn": drawn,
+            "weights for Hz": best.bandwidth,
+        }
+        return found.replace(
+            system=self._block(found.system),
+            method="H-infinity of a stage",
+            certificate=certificate,
+            tried=tried,
+            reached={},
+        )
+
+
+class _Design(NamedTuple):
+    """Weights of a bandwidth [Hz], the controller for them, and the machines' least margin."""
+
+    bandwidth: float
+    weighted: StandardPlant
+    damped_below: float
+    system: StateSpace | None = None
+    drawn: float = 0.0
+
+
+class _Drawn:
+    """What an iterator gives, kept for the next time."""
+
+    def __init__(self, source: Iterator[StandardPlant]) -> None:
+        self.source, self.known = source, list[StandardPlant]()
+
+    def __iter__(self) -> Iterator[StandardPlant]:
+        yield from self.known
+        for one in self.source:
+            self.known.append(one)
+            yield one
+
+
+def _same(one: StateSpace, other: StateSpace | None) -> bool:
+    """Return whether two controllers are the same numbers."""
+    return other is not None and all(
+        np.array_equal(getattr(one, m), getattr(other, m)) for m in "ABCD"
+    )
