@@ -152,7 +152,7 @@ class _StageTask:
         self.through = self.plant.through(self.errors)
         self.tried: dict[float, float] = {}
         self.failures: dict[float, FlexplantError] = {}
-        self.best: _Design | None = None
+        self.best: _StageTry | None = None
         known = self.plant.uncertain(frequency=self.ranges, modes=list(self.ranges))
         loop_plant = self.plant if self.whole is None else self.whole
         #: machines on which a loop must hold, made when they are first needed; the same for all
@@ -177,7 +177,7 @@ class _StageTask:
             if now == damped:
                 break
             damped = now
-            one = _Design(bandwidth, weighted, factor * bandwidth)
+            one = _StageTry(bandwidth, weighted, factor * bandwidth)
             system = self._designed(one)
             if system is None:
                 continue
@@ -192,7 +192,7 @@ class _StageTask:
                 return True
         return False
 
-    def _designed(self, one: _Design) -> StateSpace | None:
+    def _designed(self, one: _StageTry) -> StateSpace | None:
         """Return a controller, from the other methods where the first finds none."""
         try:
             return tolerant_system(one.weighted, self.uncertain, one.damped_below)
@@ -304,7 +304,7 @@ class _StageTask:
         )
 
 
-class _Design(NamedTuple):
+class _StageTry(NamedTuple):
     """Weights of a bandwidth [Hz], the controller for them, and the machines' least margin."""
 
     bandwidth: float
