@@ -10,7 +10,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 import flexplant as fx
-from flexplant.errors import FlexplantError, FlexplantWarning, ModelError, ShapeError
+from flexplant.errors import FlexplantError, FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.io import models
 from flexplant.io.paths import Format
 
@@ -367,8 +367,15 @@ def test_content_goes_before_the_suffix(tmp_path):
     placed = fx.read_matrices(tmp_path / "job_STIF2.mtx", nodes=tmp_path / "nodes.csv")
     np.testing.assert_array_equal(placed.dofs.xyz[:, 0], np.arange(6))
     assert placed.located
-    with pytest.raises(ModelError, match="does not name its rows"):
+    # both ways to say so lead to the call that reads a table of nodes
+    call = r"fx\.io\.read_dofs\('nodes\.csv', directions="
+    with pytest.raises(ModelError, match=rf"does not name its rows.*{call}"):
         fx.read_matrices(tmp_path / "K.txt", nodes=tmp_path / "nodes.csv")
+    (tmp_path / "nodes.csv").write_text("node,x,y,z\n1,0,0,0\n2,1,0,0\n")
+    with pytest.raises(LabelError, match=rf"no column.*{call}"):
+        fx.read_matrices(tmp_path / "K.txt", dofs=tmp_path / "nodes.csv")
+    dofs = fx.io.read_dofs(tmp_path / "nodes.csv", directions=("x", "y", "z"))
+    assert fx.read_matrices(tmp_path / "K.txt", dofs=dofs).dofs.labels[-1] == "2:z"
 
 
 def test_a_new_format_is_one_value(tmp_path, monkeypatch):

@@ -112,7 +112,9 @@ def read_matrices(
         if found.dofs is None:
             raise ModelError(
                 f"{path.name!r} does not name its rows, so that coordinates of nodes are not "
-                "enough: give dofs=, a table node, direction, x, y, z in the order of the rows."
+                "enough: give dofs=, a table node, direction, x, y, z in the order of the rows, "
+                "or, where each node has the same DOFs, dofs=fx.io.read_dofs("
+                f"{Path(nodes).name!r}, directions=('x', 'y', 'z')), or all six to 'rz'."
             )
         known, xyz = read_nodes_table(nodes)
         wanted = np.unique(found.dofs.nodes)

@@ -102,7 +102,13 @@ def read_dofs(
     needed = ("node", "direction") if nodes is not None else ("node", "direction", "x", "y", "z")
     missing = [name for name in needed if name not in columns]
     if missing:
-        do = "One line a DOF: node, direction, x, y, z; or give nodes=table or directions=(...)."
+        do = "One line a DOF: node, direction, x, y, z; or give nodes=table for the coordinates."
+        if "node" in columns and "direction" not in columns:
+            do = (
+                "Of nodes with the same DOFs each give "
+                f"dofs=fx.io.read_dofs({Path(path).name!r}, directions=('x', 'y', 'z')), or all "
+                "six to 'rz'; else a table with one line a DOF: node, direction, x, y, z."
+            )
         raise table.lacks(missing, do)
     numbers = table.whole("node")
     kinds = [_direction(name, path) for name in columns["direction"]]

@@ -19,7 +19,7 @@ from ..loop import ClosedLoop, ErrorBudget
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import StateSpace
 from ..modes import Modes
-from ..parallel import Progress
+from ..parallel import Progress, tick
 from ..placement import ParetoCurve, Placement, SensorMap
 from ..placement.criterion import in_words
 from ..plant import StandardPlant, decouple
@@ -111,6 +111,7 @@ def _value_lines(name: str, value: Any, design: Design, gallery: Gallery) -> str
         drawn.append(f"<div>{attempted(lambda: _ports_table(value))}{_assumptions(value)}</div>")
     if drawn:
         parts.append(f'<div class="pictures">{"".join(drawn)}</div>')
+    tick("report")
     return "".join(parts)
 
 
@@ -427,14 +428,13 @@ def report(
     design, gallery = Design(parts), Gallery()
     runs = design.of(Response).items()
     noisy = {name: run.seed for name, run in runs if run.seed is not None}
-    with Progress(0, "report"):
-        found = [
-            result(design, gallery, channel),
-            loops_section(design, gallery, channel),
-            *sections(design, gallery),
-            certificates(design),
-            _origin({**noisy, **(seeds or {})}),
-        ]
+    with Progress(len(design.named) + 2, "report") as bar:
+        found = [result(design, gallery, channel)]
+        bar.advance()
+        found += [loops_section(design, gallery, channel)]
+        bar.advance(1 + len(design.of(ClosedLoop)))
+        found += sections(design, gallery)
+        found += [certificates(design), _origin({**noisy, **(seeds or {})})]
     text = page(str(title), str(subtitle), [one for one in found if one is not None])
     with written(path) as file:
         file.write(text.encode("utf-8"))

@@ -274,7 +274,10 @@ def masses(found: Facts) -> Iterator[Line]:
             "dropped (held) DOFs take their mass along; else look at directions and labels",
         )
     if np.isfinite(center).any():
-        at = ", ".join(f"{c:.6g}" if np.isfinite(c) else "?" for c in center)
+        turning = np.nanmax(np.diag(found.body.inertia), initial=0.0)
+        least = TYPED * np.sqrt(turning / np.abs(mass[known][0]))
+        near = np.where(np.abs(center) < least, 0.0, center)  # a sum that cancels is no place
+        at = ", ".join(f"{c:.6g}" if np.isfinite(c) else "?" for c in near)
         yield ("ok", "centre of gravity", f"({at}) m", "")
     turns = np.diag(found.body.inertia)
     if np.isfinite(turns).any():
