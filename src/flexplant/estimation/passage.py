@@ -376,13 +376,9 @@ def excess(
     """Return Y (n, r) with ``P_k = P + Y Y'``, P_k the covariance now and P the stationary one.
 
     The filter of any first covariance P_k above the stationary P is the stationary filter of a
-    first state ``x + Y eta``, eta of zero mean and unit covariance, whose innovations
-    ``e = C F^k Y eta + white noise`` show eta by least squares: the partitioned filter. None where
-    P_k is not above P, or has so much to show still that digits would be lost.
-
-    References
-    ----------
-    [Lainiotis1975]_.
+    first state ``x + Y eta``, eta of zero mean and unit covariance, whose innovations ``e = C F^k Y
+    eta + white noise`` show eta by least squares: the partitioned filter. None where P_k is not
+    above P, or has so much to show still that digits would be lost. [Lainiotis1975]_.
     """
     more = P - steady.P
     if Z.shape[1]:

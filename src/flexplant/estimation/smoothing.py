@@ -23,9 +23,6 @@ def smoothed(passage: Passage, sight: Sight) -> tuple[FloatArray, FloatArray]:
         hat[k|N] = hat[k|k] + T[k] r[k],        var[k|N] = var[k|k] - T[k] M[k] T[k]'
 
     F = A - K C2, S the covariance of the innovations e and ``T = C1 P F' - N K'``.
-
-    References
-    ----------
     [BrysonFrazier1963]_; [deJong1989]_ (unknown first states).
     """
     hat, variance = passage.hat.copy(), passage.variance.copy()

@@ -126,11 +126,7 @@ def joined_frfs(
 
     ``Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y``, Y being block-diagonal, B the stretches of the joints by
     outputs, B_f their forces by inputs and Z what they give way: dual coupling by Lagrange
-    multipliers (LM-FBS).
-
-    References
-    ----------
-    [deKlerk2008]_, [vanderSeijs2013]_.
+    multipliers (LM-FBS). [deKlerk2008]_, [vanderSeijs2013]_.
     """
     _same_lines(frfs)
     parts, listed = parts_of(frfs, dofs), _joint_list(joints)

@@ -269,13 +269,9 @@ def _continuous(A: FloatArray, B: FloatArray, dt: float) -> tuple[FloatArray, Fl
 def _factor(A: FloatArray, B: FloatArray) -> FloatArray:
     """Solve ``A L L' + L L' A' + B B' = 0`` for L column by column of the Schur form.
 
-    Hammarling's method: P is never formed, so that its small eigenvalues keep their digits.
-    With S upper triangular, last row b of B, ``t = |b| / a, a^2 = -2 Re s_nn, v = b* / |b|``:
-    column ``u = -(S_1 + conj(s_nn) I)^-1 (s t + a B_1 v)``, then ``B_1 <- B_1 - a u v*``.
-
-    References
-    ----------
-    [Hammarling1982]_.
+    Hammarling's method: P is never formed, so that its small eigenvalues keep their digits. With S
+    upper triangular, last row b of B, ``t = |b| / a, a^2 = -2 Re s_nn, v = b* / |b|``: column ``u =
+    -(S_1 + conj(s_nn) I)^-1 (s t + a B_1 v)``, then ``B_1 <- B_1 - a u v*``. [Hammarling1982]_.
     """
     n = A.shape[0]
     if not n:

@@ -146,12 +146,9 @@ _ROUNDING = 1e-11
 def invariant_zeros(g: Any) -> ComplexArray:
     """Return the finite invariant zeros, where ``[A - s I, B; C, D]`` loses its normal rank.
 
-    The system is compressed until D has full row and column rank: outputs that do not feel an
-    input directly are states, and states of the rest. What is left is a regular pencil, whose
-    eigenvalues are the zeros; those at infinity have left with the compressed states.
-
-    References
-    ----------
+    The system is compressed until D has full row and column rank: outputs that do not feel an input
+    directly are states, and states of the rest. What is left is a regular pencil, whose eigenvalues
+    are the zeros; those at infinity have left with the compressed states.
     [EmamiNaeiniVanDooren1982]_.
     """
     A, B, C, D = _even(*_scaled(g))
@@ -207,14 +204,11 @@ def _even(
 def axis_zeros(g: Any) -> ComplexArray:
     """Return the invariant zeros on the imaginary axis (unit circle), upper half plane.
 
-    Where ``[A - s I, B; C, D]`` loses column rank. With more outputs than inputs they are among
-    the generalised eigenvalues of the pencil with its outputs mixed down to as many as inputs;
+    Where ``[A - s I, B; C, D]`` loses column rank. With more outputs than inputs they are among the
+    generalised eigenvalues of the pencil with its outputs mixed down to as many as inputs;
     candidates near the limit are moved onto it. The rank of the whole matrix, states, inputs and
-    outputs scaled to unit size, decides.
-
-    References
-    ----------
-    [EmamiNaeiniVanDooren1982]_; the random mixing replaces their compression.
+    outputs scaled to unit size, decides. [EmamiNaeiniVanDooren1982]_; the random mixing replaces
+    their compression.
     """
     n, m = g.n_states, len(g.inputs)
     A, B, C, D = _scaled(g)

@@ -209,9 +209,6 @@ def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
     Where ||w -> z|| < gamma is reached, it is reached with a little noise and effort added too.
     Their Riccati equations have solutions X and Y with rho(X Y) < gamma^2, which are at least the
     values of the same problem with all states known and free states as inputs, and of its dual.
-
-    References
-    ----------
     [Stoorvogel1992]_ (the two quadratic matrix inequalities of singular problems).
     """
     sides = (

@@ -297,9 +297,6 @@ def following(shaped: StateSpace, model: StateSpace, weight: float) -> tuple[Sta
     phi)`` with the normalised left coprime factors N, M of the plant, ``r`` counts rho times and
     ``e = rho (y - rho T_ref r)``: the larger rho (`weight`), the closer the loop follows the model
     T_ref, the less robust it is. W brings the gain at zero frequency to that of the model.
-
-    References
-    ----------
     [Hoyle1991]_; [Limebeer1993]_.
     """
     p, m = len(shaped.outputs), len(shaped.inputs)

@@ -45,9 +45,6 @@ def power_iteration(
 
     The iteration of Young and Doyle for real and complex blocks together. Real Deltas may come out
     inside their interval. It need not converge: what it gives is judged by what it does.
-
-    References
-    ----------
     [Young1990]_; [PackardDoyle1993]_.
     """
     n = M.shape[1]
