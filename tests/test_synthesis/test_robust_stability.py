@@ -10,7 +10,7 @@ import flexplant as fx
 from flexplant.errors import AssumptionError, LabelError, ModelError
 from flexplant.lti import StateSpace, lft, tustin
 from flexplant.synthesis import design_mu, robust_stability, worst_case_gain
-from stages import reduced, sampled
+from stages import ports, reduced, sampled, some_modes
 
 RATE = 400.0
 pytestmark = pytest.mark.slow
@@ -23,13 +23,13 @@ def plant(sampled=False):
         masses=[1.0, 1.0, 1.0], stiffnesses=[2500.0, 2500.0], ground=[30.0, 30.0, 30.0]
     )
     modes = fx.solve_modes(model, count=3, damping=fx.ModalDamping(0.01))
-    ports = fx.Ports(
+    own = fx.Ports(
         w=[fx.Disturbance("d", at="2:x", asd=1e-3)],
         u=[fx.Actuator("f", at="1:x")],
         z=[fx.Poi("tip", at="3:x", axes=("x",))],
         y=[fx.Sensor("s", at="3:x", asd=1e-6)],
     )
-    found = fx.assemble_plant(modes, ports)
+    found = fx.assemble_plant(modes, own)
     return found.discretized(RATE, delay=1) if sampled else found
 
 
@@ -190,6 +190,22 @@ def test_one_channel_a_mode_makes_every_machine_keep_the_weights():
     assert worst.lower <= found.gamma * 1.02
     with pytest.raises(LabelError, match="'push'"):
         design_mu(deltas, w={"push": 1.0}, z=z)
+
+
+def test_weights_of_a_stage_with_a_channel_left_out():
+    """The weight of the POI that has a reference is None: each machine is closed by hand."""
+    P = sampled(some_modes(0.01, 6, attached=False), ports(asd=1e-2))
+    off = P.uncertain(frequency=0.01)
+    weights = fx.stage_weights(off, 20.0)
+    assert None in weights.z.values()
+    found = design_mu(off, w=weights.w, z=weights.z, iterations=2)
+    names, gains = [delta.name for delta in off.deltas], []
+    left = {name: weights.w.get(name) for name in P.w}
+    for corner in itertools.product([-1.0, 1.0], repeat=len(names)):
+        machine = off.lft(dict(zip(names, corner, strict=True)))
+        weighted = machine.weighted(w=left, z={name: weights.z.get(name) for name in P.z})
+        gains.append(fx.hinf_norm(lft(weighted.system, found.system)))
+    assert 0.8 * found.gamma < max(gains) < 1.01 * found.gamma
 
 
 def test_a_delay_within_a_sample_is_a_delta():

@@ -21,11 +21,13 @@ from ..controller import SolvedController
 from ..reach import beyond_rounding
 from .central import central, indefinite, quadratic, riccati_solutions
 from .lower_bound import parrott
-from .singular import made_regular, missing_ranks, require_ranks
+from .singular import LEVELS, Regularised, made_regular, missing_ranks, require_ranks
 
 #: distances from the smallest gamma: 5 % of it cost 3 to 5 % of rms and 0.02 of margin; near it
 #: gains stay finite where D12 and D21 have full rank, and grow without bound where they have not
 _REGULAR, _SINGULAR = 0.01, 0.05
+#: relative width at which the bisection of a step of a search stops
+_QUICK = 0.005
 #: steps of the bisection, and of going up from its result
 _BISECTION, _GROWTH = 60, 12
 #: a norm beside that of the least quadratic cost at which nothing is left to gain
@@ -175,6 +177,35 @@ class Riccati(Value):
                     return controller, norm
             step = max(2.0 * step, self.tolerance)
         return None, 1.0
+
+
+def quick_answer(problem: Prepared) -> SolvedController:
+    """Return a controller near the smallest gamma, not verified: for the steps of a search.
+
+    Where ranks are missing with the most noise and effort that `made_regular` adds; gains are seen
+    at resonances alone.
+    """
+    regular = Regularised(problem, LEVELS[0]) if missing_ranks(problem) else None
+    given = problem if regular is None else regular.problem
+    least = quadratic(given)
+    unit = _seen(given, least)
+    if not np.isfinite(unit):
+        raise SolverError("no controller of least quadratic cost stabilises in rounding.")
+    scaled, K = given.measured_in(unit), None
+    step = _REGULAR if regular is None else _SINGULAR
+    with Progress(_BISECTION, "steps of the bisection", progress=False) as bar:
+        high = Riccati(tolerance=_QUICK)._searched(scaled, bar)[0]
+    for _ in range(_GROWTH):
+        gamma = high * (1.0 + step)
+        K = _attempt(scaled, gamma).controller
+        if K is not None and _seen(scaled, K) <= gamma * (1.0 + _SLACK):
+            break
+        K, step = None, 2.0 * step
+    K, gain = (least, 1.0) if K is None else (K, unit)
+    found = SolvedController(K.A, K.B, gain * K.C, gain * K.D, unit * high, 0.0)
+    if regular is None:
+        return found
+    return SolvedController(*regular.restored(found), found.gamma, 0.0)
 
 
 def _require_finite_gain(problem: Prepared, controller: StateSpace, gamma: float) -> None:

@@ -22,7 +22,7 @@ _RANK = 0.5
 #: what certificates call the size of what was added
 ADDED = "added noise"
 #: sizes of what is added, tried in turn: the largest that costs next to nothing in gamma is taken
-_LEVELS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
+LEVELS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
 #: relative: what a level may cost in gamma, compared with a tenth of it
 _COST = 1e-3
 #: relative: a smaller gamma that is the same
@@ -124,7 +124,7 @@ def made_regular(
     """Return the controller of a singular problem, found with a little noise and effort added."""
     found: list[_Found] = []
     errors: list[FlexplantError] = []
-    for level in _LEVELS:
+    for level in LEVELS:
         try:
             found.append(_with_level(problem, solve, norm, level))
         except FlexplantError as error:

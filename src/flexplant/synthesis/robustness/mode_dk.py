@@ -24,7 +24,7 @@ from ...parallel import Progress
 from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import Controller, SynthesisMethod
-from ..hinf.hinf_riccati import Riccati
+from ..hinf.hinf_riccati import quick_answer
 from ..hinf.mode_channels import (
     ModeChannel,
     ModeLoop,
@@ -36,6 +36,8 @@ from .uncertain_loop import weighted_names
 
 #: relative decrease of mu below which the iteration ends
 _SETTLED = 0.02
+#: relative distance of mu from the level that D was found for, from which on D is found again
+_NEAR = 0.02
 #: machines at corners of the uncertainty that are closed exactly, and by how much their gain may
 #: exceed the bound: the first order of the channels
 _MACHINES, _BEYOND = 8, 0.05
@@ -116,14 +118,16 @@ def _step(
     g = plant.system
     system = g.replace(C=g.C * scale[:, None], D=g.D * scale[:, None])
     problem = prepared(system, plant.u, plant.y)
-    found = (method or Riccati()).solve(problem)
+    found = quick_answer(problem) if method is None else method.solve(problem)
     K = problem.restored(found.A, found.B, found.C, found.D).replace(name="mu", units=plant.units)
     if not lft(system, K).is_stable:
         raise SolverError("the controller does not stabilise in rounding.")
     again = rebalanced(channels, with_channels(weighted, channels), K)
     loop = ModeLoop.of(again, with_channels(weighted, again), K, 2.0, weighted=True)
-    first = loop.level(level)
-    return _Step(min(first, loop.level(first)), K, again)  # D is found for a level
+    mu = loop.level(level)
+    if abs(mu / level - 1.0) > _NEAR:  # D is found for a level
+        mu = min(mu, loop.level(mu))
+    return _Step(mu, K, again)
 
 
 def _weighted(plant: StandardPlant, w: Any, z: Any) -> StandardPlant:
