@@ -262,7 +262,7 @@ def test_no_matlab_file_is_refused(tmp_path):
 @needs_data
 def test_published_matlab_models():
     shaft = fx.io.read_matlab(FE / "nlevp/shaft.mat")
-    content = scipy.io.loadmat(FE / "nlevp/shaft.mat")
+    content = scipy.io.loadmat(FE / "nlevp/shaft.mat", spmatrix=False)
     assert shaft.D.nnz == content["C"].nnz
     values = la.eigvals(content["K"].toarray(), content["M"].toarray())
     lowest = np.sqrt(np.sort(values[np.isfinite(values)].real)[0]) / (2 * np.pi)

@@ -102,7 +102,7 @@ def test_words_and_markers_of_any_length(tmp_path, order, marker, integer):
 @pytest.mark.parametrize("name", ["nastran_op4_data_r_c_rc", "nastran_op4_data_double_bigmat_le"])
 def test_files_of_nastran_have_their_twins_content(name):
     found = read_op4_matrices(SHARED / f"{name}.op4")
-    wanted = scipy.io.loadmat(SHARED / "nastran_op4_data_r_c_rc.mat")
+    wanted = scipy.io.loadmat(SHARED / "nastran_op4_data_r_c_rc.mat", spmatrix=False)
     assert len(found) == 3
     for key, matrix in found.items():
         twin = next(wanted[k] for k in wanted if k.upper() == key)
@@ -113,7 +113,7 @@ def test_files_of_nastran_have_their_twins_content(name):
 def test_superelements_of_nastran_have_their_twins_content():
     path = SHARED / "nas2cam_extseout_nas2cam"
     found = read_op4_matrices(path.with_suffix(".op4"))
-    twin = scipy.io.loadmat(path.with_suffix(".mat"))["nas"][0, 0]
+    twin = scipy.io.loadmat(path.with_suffix(".mat"), spmatrix=False)["nas"][0, 0]
     compared = 0
     for kind in ("kaa", "maa"):
         for part in (twin[kind][0, 0][name] for name in twin[kind].dtype.names):

@@ -47,7 +47,7 @@ def test_slicot_collection(name, hinf, omega, h2):
         pytest.skip("the SLICOT data are not here")
     import scipy.io
 
-    found = scipy.io.loadmat(path)
+    found = scipy.io.loadmat(path, spmatrix=False)
     A, B, C = (_dense(found[k]) for k in "ABC")
     g = StateSpace(A, B, C, np.zeros((C.shape[0], B.shape[1])))
     gain, freq = peak_gain(g)

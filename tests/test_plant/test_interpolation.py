@@ -94,7 +94,8 @@ def test_against_the_elements_of_the_plate():
             found = dofs.rows(INSIDE, direction) @ phi
             wanted = plate.dofs.rows(INSIDE, direction) @ modes.phi
             size = np.abs(wanted).max(axis=0)
-            assert np.all(np.abs(found - wanted).max(axis=0)[3:7] < limit * size[3:7])
+            # modes 4 to 6: rounding chooses the mixture of the two of one frequency above them
+            assert np.all(np.abs(found - wanted).max(axis=0)[3:6] < limit * size[3:6])
             np.testing.assert_allclose(found[:, :3], wanted[:, :3], atol=1e-9)
 
 

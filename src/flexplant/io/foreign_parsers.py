@@ -25,7 +25,7 @@ def matlab(path: str) -> dict[str, Any]:
 
     # deflated data grow a thousand times at most
     _bound_memory(path, 1100)
-    content = scipy.io.matlab.loadmat(path, struct_as_record=False)
+    content = scipy.io.matlab.loadmat(path, struct_as_record=False, spmatrix=False)
     return {name: _plain(value) for name, value in content.items() if name[:2] != "__"}
 
 
