@@ -39,7 +39,7 @@ class PositionMap(Value):
     seen, reached : (..., m) arrays
         Shares of each elastic mode at the best sensor and actuator (`ModeVisibility`).
     modes : (m,) sequence of str
-        The modes.
+        The elastic modes; of a sampled plant those below half its rate.
     figures : mapping {name: (...) array}
         Figures of one's own.
 
@@ -139,7 +139,9 @@ def position_map(plant: Any, judge: Any, points: Any) -> PositionMap:
     modes: tuple[str, ...] = ()
     for values in product(*grid.values()):
         there = plant.at(**dict(zip(grid, values, strict=True)))
-        shares = mode_visibility(there)
+        # of a sampled plant the modes that its controller sees as they are
+        most = 0.5 / plant.dt if plant.dt else np.inf
+        shares = [one for one in mode_visibility(there) if one.freq < most]
         modes = tuple(f"mode {one.mode} ({one.freq:.4g} Hz)" for one in shares)
         sees, pushes = ([one.shares.get(side, 0.0) for one in shares] for side in "yu")
         rows.append((_errors(own, there), sees, pushes, list(_judged(judges, there, values))))

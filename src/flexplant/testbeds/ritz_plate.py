@@ -34,23 +34,28 @@ class PolynomialShape(Interpolation):
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n^2,) with which the deflections give a motion at a point."""
+        return np.asarray(self.rows(np.asarray(xyz)[None], direction)[0])
+
+    def rows(self, points: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (p, n^2) at many points (p, 3)."""
         if direction not in _MOTIONS:
             raise LabelError(
                 f"this plate moves along {', '.join(_MOTIONS)}, got {direction!r}: its middle "
                 "plane does not stretch. Choose one of them."
             )
-        place = np.asarray(xyz[:2]) / self.size
-        if np.any(place < -EDGE) or np.any(place > 1.0 + EDGE):
+        places = np.asarray(points)[:, :2] / self.size
+        off = np.any((places < -EDGE) | (places > 1.0 + EDGE), axis=1)
+        if np.any(off):
             raise LabelError(
-                f"the point {tuple(np.asarray(xyz).tolist())} is off the plate of {self.size} m. "
-                "Choose one on it."
+                f"the point {tuple(np.asarray(points)[off][0].tolist())} is off the plate of "
+                f"{self.size} m. Choose one on it."
             )
         *orders, sign = _MOTIONS[direction]
         x, y = (
-            lagrange(self.nodes, np.array([2.0 * p - 1.0]), int(k))[0] * (2.0 / length) ** int(k)
-            for p, k, length in zip(place, orders, self.size, strict=True)
+            lagrange(self.nodes, 2.0 * p - 1.0, int(k)) * (2.0 / length) ** int(k)
+            for p, k, length in zip(places.T, orders, self.size, strict=True)
         )
-        return np.asarray(sign * np.outer(y, x).reshape(-1))
+        return np.asarray(sign * np.einsum("pi,pj->pij", y, x).reshape(len(places), -1))
 
 
 def nodes_of(order: int) -> FloatArray:
