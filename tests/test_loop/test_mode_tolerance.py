@@ -1,5 +1,6 @@
 """How far each mode may be off: eigenvalues of loops assembled by hand are the judge."""
 
+import warnings
 from functools import cache
 
 import numpy as np
@@ -278,3 +279,33 @@ def test_positions_and_speeds_measured_together_a_fraction_of_a_sample_late():
             there = closed.around(with_changes(closed.plant, moved))
             assert not there.is_stable or there.modulus_margin == pytest.approx(0.35, rel=0.02)
     assert seen >= 3
+
+
+def two_masses(off=0.0):
+    """Two masses on a spring that is stiffer, so that the mode's frequency is off by a share."""
+    model = fx.chain(masses=[1.0, 0.3], stiffnesses=[4e5 * (1.0 + off) ** 2])
+    modes = fx.solve_modes(model, count=2, damping=fx.ModalDamping(0.002 / (1.0 + off)))
+    own = fx.Ports(
+        w=[fx.Disturbance("w", at="1:x", asd=1e-2)],
+        u=[fx.Actuator("u", at="1:x")],
+        z=[fx.Poi("tip", at="2:x", axes=("x",))],
+        y=[fx.Sensor("q", at="2:x", asd=1e-9)],
+    )
+    return fx.assemble_plant(modes, own).discretized(4e3, delay=1)
+
+
+@pytest.mark.slow
+def test_laws_that_are_tuned_say_what_the_mode_below_their_notch_holds_to():
+    """The notch turns the phase of a gain above 1: machines with another spring are the judge."""
+    with pytest.warns(FlexplantWarning, match=r"mode 2 \(209.5 Hz\) holds to .* known to 2 %"):
+        found = fx.tune_loops(two_masses().uncertain(frequency=0.02), notches=1)
+    (stable,), (within,) = found.tolerances.stable, found.tolerances.within
+    assert 0.0 < within[1] < stable[1] < 0.05
+    for part, holds in ((0.99, True), (1.01, False)):
+        with warnings.catch_warnings(action="ignore"):
+            assert fx.close_loop(two_masses(part * stable[1]), found).is_stable == holds
+    margin_there = fx.close_loop(two_masses(within[1]), found).modulus_margin
+    assert margin_there == pytest.approx(0.35, rel=0.01)
+    assert found.tolerances.critical == (2,)
+    assert 0.0 < found.tolerances.draws.stable < 1.0
+    assert found.tolerances.summary in repr(found)

@@ -56,7 +56,9 @@ def stated(
 ) -> tuple[Delta, ...]:
     """Return Deltas of stated relative uncertainties of frequency and damping, mode by mode."""
     elastic = range(realisation.n_rigid + 1, realisation.n_modes + 1)
-    chosen = tuple(elastic if modes is None else modes)
+    # negative stiffness, as of magnets, is no frequency; its modes are uncertain by name only
+    swing = [n for n in elastic if np.linalg.det(realisation.pairs[n - 1]) > 0]
+    chosen = tuple(swing if modes is None else modes)
     for number in chosen:
         if number not in elastic:
             raise unknown_label("elastic mode of the plant", number, map(str, elastic))
