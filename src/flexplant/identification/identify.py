@@ -438,6 +438,8 @@ HIGHEST, LINES_OF_ORDER = 40, 4
 #: references times parts of the band from which every other order is enough: each is a large
 #: eigenvalue problem
 MANY = 4
+#: the most poles of a diagram's order, conjugates included: an eigenvalue problem of this size
+POLES = 100
 
 
 def _affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
@@ -446,9 +448,9 @@ def _affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
     fewest = min(window.seen.stop - window.seen.start for window in parts)
     if orders is None:
         # four orders at least are compared, which twenty lines afford
-        top = max(6, min(HIGHEST, fewest // LINES_OF_ORDER - 1))
-        many = len(parts) * ready.data.shape[1] >= MANY and top == HIGHEST
-        return list(range(2, top + 1, 2 if many else 1))
+        references = ready.data.shape[1]
+        top = max(6, min(HIGHEST, fewest // LINES_OF_ORDER - 1, max(POLES // references, 10)))
+        return list(range(2, top + 1, 2 if len(parts) * references >= MANY else 1))
     if 2 * (orders[-1] + 1) > fewest:
         raise ModelError(
             f"order {orders[-1]} needs more lines than the {ready.freq.size} of the band: lower "
