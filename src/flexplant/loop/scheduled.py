@@ -173,9 +173,9 @@ def schedule_loops(
 
     Notes
     -----
-    Stability is checked at the places and half way between them, of the machine at rest there. How
-    fast it may move is another question: `rms_along(..., repeats=True)` answers it for one
-    trajectory, by the growth over its repetitions.
+    Stability is checked at the places and half way between them, of the machine at rest there. For
+    all positions between, and up to which speed, is what `simulation.certify_speed` proves;
+    `rms_along(..., repeats=True)` has the growth along one trajectory.
 
     Examples
     --------
