@@ -93,6 +93,8 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     ax.plot(
         *(found.best[:2] / factor), "*", color=RED, markersize=14, label="best place", clip_on=False
     )
+    if ports is not None:
+        _make_room(ax)
     legend_below(ax)
     return ax
 
@@ -273,8 +275,14 @@ def _view(
         hatched = {"facecolor": "none", "edgecolor": "0.3", "hatch": "///", "zorder": 2.5}
         ax.add_patch(_patch(zone, factor, **hatched))
     mark_devices(ax, factor, kinds, various=various)
-    ax.margins(0.1)  # for the names of what is at an edge
+    _make_room(ax)
     legend_below(ax)
+
+
+def _make_room(ax: Axes) -> None:
+    """Leave room for the names of what is at an edge, also where contours end there."""
+    ax.use_sticky_edges = False
+    ax.margins(0.1)
 
 
 def _patch(zone: Zone, factor: float, **style: Any) -> Patch:
