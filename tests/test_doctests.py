@@ -4,6 +4,7 @@ import doctest
 import importlib
 import inspect
 import pkgutil
+import re
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -53,7 +54,11 @@ PLOTS = {n: vars(plot)[n] for n in dir(plot) if inspect.isfunction(vars(plot)[n]
 
 
 def test_every_public_name_has_a_doctest():
+    """Its own, or, of a value that is not made by hand, that of a function that returns it."""
     named = DESCRIBED | PLOTS
-    without = {name for name, item in named.items() if ">>>" not in (item.__doc__ or "")}
+    texts = [inspect.getdoc(item) or "" for item in (*DESCRIBED.values(), *PLOTS.values())]
+    shown = [text for text in texts if ">>>" in text]
+    made = {kind for text in shown for kind in re.findall(r"^Returns\n-+\n(\w+)", text, re.M)}
+    without = {name for name, item in named.items() if ">>>" not in (item.__doc__ or "")} - made
     assert without <= WITHOUT, "write an example of its use under Examples"
     assert without >= WITHOUT, "take these from the list: they have a doctest"

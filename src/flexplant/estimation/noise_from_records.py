@@ -396,16 +396,6 @@ class NoiseLevels(Value):
         Used.
     verdict : str
         Of `consistency`, on the record with these levels.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> observer = fx.design_kalman(plant)
-    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
-    >>> run = fx.simulate(fx.close_loop(plant, observer, servo), duration=4.0, rng=1)
-    >>> fx.estimation.estimate_noise(plant, run).channels
-    ('amp', 'y1:noise', 'y2:noise')
     """
 
     given: StandardPlant

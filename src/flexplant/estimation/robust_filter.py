@@ -115,13 +115,6 @@ class RobustFilter(PoiFilter):
         Of its errors on its own plant.
     certificate : HinfFilterCertificate or MinimaxCertificate
         What was checked.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> found = fx.estimation.design_hinf_filter(fx.testbeds.three_masses())
-    >>> found.sensors, found.rms("die") >= fx.design_kalman(fx.testbeds.three_masses()).rms("die")
-    (('y1', 'y2'), True)
     """
 
     system: StateSpace

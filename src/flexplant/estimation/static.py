@@ -32,12 +32,6 @@ class StaticEstimator(Value):
         Whose geometry it uses.
     larger : StandardPlant, optional
         The plant with the modes left out, where these are known.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.design_static(fx.testbeds.three_masses()).system.outputs
-    ('die:hat',)
     """
 
     system: StateSpace

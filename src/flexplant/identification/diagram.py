@@ -90,16 +90,6 @@ class StabilisationDiagram(Value):
         Of each pole, of unit length; exchanged where there are fewer outputs than inputs.
     band : (2,) array [Hz]
         Where a pole counts.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> import numpy as np
-    >>> freq = np.arange(10.0, 40.0, 0.1)
-    >>> H = 1 / (20.0**2 - freq**2 + 0.4j * freq)
-    >>> diagram = fx.identification.stabilisation_diagram(fx.Frf(freq, H[None, None]))
-    >>> len(diagram.orders) == len(diagram.poles)
-    True
     """
 
     orders: IntArray

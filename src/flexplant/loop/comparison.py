@@ -72,16 +72,6 @@ class LoopComparison(Value):
         What S is: ``die:ref to die:error``; empty when the loops have no reference.
     sampled : bool
         Whether `decay` of the rows is a spectral radius.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> observer = fx.design_kalman(plant)
-    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
-    >>> table = fx.compare_loops({"servo": fx.close_loop(plant, observer, servo)})
-    >>> table.channel, list(table.rows)
-    ('die:ref to die:error', ['servo'])
     """
 
     rows: Mapping[str, LoopFigures]

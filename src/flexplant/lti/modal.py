@@ -252,15 +252,6 @@ class Split(Value):
         Rigid-body, marginal and unstable modes, strictly proper.
     separation : float
         Norm of the decoupling transformation: how much rounding grows; 0 when A had blocks.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> sys = fx.lti.tf([1.0], [1.0, 0.0, -1.0])
-    >>> parts = fx.lti.split_stable(sys)
-    >>> whole = fx.lti.parallel(parts.stable, parts.rest)
-    >>> bool(abs(whole(2j) - sys(2j)) < 1e-12)
-    True
     """
 
     stable: StateSpace

@@ -51,13 +51,6 @@ class RiccatiSolution(Value):
         Norm of the equation's residual relative to P, states scaled to unit variance.
     iterations : int
         Doubling and Newton steps.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> found = fx.lti.solve_dare([[1.0]], [[1.0]], Q=[[2.0]], R=[[1.0]])
-    >>> round(found.spectral_radius, 6), found.residual < 1e-12
-    (0.267949, True)
     """
 
     P: FloatArray

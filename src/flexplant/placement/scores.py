@@ -46,15 +46,6 @@ class Scores(Value):
         Whether they are sensors or actuators.
     unit : str
         Of the square roots of the values, where they are mean squares of a motion.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
-    >>> scores = fx.score_sensors(plant, [["s1"], ["s3"]], candidates=candidates)
-    >>> scores.order, scores.unit
-    (array([0, 1]), 'm')
     """
 
     layouts: tuple[tuple[str, ...], ...]
@@ -401,14 +392,6 @@ class SensorMap(Value):
         Zones in which nothing was tried.
     unit : str
         Of the square roots of the values, where they are mean squares of a motion.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> found = fx.sensor_map(plant, [(0, 0, 0), (2, 0, 0)], asd=1e-10, direction="x")
-    >>> found.values.shape, bool((found.values <= found.without).all())
-    ((2,), True)
     """
 
     points: FloatArray

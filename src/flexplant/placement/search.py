@@ -417,15 +417,6 @@ class ParetoCurve(Value):
         No choice of that count (within that budget) is better.
     by_cost : bool
         Whether amounts are budgets.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
-    >>> curve = fx.placement.pareto_curve(plant, candidates, [1, 2])
-    >>> [placement.chosen for placement in curve.placements]
-    [('s1',), ('s1', 's3')]
     """
 
     amounts: FloatArray

@@ -47,17 +47,6 @@ class FiltersAlong(Value):
         between them; with the steady gain where the plant stands.
     units : mapping {str: str}
         Of the motions.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> found = fx.simulation.FiltersAlong(
-    ...     [0.0], ["die:z"], [[1e-9]], [[1.01e-9]], [[1.5e-9]], {"die:z": "m"})
-    >>> print(found)
-    <FiltersAlong: 1 sample; rms error, steady gains more
-      die:z exact 1 nm, scheduled +10 pm, frozen +500 pm>
-    >>> found.price("frozen")["die:z"].round(12)
-    array([5.e-10])
     """
 
     time: FloatArray

@@ -30,16 +30,6 @@ class RmsAlong(Value):
         The channels: z, y, driven u and what blocks show.
     units : mapping {str: str}
         Of the channels.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> rms = [[3e-9, 4e-9]]
-    >>> found = fx.simulation.RmsAlong([0.0, 1.0], rms, ["die:error"], {"die:error": "m"})
-    >>> print(found)
-    <RmsAlong: 2 samples; largest die:error 4 nm>
-    >>> found["die:error"]
-    array([3.e-09, 4.e-09])
     """
 
     time: FloatArray

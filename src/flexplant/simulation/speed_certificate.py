@@ -56,14 +56,6 @@ class SpeedCertificate(Value):
         Of the Lyapunov function ``x' P x``, over the states of plant and controller.
     attempts : sequence of (speed, failed_at)
         Speeds that were tried, each with the position where no proof was found; the last is proven.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> import numpy as np
-    >>> P = np.array([[[2.0]], [[3.0]]])
-    >>> fx.simulation.SpeedCertificate("x", 0.8, [-0.1, 0.1], P, [(1.0, 0.03), (0.8, None)])
-    <SpeedCertificate: stable on every path of x up to 0.8 a second, from -0.1 to 0.1; 2 nodes>
     """
 
     position: str

@@ -64,14 +64,6 @@ class Sensitivities(Value):
         ``S_ab = d lambda_a / d p_b``.
     parameters : sequence of q str
         Names.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
-    >>> fx.updating.eigenvalue_sensitivities(drawing, [fx.AddedMass("3:x")], modes=[2]).parameters
-    ('mass at 3:x',)
     """
 
     modes: tuple[int, ...]

@@ -45,13 +45,6 @@ class Decoupling(Value):
         The centre of gravity; 0 in directions that the model's motions do not determine.
     axes : sequence of str
         The r axes, of x, y, z, rx, ry, rz.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> rigid = fx.decouple(fx.testbeds.three_masses())
-    >>> rigid.axes, rigid.mass.round(6)
-    (('x',), array([[3.]]))
     """
 
     to_actuators: StateSpace

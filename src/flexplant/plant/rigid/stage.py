@@ -123,13 +123,6 @@ class StageWeights(Value):
         What they mean.
     uncertain : UncertainPlant, optional
         What was stated of the plant's modes, for ``design_hinf(..., uncertain=)``.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> weights = fx.stage_weights(fx.testbeds.three_masses(), 20.0)
-    >>> sorted(weights.z)
-    ['die:error', 'die:x', 'u1:effort']
     """
 
     z: Mapping[str, Any]

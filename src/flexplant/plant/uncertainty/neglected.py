@@ -59,16 +59,6 @@ class NeglectedModes(Value):
     sampled : NeglectedModes, optional
         The same bound for the sampled plant, delay and folding included: its weights are those of
         the bilinear frequency ``tan(pi f dt) / (pi dt)``, in which a sampled plant is continuous.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> model = fx.chain(masses=[1.0] * 4, stiffnesses=[4e5] * 3)
-    >>> modes = fx.solve_modes(model, count=4, damping=fx.ModalDamping(0.01))
-    >>> ports = fx.testbeds.three_masses().assembled.ports
-    >>> plant = fx.assemble_plant(modes.select([0, 1, 2]), ports).discretized(2e3, delay=1)
-    >>> fx.plant.neglected_modes(plant, modes).looseness >= 1
-    True
     """
 
     weights: StateSpace

@@ -81,17 +81,6 @@ class FixedPointController(Value):
         The largest of each channel over some starts; empty where all come to rest at zero.
     tried : mapping {"6 sections, 8 bits": str}
         What else was tried, and what the loop lost with it.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> gain = fx.StateSpace([], [], [], [[-2.0]], 1e-4, inputs=["y1"], outputs=["u1"])
-    >>> margins = {"modulus margin": 0.5, "modulus margin before": 0.52}
-    >>> sizes = {"y1": 1e-3, "u1": 2e-3}
-    >>> fx.synthesis.FixedPointController(gain, 16, 32, 0, sizes, margins, (), {})
-    <FixedPointController: 0 sections, coefficients of 16 bits, states of 32
-      modulus margin 0.5, before 0.52
-      no limit cycle found>
     """
 
     system: StateSpace

@@ -52,13 +52,6 @@ class ShapedLoop(Value):
         From y (and references) to u; what was verified is in it.
     report : LoopReport
         Crossovers and margins of each axis, the others closed.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> shaped = fx.synthesis.shape_loop(fx.lti.tf([1.0], [1.0, 1.0, 0.0]), bandwidth=10.0)
-    >>> shaped.report.is_stable
-    True
     """
 
     shaped: StateSpace

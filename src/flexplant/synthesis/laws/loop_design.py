@@ -41,13 +41,6 @@ class DesignedLoops(Value):
         What is worth knowing.
     tolerances : ModeTolerances, optional
         Of an uncertain plant: by what each mode may be off before the loop fails.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.lti.tf([1.0], [1.0, 0.0, 0.0])
-    >>> fx.design_loops(plant, fx.Pid(9e4) * fx.Lead(50.0)).report.modulus_margin > 0.3
-    True
     """
 
     system: StateSpace

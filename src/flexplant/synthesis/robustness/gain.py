@@ -47,14 +47,6 @@ class WorstCaseGain(Value):
         It can be simulated.
     frequencies, bounds : (k,) arrays [Hz, gain]
         Upper bounds at single frequencies.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> machine = fx.testbeds.three_masses()
-    >>> fx.synthesis.WorstCaseGain(1.71, 1.7, 1.69, 96.0, {"mode7:freq": 1.0}, machine, [], [])
-    <WorstCaseGain: 1.7 to 1.71, nominal 1.69
-      reached at 96 Hz by mode7:freq +1>
     """
 
     upper: float

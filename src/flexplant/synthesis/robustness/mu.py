@@ -52,13 +52,6 @@ class MuBounds(Value):
         they need not be the smallest.
     intervals : int
         Number of intervals that cover the frequency axis, 0 of a matrix.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> found = fx.synthesis.mu([[0.0, 2.0], [0.5, 0.0]], [fx.synthesis.FullBlock()] * 2)
-    >>> round(found.upper, 6), round(found.lower, 6)
-    (1.0, 1.0)
     """
 
     upper: float

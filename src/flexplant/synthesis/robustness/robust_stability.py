@@ -65,13 +65,6 @@ class RobustStability(Value):
         left out.
     left_out : SpillOver, optional
         How the nominal loop stands on the plant with the modes left out, where these are known.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> found = fx.synthesis.RobustStability(0.8, 0.5, 120.0, {"mode7:freq": 2.0}, None, [], [], {})
-    >>> found.is_robust  # and unstable at twice the uncertainty
-    True
     """
 
     upper: float

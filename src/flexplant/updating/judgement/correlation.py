@@ -148,15 +148,6 @@ class Correlation(Value):
         Numbers of the model's modes, in the measured range, whose shapes the sensors cannot
         distinguish (a MAC above 0.9 with each other there): they are paired by frequency, and a
         high MAC does not say which of a group was measured.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
-    >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[620.0j], modes=[2]))
-    >>> fx.updating.correlate(drawing, [poles]).modes
-    (2,)
     """
 
     modes: tuple[int, ...]

@@ -55,16 +55,6 @@ class Identifiability(Value):
         For parameters that are unseen or mixed: the modes, not measured so far, whose eigenvalues
         would determine the lost combinations, those that change most first; none where no
         eigenvalue does, as of mirror images on a symmetric structure.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
-    >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[630.0j], modes=[2]))
-    >>> masses = [fx.AddedMass("1:x"), fx.AddedMass("2:x")]
-    >>> fx.identifiability(drawing, masses, [poles]).unseen  # "2:x" is at rest in mode 2
-    ('mass at 2:x',)
     """
 
     parameters: tuple[str, ...]

@@ -225,18 +225,6 @@ class Localisation(Value):
         The best set that was fitted and lacks a place of the chosen one; empty for no change.
     next_bic : float
         Its criterion, infinite where no other set was fitted.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 2.0, 1.5], stiffnesses=[4e5, 3e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
-    >>> heavier = fx.chain(masses=[1.0, 2.0, 1.8], stiffnesses=[4e5, 3e5])
-    >>> measured = fx.MeasuredModes(poles=fx.solve_modes(heavier, count=3).poles[1:], modes=[2, 3])
-    >>> masses = [fx.AddedMass(place, name=place) for place in drawing.dofs.labels]
-    >>> found = fx.localise(drawing, masses, [fx.Eigenvalues(measured)], most=1)
-    >>> found.chosen, found.chosen_values.round(6)
-    (('3:x',), array([0.3]))
     """
 
     candidates: tuple[str, ...]

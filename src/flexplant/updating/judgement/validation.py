@@ -46,19 +46,6 @@ class Validation(Value):
         place.
     before, after : Correlation
         Of the unused data with the model before and after.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
-    >>> heavier = fx.chain(masses=[1.0, 1.0, 1.2], stiffnesses=[4e5, 4e5])
-    >>> poles = fx.solve_modes(heavier, count=3).poles
-    >>> known = fx.Eigenvalues(fx.MeasuredModes(poles=poles[[1]], modes=[2]))
-    >>> unused = fx.Eigenvalues(fx.MeasuredModes(poles=poles[[2]], modes=[3]))
-    >>> found = fx.validate(drawing, [fx.AddedMass("3:x")], [known], [unused])
-    >>> abs(found.before.freq_error).round(3), abs(found.after.freq_error).round(6)
-    (array([0.014]), array([0.]))
     """
 
     fit: UpdateResult
