@@ -12,9 +12,9 @@ import tempfile
 import uuid
 import zipfile
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 from ..checks import one_of
 from ..errors import LabelError, ModelError, warn
@@ -193,8 +193,8 @@ def _description(
     K = program.system
     inputs, outputs = channels(K)
     units = [K.units.get(one) for one in (*K.inputs, *K.outputs)]
-    head = f'modelName={quoteattr(K.name or name)} generationTool="flexplant"'
-    shared = f'modelIdentifier={quoteattr(name)} canHandleVariableCommunicationStepSize="true"'
+    head = f'modelName={_quoted(K.name or name)} generationTool="flexplant"'
+    shared = f'modelIdentifier={_quoted(name)} canHandleVariableCommunicationStepSize="true"'
     three = version == "3.0"
     states = "canGetAndSetFMUState" if three else "canGetAndSetFMUstate"
     shared += f' {states}="true"'
@@ -219,11 +219,11 @@ def _description(
     for number, (one, causality, unit) in enumerate(
         zip((*inputs, *outputs), sides, units, strict=True), 1
     ):
-        common = f'name={quoteattr(one)} valueReference="{number}" causality="{causality}"'
+        common = f'name={_quoted(one)} valueReference="{number}" causality="{causality}"'
         common += ' variability="discrete"' + (
             "" if causality == "input" else ' initial="calculated"'
         )
-        own = (f" unit={quoteattr(unit)}" if unit else "") + (
+        own = (f" unit={_quoted(unit)}" if unit else "") + (
             ' start="0"' if causality == "input" else ""
         )
         lines.append(
@@ -253,12 +253,12 @@ def _unit(unit: str) -> str:
         for factor in part.split():
             match = _FACTOR.fullmatch(factor)
             if match is None or match[1] not in _NAMED or unit.count("/") > 1:
-                return f"    <Unit name={quoteattr(unit)}/>"
+                return f"    <Unit name={_quoted(unit)}/>"
             power = side * int(match[2] or 1)
             total = [a + power * b for a, b in zip(total, _NAMED[match[1]], strict=True)]
     named = zip(("kg", "m", "s", "A", "rad"), total, strict=True)
     base = " ".join(f'{key}="{power}"' for key, power in named if power)
-    return f"    <Unit name={quoteattr(unit)}><BaseUnit {base}/></Unit>"
+    return f"    <Unit name={_quoted(unit)}><BaseUnit {base}/></Unit>"
 
 
 def _build(name: str, sources: Sequence[str]) -> str:
@@ -269,3 +269,8 @@ def _build(name: str, sources: Sequence[str]) -> str:
         f'  <BuildConfiguration modelIdentifier="{name}">\n    <SourceFileSet language="C99">'
         f"{listed}</SourceFileSet>\n  </BuildConfiguration>\n</fmiBuildDescription>\n"
     )
+
+
+def _quoted(text: str) -> str:
+    """Return an attribute's value; what XML's own module has for it loads the network's."""
+    return f'"{escape(text)}"'
