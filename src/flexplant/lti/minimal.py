@@ -248,7 +248,7 @@ def _agree(found: StateSpace, g: StateSpace, omega: FloatArray) -> bool:
 def _less(g: StateSpace, tol: float) -> StateSpace:
     """Return a system without the balanced states of Hankel singular values below `tol`."""
     n = g.n_states
-    if n == 1 or (n == 2 and np.iscomplexobj(np.linalg.eigvals(g.A))):
+    if n == 1 or (n == 2 and np.any(np.linalg.eigvals(g.A).imag)):
         return g  # one mode: all of it or nothing
     judged = _stabilised(g)
     # one size for all channels: what reaches the states from each input, what each output sees
