@@ -63,7 +63,7 @@ def design_stage(
     is at least `margin`, also with the modes left out where they are known, and 7/8 of it with the
     frequency of any one mode of the plant off as far as it is uncertain, and on each of 20 machines
     on which all frequencies are off at once, those of modes left out too, and shapes are mixed by
-    0.3 %.
+    0.3 %. No proof: on a long plate of another formulation 0.22 was left where the 20 kept 0.41.
 
     Parameters
     ----------
