@@ -255,7 +255,7 @@ def reported_tolerances(loop: Any) -> ModeTolerances | None:
     """
     uncertain = loop.plant.uncertainty
     if uncertain is None:
-        sure = loop.plant.has_own_modes and loop.is_stable
+        sure = loop.plant.has_own_modes and loop.is_stable and _elastic(loop.plant)[0].size
         return _within(loop, {}) if sure else None
     whole_loop = loop.completed or loop
     if not uncertain.frequencies or not whole_loop.is_stable:
