@@ -145,6 +145,24 @@ def test_a_start_where_a_mode_does_not_oscillate_is_one_that_failed():
     lost = Eigenvalues(data.measured.replace(modes=(1, 2, 7)))
     with pytest.raises(LabelError, match="no mode 7"):
         update(model, unknown, [lost])
+    with pytest.raises(LabelError, match="no mode 7"):
+        update(model, unknown, [lost], starts=[[0.0], [900.0]])
+
+
+class Lost(GaussNewton):
+    """A search that fails from a start where all modes oscillate."""
+
+    def search(self, objective, begin, *, most, tolerance):
+        super().search(objective, begin, most=1, tolerance=tolerance)
+        raise SolverError("nothing is found")
+
+
+def test_a_drawn_start_that_stops_a_mode_is_not_the_reason_why_none_leads_anywhere():
+    """Of two starts the last ceases to oscillate: its LabelError is no mistake of the call."""
+    model, data = overdamped(0)
+    with pytest.raises(SolverError, match="none of 2 starts") as caught:
+        update(model, [AddedDamping("3:z")], [data], starts=[[0.0], [900.0]], method=Lost())
+    assert not isinstance(caught.value, LabelError)
 
 
 def scattered_machine(seed):

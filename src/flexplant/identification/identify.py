@@ -54,7 +54,7 @@ from .pole_test import (
     unwindowed,
     warned,
 )
-from .refine import Exhausted, Fit, Lines, Products, refined
+from .refine import Exhausted, Fit, Lines, Products, pivoted, refined
 from .result import IdentifiedModes, answer, hann_segment, leakage_warned, of_segments
 
 #: of an identification, for its bar: the diagram, twice fit and growth, the answer
@@ -62,8 +62,9 @@ STAGES = 6
 #: changes of one kind that are accepted, and poles that a fit may have
 MOST, MOST_POLES = 6, 60
 #: lines apart that poles at peaks have: a peak that is no resonance of a linear machine is
-#: explained badly, and what is left of it is no other pole
-REGION = 20
+#: explained badly, and what is left of it is no other pole; and lines that a peak has beside it on
+#: either side, where the edge of the band shows one flank only
+REGION, FLANK = 20, 5
 #: values of the FRF times (poles times references) squared, the products of a step of the fit, up
 #: to which it is made without a request: some seconds altogether
 CHEAP = 5e7
@@ -97,7 +98,7 @@ def stabilisation_diagram(
         The frequencies used; all by default.
     orders : iterable of int, optional
         Model orders; each has order * min(n_in, n_out) poles. By default 2 to 40, or to a quarter
-        of the lines; every other one where many references make each of them costly.
+        of the lines, or to 100 poles; every other one where many references make each costly.
     tolerances : (float, float, float)
         Relative change of frequency and of damping from one order to the next, and the MAC,
         for a pole to be called stable.
@@ -378,10 +379,14 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
     spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
     none = np.zeros((lines.data.shape[1], 0), dtype=np.complex128)
     fit = Fit(lines, none[0], none)
+    ends = 2 * np.pi * np.array([lines.freq[FLANK], lines.freq[-1 - FLANK]])
     for _ in range(MOST):
         trials = [one for rivals in missed(lines, fit) for one in rivals]
         trials = [
-            one for one in trials if np.all(np.abs(one.poles[-1] - fit.poles) > REGION * spacing)
+            one
+            for one in trials
+            if ends[0] < one.poles[-1].imag < ends[1]
+            and np.all(np.abs(one.poles[-1] - fit.poles) > REGION * spacing)
         ]
         best = max(trials, key=lambda trial: trial.gain - trial.least, default=None)
         if best is None or best.gain < best.least:
@@ -394,8 +399,8 @@ def _first(lines: Lines, chosen: PoleSelection, alone: bool) -> Fit:
     """Return the fit near the poles chosen, with all residual terms and no search for others."""
     if not alone:
         return Fit(lines, chosen.poles, chosen.participation)
-    poles, part = supported(lines, chosen.poles, chosen.participation)
-    return refined(lines, poles, part, steps=QUICK, strict=False)
+    fit = supported(lines, chosen.poles, chosen.participation)
+    return refined(lines, fit.poles, fit.participation, steps=QUICK, strict=False, first=fit)
 
 
 def _refined(
@@ -417,10 +422,11 @@ def _refined(
     ]
     for _ in range(1 if ready.known else 2):
         lines = lines_of(ready)
-        if alone:
-            poles, part = supported(lines, poles, part)
+        start = supported(lines, poles, part) if alone else pivoted(lines, poles, part)
         # poles that turn out to be none may keep it from settling: judged at the end
-        fit = refined(lines, poles, part, steps=steps, strict=not alone)
+        fit = refined(
+            lines, start.poles, start.participation, steps=steps, strict=not alone, first=start
+        )
         lines, fit = improved(lines, fit, reducing, steps=steps)
         bar.advance()
         if alone:

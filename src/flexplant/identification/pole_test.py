@@ -13,7 +13,7 @@ from ..checks import ComplexArray, FloatArray
 from ..errors import SolverError, attempted, warn
 from ..tolerances import RANK
 from .model_error import coherence, own_cost, twin
-from .refine import Fit, Lines, refined
+from .refine import Fit, Lines, pivoted, refined
 
 #: probability that noise anywhere in the band passes for a pole
 CHANCE = 1e-3
@@ -21,12 +21,11 @@ CHANCE = 1e-3
 ALARM = 1e-9
 
 
-def supported(
-    lines: Lines, poles: ComplexArray, part: ComplexArray
-) -> tuple[ComplexArray, ComplexArray]:
+def supported(lines: Lines, poles: ComplexArray, part: ComplexArray) -> Fit:
     """Leave out, one by one, poles that noise alone may explain; SolverError when none is left."""
     least = pole_price(lines)
-    costs = _Costs(lines, poles, part)
+    fit = pivoted(lines, poles, part)
+    costs = _Costs(fit)
     kept = list(range(poles.size))
     while len(kept) > 1:
         unit = max(1.0, costs.of(kept) / freedom(lines, len(kept)))
@@ -42,7 +41,7 @@ def supported(
             "band, measure longer, or pick poles by hand with "
             "identification.stabilisation_diagram(frf).select(freq=[...])."
         )
-    return poles[kept], part[:, kept]
+    return fit if len(kept) == poles.size else pivoted(lines, poles[kept], part[:, kept])
 
 
 def _seen(lines: Lines, poles: ComplexArray, part: ComplexArray, kept: list[int], k: int) -> bool:
@@ -96,9 +95,9 @@ def pole_price(lines: Lines) -> float:
 class _Costs:
     """Cost of the fit with some of the poles, from one set of normal equations per output."""
 
-    def __init__(self, lines: Lines, poles: ComplexArray, part: ComplexArray) -> None:
-        self.m = poles.size
-        self.parts = Fit(lines, poles, part).linear
+    def __init__(self, fit: Fit) -> None:
+        self.m = fit.m
+        self.parts = fit.linear
         self.known: dict[tuple[int, ...], float] = {}
 
     def of(self, kept: list[int]) -> float:
@@ -273,9 +272,9 @@ def unwindowed(lines: Lines, fit: Fit) -> Proposals:
 def dropped(lines: Lines, fit: Fit) -> Proposals:
     """Propose the poles that are modes and that noise alone does not explain."""
     light = np.flatnonzero(-fit.poles.real < BROADEST * np.abs(fit.poles))
-    poles, part = supported(lines, fit.poles[light], fit.participation[:, light])
-    if poles.size < fit.poles.size:
-        yield [Trial(lines, poles, part, np.inf, -np.inf)]
+    less = supported(lines, fit.poles[light], fit.participation[:, light])
+    if less.m < fit.m:
+        yield [Trial(lines, less.poles, less.participation, np.inf, -np.inf)]
 
 
 def merged(lines: Lines, fit: Fit) -> Proposals:

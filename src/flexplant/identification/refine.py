@@ -111,6 +111,7 @@ def refined(
     fine: bool = False,
     below: float = np.inf,
     poles_only: bool = False,
+    first: Fit | None = None,
 ) -> Fit:
     r"""Return the weighted least-squares fit of poles and residual terms.
 
@@ -123,12 +124,11 @@ def refined(
     column held at 1, are found by Levenberg-Marquardt: to a tenth of a standard deviation, or
     to 3e-3 of one where the fit is to be `fine`. A fit that will not come `below` a cost is given
     up: as soon as twenty times what a full step would gain is not enough. `poles_only`: the
-    participation stays as it is, and poles are found to half a standard deviation.
+    participation stays as it is, and poles are found to half a standard deviation. `first`: the
+    `pivoted` fit at these poles, where it was made already.
     """
-    pivots = np.argmax(np.abs(participation), axis=0)
-    columns = np.arange(poles.size)
-    participation = participation / participation[pivots, columns]
-    now = Fit(lines, poles, participation, pivots)
+    now = pivoted(lines, poles, participation) if first is None else first
+    participation, pivots = now.participation, now.pivots
     # nearly Gauss-Newton from the start, whose poles are good
     damping, idle = 1e-6, 0
     power = float(np.sum(np.abs(lines.data * lines.weight) ** 2))
@@ -165,9 +165,8 @@ def refined(
         now, damping = better, damping / 10.0
         if np.abs(participation).max() > RUNAWAY:
             # the entry held at 1 is next to none: another is held
-            pivots = np.argmax(np.abs(participation), axis=0)
-            participation = participation / participation[pivots, columns]
-            now = Fit(lines, poles, participation, pivots)
+            now = pivoted(lines, poles, participation)
+            participation, pivots = now.participation, now.pivots
         # a step of so few standard deviations of what is left is none
         if predicted <= enough * now.cost / (2 * lines.data.size):
             break
@@ -181,6 +180,12 @@ def refined(
         if strict:
             raise unsettled(poles.size, steps)
     return now
+
+
+def pivoted(lines: Lines, poles: ComplexArray, participation: ComplexArray) -> Fit:
+    """Return the fit whose largest entry of each column of the participation is 1, and held."""
+    pivots = np.argmax(np.abs(participation), axis=0)
+    return Fit(lines, poles, participation / participation[pivots, np.arange(poles.size)], pivots)
 
 
 def unsettled(count: int, steps: int) -> SolverError:
@@ -235,10 +240,13 @@ class Fit:
     @cached_property
     def linear(self) -> list[tuple[FloatArray, FloatArray, float]]:
         """Per output the normal equations of its shapes, and the power they are to explain."""
-        return [
-            (stacked.T @ stacked, stacked.T @ right, float(right @ right))
-            for right, stacked in zip(self.lines.goals, self._stacked(), strict=True)
-        ]
+        found = []
+        for right, (Q, _), (R, size) in zip(
+            self.lines.goals, self.bases, self.triangles, strict=True
+        ):
+            columns = R * size
+            found.append((columns.T @ columns, columns.T @ (Q.T @ right), float(right @ right)))
+        return found
 
     @cached_property
     def own(self) -> list[Fit]:

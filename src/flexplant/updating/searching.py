@@ -255,10 +255,11 @@ def from_starts(
     ends = [_attempt(objective, one, method, most, tolerance, led=False) for one in begins]
     reached = [found for found in ends if isinstance(found, SearchEnd)]
     if not reached:
-        last = next(end for end in reversed(ends) if isinstance(end, FlexplantError))
-        if len(begins) == 1 or isinstance(last, LabelError):
-            raise last
-        raise SolverError(f"none of {len(begins)} starts leads anywhere; the last: {last}")
+        failed = [end for end in ends if isinstance(end, FlexplantError)]
+        # a mode unknown from every start is a mistake of the call; from one, it ceased to oscillate
+        if len(begins) == 1 or all(isinstance(end, LabelError) for end in failed):
+            raise failed[0]
+        raise SolverError(f"none of {len(begins)} starts leads anywhere; the last: {failed[-1]}")
     best = min(reached, key=lambda found: found.cost)
     # the modes of the best end are numbered from its own start
     if len(begins) > 1:
