@@ -8,7 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...checks import FloatArray, generator, positive
-from ...errors import AssumptionError, FlexplantError, InfeasibleError, ModelError
+from ...errors import (
+    AssumptionError,
+    CertificateError,
+    FlexplantError,
+    InfeasibleError,
+    ModelError,
+    SolverError,
+    attempted,
+)
 from ...loop import ClosedLoop, close_loop
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
@@ -194,14 +202,15 @@ class _StageTask:
 
     def _designed(self, one: _StageTry) -> StateSpace | None:
         """Return a controller, from the other methods where the first finds none."""
-        try:
+        with attempted(
+            f"one Riccati method for {one.bandwidth:.4g} Hz",
+            (SolverError, InfeasibleError, CertificateError),
+        ):
             return tolerant_system(one.weighted, self.uncertain, one.damped_below)
-        except (AssumptionError, ModelError):
-            raise
-        except FlexplantError:
-            pass
         try:
             return tolerant(one.weighted, self.uncertain, damped_below=one.damped_below).system
+        except (AssumptionError, ModelError):
+            raise
         except FlexplantError as error:
             self.failures[one.bandwidth] = error
             return None
