@@ -243,8 +243,8 @@ def table(result: dict[str, Any]) -> str:
                 parts.append(f"{name}: MA {ma:.1f} nm, MSD {msd:.1f} nm")
     parts.append("MA, MSD: largest mean and deviation of die:error over 5 ms, after the move.\n")
     (x, y, _), (old, new) = fifth.best, 1e9 * np.sqrt([fifth.without, fifth.values.min()])
-    parts.append(f"A fifth sensor helps most at ({x:g}, {y:g}) m: {old:.3f} -> {new:.3f} nm")
-    return "\n".join(parts)
+    helps = f"A fifth sensor helps most at ({x:g}, {y:g}) m: {old:.3f} -> {new:.3f} nm"
+    return "\n".join([*parts, helps])
 
 
 # %% The picture: the machine black, the drawing grey, the updated model blue, the servo orange
@@ -256,8 +256,8 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     figure, axs = plt.subplots(2, 3, figsize=(17, 9), layout="constrained")
     figure.suptitle("A virtual machine that no drawing resembles, with 0.1 % damping")
     shades = dict(zip(case["errors"][1e-3].names, SHADES, strict=True))
-    forces = [f"{1e3 * f:g} mN/√Hz" for f in FORCES]
-    fx.plot.predictions(list(case["errors"].values()), colors=shades, cases=forces, ax=axs[0, 0])
+    given, forces = list(case["errors"].values()), [f"{1e3 * f:g} mN/√Hz" for f in FORCES]
+    fx.plot.predictions(given, colors=shades, cases=forces, ax=axs[0, 0])
     for (name, loop), color in zip(case["loops"].items(), COLORS, strict=True):
         run, held = loop["run"], loop["machine"].is_stable
         style = {"label": name + ("" if held else ": unstable"), "color": color}
@@ -276,16 +276,14 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     axs[1, 0].set(ylim=(-8.0, 8.0), title="force of actuator u1, machine")
     axs[1, 1].set(xlim=(5.0, 5e3), ylim=(-50.0, 12.0), title="sensitivity, die:ref to die:error")
     axs[1, 1].legend(frameon=False, loc="lower right")
-    folder.mkdir(exist_ok=True)
+    (path := folder / "wafer_stage.png").parent.mkdir(exist_ok=True)
     claimed = {"Comment": json.dumps(result["claims"])}  # says when the README's copy is old
-    figure.savefig(folder / "wafer_stage.png", dpi=90, metadata=claimed)
+    figure.savefig(path, dpi=90, metadata=claimed)
     plt.close("all")
-    return folder / "wafer_stage.png"
+    return path
 
 
 # %% Run it
 if __name__ == "__main__":
-    import matplotlib as mpl
-
-    mpl.use("Agg")
+    os.environ.setdefault("MPLBACKEND", "Agg")
     print(table(outcome := main()), picture(outcome), sep="\n\npicture: ")
