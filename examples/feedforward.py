@@ -16,6 +16,7 @@ largest and the mean over 5 ms after it::
 """
 
 # %% Names and numbers
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,13 +109,17 @@ def picture(result: dict[str, Any], folder: Path = stage.OUT) -> Path:
     import matplotlib.pyplot as plt
 
     figure, axs = plt.subplots(2, 2, figsize=(13, 8), sharex=True, layout="constrained")
+    colors = dict(
+        zip([*TERMS, "inverse"], ("#0072B2", "#E69F00", "#009E73", "#D55E00"), strict=True)
+    )
+    show = partial(fx.plot.response, channels=["die:error"], span=(0.04, 0.2))
     for column, (name, runs) in zip(axs.T, result["runs"].items(), strict=True):
-        for ax, labels in zip(column, ([*TERMS, "inverse"], [*TERMS[1:], "inverse"]), strict=True):
-            for label in labels:
-                fx.plot.response(runs[label], ["die:error"], span=(0.04, 0.2), label=label, ax=ax)
+        for label, color in colors.items():
+            for ax in column[: 1 if label == TERMS[0] else 2]:
+                show(runs[label], label=label, color=color, ax=ax)
         peak = figures(runs["none"])[0]
         column[0].set(title=f"{name}: at most {1e-3 * peak:.1f} µm without feedforward", xlabel="")
-        column[1].set_title(f"{name}: without {TERMS[0]} alone")
+        column[1].set_title(f"{name}: the same but for {TERMS[0]} feedforward")
     folder.mkdir(exist_ok=True)
     figure.savefig(folder / "feedforward.png", dpi=90)
     plt.close("all")
