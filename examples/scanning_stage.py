@@ -11,6 +11,7 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # matrices are small: more threads only wait
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -83,14 +84,17 @@ def main() -> dict[str, Any]:
     truth = machine.loop(PORTS, *centre.blocks).plant
     places = np.linspace(*X.range, 5)
 
-    def fixed(there: fx.StandardPlant) -> float:
-        return fx.modulus_margin(fx.close_loop(there, *centre.blocks))
-
-    def following(there: fx.StandardPlant) -> float:
+    @cache
+    def loops(there: fx.StandardPlant) -> dict[str, fx.ClosedLoop]:
         law = schedule.at(there.assembled.ports.values["x"]).blocks
-        return fx.modulus_margin(fx.close_loop(there, *law))
+        laws = {"fixed": centre.blocks, "following": law}
+        return {name: fx.close_loop(there, *blocks) for name, blocks in laws.items()}
 
-    judges = {"fixed": fixed, "following": following}
+    judges = {
+        f"{name}, {what}": lambda there, name=name, figure=figure: figure(loops(there)[name])
+        for name in ("fixed", "following")
+        for what, figure in (("margin", fx.modulus_margin), ("bandwidth", fx.loop.bandwidth))
+    }
     maps = {
         "model": plant.map(judges, points=21),
         "machine": truth.map(judges, points={"x": places}),
@@ -125,47 +129,53 @@ def main() -> dict[str, Any]:
             "estimate": float(np.sqrt(np.mean(estimate**2))),
             "ma": float(np.max(ma)),
             "msd": float(np.max(msd)),
-            "margin": float(np.min(maps["machine"].figures[name])),
+            "margin": float(np.min(maps["machine"].figures[f"{name}, margin"])),
+            "bandwidth": float(np.min(maps["machine"].figures[f"{name}, bandwidth"])),
         }
         print(
-            f"{name:10s} least margin on the machine {rows[name]['margin']:.2f}; error at the die "
+            f"{name:10s} on the machine: margin {rows[name]['margin']:.2f}, bandwidth "
+            f"{rows[name]['bandwidth']:.1f} Hz at least; rms error at the die "
             f"{1e9 * rows[name]['predicted']:.1f} nm predicted, {1e9 * rows[name]['error']:.1f} on "
             f"the machine; of the estimate {1e9 * rows[name]['estimate']:.2f} nm; "
             f"MA {1e9 * rows[name]['ma']:.1f}, MSD {1e9 * rows[name]['msd']:.1f} nm"
         )
-    draw(maps, predicted, runs)
+    draw(maps, runs)
     return {"rows": rows, "maps": maps, "filters": filters, "predicted": predicted, "runs": runs}
 
 
 # %% The picture
-def draw(maps: Any, predicted: Any, runs: Any) -> None:
-    """Draw margins over the range, and errors along the scan."""
-    figure, panels = plt.subplots(3, 1, layout="constrained", figsize=(7.5, 8.0))
-    colours = {"fixed": "#D55E00", "following": "#0072B2"}
-    for name, colour in colours.items():
+def draw(maps: Any, runs: Any) -> None:
+    """Draw margin and bandwidth over the range; MA, MSD and the estimate's error along the scan."""
+    figure, panels = plt.subplots(2, 2, layout="constrained", figsize=(12.0, 7.5))
+    (margin, bandwidth), (exposed, estimated) = panels
+    for name, colour in (("fixed", "#D55E00"), ("following", "#0072B2")):
         for kind, style in (("model", "-"), ("machine", "o")):
             x = 1e3 * maps[kind].grid["x"]
-            panels[0].plot(
-                x, maps[kind].figures[name], style, color=colour, label=f"{name}, {kind}"
-            )
+            for panel, what in ((margin, "margin"), (bandwidth, "bandwidth")):
+                y = maps[kind].figures[f"{name}, {what}"]
+                panel.plot(x, y, style, color=colour, label=f"{name}, {kind}")
         run = runs[name]
-        rms = 1e9 * np.sqrt(np.mean(run["die:error"] ** 2, axis=0))
-        smooth = np.convolve(rms**2, np.full(200, 1 / 200), "same") ** 0.5
-        panels[1].plot(1e3 * run.time, smooth, ".", ms=1, color=colour, label=f"{name}, machine")
-        panels[1].plot(
-            1e3 * run.time, 1e9 * predicted[name]["die:error"], color=colour,
-            label=f"{name}, predicted",
-        )  # fmt: skip
-        estimate = 1e9 * np.sqrt(np.mean((run["die:z"] - run["die:hat"]) ** 2, axis=0))
-        panels[2].semilogy(1e3 * run.time, estimate, color=colour, label=name)
-    panels[0].set(xlabel="position x [mm]", ylabel="modulus margin")
-    panels[1].set(xlabel="time [ms]", ylabel="rms error at the die [nm]")
-    panels[2].set(xlabel="time [ms]", ylabel="rms error of its estimate [nm]")
-    for panel in panels:
+        ma = np.abs(run.moving_average("die:error")).max(axis=0)
+        msd = run.moving_std("die:error").max(axis=0)
+        for size, style, what in ((ma, "-", "MA"), (msd, "--", "MSD")):
+            exposed.plot(1e3 * run.time, 1e9 * size, style, color=colour, label=f"{what}, {name}")
+        square = np.mean((run["die:z"] - run["die:hat"]) ** 2, axis=0)
+        smooth = np.sqrt(np.convolve(square, np.full(50, 1 / 50), "same"))
+        estimated.plot(1e3 * run.time, 1e9 * smooth, color=colour, label=name)
+    scan = f"through a scan from {1e3 * X.range[0]:g} to {1e3 * X.range[1]:g} mm"
+    margin.set(xlabel="position x [mm]", ylabel="modulus margin", ylim=(0.0, 0.7))
+    bandwidth.set(xlabel="position x [mm]", ylabel="bandwidth [Hz]", ylim=(0.0, 25.0))
+    exposed.set(xlabel="time [ms]", ylabel="error at the die [nm]", ylim=(0.0, 120.0))
+    exposed.set_title(f"largest of {RUNS} runs on the machine, 5 ms windows, {scan}", fontsize=9)
+    estimated.set(
+        xlabel="time [ms]", ylabel="rms error of the die's estimate [nm]", ylim=(0.0, None)
+    )
+    estimated.set_title(f"machine, over 5 ms, {scan}", fontsize=9)
+    for panel in panels.flat:
         panel.grid(True, alpha=0.25)
         panel.legend(fontsize=8)
     OUT.mkdir(exist_ok=True)
-    figure.savefig(OUT / "scanning_stage.png", dpi=120)
+    figure.savefig(OUT / "scanning_stage.png", dpi=100)
     plt.close(figure)
 
 

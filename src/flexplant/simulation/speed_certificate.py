@@ -19,7 +19,7 @@ from ..errors import AssumptionError, LabelError, ModelError, counted, require_k
 from ..loop import ClosedLoop, ScheduledLoop
 from ..lti.equations import symmetrised
 from ..lti.lyapunov import solve_stein
-from ..parallel import one_thread
+from ..parallel import Progress, expect, one_thread
 from ..plant import Ports
 from .moving_machine import MovingMachine, Trajectory
 from .rms_along import ClosedAlong
@@ -36,6 +36,8 @@ _SHARES = (0.95, 0.8, 0.6, 0.4, 0.2)
 _DEPTH = 13
 #: the error of a quadratic, measured at two points of an interval, times this is taken as its bound
 _SAFE = 2.0
+#: multiplications for each node, of n^3, and time of calls [s]: what is said before the start
+_PRODUCTS, _CALLS = 2200.0, 0.04
 #: a quadratic for A(p) and a line for P make polynomials of degree 5
 _DEGREE = 5
 
@@ -85,6 +87,7 @@ def certify_speed(
     *,
     position: str | None = None,
     nodes: int = 41,
+    progress: bool | None = None,
 ) -> SpeedCertificate:
     """Return the proof that a loop is stable however its machine moves, up to a speed.
 
@@ -104,6 +107,8 @@ def certify_speed(
         The position that moves; the only one when not given. Others stay where the plant stands.
     nodes : int
         Positions where P is found, over the range; the places of a schedule come on top.
+    progress : bool, optional
+        A bar, as for `fx.design_hinf`.
 
     Returns
     -------
@@ -157,15 +162,18 @@ def certify_speed(
     if speed is not None:
         positive(speed, "speed")
     places = _nodes(motion, whole(nodes, "nodes", minimum=3))
-    found = _NodeFunctions(motion, places, np.inf if speed is None else speed / _SHARES[0])
-    wished = [share * found.speed for share in _SHARES] if speed is None else [float(speed)]
-    attempts = []
-    for v in wished:
-        failed = _unproven(motion, places, found.P, v)
-        attempts.append((v, None if failed is None else float(failed)))
-        if failed is None:
-            P = np.array([motion.unscaled(one) for one in found.P])
-            return SpeedCertificate(motion.position, v, places, P, tuple(attempts))
+    attempts: list[tuple[float, float | None]] = []
+    advice = "Fewer nodes or a plant of fewer modes take less."
+    with Progress(None, "proof of a speed", progress=progress, advice=advice):
+        expect(_PRODUCTS * places.size * motion.scale.size**3, seconds=_CALLS * places.size)
+        found = _NodeFunctions(motion, places, np.inf if speed is None else speed / _SHARES[0])
+        wished = [share * found.speed for share in _SHARES] if speed is None else [float(speed)]
+        for v in wished:
+            failed = _unproven(motion, places, found.P, v)
+            attempts.append((v, failed))
+            if failed is None:
+                P = np.array([motion.unscaled(one) for one in found.P])
+                return SpeedCertificate(motion.position, v, places, P, tuple(attempts))
     raise AssumptionError(
         f"no proof was found that the loop is stable while {motion.position} moves with "
         f"{wished[-1]:.3g} a second: it fails near {motion.position} = {attempts[-1][1]:.4g}"
@@ -370,7 +378,7 @@ def _unproven(
         ends = nodes[j], nodes[j + 1]
         failed = _interval(motion, ends, (P[j], S), reach, speed)
         if failed is not None:
-            return failed
+            return float(failed)
     return None
 
 

@@ -176,7 +176,7 @@ def design_hinf(
             middle = list(posed_at.values())[len(posed_at) // 2]
             weights = stage_weights(middle, bandwidth)
             posed_at = {x: one.weighted(weights) for x, one in posed_at.items()}
-        return over_positions(posed_at, lambda one: _designed(one, method, progress))
+        return over_positions(posed_at, lambda one: _designed(one, method, progress), progress)
     plant = posed(plant, u, y, "H-infinity synthesis")
     if bandwidth is not None:
         plant = plant.weighted(stage_weights(plant, bandwidth, uncertainty=uncertain))

@@ -15,6 +15,7 @@ from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
 from ...lti.preparation import prepared
 from ...lti.statespace import StateSpace
+from ...parallel import Progress, tick
 from ...plant import StandardPlant
 from ..controller import Controller
 from ..plant_range import PlantRange
@@ -25,12 +26,16 @@ from .lower_bound import pointwise_bound
 _SIZE = 0.1
 #: halvings or doublings of a size or a scale, while they help
 _STEPS = 4
+#: what a bar counts, and how many there are at most: plants by themselves, then the search
+_DESIGNS, _MOST = "designs over the positions", 5 + 4 * _STEPS
 #: rows and columns that change by less, relative to the largest, do not move
 _STILL = 1e-9
 
 
 def over_positions(
-    given: Mapping[float, Any], design: Callable[[StandardPlant], Controller]
+    given: Mapping[float, Any],
+    design: Callable[[StandardPlant], Controller],
+    progress: bool | None = None,
 ) -> Controller:
     """Return the controller whose worst norm over the positions is least of those tried.
 
@@ -42,14 +47,15 @@ def over_positions(
     search = _Search(moving, design)
     mean = _mean(moving)
     motion = _MotionChannels(moving, mean)
-    first = search.tried_with("the mean plant", mean)
-    middle = len(moving.plants) // 2
-    for i in sorted({0, middle, len(moving.plants) - 1}):
-        search.tried_with(f"the plant at {moving.places[i]:.4g}", moving.plants[i])
-    if motion.moves and first is not None:
-        motion.even(first.system)
-        search.over_channels(motion)
-    return search.answer()
+    with Progress(_MOST, _DESIGNS, progress=progress):
+        first = search.tried_with("the mean plant", mean)
+        middle = len(moving.plants) // 2
+        for i in sorted({0, middle, len(moving.plants) - 1}):
+            search.tried_with(f"the plant at {moving.places[i]:.4g}", moving.plants[i])
+        if motion.moves and first is not None:
+            motion.even(first.system)
+            search.over_channels(motion)
+        return search.answer()
 
 
 class _Search:
@@ -74,6 +80,7 @@ class _Search:
             if worst < self.least:
                 self.best = found
         self.tried[name] = worst
+        tick(_DESIGNS)
         return found
 
     def over_channels(self, motion: _MotionChannels) -> None:
