@@ -245,7 +245,7 @@ def test_advice_on_a_terminal(monkeypatch, capsys):
     assert capsys.readouterr().err.count("s more. Take fewer.\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark  # a clock decides
 @pytest.mark.parametrize("name", ["modes", "identification", "placement", "response"])
 def test_estimates_before_the_start_hold_to_a_factor(name, monkeypatch, capsys):
     """What is said before is right within five times, whatever the machine."""

@@ -76,7 +76,7 @@ def _problem(rows, count):
     """The choice of rows with the largest log det, without any plant."""
     total = len(rows)
     matrices = rows[:, :, None] * rows[:, None, :]
-    scorer = ModeRows(matrices, "log det", rows, np.ones(total))
+    scorer = ModeRows(matrices, rows, np.ones(total))
     free = RigidPart(np.zeros((total, 0)))
     layouts = Layouts(None, "y", (None,) * total, None, free, scorer)
     return Problem(layouts, count, (), LinearRows.stacked([], total))

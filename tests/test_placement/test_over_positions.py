@@ -10,6 +10,8 @@ from flexplant.estimation import design_kalman
 from flexplant.placement import (
     BranchAndBound,
     Exchange,
+    ModalObservability,
+    ModeInformation,
     OverPositions,
     PoiVariance,
     place_sensors,
@@ -115,3 +117,40 @@ def test_what_it_refuses():
         place_sensors(plant, heads, 4, OverPositions(PoiVariance("die"), {"x": [0.2]}))
     with pytest.raises(ModelError, match="measure"):
         OverPositions(PoiVariance("die"), measure="median")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("measure", ["worst", "mean"])
+def test_log_det_over_positions_is_bounded_and_proven(measure):
+    """Minus log det of what the heads see of four modes, by hand at each position."""
+    plant, heads = plant_at()
+    modes = plate_modes(4)
+    plant = assemble_plant(modes, plant.assembled.ports).discretized(4e3, delay=1)
+    criterion = OverPositions(ModeInformation(), {"x": X}, measure=measure)
+    found = place_sensors(plant, heads, 4, criterion, method=BranchAndBound(starts=1), rng=0)
+    values = {}
+    for chosen in combinations(range(len(HEADS)), 4):
+        parts = []
+        for x in X:
+            rows = [
+                modes.dofs.row((HEADS[i][0] - x, HEADS[i][1], 0.0), "z") @ modes.phi
+                * 1e-12 / heads[i].asd for i in chosen
+            ]  # fmt: skip
+            parts.append(-np.linalg.slogdet(np.array(rows).T @ np.array(rows))[1])
+        values[chosen] = (np.max if measure == "worst" else np.mean)(parts)
+    best = min(values, key=values.get)
+    assert found.proven
+    assert found.chosen == tuple(f"s{i}" for i in best)
+    assert found.value == pytest.approx(values[best], rel=1e-8)
+
+
+def test_a_measure_without_a_relaxation_is_not_proven_by_one():
+    """Of the least eigenvalue a bound of log det would close every branch unseen."""
+    plant, heads = plant_at()
+    criterion = ModalObservability(measure="least")
+    for one in (criterion, OverPositions(criterion, {"x": X})):
+        with pytest.raises(ModelError, match="no convex relaxation"):
+            place_sensors(plant, heads, 4, one, method=BranchAndBound())
+    every = place_sensors(plant, heads, 4, criterion)
+    some = place_sensors(plant, heads, 4, criterion, method=Exchange(starts=1), rng=0)
+    assert some.bound <= every.value

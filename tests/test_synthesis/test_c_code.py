@@ -325,8 +325,7 @@ def test_a_schedule_interpolates_the_outputs(tmp_path):
 
 @compiles
 def test_a_controller_that_follows_its_machine_on_a_path(tmp_path):
-    """The commands of `simulate` along a path, from its readings and positions; to the last digit
-    in double precision, to six in single."""
+    """The commands of `simulate` along a path, from its readings and positions."""
     plate = fx.kirchhoff_plate(
         size=(0.6, 0.6), thickness=0.0272, elements=(4, 4), density=2702, youngs_modulus=70e9,
         poisson_ratio=0.35,

@@ -13,7 +13,7 @@ from ..plant import StandardPlant
 from ..reduction import EffectiveIndependence
 from ..reduction.criteria import SelectionCriterion
 from ..work import Work
-from .convex import SummedMatrices
+from .convex import LogDetOfSum
 from .gramian import ByShapes, Shapes
 from .problem import Found, Problem, Search
 
@@ -112,7 +112,7 @@ def _by_driving_point(
 
 
 @dataclass(frozen=True, eq=False)
-class ModeRows(SummedMatrices):
+class ModeRows(LogDetOfSum):
     """Minus log det of the information, and the rows that it is made of."""
 
     rows: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -158,4 +158,4 @@ class ModeInformation(ByShapes):
         rows = shapes.phi[:, kept] * (1e-12 / shapes.asd)[:, None]
         bending = shapes.elastic
         point = np.sum((shapes.phi[:, bending] / shapes.omega[bending]) ** 2, axis=1)
-        return ModeRows(rows[:, :, None] * rows[:, None, :], "log det", rows, point)
+        return ModeRows(rows[:, :, None] * rows[:, None, :], rows, point)

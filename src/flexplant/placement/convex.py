@@ -116,16 +116,16 @@ def least_sum(
     return float(_safe(np.array(1.0 / most + constant))), weights
 
 
-class Convex(Scorer):
+class Convex(Scorer, ABC):
     """Scores that are a convex cost of weights of the candidates, in [0, 1]: they have bounds."""
 
+    @abstractmethod
     def tangent(self, weights: FloatArray) -> Below:
         """Return the tangent of the cost's information at weights (N,)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def cost(self, weights: FloatArray) -> float:
         """Return the cost at weights (N,); infinite where it has none."""
-        raise NotImplementedError
 
     def inner_tangent(self, branch: Branch, weights: FloatArray) -> Below | None:
         """Return the tangent at weights of a branch moved slightly inwards; None if there is none.
@@ -175,9 +175,9 @@ class Convex(Scorer):
         return float(_safe(np.array(self.value(range(self.total)))))
 
     @property
+    @abstractmethod
     def total(self) -> int:
         """How many candidates there are."""
-        raise NotImplementedError
 
 
 def _safe(bound: FloatArray) -> FloatArray:
@@ -218,16 +218,13 @@ class SummedWorth(Scorer):
 
 
 @dataclass(frozen=True, eq=False)
-class SummedMatrices(Convex):
+class SummedMatrices(Scorer):
     """Minus a measure of ``sum_i W_i`` over the chosen: W_i (N, n, n), positive semidefinite.
 
-    Minus the logarithm of the determinant is convex in weights of the candidates, so that it has a
-    relaxation [JoshiBoyd2009]_. The other measures grow with
-    each candidate: the bound is that of all of them.
+    It grows with each candidate: the bound is that of all of them.
     """
 
     matrices: FloatArray
-    measure: str
 
     @property
     def total(self) -> int:
@@ -235,7 +232,7 @@ class SummedMatrices(Convex):
         return int(self.matrices.shape[0])
 
     def value(self, chosen: Sequence[int]) -> float:
-        """Return minus the measure: infinite where log det has none."""
+        """Return minus the measure."""
         return float(self.score([tuple(chosen)])[0])
 
     def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
@@ -249,6 +246,36 @@ class SummedMatrices(Convex):
 
         return by_size(sets, of)
 
+    def bound(self, count: int, required: Sequence[int]) -> float:
+        """Return a number below the score of every choice."""
+        return float(_safe(np.array(self.value(range(self.total)))))
+
+    def _measured(self, rows: FloatArray) -> FloatArray:
+        """Return minus the measure of sums over rows (m, k) of indices."""
+        return np.asarray(-np.linalg.eigvalsh(self._sums(rows))[:, 0])
+
+    def _sums(self, rows: FloatArray) -> FloatArray:
+        total = self.matrices[rows[:, 0]]
+        for j in range(1, rows.shape[1]):
+            total += self.matrices[rows[:, j]]
+        return np.asarray(total)
+
+
+@dataclass(frozen=True, eq=False)
+class LogDetOfSum(SummedMatrices, Convex):
+    """Minus log det: convex in weights of the candidates, so that it has a relaxation.
+
+    [JoshiBoyd2009]_.
+    """
+
+    bound = Convex.bound
+    total = SummedMatrices.total
+
+    def cost(self, weights: FloatArray) -> float:
+        """Return it at weights (N,): infinite where log det has none."""
+        found = self.climbed(weights)
+        return np.inf if found is None else -found[0]
+
     def tangent(self, weights: FloatArray) -> Below:
         """Return the relaxed cost itself, which is cheap to compute."""
         return _LogDet(self)
@@ -256,8 +283,6 @@ class SummedMatrices(Convex):
     def relaxation(self, branch: Branch) -> tuple[float, FloatArray]:
         """Return a lower bound over a branch, and weights near the least relaxed cost."""
         weights = branch.centre(self.total)
-        if self.measure != "log det":
-            return self.everything(), weights
         found, weights = self.tangent(weights).least(branch, weights)
         return max(found, self.everything()), weights
 
@@ -274,12 +299,8 @@ class SummedMatrices(Convex):
         return float(logs + 2.0 * np.sum(np.log(size))), rise
 
     def _measured(self, rows: FloatArray) -> FloatArray:
-        """Return minus the measure of sums over rows (m, k) of indices."""
-        total = self.matrices[rows[:, 0]]
-        for j in range(1, rows.shape[1]):
-            total += self.matrices[rows[:, j]]
-        if self.measure == "least":
-            return np.asarray(-np.linalg.eigvalsh(total)[:, 0])
+        """Return minus log det of sums over rows (m, k) of indices, infinite where it has none."""
+        total = self._sums(rows)
         size = np.sqrt(np.maximum(np.einsum("mii->mi", total), TINY))
         try:
             root = np.linalg.cholesky(total / size[:, :, None] / size[:, None, :])
@@ -298,7 +319,7 @@ class SummedMatrices(Convex):
 class _LogDet(Below):
     """Minus log det as a function of weights: convex, and equal to the cost at choices."""
 
-    def __init__(self, costs: SummedMatrices) -> None:
+    def __init__(self, costs: LogDetOfSum) -> None:
         self.costs = costs
         self.rows = costs.matrices.reshape(costs.total, -1)
 
@@ -338,4 +359,4 @@ def summed(matrices: FloatArray, measure: str) -> Scorer:
     """Return the scorer of a measure of ``sum_i W_i``; the trace needs no matrices."""
     if measure == "trace":
         return SummedWorth(np.trace(matrices, axis1=1, axis2=2))
-    return SummedMatrices(matrices, measure)
+    return LogDetOfSum(matrices) if measure == "log det" else SummedMatrices(matrices)

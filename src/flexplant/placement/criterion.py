@@ -24,6 +24,8 @@ AGREEMENT = 1e-6
 class Scorer:
     """The scores of choices among fixed candidates; choices are rows of indices, ascending.
 
+    A kind of scorer defines `value`, or `score` for several choices at once, or both.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -42,7 +44,7 @@ class Scorer:
         FlexplantError
             When the choice has none.
         """
-        raise NotImplementedError
+        return float(self.score([chosen])[0])
 
     def outcome(self, chosen: Sequence[int]) -> tuple[float, str]:
         """Return the score of one choice, infinite with the reason when it has none.

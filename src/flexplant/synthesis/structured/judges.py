@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cache
 from typing import Any, Protocol
@@ -77,15 +78,15 @@ class GainJudge:
         return self.loop.pieces(K, by, place, sweep=sweep)
 
 
-class _SmoothJudge:
+class _SmoothJudge(ABC):
     """A number with one gradient, whose derivative is found by differences."""
 
     def __init__(self, p: Prepared, order: int) -> None:
         self.p, self.loop = p, ScaledLoop(p, order)
 
+    @abstractmethod
     def found(self, loop: Closed) -> tuple[float, FloatArray]:
         """Return the number, and its derivative by the scaled controller."""
-        raise NotImplementedError
 
     def value(self, K: Matrices) -> tuple[float, None]:
         """Return the number."""
