@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Hashable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -457,8 +458,10 @@ class Page:
                 answer = question.answer(design, loop)
             except Exception as problem:  # it must appear, and the next must not wait for it
                 answer = Consequences(missing=[f"no answer: {problem}"])
-            if not self._closed:
-                doc.add_next_tick_callback(partial(self._show_answer, serial, answer))
+            # when a page or its server closes meanwhile, bokeh takes the callbacks apart
+            with suppress(AttributeError):
+                if not self._closed:
+                    doc.add_next_tick_callback(partial(self._show_answer, serial, answer))
 
         threading.Thread(target=work, daemon=True).start()
 
