@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from math import isfinite
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -19,6 +18,8 @@ from .store import frozen as frozen
 from .store import rebuild as rebuild
 
 T = TypeVar("T")
+#: from here on the cube of a number is none of float64
+TOO_LARGE = 1e100
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 IntArray: TypeAlias = npt.NDArray[np.int64]
@@ -27,6 +28,8 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 Rng: TypeAlias = int | np.random.SeedSequence | np.random.Generator | None
 #: a (n, n) matrix, dense or sparse
 Matrix: TypeAlias = "FloatArray | sp.csc_array"
+#: draws, runs or machines in one call
+MOST_DRAWS = 10**7
 
 _PREFIXES = (
     (1e-15, "f"),
@@ -51,8 +54,17 @@ def known_units(units: Any, names: Iterable[str]) -> dict[str, str]:
     return {name: units[name] for name in names if name in units}
 
 
-def real_array(value: Any, name: str, shape: tuple[int | None, ...] | None = None) -> FloatArray:
-    """Return `value` as a finite float64 array of the given shape (None: any length)."""
+def real_array(
+    value: Any,
+    name: str,
+    shape: tuple[int | None, ...] | None = None,
+    *,
+    limit: float = TOO_LARGE,
+) -> FloatArray:
+    """Return `value` as a finite float64 array of the given shape (None: any length).
+
+    Records of a loop that diverges may be larger than the numbers that one calculates with.
+    """
     array = np.array(floats(value, name, shape))
     if shape is not None and (
         array.ndim != len(shape)
@@ -62,19 +74,48 @@ def real_array(value: Any, name: str, shape: tuple[int | None, ...] | None = Non
     ):
         got = str(array.shape) if array.ndim else f"the number {array:g}"
         raise ShapeError(f"{name} must {_form(shape)}, got {got}. Pass it in that form.")
-    if not np.all(np.isfinite(array)):
-        if not array.ndim:
-            raise ModelError(
-                f"{name} has a NaN or infinite value ({array:g}): no result could be trusted. "
-                "Pass a finite number."
-            )
-        where = ", ".join(str(int(i)) for i in np.argwhere(~np.isfinite(array))[0])
-        kind = "masked" if _masks(value) else "NaN or infinite"
-        raise ModelError(
-            f"{name} has a {kind} entry, the first at index ({where}): "
-            "no result could be trusted. Remove it at its source."
-        )
+    if array.size and not -limit < array.min() <= array.max() < limit:
+        raise _no_finite(array, name, masked=_masks(value))
     return array
+
+
+def _no_finite(array: npt.NDArray[Any], name: str, *, masked: bool) -> ModelError:
+    """Return the error of an array with an entry that is NaN, infinite or too large."""
+    finite = np.isfinite(array)
+    if finite.all():
+        return ModelError(
+            f"{name} has an entry of {array.flat[np.argmax(np.abs(array))]:.3g}: its powers are no "
+            "numbers of float64. Check its unit (SI)."
+        )
+    if not array.ndim:
+        return ModelError(
+            f"{name} has a NaN or infinite value ({array:g}): no result could be trusted. "
+            "Pass a finite number."
+        )
+    where = ", ".join(str(int(i)) for i in np.argwhere(~finite)[0])
+    kind = "masked" if masked else "NaN or infinite"
+    return ModelError(
+        f"{name} has a {kind} entry, the first at index ({where}): "
+        "no result could be trusted. Remove it at its source."
+    )
+
+
+def complex_array(
+    value: Any, name: str, shape: tuple[int | None, ...] | None = None
+) -> ComplexArray:
+    """Return `value` as a finite complex128 array of the given shape (None: any length)."""
+    array = _array_of(value, name)
+    if np.iscomplexobj(array):
+        masked = isinstance(array, np.ma.MaskedArray)
+        parts: ComplexArray = np.asarray(np.ma.filled(array, np.nan) if masked else array)
+    else:
+        parts = np.asarray(floats(value, name, shape))
+    if shape is not None:
+        real_array(np.zeros(parts.shape), name, shape)
+    size = np.abs(parts)
+    if size.size and not size.max() < TOO_LARGE:
+        raise _no_finite(size, name, masked=_masks(value))
+    return np.array(parts, dtype=np.complex128)
 
 
 def floats(value: Any, name: str, shape: tuple[int | None, ...] | None = None) -> FloatArray:
@@ -84,14 +125,7 @@ def floats(value: Any, name: str, shape: tuple[int | None, ...] | None = None) -
     """
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
-    try:
-        # asarray would hand over what lies under a mask as if it were data
-        array = np.ma.asarray(value) if _masks(value) else np.asarray(value)
-    except (TypeError, ValueError) as error:  # rows of different lengths
-        raise ModelError(
-            f"{name} must be an array of numbers, got {short(value)}: its rows have different "
-            "lengths. Give every row the same number of entries."
-        ) from error
+    array = _array_of(value, name)
     if np.iscomplexobj(array):
         raise ModelError(
             f"{name} must be real, got complex entries. Pass its real part if that is meant."
@@ -104,6 +138,22 @@ def floats(value: Any, name: str, shape: tuple[int | None, ...] | None = None) -
         return np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise _no_numbers(value, name, shape) from error
+    except OverflowError as error:
+        raise ModelError(
+            f"{name} has a number beyond float64: {short(value)}. Check its unit (SI)."
+        ) from error
+
+
+def _array_of(value: Any, name: str) -> npt.NDArray[Any]:
+    """Return anything as an array of any kind; ModelError for rows of different lengths."""
+    try:
+        # asarray would hand over what lies under a mask as if it were data
+        return np.ma.asarray(value) if _masks(value) else np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise ModelError(
+            f"{name} must be an array of numbers, got {short(value)}: its rows have different "
+            "lengths. Give every row the same number of entries."
+        ) from error
 
 
 def _masks(value: Any) -> bool:
@@ -136,7 +186,10 @@ def short(value: Any) -> str:
     """Return a value for a message: its repr, cut after 80 characters; arrays by their shape."""
     if isinstance(value, np.ndarray) and value.size > 6:
         return f"an array of shape {value.shape}"
-    text = " ".join(repr(value).split())
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # Python writes no integer of more than 4300 digits
+        text = f"a {type(value).__name__} that is too long to write"
     return text if len(text) <= 80 else text[:77] + "..."
 
 
@@ -190,9 +243,8 @@ def positive(value: Any, name: str, *, zero: bool = False) -> float:
     """Return `value` as a positive (or, with `zero`, non-negative) float."""
     if isinstance(value, bool | np.bool_):
         raise ModelError(f"{name} must be one number, got {value}. Pass the number that is meant.")
-    number = (
-        value if type(value) is float and isfinite(value) else float(real_array(value, name, ()))
-    )
+    plain = type(value) is float and abs(value) < TOO_LARGE
+    number = value if plain else float(real_array(value, name, ()))
     if number < 0 or (number == 0 and not zero):
         raise ModelError(
             f"{name} must be {'zero or ' if zero else ''}positive, got {number:g}. "
@@ -212,6 +264,17 @@ def whole(value: Any, name: str, *, minimum: int = 1, maximum: int | None = None
     return number
 
 
+def positions(values: Any, name: str, count: int) -> IntArray:
+    """Return positions, from 0, among so many as int64 (n,)."""
+    array = real_array(values, name, (None,))
+    if np.any(array != np.round(array)) or np.any((array < -count) | (array >= count)):
+        raise ModelError(
+            f"{name} must be whole numbers from 0 to {count - 1}, got {short(values)}. Choose some "
+            "of them."
+        )
+    return np.asarray(array, dtype=np.int64)
+
+
 def flag(value: Any, name: str) -> bool:
     """Return `value` as a bool: True or False, nothing that merely counts as one."""
     if not isinstance(value, bool | np.bool_):
@@ -223,7 +286,7 @@ def instance(
     value: Any, kind: Any, name: str, hint: str, error: type[FlexplantError] = ModelError
 ) -> Any:
     """Return `value`, which must be of a class, or of one of several."""
-    if not isinstance(value, kind):
+    if not isinstance(value, kind) or (kind is Iterable and not several(value)):
         listed = [one.__name__ for one in getattr(kind, "__args__", (kind,))]
         kinds = " or ".join(name for name in listed if name != "NoneType")
         raise error(f"{name} must be of type {kinds}, got {type(value).__name__}. {hint}")
@@ -250,7 +313,7 @@ def seed_sequence(rng: Any, name: str = "rng") -> np.random.SeedSequence:
     if rng is None:
         return np.random.SeedSequence()
     numbers = [rng] if isinstance(rng, int | np.integer) else rng
-    if isinstance(numbers, list | tuple | np.ndarray) and not isinstance(rng, bool):
+    if isinstance(numbers, list | tuple | np.ndarray) and several(numbers):
         entropy = [n for n in numbers if isinstance(n, int | np.integer) and n >= 0]
         if len(entropy) == len(numbers) and not any(isinstance(n, bool) for n in numbers):
             given = [int(n) for n in entropy]
@@ -296,11 +359,18 @@ def signal_names(names: Iterable[str], count: int, prefix: str, side: str) -> tu
     return listed
 
 
+def several(value: Any) -> bool:
+    """Return whether there is something to go through: a list, a generator, an array; no text."""
+    if isinstance(value, str | bytes) or (isinstance(value, np.ndarray) and not value.ndim):
+        return False
+    return isinstance(value, Iterable)
+
+
 def name_list(names: Any, name: str) -> tuple[str, ...]:
     """Return names as a tuple of str; one str is one name."""
     if isinstance(names, str):
         return (names,)
-    if not isinstance(names, Iterable) or isinstance(names, bytes):
+    if not several(names):
         raise LabelError(f"{name} are chosen by name, got {short(names)}. Pass a list of names.")
     listed = tuple(names)
     wrong = [one for one in listed if not isinstance(one, str)]
@@ -367,9 +437,12 @@ def positive_array(
 
 def members(values: Any, kind: Any, name: str, hint: str, *, least: int = 1) -> tuple[Any, ...]:
     """Return several values as a tuple, all of a class."""
-    several = isinstance(values, Iterable) and not isinstance(values, str)
-    listed = tuple(values) if several else ()
-    if not several or len(listed) < least or not all(isinstance(one, kind) for one in listed):
+    listed = tuple(values) if several(values) else ()
+    if (
+        not several(values)
+        or len(listed) < least
+        or not all(isinstance(one, kind) for one in listed)
+    ):
         kinds = " or ".join(one.__name__ for one in getattr(kind, "__args__", (kind,)))
         many = "" if not least else "at least one " if least == 1 else f"at least {least} "
         raise ModelError(f"{name} must be a list of {many}{kinds}, got {short(values)}. {hint}")
@@ -388,7 +461,7 @@ def mapping(
 
 def element_mask(value: Any, name: str) -> npt.NDArray[np.bool_]:
     """Return which elements of a mesh are chosen, some at least."""
-    mask = np.asarray(value)
+    mask = np.asarray(_array_of(value, name))
     if mask.dtype != bool or not mask.any():
         raise ShapeError(
             f"{name} must be True or False for each element and choose some, got {short(value)}. "

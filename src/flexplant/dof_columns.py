@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from .checks import FloatArray, IntArray, Value, check_names, name_list, short
+from .checks import FloatArray, IntArray, Value, check_names, name_list, real_array, several, short
 from .errors import LabelError, ShapeError, unknown_label
 from .tolerances import SAME
 
@@ -41,7 +41,8 @@ class Interpolation(Value):
         LabelError
             When one of them is off the structure.
         """
-        return np.array([self.row(point, direction) for point in points])
+        places = real_array(points, "points", (None, 3))
+        return np.array([self.row(point, direction) for point in places])
 
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
         """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
@@ -61,8 +62,13 @@ def columns_of(
 ) -> tuple[IntArray, tuple[str, ...], FloatArray]:
     """Return nodes (n,), directions and coordinates (n, 3) [m] of a table or a CSV file."""
     if isinstance(table, str | Path):
-        with open(table, newline="", encoding="utf-8") as file:
-            rows: list[Mapping[str, Any]] = list(csv.DictReader(file))
+        try:
+            with open(table, newline="", encoding="utf-8") as file:
+                rows: list[Mapping[str, Any]] = list(csv.DictReader(file))
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise LabelError(
+                f"{str(table)!r:.80} is no CSV file: {error}. Write it as text in UTF-8."
+            ) from None
     else:
         rows = listed(table, "a DOF table", "a CSV file or a list of mappings")
     if not rows or not all(isinstance(row, Mapping) for row in rows):
@@ -96,7 +102,7 @@ def _number(row: Mapping[str, Any], column: str, line: int) -> float:
 
 def listed(items: Any, name: str, form: str) -> list[Any]:
     """Return items as a list; LabelError when there is nothing to list."""
-    if not isinstance(items, Iterable):
+    if not several(items):
         raise LabelError(f"{name} must be {form}, got {items!r:.60}. Pass it in [...].")
     return list(items)
 
@@ -105,6 +111,8 @@ def node_numbers(nodes: Any) -> IntArray:
     """Return node numbers as int64; LabelError when one is not whole or too large."""
     try:
         numbers = np.asarray(nodes if isinstance(nodes, np.ndarray) else list(nodes))
+        if np.iscomplexobj(numbers):
+            raise ValueError(numbers)
         with np.errstate(invalid="ignore"):  # NaN is refused below
             whole = numbers.astype(np.int64)
     except (TypeError, ValueError, OverflowError):
@@ -267,7 +275,7 @@ def in_box(xyz: FloatArray, box: Any) -> Any:
     """Return which points (n, 3) are between the lowest and the highest corner of a box (n,)."""
     try:
         corners = np.array(box, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         corners = np.full((1,), np.nan)
     if corners.shape != (2, 3) or not np.all(corners[0] <= corners[1]):
         raise ShapeError(

@@ -132,7 +132,7 @@ def unknown_label(kind: str, name: object, known: Iterable[str], owner: str = ""
         return LabelError(
             f"no {kind} {name!r}{f' in {owner}' if owner else ''}: there is none yet."
         )
-    close = get_close_matches(str(name), known, n=3, cutoff=0.5)
+    close = get_close_matches(str(name), [k for k in known if isinstance(k, str)], n=3, cutoff=0.5)
     shown = close or known[:6]
     listed = ", ".join(repr(label) for label in shown) + (
         ", ..." if not close and len(known) > len(shown) else ""
@@ -140,6 +140,26 @@ def unknown_label(kind: str, name: object, known: Iterable[str], owner: str = ""
     lead = "Close matches" if close else "Known are"
     where = f" in {owner}" if owner else ""
     return LabelError(f"no {kind} {name!r}{where} ({len(known)} known). {lead}: {listed}.")
+
+
+def unknown_attribute(owner: str, name: str, known: Iterable[str]) -> AttributeError:
+    """Return the AttributeError for a name that a value does not have, with those near to it.
+
+    Examples
+    --------
+    >>> print(unknown_attribute("ClosedLoop", "margins", ["modulus_margin", "rms"]))
+    ClosedLoop has no 'margins'. Close matches: modulus_margin. dir() of it lists all.
+    >>> print(unknown_attribute("Response", "plot", ["rms"]))
+    Response has no 'plot'. Pictures are functions: flexplant.plot. dir() of it lists all.
+    """
+    listed = sorted(n for n in known if not n.startswith("_"))
+    stem = name.rstrip("s").lower()
+    within = [n for n in listed if len(stem) > 2 and (stem in n or n.rstrip("s") in name)]
+    close = list(dict.fromkeys([*get_close_matches(name, listed, n=3, cutoff=0.6), *within]))[:4]
+    near = f" Close matches: {', '.join(close)}." if close else ""
+    if name.startswith("plot"):
+        near = " Pictures are functions: flexplant.plot."
+    return AttributeError(f"{owner} has no {name!r}.{near} dir() of it lists all.")
 
 
 def require_known(

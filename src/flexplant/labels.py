@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from .checks import FloatArray, IntArray, Value, frozen, instance, real_array
+from .checks import FloatArray, IntArray, Value, frozen, instance, name_list, real_array
 from .dof_columns import DIRECTIONS as DIRECTIONS
 from .dof_columns import (
     DofIndex,
@@ -238,7 +238,9 @@ class DofSet(Value):
         """Return which DOFs (n,) belong to a component; None: all."""
         if component is None:
             return np.ones(len(self), dtype=bool)
-        if self.component_of is None or component not in self.components:
+        if self.component_of is None or not (
+            isinstance(component, str) and component in self.components
+        ):
             raise unknown_label("component", component, self.components)
         return self.component_of == self.components.index(component)
 
@@ -280,8 +282,7 @@ class DofSet(Value):
                 )
             keep &= np.isin(self.nodes, wanted)
         if directions is not None:
-            given = [directions] if isinstance(directions, str) else directions
-            named = set(listed(given, "directions", "one or more of x, y, z, rx, ry, rz"))
+            named = set(name_list(directions, "directions"))
             absent = sorted(str(d) for d in named - set(self.directions))
             if absent:
                 raise LabelError(
@@ -322,7 +323,8 @@ class DofSet(Value):
         LabelError
             When no DOF has this direction.
         """
-        kind = DIRECTIONS.index(direction) if direction in DIRECTIONS else -1
+        known = isinstance(direction, str) and direction in DIRECTIONS
+        kind = DIRECTIONS.index(direction) if known else -1
         rows = np.flatnonzero((self.kinds == kind) & self._owned(component))
         if not rows.size:
             raise LabelError(

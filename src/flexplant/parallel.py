@@ -398,6 +398,11 @@ class Progress:
         self.done, self._known, self._expected = 0, 0, 0.0
         self.description, self.advice = description, advice
         self._over = threading.Event()
+        if not (progress is None or isinstance(progress, bool | np.bool_)):
+            raise ModelError(
+                f"progress must be True, False or None, got {progress!r:.60}. Leave it out: then "
+                "it is shown on a terminal."
+            )
         self._forced = bool(progress)
         self._total = total
         outermost = progress is None and not _open_bars()

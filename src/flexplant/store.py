@@ -14,12 +14,12 @@ from html import escape
 from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
-from typing import IO, Any, ClassVar, Self, cast
+from typing import IO, TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import numpy as np
 import scipy.sparse as sp
 
-from .errors import FlexplantError
+from .errors import FlexplantError, unknown_attribute
 
 _HEADER = "__flexplant__"
 
@@ -30,6 +30,10 @@ def checked(check: Callable[..., Any], *, unit: str = "", **rules: Any) -> dict[
     `name`, in messages, is the field's unless the rules have another; a default None passes.
     """
     return {"check": (check, rules), "unit": unit}
+
+
+def _annotated(cls: type) -> Mapping[str, Any]:
+    return cast("Mapping[str, Any]", vars(cls).get("__annotations__", {}))
 
 
 class Value(ABC):  # noqa: B024 - its kinds have abstract methods
@@ -74,6 +78,15 @@ class Value(ABC):  # noqa: B024 - its kinds have abstract methods
             if text not in ("None", "''", "[]", "{}"):
                 shown.append(f"{field.name}={text}{' ' + unit if unit else ''}")
         return f"{type(self).__name__}({', '.join(shown)})"
+
+    if not TYPE_CHECKING:  # a type checker would take any attribute for known
+
+        def __getattr__(self, name: str) -> Any:
+            """Say which attributes are near to one that is not there."""
+            known = {n for cls in type(self).__mro__ for n in (*vars(cls), *_annotated(cls))}
+            if name.startswith("_") or name in known:  # one of its own that fails says why itself
+                return object.__getattribute__(self, name)
+            raise unknown_attribute(type(self).__name__, name, known - {"registry"})
 
     def __reduce__(self) -> tuple[Any, ...]:
         state = {
@@ -161,10 +174,19 @@ def save(value: Value, path: str | Path) -> None:
         np.savez_compressed(file, **arrays)
 
 
+def named_file(path: Any, name: str = "path") -> Path:
+    """Return the path of a file; its absence is left to what opens it."""
+    if not isinstance(path, str | Path) or not Path(path).name or "\0" in str(path):
+        raise FlexplantError(
+            f"{name} must name a file, got {path!r:.80}. Pass a text such as 'plant.npz' or a Path."
+        )
+    return Path(path)
+
+
 @contextmanager
 def written(path: str | Path) -> Iterator[IO[bytes]]:
     """Open a new file that takes the place of `path` when all is written, not before."""
-    target = Path(path)
+    target = named_file(path)
     part = target.with_name(f"{target.name}.{uuid.uuid4().hex}.part")
     try:
         with part.open("xb") as file:

@@ -110,7 +110,7 @@ def test_bad_shapes_of_filters():
             make(10.0, order=3)
     with pytest.raises(ModelError, match="depth"):
         notch(10.0, depth=-0.1)
-    with pytest.raises(ModelError, match="slope must be 1 or 2"):
+    with pytest.raises(ModelError, match="slope must be a whole number from 1 to 2"):
         inverse_sensitivity(10.0, slope=3)
     for numbers in ({"floor": 0.0}, {"floor": 1.0}, {"peak": 0.9}, {"peak": np.nan}):
         with pytest.raises(ModelError, match="0 < floor < 1 < peak"):

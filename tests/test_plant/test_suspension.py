@@ -121,7 +121,7 @@ def test_refusals():
         GroundSpring(Z8, 1.0, direction="up")
     with pytest.raises(LabelError, match="off the plate"):
         suspend(make_plate(), GroundSpring((0.7, 0.0, 0.0), 1.0))
-    with pytest.raises(ModelError, match="needs GroundSprings"):
+    with pytest.raises(ModelError, match="must be a list of at least one GroundSpring"):
         suspend(make_plate(), [])
     with pytest.raises(ModelError, match="FEModel, ReducedModel or Modes"):
         suspend("plate", springs())

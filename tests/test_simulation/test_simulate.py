@@ -331,7 +331,7 @@ def test_assumptions_are_checked(loop):
         ({"reference": np.zeros((1, 20))}, ShapeError, r"shape \(20,\)"),
         ({"reference": lambda t: t[:3]}, ShapeError, "shape"),
         ({"reference": np.nan}, ModelError, "NaN"),
-        ({"runs": 0}, ModelError, "runs must be a whole number at least 1, got 0"),
+        ({"runs": 0}, ModelError, "runs must be a whole number from 1 to .*, got 0"),
         ({"runs": 2.0}, ModelError, "runs must be a whole number"),
         ({"runs": "two"}, ModelError, "runs must be a whole number"),
         ({"runs": []}, ModelError, "runs must be at least 1"),

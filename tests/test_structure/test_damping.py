@@ -82,8 +82,8 @@ def test_measured_poles():
         ([1 + 10j], [1], "does not oscillate and decay"),
         ([-1.0], [1], "does not oscillate and decay"),
         ([-1 + 10j], [0], "mode number"),
-        (["a"], [1], "complex numbers"),
-        ([np.nan + 1j], [1], "complex numbers"),
+        (["a"], [1], "hold numbers"),
+        ([np.nan + 1j], [1], "NaN or infinite"),
     ],
 )
 def test_bad_measured_poles(poles, modes, says):

@@ -86,7 +86,7 @@ def row_of(channels: Sequence[str], name: str) -> int:
         known |= {alias: i for i, alias in enumerate(_derived(channels, kind))}
     known |= _firsts(channels)
     known |= {channel: i for i, channel in enumerate(channels)}
-    if name not in known:
+    if not isinstance(name, str) or name not in known:
         raise unknown_label("POI channel", name, channels)
     return known[name]
 

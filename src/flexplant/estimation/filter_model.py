@@ -396,6 +396,7 @@ def check_gain(plant: StandardPlant, gain: FloatArray, covariance: FloatArray) -
     >>> fx.estimation.check_gain(plant, observer.gain, observer.covariance) < 1e-6
     True
     """
+    plant = StandardPlant.of(plant)
     n, p = plant.system.n_states, len(sensors(plant))
     gain = real_array(gain, "gain", (n, p))
     covariance = real_array(covariance, "covariance", (n, n))

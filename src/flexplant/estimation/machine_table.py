@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Value, in_unit, members, short
+from ..checks import FloatArray, Value, in_unit, instance, members, short
 from ..errors import AssumptionError, FlexplantWarning, ModelError, counted, require_known
 from ..loop import close_loop
 from ..plant import StandardPlant
@@ -116,6 +116,7 @@ def errors_on_machines(
     >>> fx.estimation.errors_on_machines(estimators, [plant], "die").names
     ('filter',)
     """
+    instance(blocks, Iterable, "blocks", "Pass controllers in [...].")
     given = estimators if isinstance(estimators, Mapping) else {"estimator": estimators}
     listed = members(
         machines, StandardPlant, "machines", "Pass plant.uncertain(fit).sample(rng, 20)."

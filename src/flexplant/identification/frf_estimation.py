@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray, members, positive
-from ..errors import ModelError, ShapeError, unknown_label
+from ..errors import ModelError, ShapeError, require_known
 from ..lti.frequency import Frf
 from .periodic import Periodic, averages_advised, periodic_frf
 from .spectra import H1Estimator, SpectralMethod, dropouts_warned, records, spectral_frf
@@ -109,8 +109,8 @@ def estimate_frf(
     ['1.6', '2.0']
     """
     data = records(inputs, outputs, reference, positive(rate, "rate"))
-    if quantity not in (None, "displacement", "velocity", "acceleration"):
-        raise unknown_label("quantity", quantity, ["displacement", "velocity", "acceleration"])
+    if quantity is not None:
+        require_known("quantity", [quantity], ["displacement", "velocity", "acceleration"])
     dropouts_warned(data)
     method = H1Estimator() if method is None else method
     if isinstance(method, Periodic):

@@ -18,6 +18,7 @@ from ..checks import (
     instance,
     positive,
     real_array,
+    several,
     short,
     whole,
 )
@@ -269,8 +270,8 @@ def _identified(
 ) -> IdentifiedModes:
     ready = prepared(frf, band)
     high = float(ready.freq[-1])
-    lower = whole(lower, "lower", minimum=0)
-    terms = UPPER[-1] if upper is None else whole(upper, "upper", minimum=0)
+    lower = whole(lower, "lower", minimum=0, maximum=20)
+    terms = UPPER[-1] if upper is None else whole(upper, "upper", minimum=0, maximum=20)
     rate = None if hold is None else positive(hold, "hold")
     if rate is not None and high > rate / 2 * (1 + ROUNDING):
         raise ModelError(f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together.")
@@ -476,7 +477,7 @@ def checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
 
 def checked_orders(orders: Iterable[int]) -> list[int]:
     """Return rising model orders."""
-    if isinstance(orders, str) or not isinstance(orders, Iterable):
+    if not several(orders):
         raise ModelError(
             f"orders are whole numbers to compare, got {short(orders)}. Try range(2, 41)."
         )

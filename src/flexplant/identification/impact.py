@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, between, positive
-from ..errors import ModelError, ShapeError, SolverError, counted, unknown_label
+from ..checks import ComplexArray, FloatArray, IntArray, Value, between, instance, positive
+from ..errors import ModelError, ShapeError, SolverError, counted, require_known, unknown_label
 from ..lti.frequency import Frf
 from ..tolerances import TINY
 from .result import IdentifiedModes
@@ -138,6 +138,7 @@ class ImpactTest(Value):
         SolverError
             When no pole has damping beyond that of the window.
         """
+        instance(found, IdentifiedModes, "found", "Pass identify_modes(test.frf).")
         if not np.isfinite(self.decay):
             return found
         shift = 1.0 / self.decay
@@ -243,8 +244,8 @@ def impact_frf(
     ([0.1, 1.0], ['another blow follows after 0.04 s', 'a blow came 0.04 s before'])
     """
     data = records(force, response, None, positive(rate, "rate"))
-    if quantity not in (None, "displacement", "velocity", "acceleration"):
-        raise unknown_label("quantity", quantity, ["displacement", "velocity", "acceleration"])
+    if quantity is not None:
+        require_known("quantity", [quantity], ["displacement", "velocity", "acceleration"])
     between(level, "level", 0.0, 1.0, "A twentieth is usual: 0.05.")
     length = round(positive(segment, "segment") * data.rate)
     tau = segment / WINDOWS if decay is None else _time_constant(decay)
@@ -445,7 +446,11 @@ def _dependence(damped: float) -> float:
 
 
 def _time_constant(decay: Any) -> float:
-    return float("inf") if decay == float("inf") else positive(decay, "decay")
+    return (
+        float("inf")
+        if isinstance(decay, float) and decay == float("inf")
+        else positive(decay, "decay")
+    )
 
 
 def _full_scale(limits: Any, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> dict[str, float]:

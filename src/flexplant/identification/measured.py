@@ -16,9 +16,11 @@ from ..checks import (
     Value,
     between,
     check_names,
+    complex_array,
     instance,
     positive,
     real_array,
+    several,
     short,
     whole,
 )
@@ -130,7 +132,8 @@ class MeasuredModes(Value):
         array([-28.7+2870.j , -39.7+3970.1j])
         """
         f = np.atleast_1d(real_array(freq, "freq"))
-        z = np.broadcast_to(real_array(zeta, "zeta"), f.shape)
+        z = real_array(zeta, "zeta")
+        z = np.broadcast_to(z, f.shape) if not z.ndim else real_array(z, "zeta", f.shape)
         if np.any(z < 0) or np.any(z >= 1):
             raise ModelError("zeta must be damping ratios of 0 or more, below 1: 0.01 is 1 %.")
         turn = 2.0 * np.pi * f
@@ -197,8 +200,7 @@ class MeasuredModes(Value):
         ModelError
             When a place is no whole number.
         """
-        listed = isinstance(poles, Iterable) and not isinstance(poles, str)
-        if not listed:
+        if not several(poles):
             raise LabelError(f"select takes a list of places of the poles, got {short(poles)}.")
         places = [whole(place, "each place", minimum=0) for place in poles]
         if not places or len(set(places)) < len(places) or not set(places) <= set(range(len(self))):
@@ -225,10 +227,7 @@ def _listed(numbers: Iterable[float], form: str) -> str:
 
 
 def _checked_poles(value: Any) -> ComplexArray:
-    try:
-        poles = np.array(value, dtype=np.complex128)
-    except (TypeError, ValueError) as error:
-        raise ModelError(f"poles must be complex numbers, got {value!r:.80}.") from error
+    poles = complex_array(value, "poles")
     if poles.ndim != 1 or not poles.size:
         raise ShapeError(
             f"poles must have shape (m,) with m of at least one, got {poles.shape}: give one "
@@ -254,6 +253,7 @@ def _checked_poles(value: Any) -> ComplexArray:
 
 
 def _checked_numbers(value: Any, count: int) -> tuple[int, ...]:
+    real_array(value, "modes")  # refuses what is no array of numbers
     numbers = np.asarray(value)
     if numbers.ndim != 1 or numbers.size != count:
         raise ShapeError(
@@ -275,7 +275,7 @@ def _checked_numbers(value: Any, count: int) -> tuple[int, ...]:
 
 
 def _checked_covariance(value: Any, count: int) -> FloatArray:
-    if np.ndim(value) == 1:
+    if real_array(value, "covariance").ndim == 1:
         variance = real_array(value, "covariance", (count,))
         matrix = np.diag(np.concatenate([variance, variance]) / 2)
     else:
@@ -436,7 +436,8 @@ def _lowest(numbers: list[int], omega: FloatArray, taken: set[int]) -> list[int]
 def _likeness(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -> FloatArray:
     if measured.shapes is None or measured.dofs is None:
         return np.ones((len(measured), elastic.size))
-    given = {port.name: port for port in at.y} if hasattr(at, "y") else at or {}
+    given = {port.name: port for port in at.y} if hasattr(at, "y") else at
+    given = {} if given is None else given
     if not isinstance(given, Mapping):
         raise LabelError(
             f"at is Ports, or a mapping from the labels of shapes to places, got {at!r:.60}."

@@ -262,13 +262,19 @@ def multisine(
     >>> signals.shape  # experiments, inputs, samples
     (2, 2, 500)
     """
-    count, periods = whole(count, "count"), whole(periods, "periods")
+    count = whole(count, "count", maximum=1000)
+    periods = whole(periods, "periods", maximum=MOST_SAMPLES)
     random = generator(rng)
     _check_band(band)
     exact = positive(period, "period") * positive(rate, "rate")
     samples = round(exact)
     if abs(samples - exact) > TYPED * exact or samples < 4:
         raise ModelError(f"a period must be a whole number of samples from 4, got {exact:g}.")
+    if samples * periods * count**2 > MOST_SAMPLES:
+        raise ModelError(
+            f"{samples} samples a period, {periods} times, from {count} inputs are more than "
+            f"memory holds. Shorten the period or lower the rate."
+        )
     lines = np.arange(1, (samples + 1) // 2)
     if band is not None:
         lines = lines[(lines >= band[0] * period) & (lines <= band[1] * period)]
@@ -281,6 +287,10 @@ def multisine(
     waves = np.fft.irfft(full, samples, axis=2)
     waves *= positive(rms, "rms") / np.sqrt(np.mean(waves**2, axis=2, keepdims=True))
     return np.asarray(np.tile(waves, (1, 1, int(periods))))
+
+
+#: samples of a signal that memory holds
+MOST_SAMPLES = 10**9
 
 
 def _check_band(band: Any) -> None:

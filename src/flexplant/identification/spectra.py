@@ -375,8 +375,11 @@ def signals(value: Any, side: str, prefix: str) -> tuple[FloatArray, tuple[str, 
     if isinstance(value, Mapping):
         names = tuple(str(name) for name in value)
         parts = [real_array(part, f"{side}[{name!r}]") for name, part in value.items()]
-        if len({part.shape for part in parts}) != 1:
-            raise ShapeError(f"all {side} must have the same shape.")
+        if len({part.shape for part in parts}) != 1 or not parts[0].ndim:
+            raise ShapeError(
+                f"all {side} must have the same shape, (samples,) or (experiments, samples). Pass "
+                "{name: record}."
+            )
         array = np.stack(parts, axis=-2)
     else:
         array = real_array(value, side)

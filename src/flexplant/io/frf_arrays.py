@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import instance
 from ..errors import FlexplantError, ModelError, ShapeError, require_known, unknown_label
 from ..lti.frequency import Frf
 from .mat_matrices import mat_variables
@@ -139,6 +140,7 @@ def _frf(
     responses = _ordered(responses, grid.size, axis, data, path)
     others = {name: content[name] for name in _OPTIONAL if name in content}
     said = "".join(str(part) for part in np.ravel(others.pop("quantity", "")))
+    instance(quantity, str | None, "quantity", "Pass 'displacement', say.")
     if quantity is not None and said and said != quantity:
         raise ModelError(
             f"{str(path)!r} says it holds {said}, not {quantity}. Read it as it is, and convert: "

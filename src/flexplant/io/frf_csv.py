@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checks import FloatArray, instance
+from ..checks import FloatArray, instance, mapping
 from ..errors import FlexplantError, LabelError
 from ..lti.frequency import Frf
 from ..store import written
@@ -65,7 +65,8 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     array([1., 2.])
     """
     instance(frf, Frf, "frf", "Pass frequency_response(sys).")
-    given = dict(frf.units) | dict(units or {})
+    given = dict(frf.units)
+    given |= {} if units is None else mapping(units, "units", "Pass {channel: unit}.")
     for name in given:
         if name not in (*frf.inputs, *frf.outputs):
             raise LabelError(f"units name {name!r}, which is no channel of {frf!r}.")

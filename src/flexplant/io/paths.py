@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..checks import short
+from ..checks import several, short
 from ..errors import FlexplantError, ModelError
 from ..structure import FEMatrices
 from .numbers import cut_short
@@ -80,7 +80,7 @@ def no_motion(path: object, kinds: object) -> ModelError:
 
 def three_units(units: Any) -> tuple[Any, ...]:
     """Return the units of length, mass and time."""
-    sizes = tuple(units) if isinstance(units, Iterable) and not isinstance(units, str) else ()
+    sizes = tuple(units) if several(units) else ()
     if len(sizes) != 3:
         raise ModelError(
             f"units must be three, of length, mass and time, got {short(units)}: "

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, IntArray, instance, mapping
+from ..checks import ComplexArray, FloatArray, IntArray, flag, instance, mapping
 from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
@@ -230,6 +230,7 @@ def uncoupled(
             f"no channel is left without {', '.join(known)}: name those of the rest 'stage/41:z', "
             "outputs and inputs."
         )
+    flag(extended, "extended")
     rest_in = [machine.inputs[i] for i in kept_in]
     rest_out = [machine.outputs[i] for i in kept_out]
     units = {name: unit for name, unit in machine.units.items() if name in {*rest_in, *rest_out}}

@@ -116,6 +116,7 @@ class Joint(Value):
         ModelError
             When one number is to stand for displacements and rotations, or their number differs.
         """
+        axes = name_list(axes, "axes")
         found = []
         for value, name in ((self.stiffness, "stiffness"), (self.rate, "rate")):
             array = np.zeros(len(axes)) if value is None else np.asarray(value, dtype=np.float64)
@@ -452,6 +453,7 @@ def joint_axes(joint: Joint, first: JointEnd, second: JointEnd | None) -> tuple[
 
 def split_end(text: str, names: Sequence[str]) -> tuple[str, str]:
     """Return which component a text such as "stage/41:z" begins with, and the rest of it."""
+    names = name_list(names, "names of components")
     for name in sorted(names, key=len, reverse=True):
         if text.startswith(f"{name}/"):
             return name, text[len(name) + 1 :]

@@ -53,7 +53,7 @@ class BrokenLoop:
 
     def gain(self, freq: FloatArray, at: Side = "u") -> ComplexArray:
         """Return K P (broken at u) or P K (at y), frequency first."""
-        if at not in ("u", "y"):
+        if not isinstance(at, str) or at not in ("u", "y"):
             raise LabelError(f"a loop is broken at 'u' or 'y', got {short(at)}. Pass one of them.")
         K, P = self.respond(freq)
         return K @ P if at == "u" else P @ K

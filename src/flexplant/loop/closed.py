@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..certificates import in_words
-from ..checks import ComplexArray, FloatArray, Value, name_list
+from ..checks import ComplexArray, FloatArray, Value, name_list, whole
 from ..errors import ModelError, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
 from ..lti.interconnection import lft, loop_poles
@@ -364,7 +364,7 @@ class ClosedLoop(Value):
         """
         known = self.plant.uncertainty if known is None else known
         found = mode_tolerances(self.plant, self.broken, margin=margin, known=known)
-        if draws:
+        if whole(draws, "draws", minimum=0):
             found = found.replace(draws=machine_draws(self, known, margin, draws, rng))
         found.warn_of_critical()
         return found

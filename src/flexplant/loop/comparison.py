@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..checks import FloatArray, Value, short
+from ..checks import FloatArray, Value, instance, short
 from ..errors import LabelError, ModelError, require_known
 from ..lti.frequency_sweep import climbed
 from .blocks import references
@@ -173,6 +173,8 @@ def compare_loops(
 
 def _channels(loop: ClosedLoop, reference: str | None, error: str | None) -> tuple[str, ...]:
     """Return reference and error, or nothing when the loop has no reference."""
+    for name, given in (("reference", reference), ("error", error)):
+        instance(given, str | None, name, "Pass the name of a channel.", LabelError)
     if reference is None:
         known = [name for name in loop.plant.w if name.endswith(":ref")]
         if len(known) > 1:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, Value, generator, positive, whole
+from ..checks import FloatArray, IntArray, Value, generator, positive, real_array, whole
 from ..errors import AssumptionError, ModelError, counted, warn
 from ..plant import StandardPlant
 from ..plant.uncertainty.uncertain_plant import UncertainPlant, modal_realisation
@@ -306,8 +306,8 @@ def _known(given: Any, modes: IntArray) -> FloatArray | None:
     if isinstance(given, UncertainPlant):
         given = given.frequencies
     if isinstance(given, Mapping):
-        return np.array([float(given.get(int(mode), 0.0)) for mode in modes])
-    values = np.asarray(given, dtype=np.float64)
+        given = [given.get(int(mode), 0.0) for mode in modes]
+    values = real_array(given, "known")
     if values.ndim and values.shape != modes.shape:
         raise ModelError(
             f"known has the shape {values.shape}, the plant {counted(modes.size, 'elastic mode')}: "

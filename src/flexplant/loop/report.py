@@ -146,7 +146,7 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
 
     def __getitem__(self, name: str) -> LoopMargins:
         for loop in self.loops:
-            if loop.name == name:
+            if isinstance(name, str) and loop.name == name:
                 return loop
         raise unknown_label("loop", name, list(self))
 

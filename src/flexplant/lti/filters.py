@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import between, positive, real_array
+from ..checks import between, positive, real_array, whole
 from ..errors import ModelError
 from ..tolerances import SAME
 from .interconnection import series
@@ -242,6 +242,8 @@ def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
 
 def _butterworth(freq: float, order: int, high: float, low: float) -> StateSpace:
     omega = 2.0 * np.pi * positive(freq, "freq")
+    if not isinstance(order, int | float | np.number):
+        whole(order, "order", maximum=2)
     if order == 1:
         return first_order(high, low, omega)
     if order == 2:
@@ -351,10 +353,13 @@ def inverse_sensitivity(
     >>> round(1 / abs(W(2j * np.pi * 1e5)), 3)  # |S| may be 2 at high frequency
     2.0
     """
-    if slope not in (1, 2):
-        raise ModelError(f"slope must be 1 or 2, got {slope!r}.")
-    if not 0.0 < floor < 1.0 < peak:
-        raise ModelError(f"need 0 < floor < 1 < peak, got floor {floor:g} and peak {peak:g}.")
+    slope = whole(slope, "slope", maximum=2)
+    floor, peak = positive(floor, "floor"), positive(peak, "peak")
+    if not floor < 1.0 < peak:
+        raise ModelError(
+            f"need 0 < floor < 1 < peak, got floor {floor:g} and peak {peak:g}. They are the sizes "
+            "of S at low and at high frequency: 1e-3 and 2, say."
+        )
     high, low = peak ** (-1.0 / slope), floor ** (1.0 / slope)
     # |W| = 1 at the bandwidth w_b: (w_b high)^2 + w^2 = w_b^2 + (w low)^2
     omega = 2.0 * np.pi * positive(bandwidth, "bandwidth") * np.sqrt((1 - high**2) / (1 - low**2))
@@ -393,9 +398,7 @@ def pade(delay: float, *, order: int = 2) -> StateSpace:
     (1.0, -0.2)
     """
     time = positive(delay, "delay")
-    if order not in range(1, 13):
-        raise ModelError(f"order must be a whole number from 1 to 12, got {order!r}.")
-    n = int(order)
+    n = whole(order, "order", maximum=12)
     powers = np.cumprod([1.0, *((n - k) / ((2 * n - k) * (k + 1)) for k in range(n))])
     poles = np.roots(powers[::-1])
     upper = poles[poles.imag > SAME * np.abs(poles)]

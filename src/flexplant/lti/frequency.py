@@ -15,6 +15,7 @@ from ..checks import (
     ComplexArray,
     FloatArray,
     Value,
+    complex_array,
     known_units,
     name_list,
     positive,
@@ -235,13 +236,11 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         freq = checked_freq(self.freq)
         if np.any(np.diff(freq) <= 0):
             raise ModelError("freq must increase strictly: sort the measurement and merge doubles.")
-        data = np.array(self.data, dtype=np.complex128)
+        data = complex_array(self.data, "data")
         if data.ndim != 3 or data.shape[2] != freq.size:
             raise ShapeError(
                 f"data must have shape (n_out, n_in, {freq.size}) like freq, got {data.shape}."
             )
-        if not np.all(np.isfinite(data)):
-            raise ModelError("data has NaN or infinite entries: leave those frequencies out.")
         coherence = self.coherence
         if coherence is not None:
             coherence = real_array(coherence, "coherence", data.shape)
@@ -414,7 +413,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         LabelError
             When `quantity` is another word.
         """
-        if quantity not in ORDERS:
+        if not isinstance(quantity, str) or quantity not in ORDERS:
             raise unknown_label("quantity", quantity, ORDERS)
         if self.quantity not in ORDERS:
             raise ModelError(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import ComplexArray, FloatArray, IntArray, positive, positive_array
+from ..checks import ComplexArray, FloatArray, IntArray, positive, positive_array, whole
 from ..errors import ModelError
 from ..tolerances import ROUNDING, SPLIT, TINY
 from .responses import continuous_poles, responder
@@ -69,9 +69,10 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     True
     """
     g = as_statespace(sys)
+    if not g.inputs or not g.outputs:
+        raise ModelError("a system without inputs or outputs has no response: give it channels.")
     tolerance = positive(tolerance, "tolerance")
-    if positive(points, "points") < 2:
-        raise ModelError(f"points must be at least 2, got {points}.")
+    points = whole(points, "points", minimum=2)
     poles = continuous_poles(g)
     size = np.abs(poles) / (2 * np.pi)
     top = 0.5 / g.dt if g.dt else np.inf

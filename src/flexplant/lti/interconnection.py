@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
-from ..checks import ComplexArray, FloatArray, inner_names, name_list
+from ..checks import ComplexArray, FloatArray, inner_names, instance, name_list, short
 from ..errors import LabelError, ModelError, ShapeError, require_known
 from ..tolerances import ROUNDING
 from .equations import balanced_matrix
@@ -240,8 +240,8 @@ def feedback(forward: System, back: System | None = None, *, sign: int = -1) -> 
             f"feedback needs H with {len(g.outputs)} inputs and {len(g.inputs)} outputs, got "
             f"{len(h.inputs)} and {len(h.outputs)}."
         )
-    if sign not in (-1, 1):
-        raise ModelError(f"sign must be -1 or +1, got {sign!r}.")
+    if not isinstance(sign, int | float) or sign not in (-1, 1):
+        raise ModelError(f"sign must be -1 or +1, got {short(sign)}. -1 is negative feedback.")
     # G with its inputs and outputs twice: once open, once for the loop
     inner_in = inner_names((f"{name}|loop" for name in g.inputs), g.inputs)
     inner_out = inner_names((f"{name}|loop" for name in g.outputs), g.outputs)
@@ -306,7 +306,8 @@ def connect(
     >>> loop.poles().real
     array([-3.])
     """
-    parts = [as_statespace(sys) for sys in systems]
+    hint = "Pass systems in [...]."
+    parts = [as_statespace(sys) for sys in instance(systems, Iterable, "systems", hint)]
     produced = [name for part in parts for name in part.outputs]
     needed = [name for part in parts for name in part.inputs]
     outer, outputs = name_list(inputs, "inputs"), name_list(outputs, "outputs")

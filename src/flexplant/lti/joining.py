@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray, short
+from ..checks import ComplexArray, FloatArray, IntArray, instance, name_list, several, short, whole
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..tolerances import ROUNDING
 
@@ -155,8 +155,10 @@ def is_block_diagonal(g: Any) -> bool:
 
 def checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:
     """Return block sizes as a tuple; ShapeError unless A is block upper triangular with them."""
-    sizes = tuple(int(size) for size in blocks)
-    if any(size < 1 for size in sizes) or sum(sizes) != A.shape[0]:
+    hint = "Pass whole numbers, or blocks=None."
+    given = instance(blocks, Sequence | np.ndarray, "blocks", hint)
+    sizes = tuple(whole(size, "a block", minimum=0) for size in (given if several(given) else ()))
+    if 0 in sizes or sum(sizes) != A.shape[0]:
         raise ShapeError(f"blocks must be positive and add up to {A.shape[0]} states, got {sizes}.")
     owner = np.repeat(np.arange(len(sizes)), sizes)
     if np.any(A[owner[:, None] > owner[None, :]]):
@@ -172,8 +174,9 @@ def chosen_names(known: Sequence[str], key: Channels, side: str) -> list[str]:
     """Return the names that a name, a number, several or a slice selects."""
     if isinstance(key, slice):
         return list(known[key])
-    several = list(key) if isinstance(key, Iterable) and not isinstance(key, str) else [key]
-    for item in several:
+    given: Any = key
+    listed: list[Any] = list(given) if several(given) else [given]
+    for item in listed:
         if not isinstance(item, str | int | np.integer) or isinstance(item, bool):
             raise LabelError(
                 f"{side}s are chosen by name, number or slice, got {short(item)}. Known are: "
@@ -184,7 +187,7 @@ def chosen_names(known: Sequence[str], key: Channels, side: str) -> list[str]:
                 f"there is no {side} number {item}: the system has {len(known)} "
                 f"({short_list(known)}), counted from 0."
             )
-    return [item if isinstance(item, str) else known[item] for item in several]
+    return [item if isinstance(item, str) else known[item] for item in listed]
 
 
 def chosen_pair(
@@ -201,10 +204,8 @@ def chosen_pair(
 def rows_of(known: Sequence[str], names: Iterable[str], side: str, owner: str | None) -> IntArray:
     """Return the positions of names; LabelError where one is unknown."""
     position = {name: i for i, name in enumerate(known)}
-    if isinstance(names, str):
-        names = [names]
     rows = []
-    for name in names:
+    for name in name_list(names, f"{side}s"):
         if name not in position:
             raise unknown_label(side, name, known, owner or "")
         rows.append(position[name])

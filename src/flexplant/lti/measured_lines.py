@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..checks import ComplexArray, FloatArray, IntArray, between
+from ..checks import ComplexArray, FloatArray, IntArray, between, complex_array
 from ..errors import ModelError, ShapeError
 from ..tolerances import SAME, TINY
 
@@ -20,7 +20,7 @@ LEAST, FARTHEST = 1e-3, 40
 
 def checked_correlation(value: Any, shape: tuple[int, ...]) -> ComplexArray:
     """Return the correlation (n_out, n_out, n_freq) of the errors of outputs."""
-    correlation = np.array(value, dtype=np.complex128)
+    correlation = complex_array(value, "correlation")
     if correlation.shape != (shape[0], shape[0], shape[2]):
         raise ShapeError(
             f"correlation must have shape ({shape[0]}, {shape[0]}, {shape[2]}), "

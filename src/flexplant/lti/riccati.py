@@ -263,7 +263,8 @@ def control_care(
 def _dual(
     solve: Callable[..., RiccatiSolution], A: FloatArray, B: FloatArray, **rest: Any
 ) -> RiccatiSolution:
-    solution = solve(np.asarray(A).T, np.asarray(B).T, **rest)
+    A, B = (real_array(part, name, (None, None)) for part, name in ((A, "A"), (B, "B")))
+    solution = solve(A.T, B.T, **rest)
     return solution.replace(gain=solution.gain.T)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, real_array
+from ..checks import ComplexArray, FloatArray, complex_array, positive, real_array
 from ..errors import ModelError
 from ..tolerances import ROUNDING, SPLIT, divisor
 from .equations import mean_speed, reciprocal, state_scale
@@ -23,7 +23,7 @@ def zpk_fields(
     Each pair of poles is a block of two states with the zeros nearest to it, the least damped
     first, so that A keeps its poles to rounding: a companion form of many poles does not.
     """
-    z, p = _roots(zeros, "zeros"), _roots(poles, "poles")
+    z, p, dt = _roots(zeros, "zeros"), _roots(poles, "poles"), positive(dt, "dt", zero=True)
     if z.size > p.size:
         raise ModelError(
             f"the transfer function has {z.size} zeros and {p.size} poles: it differentiates its "
@@ -52,7 +52,7 @@ def tf_fields(
 ) -> dict[str, Any]:
     """Return A, B, C, D and blocks of a ratio of polynomials, highest power first."""
     num, den = (
-        np.trim_zeros(np.atleast_1d(real_array(part, name)), "f")
+        np.trim_zeros(np.ravel(real_array(part, name)), "f")
         for part, name in ((numerator, "the numerator"), (denominator, "the denominator"))
     )
     if not den.size:
@@ -77,9 +77,7 @@ def matrix_fields(channels: list[list[dict[str, Any]]]) -> dict[str, Any]:
 
 
 def _roots(values: npt.ArrayLike, name: str) -> ComplexArray:
-    roots = np.atleast_1d(np.asarray(values, dtype=np.complex128)).ravel()
-    if not np.all(np.isfinite(roots)):
-        raise ModelError(f"{name} must be finite numbers, got {values!r}.")
+    roots = complex_array(values, name).ravel()
     lonely = [root for root in roots if not np.isclose(roots, root.conj(), rtol=SPLIT).any()]
     if lonely:
         raise ModelError(

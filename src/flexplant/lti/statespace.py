@@ -16,7 +16,9 @@ from ..checks import (
     FloatArray,
     IntArray,
     Value,
+    complex_array,
     known_units,
+    mapping,
     positive,
     real_array,
     short,
@@ -118,7 +120,8 @@ class StateSpace(Value):
     def __post_init__(self) -> None:
         D = direct_gain(self.D, self.B, self.C)
         p, m = D.shape
-        A = real_array(self.A, "A", (None, None)) if np.size(self.A) else np.zeros((0, 0))
+        A = real_array(self.A, "A")
+        A = real_array(A, "A", (None, None)) if A.size else np.zeros((0, 0))
         n = A.shape[0]
         A = real_array(A, "A", (n, n))
         B = real_array(self.B, "B", (n, m)) if n else np.zeros((0, m))
@@ -285,12 +288,15 @@ class StateSpace(Value):
         self, inputs: dict[str, str] | None = None, outputs: dict[str, str] | None = None
     ) -> StateSpace:
         """Return the system with some channels renamed, as {old: new}."""
-        self.input_index(inputs or ())
-        self.output_index(outputs or ())
-        new = {**(inputs or {}), **(outputs or {})}
+        hint = "Pass {old: new}."
+        sides = ((inputs, "inputs"), (outputs, "outputs"))
+        new_in, new_out = ({} if n is None else mapping(n, side, hint) for n, side in sides)
+        self.input_index(new_in)
+        self.output_index(new_out)
+        new = {**new_in, **new_out}
         return self.replace(
-            inputs=[(inputs or {}).get(name, name) for name in self.inputs],
-            outputs=[(outputs or {}).get(name, name) for name in self.outputs],
+            inputs=[new_in.get(name, name) for name in self.inputs],
+            outputs=[new_out.get(name, name) for name in self.outputs],
             units={**self.units, **{new.get(n, n): unit for n, unit in self.units.items()}},
         )
 
@@ -361,7 +367,8 @@ class StateSpace(Value):
         ModelError
             When s is a pole.
         """
-        shifted = s * np.eye(self.n_states) - self.A
+        point = complex(complex_array(s, "s", ()))
+        shifted = point * np.eye(self.n_states) - self.A
         try:
             gain = self.C @ np.linalg.solve(shifted, self.B) + self.D
         except np.linalg.LinAlgError as error:
@@ -443,7 +450,7 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
 
 def direct_gain(D: Any, B: Any, C: Any) -> FloatArray:
     """Return D (p, m) of a system with inputs B and outputs C; the number 0 stands for zeros."""
-    if np.ndim(D):
+    if not isinstance(D, int | float):
         return real_array(D, "D", (None, None))
     (m,) = real_array(B, "B", (None, None)).shape[1:]
     p = len(real_array(C, "C", (None, None)))

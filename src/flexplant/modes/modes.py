@@ -9,7 +9,16 @@ from typing import Any, cast
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, real_array
+from ..checks import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    Value,
+    instance,
+    positions,
+    positive,
+    real_array,
+)
 from ..errors import ModelError, ShapeError, SolverError, counted, unknown_label
 from ..labels import DofSet, Place
 from ..structure.definite import signed_square
@@ -414,7 +423,7 @@ class Modes(Placed, Value):
         ModelError
             When elastic modes would stand before rigid-body ones.
         """
-        chosen = np.asarray(columns, dtype=np.int64)
+        chosen = positions(columns, "columns", self.n_modes)
         return Modes(
             self.omega[chosen],
             self.zeta[chosen],
@@ -470,7 +479,8 @@ class Modes(Placed, Value):
         ModelError
             When the meshes are too alike, have no shape in common, or the modes are complex.
         """
-        return mesh_error(self, finer, order)
+        hint = "Solve the finer model with the same damping."
+        return mesh_error(self, instance(finer, Modes, "finer", hint), order)
 
     @property
     def orthonormal_basis(self) -> FloatArray:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
+import scipy.sparse as sp
 
-from ..checks import ComplexArray, FloatArray, IntArray, Matrix, Value, real_array
+from ..checks import ComplexArray, FloatArray, IntArray, Matrix, Value, real_array, whole
 from ..errors import ModelError, SolverError, counted
 from ..sparse.factor import dense
 from ..structure.definite import signed_square
@@ -159,10 +160,22 @@ def normal_form(
     >>> found.n_rigid, found.zeta.round(5)
     (1, array([0.     , 0.00894]))
     """
+    M = _square(M, "M")
+    K = _square(K, "K", len(M))
+    D = None if D is None else _square(D, "D", len(M))
+    if lowest is not None:
+        whole(lowest, "lowest")
     real = real_form(M, D, K, rigid, motions)
     if D is not None:
         check_drag(real.phi[:, : real.n_rigid], dense(D), real.omega[real.n_rigid :])
     return modal(real, lowest=lowest)
+
+
+def _square(given: Any, name: str, size: int | None = None) -> FloatArray:
+    sparse: Any = given
+    matrix = real_array(dense(sparse) if sp.issparse(given) else given, name, (None, None))
+    size = len(matrix) if size is None else size
+    return real_array(matrix, name, (size, size))
 
 
 def modal(real: RealForm, *, lowest: int | None = None) -> NormalForm:

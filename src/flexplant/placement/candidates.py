@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from ..checks import FloatArray, Value, short
+from ..checks import FloatArray, Value, several, short
 from ..errors import LabelError, ModelError, require_known, unknown_label
 from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
 from ..plant.scheduling import placed, require_positions
@@ -77,6 +77,7 @@ def checked_plant(given: Any) -> StandardPlant:
 
 def with_side(plant: StandardPlant, side: str, chosen: Sequence[Port]) -> StandardPlant:
     """Return the plant with these sensors (actuators, or both) instead of its own."""
+    plant = standard_plant(plant)
     parts = {s: tuple(port for port in chosen if side_of(port) == s) for s in side}
     if plant.is_assembled:
         return plant.with_ports(plant.assembled.ports.replace(**parts))
@@ -97,7 +98,7 @@ def _restricted(plant: StandardPlant, kept: dict[str, list[str]]) -> StandardPla
 
 def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> dict[str, Port]:
     """Return candidates by name; a text stands for the plant's own sensor (actuator)."""
-    if isinstance(given, str) or not isinstance(given, Iterable):
+    if not several(given):
         raise ModelError(
             f"candidates are a list of {_NAME[side]}s or names, got {short(given)}. "
             "Put them in a list."

@@ -186,7 +186,7 @@ class _Function(Criterion):
 
 def as_criterion(given: Any, side: str = "") -> Criterion:
     """Return a criterion of one side, made of any callable from plant to float."""
-    if not callable(given):
+    if not callable(given) or isinstance(given, type):
         raise ModelError(
             "a criterion is a value such as PoiVariance(...) or placement.PoiLqr(...), or a "
             "callable from "

@@ -243,6 +243,7 @@ def _score_layouts(
     listed = [(layout,) if isinstance(layout, str) else tuple(layout) for layout in layouts]
     if not listed or not all(listed):
         raise ModelError("there is nothing to score: give at least one layout, none of them empty.")
+    instance(candidates, Iterable, "candidates", "Pass sensors or actuators in [...].")
     known = known_candidates(plant, side, [*candidates, *(p for part in listed for p in part)])
     names = [tuple(p if isinstance(p, str) else p.name for p in layout) for layout in listed]
     for layout in names:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, Value, real_array
+from ..checks import FloatArray, Value, instance, real_array
 from ..errors import LabelError, ModelError, unknown_label
 from .building import P, rebuilt, wired
 from .forces import Actuator, Disturbance
@@ -134,6 +134,7 @@ def along(plant: Partition, name: str, points: npt.ArrayLike) -> Along:
 
 
 def _port(ports: Ports, name: str) -> Any:
+    instance(name, str, "name", "Pass the name of a port.", LabelError)
     pois = [poi for poi in ports.z if poi.name == name]
     others = [port for port in ports.physical if port.name == name]
     found = pois or others

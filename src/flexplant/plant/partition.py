@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self, TypeGuard
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, Value, name_list, positive, short
+from ..checks import FloatArray, IntArray, Value, mapping, name_list, positive, real_array, short
 from ..errors import LabelError, ModelError, counted, require_known, unknown_label
 from ..labels import DIRECTIONS
 from ..lti.statespace import StateSpace, System, as_statespace
@@ -152,8 +152,9 @@ class Partition(Value):
         z = [n for n in g.outputs if n not in y] if z is None else list(name_list(z, "z"))
         return cls(
             g.select([*z, *y], [*w, *u]),
-            tuple(w), tuple(u), tuple(z), tuple(y), dict(asd or {}),
-            Foreign(None if noise_factor is None else np.asarray(noise_factor, dtype=np.float64)),
+            tuple(w), tuple(u), tuple(z), tuple(y),
+            {} if asd is None else mapping(asd, "asd", "Pass {channel: density}."),
+            Foreign(None if noise_factor is None else real_array(noise_factor, "noise_factor")),
         )  # fmt: skip
 
     @property
@@ -370,7 +371,8 @@ class Partition(Value):
             When it means none.
         """
         names: tuple[str, ...] = getattr(self, side)
-        if name in names:
+        if not isinstance(name, str) or name in names:
+            require_known("channel", [name], names)
             return name
         for poi in self.assembled.ports.z if self.is_assembled else ():
             for axis in poi.axes:

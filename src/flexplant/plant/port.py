@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from ..checks import FloatArray, Value, check_names, flag, positive, real_array, short
-from ..errors import LabelError, ModelError, unknown_label
+from ..errors import LabelError, ModelError, require_known, unknown_label
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace, as_statespace
 from .realisation import ModalRealisation
@@ -157,8 +157,7 @@ class SensorPort(Value):
 
     def __post_init__(self) -> None:
         self._set(**checked_port(self))
-        if self.quantity not in QUANTITIES:
-            raise unknown_label(f"quantity of {self.name!r}", self.quantity, QUANTITIES)
+        require_known(f"quantity of {self.name!r}", [self.quantity], QUANTITIES)
 
     @property
     def filter(self) -> StateSpace | None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from ..checks import Value, check_names, instance, members, name_list, short
+from ..checks import Value, check_names, instance, members, name_list, several, short
 from ..errors import LabelError, ModelError, require_known, unknown_label
 from ..labels import DIRECTIONS
 from ..lti.filters import pade
@@ -124,7 +124,7 @@ class Ports(Value):
     def __post_init__(self) -> None:
         for side, kind in _KINDS.items():
             given = getattr(self, side)
-            if isinstance(given, str) or not isinstance(given, Value | Iterable):
+            if isinstance(given, str) or not (isinstance(given, Value) or several(given)):
                 raise ModelError(
                     f"Ports.{side} must be a sequence of {kind}s, got {short(given)}. "
                     f"Put them in a list: {side}=[...]."
@@ -244,7 +244,7 @@ class Ports(Value):
             When there is none.
         """
         for poi in self.z:
-            if poi.name == name:
+            if isinstance(name, str) and poi.name == name:
                 return poi
         raise unknown_label("POI", name, [poi.name for poi in self.z])
 
@@ -257,7 +257,7 @@ class Ports(Value):
             When there is none.
         """
         for sensor in self.y:
-            if sensor.name == name:
+            if isinstance(name, str) and sensor.name == name:
                 return sensor
         raise unknown_label("sensor", name, [sensor.name for sensor in self.y])
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from ..checks import FloatArray, Value, check_names, short
+from ..checks import FloatArray, Value, check_names, name_list
 from ..errors import LabelError, require_known
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace
@@ -135,12 +135,7 @@ class Poi(Value):
     moves: Any = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.axes, Iterable):
-            raise LabelError(
-                f"axes of POI {self.name!r} are names such as ('z', 'rx'), got {short(self.axes)}."
-                " Name them."
-            )
-        axes = (self.axes,) if isinstance(self.axes, str) else tuple(self.axes)
+        axes = name_list(self.axes, f"axes of POI {self.name!r}")
         require_known(f"axis of POI {self.name!r}", axes, DIRECTIONS)
         if not axes:
             raise LabelError(f"POI {self.name!r} has no axes: name at least one, such as ('z',).")

@@ -201,7 +201,7 @@ def frequency_response(
         data = through.seen(grid, _realised(model, grid, through.rows, through.loads))
         route = f"all modes of the {type(model).__name__}"
         return through.frf(grid, data, route=route)
-    limit, most = positive(tolerance, "tolerance"), whole(checks, "checks", minimum=0)
+    limit, most = positive(tolerance, "tolerance"), whole(checks, "checks", minimum=0, maximum=1000)
     rows, loads = through.rows, through.loads
     advice = "A lower last frequency needs fewer modes; those that you hold are used again."
     with Progress(0, "frequency response", advice=advice):

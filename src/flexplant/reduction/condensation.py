@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, IntArray, checked, positive, whole
+from ..checks import FloatArray, IntArray, checked, positive, several, whole
 from ..errors import ModelError, ShapeError, SolverError, counted
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
@@ -62,7 +62,7 @@ def _loose(model: FEModel, kept: IntArray) -> str:
 
 def mode_numbers(numbers: Any, name: str) -> tuple[int, ...]:
     """Return mode numbers as a sorted tuple."""
-    if isinstance(numbers, str) or not isinstance(numbers, Iterable):
+    if not several(numbers):
         raise ModelError(f"{name} are given by their numbers, got {numbers!r:.60}: [1, 2, 3, 7].")
     listed = [whole(number, "a mode number") for number in numbers]
     if not listed or len(set(listed)) != len(listed):

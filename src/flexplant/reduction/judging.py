@@ -8,7 +8,7 @@ from typing import Any, Protocol, Self, TypeAlias
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, real_array, whole
+from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, real_array, short, whole
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..lti.frequency_sweep import climbed
@@ -133,7 +133,11 @@ def _judged_places(reduced: Reduced, inputs: Any, outputs: Any) -> tuple[list[Pl
 
 
 def _place_rows(full: FEModel | Modes, at: list[Place]) -> FloatArray:
-    return np.array([full.dofs.row(place) for place in at]).reshape(-1, len(full.dofs))
+    rows = np.array([full.dofs.row(place) for place in at]).reshape(-1, len(full.dofs))
+    if not rows.any(axis=1).all():
+        empty = at[int(np.argmin(rows.any(axis=1)))]
+        raise ModelError(f"the place {short(empty)} moves with no DOF: its weights are all zero.")
+    return rows
 
 
 def _loss(reduced: Reduced, own: Modes, loss: float | None) -> float:

@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, name_list, positive, real_array
+from ..checks import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    Value,
+    complex_array,
+    name_list,
+    positive,
+    real_array,
+)
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..modes.damped_modes import leaving_overdamped
@@ -56,6 +65,8 @@ class Spanned:
         ShapeError
             When there are not k rows.
         """
+        if isinstance(q, list | tuple):
+            q = complex_array(q, "q")
         if np.iscomplexobj(q):
             parts = np.asarray(q)
             return np.asarray(self.expand(parts.real) + 1j * self.expand(parts.imag))
@@ -92,7 +103,7 @@ class Spanned:
 
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return the relative parts (6,) of the rigid-body motions that T cannot make."""
-        wanted = rigid_motions(self.full_dofs, list(about))
+        wanted = rigid_motions(self.full_dofs, real_array(about, "about", (3,)))
         return missed(self.T @ self.rigid_motions(about), wanted)
 
     def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
@@ -108,7 +119,7 @@ class Spanned:
         ShapeError
             When `about` is no point.
         """
-        centre = real_array(list(about), "about", (3,))
+        centre = real_array(about, "about", (3,))
         if self.is_physical:
             return rigid_motions(self.dofs, centre)
         return np.asarray(la.lstsq(self.T, rigid_motions(self.full_dofs, centre))[0])

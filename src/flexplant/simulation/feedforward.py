@@ -308,7 +308,7 @@ def _states(g: StateSpace, B: FloatArray, s: complex) -> ComplexArray:
 
 
 def _term(term: Any) -> int:
-    if term not in TERMS:
+    if not isinstance(term, str) or term not in TERMS:
         raise LabelError(f"a term is one of {', '.join(TERMS)}, got {short(term)}. Choose one.")
     return TERMS.index(term)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..checks import FloatArray, Value, instance, positive, short, whole, with_unit
+from ..checks import FloatArray, Value, function, instance, positive, short, whole, with_unit
 from ..errors import ModelError, counted
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import force_name
@@ -132,6 +132,7 @@ def learn_feedforward(
     unit = np.linalg.norm(effects, axis=1)
     used = unit > 0
     pseudo = np.linalg.pinv((effects[used] / unit[used, None]).T, rcond=_RESOLVED)
+    function(trial, "trial", "It takes a Feedforward and returns a Response.")
     current, errors, gains = start, [], []
     for _ in range(whole(trials, "trials")):
         error = _error(trial(current), channels)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import Value, generator, instance, positive, short, whole
+from ..checks import Value, generator, instance, positive, real_array, several, short, whole
 from ..errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, counted
 from ..estimation import Consistency, KalmanEstimator, consistency, design_kalman
 from ..identification import MeasuredModes, identify_modes, numbered
@@ -163,20 +163,28 @@ class MachinePipeline(Value):
             instance(self.measurement, Mapping, "measurement", "Give {'period': 0.5}, say, or {}.")
         if not self.ports.references:
             raise ModelError("the ports need a reference for the POI: references=[Reference(...)].")
+        for name in ("parameters", "candidates", "blocks"):
+            if getattr(self, name) is not None:
+                instance(getattr(self, name), Iterable, name, "Pass a list.")
         self._set(
             parameters=tuple(self.parameters),
             rate=positive(self.rate, "rate"),
             delay=positive(self.delay, "delay", zero=True),
             modes=None
             if self.modes is None
-            else tuple(whole(n, "mode") for n in np.ravel(self.modes)),
+            else tuple(
+                whole(n, "mode") for n in (self.modes if several(self.modes) else [self.modes])
+            ),
             measurement=None if self.measurement is None else dict(self.measurement),
             deviation=positive(self.deviation, "deviation", zero=True),
             candidates=tuple(self.candidates),
             bandwidth=None
             if self.bandwidth is None
             else tuple(
-                sorted(positive(f, "bandwidth") for f in np.atleast_1d(self.bandwidth))[::-1]
+                sorted(
+                    positive(f, "bandwidth")
+                    for f in real_array(self.bandwidth, "bandwidth").ravel()
+                )[::-1]
             ),
             margin=positive(self.margin, "margin"),
             blocks=None if self.blocks is None else tuple(self.blocks),

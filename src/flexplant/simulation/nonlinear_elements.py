@@ -205,7 +205,7 @@ def finer_loop(loop: ClosedLoop, finer: int) -> ClosedLoop:
 
     The same plant before sampling, with the same delay in seconds.
     """
-    if whole(finer, "finer") == 1:
+    if whole(finer, "finer", maximum=10_000) == 1:
         return loop
     plant = loop.plant
     if plant.continuous.dt:

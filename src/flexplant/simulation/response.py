@@ -9,7 +9,16 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, IntArray, Value, check_names, known_units, positive, real_array
+from ..checks import (
+    FloatArray,
+    IntArray,
+    Value,
+    check_names,
+    known_units,
+    name_list,
+    positive,
+    real_array,
+)
 from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
 from ..loop import Spectrum
 from ..tolerances import TYPED
@@ -64,13 +73,13 @@ class Response(Value, Mapping[str, FloatArray]):
     __hash__ = object.__hash__
 
     def __post_init__(self) -> None:
-        names = tuple(str(name) for name in self.names)
+        names = name_list(self.names, "channels")
         check_names(names, "channels")
         time = real_array(self.time, "time", (None,))
         steps = np.diff(time)
         if steps.size and (steps.min() <= 0 or np.ptp(steps) > TYPED * steps.mean()):
             raise ModelError("time must increase in equal steps: moving windows count samples.")
-        data = real_array(self.data, "data")
+        data = real_array(self.data, "data", limit=np.inf)
         if data.ndim not in (2, 3) or data.shape[-2:] != (len(names), time.size):
             raise ShapeError(
                 f"data of {len(names)} channels at {time.size} times must have shape "
@@ -89,7 +98,7 @@ class Response(Value, Mapping[str, FloatArray]):
         )
 
     def __getitem__(self, channel: str) -> FloatArray:
-        if channel not in self.names:
+        if not isinstance(channel, str) or channel not in self.names:
             raise ChannelError(str(unknown_label("channel", channel, self.names)))
         signal: FloatArray = self.data[..., self.names.index(channel), :]
         return signal

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import (
+    MOST_DRAWS,
     FloatArray,
     flag,
     instance,
@@ -16,6 +17,7 @@ from ..checks import (
     real_array,
     seed_of,
     seed_sequence,
+    several,
     short,
     whole,
 )
@@ -138,6 +140,11 @@ def simulate(
     closed, loop = loop, finer_loop(loop, finer)
     plant = loop.plant
     steps = round(positive(duration, "duration") / plant.dt)
+    if steps > MOST_STEPS:
+        raise ModelError(
+            f"duration {float(duration):g} s is {steps:.3g} samples of {plant.dt:g} s: more than "
+            "memory holds. Simulate a part of it."
+        )
     if not steps:
         raise ModelError(
             f"duration {float(duration):g} s is less than half a sample ({plant.dt:g} s)."
@@ -319,6 +326,8 @@ def _sampled(signal: Any, name: str, time: FloatArray, runs: int) -> FloatArray:
     if isinstance(signal, SetPoint):
         _check_setpoint(signal, name, time)
         return signal.at(time).position
+    if isinstance(signal, type):
+        raise ModelError(f"{name} is a class, {signal.__name__}. Pass a function of time.")
     values = real_array(signal(time) if callable(signal) else signal, name)
     if values.ndim == 0:
         return values
@@ -346,12 +355,17 @@ def _check_setpoint(move: SetPoint, name: str, time: FloatArray) -> None:
             )
 
 
+#: samples of one run
+MOST_STEPS = 10**9
+
+
 def _run_numbers(runs: int | Sequence[int] | None) -> list[int]:
     if runs is None:
         return [0]
-    if not isinstance(runs, Iterable) or isinstance(runs, str):
-        return list(range(whole(runs, "runs")))
-    listed = [whole(number, "a run number", minimum=0) for number in runs]
+    given: Any = runs
+    if not several(given):
+        return list(range(whole(given, "runs", maximum=MOST_DRAWS)))
+    listed = [whole(number, "a run number", minimum=0) for number in given]
     if not listed:
         raise ModelError("runs must be at least 1, or run numbers from 0, got none. Name one.")
     return listed

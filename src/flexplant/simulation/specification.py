@@ -229,6 +229,7 @@ class Specification(Value):
         self, loop: ClosedLoop, run: Response, exposures: Any
     ) -> list[tuple[str, str, float, float, bool]]:
         channel = self._watched(loop)
+        instance(run, Response, "run", "Pass simulate(loop, ...).")
         unit = run.units.get(channel, "")
         rows: list[tuple[str, str, float, float, bool]] = []
         if self.ma is not None or self.msd is not None:

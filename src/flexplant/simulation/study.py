@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,7 +88,7 @@ def study(
     >>> fx.study([4.0, 9.0], pipeline)["root"]
     array([2., 3.])
     """
-    items = list(machines)
+    items = list(instance(machines, Iterable, "machines", "Give a sequence of them."))
     if not items:
         raise ModelError("a study needs machines, got none. Give a sequence of them.")
     if not callable(pipeline):
@@ -200,7 +200,7 @@ class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
     failed: tuple[str, ...]
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
-        if name == "failed":
+        if isinstance(name, str) and name == "failed":
             return np.array(self.failed, dtype=np.str_)
         require_known("column", [name], self)
         return self.columns[name]

@@ -9,7 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Matrix, Value, checked, flag, positive, real_array, short, whole
+from ..checks import (
+    FloatArray,
+    Matrix,
+    Value,
+    checked,
+    complex_array,
+    flag,
+    number,
+    positive,
+    real_array,
+    several,
+    short,
+    whole,
+)
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..sparse.factor import dense
@@ -89,7 +102,9 @@ class ModalDamping(Damping):
             raise ShapeError(
                 f"ratio must be a number or one per mode, got shape {ratio.shape}. Flatten it."
             )
-        others = None if self.others is None else _ratios(self.others, "others").item()
+        others = self.others
+        if others is not None:
+            others = float(_ratios(number(others, "others"), "others"))
         if others is not None and ratio.ndim == 0:
             raise ModelError(
                 "others goes with one ratio for each of the first modes: a single ratio is that of "
@@ -129,7 +144,7 @@ class ModalDamping(Damping):
         array([0.       , 0.0099995, 0.02     ])
         """
         numbers = getattr(poles, "modes", None) if modes is None else modes
-        values = np.atleast_1d(np.asarray(getattr(poles, "poles", poles)))
+        values = np.atleast_1d(complex_array(getattr(poles, "poles", poles), "poles"))
         if values.dtype.kind not in "iufc" or values.ndim != 1 or not np.all(np.isfinite(values)):
             raise ModelError(
                 f"poles must be a list of complex numbers [rad/s], got {short(poles)}. "
@@ -141,9 +156,8 @@ class ModalDamping(Damping):
                 "mode of the model it damps. Pass modes=[...], counted from 1 with the rigid-body "
                 "modes."
             )
-        if not isinstance(numbers, Iterable):
-            numbers = [numbers]
-        listed = [whole(number, "a mode number") for number in numbers]
+        numbers = numbers if several(numbers) else [numbers]
+        listed = [whole(number, "a mode number", maximum=10**6) for number in numbers]
         if len(listed) != values.size or len(set(listed)) != len(listed):
             raise ModelError(
                 f"{values.size} poles need as many different mode numbers, got {short(listed)}. "

@@ -10,7 +10,17 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import FloatArray, Matrix, Value, between, element_mask, instance, real_array, short
+from ..checks import (
+    FloatArray,
+    Matrix,
+    Value,
+    between,
+    element_mask,
+    function,
+    instance,
+    real_array,
+    short,
+)
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..tolerances import divisor
@@ -115,6 +125,9 @@ class Hysteretic(Damping):
         ModelError
             When regions have less than none or more than all of a shape's strain energy.
         """
+        shapes = real_array(
+            shapes, "shapes", (len(instance(dofs, DofSet, "dofs", "Pass model.dofs.")), None)
+        )
         if not self._regions:
             return self.zeta(omega)
         stored = np.sum(shapes * np.asarray(K @ shapes), axis=0)
@@ -286,7 +299,8 @@ class LossRegion(Value):
         elif sp.issparse(self.stiffness):
             real_array(given.data, "stored entries of a region's stiffness")
         elif isinstance(given, np.ndarray):
-            given = real_array(given, "stiffness of a region", (given.shape[0], given.shape[0]))
+            given = real_array(given, "stiffness of a region", (None, None))
+            given = real_array(given, "stiffness of a region", (len(given), len(given)))
         else:
             hint = "Give a part of K, or Spring(...) in [...]."
             given = tuple(instance(given, Iterable, "stiffness of a region", hint))
@@ -342,7 +356,12 @@ class LossRegion(Value):
         <LossRegion: loss factor 0.1, a matrix of 27 DOFs>
         """
         mask = element_mask(elements, "elements")
-        modulus = np.broadcast_to(real_array(youngs_modulus, "youngs_modulus"), mask.shape)
+        function(build, "build", "It takes the modulus of each element and returns a model.")
+        modulus = real_array(youngs_modulus, "youngs_modulus")
+        modulus = np.broadcast_to(
+            modulus if not modulus.ndim else real_array(modulus, "youngs_modulus", mask.shape),
+            mask.shape,
+        )
         more: Any = build(modulus * (1.0 + mask)).K - build(np.array(modulus)).K
         return cls(loss_factor, sp.csc_array(more))
 

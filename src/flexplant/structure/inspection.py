@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Value
+from ..checks import FloatArray, Value, one_of
 from ..errors import ModelError, counted
 from ..parallel import Progress
 from .check_facts import Facts, facts
@@ -87,6 +87,7 @@ class ModelCheck(Value):
         verdict : str
             Which.
         """
+        one_of(verdict, "verdict", ("ok", "note", "fail"))
         return tuple(subject for found, subject, _, _ in self.lines if found == verdict)
 
     def __repr__(self) -> str:

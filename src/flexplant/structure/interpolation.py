@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..checks import FloatArray, IntArray, Value, instance, positive, real_array
+from ..dof_columns import direction_names
 from ..errors import LabelError, ModelError, counted
 from ..labels import DIRECTIONS, DofSet, Interpolation
 from ..tolerances import TINY
@@ -112,6 +113,7 @@ class ScatteredShape(Interpolation):
     margin: float = 0.0
 
     def __post_init__(self) -> None:
+        self._set(directions=direction_names(self.directions))
         self._set(xyz=real_array(self.xyz, "xyz", (len(self.directions), 3)))
 
     def __repr__(self) -> str:
@@ -126,12 +128,12 @@ class ScatteredShape(Interpolation):
         LabelError
             When the point is outside the hull of the nodes, or the motion is not known there.
         """
-        return np.asarray(self.rows(np.asarray(xyz, dtype=np.float64)[None], direction)[0])
+        return np.asarray(self.rows(real_array(xyz, "xyz", (3,))[None], direction)[0])
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
         """Return the weights (p, n) at many points (p, 3), as `row` does one by one."""
         places = real_array(points, "points", (None, 3))
-        if direction not in DIRECTIONS:
+        if not isinstance(direction, str) or direction not in DIRECTIONS:
             raise LabelError(f"no motion {direction!r}: use one of {', '.join(DIRECTIONS)}.")
         if direction in self.directions:
             return self._field(direction).values(places)

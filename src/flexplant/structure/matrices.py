@@ -371,6 +371,7 @@ class FEMatrices(Value):
                 "the structure is free to move and its coordinates are not known, hence nor are "
                 "its rigid-body rotations. Give them: located_at(nodes, xyz), or to the reader."
             )
+        instance(name, str | None, "name", "Pass a text.")
         parts: Any = ready
         try:
             model = FEModel(parts.M, parts.K, parts.D, dofs=parts.dofs, name=name or self.source)

@@ -61,7 +61,7 @@ class Placed:
 
     def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return the six rigid-body motions (n, 6), rotations about a point [m]."""
-        centre = real_array(list(about), "about", (3,))
+        centre = real_array(about, "about", (3,))
         return rigid_motions(self.dofs, centre)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray
+from ..checks import FloatArray, real_array
 from ..errors import SolverError, attempted
 from ..labels import DofSet
 from ..sparse.lowest import Lowest, lowest_modes
@@ -37,7 +37,10 @@ def digits_of(given: Any) -> int | None:
     digits, in single precision. Entries in double precision that came from a text of few digits
     show it: written with as few digits as distinguish them, none has more.
     """
-    kind = np.dtype(given.dtype if hasattr(given, "dtype") else np.asarray(given).dtype)
+    if not hasattr(given, "dtype"):
+        real_array(given, "K")
+        given = np.asarray(given)
+    kind = np.dtype(given.dtype)
     if kind.kind not in "fc":
         return None
     digits = int(-np.log10(np.finfo(kind).eps / 2))

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, Value, generator, positive, short, whole
+from ..checks import (
+    ComplexArray,
+    FloatArray,
+    Value,
+    generator,
+    instance,
+    positive,
+    several,
+    short,
+    whole,
+)
 from ..errors import ModelError, unknown_label
 from ..estimation import design_static
 from ..identification import MeasuredModes
@@ -262,7 +272,7 @@ class WaferStage(Value):
         own = self._own_poles
         known = range(self._n_rigid + 1, self._n_rigid + own.size + 1)
         found = []
-        listed = [modes] if not isinstance(modes, Iterable) or isinstance(modes, str) else modes
+        listed = modes if several(modes) else [modes]
         numbers = tuple(whole(mode, "mode") for mode in listed)
         for mode in numbers:
             if mode not in known:
@@ -405,6 +415,7 @@ class WaferStage(Value):
         ModelError
             When ports lack actuators or sensors, or a number is out of range.
         """
+        instance(ports, Ports, "ports", "Pass Ports(u=[...], y=[...]).")
         if not ports.u or not ports.y:
             raise ModelError(f"an FRF needs actuators and sensors, got {ports!r}.")
         random = generator(rng)

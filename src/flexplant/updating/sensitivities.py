@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value, instance, real_array, short
+from ..checks import ComplexArray, FloatArray, Value, instance, real_array, several, short
 from ..errors import LabelError, ModelError, ShapeError, counted
 from .family import Eigen, Family, repeated_groups
 from .parameters.added import Parameter
@@ -160,7 +160,7 @@ def mode_columns(modes: Any, eigen: Eigen) -> list[int]:
     first, last = eigen.n_rigid + 1, eigen.n_rigid + eigen.poles.size
     if not eigen.poles.size:
         raise ModelError("the model has no oscillating mode: there is no eigenvalue to follow.")
-    if not isinstance(modes, Iterable) or isinstance(modes, str):
+    if not several(modes):
         raise LabelError(f"modes must be a list of numbers, got {short(modes)}. Pass [6, 7], say.")
     for number in modes:
         if isinstance(number, bool) or number not in range(1, last + 1):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import (
+    MOST_DRAWS,
     ComplexArray,
     FloatArray,
     Matrix,
@@ -355,7 +356,9 @@ class UpdateResult(Value):
             When the covariance is not known, or the count is no whole number from 1.
         """
         std = self._known_std()
-        white = generator(rng).standard_normal((whole(count, "count"), std.size))
+        white = generator(rng).standard_normal(
+            (whole(count, "count", maximum=MOST_DRAWS), std.size)
+        )
         values, vectors = np.linalg.eigh(np.asarray(self.covariance) / np.outer(std, std))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(self.values + (white @ root.T) * std, dtype=np.float64)

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray, Value, positive, real_array
+from ...checks import ComplexArray, FloatArray, Value, members, positive, real_array
 from ...errors import ModelError, counted
 from ...labels import Place
 from ...modes import Modes, normal_form
@@ -117,9 +117,9 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
     >>> held.n_rigid, held.freq[:1].round(2)
     (0, array([3.56]))
     """
-    listed = [springs] if isinstance(springs, GroundSpring) else list(springs)
-    if not listed or not all(isinstance(spring, GroundSpring) for spring in listed):
-        raise ModelError(f"suspend needs GroundSprings, got {springs!r:.80}.")
+    several = [springs] if isinstance(springs, GroundSpring) else springs
+    hint = "Pass GroundSpring(...) in [...]."
+    listed = list(members(several, GroundSpring, "springs", hint))
     given: Any = model
     if isinstance(given, FEModel):
         return _full(given, listed)  # type: ignore[return-value]

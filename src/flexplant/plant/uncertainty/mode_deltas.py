@@ -87,9 +87,8 @@ def _by_mode(given: Any, name: str, modes: Sequence[int]) -> FloatArray:
     if isinstance(given, Mapping):
         require_known("uncertain mode", map(str, given), map(str, modes))
         given = [given.get(number, 0.0) for number in modes]
-    elif np.ndim(given) == 0:
-        given = [given] * len(modes)
-    values = real_array(given, name, (len(modes),))
+    values = real_array(given, name)
+    values = real_array(values if values.ndim else np.full(len(modes), values), name, (len(modes),))
     if np.any(values < 0):
         raise ModelError(
             f"the {name} is uncertain by a share of it, 0 or more, got {values.min()}."

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray, Value, whole
+from ...checks import ComplexArray, FloatArray, Value, name_list, whole
 from ...errors import CertificateError, ModelError, counted
 from ...lti.discretisation import image_freq
 from ...lti.frequency import frequency_response
@@ -73,7 +73,7 @@ class NeglectedModes(Value):
     def narrowed(self, outputs: Sequence[str]) -> NeglectedModes:
         """Return the bound on some of the outputs, with the states of their weights alone."""
         W = self.weights
-        heads = tuple(f"{name}:neglected:" for name in outputs)
+        heads = tuple(f"{name}:neglected:" for name in name_list(outputs, "outputs"))
         kept = np.array([name.startswith(heads) for name in W.states], dtype=bool)
         weights = part_of(W, kept).select(outputs, outputs)
         mirrored = {name: of for name, of in self.mirrored.items() if of in outputs}

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ...checks import ComplexArray, FloatArray, instance, positive
+from ...checks import ComplexArray, FloatArray, instance, members, positive, several
 from ...errors import LabelError, ModelError, require_known, unknown_label
 from ...identification import MeasuredModes
 from ...labels import Place
@@ -371,9 +371,13 @@ def _fitted_poles(
     modes: Sequence[int] | None,
 ) -> tuple[tuple[int, ...], ComplexArray, FloatArray]:
     """Return mode numbers, poles and J C J', the covariance of [Re lambda; Im lambda]."""
+    if parameters is not None:
+        parameters = members(parameters, Parameter, "parameters", "Pass those of the fit.", least=0)
     covariance = _checked_fit(fit, tuple(parameters or ()))
     elastic = range(realisation.n_rigid + 1, realisation.n_modes + 1)
-    chosen = list(elastic if modes is None else modes)
+    chosen = list(elastic) if modes is None else modes
+    if several(chosen) and not len(tuple(chosen)):
+        raise ModelError("modes is empty: nothing would be uncertain. Name some, or leave it out.")
     found = eigenvalue_sensitivities(fit.model, about_fit(fit, parameters or ()), modes=chosen)
     J = np.vstack([found.S.real, found.S.imag])
     return found.modes, found.poles, J @ covariance @ J.T

@@ -10,7 +10,7 @@ from typing import Any, Generic, Literal
 import numpy as np
 import scipy.sparse as sp
 
-from ...checks import FloatArray, Value, generator, real_array, whole
+from ...checks import MOST_DRAWS, FloatArray, Value, generator, real_array, whole
 from ...errors import FlexplantWarning, ModelError, counted, require_known
 from ...lti.statespace import StateSpace, as_statespace
 from ...sparse.factor import dense
@@ -351,7 +351,7 @@ class UncertainPlant(Value, Generic[P]):
             When a machine drawn is not physical: too uncertain for a normal distribution.
         """
         machines = []
-        for i, own in enumerate(generator(rng).spawn(whole(n, "n")), 1):
+        for i, own in enumerate(generator(rng).spawn(whole(n, "n", maximum=MOST_DRAWS)), 1):
             try:
                 machines.append(self._drawn(own))
             except ModelError as error:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from ...checks import FloatArray, Value, positive, real_array, short, whole
+from ...checks import FloatArray, Value, positive, real_array, several, short, whole
 from ...errors import ModelError, ShapeError
 from ...labels import DofSet, Interpolation
 from .element_matrices import Grid
@@ -92,6 +92,8 @@ class Disc(Value):
 
 Hole = Rectangle | Disc
 
+#: elements along one axis: more of them are no model for a machine of today
+MOST = 10**6
 #: elements with less than this part of their area outside all holes are missing
 _LEAST = 0.02
 #: points along each side of an element: to see whether a hole's edge cuts it, and its area
@@ -108,6 +110,8 @@ def lengths_of(size: Any, count: int) -> tuple[float, ...]:
 
 def _asked(function: Any, name: str, centres: FloatArray) -> list[Any]:
     """Return what a user's function answers at the centres (elements, d)."""
+    if isinstance(function, type):
+        raise ModelError(f"{name} is a class, {function.__name__}. Pass a number or a function.")
     names = ", ".join("xyz"[: centres.shape[1]])
     try:
         inspect.signature(function).bind(*centres.tolist()[0])
@@ -124,14 +128,15 @@ def _asked(function: Any, name: str, centres: FloatArray) -> list[Any]:
 def counts_of(elements: Any, count: int) -> tuple[int, ...]:
     """Return `count` numbers of elements."""
     axes = "xyz"[:count]
-    listed = [elements] if count == 1 and np.ndim(elements) == 0 else elements
-    if not isinstance(listed, Sequence | np.ndarray) or len(listed) != count:
+    listed = [elements] if count == 1 and not several(elements) else elements
+    if not isinstance(listed, Sequence | np.ndarray) or not several(listed) or len(listed) != count:
         raise ShapeError(
             f"elements must be {count} whole numbers (along {', '.join(axes)}), got "
             f"{short(elements)}. Write ({', '.join(['8'] * count)}), say."
         )
     return tuple(
-        whole(value, f"elements along {axis}") for value, axis in zip(listed, axes, strict=True)
+        whole(value, f"elements along {axis}", maximum=MOST)
+        for value, axis in zip(listed, axes, strict=True)
     )
 
 
@@ -156,10 +161,10 @@ def field_of(
         answers = _asked(value, name, centres)
         found[chosen] = real_array(answers, f"{name} of the elements", (len(answers),))
         values = found.reshape(tuple(counts[::-1]))
-    elif np.ndim(value) == 0:
-        return positive(value, name)
     else:
         values = real_array(value, name)
+        if not values.ndim:
+            return positive(value, name)
         if values.shape != tuple(counts):
             raise ShapeError(
                 f"{name} must be one number, one for each element in an array of shape "
@@ -177,11 +182,13 @@ def field_of(
 
 def poisson_of(value: Any, lengths: Sequence[float], counts: Sequence[int], present: Any) -> Any:
     """Return Poisson's ratio: one number, or an array (nz, ny, nx)."""
-    if callable(value) or np.ndim(value):
+    if callable(value) or real_array(value, "poisson_ratio").ndim:
 
         def shifted(item: Any) -> Any:
             if not callable(item):
                 return 1.0 + real_array(item, "poisson_ratio")
+            if isinstance(item, type):
+                return item
             return functools.wraps(item)(lambda *at: 1.0 + item(*at))
 
         found = field_of(shifted(value), "1 + poisson_ratio", lengths, counts, present) - 1.0
@@ -223,8 +230,9 @@ def present_of(
 
 def _hole_mask(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> Any:
     if not isinstance(holes, Hole) and not callable(holes):
-        given = np.asarray(holes) if not isinstance(holes, set) else np.array(None)
-        if given.dtype == bool:
+        given = holes if isinstance(holes, np.ndarray) else np.array(holes, dtype=object)
+        if given.size and all(isinstance(one, bool | np.bool_) for one in given.flat):
+            given = given.astype(bool)
             if given.shape != tuple(counts):
                 raise ShapeError(
                     f"holes must be a mask with one entry for each element, of shape "
@@ -234,7 +242,7 @@ def _hole_mask(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> A
     centres = centres_of(lengths, counts)
     if callable(holes):
         return np.array([bool(answer) for answer in _asked(holes, "holes", centres)])
-    listed = list(holes) if isinstance(holes, Iterable) else [holes]
+    listed = list(holes) if several(holes) else [holes]
     if len(counts) != 2 or not all(isinstance(hole, Hole) for hole in listed):
         raise ModelError(
             f"holes must be Rectangle and Disc values, a mask of the elements or a function of an "
@@ -260,7 +268,9 @@ def _shares(holes: Sequence[Hole], lengths: Sequence[float], counts: Sequence[in
         line = (np.arange(number) + 0.5) / number
         points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) * steps
         every = (some[:, None] + points).reshape(-1, 2)
-        held = np.any([hole.holds(every) for hole in holes], axis=0)
+        held = np.zeros(len(every), dtype=bool)
+        for hole in holes:
+            held |= hole.holds(every)
         return np.asarray(1.0 - held.reshape(some.shape[0], -1).mean(axis=1))
 
     found = outside(corners, _FEW)

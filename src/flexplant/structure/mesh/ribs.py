@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from ...checks import FloatArray, IntArray, Value, positive, real_array
+from ...checks import FloatArray, IntArray, Value, number, positive, real_array
 from ...errors import ModelError
 from .element_matrices import Grid, beam_mass, beam_rotary, beam_stiffness
 
@@ -94,6 +94,9 @@ class Rib(Value):
                 f"a rib runs along x or along y, got {start.tolist()} to {end.tolist()}. Make an "
                 "oblique one of steps, or of a mesh of your own."
             )
+        for name in ("width", "height", "area", "inertia", "torsion", "polar"):
+            if getattr(self, name) is not None:
+                number(getattr(self, name), name)
         box = (self.width, self.height)
         free = (self.area, self.inertia, self.torsion, self.polar)
         if (None in box or any(n is not None for n in free)) and (

@@ -122,7 +122,7 @@ class PlateShape(GridShape):
         LabelError
             When the point is off the plate, or the direction is not z, rx or ry.
         """
-        if direction not in ("z", "rx", "ry"):
+        if not isinstance(direction, str) or direction not in ("z", "rx", "ry"):
             raise LabelError(
                 f"a plate in bending has no motion {direction!r}: use one of z, rx, ry."
             )
@@ -145,6 +145,7 @@ class PlateShape(GridShape):
         LabelError
             When one of them is off the plate, or the direction is not z, rx or ry.
         """
+        points = real_array(points, "points", (None, 3))
         grid, size, count = self._grid, np.array(self.size), np.array(self.elements)
         place = np.clip(points[:, :2] / size, 0.0, 1.0) * count
         nearest = np.round(place)
@@ -278,7 +279,7 @@ class BlockShape(GridShape):
         LabelError
             When the point is outside the block, or the direction is unknown.
         """
-        if direction not in _BLOCK_MOTIONS:
+        if not isinstance(direction, str) or direction not in _BLOCK_MOTIONS:
             raise LabelError(
                 f"a solid has no motion {direction!r}: use one of {', '.join(_BLOCK_MOTIONS)}."
             )

@@ -16,6 +16,7 @@ from ...checks import (
     positive,
     positive_array,
     real_array,
+    several,
     short,
 )
 from ...errors import ModelError, ShapeError
@@ -93,8 +94,8 @@ def chain(
     n = m.size
     if not n:
         raise ModelError("masses is empty: a chain needs one mass at least. Pass [1.0], say.")
-    shape = None if np.ndim(ground) == 0 else (n,)
-    held = np.zeros(n) + positive_array(ground, "ground", shape, zero=True)
+    held = real_array(ground, "ground")
+    held = np.zeros(n) + positive_array(held, "ground", (n,) if held.ndim else (), zero=True)
     k = _between_masses(stiffnesses, "stiffnesses", n)
     xyz = np.zeros((n, 3))
     xyz[:, 0] = positive(spacing, "spacing") * np.arange(n)
@@ -204,7 +205,7 @@ def beam(
 
 
 def _ends(ends: Any) -> list[tuple[str, ...]]:
-    if isinstance(ends, str) or not isinstance(ends, Iterable) or len(list(ends)) != 2:
+    if not several(ends) or len(list(ends)) != 2:
         raise ModelError(
             f"ends must be two words, for the ends at 0 and at the length, got {short(ends)}. "
             '("clamped", "free"), say.'
