@@ -62,7 +62,7 @@ def test_it_comes_back(tmp_path, quantity, known):
         assert np.array_equal(found.variance, frf.variance)
 
 
-NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+NUMBERS = st.floats(-1e99, 1e99)
 NAMES = st.text("abuy1:/ <[-],\"'", min_size=1, max_size=8).map(lambda text: f"x{text}x")
 
 
@@ -72,8 +72,6 @@ NAMES = st.text("abuy1:/ <[-],\"'", min_size=1, max_size=8).map(lambda text: f"x
 def test_any_numbers_and_names(tmp_path_factory, numbers, names):
     path = tmp_path_factory.getbasetemp() / "any.csv"
     data = np.array(numbers).reshape(2, 1, 2) * (1 + 1j)
-    if not np.all(np.isfinite(data)):
-        return
     frf = Frf([1.0, 2.0], data, inputs=names[:1], outputs=names[1:])
     if any(" <- " in name for name in names):
         with pytest.raises(LabelError, match="rename the channel"):
