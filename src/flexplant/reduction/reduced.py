@@ -66,7 +66,8 @@ class Spanned:
             When there are not k rows.
         """
         if isinstance(q, list | tuple):
-            q = complex_array(q, "q")
+            listed = complex_array(q, "q")
+            q = listed if np.iscomplexobj(q) else listed.real
         if np.iscomplexobj(q):
             parts = np.asarray(q)
             return np.asarray(self.expand(parts.real) + 1j * self.expand(parts.imag))
