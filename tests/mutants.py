@@ -2,8 +2,8 @@
 
 Two kinds: each check that raises CertificateError, switched off, so that a wrong answer passes (a
 test must hand it one); and the lines of `LINES`, a factor or term wrong in a place that matters. A
-mutant is made in a copy of the package, and dies when a fast test of its room, or of
-`test_certificates.py`, fails. Not part of the suite: some seconds for each. Prints which live.
+mutant is made in a copy of the package, and dies when a fast test of `test_certificates.py` or of
+its room fails. Not part of the suite: some seconds for each. Prints which live.
 """
 
 from __future__ import annotations
@@ -121,16 +121,21 @@ def dies(mutant: Mutant) -> bool:
         module.write_text(source[: mutant.start] + mutant.text + source[mutant.end :])
         command = [
             *(sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"),
-            *(
-                "-m",
-                "not slow and not benchmark",
-                f"tests/test_{mutant.room}",
-                "tests/test_certificates.py",
-            ),
+            *("-m", "not slow and not benchmark", "tests/test_certificates.py", *_tests(mutant)),
         ]
         setting = os.environ | {"PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1"}
         done = subprocess.run(command, cwd=TOP, env=setting, capture_output=True, check=False)
     return done.returncode == 1
+
+
+def _tests(mutant: Mutant) -> list[str]:
+    """Return the test files of the mutant's room, those that share words with its module first."""
+    words = set(mutant.module.relative_to(SOURCE).with_suffix("").as_posix().split("/")[1:])
+    words |= {part for word in words for part in word.split("_")}
+    files = sorted((TOP / "tests").glob(f"test_{Path(mutant.room).stem}/test_*.py"))
+    files += (TOP / "tests").glob(f"test_{Path(mutant.room).stem}.py")
+    files.sort(key=lambda file: -len(words.intersection(file.stem.split("_"))))
+    return [str(file) for file in files]
 
 
 def main() -> None:

@@ -16,9 +16,10 @@ from flexplant.estimation.error import error_variances
 from flexplant.estimation.left_out import left_out
 from flexplant.lti import lowpass
 from flexplant.modes import solve_modes
-from flexplant.plant import Sensor, assemble_plant, larger_plant
+from flexplant.plant import Disturbance, Sensor, assemble_plant, larger_plant
 from flexplant.reduction import DesiredDofs, ModalTruncation, reduce
-from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
+from flexplant.structure import FEModel, ModalDamping, chain, kirchhoff_plate
+from flexplant.testbeds import three_masses
 from oracles_estimation import error_by_frequency, truncated_covariance
 from plates import make_plate
 from stages import CORNERS, INSET, fitted, ports, sampled
@@ -90,6 +91,17 @@ def test_covariances_are_those_of_the_closed_form():
     scale = np.sqrt(np.outer(*[np.diag(expected)] * 2))
     whole = np.block([[found.pois, found.cross], [found.cross.T, found.sensors]])
     np.testing.assert_allclose(whole / scale, expected / scale, atol=1e-9)
+
+
+def test_a_filter_far_above_all_modes_changes_no_covariance():
+    modes = solve_modes(chain(masses=[1.0] * 4, stiffnesses=[4e5] * 3), damping=ModalDamping(0.01))
+    found = []
+    for shape in (None, lowpass(1e6)):
+        w = [Disturbance("amp", at="1:x", asd=1.0, shape=shape)]
+        channels = three_masses().assembled.ports.replace(w=w)
+        plant = assemble_plant(modes.select([0, 1, 2]), channels).discretized(2e3, delay=1)
+        found.append(float(left_out(plant, larger_plant(plant, modes)).pois[0, 0]))
+    assert found[1] == pytest.approx(found[0], rel=1e-6, abs=0)
 
 
 @pytest.mark.slow

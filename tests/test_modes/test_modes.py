@@ -8,6 +8,7 @@ import pytest
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.labels import DofSet
 from flexplant.modes import Modes, solve_modes
+from flexplant.modes.matching import mac
 from flexplant.store import load
 from flexplant.structure import ModalDamping
 from plates import make_plate
@@ -124,3 +125,8 @@ def test_residual_is_that_of_the_equation():
     np.testing.assert_allclose(
         modes.residual[3:], (left / np.linalg.norm(force, axis=0))[3:], rtol=1e-3
     )
+
+
+def test_mac_is_one_for_a_scaled_shape_and_zero_for_an_orthogonal_one():
+    X = np.array([[1.0, 0.0], [1j, 0.0], [0.0, 2.0]])
+    np.testing.assert_allclose(mac(X, X * (3 - 4j)), np.eye(2), atol=1e-15)

@@ -2,18 +2,12 @@
 
 import numpy as np
 
-from flexplant.modes.matching import mac
 from flexplant.updating.point_model import pair
 
 
 def turned(degrees):
     a = np.deg2rad(degrees)
     return np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
-
-
-def test_mac_is_one_for_a_scaled_shape_and_zero_for_an_orthogonal_one():
-    X = np.array([[1.0, 0.0], [1j, 0.0], [0.0, 2.0]])
-    np.testing.assert_allclose(mac(X, X * (3 - 4j)), np.eye(2), atol=1e-15)
 
 
 def test_distant_modes_that_swap_are_followed():
