@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from ...checks import FloatArray
+from ...tolerances import TINY
 from ..building import rebuilt
 from ..realisation import ModalRealisation
 from ..standard import StandardPlant
@@ -14,6 +17,14 @@ from .uncertain_plant import Delta, UncertainPlant, changed_modes, modal_realisa
 
 #: kinds of Deltas that say the same of the modes of a larger plant
 _OF_MODES = ("freq", "damping")
+#: std of the damping of a mode that was not measured, as a part of it (one structure's modes
+#: scatter by 20 to 40 %)
+_DAMPING = 0.3
+#: a frequency that is not known to so many half-widths of its resonance was not measured
+_MEASURED = 2.0
+#: modes of the plant further off in the larger model, relative, are others: the last ones of a
+#: reduced model stand for compliance
+_SAME = 0.05
 
 
 def draws_with_left_out(
@@ -27,22 +38,15 @@ def draws_with_left_out(
     """Return machines of a larger plant, drawn one by one; None where no Delta is of its modes.
 
     The plant's own modes are off as its Deltas say, normally with 1 at some deviations. Nothing is
-    measured of the modes left out: each frequency is off like that of the plant's least known.
+    measured of the modes left out: each frequency is off like that of the plant's least known. The
+    damping of a mode that was not measured is off by 30 % (std): a loop may live on it.
     """
-    kinds = {delta.kind for delta in uncertain.deltas}
-    if uncertain.fit is not None or not kinds <= set(_OF_MODES) or not whole.has_own_modes:
+    unknown = _Unmeasured.of(uncertain, whole)
+    if unknown is None:
         return None
-    deltas = list(uncertain.deltas)
-    covariance = uncertain.covariance
+    deltas, covariance = list(uncertain.deltas), uncertain.covariance
     realisation = modal_realisation(whole)
-    own = uncertain.plant.assembled.realisation.n_modes
-    ranges = uncertain.frequencies
-    least = max(ranges.values(), default=0.0)
-    left = [
-        Delta(f"mode{mode}:freq", mode, "freq", 2.0 * least)
-        for mode in range(own + 1, realisation.n_modes + 1)
-        if least
-    ]
+    left = [*unknown.frequencies, *unknown.damping(uncertain.deviations * _DAMPING)]
     deviation = np.sqrt(np.diag(covariance))
     root = np.linalg.cholesky(
         covariance / np.outer(deviation, deviation) + 1e-9 * np.eye(deviation.size)
@@ -61,6 +65,66 @@ def draws_with_left_out(
     return (one(each) for each in rng.spawn(count))
 
 
+def damped_less(
+    uncertain: UncertainPlant[StandardPlant], whole: StandardPlant
+) -> tuple[StandardPlant, dict[int, float]] | None:
+    """Return a larger plant whose modes that were not measured have less damping, by two deviations.
+
+    And by what share the frequency of each may be off with it: of the plant's own half of what is
+    known, one deviation. None as for `draws_with_left_out`.
+    """
+    unknown = _Unmeasured.of(uncertain, whole)
+    if unknown is None:
+        return None
+    lower = [(delta, -delta.scale) for delta in unknown.damping(2.0 * _DAMPING)]
+    ranges = {delta.mode: 0.5 * delta.scale for delta in unknown.frequencies}
+    given = uncertain.frequencies.items()
+    own = {mode: 0.5 * share for mode, share in given if mode in unknown.modes}
+    return rebuilt(whole, realisation=changed_modes(whole, lower)), ranges | own
+
+
+@dataclass(frozen=True)
+class _Unmeasured:
+    """Modes of a larger plant that were not measured, and the frequencies of those left out."""
+
+    modes: tuple[int, ...]
+    frequencies: tuple[Delta, ...]
+
+    @classmethod
+    def of(cls, uncertain: UncertainPlant[StandardPlant], whole: StandardPlant) -> Self | None:
+        """Return them; None where a Delta is of something else than modes."""
+        kinds = {delta.kind for delta in uncertain.deltas}
+        if uncertain.fit is not None or not kinds <= set(_OF_MODES) or not whole.has_own_modes:
+            return None
+        realisation, ranges = modal_realisation(whole), uncertain.frequencies
+        omega, zeta = _frequencies(realisation)
+        own = _frequencies(modal_realisation(uncertain.plant))[0]
+        least = max(ranges.values(), default=0.0)
+        rigid, n = realisation.n_rigid, min(own.size, omega.size)
+        same = np.abs(own[:n] - omega[:n]) <= _SAME * omega[:n]
+        left = [
+            i + 1
+            for i in range(rigid, realisation.n_modes)
+            if least and i + 1 not in ranges and not (i < n and same[i])
+        ]
+        wide = [mode for mode, r in ranges.items() if r > _MEASURED * zeta[mode - 1]]
+        known = {delta.mode for delta in uncertain.deltas if delta.kind == "damping"}
+        modes = tuple(mode for mode in sorted({*left, *wide} - known) if zeta[mode - 1] < 1.0)
+        return cls(modes, tuple(Delta(f"mode{m}:freq", m, "freq", 2.0 * least) for m in left))
+
+    def damping(self, scale: float) -> list[Delta]:
+        """Return the damping of each as a Delta."""
+        return [Delta(f"mode{m}:damping", m, "damping", scale) for m in self.modes]
+
+
+def _frequencies(realisation: ModalRealisation) -> tuple[FloatArray, FloatArray]:
+    """Return angular frequencies [rad/s] and damping ratios of modes, 0 of rigid-body ones."""
+    omega = np.sqrt(np.maximum(np.linalg.det(realisation.pairs), 0.0))
+    omega[: realisation.n_rigid] = 0.0
+    trace = np.trace(realisation.pairs, axis1=1, axis2=2)
+    return omega, -0.5 * trace / np.maximum(omega, TINY)
+
+
 def _mixed(
     realisation: ModalRealisation, rng: np.random.Generator, size: float
 ) -> ModalRealisation:
@@ -75,8 +139,7 @@ def _mixed(
     """
     n, r = realisation.pairs.shape[0], realisation.n_rigid
     real = ~np.any(realisation.inputs[:, ::2], axis=0)
-    omega = np.sqrt(np.maximum(np.linalg.det(realisation.pairs), 0.0))
-    omega[:r] = 0.0
+    omega, _ = _frequencies(realisation)
     E = np.triu(size * rng.standard_normal((n, n)), 1)
     E = E + E.T
     gap = omega[:, None] ** 2 - omega**2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +29,7 @@ from ...plant import (
     standard_plant,
 )
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ...plant.uncertainty.whole_machines import draws_with_left_out
+from ...plant.uncertainty.whole_machines import damped_less, draws_with_left_out
 from ..controller import Controller, with_left_out
 from .hinf_design import tolerant, tolerant_system
 from .hinf_riccati import Riccati
@@ -163,6 +163,8 @@ class _StageTask:
         self.best: _StageTry | None = None
         known = self.plant.uncertain(frequency=self.ranges, modes=list(self.ranges))
         loop_plant = self.plant if self.whole is None else self.whole
+        #: what was not measured damped by two deviations less, and the ranges of its frequencies
+        self.damped_less = damped_less(known, loop_plant)
         #: machines on which a loop must hold, made when they are first needed; the same for all
         self.machines = _Drawn(
             draws_with_left_out(known, loop_plant, generator(0), _DRAWS, shapes=_SHAPES)
@@ -229,8 +231,13 @@ class _StageTask:
         loop = close_loop(self.plant, block)
         wholes = [] if self.whole is None else [close_loop(self.whole, block)]
         margin = min(one.modulus_margin if one.is_stable else 0.0 for one in (loop, *wholes))
-        if margin < self.margin or not self._tolerates(loop):
+        if margin < self.margin or not self._tolerates(loop, self.ranges):
             return margin, 0.0
+        if self.damped_less is not None:
+            plant, ranges = self.damped_less
+            thin = (wholes or [loop])[0].around(plant)
+            if not thin.is_stable or not self._tolerates(thin, ranges):
+                return margin, 0.0
         least = 1.0
         for machine in self.machines:
             one = loop.around(machine)
@@ -242,10 +249,10 @@ class _StageTask:
     def _block(self, system: StateSpace) -> StateSpace:
         return series(self.errors, system).replace(name="stage")
 
-    def _tolerates(self, loop: ClosedLoop) -> bool:
+    def _tolerates(self, loop: ClosedLoop, ranges: Mapping[int, float]) -> bool:
         """Return whether any one mode may be off as far as it is uncertain."""
         found = loop.mode_tolerances(margin=_KEPT * self.margin)
-        needed = np.array([self.ranges.get(int(mode), 0.0) for mode in found.modes])
+        needed = np.array([ranges.get(int(mode), 0.0) for mode in found.modes])
         return not np.any(found.least < needed)
 
     def search(self, bar: Progress) -> None:
