@@ -1,8 +1,8 @@
 """Loops promised and measured, on machines of another formulation than the design model's.
 
-Run with ``-m benchmark -s``: some seven minutes. The drawing is a mesh with 24 modes; the machines
+Run with ``-m benchmark -s``: some fifteen minutes. The drawing is a mesh with 24 modes; machines
 are plates in polynomials with rotary inertia, scattered stiffness and damping (0.1 % on average),
-0.3 to 0.9 kg that no drawing shows and a second mass. Their first ten poles are measured to 1e-5;
+0.2 to 0.9 kg that no drawing shows and a second mass. Their first ten poles are measured to 1e-5;
 four of them give mass and stiffness, all calibrate the model, the fit says what is not known.
 """
 
@@ -16,7 +16,10 @@ import flexplant as fx
 
 pytestmark = pytest.mark.benchmark
 
-RATE, ZETA, MACHINES = 10e3, 0.001, 3
+RATE, ZETA = 10e3, 0.001
+#: numbers of the machines and the mass [kg] that no drawing shows
+MACHINES = {301: 0.3, 302: 0.6, 303: 0.9}
+LONG = {811: 0.2, 812: 0.5, 813: 0.8}
 MATERIAL = {"density": 2702, "poisson_ratio": 0.35}
 MODULUS = 70e9
 #: size [m], thickness [m], elements, actuators as parts of the size
@@ -27,6 +30,7 @@ CASES = {
                                                       (0.67, 0.8))),
     "small and thick": ((0.5, 0.35), 0.03, (8, 6), ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75),
                                                     (0.75, 0.75))),
+    "long": ((0.7, 0.4), 0.025, (10, 6), ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))),
 }  # fmt: skip
 
 
@@ -71,13 +75,13 @@ def test_promised_and_measured(name):
     size, thickness, elements, forces = CASES[name]
     own = ports(size, forces)
     print(f"\n{name}: margin promised, with the modes left out, on the machine; |S| < 1 up to")
-    for seed in range(301, 301 + MACHINES):
+    for seed, mass in (LONG if name == "long" else MACHINES).items():
         machine = fx.testbeds.wafer_stage(
             size=size,
             thickness=thickness,
             damping=ZETA,
             individual=seed,
-            added_mass=0.3 + 0.3 * (seed - 301),
+            added_mass=mass,
             rate=RATE,
         )
         model, whole, off = models(machine, size, thickness, elements, seed)
@@ -93,9 +97,9 @@ def test_promised_and_measured(name):
         margins = [promised, promised.completed, loop]
         said = "  ".join(f"{one.modulus_margin:.3f}" for one in margins)
         print(f"  machine {seed}: {said}  {reach:5.1f} Hz  ({spent:.0f} s of CPU)")
-        # design_stage draws machines with modes left out and shapes off: of the small plate machine
-        # 302 was 0.33 for 0.43 without, 811 is 0.456 for 0.454 with them. The bound stays wide, for
-        # that is no proof: a plate of 0.7 x 0.4 x 0.025 m (10 x 6 elements, actuators at quarters,
-        # machine 811 with 0.2 kg) promises 0.415, keeps 0.406 on those drawn, and has 0.222
-        assert loop.modulus_margin > 0.6 * promised.completed.modulus_margin
+        # design_stage draws machines with modes left out, shapes and damping off: without shapes
+        # machine 302 of the small plate was 0.33 for 0.43; without less damping of modes that were
+        # not measured the long plate 811 was 0.22 for 0.41 (a mode left out, 2 % lower and of a
+        # third less damping, half of which the controller takes away)
+        assert loop.modulus_margin > 0.8 * promised.completed.modulus_margin
         assert np.isfinite(reach)

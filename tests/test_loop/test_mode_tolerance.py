@@ -211,7 +211,10 @@ def test_draws_are_loops_around_machines_by_hand():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the loop hangs on", "ignore:.*modes that the plant left out")
 def test_modes_left_out_are_off_too_on_machines_drawn():
-    """The plant has 12 of 15 modes: the poles of machines with all 15 off, by hand, judge."""
+    """The plant has 12 of 15 modes: the poles of machines with all 15 off, by hand, judge.
+
+    The damping of the three that it left out scatters by 30 %.
+    """
     few = sampled(some_modes(ZETA, 12, attached=False), ports(asd=1e-2))
     known = few.uncertain(frequency=0.002)
     short = fx.close_loop(few, *loop().blocks, larger=plant())
@@ -223,6 +226,9 @@ def test_modes_left_out_are_off_too_on_machines_drawn():
         for mode, value in enumerate(off, 4):
             rows = [g.states.index(f"mode{mode}:{part}") for part in "qv"]
             A[rows[1], rows[0]] *= 1.0 + 0.002 * value  # at two deviations 0.2 % of frequency
+        for mode, value in enumerate(own.spawn(1)[0].standard_normal(3), 13):
+            row = g.states.index(f"mode{mode}:v")
+            A[row, row] *= np.exp(0.3 * value)
         stable.append(closed_radius(A) < 1.0)
     assert np.array_equal(found.margins > 0, stable)
     assert 0 < found.stable < 1

@@ -15,6 +15,7 @@ from flexplant.identification import MeasuredModes
 from flexplant.lti import StateSpace, frequency_response, lft, lowpass
 from flexplant.plant import BaseAcceleration, Poi, Ports, Sensor, StandardPlant, assemble_plant
 from flexplant.plant.uncertainty.neglected import neglected_modes
+from flexplant.plant.uncertainty.whole_machines import damped_less, draws_with_left_out
 from flexplant.testbeds import wafer_stage
 from flexplant.updating import AddedDamping, AddedMass, Eigenvalues, update
 from oracles_plant import machine, motion_row, undamped, z_row
@@ -247,6 +248,44 @@ def test_seeds_belong_to_machines():
     first, second = uncertain.sample(rng, 1), uncertain.sample(rng, 1)
     assert np.array_equal(first[0].system.A, three[0].system.A)
     assert not np.array_equal(first[0].system.A, second[0].system.A)
+
+
+def test_machines_with_modes_left_out_have_their_damping_off_too():
+    """A reduced model whose last mode stands for compliance, beside a model of 40 modes."""
+    small = assemble_plant(reduced(0.001), ports())
+    whole = assemble_plant(some_modes(0.001, 40, attached=False), ports())
+    # modes up to 10 measured, those up to 24 not
+    ranges = {mode: 1e-4 if mode < 11 else 0.01 for mode in range(4, 25)}
+    uncertain = small.uncertain(frequency=ranges)
+
+    def numbers(plant):
+        """Frequencies [rad/s] and damping ratios of the elastic modes, from the matrix."""
+        poles = np.linalg.eigvals(plant.assembled.realisation.A)
+        poles = poles[poles.imag > 1.0]
+        poles = poles[np.argsort(np.abs(poles))]
+        return np.abs(poles), -poles.real / np.abs(poles)
+
+    omega, zeta = numbers(whole)
+    thin, off = damped_less(uncertain, whole)
+    same, less = numbers(thin)
+    np.testing.assert_allclose(same, omega, rtol=1e-9)
+    # mode 25 of the reduced model is none of the structure: that of the larger one is left out
+    wanted = np.where(np.arange(4, 41) < 11, 1.0, np.exp(-0.6))
+    np.testing.assert_allclose(less / zeta, wanted, rtol=1e-6)
+    assert off == pytest.approx(
+        dict.fromkeys(range(11, 25), 0.005) | dict.fromkeys(range(25, 41), 0.01)
+    )
+    drawn = draws_with_left_out(uncertain, whole, np.random.default_rng(0), 400)
+    # by stiffness and damping force, whose order is that of the modes
+    pairs = np.array([np.array(one.assembled.realisation.pairs[3:]) for one in drawn])
+    own = whole.assembled.realisation.pairs[3:]
+    spread = np.std(np.linalg.det(pairs) / np.linalg.det(own), axis=0)
+    spread_of = np.std(
+        np.log(np.trace(pairs, axis1=2, axis2=3) / np.trace(own, axis1=1, axis2=2)), axis=0
+    )
+    share = np.array([ranges.get(mode, 0.01) for mode in range(4, 41)])
+    np.testing.assert_allclose(spread / share, 1.0, atol=0.15)  # half of it, twice of omega^2
+    np.testing.assert_allclose(spread_of, np.where(np.arange(4, 41) < 11, 0.0, 0.3), atol=0.045)
 
 
 def seen_and_pushed():

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from ...checks import FloatArray
-from ...tolerances import TINY
+from ...tolerances import SAME, TINY
 from ..building import rebuilt
 from ..realisation import ModalRealisation
 from ..standard import StandardPlant
@@ -17,7 +17,7 @@ from .uncertain_plant import Delta, UncertainPlant, changed_modes, modal_realisa
 
 #: kinds of Deltas that say the same of the modes of a larger plant
 _OF_MODES = ("freq", "damping")
-#: std of the damping of a mode that was not measured, as a part of it (one structure's modes
+#: std of the logarithm of the damping of a mode that was not measured (one structure's modes
 #: scatter by 20 to 40 %)
 _DAMPING = 0.3
 #: a frequency that is not known to so many half-widths of its resonance was not measured
@@ -39,14 +39,13 @@ def draws_with_left_out(
 
     The plant's own modes are off as its Deltas say, normally with 1 at some deviations. Nothing is
     measured of the modes left out: each frequency is off like that of the plant's least known. The
-    damping of a mode that was not measured is off by 30 % (std): a loop may live on it.
+    logarithm of the damping of a mode that was not measured is off by 0.3: a loop may live on it.
     """
     unknown = _Unmeasured.of(uncertain, whole)
     if unknown is None:
         return None
     deltas, covariance = list(uncertain.deltas), uncertain.covariance
-    realisation = modal_realisation(whole)
-    left = [*unknown.frequencies, *unknown.damping(uncertain.deviations * _DAMPING)]
+    left = list(unknown.frequencies)
     deviation = np.sqrt(np.diag(covariance))
     root = np.linalg.cholesky(
         covariance / np.outer(deviation, deviation) + 1e-9 * np.eye(deviation.size)
@@ -57,9 +56,11 @@ def draws_with_left_out(
             deviation * (root @ own_rng.standard_normal(deviation.size)),
             own_rng.standard_normal(len(left)) / uncertain.deviations,
         ])  # fmt: skip
+        (apart,) = own_rng.spawn(1)
+        scattered = np.exp(_DAMPING * apart.standard_normal(len(unknown.modes)))
         every = [*deltas, *left]
         changes = [(d, float(max(d.scale * x, -0.9))) for d, x in zip(every, amounts, strict=True)]
-        modes = changed_modes(whole, changes)
+        modes = changed_modes(whole, [*changes, *unknown.damped(scattered)])
         return rebuilt(whole, realisation=_mixed(modes, own_rng, shapes) if shapes else modes)
 
     return (one(each) for each in rng.spawn(count))
@@ -68,7 +69,7 @@ def draws_with_left_out(
 def damped_less(
     uncertain: UncertainPlant[StandardPlant], whole: StandardPlant
 ) -> tuple[StandardPlant, dict[int, float]] | None:
-    """Return a larger plant whose modes that were not measured have less damping, by two deviations.
+    """Return a larger plant whose unmeasured modes have less damping, 0.55 times (two deviations).
 
     And by what share the frequency of each may be off with it: of the plant's own half of what is
     known, one deviation. None as for `draws_with_left_out`.
@@ -76,7 +77,7 @@ def damped_less(
     unknown = _Unmeasured.of(uncertain, whole)
     if unknown is None:
         return None
-    lower = [(delta, -delta.scale) for delta in unknown.damping(2.0 * _DAMPING)]
+    lower = unknown.damped(np.full(len(unknown.modes), np.exp(-2.0 * _DAMPING)))
     ranges = {delta.mode: 0.5 * delta.scale for delta in unknown.frequencies}
     given = uncertain.frequencies.items()
     own = {mode: 0.5 * share for mode, share in given if mode in unknown.modes}
@@ -107,14 +108,17 @@ class _Unmeasured:
             for i in range(rigid, realisation.n_modes)
             if least and i + 1 not in ranges and not (i < n and same[i])
         ]
-        wide = [mode for mode, r in ranges.items() if r > _MEASURED * zeta[mode - 1]]
+        wide = [mode for mode, r in ranges.items() if r > _MEASURED * (1.0 + SAME) * zeta[mode - 1]]
         known = {delta.mode for delta in uncertain.deltas if delta.kind == "damping"}
         modes = tuple(mode for mode in sorted({*left, *wide} - known) if zeta[mode - 1] < 1.0)
         return cls(modes, tuple(Delta(f"mode{m}:freq", m, "freq", 2.0 * least) for m in left))
 
-    def damping(self, scale: float) -> list[Delta]:
-        """Return the damping of each as a Delta."""
-        return [Delta(f"mode{m}:damping", m, "damping", scale) for m in self.modes]
+    def damped(self, factors: FloatArray) -> list[tuple[Delta, float]]:
+        """Return the changes by which the damping of each is a multiple of what it was."""
+        return [
+            (Delta(f"mode{mode}:damping", mode, "damping", 1.0), float(factor - 1.0))
+            for mode, factor in zip(self.modes, factors, strict=True)
+        ]
 
 
 def _frequencies(realisation: ModalRealisation) -> tuple[FloatArray, FloatArray]:
