@@ -299,3 +299,12 @@ def test_a_loop_is_held_to_each_objective():
     with pytest.raises(CertificateError, match="not stable"):
         wrong = found.system.replace(C=-1e3 * found.system.C, D=-1e3 * found.system.D)
         design._verified(plant, wrong, fx.synthesis.Hinf(), ())
+
+
+def test_a_simpler_controller_may_lose_what_is_allowed_and_no_more():
+    order = import_module("flexplant.synthesis.aftercare.order")
+    before = order.LoopFacts(True, 0.9, 1.0, True, 0.5, 2.0)
+    order.required(before, before._replace(margin=0.451, gamma=2.19), 0.1, "")
+    for worse in ({"margin": 0.449}, {"gamma": 2.21}, {"is_stable": False}):
+        with pytest.raises(CertificateError, match="refused"):
+            order.required(before, before._replace(**worse), 0.1, "")

@@ -92,6 +92,8 @@ def sections(item):
 
 
 def parameters(item):
+    if getattr(item, "_is_protocol", False):  # nobody makes one
+        return []
     return [p for p in inspect.signature(item).parameters.values() if p.name not in ("self", "cls")]
 
 

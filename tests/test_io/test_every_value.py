@@ -90,6 +90,8 @@ def made():
     yield from (forward, LearnedFeedforward(forward, np.ones(2), np.ones((2, 3, 5))))
     yield from (fx.Specification(noise=1e-6), fx.Specification(noise=1e-6).check(loop))
     yield from (fx.simulation.Saturation(1.0, rate=10.0), fx.simulation.Quantiser(1e-9))
+    yield from (fx.simulation.Hysteresis(0.1), fx.simulation.Dropout(0.01))
+    yield fx.simulation.Jitter(1e-5)
     yield fx.simulation.MachinePipeline(rom, fe, unknowns, ports(), RATE, 1, [6])
     yield fx.simulation.MachineReport(
         {"mass": 0.5}, poles, fit, static, (static.system, servo), None, loop, response

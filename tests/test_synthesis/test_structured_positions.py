@@ -1,10 +1,13 @@
 """Controllers over a range of positions, judged where they were not designed."""
 
+import numpy as np
 import pytest
 from test_structured import judged, law, machine
 
 from flexplant.errors import ModelError
+from flexplant.lti import StateSpace
 from flexplant.synthesis import TunedLaws, design_structured
+from flexplant.synthesis.plant_range import between
 
 
 def moving(places=(0.0, 0.5, 1.0)):
@@ -35,3 +38,10 @@ def test_plants_of_several_machines_are_no_range():
         design_structured({}, TunedLaws(law()))
     with pytest.raises(ModelError, match="a position"):
         design_structured({"left": machine()}, TunedLaws(law()))
+
+
+def test_between_two_places_matrices_are_linear():
+    one = StateSpace([[-1.0]], [[1.0]], [[2.0]], [[0.0]])
+    two = StateSpace([[-3.0]], [[5.0]], [[4.0]], [[8.0]])
+    found = between([one, two], np.array([0.0, 4.0]), 1.0)
+    assert [getattr(found, m).item() for m in "ABCD"] == [-1.5, 2.0, 2.5, 2.0]

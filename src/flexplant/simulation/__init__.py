@@ -1,7 +1,8 @@
 """Set-points, sampled-data runs of a closed loop, and what they say of the error.
 
-- `simulate(loop, reference=, duration=, rng=)`: a `Response`, with saturation, quantisation and
-  between samples where wished; noise as `fx.design_kalman` has it.
+- `simulate(loop, reference=, duration=, rng=)`: a `Response`, with `elements` of the field
+  (`Saturation`, `Quantiser`, `Hysteresis`, `Dropout`, `Jitter`, one's own) and between samples
+  where wished; noise as `fx.design_kalman` has it, `spectral_noise` of a measured spectrum or 1/f.
 - `setpoint`, `scan`: moves of bounded velocity, acceleration and jerk.
 - `design_feedforward`, `learn_feedforward`: forces for a move.
 - `Specification`: what is required of margins and errors; a verdict says what is reached.
@@ -90,6 +91,10 @@ from .motion import Motion as Motion
 from .motion import SetPoint as SetPoint
 from .motion import scan as scan
 from .motion import setpoint as setpoint
+from .nonlinear_elements import Dropout as Dropout
+from .nonlinear_elements import Element as Element
+from .nonlinear_elements import Hysteresis as Hysteresis
+from .nonlinear_elements import Jitter as Jitter
 from .nonlinear_elements import Quantiser as Quantiser
 from .nonlinear_elements import Saturation as Saturation
 from .response import Response as Response
@@ -98,6 +103,7 @@ from .rms_along import rms_along as rms_along
 from .simulate import simulate as simulate
 from .specification import Specification as Specification
 from .specification import Verdict as Verdict
+from .spectral_noise import spectral_noise as spectral_noise
 from .speed_certificate import SpeedCertificate as SpeedCertificate
 from .speed_certificate import certify_speed as certify_speed
 from .study import StudyTable as StudyTable

@@ -245,7 +245,7 @@ class MovingMachine(MovingPlant):
         self.generators, self.first = generators, 0
         self.x, self.c = np.tile(start[:n], (count, 1)), np.tile(start[n:], (count, 1))
         if self.sensed is not None:
-            self.sensed.begin(count)
+            self.sensed.begin(generators)
 
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
         """Run one stretch: w as `given` (k, nw) or (runs, k, nw) plus noise; return if finite."""

@@ -1,14 +1,24 @@
-"""What is not linear in a loop: limits and rates of actuators, steps of sensors."""
+"""What is not linear in a loop: limits, steps, hysteresis, lost samples, times that jitter."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
-from ..checks import FloatArray, Value, checked, instance, positive, real_array, short, whole
+from ..checks import (
+    FloatArray,
+    Value,
+    between,
+    checked,
+    instance,
+    positive,
+    real_array,
+    short,
+    whole,
+)
 from ..errors import ModelError, require_known, unknown_label
 from ..loop import ClosedLoop
 from ..loop.blocks import with_known
@@ -21,9 +31,19 @@ def _limit(value: Any, name: str) -> float:
     return np.inf if isinstance(value, float) and value == np.inf else positive(value, name)
 
 
+def _least(value: Any, name: str) -> float:
+    """Return a limit below, which is not positive."""
+    found = float(real_array(value, name, ()))
+    if found > 0:
+        raise ModelError(
+            f"{name} must not be positive, got {found:g}: signals start at 0. Give the limit below."
+        )
+    return found
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Saturation(Value):
-    """Limits of a signal: ``|v| <= limit``, and ``|dv/dt| <= rate`` from sample to sample.
+    """Limits of a signal: ``least <= v <= limit``, and ``|dv/dt| <= rate`` from sample to sample.
 
     Parameters
     ----------
@@ -31,11 +51,13 @@ class Saturation(Value):
         Largest magnitude; infinite when only the rate is limited.
     rate : float [unit/s], optional
         Largest change per time; the signal starts at 0. Not limited when not given.
+    least : float [unit of the channel], optional
+        Smallest value; ``-limit`` when not given. 0 for what only pushes.
 
     Raises
     ------
     ModelError
-        When a limit is not positive.
+        When a limit is not positive, or `least` is.
 
     Examples
     --------
@@ -51,15 +73,17 @@ class Saturation(Value):
 
     limit: float = field(default=np.inf, metadata=checked(_limit))
     rate: float | None = field(default=None, metadata=checked(positive))
+    least: float | None = field(default=None, metadata=checked(_least))
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.limit == np.inf and self.rate is None:
+        if self.limit == np.inf and self.rate is None and self.least is None:
             raise ModelError("a Saturation without limits does nothing: give limit, rate or both.")
 
     def __repr__(self) -> str:
         rate = "" if self.rate is None else f", rate {self.rate:g}/s"
-        return f"<Saturation: limit {self.limit:g}{rate}>"
+        least = "" if self.least is None else f", least {self.least:g}"
+        return f"<Saturation: limit {self.limit:g}{least}{rate}>"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -91,37 +115,201 @@ class Quantiser(Value):
     step: float = field(metadata=checked(positive))
 
 
-#: what may act on a channel: one, or a quantiser and a saturation together
-Element: TypeAlias = "Saturation | Quantiser | Sequence[Saturation | Quantiser]"
+#: what an element does to the values (runs,) of a channel at a sample; it returns as many
+Act: TypeAlias = Callable[[FloatArray], FloatArray]
+
+
+@runtime_checkable
+class Element(Protocol):
+    """What a nonlinear element of one's own has: `begin`. It may be any object.
+
+    >>> class DeadZone:
+    ...     def begin(self, dt, generators):
+    ...         return lambda values: np.sign(values) * np.maximum(np.abs(values) - 0.1, 0.0)
+    >>> isinstance(DeadZone(), Element)
+    True
+    """
+
+    def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
+        """Return what acts on the values (runs,) of the channel, sample after sample.
+
+        Parameters
+        ----------
+        dt : float [s]
+            Between two samples of the controller.
+        generators : sequence of Generator
+            One for each of the runs, for what is random: a run is then the same whichever others
+            are computed with it. What is remembered starts anew here.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Hysteresis(Value):
+    """Play of a signal, a gear or a magnet: it follows once it is pushed by `width`.
+
+    ``v[k] = max(u[k] - width, min(u[k] + width, v[k-1]))``, from 0. Sums of these are the model of
+    Prandtl and Ishlinskii.
+
+    Parameters
+    ----------
+    width : float [unit of the channel]
+        Half the width of the loop.
+
+    Raises
+    ------
+    ModelError
+        When it is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> loose = fx.simulation.Hysteresis(0.5).begin(1e-3, [None])
+    >>> [float(loose(np.array([u]))[0]) for u in (0.2, 2.0, 1.5, 0.4)]
+    [0.0, 1.5, 1.5, 0.9]
+    """
+
+    width: float = field(metadata=checked(positive))
+
+    def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
+        """Return the play of so many runs."""
+        now = np.zeros(len(generators))
+
+        def play(values: FloatArray) -> FloatArray:
+            np.maximum(values - self.width, np.minimum(values + self.width, now), out=now)
+            return now
+
+        return play
+
+
+@dataclass(frozen=True, eq=False)
+class Dropout(Value):
+    """Samples that get lost: the last one that came is read again.
+
+    Parameters
+    ----------
+    share : float
+        Of the samples, each by itself; the first one comes.
+
+    Raises
+    ------
+    ModelError
+        When it is not between 0 and 1.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> lossy = fx.simulation.Dropout(0.5).begin(1e-3, [np.random.default_rng(1)])
+    >>> [float(lossy(np.array([y]))[0]) for y in (1.0, 2.0, 3.0, 4.0, 5.0)]
+    [1.0, 2.0, 2.0, 4.0, 4.0]
+    """
+
+    share: float = field(
+        metadata=checked(between, low=0.0, high=1.0, hint="It is a part of the samples: 0.01.")
+    )
+
+    def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
+        """Return what loses samples of so many runs."""
+        last = np.full(len(generators), np.nan)
+
+        def read(values: FloatArray) -> FloatArray:
+            drawn = np.array([one.random() for one in generators])
+            np.copyto(last, values, where=(drawn >= self.share) | np.isnan(last))
+            return last
+
+        return read
+
+
+@dataclass(frozen=True, eq=False)
+class Jitter(Value):
+    """Times that jitter: a sensor is read early, or a command goes out late, by up to `spread`.
+
+    Uniform, in steps of the finer samples, each sample and channel by itself. It needs `finer`.
+
+    Parameters
+    ----------
+    spread : float [s]
+        The largest one; less than the time between two samples of the controller.
+
+    Raises
+    ------
+    ModelError
+        When it is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop, late = fx.close_loop(plant, observer, servo), {"u1": fx.simulation.Jitter(2e-4)}
+    >>> fx.simulate(loop, duration=0.1, elements=late, finer=5, rng=1)["u1:effort"].shape
+    (1000,)
+    """
+
+    spread: float = field(metadata=checked(positive))
+
+    def most(self, fine: float, finer: int, name: str) -> int:
+        """Return the largest number of finer samples."""
+        found = round(self.spread / fine)
+        if not 1 <= found < finer:
+            raise ModelError(
+                f"the jitter of {name!r}, {self.spread:.3g} s, must be between one finer sample "
+                f"({fine:.3g} s) and the time between two samples of the controller "
+                f"({finer * fine:.3g} s). Pass simulate(..., finer=) of at least 2, or another "
+                "spread."
+            )
+        return found
+
+
+#: what may act on a channel
+Acts: TypeAlias = "Saturation | Quantiser | Jitter | Element"
 
 
 class Acting:
     """The elements on some channels, sample after sample and in place.
 
     Values are quantised first, then limited in rate and magnitude: a converter before its
-    amplifier.
+    amplifier; then the others act as they were listed. `hold` finer samples of dt / hold are one.
     """
 
-    def __init__(self, names: Sequence[str], elements: Mapping[str, Element], dt: float) -> None:
+    def __init__(
+        self, names: Sequence[str], elements: Mapping[str, Any], dt: float, hold: int = 1
+    ) -> None:
         self.limit, self.change = np.full(len(names), np.inf), np.full(len(names), np.inf)
-        step = np.zeros(len(names))
+        self.below, step = np.full(len(names), -np.inf), np.zeros(len(names))
+        self.dt, self.hold, self.most = dt, hold, np.zeros(len(names), dtype=np.int64)
+        self.others: list[tuple[int, Element]] = []
         for name, element in elements.items():
             i = names.index(name)
             for one in _listed(name, element):
                 if isinstance(one, Quantiser):
                     step[i] = one.step
-                else:
+                elif isinstance(one, Jitter):
+                    self.most[i] = one.most(dt / hold, hold, name)
+                elif isinstance(one, Saturation):
                     self.limit[i] = one.limit
+                    self.below[i] = -one.limit if one.least is None else one.least
                     self.change[i] = np.inf if one.rate is None else one.rate * dt
+                else:
+                    self.others.append((i, one))
         self.step, self.coarse = divisor(step), step > 0
-        self.below = -self.limit
-        self.counts, self.limits = bool(np.any(self.coarse)), bool(np.any(np.isfinite(self.limit)))
+        self.counts, self.jitters = bool(np.any(self.coarse)), bool(np.any(self.most))
+        self.limits = bool(np.any(np.isfinite(self.limit) | np.isfinite(self.below)))
         self.is_slow = bool(np.any(np.isfinite(self.change)))
-        self.begin(1)
 
-    def begin(self, runs: int) -> None:
-        """Start at 0, so many runs side by side."""
-        self.last, self.low, self.high = np.zeros((3, runs, self.step.size))
+    def begin(self, generators: Sequence[np.random.Generator]) -> None:
+        """Start at 0, so many runs side by side; what is random is apart from the runs' noises."""
+        shape = (len(generators), self.step.size)
+        self.last, self.low, self.high = np.zeros((3, *shape))
+        self.acts: list[tuple[int, Act]] = []
+        if self.others or self.jitters:
+            own = [one.spawn(len(self.others) + 1) for one in generators]
+            self.drawn = [one[-1] for one in own]
+            for j, (i, one) in enumerate(self.others):
+                self.acts.append((i, one.begin(self.dt, [each[j] for each in own])))
+        self.due = np.zeros(shape, dtype=np.int64)
+        self.past = np.full((self.hold, *shape), np.nan)  # of a sensor's motion; commands: two
 
     def apply(self, values: FloatArray) -> None:
         """Let the elements act on the values (runs, n) of a sample, in place."""
@@ -141,11 +329,43 @@ class Acting:
             np.minimum(values, self.limit, out=values)
         if self.is_slow:
             np.copyto(self.last, values)
+        for i, act in self.acts:
+            found = act(values[:, i].copy())
+            if np.shape(found) != (len(values),):
+                raise ModelError(
+                    f"an element returned shape {np.shape(found)} for {len(values)} runs. Return "
+                    "one value for each run: element.begin(dt, generators)(values) is (runs,)."
+                )
+            values[:, i] = found
+
+    def read(self, j: int, motion: FloatArray, y: FloatArray) -> None:
+        """Read sensors early: put what they were into y (runs, n), `motion` being what they are."""
+        if not self.jitters:
+            return
+        if not j:
+            self._draw()
+            early = np.take_along_axis(self.past, (self.hold - self.due)[None] % self.hold, 0)[0]
+            y += np.where((self.due > 0) & ~np.isnan(early), early - motion, 0.0)
+        self.past[j] = motion
+
+    def send(self, j: int, command: FloatArray) -> None:
+        """Let commands (runs, n) go out late, in place: until then the one before acts."""
+        if not self.jitters:
+            return
+        if not j:
+            self._draw()
+            self.past[1] = np.nan_to_num(self.past[0])
+            self.past[0] = command
+        np.copyto(command, np.where(j >= self.due, self.past[0], self.past[1]))
+
+    def _draw(self) -> None:
+        for run, generator in enumerate(self.drawn):
+            self.due[run] = generator.integers(0, self.most, endpoint=True)
 
 
 def split_elements(
     elements: Any, sensors: Sequence[str], driven: Sequence[str]
-) -> tuple[dict[str, Element], dict[str, Element]]:
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the elements on sensors and on actuators, by channel."""
     if elements is None:
         return {}, {}
@@ -160,13 +380,15 @@ def split_elements(
     return on_y, {name: element for name, element in elements.items() if name not in on_y}
 
 
-def _listed(name: str, element: Any) -> list[Saturation | Quantiser]:
+def _listed(name: str, element: Any) -> list[Acts]:
     listed = list(element) if isinstance(element, list | tuple) else [element]
-    kinds = [type(one) for one in listed]
-    if not listed or not all(isinstance(one, Saturation | Quantiser) for one in listed):
+    known = (Saturation, Quantiser, Jitter)
+    kinds = [type(one) for one in listed if isinstance(one, known)]
+    own = [isinstance(one, Element) and not isinstance(one, type) for one in listed]
+    if not listed or len(kinds) + sum(own) < len(listed):
         raise ModelError(
-            f"the element on {name!r} must be a Saturation or a Quantiser, got {short(element)}. "
-            "Pass one, or a list of both."
+            f"the element on {name!r} must be a Saturation, Quantiser, Hysteresis, Dropout, Jitter "
+            f"or have their begin(dt, generators), got {short(element)}. Pass one, or a list."
         )
     if len(set(kinds)) < len(kinds):
         raise ModelError(f"{name!r} has two elements of one kind: give the tighter one.")
@@ -179,8 +401,8 @@ class Conditions(NamedTuple):
     `paths` are the places (n_time, 3) of POIs; the controller acts in every `finer`-th sample.
     """
 
-    on_y: Mapping[str, Element] = {}
-    on_u: Mapping[str, Element] = {}
+    on_y: Mapping[str, Any] = {}
+    on_u: Mapping[str, Any] = {}
     recovery: float | None = None
     finer: int = 1
     paths: Mapping[str, FloatArray] = {}

@@ -100,8 +100,10 @@ def step_through(
         x, following = states[k], states[k + 1]
         np.matmul(m.sense, x[:, :, None], out=measured)
         y[k] += measured[:, :, 0]
-        answer = out[k]
-        if k % hold:
+        answer, within = out[k], k % hold
+        if sensed is not None:
+            sensed.read(within, measured[:, :, 0], y[k])
+        if within:
             answer[:] = out[k - 1]
         else:
             if sensed is not None:
@@ -112,6 +114,8 @@ def step_through(
                 applied.apply(law_in[:, both:, 0])
             np.matmul(m.law, law_in, out=answer[:, :, None])
             law_in[:, :nc, 0] = answer[:, :nc]
+        if applied is not None:
+            applied.send(within, answer[:, nc:split])
         if nj:
             flow_in[:, :nj, 0] = x[:, m.columns]
         flow_in[:, nj:, 0] = answer[:, nc:split]
@@ -256,8 +260,8 @@ def _under(loop: ClosedLoop, noise: Drawn, met: Conditions) -> SampleBySample:
     if met.on_u:
         command, law = split_law(loop, None if met.recovery is None else met.recovery / dt)
         parts = parts._replace(command=command, law=law)
-        applied = Acting(loop.driven, met.on_u, dt)
-    sensed = Acting(plant.y, met.on_y, dt) if met.on_y else None
+        applied = Acting(loop.driven, met.on_u, dt, met.finer)
+    sensed = Acting(plant.y, met.on_y, dt, met.finer) if met.on_y else None
     moving = Moving(plant, met.paths) if met.paths else None
     return SampleBySample(loop, parts, noise, sensed, applied, moving, met.finer)
 
@@ -308,7 +312,7 @@ class SampleBySample:
         self.first = 0
         for acting in (self.sensed, self.applied):
             if acting is not None:
-                acting.begin(count)
+                acting.begin(generators)
 
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
         """Run one stretch: w as `given` (k, nw) or (runs, k, nw) plus noise; return if finite.

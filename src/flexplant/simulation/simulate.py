@@ -30,7 +30,7 @@ from ..plant import StandardPlant
 from ..tolerances import SAME, TYPED
 from .motion import SetPoint
 from .moving_machine import MovingMachine, trajectory
-from .nonlinear_elements import Acting, Element, conditions, finer_loop
+from .nonlinear_elements import Acting, Acts, conditions, finer_loop
 from .response import Response
 from .runs import make_runner
 
@@ -44,7 +44,7 @@ def simulate(
     duration: float,
     reference: Signal | Mapping[str, Signal] | None = None,
     disturbance: Mapping[str, Signal] | None = None,
-    elements: Mapping[str, Element] | None = None,
+    elements: Mapping[str, Acts | Sequence[Acts]] | None = None,
     anti_windup: float | None = None,
     moving: Mapping[str, Any] | None = None,
     finer: int = 1,
@@ -75,9 +75,11 @@ def simulate(
         Derivatives of a SetPoint that blocks read are taken from it.
     disturbance : mapping {name: signal}, optional
         For other channels of w, held over each sample, in addition to their noise.
-    elements : mapping {name: Saturation or Quantiser, or a list of both}, optional
+    elements : mapping {name: element, or a list of some}, optional
         What acts on channels of y before they are read, and on driven actuators: u is then what
-        they apply, and blocks that read an actuator's name (observers) are fed this.
+        they apply, and blocks that read an actuator's name (observers) are fed this. A
+        `Quantiser` acts first, then a `Saturation`, then others in their order: `Hysteresis`,
+        `Dropout`, any `Element` of one's own. `Jitter` moves the instants, unknown to blocks.
     anti_windup : float [s], optional
         Time constant in which integrators (all poles slower than it) of blocks that drive
         actuators return to what is applied while that is not what they command.

@@ -22,7 +22,7 @@ from ..synthesis import (
     second_order_sections,
     write_c,
 )
-from ..synthesis.laws.law import Element
+from ..synthesis.laws.law import LawElement
 
 #: a file that a browser hands over, at most [bytes]
 _LARGEST = 64_000_000
@@ -106,7 +106,7 @@ def given_file(data: bytes) -> LoopDesign | tuple[Any, ...]:
         return value
     if isinstance(value, Law):
         return (*value.factors,) if value.gain == 1.0 else (*value.factors, value.gain)
-    if isinstance(value, Element):
+    if isinstance(value, LawElement):
         return (value,)
     if isinstance(value, StateSpace | Controller | ShapedLoop):
         return (FixedBlock.of(value),)

@@ -18,7 +18,7 @@ from ...lti.frequency import Frf
 from ...lti.interconnection import side_by_side
 from ...lti.statespace import StateSpace
 from .design_script import design_script
-from .law import Element, Law, SingleElement
+from .law import Law, LawElement, SingleElement
 from .loop_design import Axes, DesignedLoops, axes_of, connected, made
 
 #: what feedforward gains act on, in this order
@@ -58,7 +58,7 @@ class ShapedAxis(Value):
 
     def __post_init__(self) -> None:
         given: Any = self.elements
-        if isinstance(given, Element):
+        if isinstance(given, LawElement):
             given = (given,)
         if not isinstance(given, Iterable) or isinstance(given, str | Mapping):
             raise ModelError(f"elements are a list of Pid, Lead, Notch ..., got {short(given)}.")
@@ -171,7 +171,7 @@ class LoopDesign(Value):
         found = {}
         for name, axis in axes.items():
             given: Any = axis
-            if isinstance(axis, Element | list | tuple):
+            if isinstance(axis, LawElement | list | tuple):
                 given = ShapedAxis(axis)  # type: ignore[arg-type]
             found[str(name)] = instance(given, ShapedAxis, f"axis {name!r}", "Pass a ShapedAxis.")
         names = tuple(found)

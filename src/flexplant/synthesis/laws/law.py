@@ -99,7 +99,7 @@ class BlockSection(NamedTuple):
         return self.own.A, self.own.B, self.own.C, self.own.D
 
 
-class Element(Value):
+class LawElement(Value):
     """A factor of a law: multiply elements, and numbers, to a `Law`."""
 
     @property
@@ -127,7 +127,7 @@ class Element(Value):
         """
         return self.law.sampled(rate)
 
-    def __mul__(self, other: Element | float) -> Law:
+    def __mul__(self, other: LawElement | float) -> Law:
         """Return the law of both in series; a number scales it."""
         return self.law * other
 
@@ -159,7 +159,7 @@ class Element(Value):
     __radd__ = __sub__ = __rsub__ = __add__
 
 
-class SingleElement(Element):
+class SingleElement(LawElement):
     """An element with one section."""
 
     @property
@@ -179,7 +179,7 @@ class SingleElement(Element):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Law(Element):
+class Law(LawElement):
     """A product of elements, from error to command: ``gain F1(s) F2(s) ...``.
 
     Sampled, each factor is mapped by Tustin's rule.
@@ -257,9 +257,9 @@ class Law(Element):
         """
         return self.replace(rate=positive(rate, "rate"))
 
-    def __mul__(self, other: Element | float) -> Law:
+    def __mul__(self, other: LawElement | float) -> Law:
         """Return the law of both in series; a number scales it."""
-        if isinstance(other, Element):
+        if isinstance(other, LawElement):
             law = other.law
             if self.rate and law.rate and self.rate != law.rate:
                 raise ModelError(

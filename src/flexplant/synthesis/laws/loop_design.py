@@ -20,7 +20,7 @@ from ...parallel import one_thread
 from ...plant import StandardPlant, decouple
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import checked_loop, unchecked
-from .law import Element, Law
+from .law import Law, LawElement
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -132,7 +132,7 @@ def axes_controller(axes: Axes, laws: Mapping[str, Law]) -> StateSpace:
 @one_thread()
 def design_loops(
     plant: StandardPlant | UncertainPlant[Any] | System | Frf,
-    laws: Element | Mapping[str, Element],
+    laws: LawElement | Mapping[str, LawElement],
     *,
     before: System | FloatArray | None = None,
     after: System | FloatArray | None = None,
@@ -266,9 +266,9 @@ def connected(axes: Axes, inner: StateSpace, references: Mapping[str, str]) -> S
     return system.replace(inputs=inputs, outputs=axes.before.outputs)
 
 
-def checked_laws(axes: Axes, laws: Element | Mapping[str, Element]) -> dict[str, Law]:
+def checked_laws(axes: Axes, laws: LawElement | Mapping[str, LawElement]) -> dict[str, Law]:
     """Return a law for each axis, at the rate of the plant."""
-    each = dict.fromkeys(axes.names, laws) if isinstance(laws, Element) else laws
+    each = dict.fromkeys(axes.names, laws) if isinstance(laws, LawElement) else laws
     if not isinstance(each, Mapping):
         raise ModelError(
             f"laws must be a law or a mapping {{axis: law}}, got {type(laws).__name__}. Pass a "
@@ -280,7 +280,7 @@ def checked_laws(axes: Axes, laws: Element | Mapping[str, Element]) -> dict[str,
         if name not in each:
             raise LabelError(f"axis {name!r} has no law: give one for each of {axes.names}.")
         element = each[name]
-        if not isinstance(element, Element):
+        if not isinstance(element, LawElement):
             raise ModelError(
                 f"the law of {name!r} is no product of elements: {short(element)}. Pass a product "
                 "of Pid, Lead, Notch and LowPass; a gain alone is Pid(gain)."

@@ -15,7 +15,7 @@ from ...errors import ModelError, require_known
 from ...lti.preparation import Prepared
 from ...lti.statespace import System
 from ...plant import StandardPlant
-from ..laws.law import Element, Law, SingleElement, chained
+from ..laws.law import Law, LawElement, SingleElement, chained
 from ..laws.loop_design import axes_of, checked_laws
 from .scaled_loop import Matrices
 from .structures import ControllerFamily, differenced
@@ -60,7 +60,7 @@ class TunedLaws(Value):
     ('p',)
     """
 
-    laws: Element | Mapping[str, Element]
+    laws: LawElement | Mapping[str, LawElement]
     before: System | FloatArray | None = None
     after: System | FloatArray | None = None
     free: Sequence[str] = field(default=_FREE, metadata=checked(name_list, name="free numbers"))
