@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from flexplant.errors import FlexplantWarning, ModelError
+from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.identification import H1Estimator, estimate_frf, identify_modes
 from flexplant.lti import Frf
 from flexplant.store import load
@@ -110,11 +110,11 @@ def test_a_record_of_force_and_motion_gives_five_radians_a_second():
     assert at_rest == pytest.approx(1.0, rel=0.1)
 
 
-def roving(shift, seed, zeta=0.004, n_in=1, step=0.1, truth=(40.0, 75.0, 110.0, 160.0)):
-    """Six outputs, each of a machine whose frequencies are off by a relative draw of its own."""
+def roving(shift, seed, zeta=0.004, n_in=1, step=0.1, truth=(40.0, 75.0, 110.0, 160.0), setups=6):
+    """Six outputs, each (or set-up) of a machine of frequencies off by a draw of its own."""
     rng, freq = np.random.default_rng(seed), np.arange(20.0, 200.0, step)
     phi, drive = rng.normal(size=(6, 4)), rng.normal(size=(n_in, 4)) + 1.0
-    draws = 1.0 + shift * rng.normal(size=6)
+    draws = np.repeat(1.0 + shift * rng.normal(size=setups), 6 // setups)
     H = np.array([
         modal_frf(freq, pole(np.array(truth) * own, zeta), phi[[o]], drive)[0]
         for o, own in enumerate(draws)
@@ -131,7 +131,7 @@ def test_outputs_of_a_roving_sensor_share_four_modes(shift, tmp_path):
     inside, count = 0, 2
     for seed in range(count):
         frf, truth = roving(shift, seed, step=0.3)
-        with pytest.warns(FlexplantWarning, match=r"outputs disagree .* by 0\.\d+%"):
+        with pytest.warns(FlexplantWarning, match=r"outputs disagree .* by 0\.\d+ %"):
             found = identify_modes(frf)
         assert len(found) == 4
         assert found.inconsistency == pytest.approx(shift, rel=0.9)
@@ -140,6 +140,36 @@ def test_outputs_of_a_roving_sensor_share_four_modes(shift, tmp_path):
     found.save(tmp_path / "found.npz")
     assert repr(load(tmp_path / "found.npz")) == repr(found)
     assert "means of their own" in repr(found)
+
+
+@pytest.mark.parametrize(("shift", "sensors"), [(1e-4, 8), (1e-3, 8), (1e-4, 2)])
+def test_inputs_of_a_roving_hammer_share_four_modes(shift, sensors):
+    """6 to 10 modes before where sensors are as many as places hit, in silence."""
+    frf, truth = roving(shift, 1, step=0.3, n_in=sensors)
+    back = {"data": frf.data.transpose(1, 0, 2), "variance": frf.variance.transpose(1, 0, 2)}
+    with pytest.warns(FlexplantWarning, match=r"inputs disagree .* by 0\.\d+ %"):
+        found = identify_modes(Frf(frf.freq, **back))
+    assert len(found) == 4
+    assert found.inconsistency == pytest.approx(shift, rel=0.9)
+    assert np.all(np.abs((found.poles - truth).imag) < 2.6 * found.std.imag)
+    assert f"inputs disagree by {found.inconsistency:.1e}" in repr(found)
+    assert found.shapes.shape == (sensors, 4)
+
+
+def test_what_was_measured_together_has_one_shift():
+    frf, truth = roving(1e-3, 3, step=0.3, n_in=2, setups=3)
+    y = list(frf.outputs)
+    with pytest.warns(FlexplantWarning, match="outputs disagree"):
+        found = identify_modes(frf, setups=[y[:2], y[2:4], y[4:]])
+    assert len(found) == 4
+    assert found.inconsistency == pytest.approx(1e-3, rel=0.9)
+    assert np.all(np.abs((found.poles - truth).imag) < 1.96 * found.std.imag)
+    with pytest.warns(FlexplantWarning, match="outputs disagree"):
+        each = identify_modes(frf)
+    assert np.all(found.std.imag > 1.2 * each.std.imag)  # known from three, not six
+    for wrong in ([y[:2], y[2:4]], [y], [[], y], ["y1", "y2"], [y, [*frf.inputs]]):
+        with pytest.raises(LabelError, match="each of the outputs"):
+            identify_modes(frf, setups=wrong)
 
 
 def test_default_orders_are_those_that_the_lines_afford():

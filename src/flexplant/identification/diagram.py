@@ -5,17 +5,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import BoolArray, ComplexArray, FloatArray, IntArray, Value, between, real_array
+from ..checks import (
+    BoolArray,
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    Value,
+    between,
+    real_array,
+    several,
+    short,
+    whole,
+)
 from ..errors import ModelError, ShapeError, SolverError, counted
 from ..modes.matching import assigned, in_span
 from ..tolerances import TINY
+from .line_weights import PreparedLines
 
 #: flags of a pole, each including the ones before
 NEW, FREQUENCY, DAMPING, STABLE = 0, 1, 2, 3
@@ -376,3 +390,143 @@ def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray:
         return np.asarray(la.lapack.zpotrs(factor, right)[0])
     # data without noise leave orders above the true one undetermined: the smallest solution then
     return np.asarray(la.lstsq(matrix, right, cond=1e-13, lapack_driver="gelsd")[0])
+
+
+#: the highest model order by default, and the lines that each order is to have then
+HIGHEST, LINES_OF_ORDER = 40, 4
+#: references times parts of the band from which every other order is enough: each is a large
+#: eigenvalue problem
+MANY = 4
+#: the most poles of a diagram's order, conjugates included: an eigenvalue problem of this size
+POLES = 100
+
+
+def affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
+    """Return the orders, by default as many as the lines afford; ModelError for too high ones."""
+    parts = windows(ready)
+    fewest = min(window.seen.stop - window.seen.start for window in parts)
+    if orders is None:
+        # four orders at least are compared, which twenty lines afford
+        references = ready.data.shape[1]
+        top = max(6, min(HIGHEST, fewest // LINES_OF_ORDER - 1, max(POLES // references, 10)))
+        return list(range(2, top + 1, 2 if len(parts) * references >= MANY else 1))
+    if 2 * (orders[-1] + 1) > fewest:
+        raise ModelError(
+            f"order {orders[-1]} needs more lines than the {ready.freq.size} of the band: lower "
+            "the orders or measure longer."
+        )
+    return orders
+
+
+def checked_orders(orders: Iterable[int]) -> list[int]:
+    """Return rising model orders."""
+    if not several(orders):
+        raise ModelError(
+            f"orders are whole numbers to compare, got {short(orders)}. Try range(2, 41)."
+        )
+    listed = sorted({whole(n, "each of orders") for n in orders})
+    if len(listed) < 4:
+        raise ModelError(
+            f"orders must be at least four whole numbers from 1 to compare, got {listed!r:.60}."
+        )
+    return listed
+
+
+#: lines of a part, and the share of it that is used beyond each of its ends
+LINES, OVERLAP = 400, 0.25
+#: poles this share of the band outside of it are looked for: they bend the responses inside
+MARGIN = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A part of the band: its own lines first..last, and those used."""
+
+    first: int
+    last: int
+    seen: slice
+
+
+def windows(ready: PreparedLines) -> list[Window]:
+    """Return parts of about 400 lines, cut where the responses are weakest."""
+    import scipy.ndimage as ndi
+
+    n_freq = ready.freq.size
+    count = max(1, round(n_freq / LINES))
+    power = np.sum(np.abs(ready.data * ready.weight) ** 2, axis=(0, 1))
+    power = ndi.uniform_filter1d(np.log(power + TINY), 9)
+    cuts = [0]
+    for i in range(1, count):
+        middle, reach = round(i * n_freq / count), n_freq // (4 * count)
+        cuts.append(middle - reach + int(np.argmin(power[middle - reach : middle + reach])))
+    cuts.append(n_freq)
+    parts = []
+    for first, last in pairwise(cuts):
+        beyond = round(OVERLAP * (last - first))
+        parts.append(Window(first, last, slice(max(0, first - beyond), min(n_freq, last + beyond))))
+    return parts
+
+
+def diagram_of(
+    ready: PreparedLines, orders: list[int], tolerances: tuple[float, float, float], max_zeta: float
+) -> StabilisationDiagram:
+    """Return the diagrams of all parts as one; a track belongs where its median lies."""
+    low, high = float(ready.freq[0]), float(ready.freq[-1])
+    edge = MARGIN * (high - low)
+    found = []
+    for window in windows(ready):
+        freq = ready.freq[window.seen]
+        moments = _moments(ready, window, orders[-1])
+        inside = partial(_inside, band=(float(freq[0]), float(freq[-1])), max_zeta=max_zeta)
+        results = [moments.solve(order, inside) for order in orders]
+        diagram = built_diagram(results, np.array([low, high]), tolerances)
+        ends = (
+            low - edge if window.first == 0 else ready.freq[window.first],
+            high + edge if window.last == ready.freq.size else ready.freq[window.last],
+        )
+        keep = np.zeros(len(diagram), dtype=bool)
+        for track in np.unique(diagram.tracks):
+            mine = diagram.tracks == track
+            keep[mine] = ends[0] <= np.median(diagram.freq[mine]) < ends[1]
+        found.append((diagram, keep))
+    offsets = np.cumsum([0] + [int(d.tracks.max(initial=-1)) + 1 for d, _ in found])
+    tracks = [d.tracks[k] + o for (d, k), o in zip(found, offsets[:-1], strict=True)]
+    return StabilisationDiagram(
+        np.concatenate([d.orders[k] for d, k in found]),
+        np.concatenate([d.poles[k] for d, k in found]),
+        np.concatenate([d.flags[k] for d, k in found]),
+        np.concatenate(tracks),
+        shapes=np.concatenate([d.shapes[:, k] for d, k in found], axis=1),
+        participation=np.concatenate([d.participation[:, k] for d, k in found], axis=1),
+        band=np.array([low, high]),
+    )
+
+
+def weighted_by_remainder(ready: PreparedLines, order: int) -> PreparedLines:
+    """Return the same with weights from what matrix fractions of high order leave."""
+    now = ready
+    n_out, n_in, n_freq = ready.data.shape
+    for _ in range(2):
+        error: FloatArray = np.zeros(ready.data.shape)
+        parts = windows(now)
+        for window in parts:
+            own = slice(window.first, window.last)
+            fitted: ComplexArray = _moments(now, window, order).response(order, now.freq[own])
+            error[:, :, own] = np.abs(now.data[:, :, own] - fitted) ** 2
+        share = (order + 1) * len(parts) / n_freq * (1 + n_in / n_out)
+        now = now.from_errors(error, min(0.5, share))
+    return now
+
+
+def _moments(ready: PreparedLines, window: Window, order: int) -> Moments:
+    seen = window.seen
+    return Moments(ready.freq[seen], ready.data[:, :, seen], ready.line_weight[:, seen], order)
+
+
+def _inside(poles: ComplexArray, band: tuple[float, float], max_zeta: float) -> BoolArray:
+    """Return which poles count in a part of the band."""
+    freq = np.abs(poles) / (2 * np.pi)
+    zeta = -poles.real / np.abs(poles)
+    edge = MARGIN * (band[1] - band[0])
+    keep = (freq > max(band[0] - edge, 0.5 * band[0])) & (freq < band[1] + edge)
+    return np.asarray(keep & (zeta > 0) & (zeta < max_zeta) & (poles.imag > 0))

@@ -12,7 +12,7 @@ from ..errors import SolverError, attempted
 from ..tolerances import RANK, TINY
 from .model_error import ALIKE, mac, strength, twin
 from .pole_test import pole_price, shared, unit
-from .refine import Fit, Lines
+from .refine import Fit, Lines, pivoted, refined
 
 #: frequencies [Hz] of mains
 MAINS = (50.0, 60.0)
@@ -68,9 +68,9 @@ def gated(
 def steady(
     fit: Fit, reported: IntArray, spread: FloatArray
 ) -> tuple[IntArray, tuple[Rejected, ...]]:
-    """Return which poles outputs that disagree share, and the others.
+    """Return which poles outputs (or inputs) that disagree share, and the others.
 
-    One beside another, whose damping at an output is not known from zero (95 %) by its `spread`
+    One beside another, whose damping at one of them is not known from zero (95 %) by its `spread`
     (m,) over them, stands for what the outputs differ by.
     """
     beside = np.array([
@@ -78,7 +78,7 @@ def steady(
         for k, pole in enumerate(fit.poles)
     ])  # fmt: skip
     vague = beside & (1.96 * spread > -fit.poles.real)
-    reason = "not shared by the outputs: its damping differs between them by as much as it is"
+    reason = f"not shared by the {fit.lines.side}: its damping differs by as much as it is"
     out = tuple(_entry(fit, int(k), reason) for k in reported[vague[reported]])
     return reported[~vague[reported]], out
 
@@ -110,9 +110,9 @@ def _needless(
         alike = mac(fit.shapes, other, place) > ALIKE
         if not compare or alike or not _shared(lines, fit, fitted, place):
             return place, f"a twin of the pole at {size[other] / (2 * np.pi):.5g} Hz"
-    for place in _beside(fit) if compare else []:
+    for place in lesser(fit) if compare else []:
         if not _shared(lines, fit, fitted, place):
-            return place, "not shared by the outputs: it stands for what they differ by"
+            return place, f"not shared by the {lines.side}: it stands for what they differ by"
     return None
 
 
@@ -136,14 +136,25 @@ def _deviations(lines: Lines, fit: Fit) -> FloatArray:
     return np.asarray(np.sqrt(variance[: 2 * fit.poles.size]).reshape(2, -1))
 
 
-def _beside(fit: Fit) -> list[int]:
-    """Return the weaker poles beside others, the weakest first."""
+def lesser(fit: Fit, alike: float = 0.0) -> list[int]:
+    """Return the weaker poles beside others (of shapes of so high a MAC), the weakest first."""
     height, found = strength(fit), []
     for k in np.argsort(height):
         reach = BESIDE * (-fit.poles.real - fit.poles.real[k])
-        if np.any((np.abs(fit.poles - fit.poles[k]) < reach) & (height > height[k])):
+        near = (np.abs(fit.poles - fit.poles[k]) < reach) & (height > height[k])
+        if any(mac(fit.shapes, int(j), int(k)) >= alike for j in np.flatnonzero(near)):
             found.append(int(k))
     return found
+
+
+def turned(lines: Lines, fit: Fit, steps: int) -> Fit:
+    """Return the fit of lines whose inputs and outputs are exchanged, one pole a resonance.
+
+    References that disagree give each resonance several poles of one shape.
+    """
+    keep = np.delete(np.arange(fit.m), lesser(fit, ALIKE))
+    start = pivoted(lines, fit.poles[keep], fit.shapes[:, keep])
+    return refined(lines, start.poles, start.participation, steps=steps, strict=False, first=start)
 
 
 def _outside(lines: Lines, pole: complex) -> str | None:

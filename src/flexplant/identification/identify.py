@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from ..checks import (
-    BoolArray,
     ComplexArray,
-    FloatArray,
+    IntArray,
     between,
     instance,
     positive,
@@ -33,11 +29,18 @@ from ..errors import (
 )
 from ..lti.frequency import Frf
 from ..parallel import Progress, expect, one_thread
-from ..tolerances import ROUNDING, TINY
-from .diagram import Moments, PoleSelection, StabilisationDiagram, built_diagram
-from .gate import gated, steady
+from ..tolerances import ROUNDING
+from .diagram import (
+    PoleSelection,
+    StabilisationDiagram,
+    affordable,
+    checked_orders,
+    diagram_of,
+    weighted_by_remainder,
+)
+from .gate import gated, lesser, steady, turned
 from .line_weights import PreparedLines, prepared
-from .model_error import disagreement, outputs_disagree
+from .model_error import ALIKE, NOISE, disagreement, outputs_disagree
 from .pole_test import (
     UPPER,
     dropped,
@@ -140,9 +143,9 @@ def stabilisation_diagram(
     top = between(max_zeta, "max_zeta", 0.0, 1.0, "From 1 on nothing oscillates: pass 0.2, say.")
     ready, listed = prepared(frf, band), None if orders is None else checked_orders(orders)
     if not ready.known:
-        ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])
+        ready = weighted_by_remainder(ready, affordable(listed, ready)[-1])
     with one_thread():
-        return diagram_of(ready, _affordable(listed, ready), limits, top)
+        return diagram_of(ready, affordable(listed, ready), limits, top)
 
 
 def identify_modes(
@@ -155,6 +158,7 @@ def identify_modes(
     upper: int | None = None,
     hold: float | None = None,
     dofs: Mapping[str, str] | None = None,
+    setups: Iterable[Iterable[str]] | None = None,
     refine: bool | None = None,
     most: int = MOST_POLES,
     max_iterations: int = 150,
@@ -195,6 +199,9 @@ def identify_modes(
     dofs : mapping {channel: DOF label}, optional
         Where outputs and inputs are; shapes are labelled by it, and mass-normalised where an
         input and an output share a DOF.
+    setups : lists of channels, optional
+        Which outputs (or which inputs) were measured together, where a sensor (or a hammer) roved:
+        poles may differ from one to the next. Each by itself when not given.
     refine : bool, optional
         Whether to fit by maximum likelihood; when not given, where that is cheap (values of the FRF
         times (poles times references) squared up to 5e7 at each step, 5e10 in all) and worth it:
@@ -250,7 +257,8 @@ def identify_modes(
     with one_thread():
         try:
             return _identified(
-                frf, band, orders, start, lower, upper, hold, dofs, (refine, most, steps), progress
+                *(frf, band, orders, start, lower, upper, hold),
+                *((dofs, setups), (refine, most, steps), progress),
             )
         except SolverError as error:
             raise of_segments(frf, error) from None
@@ -264,7 +272,7 @@ def _identified(
     lower: int,
     upper: int | None,
     hold: float | None,
-    dofs: Mapping[str, str] | None,
+    channels: tuple[Any, Any],
     limits: tuple[bool | None, int, int],
     progress: bool | None,
 ) -> IdentifiedModes:
@@ -275,12 +283,13 @@ def _identified(
     rate = None if hold is None else positive(hold, "hold")
     if rate is not None and high > rate / 2 * (1 + ROUNDING):
         raise ModelError(f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together.")
-    labels = checked_channels(dofs, frf)
+    labels = checked_channels(channels[0], frf)
+    side, together = checked_setups(channels[1], frf)
     listed = None if orders is None else checked_orders(orders)
     if start is not None:
         instance(start, PoleSelection, "start", "Pass diagram.select(freq=[...]).")
     if not ready.known:
-        ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])
+        ready = weighted_by_remainder(ready, affordable(listed, ready)[-1])
     refine, most, steps = limits
     budget = Products()
 
@@ -293,11 +302,13 @@ def _identified(
             segment=hann_segment(frf),
             most=most,
             work=budget,
+            side=ready.side,
+            setups=together if side == ready.side else (),
         )
 
     diagram, at_peaks = None, False
     if start is None:
-        diagram = diagram_of(ready, _affordable(listed, ready), (0.01, 0.05, 0.95), 0.2)
+        diagram = diagram_of(ready, affordable(listed, ready), (0.01, 0.05, 0.95), 0.2)
         try:
             chosen = diagram.automatic()
         except SolverError:
@@ -328,13 +339,20 @@ def _identified(
         expect(work * (_REFINED if refine or (refine is None and not costly) else _FIRST))
         lines = lines_of(ready)
         fit, reason = _first(lines, chosen, alone), ""
-        differ = refine is None and alone and outputs_disagree(fit)
+        differ = refine is not False and alone and outputs_disagree(fit)
+        asked = side not in ("", lines.side)
+        if asked or (not side and refine is not False and alone and not differ and _turns(fit)):
+            other = turned(lines_of(ready.turned), fit, QUICK)
+            differ = refine is not False and alone and outputs_disagree(other)
+            if differ or asked:
+                ready, lines, fit = ready.turned, other.lines, other
+        differ = differ and refine is None
         if refine is False:
             reason = "refine=True for more"
         elif refine is None and costly:
             reason = f"refine=True for more, {work:.1e} operations a step"
         elif differ:
-            reason = "a refinement comes no nearer to poles that outputs do not share"
+            reason = f"a refinement comes no nearer to poles that {lines.side} do not share"
         else:
             budget.most = np.inf if refine else budget.done + BUDGET
             try:
@@ -362,7 +380,7 @@ def _identified(
                 fit = Fit(lines, apart.poles, fit.participation, fit.pivots)
                 rejected = tuple(sorted(rejected + others))
         if compare or budget.done > BUDGET:
-            warned(unexplained(lines, fit), None if apart is None else apart.size)
+            warned(unexplained(lines, fit), None if apart is None else (apart.size, lines.side))
         answered = answer(
             frf, ready, lines, fit, reported, labels, diagram, rejected, reason, apart
         )
@@ -394,6 +412,13 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
             break
         fit = Fit(lines, best.poles, best.participation)
     return PoleSelection(fit.poles, fit.participation) if fit.poles.size else None
+
+
+def _turns(fit: Fit) -> bool:
+    """Return whether references may disagree: more than noise is left, or poles stand beside."""
+    return len(fit.participation) > 1 and bool(
+        lesser(fit, ALIKE) or fit.cost > NOISE * freedom(fit.lines, fit.m)
+    )
 
 
 def _first(lines: Lines, chosen: PoleSelection, alone: bool) -> Fit:
@@ -440,32 +465,6 @@ def _refined(
     return ready, lines, fit
 
 
-#: the highest model order by default, and the lines that each order is to have then
-HIGHEST, LINES_OF_ORDER = 40, 4
-#: references times parts of the band from which every other order is enough: each is a large
-#: eigenvalue problem
-MANY = 4
-#: the most poles of a diagram's order, conjugates included: an eigenvalue problem of this size
-POLES = 100
-
-
-def _affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
-    """Return the orders, by default as many as the lines afford; ModelError for too high ones."""
-    parts = windows(ready)
-    fewest = min(window.seen.stop - window.seen.start for window in parts)
-    if orders is None:
-        # four orders at least are compared, which twenty lines afford
-        references = ready.data.shape[1]
-        top = max(6, min(HIGHEST, fewest // LINES_OF_ORDER - 1, max(POLES // references, 10)))
-        return list(range(2, top + 1, 2 if len(parts) * references >= MANY else 1))
-    if 2 * (orders[-1] + 1) > fewest:
-        raise ModelError(
-            f"order {orders[-1]} needs more lines than the {ready.freq.size} of the band: lower "
-            "the orders or measure longer."
-        )
-    return orders
-
-
 def checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
     """Return {channel: DOF label}, checked."""
     if dofs is None:
@@ -475,115 +474,16 @@ def checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
     return {str(name): str(label) for name, label in dofs.items()}
 
 
-def checked_orders(orders: Iterable[int]) -> list[int]:
-    """Return rising model orders."""
-    if not several(orders):
-        raise ModelError(
-            f"orders are whole numbers to compare, got {short(orders)}. Try range(2, 41)."
-        )
-    listed = sorted({whole(n, "each of orders") for n in orders})
-    if len(listed) < 4:
-        raise ModelError(
-            f"orders must be at least four whole numbers from 1 to compare, got {listed!r:.60}."
-        )
-    return listed
-
-
-#: lines of a part, and the share of it that is used beyond each of its ends
-LINES, OVERLAP = 400, 0.25
-#: poles this share of the band outside of it are looked for: they bend the responses inside
-MARGIN = 0.04
-
-
-@dataclass(frozen=True, eq=False)
-class Window:
-    """A part of the band: its own lines first..last, and those used."""
-
-    first: int
-    last: int
-    seen: slice
-
-
-def windows(ready: PreparedLines) -> list[Window]:
-    """Return parts of about 400 lines, cut where the responses are weakest."""
-    import scipy.ndimage as ndi
-
-    n_freq = ready.freq.size
-    count = max(1, round(n_freq / LINES))
-    power = np.sum(np.abs(ready.data * ready.weight) ** 2, axis=(0, 1))
-    power = ndi.uniform_filter1d(np.log(power + TINY), 9)
-    cuts = [0]
-    for i in range(1, count):
-        middle, reach = round(i * n_freq / count), n_freq // (4 * count)
-        cuts.append(middle - reach + int(np.argmin(power[middle - reach : middle + reach])))
-    cuts.append(n_freq)
-    parts = []
-    for first, last in pairwise(cuts):
-        beyond = round(OVERLAP * (last - first))
-        parts.append(Window(first, last, slice(max(0, first - beyond), min(n_freq, last + beyond))))
-    return parts
-
-
-def diagram_of(
-    ready: PreparedLines, orders: list[int], tolerances: tuple[float, float, float], max_zeta: float
-) -> StabilisationDiagram:
-    """Return the diagrams of all parts as one; a track belongs where its median lies."""
-    low, high = float(ready.freq[0]), float(ready.freq[-1])
-    edge = MARGIN * (high - low)
-    found = []
-    for window in windows(ready):
-        freq = ready.freq[window.seen]
-        moments = _moments(ready, window, orders[-1])
-        inside = partial(_inside, band=(float(freq[0]), float(freq[-1])), max_zeta=max_zeta)
-        results = [moments.solve(order, inside) for order in orders]
-        diagram = built_diagram(results, np.array([low, high]), tolerances)
-        ends = (
-            low - edge if window.first == 0 else ready.freq[window.first],
-            high + edge if window.last == ready.freq.size else ready.freq[window.last],
-        )
-        keep = np.zeros(len(diagram), dtype=bool)
-        for track in np.unique(diagram.tracks):
-            mine = diagram.tracks == track
-            keep[mine] = ends[0] <= np.median(diagram.freq[mine]) < ends[1]
-        found.append((diagram, keep))
-    offsets = np.cumsum([0] + [int(d.tracks.max(initial=-1)) + 1 for d, _ in found])
-    tracks = [d.tracks[k] + o for (d, k), o in zip(found, offsets[:-1], strict=True)]
-    return StabilisationDiagram(
-        np.concatenate([d.orders[k] for d, k in found]),
-        np.concatenate([d.poles[k] for d, k in found]),
-        np.concatenate([d.flags[k] for d, k in found]),
-        np.concatenate(tracks),
-        shapes=np.concatenate([d.shapes[:, k] for d, k in found], axis=1),
-        participation=np.concatenate([d.participation[:, k] for d, k in found], axis=1),
-        band=np.array([low, high]),
+def checked_setups(setups: Any, frf: Frf) -> tuple[str, tuple[IntArray, ...]]:
+    """Return "outputs", "inputs" or "" of none, and which of them each set-up measured."""
+    if setups is None:
+        return "", ()
+    listed = [[str(name) for name in one] for one in setups if several(one)]
+    flat = sorted(name for one in listed for name in one)
+    for side, names in (("outputs", frf.outputs), ("inputs", frf.inputs)):
+        if flat == sorted(names) and len(listed) > 1 and all(listed):
+            return side, tuple(np.array([names.index(name) for name in one]) for one in listed)
+    raise LabelError(
+        f"setups are two lists or more that hold each of the outputs {short(list(frf.outputs))}, "
+        f"or each of the inputs {short(list(frf.inputs))}, once, got {short(setups)}."
     )
-
-
-def weighted_by_remainder(ready: PreparedLines, order: int) -> PreparedLines:
-    """Return the same with weights from what matrix fractions of high order leave."""
-    now = ready
-    n_out, n_in, n_freq = ready.data.shape
-    for _ in range(2):
-        error: FloatArray = np.zeros(ready.data.shape)
-        parts = windows(now)
-        for window in parts:
-            own = slice(window.first, window.last)
-            fitted: ComplexArray = _moments(now, window, order).response(order, now.freq[own])
-            error[:, :, own] = np.abs(now.data[:, :, own] - fitted) ** 2
-        share = (order + 1) * len(parts) / n_freq * (1 + n_in / n_out)
-        now = now.from_errors(error, min(0.5, share))
-    return now
-
-
-def _moments(ready: PreparedLines, window: Window, order: int) -> Moments:
-    seen = window.seen
-    return Moments(ready.freq[seen], ready.data[:, :, seen], ready.line_weight[:, seen], order)
-
-
-def _inside(poles: ComplexArray, band: tuple[float, float], max_zeta: float) -> BoolArray:
-    """Return which poles count in a part of the band."""
-    freq = np.abs(poles) / (2 * np.pi)
-    zeta = -poles.real / np.abs(poles)
-    edge = MARGIN * (band[1] - band[0])
-    keep = (freq > max(band[0] - edge, 0.5 * band[0])) & (freq < band[1] + edge)
-    return np.asarray(keep & (zeta > 0) & (zeta < max_zeta) & (poles.imag > 0))

@@ -29,6 +29,17 @@ class PreparedLines:
     line_correlation: sp.csr_array | None = None  # of errors of different lines
 
     @property
+    def side(self) -> str:
+        """What the first axis is."""
+        return "inputs" if self.swapped else "outputs"
+
+    @property
+    def turned(self) -> PreparedLines:
+        """The same with inputs and outputs exchanged."""
+        data, weight = self.data.transpose(1, 0, 2), self.weight.transpose(1, 0, 2)
+        return replace(self, data=data, weight=weight, swapped=not self.swapped)
+
+    @property
     def independent(self) -> bool:
         """Whether errors of different entries are independent."""
         return self.line_correlation is None and (
@@ -119,10 +130,8 @@ def prepared(frf: Any, band: Any) -> PreparedLines:
     lines = frf.line_correlation()
     if lines is not None:
         lines = lines[inside][:, inside]
-    swapped = data.shape[0] < data.shape[1]
-    if swapped:
-        data, weight = data.transpose(1, 0, 2), weight.transpose(1, 0, 2)
-    return PreparedLines(freq, data, weight, correlation, known, swapped, lines)
+    ready = PreparedLines(freq, data, weight, correlation, known, False, lines)
+    return ready.turned if data.shape[0] < data.shape[1] else ready
 
 
 def checked_band(band: Any, freq: FloatArray) -> tuple[float, float]:

@@ -21,6 +21,8 @@ MOSTLY = 0.9
 NOISE = 1.5
 #: standard deviations by which chi-square may exceed its degrees of freedom by chance
 LIMIT = 3.0
+#: part of a misfit that is left by poles of one's own with the participation of shared ones
+NEXT_TO_NONE = 1e-3
 #: halvings of the interval of a variance: to nine digits
 BISECTIONS = 30
 #: lines, or half-widths, beside a pole over which misfit is compared
@@ -39,12 +41,14 @@ def outputs_disagree(fit: Fit) -> bool:
     by how the outputs differ, not by the misfit that a refinement lowers.
     """
     lines, (n_out, m) = fit.lines, fit.shapes.shape
-    count = n_out * lines.data.shape[1] * (lines.lower + lines.upper) + 4 * m * n_out
+    parts = len(lines.parts)
+    count = n_out * lines.data.shape[1] * (lines.lower + lines.upper) + 2 * m * (n_out + parts)
     free = max(1.0, 2 * lines.data.size - lines.inflation * count)
-    if n_out == 1 or fit.cost < NOISE * free:
+    if parts == 1 or fit.cost < NOISE * free:
         return False
     alone = own_cost(fit)
-    return alone < free + LIMIT * np.sqrt(2 * free * lines.inflation) and alone * NOISE < fit.cost
+    noise = LIMIT * np.sqrt(2 * free * lines.inflation) + NEXT_TO_NONE * (fit.cost - free)
+    return alone < free + noise and alone * NOISE < fit.cost
 
 
 def coherence(lines: Lines, model: ComplexArray, pole: complex) -> float:
@@ -136,7 +140,7 @@ def disagreement(lines: Lines, fit: Fit, least: float, excess: float) -> Disagre
     None where poles of their own lower the cost by less than `least`, or do not explain nearly all
     of the cost's `excess` over that of noise: something else is wrong then.
     """
-    if len(fit.shapes) == 1:
+    if len(lines.parts) == 1:
         return None
     own = fit.own
     if fit.cost - own_cost(fit) < max(least, MOSTLY * excess):
@@ -156,9 +160,9 @@ def disagreement(lines: Lines, fit: Fit, least: float, excess: float) -> Disagre
 
 
 def _parted(fit: Fit) -> list[Fit]:
-    """Return the fit of each output at the shared poles."""
-    count = range(len(fit.shapes))
-    return [Fit(fit.lines.of_output(o), fit.poles, fit.participation, fit.pivots) for o in count]
+    """Return the fits of each output, or set-up, at the shared poles."""
+    each = (fit.lines.of_rows(rows) for rows in fit.lines.parts)
+    return [Fit(lines, fit.poles, fit.participation, fit.pivots) for lines in each]
 
 
 def _variance(one: Fit) -> FloatArray:

@@ -12,8 +12,7 @@ from ..checks import ComplexArray, FloatArray, positive, real_array, whole
 from ..errors import ModelError, SolverError
 from ..modes.matching import assigned, mac
 from ..parallel import Progress, tick
-from .diagram import OrderPoles, built_diagram
-from .identify import checked_orders
+from .diagram import OrderPoles, built_diagram, checked_orders
 from .measured import MeasuredModes
 from .spectra import signals
 

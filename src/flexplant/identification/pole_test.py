@@ -215,7 +215,7 @@ def shared(lines: Lines, fit: Fit, more: Fit, least: float) -> bool:
     least = max(least, pole_price(lines) * coherence(lines, more.model, more.poles[new]))
     if fit.cost - more.cost < least:
         return False
-    if len(fit.shapes) == 1:
+    if len(lines.parts) == 1:
         return True
     if "own" not in vars(fit) and _proven(fit, more, least):
         return True
@@ -230,8 +230,9 @@ def _proven(fit: Fit, more: Fit, least: float) -> bool:
     gain = 0.0
     for o, own in enumerate(more.own):
         size = len(found)
-        with attempted(f"a fit of output {o + 1} alone", SolverError):
-            found.append(fit.of_output(o, below=own.cost + least - gain))
+        with attempted(f"a fit of {fit.lines.side} {o + 1} alone", SolverError):
+            rows = fit.lines.parts[o]
+            found.append(fit.of_rows(rows, below=own.cost + least - gain))
         if len(found) == size:
             return True
         gain += found[-1].cost - own.cost
@@ -249,7 +250,7 @@ def added(fit: Fit, more: Fit) -> int:
 
 def own_price(lines: Lines, fit: Fit) -> float:
     """Return by how much poles of their own at each output must lower the cost."""
-    count = 2 * fit.poles.size * (len(fit.shapes) - 1)
+    count = 2 * fit.poles.size * (len(lines.parts) - 1)
     return unit(lines, fit) * price(lines, max(1, count), ALARM)
 
 
@@ -534,15 +535,15 @@ def unexplained(lines: Lines, fit: Fit) -> list[Peak]:
     return kept
 
 
-def warned(left: list[Peak], apart: float | None) -> None:
+def warned(left: list[Peak], apart: tuple[float, str] | None) -> None:
     """Warn of stretches that no pole explains, of single lines, or of outputs that disagree."""
     stretches = [peak for peak in left if not peak.isolated]
     if apart is not None:
         warn(
-            f"outputs disagree on the frequencies by {apart:.2%} (standard deviation), which "
-            "explains most of what is more than noise: a sensor that moves and has mass, an "
-            "amplitude or a temperature that changed between measurements. Poles are means over "
-            "the outputs, their deviations come from how these differ."
+            f"{apart[1]} disagree on the frequencies by {100 * apart[0]:.2g} % (standard "
+            "deviation), which explains most of what is more than noise: a sensor or a hammer that "
+            "moves and has mass, an amplitude or a temperature that changed between measurements. "
+            f"Poles are means over the {apart[1]}, their deviations come from how these differ."
         )
     elif stretches:
         warn(

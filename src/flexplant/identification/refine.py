@@ -66,14 +66,22 @@ class Lines:
     #: poles that a fit may have
     most: int = 1000
     work: Products = field(default_factory=Products)
+    #: what the first axis of the data is, and which of its rows were measured together
+    side: str = "outputs"
+    setups: tuple[IntArray, ...] = ()
 
-    def of_output(self, o: int) -> Lines:
-        """Return the lines of one output."""
-        one = replace(self, data=self.data[[o]], weight=self.weight[[o]])
+    @property
+    def parts(self) -> tuple[IntArray, ...]:
+        """The rows that may have poles of their own: those of a set-up together, else each."""
+        return self.setups or tuple(np.arange(len(self.data))[:, None])
+
+    def of_rows(self, rows: IntArray) -> Lines:
+        """Return the lines of some outputs."""
+        some = replace(self, data=self.data[rows], weight=self.weight[rows], setups=())
         # what the residual terms take is known
-        one.__dict__["smooth_bases"] = [self.smooth_bases[o]]
-        one.__dict__["goals"] = [self.goals[o]]
-        return one
+        some.__dict__["smooth_bases"] = [self.smooth_bases[o] for o in rows]
+        some.__dict__["goals"] = [self.goals[o] for o in rows]
+        return some
 
     @cached_property
     def smooth(self) -> ComplexArray:
@@ -250,13 +258,13 @@ class Fit:
 
     @cached_property
     def own(self) -> list[Fit]:
-        """The fits of each output alone."""
-        return [self.of_output(o) for o in range(len(self.shapes))]
+        """The fits of each output, or set-up, alone."""
+        return [self.of_rows(rows) for rows in self.lines.parts]
 
-    def of_output(self, o: int, below: float = np.inf) -> Fit:
-        """Return the fit of one output alone: poles of its own, the participation of all."""
+    def of_rows(self, rows: IntArray, below: float = np.inf) -> Fit:
+        """Return the fit of some outputs alone: poles of their own, the participation of all."""
         return refined(
-            *(self.lines.of_output(o), self.poles, self.participation),
+            *(self.lines.of_rows(rows), self.poles, self.participation),
             steps=OWN,
             strict=False,
             below=below,

@@ -79,6 +79,7 @@ def answer(
         rejected=rejected,
         first_answer=reason,
         inconsistency=None if apart is None else apart.size,
+        inconsistent="" if apart is None else lines.side,
     )
 
 
@@ -318,8 +319,10 @@ class IdentifiedModes(MeasuredModes):
         Why poles are those of the first answer, empty where they are those of the maximum
         likelihood fit to its end (`refined`).
     inconsistency : float, optional
-        Relative deviation of the frequencies between outputs, where they disagree: poles are then
-        means over the outputs, and their covariance comes from how these differ.
+        Relative deviation of the frequencies between outputs (or inputs), where they disagree:
+        poles are then means over these, and their covariance comes from how they differ.
+    inconsistent : str
+        Which of the two disagree, "outputs" or "inputs", empty where none do.
 
     Examples
     --------
@@ -349,6 +352,7 @@ class IdentifiedModes(MeasuredModes):
     rejected: tuple[tuple[float, float, str], ...] = field(default=(), kw_only=True)
     first_answer: str = field(default="", kw_only=True)
     inconsistency: float | None = field(default=None, kw_only=True)
+    inconsistent: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -370,7 +374,8 @@ class IdentifiedModes(MeasuredModes):
         notes = ["refined" if self.refined else f"the first answer ({self.first_answer})"]
         if self.inconsistency is not None:
             notes.append(
-                f"outputs disagree by {self.inconsistency:.1e}, poles are means of their own"
+                f"{self.inconsistent} disagree by {self.inconsistency:.1e}, "
+                "poles are means of their own"
             )
         elif self.misfit > 1.0:
             notes.append(f"deviations enlarged by the misfit {self.misfit:.3g}")
