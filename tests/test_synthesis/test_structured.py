@@ -128,18 +128,24 @@ def test_gradients_are_exact(name):
             assert change == pytest.approx(slope @ step, rel=2e-4, abs=2e-6 * size * 1e-5 + 1e-13)
 
 
-def test_second_derivatives_of_a_gain_are_exact():
-    """Of entries, which the loop's matrices are linear fractions of; at a peak and at 0 Hz."""
+@pytest.mark.parametrize("finite", [True, False])
+def test_second_derivatives_of_a_gain_are_exact(finite):
+    """Of entries, which the loop's matrices are linear fractions of; at a peak and at infinity."""
     A = np.array([[0.0, 1, 0, 0], [-2, -0.1, 1, 0], [0, 0, 0, 1], [1, 0, -2, -0.1]])
     B, C = np.eye(4)[:, [1, 3]], np.eye(4)[[1, 3]]
     parts, _ = oracle.coprime_problem(A, B, C)
+    if finite:  # forces to positions: nothing is left at infinity
+        seen = np.vstack([np.eye(4)[[0, 2]], C])
+        parts = (A, np.hstack([B, B]), seen, np.zeros((4, 4)))
     plant = named(*parts, 2, 2)
     p = prepared(plant.system, plant.u, plant.y)
     family = FixedOrder(0).family(plant, p)
     search = _StructureSearch(family, [p], 10_000)
     rng = np.random.default_rng(4)
     for _ in range(3):
-        theta = -1.5 * np.eye(2).ravel() + 0.3 * rng.standard_normal(4)
+        size = 0.3 if finite else 1.5
+        theta = size * (0.2 * rng.standard_normal(4) - np.eye(2).ravel())
+        assert np.isfinite(search.value(theta)[0])
         pieces = search.pieces(theta)
         H = pieces.hessian(int(np.argmax(pieces.value)))
         step = rng.standard_normal(4)
