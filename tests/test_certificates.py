@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import flexplant as fx
-from flexplant.errors import CertificateError
+from flexplant.errors import CertificateError, ModelError
 from flexplant.synthesis import FixedOrder, PoleRegion
 
 
@@ -224,6 +224,12 @@ WRONG = {
         "synthesis.aftercare.order.kept", lambda _: lambda *_: "too much",
         lambda: reducer(loss=0.1), "no controller of fewer states",
     ),
+    "blocks for C, of several places": (
+        "synthesis.aftercare.two_state._difference", lambda _: lambda *_: 1e-3,
+        lambda: import_module("flexplant.synthesis.aftercare.two_state").scheduled_form(
+            [lead(2e3).replace(blocks=None)], driven=1
+        ), "moves the response",
+    ),
     "H2 claim": (
         "synthesis.h2._solved", larger(1.01, 4), lambda: fx.design_h2(masses()), "by the synthesis",
     ),
@@ -308,3 +314,31 @@ def test_a_simpler_controller_may_lose_what_is_allowed_and_no_more():
     for worse in ({"margin": 0.449}, {"gamma": 2.21}, {"is_stable": False}):
         with pytest.raises(CertificateError, match="refused"):
             order.required(before, before._replace(**worse), 0.1, "")
+
+
+def test_a_structured_loop_that_is_not_stable_has_no_h2_norm():
+    structured = import_module("flexplant.synthesis.structured.structured_design")
+    loop = fx.StateSpace([[0.1]], [[1.0]], [[1.0]], [[0.0]])
+    with pytest.raises(CertificateError, match="is not stable"):
+        structured._verified(two_masses(), loop, (fx.synthesis.H2(),), 1.0)
+
+
+def test_the_proven_tolerance_ends_where_the_stiffness_of_the_mode_does():
+    """By hand: the lead damps the mode as long as there is one, 10 units of 5 % either way."""
+    deltas = off_by(0.05)
+    found = fx.synthesis.robust_stability(deltas, lead(), quick=False)
+    size = 1.0 / found.upper
+    for sign in (-0.98, 0.98):
+        machine = deltas.lft({"mode2:freq": sign * size})
+        assert fx.close_loop(machine, lead()).obstacle is None
+    with pytest.raises(ModelError, match="negative stiffness"):
+        deltas.lft({"mode2:freq": -1.02 * size})
+
+
+def test_an_unstable_loop_at_one_of_the_positions_has_no_norm():
+    moved = import_module("flexplant.synthesis.hinf.moved_design")
+    plant = masses()
+    idle = fx.StateSpace([], [], [], np.zeros((len(plant.u), len(plant.y))), plant.dt,
+                         inputs=plant.y, outputs=plant.u)  # fmt: skip
+    with pytest.raises(CertificateError, match="not stable"):
+        moved._norm(plant, idle)
