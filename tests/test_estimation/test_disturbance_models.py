@@ -10,11 +10,8 @@ from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation import check_bias, design_kalman
 from flexplant.estimation.filter_model import filter_model
 from flexplant.loop import close_loop
-from flexplant.lti import h2_norm
 from flexplant.plant import (
     Disturbance,
-    FirstOrder,
-    NarrowBand,
     RandomWalk,
     RigidForce,
     Sensor,
@@ -23,25 +20,6 @@ from flexplant.plant import (
 from flexplant.simulation import simulate
 from flexplant.synthesis import design_servo
 from oracles_estimation import correlated_covariance
-
-
-@pytest.mark.parametrize(
-    "spectrum", [FirstOrder(2.0, 3.0), NarrowBand(2.0, 50.0, 0.02), RandomWalk(2.0, 1e-3)]
-)
-def test_rms_is_that_of_the_filter(spectrum):
-    """White noise of density asd: variance asd^2 / 2 times the squared H2 norm."""
-    wanted = spectrum.asd / np.sqrt(2) * h2_norm(spectrum.shape)
-    assert spectrum.rms == pytest.approx(wanted, rel=1e-10, abs=0)
-    force = spectrum.force("pump", at=INSET[0])
-    assert (force.asd, force.shape.n_states) == (spectrum.asd, spectrum.shape.n_states)
-    assert spectrum.floor("floor").asd == spectrum.asd
-
-
-def test_a_random_walk_drifts_as_stated():
-    walk, dt = RandomWalk(3.0), 0.01
-    omega = -walk.shape.A[0, 0]
-    step = (walk.asd * walk.shape.B[0, 0]) ** 2 / 2 * -np.expm1(-2 * omega * dt) / (2 * omega)
-    assert step == pytest.approx(3.0**2 * dt, rel=1e-4, abs=0)
 
 
 def biased(axes=("z", "rx", "ry"), **options):
