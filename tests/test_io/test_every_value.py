@@ -91,7 +91,7 @@ def made():
     yield from (fx.Specification(noise=1e-6), fx.Specification(noise=1e-6).check(loop))
     yield from (fx.simulation.Saturation(1.0, rate=10.0), fx.simulation.Quantiser(1e-9))
     yield from (fx.simulation.Hysteresis(0.1), fx.simulation.Dropout(0.01))
-    yield fx.simulation.Jitter(1e-5)
+    yield from (fx.simulation.Jitter(1e-5), fx.simulation.Friction(1.0, 1e6, "y1"))
     yield fx.simulation.MachinePipeline(rom, fe, unknowns, ports(), RATE, 1, [6])
     yield fx.simulation.MachineReport(
         {"mass": 0.5}, poles, fit, static, (static.system, servo), None, loop, response

@@ -7,8 +7,16 @@ from scipy import signal
 
 import flexplant as fx
 import oracles_loop as oracle
-from flexplant.errors import ModelError
-from flexplant.simulation import Dropout, Hysteresis, Jitter, Saturation, setpoint, simulate
+from flexplant.errors import FlexplantError, ModelError
+from flexplant.simulation import (
+    Dropout,
+    Friction,
+    Hysteresis,
+    Jitter,
+    Saturation,
+    setpoint,
+    simulate,
+)
 from machines import RATE, block, matrices, observer, servo, stage
 
 MOVE = setpoint(1e-3, velocity=0.02, acceleration=1.0, jerk=100.0, rest=0.01)
@@ -144,6 +152,50 @@ def test_jitter_is_that_of_switching_instants(channel):
         x, force = flown(x, command, finer - late[k]), command
 
 
+def sliding(stiffness, limit):
+    """A mass on a spring to ground, moved aside and let go; no command."""
+    model = fx.chain(masses=[2.0], stiffnesses=[], ground=800.0)
+    ports = fx.Ports(
+        w=[fx.Disturbance("guide", at="1:x", asd=1.0)], u=[fx.Actuator("u1", at="1:x")],
+        z=[fx.Poi("tip", at="1:x", axes=("x",))], y=[fx.Sensor("y1", at="1:x", asd=1e-9)],
+    )  # fmt: skip
+    plant = fx.assemble_plant(fx.solve_modes(model), ports).discretized(2e3)
+    idle = fx.StateSpace([], [], [], [[0.0]], 5e-4, inputs=["y1"], outputs=["u1"])
+    loop = fx.close_loop(plant, idle)
+    start = np.linalg.lstsq(plant.system.C[[0]], [0.1], rcond=None)[0]
+    guide = Friction(limit, stiffness, reads="y1")
+    return simulate(
+        loop, duration=1.4, finer=4, noise=False, start=start, elements={"guide": guide}
+    )
+
+
+def test_friction_takes_four_times_its_level_over_the_stiffness_a_cycle():
+    """Closed form of Coulomb's oscillator: in half a period the peak falls by 2 F / k."""
+    run = sliding(1e5, 4.0)
+    x, half = run["tip:x"], np.pi / np.sqrt(800.0 / 2.0)
+    for n in range(1, 9):
+        peak = np.abs(x[np.abs(run.time - n * half) < 0.3 * half]).max()
+        assert peak == pytest.approx(0.1 - 2 * n * 4.0 / 800.0, abs=1.5e-4)
+
+
+def test_friction_that_yields_is_that_of_the_midpoint_rule():
+    """Oracle: the motion with its yielding spring as a differential equation, by hand."""
+    run, limit, stiffness, dt = sliding(2e3, 3.0), 3.0, 2e3, 1.25e-4
+
+    def rate(t, state):
+        x, v, s = state
+        yields = abs(s) >= limit and s * v > 0
+        return [v, (-800.0 * x - s) / 2.0, 0.0 if yields else stiffness * v]
+
+    state, found = np.array([0.1, 0.0, 0.0]), []
+    for _ in range(4000):
+        found.append(state[0])
+        middle = state + 0.5 * dt * np.array(rate(0, state))
+        state = state + dt * np.array(rate(0, middle))
+        state[2] = np.clip(state[2], -limit, limit)
+    np.testing.assert_allclose(run["tip:x"][:4000], found, rtol=0, atol=2e-4)
+
+
 def test_offset_and_drift_of_a_sensor():
     """An array on the channel of a sensor's noise is added to what it measures."""
     loop = loop_of(stage())
@@ -208,11 +260,13 @@ def test_what_is_no_spectrum(asd):
     [
         ({"u1": Jitter(1e-4)}, "finer="),
         ({"u1": Cubic}, "must be a Saturation"),
+        ({"amp": Hysteresis(1.0)}, "`reads`"),
+        ({"amp": Friction(1.0, 1.0, "y7")}, "y7"),
         ({"u1": Jitter(1e-9)}, "one finer sample"),
     ],
 )
 def test_what_is_no_element(elements, said):
-    with pytest.raises(ModelError, match=said):
+    with pytest.raises(FlexplantError, match=said):
         simulate(loop_of(stage()), elements=elements, duration=0.01)
     with pytest.raises(ModelError, match="must not be positive"):
         Saturation(1.0, least=0.5)

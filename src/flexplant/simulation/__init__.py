@@ -1,8 +1,9 @@
 """Set-points, sampled-data runs of a closed loop, and what they say of the error.
 
 - `simulate(loop, reference=, duration=, rng=)`: a `Response`, with `elements` of the field
-  (`Saturation`, `Quantiser`, `Hysteresis`, `Dropout`, `Jitter`, one's own) and between samples
-  where wished; noise as `fx.design_kalman` has it, `spectral_noise` of a measured spectrum or 1/f.
+  (`Saturation`, `Quantiser`, `Hysteresis`, `Dropout`, `Jitter`, `Friction`, one's own) and between
+  samples where wished; noise as `fx.design_kalman` has it.
+- `spectral_noise`: records with a measured spectrum, or 1/f, for `simulate(disturbance=)`.
 - `setpoint`, `scan`: moves of bounded velocity, acceleration and jerk.
 - `design_feedforward`, `learn_feedforward`: forces for a move.
 - `Specification`: what is required of margins and errors; a verdict says what is reached.
@@ -93,6 +94,7 @@ from .motion import scan as scan
 from .motion import setpoint as setpoint
 from .nonlinear_elements import Dropout as Dropout
 from .nonlinear_elements import Element as Element
+from .nonlinear_elements import Friction as Friction
 from .nonlinear_elements import Hysteresis as Hysteresis
 from .nonlinear_elements import Jitter as Jitter
 from .nonlinear_elements import Quantiser as Quantiser

@@ -133,6 +133,9 @@ class Element(Protocol):
     def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
         """Return what acts on the values (runs,) of the channel, sample after sample.
 
+        On a disturbance they are those of the channel of y that the element names as `reads`, and
+        what it returns is the force: a stop, a stiffening spring.
+
         Parameters
         ----------
         dt : float [s]
@@ -218,6 +221,53 @@ class Dropout(Value):
             return last
 
         return read
+
+
+@dataclass(frozen=True, eq=False)
+class Friction(Value):
+    """Dry friction with presliding, on a disturbance at its place: a spring that yields.
+
+    ``-s``, ``s[k] = s[k-1] + stiffness (x[k] - x[k-1])`` within ``-level`` and ``level``, in every
+    finer sample: held over it, so that stiffness dt^2 must be small beside the mass.
+
+    Parameters
+    ----------
+    level : float [N]
+        At which it slides.
+    stiffness : float [N/m]
+        Before it does.
+    reads : str
+        The channel of y that measures the motion x at the place, without its noise.
+
+    Raises
+    ------
+    ModelError
+        When a number is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> guide = fx.simulation.Friction(level=2.0, stiffness=1e6, reads="y1")
+    >>> force = guide.begin(1e-3, [None])
+    >>> [round(float(force(np.array([x]))[0]), 6) + 0.0 for x in (0.0, 1e-6, 1e-5, 9e-6)]
+    [0.0, -1.0, -2.0, -1.0]
+    """
+
+    level: float = field(metadata=checked(positive))
+    stiffness: float = field(metadata=checked(positive))
+    reads: str = field(metadata=checked(instance, kind=str, hint="Name a channel of y."))
+
+    def begin(self, dt: float, generators: Sequence[np.random.Generator]) -> Act:
+        """Return the forces of so many runs, none at the first sample."""
+        force, last = np.zeros(len(generators)), np.full(len(generators), np.nan)
+
+        def pull(motion: FloatArray) -> FloatArray:
+            moved = np.where(np.isnan(last), 0.0, motion - last)
+            np.clip(force + self.stiffness * moved, -self.level, self.level, out=force)
+            last[:] = motion
+            return -force
+
+        return pull
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,13 +380,7 @@ class Acting:
         if self.is_slow:
             np.copyto(self.last, values)
         for i, act in self.acts:
-            found = act(values[:, i].copy())
-            if np.shape(found) != (len(values),):
-                raise ModelError(
-                    f"an element returned shape {np.shape(found)} for {len(values)} runs. Return "
-                    "one value for each run: element.begin(dt, generators)(values) is (runs,)."
-                )
-            values[:, i] = found
+            values[:, i] = _acted(act, values[:, i])
 
     def read(self, j: int, motion: FloatArray, y: FloatArray) -> None:
         """Read sensors early: put what they were into y (runs, n), `motion` being what they are."""
@@ -363,21 +407,71 @@ class Acting:
             self.due[run] = generator.integers(0, self.most, endpoint=True)
 
 
+def _acted(act: Act, values: FloatArray) -> FloatArray:
+    """Return what an element makes of the values (runs,)."""
+    found = act(values.copy())
+    if np.shape(found) != values.shape:
+        raise ModelError(
+            f"an element returned shape {np.shape(found)} for {len(values)} runs. Return one value "
+            "for each run: element.begin(dt, generators)(values) is (runs,)."
+        )
+    return found
+
+
+class Answering:
+    """Forces that answer motions, in every finer sample: the elements on channels of w."""
+
+    def __init__(self, plant: StandardPlant, elements: Mapping[str, Any], dt: float) -> None:
+        self.dt, self.parts = dt, []
+        for name, element in elements.items():
+            i = plant.w.index(name)
+            for one in _listed(name, element):
+                reads = getattr(one, "reads", None)
+                if not isinstance(one, Element) or reads is None:
+                    raise ModelError(
+                        f"{name!r} is a disturbance, but {short(one)} does not name the channel of "
+                        "y that it answers as `reads`. Use simulation.Friction, or an element with "
+                        "`reads`; limits act on sensors and actuators."
+                    )
+                require_known("channel that an element reads", [reads], plant.y, "the plant's y")
+                if np.any(plant.D21[:, i]):
+                    raise ModelError(
+                        f"{name!r} reaches a sensor within the sample, before an element could "
+                        "answer its motion. Give the accelerometer dynamics that roll off."
+                    )
+                self.parts.append((i, plant.y.index(reads), one, plant.B1[:, i].copy()))
+
+    def begin(self, generators: Sequence[np.random.Generator]) -> None:
+        """Start anew, so many runs side by side."""
+        own = [one.spawn(len(self.parts)) for one in generators]
+        self.acts = [
+            part[2].begin(self.dt, [each[j] for each in own]) for j, part in enumerate(self.parts)
+        ]
+
+    def push(self, motion: FloatArray, following: FloatArray, w: FloatArray) -> None:
+        """Add the forces at motions (runs, ny) to w (runs, nw), and what they do to the states."""
+        for act, (i, row, _, column) in zip(self.acts, self.parts, strict=True):
+            force = _acted(act, motion[:, row])
+            w[:, i] += force
+            following += force[:, None] * column
+
+
 def split_elements(
-    elements: Any, sensors: Sequence[str], driven: Sequence[str]
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the elements on sensors and on actuators, by channel."""
+    elements: Any, plant: StandardPlant, driven: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Return the elements on sensors, on actuators and on disturbances, by channel."""
     if elements is None:
-        return {}, {}
+        return [{}, {}, {}]
     instance(
         elements, Mapping, "elements", "Name the channel: {'u1': simulation.Saturation(10.0)}."
     )
+    forces = [name for name in plant.w if name not in plant.y and not name.endswith(":noise")]
+    sides = (plant.y, list(driven), forces)
     for name, element in elements.items():
-        if name not in sensors and name not in driven:
-            raise unknown_label("channel for an element", name, [*sensors, *driven])
+        if not any(name in side for side in sides):
+            raise unknown_label("channel for an element", name, [*plant.y, *driven, *forces])
         _listed(name, element)
-    on_y = {name: element for name, element in elements.items() if name in sensors}
-    return on_y, {name: element for name, element in elements.items() if name not in on_y}
+    return [{n: one for n, one in elements.items() if n in side} for side in sides]
 
 
 def _listed(name: str, element: Any) -> list[Acts]:
@@ -388,7 +482,7 @@ def _listed(name: str, element: Any) -> list[Acts]:
     if not listed or len(kinds) + sum(own) < len(listed):
         raise ModelError(
             f"the element on {name!r} must be a Saturation, Quantiser, Hysteresis, Dropout, Jitter "
-            f"or have their begin(dt, generators), got {short(element)}. Pass one, or a list."
+            f"or Friction or have begin(dt, generators), got {short(element)}. Pass one, or a list."
         )
     if len(set(kinds)) < len(kinds):
         raise ModelError(f"{name!r} has two elements of one kind: give the tighter one.")
@@ -403,6 +497,7 @@ class Conditions(NamedTuple):
 
     on_y: Mapping[str, Any] = {}
     on_u: Mapping[str, Any] = {}
+    on_w: Mapping[str, Any] = {}
     recovery: float | None = None
     finer: int = 1
     paths: Mapping[str, FloatArray] = {}
@@ -410,16 +505,16 @@ class Conditions(NamedTuple):
     @property
     def one_by_one(self) -> bool:
         """Whether there is something that is not linear."""
-        return bool(self.on_y or self.on_u)
+        return bool(self.on_y or self.on_u or self.on_w)
 
 
 def conditions(
     loop: ClosedLoop, elements: Any, anti_windup: Any, finer: Any, moving: Any, time: FloatArray
 ) -> Conditions:
     """Return what was given to `simulate`, checked."""
-    on_y, on_u = split_elements(elements, loop.plant.y, loop.driven)
+    on_y, on_u, on_w = split_elements(elements, loop.plant, loop.driven)
     recovery = None if anti_windup is None else positive(anti_windup, "anti_windup")
-    return Conditions(on_y, on_u, recovery, finer, _paths(loop.plant, moving, time))
+    return Conditions(on_y, on_u, on_w, recovery, finer, _paths(loop.plant, moving, time))
 
 
 def finer_loop(loop: ClosedLoop, finer: int) -> ClosedLoop:

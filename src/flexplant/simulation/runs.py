@@ -15,7 +15,7 @@ from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, Recursion, cheapest
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..tolerances import divisor
-from .nonlinear_elements import Acting, Conditions, Moving
+from .nonlinear_elements import Acting, Answering, Conditions, Moving
 
 
 class Machine(NamedTuple):
@@ -75,12 +75,14 @@ def step_through(
     sensed: Acting | None = None,
     applied: Acting | None = None,
     hold: int = 1,
+    answering: Answering | None = None,
+    w: FloatArray | None = None,
 ) -> FloatArray:
     """Fill `buffers` sample by sample and return the controller's states (runs, n) after them.
 
     Elements `sensed` act on y before it is read, `applied` on the commands of a machine that has
-    them. All is done in place. The controller acts in the first of every `hold` samples, and what
-    it commands is held.
+    them; forces `answering` motions are added to w (runs, k, nw). All is done in place. The
+    controller acts in the first of every `hold` samples, and what it commands is held.
 
     Every product is one matrix-vector product per run, never a matrix-matrix product over runs:
     its rounding, and so a run, does not depend on how many runs go side by side.
@@ -118,6 +120,8 @@ def step_through(
             applied.send(within, answer[:, nc:split])
         if nj:
             flow_in[:, :nj, 0] = x[:, m.columns]
+        if answering is not None and w is not None:
+            answering.push(measured[:, :, 0], following, w[:, k])
         flow_in[:, nj:, 0] = answer[:, nc:split]
         np.matmul(m.inflow, flow_in, out=flow)
         following += flow[:, :, 0]
@@ -263,7 +267,8 @@ def _under(loop: ClosedLoop, noise: Drawn, met: Conditions) -> SampleBySample:
         applied = Acting(loop.driven, met.on_u, dt, met.finer)
     sensed = Acting(plant.y, met.on_y, dt, met.finer) if met.on_y else None
     moving = Moving(plant, met.paths) if met.paths else None
-    return SampleBySample(loop, parts, noise, sensed, applied, moving, met.finer)
+    answering = Answering(plant, met.on_w, plant.dt) if met.on_w else None
+    return SampleBySample(loop, parts, noise, sensed, applied, moving, met.finer, answering)
 
 
 class SampleBySample:
@@ -280,8 +285,10 @@ class SampleBySample:
         applied: Acting | None = None,
         moving: Moving | None = None,
         hold: int = 1,
+        answering: Answering | None = None,
     ) -> None:
         plant, self.sensed, self.applied = loop.plant, sensed, applied
+        self.answering = answering
         self.moving, self.hold = moving, hold
         self.stretch = hold * -(-STRETCH // hold)
         self.parts, self.n, self.ny = parts, plant.system.n_states, len(plant.y)
@@ -310,7 +317,7 @@ class SampleBySample:
         )
         self.w = np.zeros((count, self.stretch, self.B1.shape[1]))
         self.first = 0
-        for acting in (self.sensed, self.applied):
+        for acting in (self.sensed, self.applied, self.answering):
             if acting is not None:
                 acting.begin(generators)
 
@@ -336,8 +343,9 @@ class SampleBySample:
         states[0] = self.x
         part = Buffers(states[: k + 1], y[:k], out[:k])
         self.controller = step_through(
-            self.parts, self.controller, part, self.sensed, self.applied, self.hold
-        )
+            self.parts, self.controller, part, self.sensed, self.applied, self.hold,
+            self.answering, self.w,
+        )  # fmt: skip
         self.x = states[k].copy()
         nc, nu = self.parts.n_controller, self.parts.n_driven
         places = [] if self.moving is None else self.moving.rows(self.first, k)

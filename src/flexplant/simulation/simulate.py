@@ -79,7 +79,8 @@ def simulate(
         What acts on channels of y before they are read, and on driven actuators: u is then what
         they apply, and blocks that read an actuator's name (observers) are fed this. A
         `Quantiser` acts first, then a `Saturation`, then others in their order: `Hysteresis`,
-        `Dropout`, any `Element` of one's own. `Jitter` moves the instants, unknown to blocks.
+        `Dropout`, any `Element` of one's own. `Jitter` moves the instants, unknown to blocks. On a
+        disturbance, `Friction` (or an `Element` with `reads`) is a force that answers a motion.
     anti_windup : float [s], optional
         Time constant in which integrators (all poles slower than it) of blocks that drive
         actuators return to what is applied while that is not what they command.
@@ -175,9 +176,9 @@ def simulate(
         runner: Any
         if positions:
             path = trajectory(plant, positions, time)
-            if met.on_u:
+            if acted := [*met.on_u, *met.on_w]:
                 raise ModelError(
-                    f"{next(iter(met.on_u))!r} has an element: commands are applied as they are "
+                    f"{acted[0]!r} has an element: commands and forces are applied as they are "
                     "where positions move. Leave it out, or let the machine stand."
                 )
             sensed = Acting(plant.y, met.on_y, float(plant.dt)) if met.on_y else None
