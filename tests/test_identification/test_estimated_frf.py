@@ -117,6 +117,15 @@ def test_coherence_is_the_share_of_the_signal():
     assert np.mean(frf.coherence) == pytest.approx(0.5, abs=0.01)
 
 
+def test_coherence_of_periods_is_that_of_one_of_them():
+    """As much noise as signal in each period, however many there are: half."""
+    u = multisine(1, rate=400.0, period=1.0, periods=60, rng=1)
+    for share, noise in ((0.5, 1.0), (0.8, 0.5)):
+        y = u + noise * np.random.default_rng(2).standard_normal(u.shape)
+        frf = estimate_frf(u, y, 400.0, method=Periodic(period=1.0))
+        assert np.mean(frf.coherence) == pytest.approx(share, abs=0.02)
+
+
 @pytest.mark.parametrize("overlap", [0.0, 0.5])
 def test_h1_variance_is_that_of_its_errors_for_two_inputs(overlap):
     rng = np.random.default_rng(6)

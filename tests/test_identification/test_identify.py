@@ -19,6 +19,7 @@ from flexplant.identification import (
     identify_modes,
     stabilisation_diagram,
 )
+from flexplant.identification.line_weights import prepared
 from flexplant.identification.pole_test import improved, missed, split, unexplained
 from flexplant.identification.refine import LEAST, Fit, Lines, refined
 from flexplant.lti import Frf
@@ -529,3 +530,14 @@ def test_resonances_lost_in_short_segments_are_refused_with_their_cause():
     for band in ((100.0, 200.0), (50.0, 400.0)):
         with pytest.raises(SolverError, match=r"segments of 2 s.*narrower"):
             identify_modes(frf, band=band)
+
+
+def test_weights_are_those_of_the_noise_whatever_share_of_it_was_fitted():
+    """Residuals of a fit that has taken half of the noise's power: the variance stays."""
+    rng, freq = np.random.default_rng(1), np.arange(1.0, 4001.0)
+    noise = 0.3 * (rng.standard_normal((1, 1, 4000)) + 1j * rng.standard_normal((1, 1, 4000)))
+    lines = prepared(Frf(freq, 1.0 + noise, ["y"], ["u"]), None)
+    for share in (0.0, 0.5):
+        weight = lines.from_residuals(np.sqrt(1.0 - share) * noise, share).weight
+        # of real and imaginary part each
+        assert np.mean(weight**-2.0) == pytest.approx(0.3**2, rel=0.05, abs=0)
