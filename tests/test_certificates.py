@@ -1,4 +1,8 @@
-"""Each certificate is handed a wrong answer and refuses it: one of its two routes is made wrong."""
+"""Each certificate is handed a wrong answer and refuses it: one of its two routes is made wrong.
+
+By 0.3 % where two routes give the same number; where one bounds the other, or a tolerance of 1 % is
+stated, by what lies beyond it.
+"""
 
 from functools import cache
 from importlib import import_module
@@ -107,12 +111,12 @@ def given(by, place):
 
 
 def second(function):
-    """Right at the first call, too large by 1 % afterwards."""
+    """Right at the first call, too large by 0.3 % afterwards."""
     calls = []
 
     def called(*args):
         calls.append(args)
-        return (1.0 if len(calls) == 1 else 1.01) * function(*args)
+        return (1.0 if len(calls) == 1 else 1.003) * function(*args)
 
     return called
 
@@ -161,24 +165,24 @@ class Unstable:
 #: what is made wrong, how, what is called then, and what is said
 WRONG = {
     "error of an observer, its dual": (
-        "estimation.error._dual", larger(1.1),
+        "estimation.error._dual", larger(1.02),
         lambda: estimate().rms("die", on=masses()), "its dual differ",
     ),
     "minimax filter": (
-        "estimation.minimax._means", larger(1.01),
+        "estimation.minimax._means", larger(1.003),
         lambda: fx.estimation.design_minimax_filter(masses(), [masses()], iterations=3),
         "those of the filter in closed form differ",
     ),
     "filter of several rates": (
-        "estimation.multirate._step", larger(1.01, 3),
+        "estimation.multirate._step", larger(1.003, 3),
         lambda: fx.estimation.design_multirate(masses(), {"y2": 2}), "one period",
     ),
     "H-infinity filter": (
-        "estimation.robust_filter._at", larger(1.5, 1),
+        "estimation.robust_filter._at", larger(1.003, 1),
         lambda: fx.estimation.design_hinf_filter(masses()), "more than the level",
     ),
     "unknown inputs": (
-        "estimation.unknown_inputs._judged", given(1.1, 2),
+        "estimation.unknown_inputs._judged", given(1.003, 2),
         lambda: fx.estimation.design_input_estimator(
             masses(), ["amp"], fx.estimation.Augmented(drift=1.0)
         ), "variances differ",
@@ -196,11 +200,11 @@ WRONG = {
         "observability Gramian",
     ),
     "budget by its spectrum": (
-        "loop.budget.integrated", larger(1.01, 1), lambda: servo().budget("die:error"),
+        "loop.budget.integrated", larger(1.003, 1), lambda: servo().budget("die:error"),
         "integral of the spectrum",
     ),
     "H2 norm by the other Gramian": (
-        "lti.norms.observability_gramian", larger(1.01),
+        "lti.norms.observability_gramian", larger(1.003),
         lambda: fx.h2_norm(fx.StateSpace([[-2.0]], [[1.0]], [[1.0]], [[0.0]])),
         "by the observability",
     ),
@@ -231,13 +235,14 @@ WRONG = {
         ), "moves the response",
     ),
     "H2 claim": (
-        "synthesis.h2._solved", larger(1.01, 4), lambda: fx.design_h2(masses()), "by the synthesis",
+        "synthesis.h2._solved", larger(1.003, 4),
+        lambda: fx.design_h2(masses()), "by the synthesis",
     ),
     "H2 stability": (
         "synthesis.h2._solved", opposite, lambda: fx.design_h2(masses()), "is not stable",
     ),
     "normalised coprime factors": (
-        "synthesis.hinf.ncf._least_by_factors", larger(1.01),
+        "synthesis.hinf.ncf._least_by_factors", larger(1.003),
         lambda: fx.synthesis.shape_loop(fx.lti.tf([1.0], [1.0, 1.0, 0.0]), bandwidth=10.0),
         "by the Hankel norm",
     ),
@@ -275,7 +280,7 @@ WRONG = {
         lambda: fx.synthesis.robust_stability(off_by(0.01), lead(), machines=8), "is unstable",
     ),
     "structured claim": (
-        "synthesis.structured.structured_design._norm", larger(1.01),
+        "synthesis.structured.structured_design._norm", larger(1.003),
         lambda: fx.synthesis.design_structured(problem(), FixedOrder(0), starts=1),
         "in the scaled problem",
     ),

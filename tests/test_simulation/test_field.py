@@ -248,11 +248,29 @@ def test_one_over_f_at_a_sensor_moves_the_machine_as_its_integral_says():
 
 
 @pytest.mark.parametrize(
-    "asd", ["pink", 3.0, ([1.0, 2.0], [1.0, 0.0]), ([2.0, 1.0], [1.0, 1.0]), lambda f: -f]
+    "asd",
+    [
+        "pink",
+        3.0,
+        ([1.0, 2.0], [1.0, 0.0]),
+        ([2.0, 1.0], [1.0, 1.0]),
+        lambda f: -f,
+        lambda f: f[:3],
+    ],
 )
 def test_what_is_no_spectrum(asd):
-    with pytest.raises(ModelError, match="asd"):
+    with pytest.raises(FlexplantError, match="asd"):
         fx.simulation.spectral_noise(asd, rate=100.0, duration=1.0)
+
+
+@pytest.mark.parametrize("found", [3.0, [np.nan], [1j], "no"])
+def test_what_an_element_may_not_return(found):
+    class Wrong:
+        def begin(self, dt, generators):
+            return lambda values: found
+
+    with pytest.raises(ModelError, match="an element returned"):
+        simulate(loop_of(stage()), elements={"u1": Wrong()}, duration=0.01)
 
 
 @pytest.mark.parametrize(

@@ -409,12 +409,14 @@ class Acting:
 
 def _acted(act: Act, values: FloatArray) -> FloatArray:
     """Return what an element makes of the values (runs,)."""
-    found = act(values.copy())
-    if np.shape(found) != values.shape:
+    found = np.asarray(act(values.copy()))
+    if found.shape != values.shape or found.dtype.kind not in "fiu":
         raise ModelError(
-            f"an element returned shape {np.shape(found)} for {len(values)} runs. Return one value "
+            f"an element returned {short(found)} for {len(values)} runs. Return one real number "
             "for each run: element.begin(dt, generators)(values) is (runs,)."
         )
+    if np.any(np.isnan(found)) and not np.any(np.isnan(values)):
+        raise ModelError(f"an element returned {short(found)} for {short(values)}. Mend it there.")
     return found
 
 

@@ -84,7 +84,8 @@ def spectral_noise(
 def _density(asd: Any, freq: FloatArray) -> FloatArray:
     """Return the density at frequencies."""
     if callable(asd):
-        values = np.broadcast_to(real_array(asd(freq), "asd"), freq.shape)
+        values = real_array(asd(freq), "asd")
+        values = real_array(values, "asd of the frequencies", freq.shape if values.ndim else ())
     else:
         if isinstance(asd, str) or not hasattr(asd, "__len__") or len(asd) != 2:
             raise ModelError(
@@ -107,4 +108,4 @@ def _density(asd: Any, freq: FloatArray) -> FloatArray:
         values = np.where(inside, np.exp(np.interp(np.log(freq), np.log(at), np.log(level))), 0.0)
     if np.any(values < 0):
         raise ModelError(f"asd must not be negative, got {values.min():.3g}.")
-    return np.asarray(values)
+    return np.asarray(values, dtype=np.float64)
