@@ -17,6 +17,7 @@ from flexplant.loop import close_loop
 from flexplant.modes import solve_modes
 from flexplant.plant import Sensor, assemble_plant
 from flexplant.plant.uncertainty.uncertain_plant import Delta, with_changes
+from flexplant.plot import report
 from flexplant.simulation import setpoint, simulate
 from flexplant.structure import ModalDamping, chain
 from flexplant.synthesis import design_servo
@@ -342,3 +343,19 @@ def test_deviations_of_moved_modes_cover_in_closed_loop():
         z.append([(shift - (np.sqrt(1.05) - 1.0)) / s, (zeta - 0.01 / np.sqrt(1.05)) / d])
     # chi-square with 8 degrees of freedom: beyond with a probability of 0.1 %
     assert np.sum(np.square(z)) < 26.0
+
+
+@pytest.mark.slow
+def test_the_report_of_a_loop_names_the_mode_that_moved(tmp_path):
+    """A run on a machine whose mode 6 is 2.5 % higher, beside the loop on the model."""
+    moved = with_changes(machine(), [(Delta("f", 6, "freq", 1.0), 0.05)])
+    observer = design_kalman(machine(), larger=machine())
+    servo = design_servo(machine(), bandwidth=25.0, observer=observer)
+    promised, there = (close_loop(P, observer, servo) for P in (machine(), moved))
+    run = simulate(there, duration=2.5, rng=3)
+    found = consistency(promised, run)
+    assert found.moved.modes == (6,)
+    assert abs(found.moved.frequency[6][0] - 0.0247) < 2e-3
+    text = report(tmp_path / "loop", promised, run).read_text()
+    said = text.partition("Beside the model of the loop")[2]
+    assert "near mode 6 " in said and "Calibrate the model" in said
