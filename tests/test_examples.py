@@ -157,13 +157,13 @@ def test_every_row_has_noise_of_its_own(result):
 
 
 def test_the_closed_loops(result):
-    """0.1 %: unstable as if the model were the machine, 87 Hz and 7.8 dB where it is tolerant."""
+    """0.1 %: unstable as if the model were the machine, 83 Hz and 7.6 dB where it is tolerant."""
     case = result["cases"][0.001]
     table, loops = case["table"], case["loops"]
     sure, held = table["H-infinity, updated"], table["tolerant, measured"]
     assert sure.decay > 1.001
     assert loops["H-infinity, updated"]["model"].is_stable  # the model does not show it
-    assert held.bandwidth == pytest.approx(87.0, abs=3.0)
+    assert held.bandwidth == pytest.approx(83.0, abs=3.0)
     promised = loops["tolerant, measured"]["model"].modulus_margin
     assert promised >= 0.4 * (1 - 1e-6)
     assert held.margin == pytest.approx(promised, rel=0.05)
