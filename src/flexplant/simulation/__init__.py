@@ -1,6 +1,6 @@
 """Set-points, sampled-data runs of a closed loop, and what they say of the error.
 
-- `simulate(loop, reference=, duration=, rng=)`: a `Response`, with `elements` of the field
+- `simulate(loop, reference=, duration=, rng=)`: a `Response`, with `elements=` of the field
   (`Saturation`, `Quantiser`, `Hysteresis`, `Dropout`, `Jitter`, `Friction`, one's own) and between
   samples where wished; noise as `fx.design_kalman` has it.
 - `spectral_noise`: records with a measured spectrum, or 1/f, for `simulate(disturbance=)`.
