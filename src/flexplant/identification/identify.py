@@ -79,6 +79,10 @@ _REFINED, _FIRST = 6e3, 200.0
 #: steps of the first answer: the diagram's poles are off by more than noise makes them
 QUICK = 2
 
+#: most residual terms on one side of the band: powers of a frequency beyond tell no more apart in
+#: double precision
+MOST_TERMS = 20
+
 
 def stabilisation_diagram(
     frf: Frf,
@@ -278,8 +282,8 @@ def _identified(
 ) -> IdentifiedModes:
     ready = prepared(frf, band)
     high = float(ready.freq[-1])
-    lower = whole(lower, "lower", minimum=0, maximum=20)
-    terms = UPPER[-1] if upper is None else whole(upper, "upper", minimum=0, maximum=20)
+    lower = whole(lower, "lower", minimum=0, maximum=MOST_TERMS)
+    terms = UPPER[-1] if upper is None else whole(upper, "upper", minimum=0, maximum=MOST_TERMS)
     rate = None if hold is None else positive(hold, "hold")
     if rate is not None and high > rate / 2 * (1 + ROUNDING):
         raise ModelError(f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together.")

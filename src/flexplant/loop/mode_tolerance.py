@@ -11,6 +11,7 @@ import numpy as np
 from ..checks import FloatArray, IntArray, Value, generator, positive, real_array, whole
 from ..errors import AssumptionError, ModelError, counted, warn
 from ..plant import StandardPlant
+from ..plant.realisation import natural
 from ..plant.uncertainty.uncertain_plant import UncertainPlant, modal_realisation
 from ..plant.uncertainty.whole_machines import draws_with_left_out
 from ..tolerances import TINY
@@ -237,9 +238,8 @@ def machine_draws(
             "plant.uncertain(frequency=...), or pass it as known=."
         )
     number, chance = whole(count, "draws"), generator(rng)
-    around, machines = loop.completed or loop, None
-    if loop.completed is not None:
-        machines = draws_with_left_out(uncertain, around.plant, chance, number)
+    around = loop.completed or loop
+    machines = draws_with_left_out(uncertain, around.plant, chance, number)
     if machines is None:  # what is uncertain is no property of the larger plant's modes
         around, machines = loop, iter(uncertain.sample(chance, number))
     loops = map(around.around, machines)
@@ -280,10 +280,7 @@ def _within(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:
 def _elastic(plant: StandardPlant) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return numbers, frequencies [Hz] and damping ratios of the modes that swing below Nyquist."""
     realisation = plant.assembled.realisation
-    trace = np.trace(realisation.pairs, axis1=1, axis2=2)
-    square = np.linalg.det(realisation.pairs)
-    omega = np.sqrt(np.maximum(square, 0.0))
-    zeta = -0.5 * trace / np.maximum(omega, TINY)
+    omega, zeta = natural(realisation.pairs)
     top = np.pi / plant.dt if plant.dt else np.inf
     swings = (np.arange(omega.size) >= realisation.n_rigid) & (zeta < 1.0) & (omega < top)
     keep = np.flatnonzero(swings & (omega > 0))

@@ -15,6 +15,7 @@ from ..lti.discretisation import block_diagonal
 from ..tolerances import SAME, TINY
 from .partition import Partition
 from .reach_and_sight import Assumption, full_ranks, no_zeros, reach_and_sight, response_at
+from .realisation import natural
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -136,7 +137,7 @@ def aliased_modes(plant: Partition) -> str:
         return ""
     rate = 1.0 / plant.dt
     count = plant.assembled.realisation.n_modes
-    freq = np.sqrt(np.maximum(np.linalg.det(plant.modal_blocks[:count]), 0.0)) / (2 * np.pi)
+    freq = natural(plant.modal_blocks[:count])[0] / (2 * np.pi)
     above = np.flatnonzero(freq >= 0.5 * rate * (1 - SAME))
     if not above.size:
         return ""

@@ -29,7 +29,7 @@ from .dynamics import structure_system, with_filters
 from .origin import Assembled, Foreign
 from .partition import Partition
 from .ports import Ports
-from .realisation import ModalRealisation
+from .realisation import ModalRealisation, natural
 from .residual_form import modes_of
 from .sampling import sampled_physical
 from .sensors import Poi
@@ -221,7 +221,7 @@ def _elastic(plant: Partition) -> FloatArray:
     """Return the frequencies [Hz] of the elastic modes of a plant."""
     if not plant.is_assembled:
         return light_modes(plant.system.poles())
-    size = np.sqrt(np.maximum(np.linalg.det(plant.modal_blocks), 0.0))
+    size, _ = natural(plant.modal_blocks)
     return np.asarray(size[size > 0] / (2.0 * np.pi))
 
 

@@ -36,6 +36,16 @@ def _nothing() -> FloatArray:
     return np.zeros(0)
 
 
+def natural(pairs: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return angular frequencies [rad/s] and damping ratios of blocks (b, 2, 2).
+
+    ``omega^2 = det, 2 zeta omega = -trace``; a frequency is 0 where nothing holds the mode back.
+    """
+    omega = np.sqrt(np.maximum(np.linalg.det(pairs), 0.0))
+    trace = np.trace(pairs, axis1=1, axis2=2)
+    return omega, np.asarray(-0.5 * trace / np.maximum(omega, TINY))
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ModalRealisation(Value):
     """A structure's modes as first-order blocks, with maps from and to its DOFs.

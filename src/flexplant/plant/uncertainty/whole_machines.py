@@ -9,9 +9,9 @@ from typing import Self
 import numpy as np
 
 from ...checks import FloatArray
-from ...tolerances import SAME, TINY
+from ...tolerances import SAME
 from ..building import rebuilt
-from ..realisation import ModalRealisation
+from ..realisation import ModalRealisation, natural
 from ..standard import StandardPlant
 from .uncertain_plant import Delta, UncertainPlant, changed_modes, modal_realisation
 
@@ -45,7 +45,6 @@ def draws_with_left_out(
     if unknown is None:
         return None
     deltas, covariance = list(uncertain.deltas), uncertain.covariance
-    left = list(unknown.frequencies)
     deviation = np.sqrt(np.diag(covariance))
     root = np.linalg.cholesky(
         covariance / np.outer(deviation, deviation) + 1e-9 * np.eye(deviation.size)
@@ -54,11 +53,11 @@ def draws_with_left_out(
     def one(own_rng: np.random.Generator) -> StandardPlant:
         amounts = np.concatenate([
             deviation * (root @ own_rng.standard_normal(deviation.size)),
-            own_rng.standard_normal(len(left)) / uncertain.deviations,
+            own_rng.standard_normal(len(unknown.frequencies)) / uncertain.deviations,
         ])  # fmt: skip
         (apart,) = own_rng.spawn(1)
         scattered = np.exp(_DAMPING * apart.standard_normal(len(unknown.modes)))
-        every = [*deltas, *left]
+        every = [*deltas, *unknown.frequencies]
         changes = [(d, float(max(d.scale * x, -0.9))) for d, x in zip(every, amounts, strict=True)]
         modes = changed_modes(whole, [*changes, *unknown.damped(scattered)])
         return rebuilt(whole, realisation=_mixed(modes, own_rng, shapes) if shapes else modes)
@@ -98,8 +97,8 @@ class _Unmeasured:
         if uncertain.fit is not None or not kinds <= set(_OF_MODES) or not whole.has_own_modes:
             return None
         realisation, ranges = modal_realisation(whole), uncertain.frequencies
-        omega, zeta = _frequencies(realisation)
-        own = _frequencies(modal_realisation(uncertain.plant))[0]
+        omega, zeta = natural(realisation.pairs)
+        own, _ = natural(modal_realisation(uncertain.plant).pairs)
         least = max(ranges.values(), default=0.0)
         rigid, n = realisation.n_rigid, min(own.size, omega.size)
         same = np.abs(own[:n] - omega[:n]) <= _SAME * omega[:n]
@@ -121,14 +120,6 @@ class _Unmeasured:
         ]
 
 
-def _frequencies(realisation: ModalRealisation) -> tuple[FloatArray, FloatArray]:
-    """Return angular frequencies [rad/s] and damping ratios of modes, 0 of rigid-body ones."""
-    omega = np.sqrt(np.maximum(np.linalg.det(realisation.pairs), 0.0))
-    omega[: realisation.n_rigid] = 0.0
-    trace = np.trace(realisation.pairs, axis1=1, axis2=2)
-    return omega, -0.5 * trace / np.maximum(omega, TINY)
-
-
 def _mixed(
     realisation: ModalRealisation, rng: np.random.Generator, size: float
 ) -> ModalRealisation:
@@ -143,7 +134,8 @@ def _mixed(
     """
     n, r = realisation.pairs.shape[0], realisation.n_rigid
     real = ~np.any(realisation.inputs[:, ::2], axis=0)
-    omega, _ = _frequencies(realisation)
+    omega, _ = natural(realisation.pairs)
+    omega[:r] = 0.0
     E = np.triu(size * rng.standard_normal((n, n)), 1)
     E = E + E.T
     gap = omega[:, None] ** 2 - omega**2

@@ -28,6 +28,7 @@ from ...plant import (
     stage_weights,
     standard_plant,
 )
+from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...plant.uncertainty.whole_machines import damped_less, draws_with_left_out
 from ..controller import Controller, with_left_out
@@ -286,7 +287,7 @@ class _StageTask:
     def _frequencies(self) -> FloatArray:
         """The uncertain frequencies [Hz], in the order of the modes."""
         pairs = self.plant.assembled.realisation.pairs[np.array(sorted(self.ranges)) - 1]
-        return np.asarray(np.sqrt(np.linalg.det(pairs)) / (2.0 * np.pi))
+        return natural(pairs)[0] / (2.0 * np.pi)
 
     def answer(self) -> Controller:
         """Return the best controller, with what was tried."""

@@ -17,6 +17,7 @@ from ...lti.frequency_sweep import highest, resonance_grid
 from ...lti.responses import responder, responses
 from ...lti.statespace import StateSpace
 from ...plant import Foreign, Poi, StandardPlant
+from ...plant.realisation import natural
 from ...plant.rigid.rigid_motion import rigid_gain
 from ...tolerances import SAME, divisor
 from ..laws.controller_elements import LowPass, Notch, Pid
@@ -155,7 +156,7 @@ def elastic(plant: StandardPlant) -> FloatArray:
     if not plant.is_assembled:
         return np.zeros(0)
     pairs = plant.modal_blocks[plant.n_rigid : plant.assembled.realisation.n_modes]
-    freq = np.sqrt(np.maximum(np.linalg.det(pairs), 0.0)) / (2.0 * np.pi)
+    freq = natural(pairs)[0] / (2.0 * np.pi)
     freq = freq[freq > 0]  # unstable pairs do not resonate
     return np.asarray(freq[freq * plant.dt < 0.45])
 
