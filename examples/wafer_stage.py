@@ -105,7 +105,7 @@ def study(damping: float) -> dict[str, Any]:
     case["errors"] = {f: axes["die:z"] for f, axes in runs.items()}
     case["axes"] = [one for axes in runs.values() for one in axes.values()]
     loops = case["loops"] = control(case)
-    said = {f"{k}, promised": v["model"] for k, v in loops.items()}
+    said = {f"{k}*": v["model"] for k, v in loops.items()}
     return case | {"table": fx.compare_loops({k: v["machine"] for k, v in loops.items()} | said)}
 
 
@@ -199,7 +199,7 @@ def claims(cases: dict[float, dict[str, Any]]) -> dict[str, bool]:
         f"without them {alone[0]:.1f} nm are predicted where the machine has {alone[1]:.1f} nm; "
         f"with them it has {cured[1]:.1f} nm": alone[1] > max(3.0 * alone[0], 1.5 * cured[1]),
         f"H-infinity for {BANDWIDTH:g} Hz designed as if the updated model were the machine is "
-        "unstable, as design_hinf warns: modes left out": not sure.stable,
+        "unstable, as design_hinf warns": not sure.stable,
         f"designed to tolerate that it holds: |S| < 1 up to {np.floor(held.bandwidth):.0f} Hz, "
         f"modulus margin {margins[1]:.2f} ({margins[0]:.2f} promised)": (
             held.bandwidth > BANDWIDTH and abs(margins[1] / margins[0] - 1.0) < 0.1
@@ -242,7 +242,7 @@ def table(result: dict[str, Any]) -> str:
             if loop["machine"].is_stable:
                 (a, b), (c, d) = 1e9 * np.transpose(loop["exposures"])
                 parts.append(f"{name}: MA {a:.1f} nm ({b:.1f} promised), MSD {c:.1f} nm ({d:.1f})")
-    parts.append("MA, MSD: largest mean and deviation of die:error over 5 ms, after the move.\n")
+    parts.append("MA, MSD: largest mean, deviation in 5 ms of die:error at rest. *: promised\n")
     (x, y, _), (old, new) = fifth.best, 1e9 * np.sqrt([fifth.without, fifth.values.min()])
     helps = f"A fifth sensor helps most at ({x:g}, {y:g}) m: {old:.3f} -> {new:.3f} nm"
     return "\n".join([*parts, helps])
