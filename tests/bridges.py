@@ -3,9 +3,7 @@
 Data: Georgia Tech, structural model updating (GPL-3: read where present, never bundled).
 """
 
-import os
 import warnings
-from pathlib import Path
 
 import numpy as np
 import scipy.io as sio
@@ -15,8 +13,8 @@ from flexplant.identification import MeasuredModes
 from flexplant.labels import DofSet
 from flexplant.reduction import ReducedModel
 from flexplant.updating import Eigenvalues, MatrixParameter, ModeShapes, update
+from shared_data import DATA
 
-DATA = Path(os.environ.get("FLEXPLANT_DATA", Path(__file__).parents[2] / "shared" / "data"))
 FILE = DATA / "fe" / "updating" / "SteelPedBrdg_sim_form1_LM.mat"
 
 TRUTH = np.array(

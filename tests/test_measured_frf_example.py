@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from bridges import DATA
+from shared_data import DATA
 
 FILE = Path(__file__).parents[1] / "examples" / "measured_frf.py"
 

@@ -12,8 +12,8 @@ import scipy.io
 import scipy.sparse as sp
 
 import flexplant as fx
-from bridges import DATA
 from flexplant.sparse.ordering import dissect
+from shared_data import DATA
 
 pytestmark = pytest.mark.benchmark
 

@@ -1,7 +1,6 @@
 """ANSYS .full files: the sample with its published frequencies, and a stand-in for the reader."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +11,12 @@ import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.io import ansys, child
 from flexplant.io.ansys import cosines_of
+from shared_data import DATA, needs
 
-FULL = Path("/work/shared/data/fe/ansys/file.full")
+FULL = DATA / "fe" / "ansys" / "file.full"
 
 
-@pytest.mark.skipif(not FULL.exists(), reason="no data folder")
+@needs(FULL)
 class TestSample:
     @pytest.mark.slow
     def test_frequencies_of_the_held_beam(self):

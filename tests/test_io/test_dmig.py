@@ -1,7 +1,6 @@
 """DMIG punch files: real ones against the frequencies Nastran printed, and cards of every form."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +10,10 @@ import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.io.dmig import read_dmig
 from flexplant.io.nastran import read_nodes
+from shared_data import DATA, needs
 
-SHARED = Path("/work/shared/data/fe/nastran")
-needs_data = pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+SHARED = DATA / "fe" / "nastran"
+needs_data = needs(SHARED)
 
 
 def printed_eigenvalues(name):

@@ -1,7 +1,6 @@
 """Matrix Market, Harwell-Boeing, MATLAB and NumPy files: written by others and read back."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +12,10 @@ import flexplant as fx
 from flexplant.errors import FlexplantError, FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.io import models
 from flexplant.io.paths import Format
+from shared_data import DATA, needs
 
-FE = Path("/work/shared/data/fe")
-needs_data = pytest.mark.skipif(not FE.exists(), reason="no data folder")
+FE = DATA / "fe"
+needs_data = needs(FE)
 
 
 def pair(n=6):

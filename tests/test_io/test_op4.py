@@ -1,7 +1,6 @@
 """OUTPUT4 files: every variant that pyYeti writes, real ones with a twin, and damaged ones."""
 
 import contextlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +10,9 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.io.op4 import read_op4, read_op4_matrices
+from shared_data import DATA, needs
 
-SHARED = Path("/work/shared/data/fe/nastran")
+SHARED = DATA / "fe" / "nastran"
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_words_and_markers_of_any_length(tmp_path, order, marker, integer):
         read_op4_matrices(path)
 
 
-@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+@needs(SHARED)
 @pytest.mark.parametrize("name", ["nastran_op4_data_r_c_rc", "nastran_op4_data_double_bigmat_le"])
 def test_files_of_nastran_have_their_twins_content(name):
     found = read_op4_matrices(SHARED / f"{name}.op4")
@@ -109,7 +109,7 @@ def test_files_of_nastran_have_their_twins_content(name):
         assert dense(matrix) == pytest.approx(dense(twin), rel=1e-14, abs=0), key
 
 
-@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+@needs(SHARED)
 def test_superelements_of_nastran_have_their_twins_content():
     path = SHARED / "nas2cam_extseout_nas2cam"
     found = read_op4_matrices(path.with_suffix(".op4"))
@@ -125,7 +125,7 @@ def test_superelements_of_nastran_have_their_twins_content():
     assert compared == 6
 
 
-@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+@needs(SHARED)
 def test_integers_of_64_bits(op4):
     path = SHARED / "nastran_op4_data_binary_fabiola.op4"
     names, wanted, _, _ = op4.read(path, into="list")
@@ -262,7 +262,7 @@ def test_complex_text_whose_last_record_counts_words(tmp_path, kind):
             assert found[name].toarray().tolist() == [[0, 0], [0, 1.5 - 2.5j], [0, 0]]
 
 
-@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+@needs(SHARED)
 def test_superelements_whose_damping_is_a_null_of_one_entry(tmp_path):
     path = tmp_path / "inboard.op4"
     content = (SHARED / "extseout" / "inboard.op4").read_bytes()
@@ -280,7 +280,7 @@ def test_superelements_whose_damping_is_a_null_of_one_entry(tmp_path):
     assert fx.read_matrices(path, damping=None).D is None
 
 
-@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+@needs(SHARED)
 def test_names_in_words_of_eight_bytes():
     names = list(read_op4_matrices(SHARED / "extseout" / "nas2cam_notall6_msc2017.op4"))
     assert names[:4] == ["SE_START", "LAMBDA", "MAA", "KAA"]

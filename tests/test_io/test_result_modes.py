@@ -1,7 +1,6 @@
 """Modes of result files: real ones of Nastran and ANSYS, and files written here word by word."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +10,10 @@ import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError, ShapeError
 from flexplant.io import read_modes
 from op2_files import op2, punch
+from shared_data import DATA, needs
 
-SHARED = Path("/work/shared/data/fe/nastran")
-needs_data = pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+SHARED = DATA / "fe" / "nastran"
+needs_data = needs(SHARED)
 #: two nodes; the second moves in system 5, turned by 90 degrees about z
 XYZ = {7: (0.0, 0.0, 0.0), 9: (0.5, 0.25, 0.0)}
 VALUES = np.random.default_rng(4).normal(size=(3, 2, 6))

@@ -1,15 +1,14 @@
 """MATLAB text of Sierra/SD: triplets, the map of rows, the mesh."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import scipy.io
 
 from flexplant.errors import FlexplantError, ModelError, ShapeError
 from flexplant.io.sierra import read_sierra
+from shared_data import DATA, needs
 
-SHARED = Path("/work/shared/data/fe/sierra")
+SHARED = DATA / "fe" / "sierra"
 
 K = np.array([[4.0, -1.5, 0.25], [-1.5, 3.0, 0.0], [0.25, 0.0, 5.0]])
 M = np.diag([1.0, 2.0, 3.0])
@@ -137,7 +136,7 @@ def test_maps_that_are_filled_entry_by_entry(tmp_path):
             read_sierra(k, dof_map=written(tmp_path, text, "a.m"))
 
 
-@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+@needs(SHARED)
 def test_a_real_map_and_its_list_of_nodes(tmp_path):
     """630 nodes, three DOFs each; as a matrix it is none."""
     with pytest.raises(FlexplantError, match="A map of DOFs goes to dof_map="):

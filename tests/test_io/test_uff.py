@@ -3,18 +3,18 @@
 import re
 import sys
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import flexplant as fx
+import shared_data
 from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.io.uff import read_frf_uff, read_modes_uff, read_nodes_uff
 from uff_files import analysis
 
 pyuff = pytest.importorskip("pyuff")
-SHARED = Path("/work/shared/data/fe/uff")
+SHARED = shared_data.DATA / "fe" / "uff"
 FREQ = np.arange(1, 33) * 0.5
 RNG = np.random.default_rng(3)
 #: (output, input): accelerance
@@ -316,7 +316,7 @@ def test_a_file_cut_within_a_dataset_says_so(tmp_path, binary):
                     read(path)
 
 
-@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+@shared_data.needs(SHARED)
 def test_files_of_others():
     modes = read_modes_uff(SHARED / "uff55_translation_rotation.uff")
     assert modes.freq == pytest.approx([97.013])

@@ -1,7 +1,5 @@
 """Similarity, modal blocks, the split into stable part and rest, minimal realisations."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import scipy.linalg as la
@@ -15,9 +13,10 @@ from flexplant.lti import StateSpace, minimal, modal_form, parallel, series, spl
 from flexplant.lti.discretisation import discretized
 from flexplant.lti.equations import balanced_matrix, state_scale
 from oracles_lti import sweep
+from shared_data import DATA
 from systems_lti import machine, system
 
-CD_PLAYER = Path(__file__).parents[3] / "shared" / "data" / "norms" / "CDplayer.mat"
+CD_PLAYER = DATA / "norms" / "CDplayer.mat"
 FREQ = np.geomspace(1.0, 4900.0, 120)
 
 

@@ -1,7 +1,5 @@
 """Norms: closed forms, SLICOT's data and routine, dense sweeps; in SI units and lightly damped."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import scipy.linalg as la
@@ -15,9 +13,10 @@ from flexplant.lti.discretisation import discretized
 from flexplant.lti.peaks import Peaks, climbed, exceeding, proved_peak, residues
 from flexplant.parallel import Progress
 from oracles_lti import largest_gain, lyapunov, peak_by_search, stein, sweep
+from shared_data import DATA
 from systems_lti import machine
 
-DATA = Path(__file__).parents[3] / "shared" / "data" / "norms"
+NORMS = DATA / "norms"
 
 
 def resonance(omega=2e3, zeta=1e-3, scale=1.0):
@@ -42,7 +41,7 @@ def test_single_resonance_in_closed_form(omega, zeta, scale):
     [("build", 0.0052763338, 5.20608, 0.0045300605), ("CDplayer", 2319821, 22.5682, 1102128.9)],
 )
 def test_slicot_collection(name, hinf, omega, h2):
-    path = DATA / f"{name}.mat"
+    path = NORMS / f"{name}.mat"
     if not path.exists():
         pytest.skip("the SLICOT data are not here")
     import scipy.io

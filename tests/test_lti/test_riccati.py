@@ -1,7 +1,5 @@
 """Riccati equations: closed forms, extended-precision recursion, scipy where it works, refusals."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import scipy.linalg as la
@@ -11,6 +9,7 @@ from hypothesis import strategies as st
 from flexplant.errors import ModelError, ShapeError, SolverError
 from flexplant.lti import control_care, control_dare, equations, solve_care, solve_dare
 from oracles_lti import double_integrator_dare, riccati_recursion, stein
+from shared_data import DATA
 
 
 def benign(seed, n=6, p=2):
@@ -238,7 +237,7 @@ def test_outputs_that_miss_a_rigid_body_mode_are_named():
 
 
 def test_compleib_problems_equal_scipy_or_have_no_solution():
-    path = Path(__file__).parents[3] / "shared" / "data" / "compleib-open.npz"
+    path = DATA / "compleib-open.npz"
     if not path.exists():
         pytest.skip("the COMPleib data are not here")
     data = np.load(path)

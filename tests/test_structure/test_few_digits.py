@@ -1,7 +1,6 @@
 """Models whose coordinates or matrices lost digits on their way: free bodies stay free."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +13,9 @@ from flexplant.errors import FlexplantWarning, ModelError
 from flexplant.structure import FEMatrices, FEModel, Spring
 from flexplant.structure.precision import digits_of
 from meshes import dofs_of, solid
+from shared_data import DATA, needs
 
-NASTRAN = Path("/work/shared/data/fe/nastran")
+NASTRAN = DATA / "fe" / "nastran"
 
 
 def rounded(values, digits):
@@ -138,7 +138,7 @@ def test_freeing_what_is_held_is_refused():
         text.model(free="yes")
 
 
-@pytest.mark.skipif(not NASTRAN.exists(), reason="needs the data of /work/shared")
+@needs(NASTRAN)
 def test_the_aircraft_with_its_coordinates_becomes_a_free_model(tmp_path):
     """Six rigid-body modes at exactly 0, the others as the f06 prints them."""
     printed = (NASTRAN / "femv5p1.f06").read_text(encoding="latin-1")

@@ -1,7 +1,6 @@
 """Foreign matrices before they are a model: against dense algebra written from the equations."""
 
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +10,9 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.structure.matrices import completed
+from shared_data import DATA, needs
 
-NASTRAN = Path("/work/shared/data/fe/nastran")
+NASTRAN = DATA / "fe" / "nastran"
 LINE = ["x"]
 
 
@@ -331,7 +331,7 @@ def test_freed_rigid_body_motions_leave_the_elastic_modes():
         held.freed()
 
 
-@pytest.mark.skipif(not NASTRAN.exists(), reason="no data folder")
+@needs(NASTRAN)
 class TestAircraft:
     """femv5p1, 426 DOFs: the f06 lists 2495.120 first, ten digits leave 2478.0 (-0.69 %)."""
 

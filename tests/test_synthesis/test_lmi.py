@@ -3,7 +3,6 @@
 import csv
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,9 +25,10 @@ from flexplant.synthesis.lmi.lmi_programs import (
     symmetric_blocks,
 )
 from oracles_lmi import closed_loop, output_feedback_gamma, state_feedback_gamma, swept_norm
+from shared_data import DATA
 
 SETTINGS = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}
-DATA = Path(__file__).parents[3] / "shared" / "data" / "compleib-open.npz"
+COMPLEIB = DATA / "compleib-open.npz"
 KEYS = ("A", "B1", "B2", "C1", "C2", "D11", "D12", "D21")
 SMALL = ["NN2", "DIS2", "NN8", "AC15", "AC4", "DIS5", "HE1", "HE2", "NN4", "REA2", "AC2", "EB1"]
 LARGE = ["TMD", "DIS1", "HE5", "AC8", "DLR1", "EB2", "TG1", "WEC1", "BDT1", "AGS", "CSE1"]
@@ -92,11 +92,11 @@ def random_parts(seed, n=8, nw=3, nu=2, nz=4, ny=2):
 
 
 def compleib(name):
-    if not DATA.exists():
+    if not COMPLEIB.exists():
         pytest.skip("the COMPleib problems are not here")
-    with np.load(DATA) as file:
+    with np.load(COMPLEIB) as file:
         parts = tuple(np.atleast_2d(file[f"{name}/{key}"]) for key in KEYS)
-    with DATA.with_suffix(".csv").open() as file:
+    with COMPLEIB.with_suffix(".csv").open() as file:
         gamma = {row["name"]: float(row["gamma"]) for row in csv.DictReader(file)}
     return parts, gamma[name]
 

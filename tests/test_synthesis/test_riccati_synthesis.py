@@ -4,7 +4,6 @@ import csv
 import re
 import time
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,10 +31,11 @@ from oracles_synthesis import (
     split,
     stability,
 )
+from shared_data import DATA, needs
 
-DATA = Path(__file__).parents[3] / "shared" / "data" / "compleib-open.npz"
+COMPLEIB = DATA / "compleib-open.npz"
 FULL_RANK = ("AC4", "AC8", "DIS5", "EB1", "EB2", "HE5", "JE3")
-needs_data = pytest.mark.skipif(not DATA.exists(), reason="COMPleib is not here")
+needs_data = needs(COMPLEIB)
 
 
 def named(A, B, C, D, nu, ny, dt=0.0):
@@ -48,7 +48,7 @@ def named(A, B, C, D, nu, ny, dt=0.0):
 
 
 def compleib(name):
-    with np.load(DATA) as data:
+    with np.load(COMPLEIB) as data:
         g = {k: data[f"{name}/{k}"] for k in ("A", "B1", "B2", "C1", "C2", "D11", "D12", "D21")}
     nu, ny = g["B2"].shape[1], g["C2"].shape[0]
     return named(
@@ -63,9 +63,9 @@ def compleib(name):
 
 def problems():
     """{name: best known gamma}, empty when the data is absent."""
-    if not DATA.exists():
+    if not COMPLEIB.exists():
         return {}
-    with DATA.with_suffix(".csv").open() as file:
+    with COMPLEIB.with_suffix(".csv").open() as file:
         return {row["name"]: float(row["gamma"]) for row in csv.DictReader(file)}
 
 
