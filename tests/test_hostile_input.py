@@ -1,5 +1,7 @@
 """Hostile arguments of the shared checks: a right answer or an error of ours with a way out."""
 
+import inspect
+import sys
 from functools import partial
 
 import numpy as np
@@ -56,3 +58,16 @@ def test_attributes_that_are_not_there_answer_with_those_that_are():
     with pytest.raises(AttributeError, match=r"Pictures are functions: flexplant\.plot"):
         _ = plant.plot
     assert not hasattr(plant, "_nothing")
+
+
+def test_arguments_that_are_not_taken_answer_with_those_that_are():
+    with pytest.raises(TypeError, match=r"Pid takes no argument 'kp'. Close matches: p\. It takes"):
+        fx.Pid(kp=1.0)
+    with pytest.raises(TypeError, match=r"'poles'. Close matches: pole, p\."):
+        fx.Pid(1.0).replace(poles=2.0)
+    with pytest.raises(TypeError, match="missing 1 required"):
+        fx.Pid()
+    assert list(inspect.signature(fx.Pid).parameters) == ["p", "i", "d", "pole"]
+    if sys.version_info >= (3, 13):  # of functions the interpreter says it
+        with pytest.raises(TypeError, match="Did you mean 'larger'"):
+            fx.design_kalman(None, largr=None)

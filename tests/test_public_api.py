@@ -72,6 +72,7 @@ PUBLIC = of(flexplant)
 for room in sorted(ROOMS - {"errors", "plot"}):
     PUBLIC |= of(getattr(flexplant, room))
 CLASSES = {name: item for name, item in PUBLIC.items() if inspect.isclass(item)}
+PICTURES = {name: item for name, item in of(flexplant.plot).items() if inspect.isfunction(item)}
 FUNCTIONS = {name: item for name, item in PUBLIC.items() if inspect.isfunction(item)}
 ERRORS = {n for n, c in CLASSES.items() if issubclass(c, BaseException)}
 CONSTRUCTORS = {name: item for name, item in CLASSES.items() if name not in ERRORS}
@@ -166,6 +167,28 @@ def keywords_closed(name, item):
     return f"{name} takes **keywords" if open_ones else None
 
 
+#: what stands by place though it has a default that is a number or a name, or is the second such:
+#: these are said together
+TOGETHER = {
+    "direction",  # after a place: dofs.nearest(xyz, "rx")
+    "inputs",  # after the outputs, as in frf["y1", "u1"]
+    "dt",  # of a transfer function, as in python-control
+    "freq",  # after what the response is of
+    "parameters",  # after the fit, as in `update`
+    "n",  # after the seed
+}
+
+
+def options_by_name(name, item):
+    """By place stands what an item acts on: up to four, then one method, model or criterion."""
+    placed = [p for p in parameters(item) if p.kind is p.POSITIONAL_OR_KEYWORD]
+    optional = [p for p in placed if p.default is not p.empty and p.name not in TOGETHER]
+    if len(placed) - len(optional) > 4 or len(optional) > 1:
+        return f"{name} takes {[p.name for p in placed]} by place"
+    scalar = optional and isinstance(optional[0].default, int | float | str)
+    return f"{name} takes {optional[0].name} by place" if scalar and len(placed) > 1 else None
+
+
 def all_errors(base):
     return {base}.union(*(all_errors(sub) for sub in base.__subclasses__()))
 
@@ -180,6 +203,7 @@ DESCRIBED = {n: i for n, i in PUBLIC.items() if inspect.isclass(i) or inspect.is
         (parameters_described, DOCUMENTED),
         (raises_named, FUNCTIONS),
         (keywords_closed, DOCUMENTED | METHODS),
+        (options_by_name, FUNCTIONS | PICTURES | METHODS),
     ],
 )
 def test_every_public_name(check, items):
@@ -202,6 +226,11 @@ def test_the_checks_can_fail():
     )
     assert raises_named("bad", bad).startswith("bad does not say under Raises")
     assert keywords_closed("bad", bad) == "bad takes **keywords"
+    assert options_by_name("bad", bad) is None
+    assert options_by_name("one", lambda level=0.9: level) is None
+    assert options_by_name("x", lambda a, b=1: a) == "x takes b by place"
+    assert options_by_name("x", lambda a=None, b=None: a) == "x takes ['a', 'b'] by place"
+    assert options_by_name("x", lambda a, b, c, d, e: a) is not None
     assert described("bad", bad) is None
     assert described("x", lambda: None) == "x has no docstring"
     assert [p.name for p in parameters(bad)] == ["first", "second", "rest"]

@@ -153,13 +153,32 @@ def unknown_attribute(owner: str, name: str, known: Iterable[str]) -> AttributeE
     Response has no 'plot'. Pictures are functions: flexplant.plot. dir() of it lists all.
     """
     listed = sorted(n for n in known if not n.startswith("_"))
-    stem = name.rstrip("s").lower()
-    within = [n for n in listed if len(stem) > 2 and (stem in n or n.rstrip("s") in name)]
-    close = list(dict.fromkeys([*get_close_matches(name, listed, n=3, cutoff=0.6), *within]))[:4]
-    near = f" Close matches: {', '.join(close)}." if close else ""
+    near = f" Close matches: {', '.join(close)}." if (close := _near(name, listed)) else ""
     if name.startswith("plot"):
         near = " Pictures are functions: flexplant.plot."
     return AttributeError(f"{owner} has no {name!r}.{near} dir() of it lists all.")
+
+
+def unknown_keyword(owner: str, name: str, known: Iterable[str]) -> TypeError:
+    """Return the TypeError for an argument that a kind does not take, with those near to it.
+
+    Examples
+    --------
+    >>> print(unknown_keyword("Pid", "kp", ["p", "i", "d", "pole"]))
+    Pid takes no argument 'kp'. Close matches: p. It takes p, i, d, pole.
+    """
+    listed = list(known)
+    near = f" Close matches: {', '.join(close)}." if (close := _near(name, listed)) else ""
+    return TypeError(
+        f"{owner} takes no argument {name!r}.{near} It takes {', '.join(listed) or 'none'}."
+    )
+
+
+def _near(name: str, listed: list[str]) -> list[str]:
+    """Return up to four names of a list that look like another, or contain it."""
+    stem = name.rstrip("s").lower()
+    within = [n for n in listed if len(stem) > 2 and (stem in n or n.rstrip("s") in name)]
+    return list(dict.fromkeys([*get_close_matches(name, listed, n=3, cutoff=0.6), *within]))[:4]
 
 
 def require_known(

@@ -6,11 +6,12 @@ import json
 import os
 import re
 import uuid
-from abc import ABC
+from abc import ABCMeta
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from html import escape
+from inspect import Parameter, Signature, signature
 from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
@@ -19,7 +20,7 @@ from typing import IO, TYPE_CHECKING, Any, ClassVar, Self, cast
 import numpy as np
 import scipy.sparse as sp
 
-from .errors import FlexplantError, unknown_attribute
+from .errors import FlexplantError, unknown_attribute, unknown_keyword
 
 _HEADER = "__flexplant__"
 
@@ -36,7 +37,36 @@ def _annotated(cls: type) -> Mapping[str, Any]:
     return cast("Mapping[str, Any]", vars(cls).get("__annotations__", {}))
 
 
-class Value(ABC):  # noqa: B024 - its kinds have abstract methods
+class _Kind(ABCMeta):
+    """The class of the kinds of values: says which arguments are near to one that is not taken.
+
+    Functions are left to the interpreter, which does so itself from Python 3.13 on: a wrapper
+    around each would cost a call, a line of every traceback, and break the pickling of those that
+    inner modules imported before it.
+    """
+
+    if not TYPE_CHECKING:  # a type checker would take any argument for known
+
+        @property
+        def __signature__(cls) -> Signature:
+            if cls.__init__ is object.__init__:  # a base without fields
+                return Signature()
+            made = signature(cls.__init__)
+            return made.replace(parameters=[*made.parameters.values()][1:])
+
+        def __call__(cls, *args: Any, **named: Any) -> Any:
+            """Return a value of this kind."""
+            try:
+                return super().__call__(*args, **named)
+            except TypeError:
+                taken = cls.__signature__.parameters
+                unknown = [name for name in named if name not in taken]
+                if unknown and not any(p.kind is Parameter.VAR_KEYWORD for p in taken.values()):
+                    raise unknown_keyword(cls.__name__, unknown[0], taken) from None
+                raise
+
+
+class Value(metaclass=_Kind):
     """A frozen dataclass whose arrays are read-only copies, also after pickling and loading.
 
     What is no such field as its kind describes is refused at construction: by ShapeError where

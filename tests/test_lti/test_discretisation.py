@@ -275,7 +275,7 @@ def test_a_series_of_filters_and_modes_keeps_its_blocks(count, push, delay):
         parts = []
         for name, to, order in zip(inputs, outputs, (1, 2, 2), strict=True):
             lag = lowpass(10.0 ** rng.uniform(0, 3.5), order=order)
-            parts.append(lag.renamed({lag.inputs[0]: name}, {lag.outputs[0]: to}))
+            parts.append(lag.renamed(inputs={lag.inputs[0]: name}, outputs={lag.outputs[0]: to}))
         return append(*parts)
 
     before, after = filters(["c1", "c2", "c3"], u), filters(y, ["m1", "m2", "m3"])

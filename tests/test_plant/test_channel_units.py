@@ -55,7 +55,10 @@ def test_units_travel_with_the_channels(tmp_path):
     assert dict(fx.load(tmp_path / "p.npz").system.units) == dict(sampled.system.units)
     part = sampled.system["die:rx", "u1"]
     assert dict(part.units) == {"u1": "N", "die:rx": "rad"}
-    assert dict(part.renamed({"u1": "f"}, {"die:rx": "a"}).units) == {"f": "N", "a": "rad"}
+    assert dict(part.renamed(inputs={"u1": "f"}, outputs={"die:rx": "a"}).units) == {
+        "f": "N",
+        "a": "rad",
+    }
     frf = fx.frequency_response(part, np.array([10.0, 20.0]))
     assert frf.unit("die:rx", "u1") == "rad/N"
     frf.save(tmp_path / "f.npz")
@@ -120,13 +123,13 @@ def test_connections_keep_the_units_of_what_is_left():
     k = StateSpace(
         [[-2.0]], one, one, [[0.0]], inputs=["x"], outputs=["f"], units={"x": "m", "f": "N"}
     )
-    other = g.renamed({"f": "f2"}, {"x": "x2"})
+    other = g.renamed(inputs={"f": "f2"}, outputs={"x": "x2"})
     assert dict(append(g, other).units) == {"f": "N", "x": "m", "f2": "N", "x2": "m"}
     assert dict(series(k, g).units) == {"x": "m"}
     assert dict(parallel(g, g).units) == dict(feedback(g).units) == {"f": "N", "x": "m"}
     both = append(g, other)
     assert dict(lft(both, k).units) == {"f2": "N", "x2": "m"}
-    joined = connect([g, other.renamed({"f2": "x"})], ["f"], ["x", "x2"])
+    joined = connect([g, other.renamed(inputs={"f2": "x"})], ["f"], ["x", "x2"])
     assert dict(joined.units) == {"f": "N", "x": "m", "x2": "m"}
     with pytest.raises(ModelError, match="units must be a mapping"):
         g.replace(units=["m"])

@@ -193,7 +193,7 @@ def test_unlocated_matrices_make_held_models_only():
         (lambda: fx.FEMatrices([[1.0]], dofs="x"), ModelError, "DofSet"),
         (lambda: fx.FEMatrices([[1.0]]).model(massless="drop"), ModelError, "refuse"),
         (lambda: fx.FEMatrices([[1.0]]).without(["1:x"]), LabelError, "no names"),
-        (lambda: fx.FEMatrices([[1.0]]).converted("mm"), LabelError, "no names yet"),
+        (lambda: fx.FEMatrices([[1.0]]).converted(length="mm"), LabelError, "no names yet"),
     ],
 )
 def test_bad_input_is_refused(make, error, match):
@@ -236,7 +236,7 @@ def test_a_penalty_is_named_by_the_check_and_dropped_on_demand():
 def test_units_of_matrices_and_coordinates():
     K, M, dofs = chain(3)
     mm = fx.FEMatrices(K, M, 2 * M, dofs=dofs.replace(xyz=1000 * dofs.xyz))
-    si = mm.converted("mm", "t")
+    si = mm.converted(length="mm", mass="t")
     np.testing.assert_allclose(si.K.toarray(), 1e3 * K, rtol=1e-14)
     np.testing.assert_allclose(si.M.toarray(), 1e3 * M, rtol=1e-14)
     np.testing.assert_allclose(si.D.toarray(), 2e3 * M, rtol=1e-14)

@@ -44,7 +44,7 @@ def edges(model, directions=None):
         [(-inf, -inf, -inf), (inf, 0, inf)],
         [(-inf, SIDE, -inf), (inf, inf, inf)],
     ]
-    return {label for box in boxes for label in model.dofs.where(None, directions, box=box)}
+    return {label for box in boxes for label in model.dofs.where(directions=directions, box=box)}
 
 
 def test_free_square_plate_of_leissa():

@@ -241,7 +241,7 @@ class Patch(Value):
                 f"Say whose: Patch('{self.component}/{dofs.components[0]}', nodes), or give box=."
             )
         own = max(inner, key=len, default=None)
-        chosen = dofs.where(self.nodes, box=self.box, component=own)
+        chosen = dofs.where(nodes=self.nodes, box=self.box, component=own)
         rows = dofs.indices(chosen.labels)
         return np.asarray(rows[dofs.kinds[rows] < 3])
 

@@ -82,7 +82,7 @@ class Scores(Value):
         """
         return "\n".join(self._lines(whole(count, "count")))
 
-    def on(self, plant: StandardPlant, rank: int = 0) -> StandardPlant:
+    def on(self, plant: StandardPlant, *, rank: int = 0) -> StandardPlant:
         """Return the plant with the layout of a rank (0 is the best) instead of its own.
 
         Parameters

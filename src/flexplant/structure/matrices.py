@@ -237,7 +237,7 @@ class FEMatrices(Value):
         return self.replace(**parts, dofs=dofs, constrained=held)
 
     def converted(
-        self, length: str | float = "m", mass: str | float = "kg", time: str | float = "s"
+        self, *, length: str | float = "m", mass: str | float = "kg", time: str | float = "s"
     ) -> FEMatrices:
         """Return the matrices and coordinates in SI, from those in other units.
 
@@ -264,7 +264,7 @@ class FEMatrices(Value):
         Examples
         --------
         >>> dofs = DofSet([1], ["z"], [[500.0, 0, 0]])
-        >>> si = FEMatrices([[12.0]], [[0.002]], dofs=dofs).converted("mm", "t").model()
+        >>> si = FEMatrices([[12.0]], [[0.002]], dofs=dofs).converted(length="mm", mass="t").model()
         >>> float(si.K[0, 0]), si.mass, float(si.dofs.xyz[0, 0])
         (12000.0, 2.0, 0.5)
         """

@@ -47,7 +47,7 @@ class FixedBlock(SingleElement):
         self._set(block=g, label=str(self.label))
 
     @classmethod
-    def of(cls, given: Any, label: str = "") -> FixedBlock:
+    def of(cls, given: Any, *, label: str = "") -> FixedBlock:
         """Return the element of a system, or of a designed controller.
 
         Parameters
