@@ -23,7 +23,9 @@ counts as so much less. Of two poles within a bandwidth with the same shape and 
 remains. Where outputs disagree on the poles (a roving sensor), they are warned of: poles are then
 means of each output's own, with the deviations of random effects. Poles whose deviation of
 frequency or damping exceeds it, mains multiples narrower than half a line and poles at the edge
-of the band are not reported, but listed with the reason in `rejected`.
+of the band are not reported, but listed with the reason in `rejected`. So are lines at multiples
+of 50 and 60 Hz that stand out of what their neighbours predict, in some outputs or all: these are
+left out before the diagram.
 
 Lines of Hann-windowed segments show a resonance widened by the window: where that explains them
 better (H1 of random excitation), each term ``1/(s - lambda)`` is fitted as such lines show it, so

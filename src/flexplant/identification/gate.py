@@ -10,19 +10,13 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, attempted
 from ..tolerances import RANK, TINY
+from .line_weights import NARROW, Rejected, mains_multiple
 from .model_error import ALIKE, mac, strength, twin
 from .pole_test import pole_price, shared, unit
 from .refine import Fit, Lines, pivoted, refined
 
-#: frequencies [Hz] of mains
-MAINS = (50.0, 60.0)
-#: width of a resonance in lines below which a disturbance of one frequency looks the same
-NARROW = 0.5
 #: half-widths beside a pole within which another one may stand for the same resonance
 BESIDE = 3.0
-
-#: frequency [Hz], damping ratio and the reason why a pole is not reported
-Rejected = tuple[float, float, str]
 
 
 def gated(
@@ -167,8 +161,5 @@ def _outside(lines: Lines, pole: complex) -> str | None:
     if min(freq - low, high - freq) < max(spacing, width / 2):
         return "at the edge of the band"
     if width < NARROW * spacing:
-        for mains in MAINS:
-            number = round(freq / mains)
-            if number and abs(freq - number * mains) < spacing / 2:
-                return f"a mains multiple, {number} x {mains:g} Hz, narrower than half a line"
+        return mains_multiple(freq, spacing)
     return None

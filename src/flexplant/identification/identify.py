@@ -382,11 +382,12 @@ def _identified(
             if apart is not None:
                 reported, others = steady(fit, reported, apart.spread[: fit.m])
                 fit = Fit(lines, apart.poles, fit.participation, fit.pivots)
-                rejected = tuple(sorted(rejected + others))
+                rejected += others
         if compare or budget.done > BUDGET:
             warned(unexplained(lines, fit), None if apart is None else (apart.size, lines.side))
+        listed_out = tuple(sorted(rejected + ready.mains))
         answered = answer(
-            frf, ready, lines, fit, reported, labels, diagram, rejected, reason, apart
+            frf, ready, lines, fit, reported, labels, diagram, listed_out, reason, apart
         )
         bar.advance(STAGES - bar.done)
     leakage_warned(frf, answered)

@@ -8,12 +8,23 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import ComplexArray, FloatArray, instance, real_array
+from ..checks import BoolArray, ComplexArray, FloatArray, instance, real_array
 from ..errors import ModelError
 from ..lti.frequency import Frf
 
 #: lines over which what a fit leaves is averaged to a variance
 WINDOW = 41
+#: frequencies [Hz] of mains
+MAINS = (50.0, 60.0)
+#: width of a resonance in lines below which a disturbance of one frequency looks the same
+NARROW = 0.5
+#: lines beside a mains multiple that windows spread it over, and those up to which it is compared
+SPREAD, COMPARED = 2, 8
+#: probability that noise anywhere in the band passes for mains
+CHANCE = 1e-3
+
+#: frequency [Hz], damping ratio and the reason why a pole, or a line, is not reported
+Rejected = tuple[float, float, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +38,7 @@ class PreparedLines:
     known: bool  # whether the weights come from a variance
     swapped: bool
     line_correlation: sp.csr_array | None = None  # of errors of different lines
+    mains: tuple[Rejected, ...] = ()  # whose lines are left out
 
     @property
     def side(self) -> str:
@@ -131,7 +143,79 @@ def prepared(frf: Any, band: Any) -> PreparedLines:
     if lines is not None:
         lines = lines[inside][:, inside]
     ready = PreparedLines(freq, data, weight, correlation, known, False, lines)
+    ready = without_mains(ready, frf.window is not None)
     return ready.turned if data.shape[0] < data.shape[1] else ready
+
+
+def mains_multiple(freq: float, spacing: float) -> str | None:
+    """Return which multiple of mains lies within half a line of a frequency, None of none."""
+    for mains in MAINS:
+        number = round(freq / mains)
+        if number and abs(freq - number * mains) < spacing / 2:
+            return f"a mains multiple, {number} x {mains:g} Hz, narrower than half a line"
+    return None
+
+
+def without_mains(ready: PreparedLines, tapered: bool) -> PreparedLines:
+    """Return the same without the lines at which some responses hold mains, seen as windows do."""
+    freq, keep = ready.freq, np.ones(ready.freq.size, dtype=bool)
+    spacing = float(np.median(np.diff(freq)))
+    at = {
+        int(np.argmin(np.abs(freq - n * f))) for f in MAINS for n in range(1, int(freq[-1] / f) + 2)
+    }
+    found = []
+    for k in sorted(at):
+        reason = mains_multiple(float(freq[k]), spacing)
+        seen = slice(k - COMPARED, k + COMPARED + 1)
+        if reason is None or seen.start < 0 or seen.stop > freq.size:
+            continue
+        d = (freq[seen] - freq[k]) / spacing
+        lines = _standing_out(ready.data[..., seen], d, CHANCE / len(at), tapered)
+        if np.any(lines):
+            keep[seen] &= ~lines
+            found.append((float(freq[k]), 0.0, reason))
+    if not found:
+        return ready
+    C, R = ready.correlation, ready.line_correlation
+    return replace(
+        ready,
+        freq=freq[keep],
+        data=ready.data[..., keep],
+        weight=ready.weight[..., keep],
+        correlation=None if C is None else C[..., keep],
+        line_correlation=None if R is None else R[keep][:, keep],
+        mains=tuple(found),
+    )
+
+
+def _standing_out(data: ComplexArray, d: FloatArray, chance: float, tapered: bool) -> BoolArray:
+    r"""Return which of some lines hold a disturbance of the frequency in their middle.
+
+    The lines aside are fitted by :math:`(1 + g d) H = a + b d + c d^2 + r/d`, d the distance in
+    lines, g that of a resonance nearby: one of half-width w in the middle has the height
+    :math:`|r|/w` there, a disturbance has no r. Through a Hann window it has side lobes, of
+    :math:`1/(\pi d^3)` of its height.
+    """
+    middle = d.size // 2
+    near = np.abs(np.arange(d.size) - middle) <= SPREAD
+    found, aside, count = np.zeros(d.size, dtype=bool), d[~near], data[..., 0].size
+    smooth = d[:, None] ** np.arange(3)
+    for row in data.reshape(-1, d.size):
+        X = np.column_stack([smooth[~near], 1.0 / aside, -aside * row[~near]])
+        inverse = np.linalg.pinv(X)
+        c = inverse @ row[~near]
+        free = X.shape[0] - X.shape[1]
+        noise = float(np.linalg.norm(row[~near] - X @ c)) / np.sqrt(free)
+        deviation = noise * np.sqrt(np.sum(np.abs(inverse) ** 2, axis=1))
+        # with so many complex degrees of freedom |e|^2 exceeds x with (1 + x/free)^-free
+        least = np.sqrt(free * np.expm1(-np.log(chance / count) / free))
+        off = np.abs(row - smooth @ c[:3] / (1.0 + c[4] * d))
+        height = least * np.hypot(noise, deviation[0])
+        skirt = abs(c[3]) + 2.0 * deviation[3]
+        if off[middle] > max(height, skirt / (NARROW / 2)):
+            found |= near & (off > height)
+            found |= tapered & (np.pi * np.abs(d) ** 3 * noise < off[middle])
+    return found
 
 
 def checked_band(band: Any, freq: FloatArray) -> tuple[float, float]:

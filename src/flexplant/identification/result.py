@@ -14,8 +14,7 @@ from ..errors import ModelError, SolverError, warn
 from ..lti.frequency import Frf, checked_freq
 from ..tolerances import TINY
 from .diagram import StabilisationDiagram
-from .gate import Rejected
-from .line_weights import PreparedLines
+from .line_weights import PreparedLines, Rejected
 from .measured import MeasuredModes
 from .model_error import Disagreement
 from .pole_test import freedom
@@ -314,7 +313,7 @@ class IdentifiedModes(MeasuredModes):
         included, from the FRF's variance and the correlation of its outputs' errors (where not
         known, they are taken for independent).
     rejected : sequence of (frequency [Hz], damping ratio, reason)
-        Poles that are not reported.
+        Poles, and lines of mains, that are not reported.
     first_answer : str
         Why poles are those of the first answer, empty where they are those of the maximum
         likelihood fit to its end (`refined`).
