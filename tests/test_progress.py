@@ -125,12 +125,29 @@ def study():
         return fx.study(list(range(200)), machines.slow_machine, executor=executor,
                         checkpoint=sys.argv[1] if len(sys.argv) > 1 else None)
 
+sampled = small.discretized(1e4, delay=1)
+observer = fx.design_kalman(sampled)
+servo = fx.design_servo(sampled, bandwidth=30.0, observer=observer)
+loop = fx.close_loop(sampled, observer, servo)
+fit = fx.update(rom, unknowns, [fx.Eigenvalues(poles)])
+seen = list(sampled.assembled.ports.y)
+mixed = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+MORE = {
+    "machines": study,
+    "samples": lambda: fx.simulate(loop, duration=2.0, rng=1, runs=3),
+    "sets of sensors": lambda: fx.place_sensors(sampled, seen, len(seen) - 1),
+    "steps of walkers": lambda: fx.sample_posterior(rom, unknowns, [fx.Eigenvalues(poles)], fit),
+    "tuning": lambda: fx.tune_loops(fx.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=2)),
+    "structured": lambda: fx.synthesis.design_structured(mixed, fx.synthesis.FixedOrder(1)),
+    "tolerance": lambda: fx.close_loop(sampled, observer, servo).mode_tolerances(),
+}
+
 def threads():
     return [pool["num_threads"] for pool in threadpool_info()]
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
 before, found = threads(), {}
-for name, work in {**WORK, "machines": study}.items():
+for name, work in {**WORK, **MORE}.items():
     if name == "parts of the record":
         work = lambda: [WORK["parts of the record"]() for _ in range(50)]
     timer = threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT))
@@ -166,7 +183,7 @@ def test_interrupted_work_leaves_nothing_behind():
         process.kill()
     assert process.returncode == 0, err.decode()
     answer = json.loads(out)
-    assert len(answer["found"]) == 9 and answer["same"]
+    assert len(answer["found"]) == 15 and answer["same"]
     for name, left in answer["found"].items():
         assert left == {"threads": True, "bars": 0, "children": 0, "alive": 1}, name
 

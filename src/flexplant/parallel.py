@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -23,7 +24,7 @@ from dataclasses import dataclass
 from functools import cache
 from math import inf
 from os import cpu_count
-from time import monotonic, perf_counter
+from time import monotonic, perf_counter, sleep
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
@@ -192,6 +193,12 @@ def _seeds(
 _SENT = 64
 #: what is said of a call whose process ended twice
 DIED: Final = "its worker died, twice (out of memory, or a crash of compiled code?)"
+#: what is said where an executor twice drops what it was given
+GONE: Final = (
+    "the executor dropped what it was given, twice: its scheduler ended and is not back, or it was "
+    "shut down while work was out. What a checkpoint has is kept: begin again with the same "
+    "checkpoint= when the executor runs, or without executor=."
+)
 
 
 @dataclass(frozen=True)
@@ -229,21 +236,36 @@ def _pooled(
     executor: Executor,
     lost: set[int],
 ) -> Iterator[tuple[int, Any]]:
-    """Yield what an executor finds; when it breaks, the calls that were out go to lost."""
-    waiting = iter(list(calls.items()))
+    """Yield what an executor finds; when it breaks, the calls that were out go to lost.
+
+    What a scheduler of dask had when it died comes back as cancelled, or not at all: all is sent
+    once more, and waits until the scheduler is back, as long as its client does.
+    """
+    waiting = deque(calls)
     out: dict[Future[Any], int] = {}
-    broken = False
+    broken, again = False, set[int]()
     try:
         while True:
-            while not broken and len(out) < _SENT and (item := next(waiting, None)) is not None:
+            while waiting and not broken and len(out) < _SENT:
+                number = waiting.popleft()
                 try:
-                    out[executor.submit(function, *item[1])] = item[0]
+                    out[executor.submit(function, *calls[number])] = number
                 except BrokenExecutor:
                     broken = True
             if not out:
                 return
             done = wait(out, return_when=FIRST_COMPLETED).done
-            for future in sorted(done, key=lambda one: out[one]):
+            if any(future.cancelled() for future in done):
+                dropped = {one: number for one, number in out.items() if not _is_there(one)}
+                if not again.isdisjoint(dropped.values()):
+                    raise SolverError(GONE)
+                for future, number in dropped.items():
+                    future.cancel()
+                    del out[future]
+                    again.add(number)
+                    waiting.append(number)
+                sleep(CHUNK)  # its client forgets what it had, also what is sent too soon
+            for future in sorted(done & out.keys(), key=lambda one: out[one]):
                 number = out.pop(future)
                 error = future.exception()
                 if error is None:
@@ -258,6 +280,11 @@ def _pooled(
     finally:
         for future in out:
             future.cancel()
+
+
+def _is_there(future: Future[Any]) -> bool:
+    """Return whether something came out, be it an error."""
+    return future.done() and not future.cancelled()
 
 
 def _single(

@@ -8,7 +8,7 @@ import re
 import uuid
 from abc import ABCMeta
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
 from html import escape
 from inspect import Parameter, Signature, signature
@@ -196,7 +196,7 @@ def frozen(value: Any) -> Any:
 
 
 def save(value: Value, path: str | Path) -> None:
-    """Write `value` to `path` as .npz; a crash leaves the old file or none."""
+    """Write `value` to `path` as .npz; a crash or a power cut leaves the old file or none."""
     arrays: dict[str, Any] = {}
     header = json.dumps(_encode(value, arrays))
     arrays[_HEADER] = np.array(header)
@@ -215,16 +215,23 @@ def named_file(path: Any, name: str = "path") -> Path:
 
 @contextmanager
 def written(path: str | Path) -> Iterator[IO[bytes]]:
-    """Open a new file that takes the place of `path` when all is written, not before."""
+    """Open a new file that takes the place of `path` when all is on the disk, not before."""
     target = named_file(path)
     part = target.with_name(f"{target.name}.{uuid.uuid4().hex}.part")
     try:
         with part.open("xb") as file:
             yield file
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(part, target)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    except OSError as error:
+        raise FlexplantError(
+            f"the file {target} cannot be written ({error.strerror or error}): what it held before "
+            "is kept. Make room, give the right to write, or name another folder."
+        ) from error
+    finally:  # where it was written it is the file now
+        with suppress(OSError):  # there is none where none could be opened
+            part.unlink()
 
 
 def load(path: str | Path) -> Any:

@@ -15,6 +15,7 @@ from ...errors import AssumptionError, LabelError, ModelError, require_known
 from ...loop import ClosedLoop, ScheduledLoop
 from ...loop.applied import applied_law
 from ...lti.statespace import StateSpace, as_statespace
+from ...store import written
 from ...tolerances import SAME
 from .c_text import CText
 from .two_state import TwoStateForm, scheduled_form, two_state_form
@@ -116,8 +117,9 @@ def write_c(
         single=single,
     )
     header = source.with_suffix(".h")
-    header.write_text(program.header, encoding="ascii")
-    source.write_text(program.source, encoding="ascii")
+    for file, text in ((header, program.header), (source, program.source)):
+        with written(file) as stream:
+            stream.write(text.encode("ascii"))
     return source, header
 
 
