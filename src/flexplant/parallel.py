@@ -196,8 +196,7 @@ DIED: Final = "its worker died, twice (out of memory, or a crash of compiled cod
 #: what is said where an executor twice drops what it was given
 GONE: Final = (
     "the executor dropped what it was given, twice: its scheduler ended and is not back, or it was "
-    "shut down while work was out. What a checkpoint has is kept: begin again with the same "
-    "checkpoint= when the executor runs, or without executor=."
+    "shut down. What a checkpoint has is kept: begin again with it when the executor runs."
 )
 
 
@@ -256,7 +255,7 @@ def _pooled(
                 return
             done = wait(out, return_when=FIRST_COMPLETED).done
             if any(future.cancelled() for future in done):
-                dropped = {one: number for one, number in out.items() if not _is_there(one)}
+                dropped = {f: n for f, n in out.items() if f.cancelled() or not f.done()}
                 if not again.isdisjoint(dropped.values()):
                     raise SolverError(GONE)
                 for future, number in dropped.items():
@@ -280,11 +279,6 @@ def _pooled(
     finally:
         for future in out:
             future.cancel()
-
-
-def _is_there(future: Future[Any]) -> bool:
-    """Return whether something came out, be it an error."""
-    return future.done() and not future.cancelled()
 
 
 def _single(
