@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -468,6 +469,17 @@ def element_mask(value: Any, name: str) -> npt.NDArray[np.bool_]:
             "Pass a comparison, x < 0.3, say."
         )
     return mask
+
+
+def why_not_called(function: Any, *arguments: Any) -> str:
+    """Return why a function does not take such arguments; empty when it does, or is of C."""
+    try:
+        inspect.signature(function).bind(*arguments)
+    except TypeError as error:
+        return str(error)
+    except ValueError:  # a function of C has no signature
+        pass
+    return ""
 
 
 def function(value: Any, name: str, hint: str) -> Any:

@@ -11,7 +11,7 @@ from flexplant.loop import close_loop
 from flexplant.loop.budget import white_noise
 from flexplant.plant import assemble_plant
 from flexplant.simulation import Quantiser, Saturation, simulate
-from flexplant.simulation.nonlinear_elements import Conditions, finer_loop
+from flexplant.simulation.conditions import Conditions, finer_loop
 from flexplant.simulation.runs import InBlocks, SampleBySample, make_runner
 from flexplant.synthesis import design_servo
 from machines import block, matrices, observer, servo, stage

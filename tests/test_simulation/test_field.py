@@ -1,5 +1,7 @@
 """Loops in the field beside plain recursions: hysteresis, lost samples, jitter, drift, spectra."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import scipy.linalg as la
@@ -288,3 +290,17 @@ def test_what_is_no_element(elements, said):
         simulate(loop_of(stage()), elements=elements, duration=0.01)
     with pytest.raises(ModelError, match="must not be positive"):
         Saturation(1.0, least=0.5)
+
+
+@pytest.mark.parametrize(
+    ("begin", "said"),
+    [
+        (lambda dt: None, "cannot be called with the time between two samples"),
+        (lambda dt, generators: 3.0, "is not a callable object"),
+        (lambda dt, generators: lambda: 0.0, "cannot be called with the values"),
+    ],
+)
+def test_an_element_that_cannot_be_called(begin, said):
+    loop = loop_of(fx.testbeds.three_masses())
+    with pytest.raises(ModelError, match=said):
+        fx.simulate(loop, duration=0.01, elements={"u1": SimpleNamespace(begin=begin)}, rng=1)

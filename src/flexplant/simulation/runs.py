@@ -15,7 +15,8 @@ from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, Recursion, cheapest
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..tolerances import divisor
-from .nonlinear_elements import Acting, Answering, Conditions, Moving
+from .conditions import Conditions, Moving
+from .nonlinear_elements import Acting, Answering
 
 
 class Machine(NamedTuple):

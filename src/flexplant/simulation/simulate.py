@@ -28,9 +28,10 @@ from ..loop.budget import white_noise
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant
 from ..tolerances import SAME, TYPED
+from .conditions import conditions, finer_loop
 from .motion import SetPoint
 from .moving_machine import MovingMachine, trajectory
-from .nonlinear_elements import Acting, Acts, conditions, finer_loop
+from .nonlinear_elements import Acting, Acts
 from .response import Response
 from .runs import make_runner
 

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from ...checks import FloatArray, Value, positive, real_array, several, short, whole
+from ...checks import (
+    FloatArray,
+    Value,
+    positive,
+    real_array,
+    several,
+    short,
+    whole,
+    why_not_called,
+)
 from ...errors import ModelError, ShapeError
 from ...labels import DofSet, Interpolation
 from .element_matrices import Grid
@@ -113,15 +121,12 @@ def _asked(function: Any, name: str, centres: FloatArray) -> list[Any]:
     if isinstance(function, type):
         raise ModelError(f"{name} is a class, {function.__name__}. Pass a number or a function.")
     names = ", ".join("xyz"[: centres.shape[1]])
-    try:
-        inspect.signature(function).bind(*centres.tolist()[0])
-    except TypeError as error:
+    why = why_not_called(function, *centres.tolist()[0]) if len(centres) else ""
+    if why:
         raise ModelError(
             f"{name} is evaluated at the centre ({names}) of each element, and this function "
-            f"cannot be called so: {error}. Write it as lambda {names}: ..."
-        ) from None
-    except (ValueError, IndexError):
-        pass  # a function of C has no signature
+            f"cannot be called so: {why}. Write it as lambda {names}: ..."
+        )
     return [function(*centre) for centre in centres.tolist()]
 
 
