@@ -33,6 +33,8 @@ MARGIN = 0.35
 #: relative change of a frequency to which a report follows a mode (a model that was updated is
 #: seldom further off), and machines that it draws: a second of work at most
 _FOLLOWED, _DRAWS = 0.01, 20
+#: times the change that is asked for, up to which one is looked for: a crossing lies within
+BEYOND = 1.25
 #: rows of the table
 _SHOWN = 5
 
@@ -189,9 +191,11 @@ def mode_tolerances(
     *,
     margin: float,
     known: Any = None,
-    limit: float = LIMIT,
+    limit: float | Mapping[int, float] = LIMIT,
 ) -> ModeTolerances:
-    """Return the smallest changes of each mode that harm a stable loop.
+    """Return the smallest changes of each mode that harm a stable loop, up to `limit`.
+
+    A mapping names the modes that are examined, each with a limit of its own.
 
     At each point of the stability boundary that a pole lies there is an equation for a complex
     change of one mode (`mode_crossings`); where its imaginary part changes its sign along the
@@ -206,6 +210,10 @@ def mode_tolerances(
         raise AssumptionError(
             "the loop is unstable as it is: no mode has a tolerance. Stabilise it first."
         )
+    if isinstance(limit, Mapping):
+        some = np.isin(modes, list(limit))
+        modes, freq, zeta = modes[some], freq[some], zeta[some]
+        limit = np.minimum([limit[int(mode)] for mode in modes], LIMIT)
     limits = np.minimum(limit, _ASIDE / _TO_A_WIDTH * zeta)
     own = _known(known, modes)
     loops = ModeLoops.of(plant, broken, modes)
@@ -266,7 +274,7 @@ def reported_tolerances(loop: Any) -> ModeTolerances | None:
 
 def _within(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:
     """Return the tolerances of a stable loop to the changes that a report follows."""
-    limit = min(max(_FOLLOWED, 1.25 * _SAFE * max(known.values(), default=0.0)), LIMIT)
+    limit = min(max(_FOLLOWED, BEYOND * _SAFE * max(known.values(), default=0.0)), LIMIT)
     try:
         return mode_tolerances(
             loop.plant, loop.broken, margin=MARGIN, known=known or None, limit=limit

@@ -18,6 +18,7 @@ from ...errors import (
     attempted,
 )
 from ...loop import ClosedLoop, close_loop
+from ...loop.mode_tolerance import BEYOND, mode_tolerances
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
@@ -253,8 +254,10 @@ class _StageTask:
 
     def _tolerates(self, loop: ClosedLoop, ranges: Mapping[int, float]) -> bool:
         """Return whether any one mode may be off as far as it is uncertain."""
-        found = loop.mode_tolerances(margin=_KEPT * self.margin)
-        needed = np.array([ranges.get(int(mode), 0.0) for mode in found.modes])
+        limit = {mode: BEYOND * needed for mode, needed in ranges.items() if needed > 0}
+        margin = _KEPT * self.margin
+        found = mode_tolerances(loop.plant, loop.broken, margin=margin, limit=limit)
+        needed = np.array([ranges[int(mode)] for mode in found.modes])
         return not np.any(found.least < needed)
 
     def search(self, bar: Progress) -> None:
