@@ -256,16 +256,16 @@ def _cells(row: LoopFigures) -> tuple[str, ...]:
         return (f"NO ({row.decay:.6f})", "-", "-", "-", "-", "-")
     return (
         f"yes ({row.decay:.6f})",
-        _text(row.bandwidth, "Hz"),
+        _hertz(row.bandwidth),
         _decibel(row.peak),
-        _text(row.peak_freq, "Hz"),
+        _hertz(row.peak_freq),
         _decibel(row.low),
         _decibel(1.0 / row.margin),
     )
 
 
-def _text(value: float, unit: str) -> str:
-    return "-" if np.isnan(value) else f"{value:.1f} {unit}"
+def _hertz(freq: float) -> str:
+    return "-" if np.isnan(freq) else f"{freq:.{1 if freq < 1e3 else 0}f} Hz"
 
 
 def _decibel(size: float) -> str:
