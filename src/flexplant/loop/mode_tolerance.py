@@ -213,8 +213,10 @@ def mode_tolerances(
     if isinstance(limit, Mapping):
         some = np.isin(modes, list(limit))
         modes, freq, zeta = modes[some], freq[some], zeta[some]
-        limit = np.minimum([limit[int(mode)] for mode in modes], LIMIT)
-    limits = np.minimum(limit, _ASIDE / _TO_A_WIDTH * zeta)
+        most = np.minimum([limit[int(mode)] for mode in modes], LIMIT)
+    else:
+        most = np.full(modes.size, limit)
+    limits = np.minimum(most, _ASIDE / _TO_A_WIDTH * zeta)
     own = _known(known, modes)
     loops = ModeLoops.of(plant, broken, modes)
     grids = [
