@@ -1,5 +1,6 @@
 """study: the same table whoever computes it, nothing lost or done twice, failures as rows."""
 
+import gc
 import json
 import os
 import signal
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import flexplant as fx
 from flexplant.errors import (
     FlexplantError,
     FlexplantWarning,
@@ -316,6 +318,23 @@ def test_a_value_of_another_kind_than_most_fails_its_machine(odd):
     assert np.isnan(table["a"]).tolist() == [machine == odd for machine in range(3)]
     said = "column 'a' holds '?', a text: most machines have a number there"
     assert table["failed"].tolist() == [said if machine == odd else "" for machine in range(3)]
+
+
+def remembering(machine):
+    """Return a row, and how many blocks of memory objects of Python have."""
+    plant = fx.testbeds.three_masses()
+    observer = fx.design_kalman(plant)
+    servo = fx.design_servo(plant, bandwidth=10.0 + machine / 100, observer=observer)
+    loop = fx.close_loop(plant, observer, servo)
+    gc.collect()
+    return {"margin": loop.modulus_margin, "blocks": sys.getallocatedblocks()}
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_machines():
+    """But for the rows."""
+    used = study(range(24), remembering)["blocks"]
+    assert used[-1] - used[14] < 9 * 50.0  # the first have met all code and filled its caches
 
 
 def test_wrong_calls():

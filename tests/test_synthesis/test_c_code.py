@@ -403,3 +403,29 @@ def test_a_wrong_block_is_found(monkeypatch, tmp_path):
     monkeypatch.setattr(two_state, "_arranged", wrong)
     with pytest.raises(CertificateError, match="differ from the system"):
         write_c(designed()[1], tmp_path / "a.c")
+
+
+@compiles
+@pytest.mark.parametrize("single", [False, True])
+def test_a_filter_in_c_does_not_drift(tmp_path, single):
+    """After a period its state is what it was, to the bit: so it will be after any number."""
+    law = fx.design_kalman(fx.testbeds.three_masses()).system
+    rng, period = np.random.default_rng(0), 50
+    records = rng.standard_normal((period, len(law.inputs))) * [
+        1e-6 if name.startswith("y") else 1.0 for name in law.inputs
+    ]
+    code = Compiled(tmp_path, law, single=single)
+    for _ in range(300):
+        before, out = bytes(code.state), [code(sample) for sample in records]
+    assert bytes(code.state) == before
+    # the answer of period `period`: x = A x + ... over one period, solved
+    x = np.zeros(law.n_states)
+    for sample in records:
+        x = law.A @ x + law.B @ sample
+    x = np.linalg.solve(np.eye(len(x)) - np.linalg.matrix_power(law.A, period), x)
+    exact = []
+    for sample in records:
+        exact.append(law.C @ x + law.D @ sample)
+        x = law.A @ x + law.B @ sample
+    scale = np.abs(exact).max(axis=0)
+    assert np.abs((np.array(out) - exact) / scale).max() < (1e-5 if single else 1e-11)
