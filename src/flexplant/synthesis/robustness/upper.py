@@ -57,6 +57,8 @@ def upper_level(
         return Certified(0.0, scalings.start)
     evened = scalings.scaled(scalings.start, osborne(M, scalings.places))
     tried = [evened, scalings.shifted(evened, M), *([] if start is None else [start])]
+    if scalings.skewed:  # the size of the leveled blocks' D beside the others' is known by trial
+        tried += [_leveled_by(scalings, one, 10.0**k) for one in tried[1:] for k in range(-8, 3)]
     reached, x = min(((reached_level(W, scalings, one), one) for one in tried), key=itemgetter(0))
     if not np.isfinite(reached):
         found = _admissible(M, scalings, x)
@@ -104,11 +106,15 @@ def _admissible(M: ComplexArray, scalings: Scalings, x: FloatArray) -> FloatArra
             x[own_range.start : end] = own[plain.d_ranges[i][0].start : plain.ends[i]]
             i += 1
     for factor in 10.0 ** np.arange(0, -13, -1.0):
-        sizes = np.where(_levels(scalings), factor, 1.0)
-        tried = scalings.scaled(x, sizes)
+        tried = _leveled_by(scalings, x, factor)
         if np.isfinite(reached_level(np.vstack([np.eye(scalings.w), M]), scalings, tried)):
             return tried
     return None
+
+
+def _leveled_by(scalings: Scalings, x: FloatArray, factor: float) -> FloatArray:
+    """Return scalings whose leveled blocks' D is so many times larger."""
+    return scalings.scaled(x, np.where(_levels(scalings), factor, 1.0))
 
 
 def _levels(scalings: Scalings) -> list[bool]:
@@ -163,7 +169,7 @@ def centred(
         gradient, hessian = slopes.derivatives(P)
         _add_of_D(scalings, x, gradient, hessian)
         gradient += 2.0 * wide * x
-        hessian[np.diag_indices_from(hessian)] += 2.0 * wide
+        hessian.reshape(-1)[:: len(x) + 1] += 2.0 * wide
         step, decrement = _newton(hessian, gradient, trace)
         # the value is off by the square of it
         if not decrement > 1e-6:
@@ -185,28 +191,34 @@ def centred(
 
 
 class _Slopes(NamedTuple):
-    """The derivatives S_p of S: numbers (n_x, n) at n places (row, column) that they share."""
+    """The derivatives S_p of S: numbers (n_x, n) at n places that they share.
 
-    row: IntArray
-    column: IntArray
+    `across` are the places in P of what each pair of them multiplies; `room` (2, n, n) is written
+    to in every step: new memory of this size takes longer than what is computed in it.
+    """
+
+    across: IntArray
     values: sp.csr_array
+    room: ComplexArray
 
     @classmethod
     def of(cls, scalings: Scalings, value: ComplexArray) -> _Slopes:
         """Return those of values for each entry of S, zero where an entry does not move."""
         size = scalings.w + scalings.z
         places, at = np.unique(scalings.row * size + scalings.column, return_inverse=True)
-        shape = (scalings.count, places.size)
-        return cls(
-            places // size, places % size, sp.csr_array((value, (scalings.owner, at)), shape)
-        )
+        n = places.size
+        values = sp.csr_array((value, (scalings.owner, at)), (scalings.count, n))
+        across = size * (places % size)[:, None] + places // size
+        return cls(across, values, np.empty((2, n, n), dtype=np.complex128))
 
     def derivatives(self, P: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Return -tr(P S_p) and tr(P S_p P S_q)."""
-        across = P[np.ix_(self.column, self.row)]
+        across, product = self.room
+        P.take(self.across, out=across, mode="clip")
+        np.multiply(across, across.T, out=product)
         gradient: Any = self.values @ across.diagonal()
-        hessian: Any = self.values @ (self.values @ (across * across.T)).T
-        return -gradient.real, hessian.real
+        hessian: Any = self.values @ (self.values @ product).T
+        return -gradient.real, hessian.real.copy()
 
 
 def _add_of_D(scalings: Scalings, x: FloatArray, gradient: FloatArray, hessian: FloatArray) -> None:
@@ -255,7 +267,7 @@ def _skewed(
                     x, level, merit = moved, there, new
                     break
                 size *= 0.5
-            if size <= 1e-10 or decrement < _CENTRED:
+            if size <= 1e-10 or decrement < _CENTRED or level <= enough:
                 break
         reached = reached_level(W, scalings, x)
         if reached < best.level:
@@ -273,12 +285,12 @@ def _newton(
     size = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), TINY))
     scaled = hessian * size * size[:, None]
     # of a unit diagonal: keeps a singular Hessian solvable
-    scaled[np.diag_indices_from(scaled)] += 1e-13
+    scaled.reshape(-1)[:: len(size) + 1] += 1e-13
     right = gradient[:, None] if trace is None else np.column_stack([gradient, trace])
-    try:
-        both = size[:, None] * la.cho_solve(la.cho_factor(scaled), size[:, None] * right)
-    except la.LinAlgError:
+    _, solution, failed = la.lapack.dposv(scaled, size[:, None] * right)
+    if failed:
         return np.zeros_like(gradient), 0.0
+    both = size[:, None] * solution
     step = -both[:, 0]
     if trace is not None:
         step = step + (trace @ both[:, 0]) / (trace @ both[:, 1]) * both[:, 1]
