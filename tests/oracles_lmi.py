@@ -1,4 +1,4 @@
-"""Smallest H-infinity norms known by hand, and slow norms; no flexplant here."""
+"""Smallest H-infinity norms known by hand, H2 norms by an LMI, slow norms; no flexplant here."""
 
 import numpy as np
 
@@ -53,3 +53,36 @@ def swept_norm(A, B, C, D, points=4000):
     return max(
         float(np.linalg.norm(C @ np.linalg.solve(1j * w * eye - A, B) + D, 2)) for w in omega
     )
+
+
+def least_h2_norm(p, sampled):
+    """Scherer's linear change of variables, one semidefinite program over all controllers.
+
+    Of a realisation X and Y, its inverse, of the Gramian are unknown, and K^ = (A^, B^, C^, D^).
+    """
+    import cvxpy as cp
+
+    n, nw = p["B1"].shape
+    nu, (ny, nz) = p["B2"].shape[1], (len(p["C2"]), len(p["C1"]))
+    X, Y, W = (cp.Variable((k, k), symmetric=True) for k in (n, n, nz))
+    K = {"A": (n, n), "B": (n, ny), "C": (nu, n), "D": (nu, ny)}
+    K = {name: cp.Variable(shape) for name, shape in K.items()}
+    G = cp.bmat([[X, np.eye(n)], [np.eye(n), Y]])
+    A = cp.bmat([
+        [p["A"] @ X + p["B2"] @ K["C"], p["A"] + p["B2"] @ K["D"] @ p["C2"]],
+        [K["A"], Y @ p["A"] + K["B"] @ p["C2"]],
+    ])  # fmt: skip
+    B = cp.vstack([p["B1"] + p["B2"] @ K["D"] @ p["D21"], Y @ p["B1"] + K["B"] @ p["D21"]])
+    C = cp.hstack([p["C1"] @ X + p["D12"] @ K["C"], p["C1"] + p["D12"] @ K["D"] @ p["C2"]])
+    D = p["D11"] + p["D12"] @ K["D"] @ p["D21"]
+    none, one = np.zeros((2 * n, nw)), np.eye(nw)
+    if sampled:
+        stable = cp.bmat([[G, A, B], [A.T, G, none], [B.T, none.T, one]])
+        seen = cp.bmat([[W, C, D], [C.T, G, none], [D.T, none.T, one]])
+        rules = [stable >> 0, seen >> 0]
+    else:
+        stable = cp.bmat([[-A - A.T, B], [B.T, one]])
+        rules = [stable >> 0, cp.bmat([[G, C.T], [C, W]]) >> 0, D == 0]
+    problem = cp.Problem(cp.Minimize(cp.trace(W)), rules)
+    problem.solve(solver=cp.CLARABEL)
+    return float(np.sqrt(problem.value))

@@ -241,6 +241,13 @@ WRONG = {
     "H2 stability": (
         "synthesis.h2._solved", opposite, lambda: fx.design_h2(masses()), "is not stable",
     ),
+    "inverse of a plant": (
+        "simulation.feedforward.responder", lambda function: lambda g: larger(1.003)(function(g)),
+        lambda: fx.simulation.inverse_forces(
+            servo(), fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.05),
+            duration=0.2, bandwidth=60.0,
+        ), "forces do not minimise",
+    ),
     "normalised coprime factors": (
         "synthesis.hinf.ncf._least_by_factors", larger(1.003),
         lambda: fx.synthesis.shape_loop(fx.lti.tf([1.0], [1.0, 1.0, 0.0]), bandwidth=10.0),

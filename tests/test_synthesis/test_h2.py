@@ -8,6 +8,7 @@ from test_spill_over import many, small
 from flexplant.errors import AssumptionError, FlexplantWarning
 from flexplant.lti import StateSpace
 from flexplant.synthesis import design_h2
+from oracles_lmi import least_h2_norm
 from oracles_synthesis import closed_loop, split, stability
 from stages import RATE, ports, reduced, sampled
 
@@ -149,6 +150,16 @@ def test_cheap_control_and_clean_sensors_reach_their_limits(dt):
     clean = design(scalar(dt, noise=0.0))
     assert clean.gamma == pytest.approx(np.sqrt(g) if dt else 1.0, rel=5e-3)
     assert "D21" in clean.notes[0]
+
+
+@TIMES
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_semidefinite_program_over_all_controllers_does_no_better(dt, seed):
+    P = random_plant(dt, seed=seed)
+    least = least_h2_norm(split(P.A, P.B, P.C, P.D, 2, 2), bool(dt))
+    found = design(P, 2, 2)
+    assert found.gamma == pytest.approx(least, rel=1e-4)
+    assert found.lower == pytest.approx(least, rel=1e-4)
 
 
 @TIMES
