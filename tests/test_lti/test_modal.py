@@ -127,6 +127,15 @@ def test_a_defective_system_stays_dense_and_says_so():
         modal_form("plant")
 
 
+@pytest.mark.parametrize("count", [4, 5, 6, 7])
+def test_chains_of_integrators_stay_dense(count):
+    """LAPACK cannot order their poles, which rounding spreads over a circle."""
+    chain = np.eye(count, k=-1)
+    g = StateSpace(chain, np.ones((count, 1)), np.ones((1, count)), 0.0)
+    found = modal_form(g)
+    assert found.system is g and found.reason.startswith("dense form kept")
+
+
 @pytest.mark.parametrize("delay", [None, 1.0])
 @pytest.mark.parametrize("dense", [False, True])
 def test_split_keeps_rigid_bodies_apart(dense, delay):

@@ -137,7 +137,8 @@ def _dense_groups(g: StateSpace) -> list[_Group]:
         V = np.hstack(bases)
         units = np.linalg.norm(V, axis=1)  # those in which what a cascade amplifies is of one size
         V = V / units[:, None]
-        apart = V.shape == A.shape and float(np.linalg.cond(V)) <= LARGEST
+        whole = V.shape == A.shape and bool(np.all(np.isfinite(V)))
+        apart = whole and float(np.linalg.cond(V)) <= LARGEST
         if apart:
             break
     centre = 1.0 if g.dt else 0.0

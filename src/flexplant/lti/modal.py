@@ -93,7 +93,13 @@ def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
         return ModalForm(g, np.eye(n), 1.0, 0.0)
     d = state_scale(g.A, g.B, g.C)
     A = g.A * d / d[:, None]
-    V, pairs, blocks = _basis(A, 1.0 if g.dt else 0.0)
+    try:
+        V, pairs, blocks = _basis(A, 1.0 if g.dt else 0.0)
+    except la.LinAlgError as error:
+        reason = (
+            f"dense form kept: two nearly equal poles cannot be set apart from others ({error})"
+        )
+        return ModalForm(g, np.eye(n), np.inf, 0.0, reason)
     condition = float(np.linalg.cond(V)) if V.shape == A.shape else np.inf
     reason = ""
     if condition > largest_condition:
@@ -315,22 +321,29 @@ def split_stable(sys: System) -> Split:
     def inside(real: float, imag: float) -> bool:
         return bool((np.hypot(real, imag) - 1.0 if g.dt else real) < edge)
 
-    T, Z, k = la.schur(A, sort=inside)
+    try:
+        T, Z, k = la.schur(A, sort=inside)
+    except la.LinAlgError as error:  # poles at the edge, which rounding moves across it
+        raise _inseparable(g) from error
     if k == g.n_states:
         return Split(g, part_of(g, np.zeros(k, dtype=bool)).replace(D=0 * g.D), 0.0)
     if not k:
         return Split(part_of(g, np.zeros(g.n_states, dtype=bool)), g.replace(D=0 * g.D), 0.0)
     X, scale, info = la.lapack.dtrsyl(T[:k, :k], T[k:, k:], -T[:k, k:], isgn=-1)
     if info or not np.isfinite(X).all():
-        raise SolverError(
-            f"{g!r} cannot be split: its stable part and the rest share a pole to working "
-            "precision. Add damping, or reduce it in coordinates where the modes are apart."
-        )
+        raise _inseparable(g)
     X = X / scale
     turned, seen = Z.T @ B, C @ Z
     stable = _part(g, T[:k, :k], turned[:k] - X @ turned[k:], seen[:, :k], g.D)
     rest = _part(g, T[k:, k:], turned[k:], seen[:, :k] @ X + seen[:, k:], 0 * g.D)
     return Split(stable, rest, float(np.linalg.norm(X, 2)))
+
+
+def _inseparable(g: StateSpace) -> SolverError:
+    return SolverError(
+        f"{g!r} cannot be split: its stable part and the rest share a pole to working precision. "
+        "Add damping, or reduce it in coordinates where the modes are apart."
+    )
 
 
 def _by_blocks(g: StateSpace) -> Split | None:
