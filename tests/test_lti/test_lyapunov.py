@@ -1,5 +1,7 @@
 """Stein and Lyapunov equations and Gramians, against one linear system of n^2 unknowns."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 import scipy.linalg as la
@@ -165,3 +167,20 @@ def test_sylvester_equation_of_two_matrices():
     X = rng.standard_normal((5, 3))
     found = equations.sylvester(A, B, X @ B - A @ X)
     np.testing.assert_allclose(found, X, rtol=0, atol=1e-12 * np.abs(X).max())
+
+
+@pytest.mark.parametrize("zeta", [1e-7, 1e-3, 0.5, 0.999])
+def test_the_gramian_of_light_modes_has_all_its_digits(zeta):
+    """By hand: of one mode diag(1 / 4 z w^3, 1 / 4 z w); of two, velocities by the same force."""
+    w = np.array([1.0, 1.0 + 1e-6, 300.0])
+    A = la.block_diag(*([[0.0, 1.0], [-(f**2), -2.0 * zeta * f]] for f in w))
+    B = np.tile([[0.0], [1.0]], (3, 1))
+    g = StateSpace(A, B, np.eye(6), np.zeros((6, 1)), blocks=[2, 2, 2])
+    X = controllability_gramian(g)
+    np.testing.assert_allclose(X[0::2, 0::2].diagonal(), 0.25 / (zeta * w**3), rtol=1e-13, atol=0)
+    np.testing.assert_allclose(X[1::2, 1::2].diagonal(), 0.25 / (zeta * w), rtol=1e-13, atol=0)
+    # E v_a v_b = (c b^2 + d a^2) / ((a^2 - b^2)^2 + (c + d) (c b^2 + d a^2)), c = 2 z a, d = 2 z b
+    a, b = (Fraction(float(one)) for one in w[:2])
+    c, d = (2 * Fraction(zeta) * one for one in (a, b))
+    found = X[1, 3] * float((a**2 - b**2) ** 2 + (c + d) * (c * b**2 + d * a**2))
+    assert found == pytest.approx(float(c * b**2 + d * a**2), rel=1e-9)

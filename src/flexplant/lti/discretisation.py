@@ -198,8 +198,12 @@ def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArra
     With m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so
     ``e^(A h) = e^(m h) (cosh(r h) I + sinh(r h) / r N)``, r^2 = q: trigonometric for an oscillating
     pair, linear in h for a rigid-body pair. The integral is a Taylor series on h / 2^s, doubled
-    by ``I(2 t) = I(t) + e^(A t) I(t)``: no division by small frequencies.
+    by ``I(2 t) = I(t) + e^(A t) I(t)``: no division by small frequencies. There both states of a
+    pair have units in which they are of one size, so that s is small.
     """
+    given, pairs, units = pairs, pairs.copy(), _even_units(pairs)
+    pairs[:, 0, 1] /= units
+    pairs[:, 1, 0] *= units
     size = float(np.max(np.abs(pairs).sum(axis=2))) * h
     doublings = max(0, int(np.ceil(np.log2(max(size, TINY) / 0.5))))
     t = h / 2**doublings
@@ -211,7 +215,17 @@ def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArra
         integral = integral + term
     for k in range(doublings):
         integral = integral + pair_expm(pairs, t * 2**k) @ integral
-    return pair_expm(pairs, h), integral
+    integral[:, 0, 1] *= units
+    integral[:, 1, 0] /= units
+    return pair_expm(given, h), integral
+
+
+def _even_units(pairs: FloatArray) -> FloatArray:
+    """Return the unit (b,) of each first state, a power of two, that makes a pair symmetric."""
+    ahead, back = np.abs(pairs[:, 0, 1]), np.abs(pairs[:, 1, 0])
+    both = (ahead > 0) & (back > 0)
+    gap = np.log2(np.where(both, ahead, 1.0)) - np.log2(np.where(both, back, 1.0))
+    return np.asarray(np.exp2(np.round(0.5 * gap)))
 
 
 def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
