@@ -32,6 +32,7 @@ from test_estimation_benchmarks import observer
 from test_lti_benchmarks import slycot_hinf
 
 import flexplant as fx
+from flexplant.loop.applied import applied_law
 from flexplant.lti import solve_dare
 from plates import make_plate
 from systems_lti import machine
@@ -182,6 +183,46 @@ def simulated():
     return f"100 000 samples of a loop, {g.n_states} states", "python-control", *spent
 
 
+def saturated():
+    """The same with commands that saturate; the peer's equations as short as they can be."""
+    loop = simulation.stage_loop()
+    plant, count, part, limit = loop.plant, 100_000, 2_000, 0.02
+    law = applied_law(loop, None)[0]  # its observer reads what is applied
+    g, n, m = plant.system, plant.system.n_states, law.n_states
+    rows, w, u = g.output_index(plant.y), g.input_index(plant.w), g.input_index(loop.driven)
+    A, Bw, Bu, C, D = g.A, g.B[:, w], g.B[:, u], g.C[rows], g.D[np.ix_(rows, w)]
+    ny, nu = len(plant.y), len(loop.driven)
+    F, L = law.C[:nu], law.D[:nu, :ny]
+
+    def following(t, x, w, _):
+        y = C @ x[:n] + D @ w
+        u = np.clip(F @ x[n:] + L @ y, -limit, limit)
+        return np.concatenate([A @ x[:n] + Bw @ w + Bu @ u, law.A @ x[n:] + law.B @ [*y, *u]])
+
+    def seen(t, x, w, _):
+        return C @ x[:n] + D @ w
+
+    sizes = {"inputs": len(plant.w), "outputs": len(plant.y), "states": n + m, "dt": g.dt}
+    twin = control.NonlinearIOSystem(following, seen, **sizes)
+    given = np.zeros((len(plant.w), part))
+    given[plant.w.index("die:ref")] = 1e-6
+    options = {"duration": count * g.dt, "reference": 1e-6, "noise": False}
+    options["elements"] = {name: fx.simulation.Saturation(limit) for name in loop.driven}
+    ours, peer, mine, theirs = race(
+        lambda: fx.simulate(loop, **options),
+        lambda: control.input_output_response(twin, g.dt * np.arange(part), given, np.zeros(n + m)),
+        1,
+    )
+    assert abs(ours["u1"]).max() == limit
+    near(ours["y1"][:part], peer.outputs[plant.y.index("y1")], 1e-8)
+    return (
+        f"the same, commands saturated ({part} of them)",
+        "python-control",
+        mine,
+        (theirs * count / part),
+    )
+
+
 def designed_small():
     plant = fx.plant.mixed_sensitivity(
         fx.lti.tf([1.0], [1.0, 0.02, 1.0]), S=fx.lowpass(0.02), KS=0.1
@@ -263,6 +304,7 @@ ROWS = (
     riccati,
     filtered,
     simulated,
+    saturated,
     designed_small,
     designed,
     mu_bounds,
