@@ -97,10 +97,10 @@ faster; the answers are compared first. Figures of another run differ by some 20
 | poles of a close pair in noise: error 5e-07 | 0.41 s | scikit-rf: 7e-07 | 0.18 s | 0.44 |
 | a sparse OUTPUT4 file of Nastran | 7.1 ms | pyYeti | 32 ms | 4.5 |
 
-Peers are better where no check is wanted. Of the 16 ms for all modes of the plate, 6 are residuals
-of each, 5 set rigid-body motions apart and find soft modes again to all digits; a hold returns a
+Peers are better where no check is wanted. Of the 16 ms for all modes of the plate, 5 are residuals
+of each, 6 set rigid-body motions apart and find soft modes again to all digits; a hold returns a
 labelled system, checked; H-infinity of 3 states is enclosed to 1 %, its norm found twice; mu has a
-lower bound too, by a perturbation that reaches it, and an upper one by another route.
+lower bound too, by a perturbation that reaches it.
 ``python -m pytest -m benchmark -s tests/benchmarks`` times many more.
 
 **Limits**

@@ -216,10 +216,10 @@ def saturated():
     assert abs(ours["u1"]).max() == limit
     near(ours["y1"][:part], peer.outputs[plant.y.index("y1")], 1e-8)
     return (
-        f"the same, commands saturated ({part} of them)",
-        "python-control",
+        "the same, commands saturated",
+        f"python-control ({part} of them)",
         mine,
-        (theirs * count / part),
+        theirs * count / part,
     )
 
 

@@ -250,11 +250,12 @@ def _of_oscillators(pairs: FloatArray, swing: FloatArray, W: FloatArray) -> Floa
     r10 = ci * w00 + gi * w10 + w10 * g - w11 * e
     r11 = ci * w01 + gi * w11 - w10 * c + w11 * a
     size = (d + t * half[:, None]) ** 2 + t * t * swing[:, None]  # its determinant
-    X = np.empty_like(W)
+    X: FloatArray = np.empty_like(W)
     m00, m01, m10, m11 = t * ai + d, t * ei, t * ci, t * gi + d
     X[::2, ::2], X[::2, 1::2] = m01 * r10 - m11 * r00, m01 * r11 - m11 * r01
     X[1::2, ::2], X[1::2, 1::2] = m10 * r00 - m00 * r10, m10 * r01 - m00 * r11
-    return X / np.repeat(np.repeat(size, 2, axis=0), 2, axis=1)
+    X /= np.repeat(np.repeat(size, 2, axis=0), 2, axis=1)
+    return X
 
 
 #: largest residual beside the terms of the equation: rounding leaves 1e-13 of some hundred states
