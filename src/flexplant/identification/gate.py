@@ -11,7 +11,7 @@ from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, attempted
 from ..tolerances import RANK, TINY
 from .line_weights import NARROW, Rejected, mains_multiple
-from .model_error import ALIKE, mac, strength, twin
+from .model_error import ALIKE, mac, outputs_disagree, own_cost, strength, twin
 from .pole_test import pole_price, shared, unit
 from .refine import Fit, Lines, pivoted, refined
 
@@ -130,13 +130,17 @@ def _deviations(lines: Lines, fit: Fit) -> FloatArray:
     return np.asarray(np.sqrt(variance[: 2 * fit.poles.size]).reshape(2, -1))
 
 
-def lesser(fit: Fit, alike: float = 0.0) -> list[int]:
-    """Return the weaker poles beside others (of shapes of so high a MAC), the weakest first."""
+def lesser(fit: Fit, alike: float = 0.0, *, driven: bool = False) -> list[int]:
+    """Return the weaker poles beside others (of shapes of so high a MAC), the weakest first.
+
+    `driven`: of participation of so high a MAC.
+    """
     height, found = strength(fit), []
+    vectors = fit.participation if driven else fit.shapes
     for k in np.argsort(height):
         reach = BESIDE * (-fit.poles.real - fit.poles.real[k])
         near = (np.abs(fit.poles - fit.poles[k]) < reach) & (height > height[k])
-        if any(mac(fit.shapes, int(j), int(k)) >= alike for j in np.flatnonzero(near)):
+        if any(mac(vectors, int(j), int(k)) >= alike for j in np.flatnonzero(near)):
             found.append(int(k))
     return found
 
@@ -149,6 +153,23 @@ def turned(lines: Lines, fit: Fit, steps: int) -> Fit:
     keep = np.delete(np.arange(fit.m), lesser(fit, ALIKE))
     start = pivoted(lines, fit.poles[keep], fit.shapes[:, keep])
     return refined(lines, start.poles, start.participation, steps=steps, strict=False, first=start)
+
+
+def single(fit: Fit, steps: int) -> Fit | None:
+    """Return the fit of one pole a resonance where outputs that disagree made it several.
+
+    These are of one participation. It is taken where poles of each output's own then explain more
+    than all the shared ones, None where they do not.
+    """
+    out = lesser(fit, ALIKE, driven=True)
+    if not out:
+        return None
+    keep = np.delete(np.arange(fit.m), out)
+    poles, part = fit.poles[keep], fit.participation[:, keep]
+    less = refined(fit.lines, poles, part, steps=steps, strict=False, poles_only=True)
+    if outputs_disagree(less) and own_cost(less) < fit.cost:
+        return less
+    return None
 
 
 def _outside(lines: Lines, pole: complex) -> str | None:

@@ -38,7 +38,7 @@ from .diagram import (
     diagram_of,
     weighted_by_remainder,
 )
-from .gate import gated, lesser, steady, turned
+from .gate import gated, lesser, single, steady, turned
 from .line_weights import PreparedLines, prepared
 from .model_error import ALIKE, NOISE, disagreement, outputs_disagree
 from .pole_test import (
@@ -343,11 +343,14 @@ def _identified(
         expect(work * (_REFINED if refine or (refine is None and not costly) else _FIRST))
         lines = lines_of(ready)
         fit, reason = _first(lines, chosen, alone), ""
-        differ = refine is not False and alone and outputs_disagree(fit)
+        judged = refine is not False and alone
+        less = single(fit, QUICK) if judged else None
+        fit = fit if less is None else less
+        differ = judged and (less is not None or outputs_disagree(fit))
         asked = side not in ("", lines.side)
-        if asked or (not side and refine is not False and alone and not differ and _turns(fit)):
+        if asked or (not side and judged and not differ and _turns(fit)):
             other = turned(lines_of(ready.turned), fit, QUICK)
-            differ = refine is not False and alone and outputs_disagree(other)
+            differ = judged and outputs_disagree(other)
             if differ or asked:
                 ready, lines, fit = ready.turned, other.lines, other
         differ = differ and refine is None
