@@ -11,7 +11,7 @@ from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, attempted
 from ..tolerances import RANK, TINY
 from .line_weights import NARROW, Rejected, mains_multiple
-from .model_error import ALIKE, mac, outputs_disagree, own_cost, strength, twin
+from .model_error import ALIKE, mac, strength, twin
 from .pole_test import pole_price, shared, unit
 from .refine import Fit, Lines, pivoted, refined
 
@@ -104,7 +104,7 @@ def _needless(
         alike = mac(fit.shapes, other, place) > ALIKE
         if not compare or alike or not _shared(lines, fit, fitted, place):
             return place, f"a twin of the pole at {size[other] / (2 * np.pi):.5g} Hz"
-    for place in lesser(fit) if compare else []:
+    for place in lesser(fit, fit.shapes) if compare else []:
         if not _shared(lines, fit, fitted, place):
             return place, f"not shared by the {lines.side}: it stands for what they differ by"
     return None
@@ -130,13 +130,9 @@ def _deviations(lines: Lines, fit: Fit) -> FloatArray:
     return np.asarray(np.sqrt(variance[: 2 * fit.poles.size]).reshape(2, -1))
 
 
-def lesser(fit: Fit, alike: float = 0.0, *, driven: bool = False) -> list[int]:
-    """Return the weaker poles beside others (of shapes of so high a MAC), the weakest first.
-
-    `driven`: of participation of so high a MAC.
-    """
+def lesser(fit: Fit, vectors: ComplexArray, alike: float = 0.0) -> list[int]:
+    """Return the weaker poles beside others (of vectors of so high a MAC), the weakest first."""
     height, found = strength(fit), []
-    vectors = fit.participation if driven else fit.shapes
     for k in np.argsort(height):
         reach = BESIDE * (-fit.poles.real - fit.poles.real[k])
         near = (np.abs(fit.poles - fit.poles[k]) < reach) & (height > height[k])
@@ -145,31 +141,17 @@ def lesser(fit: Fit, alike: float = 0.0, *, driven: bool = False) -> list[int]:
     return found
 
 
-def turned(lines: Lines, fit: Fit, steps: int) -> Fit:
-    """Return the fit of lines whose inputs and outputs are exchanged, one pole a resonance.
+def single(lines: Lines, fit: Fit, vectors: ComplexArray, steps: int) -> Fit:
+    """Return the fit of lines, of one pole a resonance, whose participation are these vectors.
 
-    References that disagree give each resonance several poles of one shape.
+    Outputs that disagree give each resonance several poles of one participation; references do of
+    one shape, which is the participation once inputs and outputs are exchanged. It is held: poles
+    that the rows do not share would bend it.
     """
-    keep = np.delete(np.arange(fit.m), lesser(fit, ALIKE))
-    start = pivoted(lines, fit.poles[keep], fit.shapes[:, keep])
-    return refined(lines, start.poles, start.participation, steps=steps, strict=False, first=start)
-
-
-def single(fit: Fit, steps: int) -> Fit | None:
-    """Return the fit of one pole a resonance where outputs that disagree made it several.
-
-    These are of one participation. It is taken where poles of each output's own then explain more
-    than all the shared ones, None where they do not.
-    """
-    out = lesser(fit, ALIKE, driven=True)
-    if not out:
-        return None
-    keep = np.delete(np.arange(fit.m), out)
-    poles, part = fit.poles[keep], fit.participation[:, keep]
-    less = refined(fit.lines, poles, part, steps=steps, strict=False, poles_only=True)
-    if outputs_disagree(less) and own_cost(less) < fit.cost:
-        return less
-    return None
+    keep = np.delete(np.arange(fit.m), lesser(fit, vectors, ALIKE))
+    start = pivoted(lines, fit.poles[keep], vectors[:, keep])
+    now = start.poles, start.participation
+    return refined(lines, *now, steps=steps, strict=False, poles_only=True, first=start)
 
 
 def _outside(lines: Lines, pole: complex) -> str | None:

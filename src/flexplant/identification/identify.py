@@ -38,7 +38,7 @@ from .diagram import (
     diagram_of,
     weighted_by_remainder,
 )
-from .gate import gated, lesser, single, steady, turned
+from .gate import gated, lesser, single, steady
 from .line_weights import PreparedLines, prepared
 from .model_error import ALIKE, NOISE, disagreement, outputs_disagree
 from .pole_test import (
@@ -344,13 +344,14 @@ def _identified(
         lines = lines_of(ready)
         fit, reason = _first(lines, chosen, alone), ""
         judged = refine is not False and alone
-        less = single(fit, QUICK) if judged else None
-        fit = fit if less is None else less
-        differ = judged and (less is not None or outputs_disagree(fit))
+        if judged and lesser(fit, fit.participation, ALIKE):
+            less = single(lines, fit, fit.participation, QUICK)
+            fit = less if outputs_disagree(less, fit.cost) else fit
+        differ = judged and outputs_disagree(fit)
         asked = side not in ("", lines.side)
         if asked or (not side and judged and not differ and _turns(fit)):
-            other = turned(lines_of(ready.turned), fit, QUICK)
-            differ = judged and outputs_disagree(other)
+            other = single(lines_of(ready.turned), fit, fit.shapes, QUICK)
+            differ = judged and outputs_disagree(other, np.inf if asked else fit.cost)
             if differ or asked:
                 ready, lines, fit = ready.turned, other.lines, other
         differ = differ and refine is None
@@ -425,7 +426,7 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
 def _turns(fit: Fit) -> bool:
     """Return whether references may disagree: more than noise is left, or poles stand beside."""
     return len(fit.participation) > 1 and bool(
-        lesser(fit, ALIKE) or fit.cost > NOISE * freedom(fit.lines, fit.m)
+        lesser(fit, fit.shapes, ALIKE) or fit.cost > NOISE * freedom(fit.lines, fit.m)
     )
 
 

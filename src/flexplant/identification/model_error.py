@@ -34,8 +34,10 @@ def own_cost(fit: Fit) -> float:
     return sum(one.cost for one in fit.own)
 
 
-def outputs_disagree(fit: Fit) -> bool:
+def outputs_disagree(fit: Fit, least: float = np.inf) -> bool:
     """Return whether poles of each output's own leave noise alone, shared ones far more.
+
+    And less than another fit, of more poles, does (`least`).
 
     No pole that outputs share explains what is left then, and where the shared poles are is known
     by how the outputs differ, not by the misfit that a refinement lowers.
@@ -48,7 +50,7 @@ def outputs_disagree(fit: Fit) -> bool:
         return False
     alone = own_cost(fit)
     noise = LIMIT * np.sqrt(2 * free * lines.inflation) + NEXT_TO_NONE * (fit.cost - free)
-    return alone < free + noise and alone * NOISE < fit.cost
+    return alone < min(least, free + noise) and alone * NOISE < fit.cost
 
 
 def coherence(lines: Lines, model: ComplexArray, pole: complex) -> float:
