@@ -268,7 +268,7 @@ before = list(warnings.filters), numpy.get_printoptions(), numpy.geterr()
 import flexplant
 after = list(warnings.filters), numpy.get_printoptions(), numpy.geterr()
 heavy = "matplotlib control cvxpy clarabel filterpy tqdm slycot pandas".split()
-parts = "stats ndimage integrate interpolate signal optimize spatial special".split()
+parts = "io stats ndimage integrate interpolate signal optimize spatial special".split()
 heavy += [f"scipy.{name}" for name in parts]
 print(json.dumps({
     "heavy": [name for name in heavy if name in sys.modules],

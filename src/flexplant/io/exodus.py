@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import scipy.io
+import scipy
 
 from ..checks import FloatArray, Matrix, one_of, real_array
 from ..errors import FlexplantError, LabelError, ModelError

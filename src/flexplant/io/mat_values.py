@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import scipy.io
+import scipy
 
 from ..checks import short
 from ..errors import LabelError, ModelError, require_known

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 import scipy.sparse as sp
-from scipy.io import mmread
 
 from ..checks import FloatArray
 from ..errors import FlexplantError, ShapeError
@@ -177,7 +177,7 @@ def _plain_entries(body: bytes, head: _Header) -> Any | None:
     sizes = f"{head.shape[0]} {head.shape[1]} {head.entries}"
     first = f"%%MatrixMarket matrix coordinate real general\n{sizes}\n".encode()
     try:
-        entries = mmread(BytesIO(first + body), spmatrix=False)
+        entries = scipy.io.mmread(BytesIO(first + body), spmatrix=False)
     except (ValueError, OverflowError):  # a wrong index, count or size: the error of ours names it
         return None
     return entries if np.all(np.isfinite(entries.data)) else None
