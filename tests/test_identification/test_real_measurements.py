@@ -1,7 +1,6 @@
 """Measurements that no linear machine explains: real ones, and outputs that do not agree."""
 
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,15 +11,12 @@ from flexplant.identification import H1Estimator, estimate_frf, identify_modes
 from flexplant.lti import Frf
 from flexplant.store import load
 from oracles_identification import modal_frf, noisy, pole
-
-MEASURED = Path(__file__).parents[3] / "shared" / "data" / "measured"
+from shared_data import DATA
 
 
 def content(name):
-    for place in (MEASURED, Path("/work/shared/data/measured")):
-        if (place / name).exists():
-            return scipy.io.loadmat(place / name)
-    return pytest.skip(f"{name} is not there")
+    path = DATA / "measured" / name
+    return scipy.io.loadmat(path) if path.exists() else pytest.skip(f"needs {path}")
 
 
 def ruler(low, high):
