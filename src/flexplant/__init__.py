@@ -93,7 +93,7 @@ faster; the answers are compared first. Figures of another run differ by some 20
 | the same, commands saturated | 2.2 s | python-control (2000 of them) | 3.9 s | 1.8 |
 | H-infinity, 3 states: norm 0.138 | 37 ms | python-control, slycot: 0.137 | 19 ms | 0.51 |
 | H-infinity, 61 states of a stage: norm 0.947 | 0.45 s | slycot: no answer in 10 s | - | - |
-| mu of 12 complex scalars, both bounds | 0.19 s | slycot ab13md, the upper one | 12 ms | 0.063 |
+| mu of 12 complex scalars, both bounds | 49 ms | slycot ab13md, the upper one | 14 ms | 0.29 |
 | poles of a close pair in noise: error 5e-07 | 0.41 s | scikit-rf: 7e-07 | 0.18 s | 0.44 |
 | a sparse OUTPUT4 file of Nastran | 7.1 ms | pyYeti | 32 ms | 4.5 |
 

@@ -184,8 +184,14 @@ def crossing_multiple(
         worst = np.argmax(values.real if near is None else -np.abs(values - near))
         return complex(values[worst])
 
-    best, phases = (0.0, 0.0), np.linspace(-np.pi, np.pi, _PHASES)
-    values = [eigenvalue(phase, None) for phase in phases]
+    best, values = (0.0, 0.0), list[complex]()
+    phases = np.linspace(-np.pi, np.pi, _PHASES)
+    if np.any(fixed):
+        values = [eigenvalue(phase, None) for phase in phases]
+    else:  # all eigenvalues turn with the phase
+        every = la.eigvals(M @ turned)
+        largest = complex(every[np.argmax(np.abs(every))])
+        best = abs(largest), -float(np.angle(largest))
     for i in np.flatnonzero(np.diff(np.sign([v.imag for v in values]))).tolist():
         low, high, value = phases[i], phases[i + 1], values[i]
         sign = np.sign(value.imag)

@@ -30,6 +30,8 @@ from .upper import upper_level
 
 #: frequencies at which a perturbation is sought, starts at each
 _SOUGHT, _STARTS = 8, 6
+#: part of the upper bound from which a lower one is not raised further: no design hangs on less
+_MET = 0.999
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -174,6 +176,8 @@ def _of_matrix(M: ComplexArray, blocks: Sequence[Block], rng: np.random.Generato
         if found is not None and 1.0 / found[0] > lower:
             lower = 1.0 / found[0]
             delta = np.asarray(found[0] * matrix_of(found[1], where))
+        if lower >= _MET * upper:
+            break
     return MuBounds(upper, lower, float("nan"), delta)
 
 
