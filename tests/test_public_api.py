@@ -171,6 +171,8 @@ def keywords_closed(name, item):
 #: these are said together
 TOGETHER = {
     "direction",  # after a place: dofs.nearest(xyz, "rx")
+    "directions",  # after the nodes, as in dofs.where(nodes, "z")
+    *("length", "mass", "time"),  # the units of a model: matrices.converted("mm", "t")
     "inputs",  # after the outputs, as in frf["y1", "u1"]
     "dt",  # of a transfer function, as in python-control
     "freq",  # after what the response is of

@@ -246,9 +246,9 @@ class DofSet(Value):
 
     def where(
         self,
-        *,
         nodes: Iterable[int] | int | None = None,
         directions: Iterable[str] | str | None = None,
+        *,
         box: Sequence[Sequence[float]] | FloatArray | None = None,
         component: str | None = None,
     ) -> DofSet:

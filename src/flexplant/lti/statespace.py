@@ -285,7 +285,7 @@ class StateSpace(Value):
         return self * (1.0 / number)
 
     def renamed(
-        self, *, inputs: dict[str, str] | None = None, outputs: dict[str, str] | None = None
+        self, inputs: dict[str, str] | None = None, outputs: dict[str, str] | None = None
     ) -> StateSpace:
         """Return the system with some channels renamed, as {old: new}."""
         hint = "Pass {old: new}."

@@ -237,7 +237,7 @@ class FEMatrices(Value):
         return self.replace(**parts, dofs=dofs, constrained=held)
 
     def converted(
-        self, *, length: str | float = "m", mass: str | float = "kg", time: str | float = "s"
+        self, length: str | float = "m", mass: str | float = "kg", time: str | float = "s"
     ) -> FEMatrices:
         """Return the matrices and coordinates in SI, from those in other units.
 
