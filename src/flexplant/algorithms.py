@@ -20,7 +20,7 @@ too close for the diagram) is taken apart where that lowers chi-square by more t
 Measurements that no linear machine explains: a pole is added only for what the outputs share,
 beyond poles of their own at each of them, and misfit that is correlated over neighbouring lines
 counts as so much less. Of two poles within a bandwidth with the same shape and participation one
-remains. Where outputs disagree on the poles (a roving sensor), they are warned of: poles are then
+remains. Where outputs (inputs, runs) disagree on the poles, they are warned of: poles are then
 means of each output's own, with the deviations of random effects. Poles whose deviation of
 frequency or damping exceeds it, mains multiples narrower than half a line and poles at the edge
 of the band are not reported, but listed with the reason in `rejected`. So are lines at multiples

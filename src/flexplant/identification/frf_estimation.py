@@ -140,6 +140,9 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
     not contain it, and the variance is 28 to 300 times too small. Give `multisine` another `rng`
     for each run.
 
+    A machine that drifts between runs is seen in their mean as broader resonances, off by more than
+    its deviations: give `identify_modes` the runs themselves then.
+
     Parameters
     ----------
     repeated : iterable of at least two Frf
@@ -172,26 +175,8 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
     >>> mean.variance.round(4)
     array([[[0.01, 0.01]]])
     """
-    why = "One measurement says nothing about its noise: pass two or more."
-    frfs = members(repeated, Frf, "repeated measurements", why, least=2)
+    frfs = repetitions(repeated)
     first = frfs[0]
-    for frf in frfs[1:]:
-        same = (frf.inputs, frf.outputs) == (first.inputs, first.outputs)
-        if not same or not np.array_equal(frf.freq, first.freq):
-            raise ShapeError(
-                f"repeated measurements have the same channels and frequencies, got {first!r} and "
-                f"{frf!r}."
-            )
-        if frf.quantity != first.quantity:
-            raise ModelError(
-                f"quantities differ: {first.quantity!r} and {frf.quantity!r}. Convert first."
-            )
-        if (frf.window, frf.resolution) != (first.window, first.resolution):
-            raise ModelError(
-                f"segments differ: window {first.window!r} at a resolution of {first.resolution} "
-                f"Hz, and {frf.window!r} at {frf.resolution} Hz. They leak differently, and their "
-                "mean has no window: estimate all with the same method."
-            )
     data = np.array([frf.data for frf in frfs])
     mean: ComplexArray = data.mean(axis=0)
     error = data - mean
@@ -235,3 +220,53 @@ def _freedom(correlation: ComplexArray, size: FloatArray, spare: int, n_in: int)
     alike[np.arange(power.size), np.arange(power.size)] = 1.0
     n_e = float(np.sum(power) ** 2 / (power @ alike @ power))
     return float(spare / (1 / n_in + 1 / n_e - 1 / (n_in * n_e)))
+
+
+def repetitions(repeated: Iterable[Frf]) -> tuple[Frf, ...]:
+    """Return measurements of the same channels at the same frequencies, checked."""
+    why = "One measurement says nothing about its noise: pass two or more."
+    frfs = members(repeated, Frf, "repeated measurements", why, least=2)
+    first = frfs[0]
+    for frf in frfs[1:]:
+        same = (frf.inputs, frf.outputs) == (first.inputs, first.outputs)
+        if not same or not np.array_equal(frf.freq, first.freq):
+            raise ShapeError(
+                f"repeated measurements have the same channels and frequencies, got {first!r} and "
+                f"{frf!r}."
+            )
+        if frf.quantity != first.quantity:
+            raise ModelError(
+                f"quantities differ: {first.quantity!r} and {frf.quantity!r}. Convert first."
+            )
+        if (frf.window, frf.resolution) != (first.window, first.resolution):
+            raise ModelError(
+                f"segments differ: window {first.window!r} at a resolution of {first.resolution} "
+                f"Hz, and {frf.window!r} at {frf.resolution} Hz. They leak differently, and their "
+                "mean has no window: estimate all with the same method."
+            )
+    return frfs
+
+
+def stacked(runs: tuple[Frf, ...]) -> Frf:
+    """Return the outputs of all runs as outputs of one measurement."""
+    first = runs[0]
+    variances = [run.variance for run in runs if run.variance is not None]
+    blocks = [run.correlation for run in runs if run.correlation is not None]
+    correlation, n = None, len(first.outputs)
+    if len(blocks) == len(runs):
+        correlation = np.zeros((n * len(runs), n * len(runs), first.freq.size), complex)
+        for k, block in enumerate(blocks):
+            correlation[k * n : (k + 1) * n, k * n : (k + 1) * n] = block
+    return Frf(
+        first.freq,
+        np.concatenate([run.data for run in runs]),
+        variance=np.concatenate(variances) if len(variances) == len(runs) else None,
+        correlation=correlation,
+        outputs=[f"{name} of run {k + 1}" for k in range(len(runs)) for name in first.outputs],
+        inputs=first.inputs,
+        quantity=first.quantity,
+        freedom=first.freedom if len(variances) == len(runs) else None,
+        window=first.window,
+        resolution=first.resolution,
+        overlap=first.overlap,
+    )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,7 @@ from .diagram import (
     diagram_of,
     weighted_by_remainder,
 )
+from .frf_estimation import repetitions, stacked
 from .gate import gated, lesser, single, steady
 from .line_weights import PreparedLines, prepared
 from .model_error import ALIKE, NOISE, disagreement, outputs_disagree
@@ -61,6 +63,8 @@ from .pole_test import (
 from .refine import Exhausted, Fit, Lines, Products, pivoted, refined
 from .result import IdentifiedModes, answer, hann_segment, leakage_warned, of_segments
 
+#: what poles of their own may belong to, beside outputs and inputs
+RUNS = "runs"
 #: of an identification, for its bar: the diagram, twice fit and growth, the answer
 STAGES = 6
 #: changes of one kind that are accepted, and poles that a fit may have
@@ -153,7 +157,7 @@ def stabilisation_diagram(
 
 
 def identify_modes(
-    frf: Frf,
+    frf: Frf | Sequence[Frf],
     *,
     band: tuple[float, float] | None = None,
     orders: Iterable[int] | None = None,
@@ -181,8 +185,11 @@ def identify_modes(
 
     Parameters
     ----------
-    frf : Frf
-        Measured. With a variance, errors are weighted by it and the covariance follows from it
+    frf : Frf, or list of Frf
+        Measured, or runs of the same channels between which the machine may have drifted (a mean of
+        these shows broader resonances, and hides it): poles are then means over the runs, and their
+        deviations come from how these differ.
+        With a variance, errors are weighted by it and the covariance follows from it
         (and from the correlation between outputs, and between lines by the window, where known);
         without, both come from what the fit leaves, averaged over 41 lines.
     band : (low, high) [Hz], optional
@@ -258,18 +265,19 @@ def identify_modes(
     most, steps = whole(most, "most"), whole(max_iterations, "max_iterations")
     if refine is not None and not isinstance(refine, bool):
         raise ModelError(f"refine is True, False or None, got {short(refine)}.")
+    runs: tuple[Any, ...] = repetitions(frf) if isinstance(frf, list | tuple) else (frf,)
     with one_thread():
         try:
             return _identified(
-                *(frf, band, orders, start, lower, upper, hold),
+                *(runs, band, orders, start, lower, upper, hold),
                 *((dofs, setups), (refine, most, steps), progress),
             )
         except SolverError as error:
-            raise of_segments(frf, error) from None
+            raise of_segments(runs[0], error) from None
 
 
 def _identified(
-    frf: Frf,
+    runs: tuple[Frf, ...],
     band: tuple[float, float] | None,
     orders: Iterable[int] | None,
     start: PoleSelection | None,
@@ -280,7 +288,8 @@ def _identified(
     limits: tuple[bool | None, int, int],
     progress: bool | None,
 ) -> IdentifiedModes:
-    ready = prepared(frf, band)
+    frf = runs[0]
+    ready = prepared(stacked(runs) if len(runs) > 1 else frf, band)
     high = float(ready.freq[-1])
     lower = whole(lower, "lower", minimum=0, maximum=MOST_TERMS)
     terms = UPPER[-1] if upper is None else whole(upper, "upper", minimum=0, maximum=MOST_TERMS)
@@ -289,6 +298,10 @@ def _identified(
         raise ModelError(f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together.")
     labels = checked_channels(channels[0], frf)
     side, together = checked_setups(channels[1], frf)
+    if len(runs) > 1:
+        if side:
+            raise ModelError("setups= are those of one measurement, got several: give one of them.")
+        side, together = RUNS, tuple(np.split(np.arange(len(runs) * len(frf.outputs)), len(runs)))
     listed = None if orders is None else checked_orders(orders)
     if start is not None:
         instance(start, PoleSelection, "start", "Pass diagram.select(freq=[...]).")
@@ -298,6 +311,7 @@ def _identified(
     budget = Products()
 
     def lines_of(ready: PreparedLines) -> Lines:
+        rows = RUNS if side == RUNS and ready.side == "outputs" else ready.side
         # with all residual terms, so that no pole is kept or moved to stand in for one
         return Lines(
             *(ready.freq, ready.data, ready.weight, lower, terms, rate, ready.known),
@@ -306,8 +320,8 @@ def _identified(
             segment=hann_segment(frf),
             most=most,
             work=budget,
-            side=ready.side,
-            setups=together if side == ready.side else (),
+            side=rows,
+            setups=together if side == rows else (),
         )
 
     diagram, at_peaks = None, False
@@ -389,6 +403,10 @@ def _identified(
                 rejected += others
         if compare or budget.done > BUDGET:
             warned(unexplained(lines, fit), None if apart is None else (apart.size, lines.side))
+        if side == RUNS:
+            ready = ready.over_runs(len(runs))
+            lines = replace(lines, data=ready.data, weight=ready.weight, setups=())
+            fit = Fit(lines, fit.poles, fit.participation, fit.pivots)
         listed_out = tuple(sorted(rejected + ready.mains))
         answered = answer(
             frf, ready, lines, fit, reported, labels, diagram, listed_out, reason, apart

@@ -87,6 +87,15 @@ class PreparedLines:
         mean = 1.0 / np.sqrt(np.mean(self.weight**-2.0, axis=1))
         return np.asarray(mean / mean.max())
 
+    def over_runs(self, count: int) -> PreparedLines:
+        """Return the mean of so many runs, stacked along the first axis."""
+        data = np.mean(self.data.reshape(count, -1, *self.data.shape[1:]), axis=0)
+        power = np.sum(self.weight.reshape(count, *data.shape) ** -2.0, axis=0)
+        C, n = self.correlation, len(data)
+        if C is not None:
+            C = np.mean([C[k : k + n, k : k + n] for k in range(0, len(C), n)], axis=0)
+        return replace(self, data=data, weight=count / np.sqrt(power), correlation=C)
+
     def from_errors(self, power: FloatArray, fitted_share: float) -> PreparedLines:
         """Return the same with weights from the squared errors of a rough fit."""
         # at sharp peaks such a fit leaves more than noise; the median does not see them

@@ -321,7 +321,7 @@ class IdentifiedModes(MeasuredModes):
         Relative deviation of the frequencies between outputs (or inputs), where they disagree:
         poles are then means over these, and their covariance comes from how they differ.
     inconsistent : str
-        Which of the two disagree, "outputs" or "inputs", empty where none do.
+        Which of them disagree, "outputs", "inputs" or "runs", empty where none do.
 
     Examples
     --------
