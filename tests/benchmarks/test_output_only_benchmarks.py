@@ -50,7 +50,11 @@ def shaken(rng):
 
 
 def test_twelve_modes_of_a_mast():
-    """Near pairs 1.5 % apart; the peer reported before found nine of twelve."""
+    """Near pairs 1.5 % apart, chosen by nobody, with deviations.
+
+    pyOMA2 1.4.3 (SSI, 50 block rows), told the twelve frequencies and an order of 40, meets all
+    in 4 s without deviations; left to choose the order it finds none of them at once.
+    """
     freq, zeta, rate, y = shaken(np.random.default_rng(0))
     start = time.process_time()
     found = identify_output_only(y, rate=rate, band=(0.6 * freq.min(), 1.1 * freq.max()))
