@@ -9,6 +9,7 @@ import scipy.linalg as la
 
 import flexplant as fx
 from flexplant.errors import AssumptionError, FlexplantWarning, ModelError
+from flexplant.loop.mode_tolerance import mode_tolerances
 from flexplant.plant.uncertainty.uncertain_plant import Delta, with_changes
 from stages import RATE, ports, sampled, some_modes
 
@@ -143,6 +144,24 @@ def test_a_loop_that_tolerates_all_says_so():
     found = fx.close_loop(plant(), observer, servo).mode_tolerances(known=0.01)
     assert found.critical == ()
     assert "does harm" in found.summary
+
+
+def test_modes_that_are_named_are_examined_up_to_limits_of_their_own():
+    every, one = tolerances(), loop()
+    worst = every.modes[np.argsort(every.least)[:3]]
+    limits = {int(mode): 0.05 if mode == worst[0] else 1e-3 for mode in worst}
+    found = mode_tolerances(one.plant, one.broken, margin=every.margin, limit=limits)
+    row = np.searchsorted(every.modes, found.modes)
+    np.testing.assert_array_equal(found.modes, np.sort(worst))
+    for got, wanted in ((found.stable, every.stable[row]), (found.within, every.within[row])):
+        limit = np.tile(found.limit[:, None], (1, 2))
+        near = np.abs(wanted) < limit
+        np.testing.assert_allclose(got[near], wanted[near], rtol=1e-2)
+        assert np.all(
+            np.abs(got[~near]) > 0.99 * np.broadcast_to(found.limit[:, None], got.shape)[~near]
+        )
+    none = mode_tolerances(one.plant, one.broken, margin=every.margin, limit={99: 0.01})
+    assert not none.modes.size
 
 
 def test_what_cannot_be_judged_is_refused():

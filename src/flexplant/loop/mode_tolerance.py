@@ -218,6 +218,9 @@ def mode_tolerances(
         most = np.full(modes.size, limit)
     limits = np.minimum(most, _ASIDE / _TO_A_WIDTH * zeta)
     own = _known(known, modes)
+    if not modes.size:
+        none = np.zeros((0, 2))
+        return ModeTolerances(modes, freq, none, none, none, margin, limits, own)
     loops = ModeLoops.of(plant, broken, modes)
     grids = [
         _around(f, z, end, broken.grid, plant.dt)

@@ -255,8 +255,6 @@ class _StageTask:
     def _tolerates(self, loop: ClosedLoop, ranges: Mapping[int, float]) -> bool:
         """Return whether any one mode may be off as far as it is uncertain."""
         limit = {mode: BEYOND * needed for mode, needed in ranges.items() if needed > 0}
-        if not limit:
-            return True
         margin = _KEPT * self.margin
         found = mode_tolerances(loop.plant, loop.broken, margin=margin, limit=limit)
         needed = np.array([ranges[int(mode)] for mode in found.modes])
