@@ -284,10 +284,11 @@ def test_minimal_judges_each_mode_at_its_own_frequency(pairs, form, dt):
     assert minimal(g) is g
     twice = parallel(g, g)
     found = minimal(twice)
-    if form == "mixed" and found is twice:
+    if form == "mixed" and found.n_states > g.n_states:
         # orthogonally mixed, the rounding of 1e8 is there beside 0.03 at slow modes: with some
-        # versions of LAPACK the responses agree to 1e-4 only, and nothing is taken out
+        # versions of LAPACK the responses agree to 1e-4 only, and less is taken out
         assert pairs is WIDE["free mass"]
+        assert error(found, twice, np.array([101.0, 3030.0])) < 1e-3
         return
     assert found.n_states == g.n_states
     freq = np.array([1.01 * freq for freq, _ in pairs if freq])
