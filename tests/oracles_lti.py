@@ -111,3 +111,16 @@ def peak_by_search(A, B, C, D, dt):
         a, b = high - ratio * (high - low), low + ratio * (high - low)
         low, high = (low, b) if size(a) > size(b) else (a, high)
     return max(best[0], size(0.5 * (low + high)))
+
+
+def periodic_answer(law, records):
+    """Outputs (period, p) of a sampled system that records (period, m) have driven for ever."""
+    x = np.zeros(law.n_states)
+    for sample in records:
+        x = law.A @ x + law.B @ sample
+    over = np.linalg.matrix_power(law.A, len(records))
+    x, out = np.linalg.solve(np.eye(len(x)) - over, x), []
+    for sample in records:
+        out.append(law.C @ x + law.D @ sample)
+        x = law.A @ x + law.B @ sample
+    return np.array(out)

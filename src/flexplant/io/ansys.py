@@ -54,7 +54,7 @@ def read_ansys(
     Returns
     -------
     FEMatrices
-        In the units of the model: `.converted(length="mm", mass="t")` turns them to SI.
+        In the units of the model: `.converted("mm", "t")` turns them to SI.
 
     Raises
     ------

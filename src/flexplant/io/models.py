@@ -141,7 +141,7 @@ def read_model(
 ) -> FEModel:
     """Return the model of a file, whichever program wrote it.
 
-    As `read_matrices(...).converted(...).model(massless=...)`: what is wrong with a file is
+    As `read_matrices(...).converted(*units).model(massless=...)`: what is wrong with a file is
     refused with a reason, and `check(read_matrices(...))` reports all of it.
 
     Parameters
@@ -201,7 +201,7 @@ def read_model(
     array([[ 2000., -1000.],
            [-1000.,  1000.]])
     """
-    length, mass_unit, time = three_units(units)
+    sizes = three_units(units)
     found = read_matrices(
         path,
         stiffness=stiffness,
@@ -214,8 +214,8 @@ def read_model(
         exodus=exodus,
         rotations=rotations,
     )
-    if (length, mass_unit, time) != ("m", "kg", "s"):
-        found = found.converted(length=length, mass=mass_unit, time=time)
+    if sizes != ("m", "kg", "s"):
+        found = found.converted(*sizes)
     return found.model(massless=massless, free=free, name=name or Path(path).name)
 
 

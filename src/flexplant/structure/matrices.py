@@ -264,7 +264,7 @@ class FEMatrices(Value):
         Examples
         --------
         >>> dofs = DofSet([1], ["z"], [[500.0, 0, 0]])
-        >>> si = FEMatrices([[12.0]], [[0.002]], dofs=dofs).converted(length="mm", mass="t").model()
+        >>> si = FEMatrices([[12.0]], [[0.002]], dofs=dofs).converted("mm", "t").model()
         >>> float(si.K[0, 0]), si.mass, float(si.dofs.xyz[0, 0])
         (12000.0, 2.0, 0.5)
         """
