@@ -43,6 +43,8 @@
    System Synthesis Conference, 1963.
 .. [Cauberghe2004] Cauberghe, Applied frequency-domain system identification in the field of
    experimental and operational modal analysis, PhD thesis, Vrije Universiteit Brussel, 2004.
+.. [Chen2008] Chen, Davis, Hager, Rajamanickam, Algorithm 887: CHOLMOD, supernodal sparse Cholesky
+   factorization and update/downdate, ACM Trans. Math. Softw. 35, 2008.
 .. [ChenChen2008] Chen, Chen, Extended Bayesian information criteria for model selection with large
    model spaces, Biometrika 95, 2008.
 .. [Chu2004] Chu, Fan, Lin, Wang, Structure-preserving algorithms for periodic discrete-time

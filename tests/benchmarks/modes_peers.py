@@ -1,6 +1,7 @@
 """One measurement in a process of its own: 24 modes of a mesh by one method, as one JSON line.
 
-python modes_peers.py plate 181 ours|mixed|default|superlu|pardiso (mixed: ours on PARDISO)
+python modes_peers.py plate 181 METHOD: ours, ours_on_pardiso, ours_on_cholmod, default, superlu,
+pardiso or cholmod.
 """
 
 import json
@@ -15,6 +16,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import flexplant as fx
 import meshes
 
 COUNT = 24
@@ -84,10 +86,15 @@ def superlu(A):
 
 def pardiso(A):
     """MKL PARDISO, where MKL is installed (or MKLROOT tells where it is)."""
-    from flexplant.sparse import Pardiso
-    from flexplant.sparse.pardiso import PardisoCholesky
+    return fx.sparse.Pardiso().factored(A).solve
 
-    return PardisoCholesky(A, Pardiso()).solve
+
+def cholmod(A):
+    """CHOLMOD, where scikit-sparse is installed."""
+    return fx.sparse.Cholmod().factored(A).solve
+
+
+FACTORS = {"ours_on_pardiso": fx.sparse.Pardiso(), "ours_on_cholmod": fx.sparse.Cholmod()}
 
 
 def main(kind, n, method):
@@ -96,10 +103,8 @@ def main(kind, n, method):
     times = {}
     if method == "ours":
         squares, phi = ours(mesh, times)
-    elif method == "mixed":
-        from flexplant.sparse import Pardiso
-
-        squares, phi = ours(mesh, times, factor=Pardiso())
+    elif method in FACTORS:
+        squares, phi = ours(mesh, times, factor=FACTORS[method])
     else:
         squares, phi = peer(mesh, times, globals()[method])
     memory = peak()

@@ -10,6 +10,7 @@ import scipy.sparse as sp
 
 from ..checks import ComplexArray, FloatArray
 from ..errors import SolverError, counted, warn
+from ..sparse.cholmod import Cholmod
 from ..sparse.factor import by_rows, diagonal
 from ..sparse.lanczos import Absolute, beyond
 from ..sparse.pardiso import Pardiso
@@ -42,7 +43,7 @@ def damped_modes(
     phi: FloatArray,
     count: int,
     top: float,
-    method: Pardiso | None,
+    method: Pardiso | Cholmod | None,
 ) -> Modes:
     """Return the complex modes of a large model, by a basis that grows until they are right.
 

@@ -10,6 +10,7 @@ import scipy.sparse as sp
 
 from ..checks import FloatArray
 from ..errors import ModelError, SolverError, attempted, counted
+from ..sparse.cholmod import Cholmod, CholmodCholesky
 from ..sparse.factor import DENSE_LIMIT, same_pattern
 from ..sparse.lanczos import rounding_of
 from ..sparse.lowest import SignedFactor, multifrontal_inertia, signed_factor
@@ -37,7 +38,7 @@ class StiffnessFactor:
     """
 
     def __init__(
-        self, model: FEModel, method: Pardiso | None = None, *, single: bool = False
+        self, model: FEModel, method: Pardiso | Cholmod | None = None, *, single: bool = False
     ) -> None:
         self.M: Any = sp.csc_array(model.M)
         self.K: Any = sp.csc_array(model.K)
@@ -52,10 +53,10 @@ class StiffnessFactor:
         shifted = _shifted(self.K, self.M, self.sigma)
         self.dissection = dissection_of(model)
         try:
-            self._cholesky: MultifrontalCholesky | PardisoCholesky = (
+            self._cholesky: MultifrontalCholesky | PardisoCholesky | CholmodCholesky = (
                 MultifrontalCholesky(shifted, self.dissection, single=single)
                 if method is None
-                else PardisoCholesky(shifted, method)
+                else method.factored(shifted)
             )
         except SolverError as error:
             if single:
@@ -143,7 +144,7 @@ def counting_factor(model: FEModel, square: float) -> CountingFactor | None:
     return None if signed is None else CountingFactor(signed, square)
 
 
-def stiffness_factor(model: FEModel, method: Pardiso | None = None) -> StiffnessFactor:
+def stiffness_factor(model: FEModel, method: Pardiso | Cholmod | None = None) -> StiffnessFactor:
     """Return the factor of a sparse model, the same one as long as it is in use."""
     known = _held.get(model)
     factor = known() if known is not None else None
@@ -159,7 +160,7 @@ def held_factor(model: FEModel) -> StiffnessFactor | None:
     return stiffness_factor(model) if large else None
 
 
-def search_factor(model: FEModel, method: Pardiso | None = None) -> StiffnessFactor:
+def search_factor(model: FEModel, method: Pardiso | Cholmod | None = None) -> StiffnessFactor:
     """Return a factor to search modes with: the one in use, or one in single precision."""
     known, order = _held.get(model), dissection_of(model)
     unused = known is None or known() is None

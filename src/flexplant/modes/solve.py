@@ -13,6 +13,7 @@ from ..checks import FloatArray, instance, positive, short
 from ..errors import ModelError, SolverError, warn
 from ..labels import Place
 from ..parallel import Progress
+from ..sparse.cholmod import Cholmod
 from ..sparse.factor import DENSE_LIMIT, by_rows, dense, diagonal
 from ..sparse.lanczos import STEPS, Absolute, column_groups, rounding_of
 from ..sparse.pardiso import Pardiso
@@ -45,7 +46,7 @@ def solve_modes(
     damping: Damping | None = None,
     compliance_at: Place | Iterable[Place] = (),
     compliance_damping: Damping | float | None = None,
-    factor: Pardiso | None = None,
+    factor: Pardiso | Cholmod | None = None,
     progress: bool | None = None,
 ) -> Modes:
     """Return the lowest modes of a structure, mass-normalised, rigid-body modes exactly at 0.
@@ -66,7 +67,7 @@ def solve_modes(
         modes is kept, by residual attachment vectors.
     compliance_damping : Damping or float, optional
         Of the attachment vectors; None: damped like the modes.
-    factor : Pardiso, optional
+    factor : Pardiso or Cholmod, optional
         Solver of a large sparse model in place of the library's own.
     progress : bool, optional
         A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
@@ -119,7 +120,7 @@ def solve_modes(
     if damping is not None:
         instance(damping, Damping, "damping", "Pass ModalDamping(0.01) for 1 %.")
     if factor is not None:
-        instance(factor, Pardiso, "factor", "Leave it out for the library's own factor.")
+        instance(factor, Pardiso | Cholmod, "factor", "Leave it out for the library's own factor.")
     kept, top = _asked(model, count, below)
     at = places(compliance_at)
     if at and model.n_unstable:
@@ -248,7 +249,7 @@ def _loss_coupling(model: FEModel, omega: FloatArray, phi: FloatArray, law: Hyst
 
 
 def _undamped(
-    model: FEModel, count: int, top: float, method: Pardiso | None
+    model: FEModel, count: int, top: float, method: Pardiso | Cholmod | None
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     rigid = model.rigid_body
     n, r = rigid.shape
@@ -303,7 +304,7 @@ def _complex_modes(
     count: int,
     top: float,
     names: tuple[str, ...],
-    factor: Pardiso | None,
+    factor: Pardiso | Cholmod | None,
 ) -> Modes:
     if names:
         raise ModelError(

@@ -12,6 +12,7 @@ import scipy.linalg as la
 from ..checks import FloatArray, IntArray, Matrix, Rng
 from ..errors import ModelError, SolverError, counted
 from ..parallel import expect, one_thread, tick
+from ..sparse.cholmod import Cholmod
 from ..sparse.factor import by_rows
 from ..sparse.lanczos import (
     BLOCK,
@@ -64,7 +65,7 @@ _JUDGED = 8
 
 
 def counted_modes(
-    model: FEModel, count: int, top: float = np.inf, method: Pardiso | None = None
+    model: FEModel, count: int, top: float = np.inf, method: Pardiso | Cholmod | None = None
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     """Return the lowest elastic modes with omega^2 up to `top`, and what was counted."""
     # Lanczos finds them, a Sturm count in a gap above says how many; missing ones are sought
@@ -74,7 +75,7 @@ def counted_modes(
 
 
 def _counted(
-    model: FEModel, count: int, top: float, method: Pardiso | None
+    model: FEModel, count: int, top: float, method: Pardiso | Cholmod | None
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     n, r = model.rigid_body.shape
     new = search_factor

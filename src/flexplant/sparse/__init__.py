@@ -1,4 +1,4 @@
-"""Symmetric sparse factors: orderings, Cholesky, LDL', PARDISO.
+"""Symmetric sparse factors: orderings, Cholesky, LDL', PARDISO, CHOLMOD.
 
 Large models are solved by a multifrontal factor in NumPy, without a compiler: nested dissection
 orders the unknowns, dense fronts do the work. It is used by `fx.solve_modes` and by frequency
@@ -13,7 +13,8 @@ responses of structures, and needs no call of its own. What can be chosen is ano
 array([  0. ,   0. ,   0. , 271.8, 293. , 628.6])
 
 ``fx.solve_modes(model, count=24, factor=fx.sparse.Pardiso())`` takes that of Intel's library
-(extra ``mkl``). Names elsewhere: ``scipy.sparse.linalg.splu``, CHOLMOD, MUMPS.
+(extra ``mkl``), ``factor=fx.sparse.Cholmod()`` that of SuiteSparse (scikit-sparse). Names
+elsewhere: ``scipy.sparse.linalg.splu``, MUMPS.
 
 **Memory.** On a virtual machine, memory that a process gives back and takes again costs time. The
 C library keeps it with
@@ -24,6 +25,7 @@ with AVX-512, it took 66 s.
 """
 
 from ..rooms import public_names as _public_names
+from .cholmod import Cholmod as Cholmod
 from .pardiso import Pardiso as Pardiso
 
 __dir__ = _public_names(__name__)

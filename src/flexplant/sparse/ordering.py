@@ -12,8 +12,9 @@ import scipy.sparse.csgraph as csgraph
 
 from ..checks import BoolArray, FloatArray, IntArray
 
-#: a part of fewer DOFs is eliminated as one dense block
-LEAF = 96
+#: a part of fewer DOFs is eliminated as one dense block: of 40, twice the fronts take 30 % longer,
+#: of 96 a plate's factor has 16 % more entries
+LEAF = 64
 #: a node with this many times the mean number of neighbours (a spider, a constraint) goes last
 _HUB = 20
 #: coordinates whose first separator has more than this times the nodes of the graph's own do not

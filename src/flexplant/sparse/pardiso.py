@@ -29,8 +29,9 @@ _NAMES = ("libmkl_rt.so*", "libmkl_rt*.dylib", "mkl_rt*.dll")
 class Pardiso(Value):
     """Factor with MKL PARDISO, on one thread: ``pip install 'flexplant[mkl]'``.
 
-    Faster than the library's own factor on processors that MKL favours. Modes are counted and
-    checked as always, by the library's own factorisation.
+    On an Intel processor 24 modes of a plate of 99 400 DOFs took 4.4 s with it and 5.2 s without,
+    of a solid of 98 300 DOFs 27 s and 23 s. Modes are counted and checked as always, by the
+    library's own factorisation.
 
     Parameters
     ----------
@@ -49,6 +50,10 @@ class Pardiso(Value):
 
     def __repr__(self) -> str:
         return f"Pardiso({'' if self.library is None else repr(self.library)})"
+
+    def factored(self, matrix: Any) -> PardisoCholesky:
+        """Return the factor of a sparse symmetric positive definite matrix."""
+        return PardisoCholesky(matrix, self)
 
 
 class PardisoCholesky:
