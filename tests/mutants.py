@@ -45,7 +45,7 @@ LINES = [
     ("reduction/ranking.py", "np.sqrt(1 + 2 * a)", "np.sqrt(1 + a)"),
     ("estimation/filter_model.py", "L_z @ m.R - 2.0 * N", "L_z @ m.R - N"),
     ("structure/damping.py", "ratio = 0.5 * (self.alpha", "ratio = 1.0 * (self.alpha"),
-    ("loop/mode_tolerance.py", "zeta = -0.5 * trace", "zeta = -1.0 * trace"),
+    ("plant/realisation.py", "-0.5 * trace / np", "-1.0 * trace / np"),
     ("updating/judgement/posterior.py", "return -0.5 * float(r @ r)", "return -float(r @ r)"),
     ("loop/report.py", "0.5 * at_zero",
      "1.0 * at_zero"),
