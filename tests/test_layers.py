@@ -13,7 +13,7 @@ ROOT = Path(flexplant.__file__).parent
 #: in import order; the first entry is the foundation, whose modules may use each other
 ROOMS = (
     (
-        *("errors", "rooms", "checks", "store", "certificates", "versions", "parallel"),
+        *("errors", "calls", "rooms", "checks", "store", "certificates", "versions", "parallel"),
         *("tolerances", "fingerprint", "work", "dof_columns", "labels", "bibliography"),
         *("foreign_names", "algorithms"),
     ),

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from .errors import FlexplantError, LabelError, ModelError, ShapeError
+from .errors import short as short
 from .store import Value as Value
 from .store import checked as checked
 from .store import frozen as frozen
@@ -28,7 +29,7 @@ BoolArray: TypeAlias = npt.NDArray[np.bool_]
 #: what seeds chance
 Rng: TypeAlias = int | np.random.SeedSequence | np.random.Generator | None
 #: a (n, n) matrix, dense or sparse
-Matrix: TypeAlias = "FloatArray | sp.csc_array"
+Matrix: TypeAlias = FloatArray | sp.csc_array
 #: draws, runs or machines in one call
 MOST_DRAWS = 10**7
 
@@ -181,17 +182,6 @@ def _form(shape: tuple[int | None, ...]) -> str:
         return "be a matrix, of shape (rows, columns)"
     sizes = ", ".join("any" if n is None else str(n) for n in shape)
     return f"have shape ({sizes}{',' if len(shape) == 1 else ''})"
-
-
-def short(value: Any) -> str:
-    """Return a value for a message: its repr, cut after 80 characters; arrays by their shape."""
-    if isinstance(value, np.ndarray) and value.size > 6:
-        return f"an array of shape {value.shape}"
-    try:
-        text = " ".join(repr(value).split())
-    except ValueError:  # Python writes no integer of more than 4300 digits
-        text = f"a {type(value).__name__} that is too long to write"
-    return text if len(text) <= 80 else text[:77] + "..."
 
 
 def in_unit(size: float, unit: str | None) -> tuple[float, str]:

@@ -23,6 +23,9 @@ import warnings
 from collections.abc import Hashable, Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
 
 
 class FlexplantError(Exception):
@@ -91,6 +94,17 @@ class FlexplantWarning(UserWarning):
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun: `1 mode`, `2 modes`."""
     return f"{number} {noun}{'s' * (number != 1)}"
+
+
+def short(value: Any) -> str:
+    """Return a value for a message: its repr, cut after 80 characters; arrays by their shape."""
+    if isinstance(value, np.ndarray) and value.size > 6:
+        return f"an array of shape {value.shape}"
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # Python writes no integer of more than 4300 digits
+        text = f"a {type(value).__name__} that is too long to write"
+    return text if len(text) <= 80 else text[:77] + "..."
 
 
 @contextmanager

@@ -1,15 +1,27 @@
-"""What `dir` and completion show of a room: its public names, not the modules behind them."""
+"""What a room shows: its public names, not the modules behind them; its functions as `calls` has.
+
+Functions are replaced in the module that defines them too, where pickling looks for them.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from types import ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
+
+from .calls import answering
 
 
 def public_names(room: str) -> Callable[[], list[str]]:
-    """Return the `__dir__` of a package: the names that it re-exports."""
+    """Return the `__dir__` of a package, the names that it re-exports; its functions answer."""
+    for name, item in [*vars(sys.modules[room]).items()]:
+        if not isinstance(item, FunctionType) or name.startswith("_"):
+            continue
+        module, made = sys.modules[item.__module__], answering(item)
+        setattr(sys.modules[room], name, made)
+        if vars(module).get(name) is item:
+            setattr(module, name, made)
 
     def names() -> list[str]:
         shown = vars(sys.modules[room]).items()

@@ -5,22 +5,24 @@ from __future__ import annotations
 import json
 import os
 import re
+import sys
 import uuid
 from abc import ABCMeta
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
 from html import escape
-from inspect import Parameter, Signature, signature
+from inspect import Signature, signature
 from itertools import groupby
 from pathlib import Path
-from types import MappingProxyType
+from types import FunctionType, MappingProxyType
 from typing import IO, TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import numpy as np
 import scipy.sparse as sp
 
-from .errors import FlexplantError, unknown_attribute, unknown_keyword
+from .calls import FAILURES, answering, explanation
+from .errors import FlexplantError, unknown_attribute
 
 _HEADER = "__flexplant__"
 
@@ -38,14 +40,25 @@ def _annotated(cls: type) -> Mapping[str, Any]:
 
 
 class _Kind(ABCMeta):
-    """The class of the kinds of values: says which arguments are near to one that is not taken.
+    """The class of the kinds of values: calls of them and of their methods name what does not fit.
 
-    Functions are left to the interpreter, which does so itself from Python 3.13 on: a wrapper
-    around each would cost a call, a line of every traceback, and break the pickling of those that
-    inner modules imported before it.
+    See `calls`.
     """
 
     if not TYPE_CHECKING:  # a type checker would take any argument for known
+
+        def __new__(
+            cls, name: str, bases: tuple[type, ...], own: dict[str, Any], **named: Any
+        ) -> Any:
+            """Return a kind with its public methods as `answering` ones."""
+            for key, item in own.items():
+                if key.startswith("_") or name.startswith("_"):
+                    continue
+                if isinstance(item, FunctionType):
+                    own[key] = answering(item)
+                elif isinstance(item, classmethod | staticmethod):
+                    own[key] = type(item)(answering(item.__func__))
+            return super().__new__(cls, name, bases, own, **named)
 
         @property
         def __signature__(cls) -> Signature:
@@ -58,12 +71,11 @@ class _Kind(ABCMeta):
             """Return a value of this kind."""
             try:
                 return super().__call__(*args, **named)
-            except TypeError:
-                taken = cls.__signature__.parameters
-                unknown = [name for name in named if name not in taken]
-                if unknown and not any(p.kind is Parameter.VAR_KEYWORD for p in taken.values()):
-                    raise unknown_keyword(cls.__name__, unknown[0], taken) from None
-                raise
+            except FAILURES as error:
+                found = explanation(cls, args, named, error, sys._getframe(1).f_globals)
+                if found is None:
+                    raise
+                raise found from error
 
 
 class Value(metaclass=_Kind):

@@ -120,7 +120,7 @@ class Joint(Value):
         found = []
         for value, name in ((self.stiffness, "stiffness"), (self.rate, "rate")):
             array = np.zeros(len(axes)) if value is None else np.asarray(value, dtype=np.float64)
-            if array.ndim == 0 and len({axis[0] == "r" for axis in axes}) > 1 and array:
+            if array.ndim == 0 and len({axis.startswith("r") for axis in axes}) > 1 and array:
                 raise ModelError(
                     f"one {name} of {self!r} cannot serve displacements and rotations "
                     f"({', '.join(axes)}): their units differ. Give one number for each axis."

@@ -44,7 +44,7 @@ def checked_window(window: Any) -> str | tuple[Any, ...]:
     window = tuple(window) if isinstance(window, list) else window
     try:
         get_window(window, 16)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, IndexError) as error:
         raise ModelError(f"window {window!r} is not one of scipy.signal: {error}") from error
     return window  # type: ignore[no-any-return]
 

@@ -190,12 +190,14 @@ class Moves(Value):
 
     def place(self, values: Mapping[str, float]) -> Place:
         """Return the place at values of the positions."""
+        require_known("position", self.names, values, "the values given")
         one = {name: np.array([values[name]]) for name in self.names}
         found = [(tuple(points[0].tolist()), weight) for weight, points in self.points(one)]
         return dict(found) if isinstance(self.start, Mapping) else found[0][0]
 
     def points(self, values: Mapping[str, FloatArray]) -> list[tuple[float, FloatArray]]:
         """Return weights, and points (n, 3) [m], of the place at values (n,) of the positions."""
+        require_known("position", self.names, values, "the values given")
         if isinstance(self.along, PlaceTable):
             from scipy.interpolate import interpn
 

@@ -165,7 +165,7 @@ class Greedy(SelectionCriterion):
         taken: Any = np.array(required)
         free = np.ones(pool.shape[0], dtype=bool)
         found: list[int] = []
-        for _ in range(count):
+        for _ in range(min(count, pool.shape[0])):
             lowest = np.where(free, _smallest_with(taken, pool), -np.inf)
             best = int(np.argmax(lowest))
             free[best] = False

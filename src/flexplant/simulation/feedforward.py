@@ -316,7 +316,10 @@ def _term(term: Any) -> int:
 
 def term_numbers(terms: Any) -> list[int]:
     """Return the orders of derivatives that are named."""
-    return [_term(term) for term in name_list(terms, "terms")]
+    listed = name_list(terms, "terms")
+    if not listed:
+        raise ModelError(f"terms names no derivative to feed forward. Choose from {list(TERMS)}.")
+    return [_term(term) for term in listed]
 
 
 def _check_order(move: Any, gains: FloatArray) -> None:

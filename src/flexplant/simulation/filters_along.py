@@ -223,10 +223,10 @@ class _Filters:
 
     def scheduled(self) -> Callable[[int], FloatArray]:
         """Return steady gains of some positions on the way, linear between them."""
-        if len(self.moved) > 1:
+        if len(self.moved) != 1:
             raise ModelError(
-                f"{', '.join(self.moved)} move at once: gains are scheduled by one position. Name "
-                "one, or take another position as a function of it in a PlaceTable."
+                f"gains are scheduled by one position, and {', '.join(self.moved) or 'none'} "
+                "moves. Name one, or take others as functions of it in a PlaceTable."
             )
         (name,) = self.moved
         path = self.machine.path.at(self.time)[name]

@@ -113,6 +113,7 @@ class FEModel(Placed, Value):
         n = len(instance(self.dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz)."))
         if not n:
             raise ModelError("the DofSet holds no DOF: there is no structure. Check the table.")
+        instance(self.name, str | None, "name", "Pass text for reports.")
         digits = digits_of(self.K)
         M, K = symmetric(self.M, "M", n), symmetric(self.K, "K", n)
         D = None if self.D is None else symmetric(self.D, "D", n)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import ComplexArray, FloatArray, Value, short
+from ...checks import ComplexArray, FloatArray, Value, complex_array
 from ...errors import ModelError, ShapeError
 from ...identification import MeasuredModes
 from ...modes import matching
@@ -116,7 +116,7 @@ def fdac(H: Any, G: Any) -> FloatArray:
     array([[ 1., -1.],
            [ 1., -1.]])
     """
-    a, b = _numbers(H, "H"), _numbers(G, "G")
+    a, b = complex_array(H, "H"), complex_array(G, "G")
     if a.shape[:-1] != b.shape[:-1] or a.ndim < 1:
         raise ShapeError(f"H has channels {a.shape[:-1]} and G {b.shape[:-1]}: choose the same.")
     a, b = a.reshape(-1, a.shape[-1]), b.reshape(-1, b.shape[-1])
@@ -248,27 +248,14 @@ def _alike(seen: ComplexArray, point: Point, columns: list[int]) -> tuple[tuple[
 
 
 def _shapes(value: Any, name: str) -> ComplexArray:
-    array = _numbers(value, name)
-    if array.ndim != 2:
-        raise ShapeError(
-            f"{name} must have shape (n, m), got {array.shape}. Pass shapes in columns."
-        )
-    if not np.all(np.isfinite(array)):
-        raise ModelError(f"{name} has NaN or infinite entries.")
+    array = complex_array(value, name, (None, None))
     if np.any(np.all(array == 0, axis=0)):
         raise ModelError(f"{name} holds a zero shape: its MAC is not defined.")
     return array
 
 
-def _numbers(value: Any, name: str) -> ComplexArray:
-    try:
-        return np.asarray(value, dtype=np.complex128)
-    except (TypeError, ValueError):
-        raise ModelError(f"{name} must hold numbers, got {short(value)}. Pass an array.") from None
-
-
 def _responses(H: Any, G: Any) -> tuple[ComplexArray, ComplexArray]:
-    a, b = _numbers(H, "H"), _numbers(G, "G")
+    a, b = complex_array(H, "H"), complex_array(G, "G")
     if a.shape != b.shape or a.ndim < 1:
         raise ShapeError(
             f"H has shape {a.shape} and G {b.shape}: choose the same channels and lines."
