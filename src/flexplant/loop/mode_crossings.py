@@ -399,12 +399,13 @@ def size_reached(
         start = np.minimum(_LEAST, 0.5 * ends[:, side])
         steps = np.geomspace(start, ends[:, side], _TRIED)
         reached = np.array([few.exceeds(sign * step, count) for step in steps])
-        first, each = np.argmax(reached, axis=0), np.arange(count)
-        below = np.where(first > 0, steps[first - 1, each], 0.0)
-        change = few.halved(below, steps[first, each], sign)
         where = np.flatnonzero(np.any(reached, axis=0))
         if not where.size:
             continue
+        first, each = np.argmax(reached, axis=0), np.arange(count)
+        below = np.where(first > 0, steps[first - 1, each], 0.0)
+        those = few.take(np.isin(few.modes.mode, where))
+        change = those.halved(below, steps[first, each], sign)
         # the peak's top between the lines of the grid
         share, tops = few.share(sign * change), []
         for i in where:

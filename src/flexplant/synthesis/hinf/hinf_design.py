@@ -195,11 +195,16 @@ def tolerant(
     method: SynthesisMethod | None = None,
     progress: bool | None = None,
     damped_below: float = 0.0,
+    solved: Solved | None = None,
 ) -> Controller:
     """Return the controller of a plant with channels for its modes, evened out in closed loop."""
     instance(uncertain, UncertainPlant, "uncertain", "Make it by plant.uncertain(frequency=0.005).")
-    channels, first = _even_channels(plant, uncertain, method, progress, damped_below)
-    answer = _designed(with_channels(plant, channels), method, progress)
+    if solved is None:
+        channels, first = _even_channels(plant, uncertain, method, progress, damped_below)
+        answer = _designed(with_channels(plant, channels), method, progress)
+    else:
+        channels, first = solved.channels, solved.first
+        answer = _designed(with_channels(plant, channels), None, progress, solved.found)
     scales = {one.mode: one.D for one in channels}
     stated = [one.replace(D=scales[one.mode]) for one in mode_channels(plant, uncertain)]
     share = tolerated(stated, with_channels(plant, stated), answer.system)
@@ -214,15 +219,24 @@ def tolerant(
     )
 
 
+class Solved(NamedTuple):
+    """What `tolerant` verifies: channels evened out, gamma before they were, and an answer."""
+
+    channels: tuple[ModeChannel, ...]
+    first: float
+    found: SolvedController
+
+
 def tolerant_system(
     plant: StandardPlant, uncertain: UncertainPlant[Any], damped_below: float
-) -> StateSpace:
-    """Return the controller that `tolerant` verifies, by itself: less than half of the work."""
-    channels, _ = _even_channels(plant, uncertain, None, False, damped_below)
+) -> tuple[StateSpace, Solved]:
+    """Return the controller that `tolerant` verifies, by itself, and what led to it."""
+    channels, first = _even_channels(plant, uncertain, None, False, damped_below)
     open_plant = with_channels(plant, channels)
     problem = prepared(open_plant.system, open_plant.u, open_plant.y)
     found = Riccati(progress=False).solve(problem)
-    return problem.restored(found.A, found.B, found.C, found.D)
+    system = problem.restored(found.A, found.B, found.C, found.D)
+    return system, Solved(channels, first, found)
 
 
 def _even_channels(
@@ -246,16 +260,19 @@ def _even_channels(
 
 
 def _designed(
-    plant: StandardPlant, method: SynthesisMethod | None, progress: bool | None
+    plant: StandardPlant,
+    method: SynthesisMethod | None,
+    progress: bool | None,
+    known: SolvedController | None = None,
 ) -> Controller:
-    """Return the verified controller of a plant."""
+    """Return the verified controller of a plant, where `known` from what `Riccati` finds."""
     problem = prepared(plant.system, plant.u, plant.y)
     try:
         require_reach(problem)
         if plant.is_assembled:  # whatever a method makes of it: this motion would drift
             require_shown(problem)
         if method is None:
-            answer = best_answer(plant, problem, progress)
+            answer = best_answer(plant, problem, progress, known)
         else:
             if progress is not None and isinstance(method, (Riccati, Lmi)):
                 method = method.replace(progress=progress)
@@ -365,8 +382,16 @@ def answered(plant: StandardPlant, problem: Prepared, method: SynthesisMethod) -
     return one._replace(lower=raised_bound(problem, one.gamma, known))
 
 
-def best_answer(plant: StandardPlant, problem: Prepared, progress: bool | None) -> Answer:
-    """Return the answer of `Riccati`, or where it is not close to its bound the better of two."""
+def best_answer(
+    plant: StandardPlant,
+    problem: Prepared,
+    progress: bool | None,
+    known: SolvedController | None = None,
+) -> Answer:
+    """Return the answer of `Riccati`, or where it is not close to its bound the better of two.
+
+    `known`: what the former is known to find.
+    """
     answers: list[Answer] = []
     #: answers whose loop may be stable with a larger norm than the method claims
     broken: list[tuple[SynthesisMethod, SolvedController]] = []
@@ -377,7 +402,8 @@ def best_answer(plant: StandardPlant, problem: Prepared, progress: bool | None) 
         method = Riccati(regularised=regularised, progress=progress)
         tried[name] = np.inf
         try:
-            found = method.solve(problem)
+            found = known or method.solve(problem)
+            known = None
         except FlexplantError as error:
             if isinstance(error, InfeasibleError) and not answers:
                 raise

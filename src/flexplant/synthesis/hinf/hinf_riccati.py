@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -9,7 +10,14 @@ import numpy as np
 import scipy.linalg as la
 
 from ...checks import Value, checked, positive
-from ...errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, SolverError
+from ...errors import (
+    AssumptionError,
+    FlexplantError,
+    InfeasibleError,
+    ModelError,
+    SolverError,
+    attempted,
+)
 from ...lti.equations import OnAxisError
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
@@ -129,8 +137,13 @@ class Riccati(Value):
             return SolvedController(least.A, least.B, least.C, least.D, 0.0, 0.0)
         scaled = problem.measured_in(unit)
         with Progress(_BISECTION, "steps of the bisection", progress=self.progress) as bar:
-            high, low = self._searched(scaled, bar)
-        controller, norm = self._accepted(scaled, high, back_off)
+            # what the equations promise of a step is seen at the end; where it does not hold there
+            # they are at their rounding, and each step is seen
+            high, low = self._searched(scaled, bar, _stable)
+            controller, norm, held = self._accepted(scaled, high, back_off)
+            if not held:
+                high, low = self._searched(scaled, bar, _below)
+                controller, norm, _ = self._accepted(scaled, high, back_off)
         if controller is None:  # nothing below it holds
             controller = least.replace(C=least.C / unit)
             norm = _norm(scaled, controller)
@@ -144,8 +157,16 @@ class Riccati(Value):
             unit * min(low, norm),
         )
 
-    def _searched(self, problem: Prepared, bar: Progress) -> tuple[float, float]:
-        """Return the smallest gamma that bisection reached from 1, and the largest refuted one."""
+    def _searched(
+        self,
+        problem: Prepared,
+        bar: Progress,
+        holds: Callable[[Prepared, StateSpace, float], bool],
+    ) -> tuple[float, float]:
+        """Return the smallest gamma that bisection reached from 1, and the largest refuted one.
+
+        One is reached where there is a controller, whose loop `holds` for it.
+        """
         high = 1.0
         low = tried = min(_direct_bound(problem), high)
         for _ in range(_BISECTION):
@@ -155,7 +176,7 @@ class Riccati(Value):
             attempt = _attempt(problem, middle)
             bar.advance()
             K = attempt.controller
-            if K is not None and _seen(problem, K) <= middle * (1.0 + _SLACK):
+            if K is not None and holds(problem, K, middle):
                 high = middle
                 continue
             tried = middle
@@ -165,18 +186,21 @@ class Riccati(Value):
 
     def _accepted(
         self, problem: Prepared, high: float, back_off: float
-    ) -> tuple[StateSpace | None, float]:
-        """Return the backed-off controller with the norm of its loop, going up until it holds."""
+    ) -> tuple[StateSpace | None, float, bool]:
+        """Return the backed-off controller with the norm of its loop, going up until it holds.
+
+        And whether it held at once.
+        """
         step = back_off if self.back_off is None else self.back_off
-        for _ in range(_GROWTH):
+        for number in range(_GROWTH):
             gamma = high * (1.0 + step)
             controller = _attempt(problem, gamma).controller
             if controller is not None:
                 norm = _norm(problem, controller)
                 if norm <= gamma * (1.0 + _SLACK):
-                    return controller, norm
+                    return controller, norm, number == 0
             step = max(2.0 * step, self.tolerance)
-        return None, 1.0
+        return None, 1.0, False
 
 
 def quick_answer(problem: Prepared) -> SolvedController:
@@ -194,7 +218,7 @@ def quick_answer(problem: Prepared) -> SolvedController:
     scaled, K = given.measured_in(unit), None
     step = _REGULAR if regular is None else _SINGULAR
     with Progress(_BISECTION, "steps of the bisection", progress=False) as bar:
-        high = Riccati(tolerance=_QUICK)._searched(scaled, bar)[0]
+        high = Riccati(tolerance=_QUICK)._searched(scaled, bar, _below)[0]
     for _ in range(_GROWTH):
         gamma = high * (1.0 + step)
         K = _attempt(scaled, gamma).controller
@@ -264,6 +288,18 @@ def _seen(problem: Prepared, controller: StateSpace) -> float:
     freq = np.unique(np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag)])) / (2.0 * np.pi)
     gains = np.linalg.norm(responses(loop, freq).transpose(2, 0, 1), 2, axis=(1, 2))
     return max(float(gains.max()), float(np.linalg.norm(loop.D, 2)))
+
+
+def _below(problem: Prepared, controller: StateSpace, gamma: float) -> bool:
+    """Return whether the gains of the loop at its resonances are below gamma."""
+    return _seen(problem, controller) <= gamma * (1.0 + _SLACK)
+
+
+def _stable(problem: Prepared, controller: StateSpace, _gamma: float) -> bool:
+    """Return whether the loop is stable."""
+    with attempted("a loop of the bisection"):
+        return bool(lft(problem.system, controller).is_stable)
+    return False
 
 
 class _Attempt(NamedTuple):

@@ -33,7 +33,7 @@ from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...plant.uncertainty.whole_machines import damped_less, draws_with_left_out
 from ..controller import Controller, with_left_out
-from .hinf_design import tolerant, tolerant_system
+from .hinf_design import Solved, tolerant, tolerant_system
 from .hinf_riccati import Riccati
 
 #: |S| crosses 1 at about two thirds of the bandwidth of these weights, which bound the efforts
@@ -191,9 +191,10 @@ class _StageTask:
                 break
             damped = now
             one = _StageTry(bandwidth, weighted, factor * bandwidth)
-            system = self._designed(one)
-            if system is None:
+            found = self._designed(one)
+            if found is None:
                 continue
+            system, solved = found
             margin, drawn = self._judged(system)
             if margin < self.margin:  # of the model itself: more damping is no cure
                 self.tried[bandwidth] = max(self.tried[bandwidth], margin)
@@ -201,11 +202,11 @@ class _StageTask:
             if drawn >= _KEPT * self.margin:
                 self.tried[bandwidth] = margin
                 if self.best is None or bandwidth > self.best.bandwidth:
-                    self.best = one._replace(system=system, drawn=drawn)
+                    self.best = one._replace(system=system, drawn=drawn, solved=solved)
                 return True
         return False
 
-    def _designed(self, one: _StageTry) -> StateSpace | None:
+    def _designed(self, one: _StageTry) -> tuple[StateSpace, Solved | None] | None:
         """Return a controller, from the other methods where the first finds none."""
         with attempted(
             f"one Riccati method for {one.bandwidth:.4g} Hz",
@@ -213,7 +214,8 @@ class _StageTask:
         ):
             return tolerant_system(one.weighted, self.uncertain, one.damped_below)
         try:
-            return tolerant(one.weighted, self.uncertain, damped_below=one.damped_below).system
+            found = tolerant(one.weighted, self.uncertain, damped_below=one.damped_below)
+            return found.system, None
         except (AssumptionError, ModelError):
             raise
         except FlexplantError as error:
@@ -305,7 +307,7 @@ class _StageTask:
             )
         best, drawn = self.best, self.best.drawn
         options: dict[str, Any] = {"damped_below": best.damped_below}
-        found = tolerant(best.weighted, self.uncertain, **options)
+        found = tolerant(best.weighted, self.uncertain, **options, solved=best.solved)
         if not _same(found.system, best.system):
             # a better answer than that of one Riccati method: it must hold as well
             margin, drawn = self._judged(found.system)
@@ -333,6 +335,7 @@ class _StageTry(NamedTuple):
     damped_below: float
     system: StateSpace | None = None
     drawn: float = 0.0
+    solved: Solved | None = None
 
 
 class _Drawn:
