@@ -414,6 +414,8 @@ NOTED, WARNED = 0.15, 0.5
 #: translations
 _MOVES = ("x", "y", "z")
 _NONE = np.zeros(0, dtype=np.int64)
+#: where a realisation keeps the nodes per wavelength of its modes
+_KEPT = "_nodes"
 #: relative: nodes whose extent is less are in a plane, or on a line
 _FLAT = 1e-9
 #: an edge is of the mesh up to this length beside the mean at its ends: elements of 1 to 3
@@ -444,6 +446,15 @@ def nodes_per_wavelength(
     turn = np.arccos(np.clip(1.0 - apart / divisor(size), -1.0, 1.0))
     # a rigid-body motion has no wave: any large number of nodes will do
     return np.asarray(2.0 * np.pi / np.maximum(turn, 1e-9))
+
+
+def _nodes_of(model: Any, outputs: FloatArray) -> FloatArray | None:
+    """Return the nodes per wavelength of modes, from the outputs of their pairs of states."""
+    if not isinstance(model, FEModel | Modes | ReducedModel):
+        return None
+    if isinstance(model, ReducedModel):
+        outputs = model.T @ outputs
+    return nodes_per_wavelength(model, outputs.reshape(len(outputs), -1, 2))
 
 
 def _coupled(model: FEModel) -> tuple[IntArray, IntArray]:
@@ -507,12 +518,10 @@ def unresolved_share(
     """
     if not larger.is_assembled:
         return None
-    model, outputs = larger.model, larger.assembled.realisation.outputs
-    if not isinstance(model, FEModel | Modes | ReducedModel):
-        return None
-    if isinstance(model, ReducedModel):
-        outputs = model.T @ outputs
-    nodes = nodes_per_wavelength(model, outputs.reshape(len(outputs), -1, 2))
+    realisation = larger.assembled.realisation
+    if _KEPT not in realisation.__dict__:  # many plants are made of one
+        realisation.__dict__[_KEPT] = _nodes_of(larger.model, realisation.outputs)
+    nodes = realisation.__dict__[_KEPT]
     if nodes is None:
         return None
     coarse = modes[nodes[modes - 1] < NODES] - 1
