@@ -24,7 +24,7 @@ import flexplant as fx
 OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 L, RATE = 0.6, 10e3  # m, Hz
 NOISE = 0.1e-9 / np.sqrt(RATE / 2)  # m/sqrt(Hz): sensors of 0.1 nm rms per sample
-FORCES = (1e-4, 1e-3, 1e-2)  # N/sqrt(Hz): amplifier noise, two decades
+FORCES = (1e-3, 1e-2)  # N/sqrt(Hz): amplifier noise of a good and of a poor one
 DAMPINGS, BANDWIDTH = (0.01, 0.001), 80.0  # Hz, of the H-infinity design that tolerates nothing
 BAND = 150.0, 1600.0  # Hz, where poles are identified
 CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]

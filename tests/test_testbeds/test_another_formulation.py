@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg as la
 
 import flexplant as fx
-from flexplant.errors import LabelError, ModelError
+from flexplant.errors import InfeasibleError, LabelError, ModelError
 from flexplant.sparse.factor import dense
 from flexplant.testbeds.ritz_plate import ritz_plate
 from stages import RATE, ports
@@ -246,14 +246,19 @@ def test_the_search_judges_the_modes_left_out():
         references=[fx.Reference("die")],
     )
     plant = fx.assemble_plant(fit.calibrated(poles), own).discretized(RATE, delay=one.delay)
-    sure = fit.frequency_uncertainty(poles)
-    controller = fx.design_stage(plant.uncertain(frequency=sure), larger=whole)
+    uncertain = plant.uncertain(frequency=fit.frequency_uncertainty(poles))
+    fast = fx.design_stage(uncertain, bandwidth=100.0)
+    assert fx.close_loop(plant, fast).modulus_margin >= 0.4
+    with pytest.raises(InfeasibleError, match="150 Hz gives a loop"):
+        fx.design_stage(uncertain, bandwidth=100.0, larger=whole)
+    controller = fx.design_stage(uncertain, bandwidth=70.0, larger=whole)
     promised = fx.close_loop(plant, controller, larger=whole)
     assert promised.modulus_margin > promised.completed.modulus_margin >= 0.4
     loop = one.loop(own, controller)
     assert loop.is_stable
     assert loop.modulus_margin > 0.9 * promised.completed.modulus_margin
     assert fx.compare_loops({"machine": loop}).rows["machine"].bandwidth > 60.0
+    assert one.loop(own, fast).modulus_margin < 0.3
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -182,13 +182,18 @@ def lines_of(white: FloatArray) -> InnovationLines:
     return InnovationLines(np.fft.rfftfreq(len(x))[at].astype(np.float64), X, len(x))
 
 
-def seen_from_states(A: FloatArray, C: FloatArray, freq: FloatArray) -> ComplexArray:
+def seen_from_states(
+    A: FloatArray, C: FloatArray, freq: FloatArray, blocks: Sequence[int] | None = None
+) -> ComplexArray:
     """Return ``C (z I - A)^-1`` (m, p, n) at frequencies [cycles per sample].
 
-    Of the transposed system, which has the fewer inputs.
+    Of the transposed system, which has the fewer inputs, from its last state to its first: upper
+    triangular in the same blocks.
     """
     n, p = C.shape[1], C.shape[0]
-    turned = StateSpace(A.T, C.T, np.eye(n), np.zeros((n, p)), 1.0)
+    back = None if blocks is None else tuple(blocks)[::-1]
+    parts = A.T[::-1, ::-1], C.T[::-1], np.eye(n)[::-1], np.zeros((n, p))
+    turned = StateSpace(*parts, 1.0, blocks=back)
     return np.asarray(frequency_response(turned, freq).data.transpose(2, 1, 0))
 
 
@@ -218,19 +223,23 @@ def impulse(observer: KalmanEstimator, count: int) -> FloatArray:
 
 
 def parts_of(
-    observer: KalmanEstimator, plant: StandardPlant | None, freq: FloatArray
+    observer: KalmanEstimator,
+    plant: StandardPlant | None,
+    freq: FloatArray,
+    white: ComplexArray | None = None,
 ) -> InnovationParts:
     """Return the density of the whitened innovations of a filter that runs on a plant.
 
     ``V (Y Y* + R) V*`` with V that of `whitening`, ``Y = C (z I - A)^-1 G + H`` from the noises of
     the plant to its sensors and R the sensors' own. None: on the filter's own model, where modes
-    left out are white noise of the sensors and the sum of both parts is I.
+    left out are white noise of the sensors and the sum of both parts is I. `white`: V, where it is
+    known.
     """
     p = len(observer.sensors)
     process = np.empty((freq.size, p, p), dtype=np.complex128)
     sensors = np.empty_like(process)
     for at in _pieces(freq.size):
-        V = whitening(observer, freq[at])
+        V = whitening(observer, freq[at]) if white is None else white[at]
         if plant is None:
             sensors[at] = _squared(V @ np.linalg.cholesky(observer.model.R))
             process[at] = np.eye(p) - sensors[at]
@@ -238,7 +247,10 @@ def parts_of(
         rows = [plant.y.index(name) for name in observer.sensors]
         g = plant.system
         C = g.C[g.output_index(observer.sensors)]
-        Y = seen_from_states(g.A, C, freq[at]) @ plant.noise_factor + plant.noise_direct[rows]
+        Y = (
+            seen_from_states(g.A, C, freq[at], g.blocks) @ plant.noise_factor
+            + plant.noise_direct[rows]
+        )
         process[at] = _squared(V @ Y)
         own = plant.sensor_noise_factor[rows]
         sensors[at] = _squared(V @ own)

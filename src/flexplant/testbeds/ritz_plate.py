@@ -17,8 +17,9 @@ from ..labels import DofSet
 from ..sparse.factor import dense
 from ..structure import FEModel
 
-#: order in each direction: the first twenty frequencies of the paper's plate to 1e-6
-ORDER = 15
+#: order in each direction: of the paper's plate the first twenty frequencies to 2e-6 and forty, to
+#: 7 kHz, to 1e-3; one of 15 takes twice as long in every loop
+ORDER = 13
 #: relative: a point so far outside still lies on the edge
 EDGE = 1e-9
 #: derivatives in (x, y) of the deflection and their sign: rx = dz/dy, ry = -dz/dx

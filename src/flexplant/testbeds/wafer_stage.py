@@ -47,6 +47,9 @@ DRAWING: Mapping[str, Any] = {
 #: of a machine: relative scatter of stiffness over the plate and of damping over its modes [-],
 #: delay [samples], step of its sensors [m], and a second mass [kg], at most
 STIFFNESS, SPREAD, LATENCY, STEP, SECOND = 0.003, 0.3, 1.3, 5e-11, 0.1
+#: dampings that a machine draws, of which its modes take the first: its second mass comes after
+#: them, and is the same for plates of any order
+DAMPINGS = 253
 #: Hz, of the servo that holds a stage on magnets while it is measured
 HELD = 50.0
 
@@ -168,7 +171,8 @@ def _individual(
     sides = drawing["size"]
     bare = ritz_plate(stiffer=waves(random, sides), **drawing)
     omega, phi = elastic_modes(bare)
-    zeta = positive(damping, "damping", zero=True) * np.exp(SPREAD * random.normal(size=omega.size))
+    own = random.normal(size=DAMPINGS)[: omega.size]
+    zeta = positive(damping, "damping", zero=True) * np.exp(SPREAD * own)
     shapes = bare.M @ phi
     D = shapes * (2.0 * zeta * omega) @ shapes.T
     spot = (sides[0] * random.random(), sides[1] * random.random(), 0.0)
