@@ -152,18 +152,18 @@ def test_every_row_has_noise_of_its_own(result):
         predicted, measured = (
             [errors["geometry alone"][i] for errors in case["errors"].values()] for i in (0, 1)
         )
-        assert predicted[2] / predicted[1] == pytest.approx(10.0, rel=1e-2)
-        assert abs(measured[2] / measured[1] / 10.0 - 1) > 1e-3
+        assert predicted[1] / predicted[0] == pytest.approx(10.0, rel=1e-2)
+        assert abs(measured[1] / measured[0] / 10.0 - 1) > 1e-3
 
 
 def test_the_closed_loops(result):
-    """0.1 %: unstable as if the model were the machine, 83 Hz and 7.6 dB where it is tolerant."""
+    """0.1 %: unstable as if the model were the machine, 78 Hz and 7.4 dB where it is tolerant."""
     case = result["cases"][0.001]
     table, loops = case["table"], case["loops"]
     sure, held = table["H-infinity, updated"], table["tolerant, measured"]
     assert sure.decay > 1.001
     assert not loops["H-infinity, updated"]["model"].is_stable  # the modes left out show it
-    assert held.bandwidth == pytest.approx(83.0, abs=3.0)
+    assert held.bandwidth == pytest.approx(78.5, abs=2.0)
     promised = loops["tolerant, measured"]["model"].modulus_margin
     assert promised >= 0.4 * (1 - 1e-6)
     assert held.margin == pytest.approx(promised, rel=0.05)
@@ -244,7 +244,7 @@ def test_the_papers_column(examples, paper):
 def test_the_table(stage, result):
     text = stage.table(result)
     assert max(map(len, text.splitlines())) <= 110
-    assert text.count("95% interval") == 6
+    assert text.count("95% interval") == 4
     assert text.count("max |S| at u") == 2
     assert "NO (1.00" in text
     assert all(claim in text for claim in result["claims"])
@@ -411,7 +411,7 @@ def test_the_table_names_every_knob():
     assert {name for knobs in named for name in knobs} == KNOBS
 
 
-@pytest.mark.parametrize(("bandwidth", "knobs", "numbers"), rows()[1::2])  # 4 s each
+@pytest.mark.parametrize(("bandwidth", "knobs", "numbers"), rows()[1::3])  # 3 s each
 def test_a_line_of_the_table(judged, bandwidth, knobs, numbers):
     _, measured = judged(bandwidth, knobs)
     steps = np.array([0.02 * numbers[0], 0.03 * numbers[1], 0.4, 0.015, 0.00006])

@@ -62,12 +62,16 @@ def real_array(
     shape: tuple[int | None, ...] | None = None,
     *,
     limit: float = TOO_LARGE,
+    copy: bool = True,
 ) -> FloatArray:
     """Return `value` as a finite float64 array of the given shape (None: any length).
 
-    Records of a loop that diverges may be larger than the numbers that one calculates with.
+    Records of a loop that diverges may be larger than the numbers that one calculates with. Not
+    copied, an array of float64 comes back itself: for values, whose own copies are read-only.
     """
-    array = np.array(floats(value, name, shape))
+    array = floats(value, name, shape)
+    if copy:
+        array = np.array(array)
     if shape is not None and (
         array.ndim != len(shape)
         or any(
@@ -359,6 +363,8 @@ def several(value: Any) -> bool:
 
 def name_list(names: Any, name: str) -> tuple[str, ...]:
     """Return names as a tuple of str; one str is one name."""
+    if type(names) is tuple and all(type(one) is str for one in names):
+        return names
     if isinstance(names, str):
         return (names,)
     if not several(names):

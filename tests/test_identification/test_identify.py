@@ -401,7 +401,7 @@ TRIAL = pole([47.5, 48.2, 53.0], [0.004, 0.005, 0.003])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("common", "trials"), [(0.0, 40), (0.9, 80)])
+@pytest.mark.parametrize(("common", "trials"), [(0.0, 30), (0.9, 40)])
 def test_confidence_covers_the_truth(common, trials):
     """Many trials: chi-square of all poles together, 95 % regions within a binomial interval.
 

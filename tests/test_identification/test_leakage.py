@@ -107,9 +107,9 @@ PHI = np.array([[1.0, 0.8], [0.6, -1.0], [-0.7, 0.5]])
 
 @pytest.mark.slow
 def test_fits_over_hann_lines_claim_what_they_are_off_by():
-    """30 records, four poles parts each: the rms of z is 1 within 15 %; it was 1.4."""
+    """12 records, four poles parts each: the rms of z is 1 within 20 %; it was 1.4."""
     truth, rate, scores, misfits = pole(FREQS, ZETA), 400.0, [], []
-    for seed in range(30):
+    for seed in range(12):
         rng = np.random.default_rng(seed)
         u = rng.normal(size=160_000)
         y = moved(u, FREQS, ZETA, PHI, rate)
@@ -122,7 +122,7 @@ def test_fits_over_hann_lines_claim_what_they_are_off_by():
         misfits.append(found.misfit)
     # without what is left of leakage, which widens a resonance of 20 lines by 0.5 %
     spread = np.sqrt(np.mean(np.var(scores, axis=0, ddof=1)))
-    assert spread == pytest.approx(1.0, abs=0.15)
+    assert spread == pytest.approx(1.0, abs=0.2)
     assert np.mean(misfits) == pytest.approx(1.0, abs=0.03)
 
 

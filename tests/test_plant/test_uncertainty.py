@@ -204,7 +204,7 @@ def test_machines_of_a_fit_spread_as_its_covariance_says():
     std = np.sqrt(np.diag(fit.covariance))
     fit = fit.replace(covariance=np.outer(std, std) * [[1.0, -0.9], [-0.9, 1.0]])
     uncertain = plant.uncertain(fit, unknowns, modes=[6, 7])
-    machines = uncertain.sample(4, 300)
+    machines = uncertain.sample(4, 120)
     poles = np.array(
         [[complex(*_upper(m.modal_blocks[k - 1])) for k in (6, 7, 9)] for m in machines]
     )
@@ -223,7 +223,7 @@ def test_machines_of_a_fit_spread_as_its_covariance_says():
 def test_machines_of_measured_modes_spread_as_measured():
     plant = assemble_plant(some_modes(), ports())
     doubt = own_doubt(plant, (5, 6), 0.05)
-    machines = plant.uncertain(doubt).sample(np.random.default_rng(8), 600)
+    machines = plant.uncertain(doubt).sample(np.random.default_rng(8), 200)
     pairs = np.array([m.modal_blocks[[4, 5]] for m in machines])
     nominal = plant.modal_blocks[[4, 5]]
     stiffness = np.linalg.det(pairs) / np.linalg.det(nominal) - 1
@@ -354,7 +354,7 @@ def test_the_bound_on_neglected_modes_is_tight(count):
     omega, phi = undamped(M, K)
     see, push = seen_and_pushed()
     C, B = (see @ phi)[:, count:], (phi.T @ push.T)[count:]
-    freq = np.concatenate([[0.0, 0.2], np.geomspace(1.0, 5e3, 400)])
+    freq = np.concatenate([[0.0, 0.2], np.geomspace(1.0, 5e3, 150)])
     ratio, loop = [], []
     for f in freq:
         s = 2j * np.pi * f

@@ -50,21 +50,21 @@ def test_the_exact_filter_is_the_best_and_schedules_come_near(plant):
 
 @pytest.mark.slow
 def test_predicted_errors_are_those_of_runs(plant):
-    """Along a scan that repeats: 4 % of some 2000 independent errors."""
+    """Along a scan that repeats: 5 % of some 1300 independent errors."""
     observer = fx.design_kalman(plant)
     loop = fx.close_loop(plant, observer, fx.design_servo(plant, bandwidth=40.0, observer=observer))
     moving = {"x": scan}
     found = fx.simulation.filters_along(plant, moving=moving, duration=0.125, repeats=True)
-    runs = fx.simulate(loop, moving=moving, duration=1.0, rng=4, runs=3)
+    runs = fx.simulate(loop, moving=moving, duration=1.0, rng=4, runs=2)
     errors = {name: [] for name in found.names}
-    for r in range(3):
+    for r in range(2):
         record = {name: runs[name][r] for name in (*(f"y{i}" for i in range(4)), *plant.u)}
         made = fx.simulation.estimate_along(plant, record, moving=moving)
         for name, estimate in made.items():
             errors[name].append((estimate - runs[name][r])[2500:])
     for i, name in enumerate(found.names):
         rms = float(np.sqrt(np.mean(found.exact[i] ** 2)))
-        assert float(np.sqrt(np.mean(np.square(errors[name])))) == pytest.approx(rms, rel=0.06)
+        assert float(np.sqrt(np.mean(np.square(errors[name])))) == pytest.approx(rms, rel=0.07)
 
 
 def test_refusals(plant):

@@ -59,9 +59,9 @@ def test_responses_end_at_the_estimate_of_the_full_model(machine):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["responses", "modes"])
 def test_the_covariance_is_that_of_the_errors(machine, kind):
-    """12 noisy measurements, 5 unknowns: ``(p - p_true)^T C^-1 (p - p_true)`` is chi-square."""
+    """5 noisy measurements, 5 unknowns: ``(p - p_true)^T C^-1 (p - p_true)`` is chi-square."""
     total = wrong = 0.0
-    for seed in range(12):
+    for seed in range(5):
         data = getattr(machine, kind)(np.random.default_rng(seed))
         fit = update(machine.rom, machine.unknowns, data, full=machine.full, starts=1)
         total += (fit.values - TRUTH) @ np.linalg.solve(fit.covariance, fit.values - TRUTH)
@@ -69,7 +69,7 @@ def test_the_covariance_is_that_of_the_errors(machine, kind):
             gap = fit.rounds[0] - TRUTH
             wrong = gap @ np.linalg.solve(fit.covariance, gap)
             assert wrong > 10 * stats.chi2.isf(1e-4, 5) / 5
-    assert 1e-3 < stats.chi2.sf(total, 60) < 1 - 1e-3
+    assert 1e-3 < stats.chi2.sf(total, 25) < 1 - 1e-3
 
 
 def test_damping_of_the_reduced_model_is_that_of_the_full_one(machine):

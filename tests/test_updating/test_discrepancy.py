@@ -146,10 +146,10 @@ def inside(individual):
 
 @pytest.mark.slow
 def test_true_frequencies_and_dampings_lie_inside():
-    """Of 3 machines here; of 100: 97 % of frequencies and 98 % of dampings."""
-    found = np.array([inside(individual) for individual in range(3, 6)])
-    assert found[:, 0].mean() > 0.93
-    assert found[:, 1].mean() > 0.93
+    """Of 2 machines here; of 100: 97 % of frequencies and 98 % of dampings."""
+    found = np.array([inside(individual) for individual in range(3, 5)])
+    assert found[:, 0].mean() > 0.9
+    assert found[:, 1].mean() > 0.9
 
 
 @pytest.mark.benchmark

@@ -8,7 +8,7 @@ from flexplant.identification import MeasuredModes
 from flexplant.updating import AddedDamping, AddedMass, Eigenvalues, update
 from noisy_plate import Campaign, judged, with_mass
 
-TRIALS = 200
+TRIALS = 100
 
 
 @pytest.mark.slow
@@ -32,5 +32,5 @@ def test_interval_from_poles_covers_the_mass(plate):
         unknowns = [AddedMass(plate.z8), AddedDamping(plate.z8)]
         fits.append(update(rom, unknowns, [Eigenvalues(data)], starts=1))
     covered, error = judged(fits)
-    assert 0.92 <= covered <= 0.98
+    assert 0.9 <= covered <= 0.99
     assert error < 0.01

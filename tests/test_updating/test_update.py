@@ -412,7 +412,7 @@ def test_covariance_is_that_of_repeated_measurements(make):
     C = A @ A.T + 1e-9 * np.eye(6)
     root = np.linalg.cholesky(C)
     parameters = [AddedMass("2:z"), AddedDamping("2:z")]
-    values, count = [], 400
+    values, count = [], 150
     for _ in range(count):
         noise = root @ rng.normal(size=6)
         measured = MeasuredModes(truth + noise[:3] + 1j * noise[3:], modes=[1, 2, 3], covariance=C)

@@ -157,11 +157,14 @@ def checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:
     """Return block sizes as a tuple; ShapeError unless A is block upper triangular with them."""
     hint = "Pass whole numbers, or blocks=None."
     given = instance(blocks, Sequence | np.ndarray, "blocks", hint)
-    sizes = tuple(whole(size, "a block", minimum=0) for size in (given if several(given) else ()))
+    sizes = tuple(given) if several(given) else ()
+    if not all(type(size) is int and size >= 0 for size in sizes):
+        sizes = tuple(whole(size, "a block", minimum=0) for size in sizes)
     if 0 in sizes or sum(sizes) != A.shape[0]:
         raise ShapeError(f"blocks must be positive and add up to {A.shape[0]} states, got {sizes}.")
     owner = np.repeat(np.arange(len(sizes)), sizes)
-    if np.any(A[owner[:, None] > owner[None, :]]):
+    rows, columns = np.nonzero(A)
+    if np.any(owner[rows] > owner[columns]):
         raise ShapeError("A is not block upper triangular with the given blocks; pass blocks=None.")
     return sizes
 

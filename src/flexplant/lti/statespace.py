@@ -120,12 +120,13 @@ class StateSpace(Value):
     def __post_init__(self) -> None:
         D = direct_gain(self.D, self.B, self.C)
         p, m = D.shape
-        A = real_array(self.A, "A")
-        A = real_array(A, "A", (None, None)) if A.size else np.zeros((0, 0))
+        A = real_array(self.A, "A", copy=False)
+        A = A if A.size else np.zeros((0, 0))
+        if A.ndim != 2 or A.shape[0] != A.shape[1]:
+            A = real_array(real_array(A, "A", (None, None)), "A", (len(A), len(A)))
         n = A.shape[0]
-        A = real_array(A, "A", (n, n))
-        B = real_array(self.B, "B", (n, m)) if n else np.zeros((0, m))
-        C = real_array(self.C, "C", (p, n)) if n else np.zeros((p, 0))
+        B = real_array(self.B, "B", (n, m), copy=False) if n else np.zeros((0, m))
+        C = real_array(self.C, "C", (p, n), copy=False) if n else np.zeros((p, 0))
         inputs = signal_names(self.inputs, m, "u", "inputs")
         outputs = signal_names(self.outputs, p, "y", "outputs")
         self._set(
@@ -451,7 +452,7 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
 def direct_gain(D: Any, B: Any, C: Any) -> FloatArray:
     """Return D (p, m) of a system with inputs B and outputs C; the number 0 stands for zeros."""
     if not isinstance(D, int | float):
-        return real_array(D, "D", (None, None))
+        return real_array(D, "D", (None, None), copy=False)
     (m,) = real_array(B, "B", (None, None)).shape[1:]
     p = len(real_array(C, "C", (None, None)))
     if real_array(D, "D", ()) != 0:

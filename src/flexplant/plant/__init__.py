@@ -45,15 +45,15 @@ reaches 1, then its peak, the modulus margin at u, and |S| at 5 Hz::
 
     bandwidth  changed          gamma   to [Hz]  |S| [dB]  margin at u  |S| at 5 Hz
            60                    1.01      51       5.3        0.51        0.0024
-          100                    1.04      78       5.9        0.43        0.0006
-          120                    1.08      89       6.3        0.41        0.0004
-          140                    1.18      97       7.8        0.39        0.0003
-          120  peak 1.3          1.60      88       7.0        0.45        0.0004
+          100                    1.04      78       5.8        0.43        0.0006
+          120                    1.08      90       6.3        0.39        0.0004
+          140                    1.18      97       7.9        0.37        0.0003
+          120  peak 1.3          1.61      88       7.1        0.44        0.0004
           120  peak 6            1.00      65       8.1      unstable      0.0005
-          120  disturbance 6     1.08      89       6.1        0.40        0.0004
-          120  effort 3          1.77     102       9.2        0.35        0.0002
-          120  effort 30         1.01      68       5.7        0.46        0.0010
-          120  noise 0.5         1.08      90       6.3        0.41        0.0004
+          120  disturbance 6     1.08      88       6.1        0.39        0.0004
+          120  effort 3          1.78     102       9.4        0.34        0.0002
+          120  effort 30         1.01      68       5.6        0.46        0.0010
+          120  noise 0.5         1.08      89       6.3        0.39        0.0004
 
 A larger effort makes the loop slower and its margin larger; disturbance and noise matter
 little here; peak 6 lets a mode that is off go unstable. Where frequencies are certain the
