@@ -47,7 +47,7 @@ _DECAYING, _DEEPER = 1e-2, 50
 #: radius around the end, relative, within which the report looks for a decrease
 _RADIUS = 1e-3
 #: the norm that the search claims and the one verified on the plant as given agree to this
-_AGREEMENT = 1e-3
+_AGREEMENT = 5e-4
 #: relative decrease that is left above which the end is said to be no local minimum
 _SHORT = 1e-2
 #: logarithms of norms that count as the same
