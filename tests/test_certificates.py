@@ -1,7 +1,7 @@
 """Each certificate is handed a wrong answer and refuses it: one of its two routes is made wrong.
 
 By 0.1 % where two routes give the same number; where one bounds the other (the gain of a filter
-that is 0.1 % off is still below its level), or a tolerance of 1 % is stated, by what lies beyond it.
+0.1 % off is still below its level), or a tolerance of 1 % is stated, by what lies beyond it.
 """
 
 from functools import cache

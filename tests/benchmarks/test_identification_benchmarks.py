@@ -10,7 +10,7 @@ import scipy.io
 
 from flexplant.identification import identify_modes
 from flexplant.lti import Frf
-from oracles_identification import modal_frf, noisy, pole
+from oracles_identification import drifting, modal_frf, noisy, pole, roving
 
 pytestmark = pytest.mark.benchmark
 FREQ = np.arange(10.0, 150.0, 0.05)
@@ -164,3 +164,30 @@ def test_poles_damping_and_time_beside_a_quick_peer(case):
         assert default[1] < 0.03
         assert default[2] == truth.size
         assert default[0].max() < 1.1 * peer[0].max()
+
+
+def disagreeing(what, seed):
+    """A machine whose outputs, inputs or runs differ by 0.1 %: what is measured, its poles."""
+    if what == "runs":
+        return drifting(1e-3, seed)[:2]
+    if what == "outputs":
+        return roving(1e-3, seed, step=0.3)
+    frf, truth = roving(1e-3, seed, zeta=0.02, step=0.3, n_in=8)
+    turned = {"data": frf.data.transpose(1, 0, 2), "variance": frf.variance.transpose(1, 0, 2)}
+    return Frf(frf.freq, **turned), truth
+
+
+@pytest.mark.parametrize(("what", "machines"), [("runs", 80), ("outputs", 60), ("inputs", 40)])
+def test_deviations_hold_where_what_was_measured_disagrees(what, machines):
+    """Within 1.96 deviations lie 95 % of frequencies; poles of one machine err together."""
+    inside = []
+    for seed in range(100, 100 + machines):
+        measured, truth = disagreeing(what, seed)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = identify_modes(measured)
+        assert len(found) == truth.size
+        inside.append(np.mean(np.abs((found.poles - truth).imag) < 1.96 * found.std.imag))
+    share, deviation = np.mean(inside), np.std(inside) / np.sqrt(machines)
+    print(f"\n{machines} machines, {what}: {100 * share:.1f} +- {100 * deviation:.1f} %")
+    assert share > 0.95 - 2.5 * deviation

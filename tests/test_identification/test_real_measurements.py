@@ -10,7 +10,7 @@ from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeErro
 from flexplant.identification import H1Estimator, estimate_frf, identify_modes
 from flexplant.lti import Frf
 from flexplant.store import load
-from oracles_identification import modal_frf, noisy, pole
+from oracles_identification import drifting, modal_frf, noisy, pole, roving
 from shared_data import DATA
 
 
@@ -152,20 +152,6 @@ def test_a_record_of_force_and_motion_gives_five_radians_a_second():
     assert at_rest == pytest.approx(1.0, rel=0.1)
 
 
-def roving(shift, seed, zeta=0.004, n_in=1, step=0.1, truth=(40.0, 75.0, 110.0, 160.0), setups=6):
-    """Six outputs, each (or set-up) of a machine of frequencies off by a draw of its own."""
-    rng, freq = np.random.default_rng(seed), np.arange(20.0, 200.0, step)
-    phi, drive = rng.normal(size=(6, 4)), rng.normal(size=(n_in, 4)) + 1.0
-    draws = np.repeat(1.0 + shift * rng.normal(size=setups), 6 // setups)
-    H = np.array([
-        modal_frf(freq, pole(np.array(truth) * own, zeta), phi[[o]], drive)[0]
-        for o, own in enumerate(draws)
-    ])  # fmt: skip
-    deviation = 1e-3 * np.sqrt(np.mean(np.abs(H) ** 2))
-    variance = np.full(H.shape, deviation**2)
-    return Frf(freq, noisy(H, deviation, rng), variance=variance), pole(truth, zeta)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("shift", [1e-4, 1e-3])
 def test_outputs_of_a_roving_sensor_share_four_modes(shift, tmp_path):
@@ -240,17 +226,6 @@ def test_what_was_measured_together_has_one_shift():
     for wrong in ([y[:2], y[2:4]], [y], [[], y], ["y1", "y2"], [y, [*frf.inputs]]):
         with pytest.raises(LabelError, match="each of the outputs"):
             identify_modes(frf, setups=wrong)
-
-
-def drifting(shift, seed, zeta=0.01):
-    """Six runs of five outputs and two inputs; the machine of each run is off by a draw."""
-    rng, freq, truth = np.random.default_rng(seed), np.arange(20.0, 200.0, 0.5), [40.0, 75.0, 150.0]
-    phi, runs = rng.normal(size=(5, 3)), []
-    for own in 1.0 + shift * rng.normal(size=6):
-        H = modal_frf(freq, pole(np.array(truth) * own, zeta), phi, phi[:2])
-        sigma = 1e-3 * np.sqrt(np.mean(np.abs(H) ** 2))
-        runs.append(Frf(freq, noisy(H, sigma, rng), variance=np.full(H.shape, sigma**2)))
-    return runs, pole(truth, zeta), phi
 
 
 def test_runs_of_a_drifting_machine_give_means_and_how_they_differ():

@@ -80,7 +80,7 @@ CHEAP = 5e7
 BUDGET = 5e10
 #: multiplications of a whole fit and of a first answer for those of a step, on average
 _REFINED, _FIRST = 6e3, 200.0
-#: steps of the first answer: the diagram's poles are off by more than noise makes them
+#: steps that compare fits: the diagram's poles are off by more than noise makes them
 QUICK = 2
 
 #: most residual terms on one side of the band: powers of a frequency beyond tell no more apart in
@@ -356,8 +356,9 @@ def _identified(
         bar.advance()
         expect(work * (_REFINED if refine or (refine is None and not costly) else _FIRST))
         lines = lines_of(ready)
-        fit, reason = _first(lines, chosen, alone), ""
         judged = refine is not False and alone
+        # one step is as near to a machine as noise is; what outputs disagree in needs more
+        fit, reason = _first(lines, chosen, alone, QUICK if judged else 1), ""
         if judged and lesser(fit, fit.participation, ALIKE):
             less = single(lines, fit, fit.participation, QUICK)
             fit = less if outputs_disagree(less, fit.cost) else fit
@@ -448,12 +449,12 @@ def _turns(fit: Fit) -> bool:
     )
 
 
-def _first(lines: Lines, chosen: PoleSelection, alone: bool) -> Fit:
+def _first(lines: Lines, chosen: PoleSelection, alone: bool, steps: int) -> Fit:
     """Return the fit near the poles chosen, with all residual terms and no search for others."""
     if not alone:
         return Fit(lines, chosen.poles, chosen.participation)
     fit = supported(lines, chosen.poles, chosen.participation)
-    return refined(lines, fit.poles, fit.participation, steps=QUICK, strict=False, first=fit)
+    return refined(lines, fit.poles, fit.participation, steps=steps, strict=False, first=fit)
 
 
 def _refined(

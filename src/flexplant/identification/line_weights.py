@@ -101,8 +101,10 @@ class PreparedLines:
         # at sharp peaks such a fit leaves more than noise; the median does not see them
         import scipy.ndimage as ndi
 
-        power = ndi.median_filter(power, (1, 1, WINDOW), mode="nearest") / np.log(2.0)
-        return self._weighted(power, fitted_share)
+        # row by row: of one axis SciPy is five times as fast
+        rows = power.reshape(-1, power.shape[2])
+        median = np.array([ndi.median_filter(row, WINDOW, mode="nearest") for row in rows])
+        return self._weighted(median.reshape(power.shape) / np.log(2.0), fitted_share)
 
     def from_residuals(self, error: ComplexArray, fitted_share: float) -> PreparedLines:
         """Return the same with weights from what a fit left, averaged over lines."""
@@ -207,24 +209,27 @@ def _standing_out(data: ComplexArray, d: FloatArray, chance: float, tapered: boo
     """
     middle = d.size // 2
     near = np.abs(np.arange(d.size) - middle) <= SPREAD
-    found, aside, count = np.zeros(d.size, dtype=bool), d[~near], data[..., 0].size
+    aside, rows = d[~near], data.reshape(-1, d.size)
     smooth = d[:, None] ** np.arange(3)
-    for row in data.reshape(-1, d.size):
-        X = np.column_stack([smooth[~near], 1.0 / aside, -aside * row[~near]])
-        inverse = np.linalg.pinv(X)
-        c = inverse @ row[~near]
-        free = X.shape[0] - X.shape[1]
-        noise = float(np.linalg.norm(row[~near] - X @ c)) / np.sqrt(free)
-        deviation = noise * np.sqrt(np.sum(np.abs(inverse) ** 2, axis=1))
-        # with so many complex degrees of freedom |e|^2 exceeds x with (1 + x/free)^-free
-        least = np.sqrt(free * np.expm1(-np.log(chance / count) / free))
-        off = np.abs(row - smooth @ c[:3] / (1.0 + c[4] * d))
-        height = least * np.hypot(noise, deviation[0])
-        skirt = abs(c[3]) + 2.0 * deviation[3]
-        if off[middle] > max(height, skirt / (NARROW / 2)):
-            found |= near & (off > height)
-            found |= tapered & (np.pi * np.abs(d) ** 3 * noise < off[middle])
-    return found
+    known = np.column_stack([smooth[~near], 1.0 / aside])
+    fixed = np.broadcast_to(known, (len(rows), *known.shape))
+    X = np.concatenate([fixed, -(aside * rows[:, ~near])[:, :, None]], axis=2)
+    inverse = np.linalg.pinv(X)
+    c = (inverse @ rows[:, ~near, None])[..., 0]
+    free = X.shape[1] - X.shape[2]
+    left = rows[:, ~near] - (X @ c[..., None])[..., 0]
+    noise = np.linalg.norm(left, axis=1) / np.sqrt(free)
+    deviation = noise[:, None] * np.sqrt(np.sum(np.abs(inverse) ** 2, axis=2))
+    # with so many complex degrees of freedom |e|^2 exceeds x with (1 + x/free)^-free
+    least = np.sqrt(free * np.expm1(-np.log(chance / len(rows)) / free))
+    off = np.abs(rows - c[:, :3] @ smooth.T / (1.0 + c[:, 4:] * d))
+    height = least * np.hypot(noise, deviation[:, 0])
+    skirt = np.abs(c[:, 3]) + 2.0 * deviation[:, 3]
+    holds = off[:, middle] > np.maximum(height, skirt / (NARROW / 2))
+    lines = near & (off > height[:, None])
+    if tapered:
+        lines |= np.pi * np.abs(d) ** 3 * noise[:, None] < off[:, [middle]]
+    return np.asarray(np.any(lines[holds], axis=0))
 
 
 def checked_band(band: Any, freq: FloatArray) -> tuple[float, float]:
