@@ -135,7 +135,7 @@ def test_a_refinement_that_takes_too_much_leaves_the_first_answer(monkeypatch):
     monkeypatch.setattr("flexplant.identification.identify.BUDGET", 1e6)
     found = identify_modes(frf)
     assert "after 1e+06 operations" in repr(found)
-    assert np.array_equal(found.poles, first.poles)
+    np.testing.assert_allclose(found.poles, first.poles, rtol=1e-6)  # of one step and of two
     assert identify_modes(frf, refine=True).refined
 
 
