@@ -60,7 +60,7 @@ AMPLIFIER = 1e-4  # N/sqrt(Hz) at its input
 ENCODER = 1e-11  # m/sqrt(Hz)
 FLOOR = 2e-5  # m/s^2/sqrt(Hz) between 1 and 60 Hz
 #: where the POI goes, from the middle of the top to a corner
-PATH = [(0.2 + 0.16 * s, 0.15 + 0.11 * s, LZ) for s in np.linspace(0.0, 1.0, 5)]
+PATH = [(0.2 + 0.16 * s, 0.15 + 0.11 * s, LZ) for s in np.linspace(0.0, 1.0, 3)]
 
 
 # %% The machine
