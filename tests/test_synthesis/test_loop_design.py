@@ -87,10 +87,10 @@ def test_modes_left_out_are_checked():
     fine = design_loops(P, gentle, larger=many(), references={"cog:z": "z:ref"})
     assert fine.system.inputs[-1] == "z:ref"  # which takes no part in the loop
     assert fine.left_out is not None and fine.left_out.is_fine
-    fast = tune_loops(P, notches=1)
+    fast = tune_loops(P, notches=0)
     with pytest.warns(FlexplantWarning, match="with the modes that the plant left out"):
         assert not design_loops(P, fast.laws, larger=many()).left_out.is_fine
-    known = tune_loops(P, larger=many(), notches=1)
+    known = tune_loops(P, larger=many(), notches=0)
     assert known.report.is_stable
     assert min(known.left_out.modulus_margin, known.left_out.without) >= 0.5
 
@@ -104,11 +104,13 @@ def body(late, spring=0.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_less_delay_or_a_lower_margin_buys_bandwidth(sign):
+@pytest.mark.parametrize(
+    ("sign", "cases"), [(1.0, ((6, 2.0), (1, 2.0), (1, 3.0))), (-1.0, ((6, 2.0), (1, 2.0)))]
+)
+def test_less_delay_or_a_lower_margin_buys_bandwidth(sign, cases):
     """A plant that counts backwards is met by a law of negative gain."""
     reached = []
-    for late, peak in ((6, 2.0), (1, 2.0), (1, 3.0)):
+    for late, peak in cases:
         G = sign * body(late)
         found = tune_loops(G, peak=peak, notches=1)
         (one,) = found.report.loops
@@ -143,10 +145,10 @@ def test_on_springs_within_the_lines():
 
 @pytest.mark.slow
 def test_tuned_on_the_measured_machine_stable_on_the_truth():
-    """Noise, lines of 1 Hz, a hidden mass: no model but the rigid-body axes of the drawing."""
+    """Noise, lines of 2 Hz, a hidden mass: no model but the rigid-body axes of the drawing."""
     machine = wafer_stage()
     channels = ports(asd=1e-4, references=[])
-    frf = machine.measure_frf(channels, period=1.0, periods=2, amplitude=30.0, rng=3)
+    frf = machine.measure_frf(channels, period=0.5, periods=2, amplitude=30.0, rng=3)
     found = tune_loops(frf, **measured()[1], rate=RATE, delay=1, hold=False, notches=1)
     truth = assemble_plant(machine.truth, ports(references=[])).discretized(RATE, delay=1)
     loop = fx.close_loop(truth, found)
