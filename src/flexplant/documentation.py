@@ -94,7 +94,8 @@ class _Page(HTMLParser):
 
 def check_links(folder: Path) -> Links:
     """Return what the pages of a folder hold, and which of their links lead nowhere."""
-    pages = {path: _Page(path.read_text(encoding="utf-8")) for path in folder.rglob("*.html")}
+    found = (path.resolve() for path in folder.resolve().rglob("*.html"))
+    pages = {path: _Page(path.read_text(encoding="utf-8")) for path in found}
     broken, links = [], 0
     for path, page in pages.items():
         for reference in page.references:
@@ -102,10 +103,11 @@ def check_links(folder: Path) -> Links:
                 continue  # other places in the net, and data in the page
             links += 1
             file, _, place = reference.partition("#")
-            target = (path.parent / file).resolve() if file else path.resolve()
-            known = {one.resolve(): found for one, found in pages.items()}.get(target)
-            if not target.exists() or (place and (known is None or place not in known.places)):
-                broken.append(f"{path.relative_to(folder)}: {reference}")
+            target = (path.parent / file).resolve() if file else path
+            known = pages.get(target)
+            there = known is not None or target.exists()
+            if not there or (place and (known is None or place not in known.places)):
+                broken.append(f"{path.relative_to(folder.resolve())}: {reference}")
     pictures = sum(page.pictures for page in pages.values())
     return Links(len(pages), links, pictures, tuple(dict.fromkeys(broken)))
 
