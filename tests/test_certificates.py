@@ -294,6 +294,7 @@ WRONG = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", WRONG)
 def test_a_wrong_answer_is_refused(what, monkeypatch):
     target, wrong, call, said = WRONG[what]

@@ -72,6 +72,7 @@ def whole(path):
     return found[0]
 
 
+@pytest.mark.slow
 def test_killed_in_the_middle_of_save_the_old_file_or_the_new_one_is_there(tmp_path):
     path, rng = tmp_path / "value.npz", np.random.default_rng(0)
     numbered(0.0).save(path)
@@ -91,6 +92,7 @@ def test_killed_in_the_middle_of_save_the_old_file_or_the_new_one_is_there(tmp_p
     assert cut  # some were in the middle
 
 
+@pytest.mark.slow
 def test_two_that_save_to_one_file_and_one_that_loads(tmp_path):
     path = tmp_path / "value.npz"
     numbered(0.0).save(path)
@@ -117,6 +119,7 @@ WRITERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["No space left on device", "Read-only file system"])
 @pytest.mark.filterwarnings("ignore:no C compiler")
 def test_what_cannot_be_written_leaves_the_old_file(disk, fault):
@@ -179,6 +182,7 @@ class Filling:
         return float(sum(sensor.at[0] ** 2 for sensor in plant.assembled.ports.y))
 
 
+@pytest.mark.slow
 def test_a_placement_whose_disk_is_full_goes_on_when_there_is_room(disk, tmp_path):
     plant, sensors, _ = machine(12, count=11)
     criterion, path = Filling(disk), disk / "search.jsonl"

@@ -96,6 +96,7 @@ def test_the_whole_chain_from_a_measured_frf(fleet, tmp_path):
     assert chain.replace(candidates=()).report(poles, 1).measured.modes == poles.modes
 
 
+@pytest.mark.slow
 def test_a_virtual_machine_is_measured_with_the_options_given(fleet, monkeypatch):
     """Where it is not its poles that are taken; the identification has the band and the hold."""
 
@@ -115,6 +116,7 @@ def test_a_virtual_machine_is_measured_with_the_options_given(fleet, monkeypatch
     assert seen == {"band": (1.0, 2.0), "hold": 3.0, "frf": ("frf", 4, 0.5, 7)}
 
 
+@pytest.mark.slow
 def test_the_chain_refuses_what_it_cannot_use(fleet):
     chain = fleet.pipeline()
     assert repr(chain) == "<MachinePipeline: 2 parameters updated, H-infinity, 60, 40 Hz>"

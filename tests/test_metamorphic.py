@@ -161,6 +161,7 @@ def test_poles_and_responses(tell, seed):
     np.testing.assert_allclose(G2, G1, atol=1e-9 * np.abs(G1).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_error_of_the_observer_and_scores(tell, seed):
     one = truss(seed)
@@ -182,6 +183,7 @@ def test_error_of_the_observer_and_scores(tell, seed):
         assert by2[layout] / two.length**2 == pytest.approx(value, rel=1e-6, abs=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampled", [False, True])
 def test_norms_of_the_best_controllers(tell, sampled):
     one = truss(7, held=True)

@@ -221,6 +221,7 @@ def loaded(g):
     return flexplant.StateSpace(g.A, B, C, D, inputs=["w", "n", "u"], outputs=["z", "e", "y"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "inner", "call"),
     [

@@ -202,6 +202,7 @@ def test_a_notebook_is_somebody(monkeypatch, capsys):
     assert "modes" in said.out and not said.err
 
 
+@pytest.mark.slow
 def test_where_nobody_looks_one_line_says_how_long(monkeypatch, capsys):
     monkeypatch.setattr(progress, "PATIENCE", 0.05)
     for total, said in ((4, r"modes: 0 s, 1 of 4 done, some 0 s more\n"), (None, r"modes: 0 s\n")):
@@ -219,6 +220,7 @@ def test_where_nobody_looks_one_line_says_how_long(monkeypatch, capsys):
     assert capsys.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_a_long_first_item_and_a_long_rest(monkeypatch, capsys):
     """As soon as one is done it is said how long all take; of much, what would make it less."""
     monkeypatch.setattr(progress, "PATIENCE", 0.05)
@@ -267,6 +269,7 @@ def test_advice_on_a_terminal(monkeypatch, capsys):
     assert capsys.readouterr().err.count("s more. Take fewer.\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.benchmark  # a clock decides
 @pytest.mark.parametrize("name", ["modes", "identification", "placement", "response"])
 def test_estimates_before_the_start_hold_to_a_factor(name, monkeypatch, capsys):

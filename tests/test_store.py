@@ -55,6 +55,7 @@ def same(a, b):
     return type(a) is type(b) and repr(a) == repr(b)
 
 
+@pytest.mark.slow
 @given(ITEMS)
 def test_scalars_and_containers_come_back(path, item):
     Parcel(item).save(path)

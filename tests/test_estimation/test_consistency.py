@@ -114,6 +114,7 @@ def test_process_noise_alone_is_off():
     assert judged(plant(scale=3.0), machine()).cause == "noise ratio"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [4, 6])
 def test_a_wrong_frequency_is_named_with_its_mode(mode):
     moved = with_changes(machine(), [(Delta(f"mode{mode}:freq", mode, "freq", 1.0), 0.06)])
@@ -134,6 +135,7 @@ def test_a_truncated_model_is_named():
     assert found.peaks[0][0] == pytest.approx(modes(1e-2, 9).freq[8], rel=0.03, abs=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [2, pytest.param(15, marks=pytest.mark.slow)])
 def test_modes_left_out_beside_a_kept_one_are_no_change_of_it(more):
     """Modes 9 and 10 are a pair, mode 11 lies 1 % above: what shows is near mode 9, kept."""
@@ -146,6 +148,7 @@ def test_modes_left_out_beside_a_kept_one_are_no_change_of_it(more):
     assert "its predicted errors hold" in known.text
 
 
+@pytest.mark.slow
 def test_a_folded_mode_beside_a_kept_one_is_named():
     """Modes at 4456 Hz appear at 456 Hz, beside mode 6 at 463 Hz."""
     kept = list(range(9))
@@ -160,6 +163,7 @@ def test_a_folded_mode_beside_a_kept_one_is_named():
     assert "the plant is right" in known.text and "(4456 Hz in the larger model)" in known.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "kind", "amount"),
     [
@@ -184,6 +188,7 @@ def one_sensor(count):
     return assemble_plant(every.select(range(count)), own).discretized(2e3, delay=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kept", "mode", "kind", "amount", "cause"),
     [
@@ -213,6 +218,7 @@ def test_an_offset_of_a_sensor_is_named_with_its_size(sensor, size):
     assert float(value) * scale == pytest.approx(size, rel=0.1, abs=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 30])
 def test_outliers_are_named_and_gated(count):
     records, _ = recorded(machine())

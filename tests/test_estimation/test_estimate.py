@@ -279,6 +279,7 @@ def test_what_counts_as_a_record_and_what_comes_out(tmp_path):
         want["die:hat"][0] = 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [row[0] for row in LAGS.values()], ids=list(LAGS))
 def test_a_gate_makes_outliers_missing_samples(method):
     """Alone, in two sensors, one after the other, while the filter starts: the NaN estimate."""

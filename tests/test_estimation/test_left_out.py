@@ -168,6 +168,7 @@ def test_modes_left_out_as_noise_forgive_what_is_not_known_of_them():
     assert fragile > 1.3 * 1e9 * many.rms("die")
 
 
+@pytest.mark.slow
 def test_modes_that_the_reduced_model_knows_are_the_default():
     real = solve_modes(make_plate(elements=(4, 4)), count=40, damping=ModalDamping(0.01))
     grid = [real.dofs.nearest((x, y, 0), "z") for x in (0, 0.3, 0.6) for y in (0, 0.3, 0.6)]
@@ -212,6 +213,7 @@ def steady_error(truth, observer):
     return abs(error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.5, 1.0])
 @pytest.mark.parametrize("attached", [False, True])
 def test_a_steady_force_bends_the_modes_left_out_and_the_filter_knows(attached, delay):
@@ -240,6 +242,7 @@ def shaped(kind):
     return base.replace(y=[*base.y, speed])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["disturbance", "filter", "delay", "actuator", "velocity"])
 def test_filters_delays_and_shapes_act_on_the_modes_left_out(kind):
     """From many times the best possible error to less than twice: dynamics are accounted for."""

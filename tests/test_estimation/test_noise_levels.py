@@ -125,6 +125,7 @@ def chain_record(count, rate, seed, duration=4.0):
     return truth, every, run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "kept", "rate", "kind"),
     [(5, 3, 2e3, "modes"), pytest.param(8, 4, 1e4, "plant", marks=pytest.mark.slow)],
@@ -151,6 +152,7 @@ def test_levels_that_stand_for_modes_left_out_are_warned_of():
     assert "a mode left out" in blind.verdict
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_level_that_nothing_shows_has_a_bound(seed):
     """True levels given: the first sensor's noise is far below its motion within a sample."""

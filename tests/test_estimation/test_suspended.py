@@ -112,12 +112,14 @@ def check(plant, larger):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [10, 20])
 def test_a_plate_on_springs(count):
     modes = plate_modes()
     check(plate_plant(modes.select(range(count))), modes.select(range(40)))
 
 
+@pytest.mark.slow
 def test_every_order_passes_and_weak_springs_change_little():
     """Beside the free plate, whose rigid-body motion leaves no square behind."""
     for count in (10, 20):
@@ -139,6 +141,7 @@ def test_a_block_on_springs(kind, freq, count):
     check(block_plant(kind, modes.select(range(count))), modes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reading", [{}, {"dynamics": lowpass(3e3)}, {"latency": 3e-5}])
 def test_dampers_filters_and_delays(reading):
     """Complex modes; states of the sensors, which follow the suspension too."""

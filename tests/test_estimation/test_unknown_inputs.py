@@ -63,6 +63,7 @@ def test_stationary_gains_are_those_of_the_published_recursion(direct):
     assert found.certificate.difference < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direct", [True, False])
 def test_runs_have_the_predicted_errors_whatever_the_input_is(direct):
     """A ramp, a wave and a jump of a thousand deviations leave no bias."""

@@ -126,6 +126,7 @@ def test_coherence_of_periods_is_that_of_one_of_them():
         assert np.mean(frf.coherence) == pytest.approx(share, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overlap", [0.0, 0.5])
 def test_h1_variance_is_that_of_its_errors_for_two_inputs(overlap):
     rng = np.random.default_rng(6)

@@ -92,6 +92,7 @@ def test_the_pair_that_was_merged_and_the_mode_that_became_zero():
     assert np.abs(found.freq / (np.abs(truth) / 2 / np.pi) - 1).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_a_missed_mode_is_warned_of_and_a_merged_one_added():
     """Started without the 90.09 Hz neighbour: by hand it is warned of; left alone it is there."""
     frf = measured(freq=np.arange(80.0, 100.0, 0.02), level=1e-2)
@@ -112,6 +113,7 @@ def test_a_missed_mode_is_warned_of_and_a_merged_one_added():
     assert np.abs(np.sort_complex(fit.poles) - np.sort_complex(found.poles)).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_a_disturbance_of_one_frequency_is_warned_of_and_gives_no_pole():
     """Variances from few runs are several times too small at some line: that is no warning."""
     truth, freq, freedom = pole([47.5, 66.0], [4e-3, 5e-3]), np.arange(30.0, 90.0, 0.1), 4
@@ -174,6 +176,7 @@ def gain_of_truth(frf, found, missed, phi):
     return cost(found.poles, found.participation) - cost(more, part)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [20, 40])
 def test_a_repeated_pole_that_passed_for_one_is_taken_apart(seed):
     """Sets whose second pole at 120 Hz was lost in silence: worth 150 and 80 of chi-square."""

@@ -83,6 +83,7 @@ def test_neighbouring_hann_lines_are_correlated_by_4_9_and_1_36():
     assert np.abs(box - np.eye(8)).max() < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("window", "overlap"), [("hann", 0.0), ("hann", 0.5), ("boxcar", 0.5)])
 def test_errors_of_lines_are_correlated_as_stated(window, overlap):
     """Noise on the output, 30 records of 240 segments, 124 lines: five standard errors."""

@@ -201,6 +201,7 @@ def test_files_that_do_not_belong_together(tmp_path):
         read_abaqus(tmp_path / "none.mtx")
 
 
+@pytest.mark.slow
 def test_cut_files(tmp_path):
     content = entries(K)
     for cut in range(len(content) - 2):

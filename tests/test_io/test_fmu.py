@@ -58,6 +58,7 @@ def masses():
     return plant, fx.close_loop(plant, observer, servo)
 
 
+@pytest.mark.slow
 @compiles
 @pytest.mark.parametrize("version", VERSIONS)
 def test_plant_and_controller_as_units_give_the_run_of_simulate(version, tmp_path):

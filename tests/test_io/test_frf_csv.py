@@ -66,6 +66,7 @@ NUMBERS = st.floats(-1e99, 1e99)
 NAMES = st.text("abuy1:/ <[-],\"'", min_size=1, max_size=8).map(lambda text: f"x{text}x")
 
 
+@pytest.mark.slow
 @given(
     st.lists(NUMBERS, min_size=4, max_size=4), st.lists(NAMES, min_size=3, max_size=3, unique=True)
 )

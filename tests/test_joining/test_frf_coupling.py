@@ -105,6 +105,7 @@ def stated(frf, factor):
     return frf.replace(variance=(1e-6 * frf.mag) ** 2, correlation=between)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [0.0, 0.8])
 def test_variances_of_responses_give_that_of_the_machine(part):
     """Errors of outputs under one force are independent, or share a part."""

@@ -305,6 +305,7 @@ def test_modes_on_a_spring():
     np.testing.assert_allclose(machine.modes().freq[5:], truth, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_reduced_machine_is_a_model_like_any():
     """Labels, plants, an update of a joint's stiffness, a machine in a machine."""
     half = plate(2, 0.3)

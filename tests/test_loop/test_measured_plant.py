@@ -67,6 +67,7 @@ def test_channels_of_the_frf_in_any_order_and_more_of_them():
     )
 
 
+@pytest.mark.slow
 def test_margin_and_bandwidth_on_a_dense_frf_are_those_of_the_model():
     loop = loop_of()
     frf = frf_of(loop, np.arange(1.0, 4000.0, 0.5))

@@ -115,6 +115,7 @@ def test_a_mode_without_a_tolerance_may_be_anywhere_in_the_range():
             assert radius(int(found.modes[row]), freq=change) < 1.0
 
 
+@pytest.mark.slow
 def test_the_margin_falls_to_what_was_stated():
     found = tolerances()
     for row in np.argsort(found.least)[:3]:

@@ -115,6 +115,7 @@ def test_the_margin_of_all_loops_is_that_of_the_side_where_they_are_broken():
     assert found["y"] > 8.0 * found["u"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("springs", [0.0, (2 * np.pi * 2.0) ** 2, -((2 * np.pi * 2.0) ** 2)])
 def test_the_count_is_that_of_the_characteristic_polynomial(springs):
     """PID of many gains on machines with light modes; unstable ones among them."""
@@ -212,6 +213,7 @@ def body_with_modes(rng, axes):
     return G, K, lines, 2.0 * zeta * freq
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 @pytest.mark.parametrize("axes", [1, 2])
 def test_stable_on_coarse_lines_is_stable_or_says_of_which_modes_it_is_not(axes, noise):

@@ -36,6 +36,7 @@ def stable(seed, n=6, m=2, p=3):
     return StateSpace(A, rng.standard_normal((n, m)), rng.standard_normal((p, n)), D)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000), st.booleans())
 def test_factors_and_hankel_values_against_dense_gramians(seed, sampled):
     g = stable(seed)

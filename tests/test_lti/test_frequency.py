@@ -149,6 +149,7 @@ def test_first_order_gain_in_closed_form():
     assert value == pytest.approx((1 - pole) / (z - pole), rel=1e-12, abs=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "zeta"), [(1, 1e-3), (4, 1e-2), (4, 1e-4)])
 @pytest.mark.parametrize("sampled", [False, True])
 def test_the_line_through_the_default_grid_is_the_response(size, zeta, sampled):

@@ -182,6 +182,7 @@ def test_split_of_nothing():
         split_stable(3 + 1j)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [None, 0.0])
 @pytest.mark.parametrize("rigid", [0, 2])
 def test_minimal_of_a_system_beside_itself(rigid, delay):
@@ -267,6 +268,7 @@ WIDE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "dt"), [("blocks", 0), ("dense", 0), ("mixed", 0), ("blocks", 2e-5), ("dense", 2e-5)]
 )

@@ -103,6 +103,7 @@ def test_a_slow_sampler_of_a_fast_mode(rate, blocks):
     assert scaled_gap(covariance(g, [1.0], h), X - E @ X @ E.T) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.1, 3.0, 40.0, 300.0])
 @pytest.mark.parametrize("zeta", [0.001, 0.3, 0.99])
 def test_many_modes_and_few_forces_take_few_columns(size, zeta):

@@ -78,6 +78,7 @@ def test_machine_in_si_units_equals_slycot(blocks, zeta, delay):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blocks", [True, False])
 @pytest.mark.parametrize("zeta", [1e-2, 1e-3])
 @pytest.mark.parametrize("sampled", [True, False])

@@ -61,6 +61,7 @@ def halves(rate):
     return fx.joined(models, joints, placed=placed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "slow"), [(300.0, False), (3e4, True), (3e6, True)])
 def test_overdamped_motions_are_set_apart(rate, slow, monkeypatch):
     """Far above the wanted modes, in silence; with a warning where their poles are among them."""

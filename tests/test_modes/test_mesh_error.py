@@ -50,6 +50,7 @@ def test_beams_converge_by_their_own_order():
     np.testing.assert_allclose(found.error, true, rtol=0.35, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_meshes_that_say_nothing_are_refused():
     with pytest.raises(ModelError, match="Halve the elements"):
         modes(8).mesh_error(modes(9))

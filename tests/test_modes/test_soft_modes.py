@@ -88,6 +88,7 @@ def test_a_stiff_grounding_spring_is_a_support(factor):
     assert np.abs(modes.omega[2:] / held.omega[2:] - 1).max() < 5e-3 / factor + 1e-9
 
 
+@pytest.mark.slow
 @EXTENDED
 @pytest.mark.parametrize(
     "stiffness", [1e-2, *(pytest.param(k, marks=pytest.mark.slow) for k in (1.0, 1e3)), 1e6]
@@ -128,6 +129,7 @@ def test_a_large_plate_on_springs_from_a_thousandth_to_a_million_newtons_per_met
     assert np.all(modes.omega[3:] > alone.omega[3:] * (1 - 1e-8))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("total", [1e4, 10.0, 1.0])
 def test_a_bed_of_springs_under_every_node_holds_as_softly(total):
     """No DOF has a larger force than rounding could make at it: all of them add up."""

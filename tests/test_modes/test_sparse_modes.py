@@ -95,6 +95,7 @@ def test_what_a_search_missed_is_found_by_the_count(structure, monkeypatch):
     assert certificate["counted"] == certificate["found"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("single", [False, True])
 def test_below_a_frequency(structure, monkeypatch, single):
     """Bulky structures are counted and searched with one factor, in single precision."""
@@ -194,6 +195,7 @@ def copies_of(mesh, copies, apart=2.0):
     return FEModel(M, K, dofs=DofSet(nodes, one.directions * copies, xyz))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("copies, count", [(13, 30), (40, 4), (40, 30), (25, 61)])
 def test_any_multiplicity_is_found(copies, count):
     """More copies of a mode than a block has vectors, or than are wanted."""
@@ -232,6 +234,7 @@ def test_bodies_far_from_the_origin_are_free():
     assert held.rigid_body.shape[1] == 6 * 25 - 1
 
 
+@pytest.mark.slow
 def test_bodies_that_nothing_joins_keep_their_motions():
     """Free solids, more than fifty, and free masses: each has its own rigid-body motions."""
     mesh = meshes.solid(1, 1, 1)

@@ -74,6 +74,7 @@ def test_the_cost_is_the_h2_norm_of_the_best_controller(make):
     assert COST(led) == pytest.approx(COST(plant), rel=1e-9, abs=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "delay",
     [pytest.param(0.0, marks=pytest.mark.slow), 1.0, pytest.param(2.0, marks=pytest.mark.slow)],

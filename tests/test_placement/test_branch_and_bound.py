@@ -161,6 +161,7 @@ def test_branches_find_what_every_subset_shows(make, monkeypatch, side):
     assert rough.gap <= 0.2
 
 
+@pytest.mark.slow
 def test_from_the_worst_start_the_optimum_is_found_all_the_same(make, monkeypatch):
     """A bound too high by a little cuts off the optimum; a start that is best would hide it."""
     room = "flexplant.placement.branch_and_bound"
@@ -179,6 +180,7 @@ def test_from_the_worst_start_the_optimum_is_found_all_the_same(make, monkeypatc
         assert found.bound == found.value
 
 
+@pytest.mark.slow
 def test_a_limit_of_branches_says_that_it_was_hit(make):
     plant, sensors, _ = make(14, count=12)
     best = place_sensors(plant, sensors, 4)

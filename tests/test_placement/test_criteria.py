@@ -19,6 +19,7 @@ def matrices(plant, axes):
     return g.A, plant.B2, plant.C2, plant.process_noise, plant.sensor_noise, rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("axes", [None, "rx", {"z": 1.0, "ry": 0.05}])
 def test_variance_is_that_of_the_recursion(make, seed, axes):
@@ -31,6 +32,7 @@ def test_variance_is_that_of_the_recursion(make, seed, axes):
     assert PoiVariance("die", axes)(plant) == pytest.approx(expected, rel=1e-8, abs=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, 1.0, 2.0, 0.4, 1.6])
 def test_cost_is_that_of_the_recursion(make, delay):
     plant, _, _ = make(3, delay=delay)

@@ -173,6 +173,7 @@ def test_after_the_loss_of_one_the_others_suffice(make):
     assert best.value > place_actuators(plant, actuators, 4, lost.criterion).value
 
 
+@pytest.mark.slow
 def test_a_short_list_by_the_hinf_level():
     """A synthesis for each sensor of a chain: best beside the force, not where the POI is."""
     K = 1e6 * (2 * np.eye(5) - np.eye(5, k=1) - np.eye(5, k=-1))

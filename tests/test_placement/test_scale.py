@@ -118,6 +118,7 @@ def test_killed_and_resumed_nothing_is_lost_or_done_twice(make, tmp_path):
     assert set(found.chosen) == {sensor.name for sensor in lowest}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: type(method).__name__)
 def test_a_file_that_was_cut_gives_the_same_answer(make, tmp_path, method):
     plant, sensors, _ = make(12)
@@ -218,6 +219,7 @@ WAYS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [None, lowpass(60.0)], ids=["white", "shaped"])
 @pytest.mark.parametrize(
     ("use", "way"),
@@ -252,6 +254,7 @@ def test_plants_are_assembled_once_not_per_choice(monkeypatch, use, way, shape):
     assert seen[0].get("inertia", 0) <= 2 * 4 * each  # those of the larger model too
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [None, lowpass(60.0)], ids=["white", "shaped"])
 @pytest.mark.parametrize("delay", [1.0, 1.5])
 @pytest.mark.parametrize("references", [(), (Reference("die"),)], ids=["", "reference"])

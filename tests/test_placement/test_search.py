@@ -164,6 +164,7 @@ def test_a_criterion_without_finite_values(make):
         place_sensors(plant, sensors[:5], 3, lambda p: np.inf, method=Exchange(starts=1))
 
 
+@pytest.mark.slow
 def test_threads_give_the_same_to_the_bit(make, send_everything):
     plant, sensors, _ = make(12)
     for method in (Exchange(starts=4), BranchAndBound(starts=2)):

@@ -226,6 +226,7 @@ def test_the_same_noise_with_a_filter_and_a_late_sensor():
     np.testing.assert_allclose(found, shared, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_norms_are_those_of_the_matrices():
     M, D, K = chain("held grounded")
     A, B, C = first_order(M, D, K, np.eye(4)[[3]], np.eye(4)[[0]])

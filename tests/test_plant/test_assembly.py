@@ -64,6 +64,7 @@ def test_names_and_order():
     assert quiet.y == ("y1", "y2", "y3", "y4")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("quantity", "order"), [("velocity", 1), ("acceleration", 2)])
 @pytest.mark.parametrize("kind", ["real", "complex", "modes"])
 def test_velocity_and_acceleration_are_s_times_displacement(quantity, order, kind):
@@ -223,6 +224,7 @@ def test_delay_acts_on_u_alone():
     assert plant.delay == 1.6
 
 
+@pytest.mark.slow
 def test_rescaling_w_by_1e9():
     """A_d bit-equal, Q_d scaled to 1e-12; references and sensor noises stay sample values."""
     for model in (some_modes(0.001), full(mass=0.5)):

@@ -70,6 +70,7 @@ def channels(plant):
     return plant.system.select(["die:z", "die:rx", "die:ry", "y1"], ["u1", "amp2"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [full, reduced, some_modes])
 @pytest.mark.parametrize("damping", [0.0, 20.0])
 def test_poles_and_responses_are_those_of_the_dense_model(model, damping):

@@ -78,6 +78,7 @@ def reduced_oracle(model, freq=FREQ):
     return receptance(model.M, model.D, model.K, np.array(see) @ T, push @ T, 2 * np.pi * freq)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zeta", [0.01, 0.001])
 def test_a_reduced_model_before_and_after_the_update(zeta):
     # oracle: dense solves of M*, D*, K*; after the update the damping is not proportional
@@ -90,6 +91,7 @@ def test_a_reduced_model_before_and_after_the_update(zeta):
     assert after.values[0] == pytest.approx(0.5, abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["modes", "reduced", "updated"])
 @pytest.mark.parametrize("zeta", [0.01, 0.001])
 def test_poles(which, zeta):

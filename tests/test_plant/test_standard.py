@@ -245,6 +245,7 @@ def test_sampling_refuses(plant):
         _ = plant.process_noise
 
 
+@pytest.mark.slow
 @given(st.integers(0, 3) | st.floats(0.01, 3.0), st.floats(600.0, 2e4))
 def test_a_static_force_accelerates_the_rigid_body_alike_at_any_rate(delay, rate):
     # oracle: F = m a of the whole plate; integer delays and fractions leave the sum of forces
@@ -338,6 +339,7 @@ class TestWhereItCameFrom:
 DYNAMIC = lowpass(2e3, order=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [None, 0.0, 1.0, 1.5])
 @pytest.mark.parametrize("late", [0.0, 130e-6])
 @pytest.mark.parametrize("part", [DYNAMIC, None], ids=["filters", "bare"])

@@ -44,6 +44,7 @@ def test_one_number_is_for_all_elastic_modes_and_an_array_for_some():
     assert {d.mode: d.scale for d in some.deltas} == {5: 0.02, 7: 0.04}
 
 
+@pytest.mark.slow
 def test_draws_spread_as_stated():
     """At delta = 1 two standard deviations: nearly all draws lie within."""
     omega = swing(plant())[0]
@@ -147,6 +148,7 @@ def spring_of_masses(extra=0.0):
     return fx.assemble_plant(drawing, ports).discretized(2e3, delay=1.3)
 
 
+@pytest.mark.slow
 def test_a_parameter_of_the_model():
     """A mass known to 5 %: the machine is that of the heavier chain, shapes and all."""
     uncertain = spring_of_masses().uncertain(parameters={fx.AddedMass("3:x"): 0.05})
@@ -225,6 +227,7 @@ def test_a_loop_under_all_kinds_at_once():
     assert found.lower > 0.9 * found.upper
 
 
+@pytest.mark.slow
 def test_a_gain_margin_is_what_mu_says():
     """One uncertain gain: the loop is lost where its poles say so, of gains raised by hand."""
     P = fx.testbeds.three_masses()

@@ -168,6 +168,7 @@ def test_modes_in_use_are_not_solved_again(plate, monkeypatch):
     assert "30 modes" not in fx.frequency_response(model, PLAIN, FREQ).route
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law",
     [fx.ModalDamping(0.01), fx.Hysteretic(0.02), fx.Rayleigh(2.0, 1e-6), None],

@@ -79,6 +79,7 @@ def rows(places, about=CENTRE):
     return np.array(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("freq", "exact"), [(1.0, 1e-6), (3.0, 1e-5), (10.0, 1e-4)])
 def test_the_rigid_body_is_that_of_the_box(freq, exact):
     plant = plant_of(freq)

@@ -56,6 +56,7 @@ def wanted(damping=DAMP):
 DIE = (L / 2 + 0.01, L / 2 + 0.02, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "rtol"), [(full, 2e-6), (reduced, 2e-2), (some_modes, 2e-2)])
 @pytest.mark.parametrize("damping", [0.0, DAMP])
 def test_responses_of_the_suspended_plate(model, rtol, damping):

@@ -77,6 +77,7 @@ def same_response(a, b, tolerance=1e-9):
     return np.max(np.abs(one - two) / size) < tolerance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quantity", ["displacement", "velocity", "acceleration"])
 @pytest.mark.parametrize(
     "values",
@@ -127,6 +128,7 @@ def _relative(poles, covariance):
 VALUES = {"mode6:freq": 0.7, "mode7:damping": -0.5, "mode7:freq": -1.0, "mode6:damping": 2.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [None, RATE])
 def test_a_fit_with_a_damper_gives_complex_modes_and_the_same_lft(rate):
     fit, unknowns = fitted()
@@ -250,6 +252,7 @@ def test_seeds_belong_to_machines():
     assert not np.array_equal(first[0].system.A, second[0].system.A)
 
 
+@pytest.mark.slow
 def test_machines_with_modes_left_out_have_their_damping_off_too():
     """A reduced model whose last mode stands for compliance, beside a model of 40 modes."""
     small = assemble_plant(reduced(0.001), ports())
@@ -381,6 +384,7 @@ def test_neglected_modes_are_no_excuse_for_another_mass():
         plant.uncertain(fit, unknowns, modes=[6], neglected=three)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_opened_is_said():
     fit, unknowns = fitted()
     plant = updated()

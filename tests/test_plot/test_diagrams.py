@@ -72,6 +72,7 @@ def test_a_zero_at_half_the_rate_does_not_draw_the_axis_down():
     assert high - low < 200
 
 
+@pytest.mark.slow
 def test_nyquist_names_the_distance_from_minus_one():
     L = 20.0 * tf([1.0, 1.0], [1.0, 0.0, 0.0]) * tf([1.0], [0.02, 1.0])
     ax = fx.plot.nyquist({"servo": L})

@@ -118,6 +118,7 @@ def run_of(errors):
     return Response(time, np.array(errors), ("die:z", "die:error"), units)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "prefix"), [(3e-9, "n"), (4e-6, "\N{MICRO SIGN}"), (5e-3, "m"), (20.0, ""), (2e4, "k")]
 )
@@ -197,6 +198,7 @@ def test_layout_shows_every_port_where_it_is():
         fx.plot.layout(dofs, desired=["0:z"])
 
 
+@pytest.mark.slow
 def test_the_update():
     fit = fitted(reduced(), POLES)
     steps = len(fit.history) + 1

@@ -26,6 +26,7 @@ def stage():
     return assemble_plant(plate_modes(10), ports).discretized(5e3, delay=1), sensors, grid
 
 
+@pytest.mark.slow
 def test_the_curve_is_in_nanometres_and_its_bound_below():
     plant, sensors, _ = stage()
     curve = pareto_curve(plant, sensors, range(3, 6), method=Exchange(1), rng=0)

@@ -179,6 +179,7 @@ def all_methods():
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", range(11))
 def test_every_model_goes_on(plate, which):
     """Rigid-body motions exact, plant, decoupling, rows, an update, identifiability."""
@@ -378,6 +379,7 @@ EVERY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", EVERY.values(), ids=EVERY)
 def test_every_method_is_called_alike_and_judged(plate, method):
     """A model with a damper to ground, from the matrices; from Modes where these are enough."""

@@ -154,6 +154,7 @@ def test_the_report_can_fail(plate):
     assert shifted.frf_error.max() == pytest.approx(0.5, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [ModalTruncation(24, inputs=KEPT), ModalBalanced(24, KEPT)])
 def test_a_bound_of_some_modes_says_so(plate, method):
     """Of 24 modes solved none is left out: the bound of what is, 0, says nothing of the others."""

@@ -39,6 +39,7 @@ def true_error(modes, model, below=np.inf):
     return worst
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [5, 12, 30])
 @pytest.mark.parametrize("from_model", [False, True])
 def test_the_bound_of_truncation_holds(plate, modes, count, from_model):
@@ -50,6 +51,7 @@ def test_the_bound_of_truncation_holds(plate, modes, count, from_model):
     assert model.coordinates[:4] == ("mode 1", "mode 2", "mode 3", "mode 4")
 
 
+@pytest.mark.slow
 def test_the_bound_is_reached_by_one_neglected_mode(modes):
     ranking = rank_modes(modes, inputs=INTO, outputs=OUT)
     method = ModalBalanced(modes.n_modes - 1, INTO, outputs=OUT)
@@ -150,6 +152,7 @@ def test_refusals(plate, modes):
     assert undamped.bound is None  # no finite one
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.95, 1.001, 1.5])
 @pytest.mark.parametrize("count", [5, 9])
 @pytest.mark.parametrize("made", ["modes", "static", "balanced", "model"])

@@ -105,6 +105,7 @@ def test_a_moving_poi_is_at_each_sample_that_of_its_place(loop):
     assert np.abs(run["die:ry"] - plain["die:ry"]).max() > 0.01 * plain.peak("die:ry")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("finer", "moves"), [(1, True), (3, False), (4, True)])
 def test_in_blocks_all_is_as_in_single_samples(loop, finer, moves):
     """Under noise, over more than one piece: a POI that moves, and between samples."""

@@ -43,6 +43,7 @@ def close(one, other):
         assert one[name] == pytest.approx(other[name], rel=1e-5, abs=0, nan_ok=True), name
 
 
+@pytest.mark.slow
 def test_modes_and_reduced_models_are_updated_as_the_drawing_is():
     """With all modes of the drawing the rows are the same, attachment vectors included."""
     drawing = bare().with_damping(LAW)
@@ -58,6 +59,7 @@ def test_modes_and_reduced_models_are_updated_as_the_drawing_is():
     assert near.modulus_margin == pytest.approx(expected["margin expected"], rel=1e-2)
 
 
+@pytest.mark.slow
 def test_the_report_holds_the_run_against_the_model():
     """Power around each mode beside the predicted; a run that is too short says so."""
     short, longer = (pipeline(duration=t).report(machine(0.1), 1) for t in (0.05, 1.0))
@@ -67,6 +69,7 @@ def test_the_report_holds_the_run_against_the_model():
     assert "The run beside the model\n  <Consistency at 95 %" in repr(longer)
 
 
+@pytest.mark.slow
 def test_damping_in_place_of_a_matrix():
     same = pipeline(full=bare(), damping=LAW)
     close(same(machine(0.0), 1), pipeline()(machine(0.0), 1))
@@ -98,6 +101,7 @@ def test_damping_of_a_model_that_is_large():
         )
 
 
+@pytest.mark.slow
 def test_delays_of_a_fraction_of_a_sample():
     report = pipeline(delay=1.5).report(machine(0.1), 1)
     assert report.observer.plant.delay == 1.5

@@ -88,6 +88,7 @@ def by_fine_steps(modes, loop, steps, parts, amplitude):
     return shown
 
 
+@pytest.mark.slow
 def test_against_fine_steps(modes, loop):
     steps = 120
     run = fx.simulate(

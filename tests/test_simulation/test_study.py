@@ -104,6 +104,7 @@ def marked(machine):
     return {"pid": os.getpid(), "mark": os.environ.get("STUDY_MARK", ""), "method": method}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("context", CONTEXTS)
 @pytest.mark.parametrize("limit", [False, True])
 def test_a_process_that_dies_or_hangs_takes_only_its_machine_with_it(context, limit):

@@ -68,6 +68,7 @@ def test_random_graphs(seed, n, density, leaf):
         assert multifrontal_inertia(indefinite, dissection) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mesh", [meshes.plate(14), meshes.solid(6, 5, 4)], ids=["plate", "solid"])
 @pytest.mark.parametrize("known", [True, False])
 def test_meshes(mesh, known):

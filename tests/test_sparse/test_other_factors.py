@@ -45,6 +45,7 @@ def test_indefinite_matrices_are_refused(method):
         method.factored(sp.csc_array(K - 1e9 * M))
 
 
+@pytest.mark.slow
 def test_modes(method):
     mesh = meshes.plate(24)
     model = FEModel(mesh[0], mesh[1], dofs=meshes.dofs_of(mesh))

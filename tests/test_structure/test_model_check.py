@@ -291,6 +291,7 @@ def beside_a_mass(directions):
     return fx.FEMatrices(K, M, dofs=dofs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "given, taken",
     [

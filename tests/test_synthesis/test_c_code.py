@@ -324,6 +324,7 @@ def test_a_schedule_interpolates_the_outputs(tmp_path):
         write_c({0.0: law(1.0), 1.0: law(2.0)}, tmp_path / "a.c", schedule="y")
 
 
+@pytest.mark.slow
 @compiles
 def test_a_controller_that_follows_its_machine_on_a_path(tmp_path):
     """The commands of `simulate` along a path, from its readings and positions."""

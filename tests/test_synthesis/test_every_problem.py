@@ -72,6 +72,7 @@ def test_the_rounding_of_tustin_gives_no_rank(noise):
     assert ("D21 has rank 0 of 1" in found.notes[0]) == (not noise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_singular_structures_sampled_with_a_hold_are_served(seed):
     plant = structure(seed, w=2, z=2, modes=4)
@@ -90,6 +91,7 @@ def test_d12_and_d21_of_rounding_are_zero():
         assert solved(A, B, C, dirty).gamma == pytest.approx(best, rel=1e-6, abs=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tiny", [1e-6, 1e-8, 1e-10, 1e-12])
 def test_tiny_efforts_and_noises_beside_ordinary_ones(tiny):
     """Gamma is between that of no effort and of a larger one, and the same within the back-off."""

@@ -189,6 +189,7 @@ def test_accelerometers_feed_through():
     assert brute_norm(*loop, 0.0, count=150) == pytest.approx(found.gamma, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_controller_is_saved_whole(tmp_path):
     found = stage()[3]
     found.save(tmp_path / "k.npz")
@@ -263,6 +264,7 @@ def test_a_plant_without_weights_is_solved_in_any_units():
     assert found.lower <= found.gamma <= 1.052 * found.lower  # the back-off and the tolerance
 
 
+@pytest.mark.slow
 def test_a_plant_beyond_rounding_is_told_so():
     """Sixteen lags in a row, each of gain 1000: 1e48 from the first state to the last."""
     n = 16

@@ -45,6 +45,7 @@ def judged(P, u, y, method, best, low=2e-3, over=1e-4, high=0.055):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS, ids=["Riccati", "Lmi"])
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_coprime_factors(name, method):
@@ -76,6 +77,7 @@ def test_sampled_by_the_bilinear_map(method):
 
 # the infimum is approached only as the Lyapunov matrices grow without bound (the optimal loop
 # cancels modes): gamma, and the bound for moderate ones, lie a little above it
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("zero", "pole", "over"),
     [(2.0, -1.0, 5e-4), (0.3, -0.1, 5e-3), (3.0, 1.0, 2e-4), (0.5, 2.0, 2e-4)],

@@ -118,16 +118,19 @@ def check(parts, gamma, bound=3e-3):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("a", [-2.0, -0.5, 0.0, 1.0])
 def test_measurement_without_noise_reaches_state_feedback(a):
     check(scalar(a, 0.0), state_feedback_gamma(a))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("a", [-2.0, 0.0, 1.0])
 def test_effort_without_weight_is_the_dual(a):
     check(transposed(scalar(a, 0.0)), state_feedback_gamma(a))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("a", [-2.0, -0.5, 0.0, 1.0])
 def test_scalar_output_feedback_equals_the_root_of_its_riccati_equations(a):
     check(scalar(a, 1.0), output_feedback_gamma(a), bound=1e-5)
@@ -148,6 +151,7 @@ def test_compleib_up_to_20_states(name):
     check(*compleib(name), bound=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_bound_and_riccati_meet_with_feedthrough(seed):
     P, u, y = system(random_parts(seed))
@@ -168,6 +172,7 @@ def random_system(n, seed, full):
 
 
 # the solver's own settings stop at "InsufficientProgress" on each of these
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "seed", "full"),
     [

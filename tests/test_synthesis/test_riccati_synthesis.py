@@ -91,6 +91,7 @@ def checked(P, u, y, method=None):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.0, 0.05])
 @pytest.mark.parametrize("a", [0.0, -0.4, 0.3, 2.0, 8.0])
 def test_the_scalar_optimum_lies_between_lower_and_gamma(a, dt):
@@ -241,6 +242,7 @@ def test_a_loop_above_its_gamma_is_not_accepted(monkeypatch):
     assert found.lower <= scalar_optimum(1.0)
 
 
+@pytest.mark.slow
 @needs_data
 @pytest.mark.parametrize("name", FULL_RANK)
 def test_compleib_with_full_rank(name):
@@ -258,6 +260,7 @@ def test_compleib_with_full_rank(name):
             certified_norm(lft(P, found.system.replace(C=flipped, D=D)), found.gamma)
 
 
+@pytest.mark.slow
 @needs_data
 @pytest.mark.parametrize("name", [n for n in problems() if n not in FULL_RANK])
 def test_compleib_without_full_rank(name):

@@ -132,6 +132,7 @@ def rigid_loop(servo, delay, rate=RATE, sign=1.0):
     return np.abs(np.linalg.eigvals(loop)).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0, 1, 1.5, 2])
 @pytest.mark.parametrize("bandwidth", [10.0, 50.0, 200.0])
 def test_the_certificate(delay, bandwidth):

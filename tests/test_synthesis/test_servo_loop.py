@@ -115,6 +115,7 @@ def test_notches_are_placed_where_they_serve():
     assert margins[0] > 0.55 > 0.5 > margins[1]
 
 
+@pytest.mark.slow
 def test_a_servo_that_cannot_run_is_refused_with_the_bandwidth_that_can():
     plant, static, kalman = updated()
     for observer, bandwidth in ((static, 100.0), (kalman, 80.0)):
@@ -203,6 +204,7 @@ def test_modes_left_out_count():
     assert with_all <= reach * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_refusals():
     plant, static, kalman = updated()
     with pytest.raises(LabelError, match="the servo acts on die:ry:hat too"):

@@ -32,6 +32,7 @@ def crossover(G, K, low=1.0, high=800.0):
     return freq[int(np.argmax(np.array(gain) < 1.0))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.0, 2e4], ids=["continuous", "sampled and late"])
 @pytest.mark.parametrize("rolloff", [None, 400.0])
 def test_from_bandwidth_to_margins(rate, rolloff):

@@ -184,6 +184,7 @@ def test_where_none_are_known_the_answer_says_so():
     assert loop.left_out is None
 
 
+@pytest.mark.slow
 def test_a_closed_loop_carries_the_check(tmp_path):
     errors, _, found, _ = design()
     plant = sampled(small())
@@ -228,6 +229,7 @@ def by_servo(bandwidth):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "peak"),
     [

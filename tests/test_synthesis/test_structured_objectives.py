@@ -57,6 +57,7 @@ def test_the_h2_gain_in_closed_form(effort):
     assert found.system.D[0, 0] == pytest.approx(-1.0 / effort, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_peak_gain_in_closed_form():
     """x: 1 / k, u: 1 for any k; sampled x: the same sum, as 0 < 1 - k dt."""
     for dt in (0.0, 0.01):
@@ -91,6 +92,7 @@ def test_the_full_order_reaches_the_optimum_of_h2(dt):
             design(plant, FixedOrder(1), objective=H2())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [H2Judge, PeakJudge])
 @pytest.mark.parametrize("sampled", [False, True])
 def test_gradients_by_differences(kind, sampled):

@@ -89,6 +89,7 @@ def test_the_rigid_gain_is_newtons_law_free_partly_and_wholly_suspended(model):
             np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6 * abs(wanted).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_free_and_suspended_gains_agree_to_rounding(model):
     """The free one's by its modes at 0 Hz, as ever; the suspended one's by geometry."""
@@ -158,6 +159,7 @@ def loops(model):
     return found
 
 
+@pytest.mark.slow
 def test_the_servo_is_the_free_ones_and_its_loop_too():
     (free, free_loop), (soft, soft_loop) = loops(some_modes)
     for name in "ABCD":
@@ -233,6 +235,7 @@ def test_the_static_relation_predicts_the_same_rms_on_springs():
     assert soft.rms("die") == pytest.approx(free.rms("die"), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_weights_of_a_suspended_stage_are_the_free_ones_and_its_hinf_loop():
     free = sampled(some_modes(count=6, attached=False))
     soft = sampled(suspend(some_modes(count=6, attached=False), springs()))
@@ -291,6 +294,7 @@ SUSPENDED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", SUSPENDED)
 def test_hinf_of_plates_and_solids_on_springs_reaches_what_the_weights_require(case):
     make, *how = SUSPENDED[case]

@@ -59,6 +59,7 @@ def radius(machine_plant, controller):
     return np.abs(loop_on(machine_plant, controller).poles()).max()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the closed loop is unstable")
 def test_what_the_plain_design_does_not_tolerate_the_tolerant_one_does():
     machines = [machine(seed) for seed in range(1, 9)]
@@ -104,6 +105,7 @@ def test_a_stage_is_as_fast_as_its_uncertainty_allows():
     assert fast > 1.2 * slow
 
 
+@pytest.mark.slow
 def test_a_bandwidth_that_cannot_be_kept_is_refused_with_what_was_tried():
     with pytest.raises(InfeasibleError, match="no bandwidth of 600 Hz"):
         fx.design_stage(plant().uncertain(frequency=0.03), bandwidth=400.0)

@@ -82,6 +82,7 @@ def test_motions_between_nodes_are_those_of_one_polynomial():
         plate.dofs.row(at, "x")
 
 
+@pytest.mark.slow
 def test_no_mesh_of_the_drawing_has_its_frequencies():
     found = machine().poles(range(4, 20)).freq
     for n in (8, 16, 24):
@@ -91,6 +92,7 @@ def test_no_mesh_of_the_drawing_has_its_frequencies():
         assert np.median(off) > 0.005
 
 
+@pytest.mark.slow
 def test_machines_differ_and_each_is_itself():
     first, again, other = machine(1), fx.testbeds.wafer_stage(damping=0.001), machine(2)
     np.testing.assert_allclose(first.poles([9]).poles, again.poles([9]).poles, rtol=1e-9)
@@ -101,6 +103,7 @@ def test_machines_differ_and_each_is_itself():
     assert first.delay == 1.3
 
 
+@pytest.mark.slow
 def test_its_sensors_have_steps():
     static = fx.design_static(fx.assemble_plant(drawing(), ports()).discretized(RATE, delay=1.3))
     servo = fx.design_servo(
@@ -288,6 +291,7 @@ def test_predicted_errors_are_those_of_unseen_machines():
     assert np.abs(off).max() < 0.1
 
 
+@pytest.mark.slow
 def test_frequencies_are_uncertain_by_what_was_not_explained():
     """Measured modes by their deviation, others by the misfit of those measured and by the mesh."""
     model = drawing()

@@ -64,6 +64,7 @@ def test_a_slender_block_is_a_beam():
     assert (freq[:6] == 0.0).all()
 
 
+@pytest.mark.slow
 def test_meshes_of_the_drawing_come_nearer_and_stay_above():
     bare = fx.solve_modes(ritz_block(**BLOCK), count=18).freq[6:]
     coarse, fine = (
@@ -89,6 +90,7 @@ def test_motions_between_the_nodes():
         block.dofs.row(point, "s")
 
 
+@pytest.mark.slow
 def test_what_the_magnets_make_grow():
     """A rigid body on springs of negative stiffness, by hand; theirs are up to 10 % off."""
     box, mass = np.array(BLOCK["size"]), np.prod(BLOCK["size"]) * BLOCK["density"]
@@ -107,6 +109,7 @@ def test_what_the_magnets_make_grow():
     assert np.abs(grow / drawn - 1.0).max() > 0.005
 
 
+@pytest.mark.slow
 def test_machines_differ_and_refuse():
     one, other = (fx.testbeds.magnet_stage(individual=i).poles([7, 8, 9]) for i in (1, 2))
     off = np.abs(one.freq / other.freq - 1.0)

@@ -336,6 +336,7 @@ def numbers(poles):
     return [np.array(part) for part in parts]
 
 
+@pytest.mark.slow
 def test_designs_receive_only_answers():
     """Garbage for its matrices after measuring: designs stay the same to the bit."""
     hidden = wafer_stage(elements=(8, 8))

@@ -69,6 +69,7 @@ def fitted(individual, modes=KNOWN, elastic=True):
         return fx.update(model, unknown, [fx.Eigenvalues(measured(individual, modes))])
 
 
+@pytest.mark.slow
 def test_variances_are_those_of_balanced_groups():
     """Restricted likelihood of groups: sums of squares over n - 1, beside the usual one's two."""
     rng = np.random.default_rng(3)
@@ -88,6 +89,7 @@ def test_variances_are_those_of_balanced_groups():
     assert V[0, 0] == pytest.approx(found[0].deviation ** 2 + 1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("individual", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_no_mode_dictates_what_the_model_cannot_explain(individual):
     """0.5 kg: two poles alone, whose noise is 1e-5, gave 0.93 +- 0.04 and 0.85 +- 0.02."""
@@ -152,6 +154,7 @@ def test_true_frequencies_and_dampings_lie_inside():
     assert found[:, 1].mean() > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.benchmark
 def test_intervals_over_many_machines():
     """Shares inside, of modes that were measured and of the others (30 machines: 1.00 and 0.97)."""

@@ -55,6 +55,7 @@ def held_models(draw):
     return FEModel(M, K, D, dofs=dofs)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(model=held_models(), kind=st.sampled_from(KINDS), where=st.integers(0, 5))
 def test_any_damping_against_complex_step_and_differences(model, kind, where):

@@ -80,6 +80,7 @@ MASS = [AddedMass("2:z"), AddedMass("3:z")]
 # ---- every kind of residual finds the change
 
 
+@pytest.mark.slow
 def test_every_residual_finds_the_change_and_all_together(chain):
     parts = changed(chain, mass=[(1, 0.3)], stiffness=[(3, 8.0)])
     M, D, K = parts
@@ -116,6 +117,7 @@ def test_shapes_alone_find_a_spring(chain):
     assert fit.values[0] == pytest.approx(15.0, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_trust_region_and_gauss_newton_agree_with_the_paper(plate):
     target = oracle.truth(0.01)
     rom = plate.reduced(0.01, True)
@@ -186,6 +188,7 @@ def test_a_size_by_differences_of_the_full_model(plate, thicker_plate):
 # ---- bounds, priors, starts
 
 
+@pytest.mark.slow
 def test_bounds_hold_and_are_flagged(chain):
     parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
     residuals = [Eigenvalues(measured(parts, 1e-4))]
@@ -247,6 +250,7 @@ def test_posterior_covariance_is_that_of_the_linear_problem(chain):
     assert (high - low) / 2 == pytest.approx(1.959964 * fit.std[0], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_laplace_and_ensemble_draws_agree(chain):
     parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
     residuals = [Eigenvalues(measured(parts, 0.005))]
@@ -343,6 +347,7 @@ def test_tikhonov_and_truncation_bound_what_cannot_be_told(chain):
 # ---- before and after
 
 
+@pytest.mark.slow
 def test_identifiability_names_what_is_missing(chain, plate):
     poles = measured(changed(chain, mass=[(1, 0.3)]), 1e-3, modes=(1,))
     everywhere = [AddedMass(f"{i}:z") for i in range(1, 5)]

@@ -115,6 +115,7 @@ def test_the_full_model_with_the_parameters_of_a_fit(plate):
     assert np.abs(found / exact - 1).max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zeta", [0.01, 0.001])
 def test_a_slightly_negative_drag_is_no_obstacle(zeta):
     """The damper of the paper's update ends at -0.2 zeta N s/m: below the convention for drags."""

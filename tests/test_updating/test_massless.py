@@ -48,6 +48,7 @@ def exact(rom, mass=0.0, spring=0.0, damper=0.0):
     return poles[poles.imag > 1e-2]
 
 
+@pytest.mark.slow
 def test_a_mass_and_a_spring_on_a_massless_boundary_are_found(rom):
     poles = exact(rom, mass=0.4, spring=25.0)[:3]
     data = Eigenvalues(MeasuredModes(poles, modes=[2, 3, 4]))

@@ -36,6 +36,7 @@ def formal(fit):
     return fit.std / np.sqrt(fit.chi2 / fit.dof)
 
 
+@pytest.mark.slow
 def test_a_region_left_out():
     """All of E is 3 % higher, a strip another 12 %: E alone is wrong, which is said."""
     strip = np.zeros(PLATE["elements"], dtype=bool)
@@ -67,6 +68,7 @@ def test_a_region_left_out():
     assert "standard deviations" in text and "localise(" in text and " Hz (" in text
 
 
+@pytest.mark.slow
 def test_a_mass_looked_for_in_the_wrong_place():
     """Half a kilogram at one place, looked for at another: 0.17 kg there, which does not fit."""
     campaign = noisy_plate.Campaign()

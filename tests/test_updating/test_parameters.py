@@ -104,6 +104,7 @@ def test_a_mass_rides_on_all_translations_as_a_point_mass_does():
         AddedStiffness(place, direction="xyz")
 
 
+@pytest.mark.slow
 def test_a_mass_in_three_directions_is_found():
     """On a machine with such a mass; one along z alone leaves the motions in the plane as drawn."""
     sides = {"size": (0.4, 0.3, 0.05), "elements": (3, 2, 1)}

@@ -48,6 +48,7 @@ def test_matrices_are_those_of_the_plate(thickness):
         assert gap < 1e-9 * abs(whole).max()
 
 
+@pytest.mark.slow
 def test_three_per_cent_are_found(thickness, plate):
     """11 standard deviations off with the derivative alone."""
     rom = plate.reduced(0.01, False)

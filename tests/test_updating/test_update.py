@@ -39,6 +39,7 @@ def changed_poles(model, changes):
 # ---- the paper's plate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("zeta", "damping"), [(0.01, -0.2087), (0.001, -0.02087)])
 def test_modal_reduction_ends_at_the_papers_bias(plate, zeta, damping):
     target = oracle.truth(zeta)
@@ -51,6 +52,7 @@ def test_modal_reduction_ends_at_the_papers_bias(plate, zeta, damping):
     np.testing.assert_allclose(fit.values[0], oracle.modal_fit(zeta, target, False)[0], rtol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("zeta", "damping"), [(0.01, 3e-3), (0.001, 3e-4)])
 def test_one_attachment_vector_finds_the_mass(plate, zeta, damping):
     target = oracle.truth(zeta)
@@ -63,6 +65,7 @@ def test_one_attachment_vector_finds_the_mass(plate, zeta, damping):
     np.testing.assert_allclose(fit.values, expected, rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_one_percent_of_thickness_breaks_the_pins(plate, thicker_plate):
     target = oracle.truth(0.01)
     for attached in (False, True):
@@ -110,6 +113,7 @@ def test_updated_model_has_the_measured_poles(plate):
     np.testing.assert_allclose(poles[3:13], oracle.poles(M, D, K)[:10], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_modes_are_expanded_to_the_full_structure(plate):
     fit = fitted(plate, plate.reduced(0.01, True), oracle.truth(0.01))
     modes = fit.modes()
@@ -129,6 +133,7 @@ def test_modes_are_expanded_to_the_full_structure(plate):
     assert weight > 1 - 1e-6
 
 
+@pytest.mark.slow
 def test_update_takes_the_full_model_too(plate):
     fe = plate.model
     target = oracle.truth(0.0)
@@ -368,6 +373,7 @@ def test_a_fit_that_no_physical_step_improves_raises(make, as_reduced):
         update(free, [AddedStiffness("1:z")], [Eigenvalues(measured)])
 
 
+@pytest.mark.slow
 def test_start_at_the_answer_takes_no_step(plate):
     fit = fitted(plate, plate.reduced(0.01, True), oracle.truth(0.01))
     again = fitted(
@@ -381,6 +387,7 @@ def test_start_at_the_answer_takes_no_step(plate):
     assert np.array_equal(again.values, fit.values)
 
 
+@pytest.mark.slow
 def test_unobservable_parameters_are_named(plate, make):
     rom = plate.reduced(0.01, True)
     torsion = MeasuredModes([-15 + 1530j], modes=[4])

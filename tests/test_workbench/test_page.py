@@ -82,6 +82,7 @@ def test_a_slider_and_a_number_change_the_design_and_the_curves(page):
     assert (fig.y_range.start, page.views.freq_range.start) == (-55.0, 7.0)  # zoom stays
 
 
+@pytest.mark.slow
 def test_elements_come_go_move_and_are_switched_off(page):
     page.kind.value = "notch"
     page._add()
@@ -142,6 +143,7 @@ def test_what_is_wrong_is_said_and_the_last_good_design_stands(page):
     assert not page.message.visible
 
 
+@pytest.mark.slow
 def test_two_tabs_do_not_disturb_each_other(frf):
     bench = fx.workbench(frf, **SAMPLED, open_browser=False)
     one, two = Page(bench), Page(bench)
@@ -150,6 +152,7 @@ def test_two_tabs_do_not_disturb_each_other(frf):
     assert one.design.axes["y1"].gain == 2.0
 
 
+@pytest.mark.slow
 def test_what_is_refused_is_not_shown(frf):
     """The boxes hold the design's numbers; corners do not change places; a reload goes on."""
     bench = fx.workbench(frf, **SAMPLED, open_browser=False)
@@ -178,6 +181,7 @@ def test_what_is_refused_is_not_shown(frf):
         fields_of(fx.Notch(100.0), 1e3)[2].put(fx.Notch(100.0), 0.0)
 
 
+@pytest.mark.slow
 def test_a_handle_is_dragged_a_machine_is_clicked(frf):
     fleet = {f"stage {i}": measured(light(MODE * f)) for i, f in enumerate((1.0, 1.02, 1.3), 1)}
     page = Page(fx.workbench(fleet, **SAMPLED, open_browser=False))
@@ -206,6 +210,7 @@ def test_a_handle_is_dragged_a_machine_is_clicked(frf):
     assert page.loop.machine is page.machine
 
 
+@pytest.mark.slow
 def test_limits_are_drawn_and_judged():
     page = Page(fx.workbench(light(), open_browser=False))
     box = page.views._boxes[0]
@@ -219,6 +224,7 @@ def test_limits_are_drawn_and_judged():
     assert "not met" in page.judged.object
 
 
+@pytest.mark.slow
 def test_feedforward_and_files(page, tmp_path):
     page.side.forward[2].value = "1.5"
     assert page.design.axes["y1"].feedforward == (0.0, 0.0, 1.5)
@@ -244,6 +250,7 @@ def test_feedforward_and_files(page, tmp_path):
     assert "the design is of axes x at 0 Hz" in other.message.object
 
 
+@pytest.mark.slow
 def test_what_is_exported_is_the_controller(page, tmp_path):
     """C compiled, sections, MATLAB and the script against the matrices, over 400 samples."""
     K = page.design.controller()
@@ -404,6 +411,7 @@ def test_files_that_hold_a_plant(frf, tmp_path, capsys):
     assert "there is no file" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_the_page_in_its_cell(frf, monkeypatch):
     bench = fx.workbench(frf, **SAMPLED, open_browser=False)
     import panel as pn
