@@ -13,6 +13,7 @@ from flexplant.identification import (
     average_frfs,
     estimate_frf,
     identify_modes,
+    impact_frf,
     multisine,
 )
 from flexplant.identification.refine import hann_ratio
@@ -267,3 +268,22 @@ def test_averages_and_periods_advise_each_other():
     )
     assert len(said) == 1 and "H1Estimator(...)" in said[0] and "impact_frf" in said[0]
     assert not said_of(lambda: estimate_frf(random, 2 * random, 1000.0))[1]
+
+
+def test_averages_and_periods_send_blows_where_their_poles_come_out():
+    """Blows at times of no pattern: both methods name `impact_frf`, whose answer is right."""
+    rate, freqs, zeta = 1000.0, [41.3, 102.6], 0.008
+    u = np.zeros(10000)
+    for start in (30, 2140, 3990, 6105, 7950):
+        u[start : start + 3] = [0.5, 1.0, 0.5]
+    y = moved(u, freqs, zeta, np.array([[1.0, 0.8], [0.6, -1.0]]), rate)
+    y = y + 1e-3 * np.std(y) * np.random.default_rng(4).normal(size=y.shape)
+    for method in (H1Estimator(segment=2.0), Periodic(period=2.0)):
+        _, said = said_of(lambda m=method: estimate_frf(u, y, rate, method=m))
+        assert len(said) == 1 and "identification.impact_frf(" in said[0]
+    # from one call of the advice: the force, the response, the rate and a segment
+    test, said = said_of(lambda: impact_frf(u, y, rate, segment=1.5))
+    assert not said
+    found = identify_modes(test.frf, band=(20.0, 200.0), hold=rate)
+    assert found.freq == pytest.approx(freqs, rel=1e-3)
+    assert test.corrected(found).zeta == pytest.approx(zeta, rel=0.02)

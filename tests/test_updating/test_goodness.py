@@ -109,6 +109,27 @@ def test_a_bad_fit_warns_names_and_weighs_anew(chain):
     assert right.values[0] == pytest.approx(25.0, rel=1e-3)
 
 
+def test_responses_that_a_model_does_not_explain_print_no_deviation(chain):
+    """Coherent misfit of 45 lines is no noise: what +- would be is not known, and not printed."""
+    K, noise = np.array(chain.K), np.random.default_rng(3).normal(size=(2, 4, 1, 45))
+    freq, std = np.linspace(0.3, 3.2, 45), 1e-5
+    for stiffer, printed in ((0.0, True), (25.0, False)):
+        K[3, 3] += stiffer
+        s = 2j * np.pi * freq
+        heavy = np.array(chain.M) + np.diag([0, 0.3, 0, 0])
+        H = np.array([np.linalg.inv(z * z * heavy + z * chain.D + K)[:, :1] for z in s])
+        H = np.moveaxis(H, 0, 2) + std * (noise[0] + 1j * noise[1]) / np.sqrt(2)
+        frf = Frf(freq, H, inputs=["1:z"], outputs=[f"{k}:z" for k in range(1, 5)])
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            fit = update(chain, [AddedMass("2:z")], [FrfResidual(frf, variance=std**2)])
+        assert (fit.p_value > 1e-3) == printed
+        assert any("more than noise" in str(one.message) for one in said) != printed
+        named = [line for line in repr(fit).splitlines() if "mass at 2:z =" in line]
+        assert len(named) == 1 and ("+-" in named[0]) == printed
+        assert ("no +-: what is left is no noise" in repr(fit)) != printed
+
+
 def test_a_negative_mass_is_remarked_on(chain):
     poles = heavier(chain, mass=-0.4)
     data = MeasuredModes(poles, modes=[1, 2, 3, 4], covariance=(1e-3 * np.abs(poles)) ** 2)
