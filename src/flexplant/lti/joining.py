@@ -170,7 +170,7 @@ def checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:
 
 
 #: what selects channels: a name or number, several, or a slice
-Channels: TypeAlias = "str | int | slice | Sequence[str | int]"
+Channels: TypeAlias = str | int | slice | Sequence[str | int]
 
 
 def chosen_names(known: Sequence[str], key: Channels, side: str) -> list[str]:

@@ -37,7 +37,9 @@ class PlantChannel(Value):
     side: str
 
 
-Port: TypeAlias = "SensorPort | Actuator | PlantChannel"
+Port: TypeAlias = SensorPort | Actuator | PlantChannel
+
+
 #: what is chosen: sensors, actuators, or both
 Side: TypeAlias = Literal["y", "u", "yu"]
 

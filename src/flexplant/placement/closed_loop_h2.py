@@ -52,7 +52,7 @@ class MotionAndEffort(Criterion):
         given = [*shown(self.poi, self.axes), f"effort={self.effort:g}"]
         return f"{type(self).__name__}({', '.join(given)})"
 
-    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+    def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
         """Raise AssumptionError when w does not excite or the axes miss a rigid-body mode."""
         _require_control(plant, self.factors(plant), repr(self))
 
@@ -123,7 +123,7 @@ class PoiLqr(MotionAndEffort):
         found = float(np.einsum("ij,jk,ik->", seen, P, seen))
         return confirmed(cost, found)
 
-    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the cost as a function of the actuators alone; all else is computed once.
 
         A delay of d whole samples leaves what happens meanwhile to no controller: it is a constant,
@@ -174,7 +174,7 @@ def _require_control(plant: StandardPlant, factors: Mapping[str, float], what: s
 
 
 def _late(
-    plant: StandardPlant, rows: FloatArray, candidates: Sequence[Any], fraction: float
+    plant: StandardPlant, rows: FloatArray, candidates: Sequence[Port], fraction: float
 ) -> tuple[IntArray, StateSpace]:
     """Return the plant of all candidates with a part of a sample of delay, and the states it adds.
 
@@ -251,7 +251,7 @@ class ClosedLoopH2(MotionAndEffort):
         found += float(np.sum((self.effort * F @ K) @ noise * (self.effort * F @ K)))
         return confirmed(cost, found)
 
-    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+    def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
         """Raise AssumptionError when a rigid-body mode is missed or a candidate fits no filter."""
         super().check(plant, candidates)
         sensors = [port for port in candidates if side_of(port) == "y"]

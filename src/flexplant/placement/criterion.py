@@ -151,10 +151,10 @@ class Criterion(Value):
     def __call__(self, plant: StandardPlant) -> float:
         """Return the criterion on a plant."""
 
-    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+    def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
         """Raise AssumptionError for what no choice among the candidates can repair."""
 
-    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the scores of choices among candidates; what they share is computed once.
 
         Parameters
@@ -232,6 +232,6 @@ class Wrapping(Criterion):
         """Return the unit of the criterion that is wrapped."""
         return self.inner.unit(plant)
 
-    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+    def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
         """Check the criterion that is wrapped."""
         as_criterion(self.criterion, sides_of(candidates)).check(plant, candidates)

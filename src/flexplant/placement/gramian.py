@@ -16,6 +16,7 @@ from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..tolerances import divisor
+from .candidates import Port
 from .convex import MEASURES, SummedWorth, by_size, summed
 from .criterion import Criterion, Scorer
 
@@ -79,7 +80,7 @@ class ByShapes(Criterion):
         scorer = self.of(plant, shapes_of(plant, ports))
         return float(scorer.score([tuple(range(len(ports)))])[0])
 
-    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the criterion of choices among candidates."""
         return self.of(plant, shapes_of(plant, candidates))
 
@@ -219,7 +220,7 @@ class ModalGramian(Criterion):
         ports = getattr(plant.assembled.ports, self.sides)
         return np.asarray(self._each(plant.assembled.realisation, ports).sum(axis=0))
 
-    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the measure of sums of the candidates' Gramians."""
         return summed(self._each(plant.assembled.realisation, candidates), self.measure)
 

@@ -64,7 +64,7 @@ class OverPositions(Wrapping):
         values = [self.criterion(there) for there in self._plants(plant)]
         return float(over(self.measure, values))
 
-    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+    def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
         """Check the criterion at every position, and that the candidates suffice there."""
         for there, ports in self._there(plant, candidates):
             rigid = RigidPart.of(there, sides_of(ports), ports)
@@ -77,7 +77,7 @@ class OverPositions(Wrapping):
                 )
             super().check(there, ports)
 
-    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the scores by those at each position."""
         inner, side = self.inner, sides_of(candidates)
         parts, rigid = [], []
@@ -100,7 +100,7 @@ class OverPositions(Wrapping):
             yield plant.at(**dict(zip(grid, values, strict=True)))
 
     def _there(
-        self, plant: StandardPlant, candidates: Sequence[Any]
+        self, plant: StandardPlant, candidates: Sequence[Port]
     ) -> Iterator[tuple[StandardPlant, list[Port]]]:
         """Yield the plant with all candidates at each position, and where these are there."""
         keys = [(side_of(port), port.name) for port in candidates]

@@ -19,12 +19,12 @@ from ..plant import Actuator, StandardPlant, larger_plant
 from ..plant.dynamics import followed
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from .candidates import with_side
+from .candidates import Port, with_side
 from .criterion import Criterion, OnBoth, OnPlant, Scorer
 from .quadratic import WorstRow, quadratic
 
 #: POIs, or axes of a POI, that count, each once or by a factor
-Named: TypeAlias = "str | Sequence[str] | Mapping[str, float] | None"
+Named: TypeAlias = str | Sequence[str] | Mapping[str, float] | None
 
 
 def checked_names(given: Any, name: str) -> tuple[str, ...] | Mapping[str, float] | None:
@@ -124,7 +124,7 @@ def _own_states(plant: StandardPlant) -> int:
     return (plant.continuous if plant.is_assembled else plant).system.n_states
 
 
-def measured_rows(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArray:
+def measured_rows(plant: StandardPlant, candidates: Sequence[Port]) -> FloatArray:
     """Return what sensors see of these states, over the deviation of one sample."""
     whole = with_side(plant, "y", candidates)
     rows = [whole.y.index(port.name) for port in candidates]
@@ -137,7 +137,7 @@ def sensor_rows(plant: StandardPlant) -> list[int]:
     return [plant.y.index(name) for name in sensors(plant)]
 
 
-def pushed_columns(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArray:
+def pushed_columns(plant: StandardPlant, candidates: Sequence[Port]) -> FloatArray:
     """Return what a unit of each actuator, held over one sample, does to these states."""
     if not plant.is_assembled:
         return np.asarray(plant.B2[:, [plant.u.index(port.name) for port in candidates]])
@@ -145,14 +145,14 @@ def pushed_columns(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArra
     return held_exactly(pushed(plant, candidates, silent), 1.0 / plant.dt).B
 
 
-def pushed(plant: StandardPlant, candidates: Sequence[Any], rows: FloatArray) -> StateSpace:
+def pushed(plant: StandardPlant, candidates: Sequence[Port], rows: FloatArray) -> StateSpace:
     """Return the system between actuators and some rows of its states, continuous."""
     g = with_side(plant.continuous, "u", candidates).system
     B = g.B[:, g.input_index([port.name for port in candidates])]
     return StateSpace(g.A, B, rows, np.zeros((len(rows), B.shape[1])), blocks=g.blocks)
 
 
-def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:
+def plain(plant: StandardPlant, candidates: Sequence[Port]) -> bool:
     """Return whether candidates change rows of B or C only: they, y and u have no states.
 
     Disturbances may have: a shape, the acceleration of the base.
@@ -268,7 +268,7 @@ class PoiVariance(Criterion):
         """Return the unit of the square root."""
         return unit_of(plant, self._factors(plant))
 
-    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+    def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
         """Raise AssumptionError when w misses a rigid-body mode or a candidate fits no filter."""
         self._factors(plant)
         _ = plant.noise_factor
@@ -285,7 +285,7 @@ class PoiVariance(Criterion):
         if plant.is_assembled:
             _check_direct(plant, candidates)
 
-    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the variance as a function of the sensors alone; all else is computed once.
 
         Delay lines of u are left out: their states are known exactly. Where ports have

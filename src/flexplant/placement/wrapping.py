@@ -75,7 +75,7 @@ class LeftOutModes(Criterion):
         own = getattr(plant.assembled.ports, SIDES[self.of])
         return float(self.scorer(plant, own).value(range(len(own))))
 
-    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the share of choices among candidates of this kind; others do not count."""
         own = [side_of(port) == SIDES[self.of] for port in candidates]
         counted = np.array(own, dtype=np.float64)
@@ -156,12 +156,12 @@ class Penalised(Wrapping):
         """Return it on a plant."""
         return float(_penalised_sum(self.criterion(plant), self.penalty(plant), self.weight))
 
-    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+    def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
         """Check both."""
         super().check(plant, candidates)
         as_criterion(self.penalty, sides_of(candidates)).check(plant, candidates)
 
-    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the scores of choices by those of both."""
         base, more = self.inner, as_criterion(self.penalty)
         return PenalisedScores(
@@ -224,12 +224,12 @@ class OverMachines(Wrapping):
         values = [self.criterion(machine.with_ports(ports)) for machine in self.machines]
         return float(over(self.measure, values))
 
-    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+    def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
         """Check the criterion on every machine."""
         for machine in self._with(plant):
             super().check(machine, candidates)
 
-    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the scores by those on each machine."""
         inner = self.inner
         parts = tuple(inner.scorer(machine, candidates) for machine in self._with(plant))

@@ -23,7 +23,7 @@ from ..sparse.factor import (
 from ..sparse.lanczos import rounding_of
 
 #: what becomes a matrix of a structure
-MatrixLike: TypeAlias = "npt.ArrayLike | sp.sparray | sp.spmatrix"
+MatrixLike: TypeAlias = npt.ArrayLike | sp.sparray | sp.spmatrix
 #: relative to the diagonal: entries of a symmetric matrix differ by less from their mirror images
 _SYMMETRY_TOLERANCE = 1e-9
 #: relative to the diagonal: K and D may have eigenvalues this far below zero

@@ -160,7 +160,7 @@ def mode_columns(modes: Any, eigen: Eigen) -> list[int]:
     first, last = eigen.n_rigid + 1, eigen.n_rigid + eigen.poles.size
     if not eigen.poles.size:
         raise ModelError("the model has no oscillating mode: there is no eigenvalue to follow.")
-    if not several(modes):
+    if not several(modes) or not len(modes):
         raise LabelError(f"modes must be a list of numbers, got {short(modes)}. Pass [6, 7], say.")
     for number in modes:
         if isinstance(number, bool) or number not in range(1, last + 1):

@@ -24,7 +24,7 @@ from ...labels import DofSet, Interpolation
 from .element_matrices import Grid
 
 #: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre
-Field: TypeAlias = "float | Sequence[Any] | FloatArray | Callable[..., float]"
+Field: TypeAlias = float | Sequence[Any] | FloatArray | Callable[..., float]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

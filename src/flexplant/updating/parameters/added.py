@@ -17,7 +17,7 @@ from ...labels import DIRECTIONS, Place
 #: how the function that builds a model is written
 MAKES = "It returns an FEModel: lambda t: kirchhoff_plate(thickness=t, ...), say."
 #: derivatives of M, D and K to one parameter, None where zero
-Derivatives: TypeAlias = "tuple[Matrix | None, Matrix | None, Matrix | None]"
+Derivatives: TypeAlias = tuple[Matrix | None, Matrix | None, Matrix | None]
 
 
 class Parameter(Value):
