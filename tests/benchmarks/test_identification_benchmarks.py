@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import scipy.io
 
+from disagreeing import drifting, roving
 from flexplant.identification import identify_modes
 from flexplant.lti import Frf
-from oracles_identification import drifting, modal_frf, noisy, pole, roving
+from oracles_identification import modal_frf, noisy, pole
 
 pytestmark = pytest.mark.benchmark
 FREQ = np.arange(10.0, 150.0, 0.05)

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import scipy.io
 
+from disagreeing import drifting, roving
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.identification import H1Estimator, estimate_frf, identify_modes
 from flexplant.lti import Frf
 from flexplant.store import load
-from oracles_identification import drifting, modal_frf, noisy, pole, roving
+from oracles_identification import modal_frf, noisy, pole
 from shared_data import DATA
 
 

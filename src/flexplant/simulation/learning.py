@@ -7,7 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..checks import FloatArray, Value, function, instance, positive, short, whole, with_unit
+from ..checks import (
+    MOST_DRAWS,
+    FloatArray,
+    Value,
+    function,
+    instance,
+    positive,
+    short,
+    whole,
+    with_unit,
+)
 from ..errors import ModelError, counted
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import force_name
@@ -134,7 +144,7 @@ def learn_feedforward(
     pseudo = np.linalg.pinv((effects[used] / unit[used, None]).T, rcond=_RESOLVED)
     function(trial, "trial", "It takes a Feedforward and returns a Response.")
     current, errors, gains = start, [], []
-    for _ in range(whole(trials, "trials")):
+    for _ in range(whole(trials, "trials", maximum=MOST_DRAWS)):
         error = _error(trial(current), channels)
         if error.size != effects.shape[1]:
             raise ModelError(
