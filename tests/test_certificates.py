@@ -336,6 +336,7 @@ def test_a_structured_loop_that_is_not_stable_has_no_h2_norm():
         structured._verified(two_masses(), loop, (fx.synthesis.H2(),), 1.0)
 
 
+@pytest.mark.slow
 def test_the_proven_tolerance_ends_where_the_stiffness_of_the_mode_does():
     """By hand: the lead damps the mode as long as there is one, 10 units of 5 % either way."""
     deltas = off_by(0.05)

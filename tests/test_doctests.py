@@ -38,6 +38,7 @@ def check(modules):
     return sum(tried for tried, _ in found.values())
 
 
+@pytest.mark.slow
 def test_doctests():
     assert check([name for name in MODULES if not name.startswith(DESIGNS)]) > 500
 

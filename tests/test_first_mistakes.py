@@ -124,6 +124,7 @@ ANSWERS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_nothing_is_dropped_without_a_word():
     """An error of ours that is caught and followed by None, continue or pass goes into the log."""
     ours = {n for n, item in vars(errors).items() if isinstance(item, type)}

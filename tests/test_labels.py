@@ -29,6 +29,7 @@ def dofsets(draw):
     )
 
 
+@pytest.mark.slow
 @given(dofsets())
 def test_labels_and_rows_are_each_other_s_inverse(dofs):
     assert [dofs.index(label) for label in dofs] == list(range(len(dofs)))
@@ -41,6 +42,7 @@ def test_labels_and_rows_are_each_other_s_inverse(dofs):
         assert dofs.row(xyz, label.split(":")[1])[dofs.index(label)] == 1
 
 
+@pytest.mark.slow
 @given(dofsets(), st.randoms())
 def test_select_keeps_the_order_given(dofs, random):
     labels = list(dofs)

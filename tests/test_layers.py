@@ -7,7 +7,11 @@ import sys
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 import flexplant
+
+pytestmark = pytest.mark.slow  # every module is parsed
 
 ROOT = Path(flexplant.__file__).parent
 #: in import order; the first entry is the foundation, whose modules may use each other

@@ -236,6 +236,7 @@ def test_a_long_first_item_and_a_long_rest(monkeypatch, capsys):
         assert re.fullmatch(r"machines: 0 s, 1 of 4 done, some 1 s more" + more, said[1])
 
 
+@pytest.mark.slow
 def test_what_is_known_before_is_said_before(monkeypatch, capsys):
     """Once, with the advice where it is long; what a checkpoint has does not count as quick."""
     for seconds, line in ((4.4, "some 4 s expected"), (444.0, "some 400 s expected. Take fewer.")):

@@ -242,6 +242,7 @@ def test_the_checks_can_fail():
 ELSEWHERE = {"append", "split", "matched", "Filter", "LoopLimits"}
 
 
+@pytest.mark.slow
 def test_names_in_advice_are_at_the_front_or_have_their_room():
     """`GroundSpring` in an error sends a reader to search; `fx.plant.GroundSpring` does not."""
     homes = {n: room for room, where in rooms().items() for n in dir(where) if room != "errors"}

@@ -373,6 +373,7 @@ def not_refused(entries, kinds=KINDS, step=NEXT_STEP):
 GROUPS = by_function(CALLS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", GROUPS)
 def test_wrong_kinds(function):
     wrong = not_refused(GROUPS[function])
@@ -401,6 +402,7 @@ def test_what_counts_as_a_next_step():
         assert NEXT_STEP.search(text)
 
 
+@pytest.mark.slow
 def test_the_rate_of_these_tests_is_the_stages():
     assert plant().dt == 1 / RATE
     with pytest.raises(FlexplantError, match=r"mode 70 at .* not below half the rate, 1000 Hz"):
@@ -433,6 +435,7 @@ def test_a_system_where_a_plant_is_needed_is_told_what_it_lacks():
                 function(sys)
 
 
+@pytest.mark.slow
 def test_a_system_whose_labels_tell_is_a_plant_where_no_more_is_needed():
     """The H-infinity controller of an assembled plant, weighted, and of its bare system."""
     small = sampled(some_modes(count=4, attached=False))

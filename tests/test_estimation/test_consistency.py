@@ -84,6 +84,7 @@ def test_a_right_model_passes_as_often_as_stated():
     assert low <= passed <= high
 
 
+@pytest.mark.slow
 def test_a_right_model_of_the_plate():
     found = judged(machine(), machine())
     assert found.holds, found
@@ -96,6 +97,7 @@ def test_a_right_model_of_the_plate():
         assert mean == pytest.approx(1.0, abs=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "word"), [(1.2, "larger"), (0.8, "smaller")])
 def test_all_noises_off_by_a_factor(factor, word):
     found = judged(machine(), plant(scale=factor, sensor_scale=factor))
@@ -105,6 +107,7 @@ def test_all_noises_off_by_a_factor(factor, word):
     assert found.nees["die:z"][0] == pytest.approx(factor**2, rel=0.25, abs=0)
 
 
+@pytest.mark.slow
 def test_process_noise_alone_is_off():
     found = judged(machine(), plant(scale=3.0))
     assert found.cause == "noise ratio"
@@ -128,6 +131,7 @@ def test_a_wrong_frequency_is_named_with_its_mode(mode):
     assert found.peaks[0][0] == pytest.approx(omega / (2 * np.pi), rel=0.03, abs=0)
 
 
+@pytest.mark.slow
 def test_a_truncated_model_is_named():
     found = judged(plant(count=8), machine())
     assert found.cause == "truncation"
@@ -136,7 +140,7 @@ def test_a_truncated_model_is_named():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("more", [2, pytest.param(15, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("more", [2, 15])
 def test_modes_left_out_beside_a_kept_one_are_no_change_of_it(more):
     """Modes 9 and 10 are a pair, mode 11 lies 1 % above: what shows is near mode 9, kept."""
     blind = judged(machine(), plant(count=9 + more))
@@ -169,7 +173,7 @@ def test_a_folded_mode_beside_a_kept_one_is_named():
     [
         (7, "freq", 0.04),
         (4, "damping", -0.8),
-        pytest.param(11, "freq", 0.05, marks=pytest.mark.slow),
+        (11, "freq", 0.05),
     ],
 )
 def test_a_changed_mode_is_no_other_mode(mode, kind, amount):
@@ -207,6 +211,7 @@ def test_one_sensor_shows_whether_a_mode_has_moved_or_is_left_out(kept, mode, ki
     assert cause == "truncation" or f"near mode {mode} " in found.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sensor", "size"), [("y1", 20e-9), ("y3", -5e-9), ("y2", 1e-6)])
 def test_an_offset_of_a_sensor_is_named_with_its_size(sensor, size):
     records, _ = recorded(machine())
@@ -238,6 +243,7 @@ def test_outliers_are_named_and_gated(count):
     assert consistency(observer, observer.estimate(bad)).causes == ("outliers", "offset")
 
 
+@pytest.mark.slow
 def test_a_blow_that_a_mode_left_out_rings_from_is_no_outlier():
     records, _ = recorded(machine())
     ringing = np.zeros(20000)

@@ -21,6 +21,7 @@ def machine(places):
     return sampled(reduced(), ports(y=y, references=()))
 
 
+@pytest.mark.slow
 def test_as_many_motions_as_sensors_are_the_same_filter():
     plant = machine(CORNERS[:3])
     motions = decouple(plant).to_motions

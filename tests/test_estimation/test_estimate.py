@@ -186,11 +186,7 @@ def test_the_stationary_filter_in_blocks_is_the_plain_loop():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
-    [
-        Filter(),
-        FixedLag(60),
-        *(pytest.param(m, marks=pytest.mark.slow) for m in (Predictor(), FixedLag(7), Smoother())),
-    ],
+    [Filter(), FixedLag(60), Predictor(), FixedLag(7), Smoother()],
 )
 def test_blocks_and_the_time_varying_filter_agree_around_gaps(method, monkeypatch):
     kalman = observer()
@@ -304,6 +300,7 @@ def test_a_gate_makes_outliers_missing_samples(method):
     assert not blind.gated.size and "beyond" not in repr(blind)
 
 
+@pytest.mark.slow
 def test_a_gate_that_silences_a_sensor_warns():
     kalman = observer()
     y, u, _ = run(kalman.model, 1000, seed=8)
@@ -413,7 +410,7 @@ def test_the_report_by_lag_is_that_of_the_estimates():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("truncated", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("truncated", [False, True])
 @pytest.mark.parametrize("method", [Predictor(), Filter(), FixedLag(4), Smoother()])
 def test_a_moving_poi_is_at_each_sample_a_poi_that_stands_there(method, truncated):
     """Start, a gap, blocks, compliance and noise of modes left out: row by row the fixed POI's."""

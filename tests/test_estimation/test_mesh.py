@@ -81,6 +81,7 @@ def test_modes_have_the_mesh_of_their_model(kind):
     assert np.median(found) == pytest.approx(1.05, abs=0.06)
 
 
+@pytest.mark.slow
 def test_a_coarse_mesh_is_warned_of_in_every_form_of_the_larger_model():
     coarse = plate(8)
     modes = solve_modes(coarse, count=100)

@@ -18,6 +18,7 @@ def matrices(plant):
     return {name: getattr(m, name) for name in ("A", "C1", "C2", "Q", "R")}
 
 
+@pytest.mark.slow
 def test_variances_are_those_of_the_recursion_in_the_long_run():
     plant = plate_plant(1e-2, count=8, sensor_asd=1e-10)
     found = design_multirate(plant, EVERY)

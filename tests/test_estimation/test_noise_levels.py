@@ -128,7 +128,7 @@ def chain_record(count, rate, seed, duration=4.0):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "kept", "rate", "kind"),
-    [(5, 3, 2e3, "modes"), pytest.param(8, 4, 1e4, "plant", marks=pytest.mark.slow)],
+    [(5, 3, 2e3, "modes"), (8, 4, 1e4, "plant")],
 )
 def test_modes_left_out_are_no_noise_of_the_sensors(count, kept, rate, kind):
     """Given the true densities: without larger= sensors would be 100 times noisier, +- 0.3 %."""
@@ -172,6 +172,7 @@ def test_outliers_are_left_out_by_a_gate():
     assert np.all(np.abs(found.ratios - [1.0, 1.0]) < 0.6)
 
 
+@pytest.mark.slow
 def test_refusals():
     with pytest.raises(ModelError, match="at least 1000 samples"):
         estimate_noise(one_state(0.9), scalar_record(1, 900))

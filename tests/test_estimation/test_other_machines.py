@@ -66,6 +66,7 @@ def joint(machine, kalman, law):
     return np.diag(E @ X @ E.T + Dy @ R @ Dy.T)
 
 
+@pytest.mark.slow
 def test_in_a_closed_loop_on_another_machine_it_is_the_joint_lyapunov_equation():
     kalman, law = observer(), servo()
     for truth in (machine(), kalman.plant):

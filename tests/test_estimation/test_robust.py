@@ -62,6 +62,7 @@ def truth(plant):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("a", [0.6, 1.0])
 def test_no_pair_of_gains_has_a_smaller_peak(a):
     """One state: the best of all filters has one state, so two gains are all that there is."""

@@ -49,6 +49,7 @@ def random_plant(direct):
     return (A, G, C, H), by_hand(A, G, C, H)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direct", [True, False])
 def test_stationary_gains_are_those_of_the_published_recursion(direct):
     (A, G, C, H), plant = random_plant(direct)

@@ -150,6 +150,7 @@ def test_the_direct_way_is_biased_towards_the_controller_and_the_joint_one_is_no
     assert off(direct, G) > 2.5
 
 
+@pytest.mark.slow
 def test_noise_that_returns_through_the_controller_is_warned_of():
     """Forces of 1 N, disturbances of 0.5 N, a 50 Hz loop; in open loop there is no warning."""
     rng = np.random.default_rng(1)

@@ -93,6 +93,7 @@ def records(rng, n=2**17, noise_u=0.0, noise_y=0.0, gain=1.5):
     return u + noise_u * rng.normal(size=n), y + noise_y * rng.normal(size=n)
 
 
+@pytest.mark.slow
 def test_h1_h2_hv_have_the_bias_of_their_textbook():
     """Noise on the input lowers H1 by 1/(1 + N/S), noise on the output raises H2 by (1 + N/S)."""
     u, y = records(np.random.default_rng(2), noise_u=0.5, noise_y=0.6)
@@ -150,6 +151,7 @@ def floating():
     return loop, r, *loop.run(r, v)
 
 
+@pytest.mark.slow
 def test_h1_is_biased_under_feedback_and_joint_input_output_is_not(floating):
     loop, r, u, y = floating
     method = H1Estimator(segment=0.5)
@@ -282,6 +284,7 @@ def test_h2_needs_as_many_outputs_as_inputs():
         assert np.abs(frf.data - mix[:, :, None]).max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("periods", [2, 3, 4, 7])
 def test_drift_between_periods_is_not_taken_for_more_noise_than_it_makes(periods):
     """A random walk leaks into all lines, of the mean of P periods with 1/P^2 of its power."""

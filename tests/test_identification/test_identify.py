@@ -81,6 +81,7 @@ def test_close_and_repeated_modes_with_rigid_body_motion():
     assert np.sqrt(np.mean(rest**2)) < 1.05
 
 
+@pytest.mark.slow
 def test_the_pair_that_was_merged_and_the_mode_that_became_zero():
     """One reference, poles at 47.5 and 48.2 Hz; sdypy-EMA merged them and gave a 0 Hz mode."""
     truth = pole([47.5, 48.2, 112.0], [0.004, 0.004, 0.01])
@@ -353,6 +354,7 @@ def test_flags_say_what_stays():
         ).automatic()
 
 
+@pytest.mark.slow
 def test_a_held_machine_needs_its_hold():
     freq = np.arange(20.0, 200.0, 0.1)
     rate, truth = 500.0, pole([60.0, 130.0], [0.01, 0.005])
@@ -515,6 +517,7 @@ def test_bad_choices_are_refused():
         PoleSelection([-1 - 10j], [[1.0]])
 
 
+@pytest.mark.slow
 def test_identified_response_is_asked_at_positive_frequencies():
     found = identify_modes(measured(CLOSE[:2], PHI[:, :2], n_in=2), orders=range(2, 12))
     assert isinstance(found, IdentifiedModes)
@@ -522,6 +525,7 @@ def test_identified_response_is_asked_at_positive_frequencies():
         found.frf(np.array([0.0, 1.0]))
 
 
+@pytest.mark.slow
 def test_resonances_lost_in_short_segments_are_refused_with_their_cause():
     """One pole of 0.05 % at 150 Hz in segments of 2 s: 0.3 lines wide."""
     rng, rate = np.random.default_rng(1), 1000.0

@@ -143,6 +143,7 @@ def test_what_the_window_makes_of_a_pole_against_a_sum():
         assert abs(slope - (ahead - behind) / (2 * h))[0] < 1e-6 * abs(slope[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lines", "off"), [(0.5, 0.1), (4.0, 0.02)])
 def test_damping_is_that_of_the_machine_through_the_window(lines, off):
     """A resonance of half a line became two or three poles, one of four lines was 10 % wider."""
@@ -208,6 +209,7 @@ def said_of(call):
     return found, [str(one.message) for one in said]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("window", "lines"), [("boxcar", 4), ("boxcar", 16), ("hamming", 8)])
 def test_what_leakage_adds_to_the_damping_is_warned_of_with_its_size(window, lines):
     """Random excitation: 2 to 9 % more damping, 10 deviations and more, was silent from 5 lines."""

@@ -58,6 +58,7 @@ def test_poles_and_their_uncertainty():
     assert np.abs(scores.mean(axis=0)).max() < 4 / np.sqrt(12)
 
 
+@pytest.mark.slow
 def test_what_the_record_does_not_hold_is_refused():
     y = shaken(np.random.default_rng(0), 6000)
     named = dict(zip("abcd", y, strict=True))

@@ -73,6 +73,7 @@ def hum(freq, at, window):
     return np.fft.fft(tone)[: freq.size] / 2048
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:segments of 1 s:flexplant.errors.FlexplantWarning")
 @pytest.mark.parametrize("window", [None, "hann"])
 @pytest.mark.parametrize("known", [True, False])
@@ -97,6 +98,7 @@ def test_mains_in_some_outputs_is_left_out_and_named(window, known):
         assert np.abs([error.real / found.std.real, error.imag / found.std.imag]).max() < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [(150.0, 0.001, 0.1), (61.0, 0.0025, 1.0)], ids=["on", "beside"])
 def test_a_mode_at_a_mains_multiple_is_kept(case):
     """0.1 % at 150 Hz are three lines; 61 Hz is a third of a line wide, next to the line at 60."""
@@ -110,6 +112,7 @@ def test_a_mode_at_a_mains_multiple_is_kept(case):
     assert found.rejected == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("band", [(150, 300), (100, 300), (50, 400), (180, 250), (200, 225)])
 def test_one_published_mode_has_no_twin(band):
     with warnings.catch_warnings():
@@ -130,6 +133,7 @@ def test_a_peak_whose_phase_rises_is_found_all_the_same(band):
     assert found.freq.tolist() == pytest.approx([192.59], abs=0.2)
 
 
+@pytest.mark.slow
 def test_a_refinement_that_takes_too_much_leaves_the_first_answer(monkeypatch):
     frf, _ = roving(0.0, 1, step=0.3)
     first = identify_modes(frf, refine=False)
@@ -174,6 +178,7 @@ def test_outputs_of_a_roving_sensor_share_four_modes(shift, tmp_path):
 CASES = [(1e-4, 8, 0.004), (1e-3, 8, 0.02), (1e-4, 2, 0.004)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shift", "sensors", "zeta"), CASES)
 def test_inputs_of_a_roving_hammer_share_four_modes(shift, sensors, zeta):
     """6 to 10 modes before where sensors are as many as places hit, in silence."""
@@ -188,6 +193,7 @@ def test_inputs_of_a_roving_hammer_share_four_modes(shift, sensors, zeta):
     assert found.shapes.shape == (sensors, 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("references", [2, 3])
 def test_broad_resonances_of_several_references_have_one_pole_each(references):
     """Two poles of one participation each, 5 to 8 modes at 18 of 32 machines, 5 s a fit."""
@@ -201,6 +207,7 @@ def test_broad_resonances_of_several_references_have_one_pole_each(references):
     assert np.sum(inside) >= 10  # of 95 % fewer are inside once in fifty such tests
 
 
+@pytest.mark.slow
 def test_two_modes_of_one_participation_are_two():
     rng, freq = np.random.default_rng(0), np.arange(20.0, 120.0, 0.3)
     truth, phi = pole([47.5, 49.0, 90.0], [0.02, 0.02, 0.02]), rng.normal(size=(6, 3))
@@ -213,6 +220,7 @@ def test_two_modes_of_one_participation_are_two():
     assert found.inconsistency is None
 
 
+@pytest.mark.slow
 def test_what_was_measured_together_has_one_shift():
     frf, truth = roving(1e-3, 3, step=0.3, n_in=2, setups=3)
     y = list(frf.outputs)
@@ -229,6 +237,7 @@ def test_what_was_measured_together_has_one_shift():
             identify_modes(frf, setups=wrong)
 
 
+@pytest.mark.slow
 def test_runs_of_a_drifting_machine_give_means_and_how_they_differ():
     """Of the mean of such runs 8 % of the frequencies lay within 1.96 deviations, in silence."""
     inside, dofs = 0, {"y1": "a", "u1": "a", "y2": "b", "u2": "b"}
@@ -249,6 +258,7 @@ def test_runs_of_a_drifting_machine_give_means_and_how_they_differ():
         identify_modes([runs[0], runs[1].select(outputs=["y1"])])
 
 
+@pytest.mark.slow
 def test_runs_of_a_machine_that_stays_are_their_mean():
     runs, truth, _ = drifting(0.0, 1)
     alike = np.full((5, 5, runs[0].freq.size), 0.5) + 0.5 * np.eye(5)[:, :, None]
@@ -271,6 +281,7 @@ def test_default_orders_are_those_that_the_lines_afford():
     assert found.freq.tolist() == pytest.approx([190.0], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_costly_refinement_is_said_and_the_first_answer_is_near_it(monkeypatch, capsys):
     monkeypatch.setattr("flexplant.identification.identify.CHEAP", 10.0)
     frf, truth = roving(0.0, 1)
@@ -286,6 +297,7 @@ def test_a_costly_refinement_is_said_and_the_first_answer_is_near_it(monkeypatch
     assert np.abs((first.poles - best.poles).imag / best.std.imag).max() < 1.0
 
 
+@pytest.mark.slow
 def test_poles_at_the_edge_are_listed_and_the_limit_of_poles_holds():
     frf, _ = roving(0.0, 1)
     edge = identify_modes(frf, band=(20.0, 110.15))

@@ -371,6 +371,7 @@ def test_names_of_values_are_unique():
     assert sorted(set(every)) == sorted(every)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_goes_through_a_file(name, tmp_path):
     value = zoo().get(name)
@@ -384,6 +385,7 @@ def test_goes_through_a_file(name, tmp_path):
     same(value, pickle.loads(pickle.dumps(value)), name)
 
 
+@pytest.mark.slow
 def test_what_was_loaded_works(tmp_path):
     """Designs and runs from files give the same numbers."""
     loop = zoo()["ClosedLoop"]
@@ -398,6 +400,7 @@ def test_what_was_loaded_works(tmp_path):
     assert np.array_equal(again.sample(1)[0].system.A, uncertain.sample(1)[0].system.A)
 
 
+@pytest.mark.slow
 def test_files_of_other_versions(tmp_path, monkeypatch):
     """A field that came later has its default; what the class does not know is named."""
     plant = zoo()["StandardPlant"]

@@ -133,6 +133,7 @@ def test_hdf5(tmp_path, monkeypatch):
         read_exodus_modes(path)
 
 
+@pytest.mark.slow
 def test_cut_or_foreign_files(tmp_path):
     path, part = write(tmp_path / "a.exo"), tmp_path / "b.exo"
     content = path.read_bytes()

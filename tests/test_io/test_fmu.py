@@ -94,6 +94,7 @@ def test_plant_and_controller_as_units_give_the_run_of_simulate(version, tmp_pat
         np.testing.assert_allclose(values, run[name], atol=1e-9 * np.abs(run[name]).max())
 
 
+@pytest.mark.slow
 @compiles
 @pytest.mark.parametrize("version", VERSIONS)
 def test_fmpy_runs_a_unit_with_names_of_any_letters(version, tmp_path):

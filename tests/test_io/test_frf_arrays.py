@@ -34,6 +34,7 @@ READERS = {"npz": read_frf_npz, "mat": read_frf_mat}
 KINDS = pytest.mark.parametrize("kind", ["npz", "mat"])
 
 
+@pytest.mark.slow
 @KINDS
 def test_everything_the_file_holds(tmp_path, kind):
     coherence, variance = RNG.uniform(size=DATA.shape), RNG.uniform(size=DATA.shape)
@@ -60,6 +61,7 @@ def test_everything_the_file_holds(tmp_path, kind):
         READERS[kind](path, quantity="displacement")
 
 
+@pytest.mark.slow
 @KINDS
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_the_axis_of_frequency_is_found(tmp_path, kind, axis):

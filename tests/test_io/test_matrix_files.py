@@ -259,6 +259,7 @@ def test_no_matlab_file_is_refused(tmp_path):
         fx.io.read_matlab(path)
 
 
+@pytest.mark.slow
 @needs_data
 def test_published_matlab_models():
     shaft = fx.io.read_matlab(FE / "nlevp/shaft.mat")

@@ -133,6 +133,7 @@ def test_variances_of_responses_give_that_of_the_machine(part):
     np.testing.assert_allclose(found.variance, wanted, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_an_extended_interface_uses_all_channels_of_what_is_known():
     """Inner channels of the frame say what goes through its joints, also without pairs."""
     parts = {name: measured(name) for name in CHANNELS}
@@ -253,6 +254,7 @@ def test_patches_and_lever_arms_of_responses(pushed):
     np.testing.assert_allclose(alone.data, frfs["stage"].data, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_what_responses_cannot_say_is_refused():
     frfs = {name: measured(name) for name in CHANNELS}
     with pytest.raises(LabelError, match="named alike"):

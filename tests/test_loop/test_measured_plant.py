@@ -110,6 +110,7 @@ def test_margin_and_bandwidth_of_the_machine():
     assert bandwidth((frf, loop)) == pytest.approx(bandwidth(loop), abs=2.0)
 
 
+@pytest.mark.slow
 def test_velocity_sensors_and_displacement_controllers():
     """A controller knows what its sensors measure; an Frf of another quantity is refused."""
     loop, freq = loop_of(), np.geomspace(5.0, 500.0, 20)
@@ -145,6 +146,7 @@ def test_conversion_by_powers_of_2_pi_i_f():
         frf.converted("speed")
 
 
+@pytest.mark.slow
 def test_frf_to_control():
     frf = frf_of(loop_of(), np.array([3.0, 40.0, 900.0]))
     theirs = frf.to_control(1 / RATE)

@@ -90,10 +90,12 @@ def margin(mode, change, around):
     return min(sizes)
 
 
+@pytest.mark.slow
 def test_the_loop_by_hand_is_the_loop():
     assert radius(4) == pytest.approx(np.abs(loop().poles()).max(), abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["freq", "damping"])
 def test_a_pole_crosses_the_boundary_at_each_tolerance_and_not_before(kind):
     found = tolerances()
@@ -126,6 +128,7 @@ def test_the_margin_falls_to_what_was_stated():
             assert least == pytest.approx(0.35, rel=0.01)
 
 
+@pytest.mark.slow
 def test_what_is_known_of_a_mode_stands_beside_its_tolerance():
     found = tolerances()
     worst = int(np.argmin(found.least))
@@ -139,6 +142,7 @@ def test_what_is_known_of_a_mode_stands_beside_its_tolerance():
     assert str(mode) in found.summary and "leads to" in found.summary
 
 
+@pytest.mark.slow
 def test_a_loop_that_tolerates_all_says_so():
     observer = fx.design_kalman(plant())
     servo = fx.design_servo(plant(), bandwidth=5.0, observer=observer)
@@ -188,6 +192,7 @@ def around(given):
     return found, str(said[0].message)
 
 
+@pytest.mark.slow
 def test_a_loop_on_an_uncertain_plant_says_what_its_modes_hold_to():
     found, said = around(uncertain())
     fragile = tolerances()
@@ -289,6 +294,7 @@ def of_both_kinds():
     return fx.close_loop(sampled_plant, design)
 
 
+@pytest.mark.slow
 def test_positions_and_speeds_measured_together_a_fraction_of_a_sample_late():
     """Each machine is assembled and sampled anew: stable before, unstable behind a tolerance."""
     closed = of_both_kinds()

@@ -98,6 +98,7 @@ def machine(rng, springs):
     return num, den
 
 
+@pytest.mark.slow
 def test_the_margin_of_all_loops_is_that_of_the_side_where_they_are_broken():
     """Two first-order loops, one coupled 20 times into the other: far apart at u and at y."""
     G = StateSpace(-0.01 * np.eye(2), np.eye(2), [[1.0, 20.0], [0.0, 1.0]], np.zeros((2, 2)),
@@ -142,6 +143,7 @@ def test_the_count_is_that_of_the_characteristic_polynomial(springs):
     assert seen == {True, False}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [2, 3])
 @pytest.mark.parametrize("measured", [False, True])
 def test_units_of_an_axis_change_no_margin_of_loops_of_several_units(axes, measured):
@@ -176,6 +178,7 @@ def test_units_of_an_axis_change_no_margin_of_loops_of_several_units(axes, measu
     assert found[1e-6, False].modulus_margin < 1e-3  # what mixed units made of it
 
 
+@pytest.mark.slow
 def test_the_scaling_of_axes_is_optimal():
     """Against a search over D: within the 2 % of the power of singular values that is minimised."""
     rng = np.random.default_rng(0)
@@ -259,6 +262,7 @@ def test_what_cannot_be_judged_says_why():
     assert "measure at higher frequencies" in short.reason
 
 
+@pytest.mark.slow
 def test_each_loop_is_broken_with_the_others_closed():
     """Two coupled masses: L_1 with loop 2 closed, by hand."""
     M = np.array([[2.0, 0.7], [0.7, 1.0]])

@@ -109,6 +109,7 @@ def test_feedforward_follows_the_path(plant):
     assert worst["following"] < 0.02 * worst["frozen"]
 
 
+@pytest.mark.slow
 def test_refusals(plant):
     with pytest.raises(AssumptionError, match="where the controller lies between two designs"):
         schedule_loops(plant, design, places=[-0.1, 0.1])

@@ -76,6 +76,7 @@ def test_hankel_values_of_a_machine_equal_slycot(delay):
     np.testing.assert_allclose(hankel_values(g)[:20], found[4][:20], rtol=1e-8)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000), st.integers(0, 6), st.booleans(), st.booleans())
 def test_promised_and_made_error(seed, order, match_dc, sampled):
     g = stable(seed)
@@ -155,6 +156,7 @@ def test_the_smallest_order_within_a_tolerance():
     assert again.error < 1e-10 * values[0]
 
 
+@pytest.mark.slow
 def test_weights_move_the_error_out_of_their_band():
     g = machine(0, 16, m=2, p=2, zeta=1e-2)
     low = append(

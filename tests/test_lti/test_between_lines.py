@@ -1,6 +1,7 @@
 """A response between its lines: exact for one mode, with an error that says when it is not."""
 
 import numpy as np
+import pytest
 
 from flexplant import Frf
 from flexplant.loop import in_axes
@@ -31,6 +32,7 @@ def test_where_two_modes_share_an_interval_the_error_says_so():
     assert error[np.argmax(wrong)] > 0.1 * wrong.max()
 
 
+@pytest.mark.slow
 def test_the_variance_of_a_plant_in_axes():
     """after G before, aliases added, beside 500 draws; and by coherence."""
     rng = np.random.default_rng(4)

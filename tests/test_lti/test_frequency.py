@@ -33,6 +33,7 @@ def test_lightly_damped_machine_is_exact(delay, blocks):
     assert_same(g if blocks else g.replace(blocks=None), FREQ)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000))
 def test_block_upper_triangular_systems(seed):
     rng = np.random.default_rng(seed)

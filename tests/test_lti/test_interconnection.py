@@ -81,6 +81,7 @@ def test_append(seed):
     assert both.outputs == (*first.outputs, *second.outputs)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 0.1]))
 def test_lft(seed, dt):
     rng = np.random.default_rng(seed)
@@ -128,6 +129,7 @@ def test_feedback(seed, sign):
     assert (loop.inputs, loop.outputs) == (G.inputs, G.outputs)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000))
 def test_connect(seed):
     plant = system(seed, m=3, p=2).replace(inputs=["d", "u1", "u2"], outputs=["y", "z"])
@@ -205,6 +207,7 @@ def test_bad_input():
         series(g, "gain")
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 0.1]))
 def test_every_operation_takes_a_control_system(seed, dt):
     g, h = system(seed, m=2, p=2, dt=dt), system(seed + 1, n=3, m=2, p=2, dt=dt, prefix="b")
@@ -250,6 +253,7 @@ def test_a_loop_of_very_large_and_very_small_gains_is_well_posed(gain):
         connect([up, alone], ["w"], ["a"])
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 0.1]))
 def test_operators_are_those_of_transfer_functions_with_names(seed, dt):
     rng = np.random.default_rng(seed)

@@ -122,6 +122,7 @@ def test_random_systems(seed):
     assert h2_norm(g.replace(D=0 * D)) == pytest.approx(expected, rel=1e-8, abs=0)
 
 
+@pytest.mark.slow
 def test_a_peak_between_the_poles_is_found_by_the_level_set():
     # the feedthrough cancels at the resonances and the peak lies elsewhere
     g = machine(0, 6, zeta=1e-2, m=2, p=2)
@@ -132,6 +133,7 @@ def test_a_peak_between_the_poles_is_found_by_the_level_set():
     assert found <= hinf_norm(g) * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_a_flat_peak_just_above_the_feedthrough_is_found():
     """Near the gain of D the Hamiltonian matrix is nearly singular; a sweep finds 8e-4 more."""
     A = [[-0.307, 1.4, -0.0211, 0], [0.78, 0, -5.72, 0], [31.4, 30.5, -52.5, 0]]
@@ -149,6 +151,7 @@ def test_a_flat_peak_just_above_the_feedthrough_is_found():
     assert 0.01 < freq < 0.03
 
 
+@pytest.mark.slow
 def test_a_narrow_peak_of_a_closed_loop_is_found():
     # a loop whose poles differ from the plant's: dense A, one very light mode
     g = machine(0, 8, zeta=1e-4, m=1, p=1, seed=3)

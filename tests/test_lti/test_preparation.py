@@ -77,6 +77,7 @@ def test_the_restored_controller_gives_the_loop_of_the_prepared_problem(dt, d22)
     assert (stability(here[0], dt) < 0) == (stability(there[0], 0.0) < 0)
 
 
+@pytest.mark.slow
 @given(
     exponents=st.lists(st.floats(-9, 9), min_size=10, max_size=10),
     dt=st.sampled_from([0.0, 0.02]),

@@ -137,6 +137,7 @@ def test_gain_of_a_machine_has_the_covariance_of_its_own_stein_equation():
     np.testing.assert_allclose(np.diag(P), 1.0, rtol=1e-9)
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(-30, 30), min_size=14, max_size=14), st.integers(-40, 40))
 def test_units_of_states_and_noise_do_not_matter(powers, joint):
     A, C, Q, R = machine(3, 4)

@@ -21,6 +21,7 @@ def modes(n, count=20):
     return fx.solve_modes(fx.kirchhoff_plate(elements=(n, n), **THIN), count=count)
 
 
+@pytest.mark.slow
 def test_the_error_is_that_from_the_converged_plate():
     found = modes(8, 13).mesh_error(modes(16, 17))  # the order of later ones differs
     exact = elastic_modes(ritz_plate(**THIN))[0][: found.modes.size] / (2 * np.pi)
@@ -60,5 +61,6 @@ def test_meshes_that_say_nothing_are_refused():
         modes(8).mesh_error(modes(16), order=0.0)
 
 
+@pytest.mark.slow
 def test_it_is_said_in_one_line():
     assert repr(modes(8, 6).mesh_error(modes(16, 6))).startswith("<MeshError: 3 modes, ")

@@ -63,9 +63,7 @@ def test_a_fine_clamped_beam(elements):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "elements", [50, 400, pytest.param(700, marks=pytest.mark.slow), 751, 2000]
-)
+@pytest.mark.parametrize("elements", [50, 400, 700, 751, 2000])
 def test_a_clamped_beam_of_any_size_has_the_textbook_frequency(elements):
     """Dense up to 750 elements, sparse beyond: 2e-4 off at 400, refused from 500 on before."""
     model = beam(
@@ -90,9 +88,7 @@ def test_a_stiff_grounding_spring_is_a_support(factor):
 
 @pytest.mark.slow
 @EXTENDED
-@pytest.mark.parametrize(
-    "stiffness", [1e-2, *(pytest.param(k, marks=pytest.mark.slow) for k in (1.0, 1e3)), 1e6]
-)
+@pytest.mark.parametrize("stiffness", [1e-2, 1.0, 1e3, 1e6])
 @pytest.mark.parametrize("route", ["dense", "sparse"])
 def test_soft_springs_beside_extended_precision(stiffness, route, monkeypatch):
     if route == "sparse":
@@ -107,9 +103,7 @@ def test_soft_springs_beside_extended_precision(stiffness, route, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "stiffness", [1e-3, *(pytest.param(k, marks=pytest.mark.slow) for k in (0.1, 10.0, 1e3)), 1e5]
-)
+@pytest.mark.parametrize("stiffness", [1e-3, 0.1, 10.0, 1e3, 1e5])
 def test_a_large_plate_on_springs_from_a_thousandth_to_a_million_newtons_per_metre(stiffness):
     free = plate((24, 24))
     model = suspended(free, stiffness)
@@ -142,6 +136,7 @@ def test_a_bed_of_springs_under_every_node_holds_as_softly(total):
     assert abs(modes.omega[0] / expected - 1) < 1e-7 * total + modes.rounding[0] + 1e-3
 
 
+@pytest.mark.slow
 def test_what_is_free_says_how_soft_a_suspension_would_look_free():
     free = plate((24, 24))
     modes, report = solve_modes(free, count=5), check(free)
@@ -229,6 +224,7 @@ def test_a_soft_spring_between_two_bodies_leaves_the_motions_of_both():
     np.testing.assert_allclose(modes.omega[3:6], by_hand, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("elements", [(6, 5), (24, 22)])
 def test_a_mechanism_is_named_as_check_names_it(elements):
     """A plate hanging by one DOF of another one turns about it."""
@@ -246,6 +242,7 @@ def test_a_mechanism_is_named_as_check_names_it(elements):
     assert "The first moves " in str(told.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("elements", [(6, 5), (24, 22)])
 def test_soft_springs_do_not_hide_a_mechanism(elements):
     """One of two plates on springs of 10 N/m: it is held, the hinges of the other are named."""

@@ -54,6 +54,7 @@ def test_the_paper_s_plate(plate):
     assert_modes_of(plate, modes)
 
 
+@pytest.mark.slow
 def test_the_pins_feel_one_percent_of_thickness():
     thick = make_plate(thickness=0.0272 * 1.01)
     assert np.all(np.abs(solve_modes(thick, count=8).freq[3:] / ELASTIC - 1) > 5e-3)
@@ -86,6 +87,7 @@ def test_poles_with_half_a_kilogram(plate, zeta):
     np.testing.assert_allclose(modes.freq[3], ELASTIC[0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_poles_are_the_oracle_s(plate):
     M, K = oracle.plate_matrices(8, 8)
     D = oracle.modal_damping_matrix(M, K, 0.01)
@@ -97,6 +99,7 @@ def test_poles_are_the_oracle_s(plate):
     )
 
 
+@pytest.mark.slow
 def test_complex_modes_fulfil_the_quadratic_problem(plate):
     model = truth(plate, 0.01)
     modes = solve_modes(model, count=24)
@@ -114,6 +117,7 @@ def test_complex_modes_fulfil_the_quadratic_problem(plate):
     np.testing.assert_allclose(gram, np.diag(2j * lam[3:].imag), atol=1e-6 * np.abs(lam[-1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("elements", [(12, 12), (14, 9)])
 def test_sparse_and_dense_routes_agree(elements, monkeypatch):
     model = make_plate(elements=elements)
@@ -132,6 +136,7 @@ def test_sparse_and_dense_routes_agree(elements, monkeypatch):
     assert np.array_equal(sparse.omega[:3], np.zeros(3))
 
 
+@pytest.mark.slow
 def test_sparse_route_finds_every_partner():
     # square: modes 7/8, 9/10, 13/14, ... are exact pairs, of which Lanczos may drop one
     model = make_plate(elements=(24, 24))
@@ -142,6 +147,7 @@ def test_sparse_route_finds_every_partner():
     np.testing.assert_allclose(modes.omega[8], modes.omega[9], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_lost_partner_is_found_again(monkeypatch):
     model = make_plate(elements=(24, 24))
     expected = solve_modes(model, count=24)
@@ -300,6 +306,7 @@ def test_the_certificate_holds_the_rigid_body_residual(plate):
     assert rigid_residual(held) > 1.5 * left.max()
 
 
+@pytest.mark.slow
 def test_below_a_frequency_is_sparse_from_some_hundred_dofs_on(monkeypatch):
     model = make_plate(elements=(26, 26))
     monkeypatch.setattr(solve, "elastic_modes", None)

@@ -67,6 +67,7 @@ def test_none_is_missing_in_many_runs(structure):
         np.testing.assert_allclose(factor.sigma + 1 / theta, expected[:20], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_one_starting_vector_is_enough(structure, monkeypatch):
     """In exact arithmetic it sees one member of each pair: rounding or the count brings others."""
     model, expected = structure

@@ -77,7 +77,7 @@ def test_the_cost_is_the_h2_norm_of_the_best_controller(make):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "delay",
-    [pytest.param(0.0, marks=pytest.mark.slow), 1.0, pytest.param(2.0, marks=pytest.mark.slow)],
+    [0.0, 1.0, 2.0],
 )
 def test_pairs_equal_every_pair_and_the_bound_bounds(make, delay):
     plant, sensors, actuators = make(44, count=6, delay=delay)
@@ -215,6 +215,7 @@ def test_screening_finds_what_every_subset_shows():
     assert alone.value < found.value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["y", "u", "yu"])
 def test_a_plant_made_elsewhere(make, kind):
     """Candidates are rows and columns of its system: the same choices, values and bounds."""

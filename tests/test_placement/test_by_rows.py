@@ -38,6 +38,7 @@ def test_identities_of_effective_independence_are_exact():
     assert EffectiveIndependence().values(rows)[7] == pytest.approx(1.0, rel=1e-12, abs=0.0)
 
 
+@pytest.mark.slow
 def test_searches_by_rows_differ_and_are_bounded(make):
     plant, sensors, _ = make(42, count=14)
     goal = ModeInformation()

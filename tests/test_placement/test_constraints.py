@@ -90,7 +90,7 @@ def machine(make):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", CASES)
-@pytest.mark.parametrize("side", ["y", pytest.param("u", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("side", ["y", "u"])
 def test_every_search_finds_the_best_that_satisfies(machine, monkeypatch, kind, side):
     for name, few in (("_SCREENED", 30), ("_SCORED", 5)):
         monkeypatch.setattr(f"flexplant.placement.branch_and_bound.{name}", few)
@@ -116,6 +116,7 @@ def test_every_search_finds_the_best_that_satisfies(machine, monkeypatch, kind, 
             assert found.evaluations == len(sets)
 
 
+@pytest.mark.slow
 def test_several_at_once_and_required(machine):
     plant, sensors, _ = machine
     given = [CASES["mirrored"][0], CASES["excluded"][0], OffPoi(-1)]
@@ -137,6 +138,7 @@ def test_several_at_once_and_required(machine):
         place_sensors(plant, sensors, 3, constraints=[*row, OffPoi(-1)])
 
 
+@pytest.mark.slow
 def test_places_of_ports_with_several_points(machine):
     """A differential sensor is where each of its points is."""
     plant, sensors, _ = machine
@@ -185,6 +187,7 @@ def test_several_types_of_devices_at_one_place(machine):
     assert sum(name.startswith("u0") for name in both.chosen) in (0, 2)
 
 
+@pytest.mark.slow
 def test_no_sensor_of_a_map_is_on_the_die(machine):
     plant, sensors, _ = machine
     plant = plant.with_ports(plant.assembled.ports.replace(y=[sensors[i] for i in (0, 2, 9)]))
@@ -202,6 +205,7 @@ def test_no_sensor_of_a_map_is_on_the_die(machine):
     assert len(apart.points) > 2
 
 
+@pytest.mark.slow
 def test_constraints_are_values_and_refuse_what_they_are_not(machine, tmp_path):
     plant, sensors, _ = machine
     for i, (constraint, _) in enumerate(CASES.values()):

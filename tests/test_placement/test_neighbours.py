@@ -94,6 +94,7 @@ def test_sensors(make, name):
     assert best_of(make, seed, "y", one) != best_of(make, seed, "y", other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ACTUATORS)
 def test_actuators(make, name):
     seed, one, other = ACTUATORS[name]

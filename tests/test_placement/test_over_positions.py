@@ -74,6 +74,7 @@ def test_the_best_over_positions_is_that_of_plants_by_hand(measure):
     assert criterion(alone.on(plant)) > found.value
 
 
+@pytest.mark.slow
 def test_a_choice_that_loses_a_rigid_body_mode_somewhere_has_no_score():
     """Three heads are on one line where the stage is at 0.1 m."""
     plant, _ = plant_at()

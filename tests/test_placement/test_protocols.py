@@ -87,6 +87,7 @@ def test_a_criterion_with_a_scorer_of_its_own(make):
         place_actuators(plant, actuators, 4, Precision())
 
 
+@pytest.mark.slow
 def test_the_same_function_without_a_scorer(make):
     """A callable from plant to float gives the same choice, without a bound."""
     plant, sensors, _ = make(11, count=9)

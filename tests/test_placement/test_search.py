@@ -87,6 +87,7 @@ def test_exhaustive_is_every_subset(make):
         place_sensors(plant, sensors, 4, method=Exhaustive(limit=125))
 
 
+@pytest.mark.slow
 def test_required_candidates_stay(make):
     plant, sensors, _ = make(13, count=10)
     free = place_sensors(plant, sensors, 4, rng=0)
@@ -135,6 +136,7 @@ def test_a_plain_callable(make):
     assert all(np.all(np.diff(steps) < 0) for steps in found.history)
 
 
+@pytest.mark.slow
 def test_sensors_in_a_row_are_refused_with_the_motion_named(make):
     plant, sensors, _ = make(11)
     row = [Sensor(f"r{i}", at=(0.05 * i, 0.175, 0.0), asd=1e-13) for i in range(8)]

@@ -12,6 +12,7 @@ from flexplant.structure import Disc, Rectangle
 GRID = np.array([(x, y, 0.0) for y in (0.0, 0.2, 0.35) for x in (0.0, 0.25, 0.5)])
 
 
+@pytest.mark.slow
 def test_every_point_is_the_plant_with_one_more_sensor(make, tmp_path):
     plant, _, _ = make(21)
     found = sensor_map(plant, GRID, PoiVariance("die"), asd=2e-11)

@@ -69,6 +69,7 @@ def test_points_as_keys_are_drawn():
     np.testing.assert_allclose(drawn[0], [[300.0, 300.0]])
 
 
+@pytest.mark.slow
 def test_a_fit_alone_opens_its_uncertainty():
     rom = reduced()
     at = rom.full_dofs.nearest(Z8, "z")

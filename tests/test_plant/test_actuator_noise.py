@@ -54,6 +54,7 @@ def test_noise_of_amplifiers_is_that_of_doubled_ones_without_their_states():
     assert both[0].rms("die") > 1.001 * rms[0]
 
 
+@pytest.mark.slow
 def test_weights_placement_and_refusals():
     plant = fx.assemble_plant(reduced(), machine(doubled=False))
     weights = fx.stage_weights(plant, 50.0)

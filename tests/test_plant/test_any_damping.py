@@ -312,6 +312,7 @@ def switching():
     return low, high
 
 
+@pytest.mark.slow
 def test_the_two_forms_agree_where_one_gives_way_to_the_other():
     M, D, K = chain("held light")
     answers = []

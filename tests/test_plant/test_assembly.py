@@ -73,12 +73,14 @@ def test_velocity_and_acceleration_are_s_times_displacement(quantity, order, kin
     agree(one(OFF_NODE, model=model, quantity=quantity), S**order * still, 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [0, 1, 2])
 def test_quantities_against_the_dense_oracle(order):
     quantity = ("displacement", "velocity", "acceleration")[order]
     agree(one(OFF_NODE, quantity=quantity), S**order * oracle(z_row(0.31, 0.26)))
 
 
+@pytest.mark.slow
 def test_an_accelerometer_sees_the_force_at_once():
     # oracle: M^-1, rigid body and all modes together
     M, _, _ = machine(0.01, mass=0.5)

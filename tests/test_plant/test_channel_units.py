@@ -45,6 +45,7 @@ def test_ports_tell_the_unit_of_every_channel():
     assert "mixed" not in found
 
 
+@pytest.mark.slow
 def test_units_travel_with_the_channels(tmp_path):
     plant = fx.assemble_plant(some_modes(), ports())
     sampled = plant.discretized(10e3, delay=1)

@@ -47,6 +47,7 @@ def test_the_decoupled_plant_is_a_double_integrator_each_axis():
     np.testing.assert_allclose(forced @ axes.mass, np.eye(3), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_an_added_mass_moves_the_centre():
     axes = decouple(assemble_plant(full(mass=0.5), ports()))
     centre = (MASS * L / 2 + 0.5 * Z8[1]) / (MASS + 0.5)

@@ -222,6 +222,7 @@ def test_a_single_mass_on_a_magnet():
     assert solve_modes(model, count=1).omega == pytest.approx([-np.sqrt(5.0)], rel=1e-12, abs=0)
 
 
+@pytest.mark.slow
 def test_a_large_sparse_model_on_magnets():
     plate = make_plate(elements=(24, 24))
     held = suspend(plate, magnets())
@@ -233,6 +234,7 @@ def test_a_large_sparse_model_on_magnets():
     assert modes.certificate["counted"] == modes.certificate["found"]
 
 
+@pytest.mark.slow
 def test_what_is_for_free_or_held_structures_says_so():
     held = suspend(make_plate().with_damping(ModalDamping(0.01)), magnets())
     modes = solve_modes(held, count=8)

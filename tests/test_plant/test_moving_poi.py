@@ -45,6 +45,7 @@ def test_rows_along_against_the_dense_plate():
     np.testing.assert_allclose((rows.C[:, :3] @ state).ravel(), wanted, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_force_along_against_the_dense_plate():
     """What a force does to the POI, a sensor and an accelerometer, from wherever it acts."""
     from oracles_plant import machine

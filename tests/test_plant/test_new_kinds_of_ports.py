@@ -89,6 +89,7 @@ STRETCH = Stretch("s", CORNERS[3], CORNERS[0], length=0.5, asd=NOISE)
 U = ["u1", "u2", "u3", "u4", "amp1"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [full, some_modes, reduced])
 def test_assembled(model):
     """It shows the difference of two ordinary sensors, of all three models of a structure."""
@@ -116,6 +117,7 @@ def test_velocity_and_acceleration():
         assert np.any(plant.system.select(["s"], U).D) == (quantity == "acceleration")
 
 
+@pytest.mark.slow
 def test_sampled_estimated_simulated_saved(tmp_path):
     """A filter, a latency, a Kalman filter and a run: those of the same sum of displacements."""
     filtered = {"asd": NOISE, "dynamics": lowpass(2e3), "latency": 1.3 / RATE}
@@ -152,6 +154,7 @@ def test_see_may_be_anything_linear():
     np.testing.assert_allclose(response(plant, ["l"], U), wanted, rtol=1e-9, atol=scale)
 
 
+@pytest.mark.slow
 def test_a_candidate():
     """It is scored among others, as its own plant would be."""
     few = reduce(some_modes(attached=False), ModalTruncation(12))

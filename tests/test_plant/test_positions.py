@@ -76,6 +76,7 @@ def test_a_family_costs_rows_and_no_modes(modes):
         np.testing.assert_array_equal(there.modal_blocks, plant.modal_blocks)
 
 
+@pytest.mark.slow
 def test_weights_blocks_reduction_and_files_go_along(modes, tmp_path):
     plant = fx.assemble_plant(modes, ports()).discretized(1e4, delay=1.3)
     weights = fx.stage_weights(plant, 40.0)
@@ -158,6 +159,7 @@ def test_refusals(modes):
         fx.assemble_plant(modes, given).at({"y": (0.1, 0.1, 0.0)})
 
 
+@pytest.mark.slow
 def test_a_map_of_the_range(modes):
     """Decoupling by lever arms, modes by their shapes, figures as given."""
     given = ports().replace(

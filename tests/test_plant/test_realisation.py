@@ -121,6 +121,7 @@ def test_poles(which, zeta):
     np.testing.assert_allclose(upper.real, wanted.real, rtol=1e-6 if which == "updated" else 1e-8)
 
 
+@pytest.mark.slow
 def test_poles_after_the_update_are_the_measured_ones():
     # oracles: the update's own eigenvalues of another pencil (1e-11); the poles as measured, which
     # are rounded to 1e-3 rad/s

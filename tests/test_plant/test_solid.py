@@ -30,6 +30,7 @@ def body_row(at, direction, centre):
     return np.concatenate([np.eye(3)[k], np.cross(np.eye(3), arm)[:, k]])
 
 
+@pytest.mark.slow
 def test_modes_of_the_block():
     modes = found()["modes"]
     assert modes.n_rigid == 6
@@ -43,6 +44,7 @@ def test_modes_of_the_block():
     np.testing.assert_allclose(modes.freq[6], 2330.0, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_all_assumptions_hold_and_one_sensor_less_is_named():
     plant = found()["plant"]
     assert found()["report"].ok

@@ -160,6 +160,7 @@ def test_several_references_must_be_named():
         stage_weights("plant", 30.0)
 
 
+@pytest.mark.slow
 def test_other_points_of_the_body_move_with_the_reference_and_are_left_out():
     """Held at rest beside a reference they would cost a hundredfold, the weight's floor."""
     left, right = (Poi(n, at=(x, 0.3, 0.0), axes=AXES) for n, x in (("left", 0.15), ("right", 0.4)))

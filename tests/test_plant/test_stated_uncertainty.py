@@ -174,6 +174,7 @@ def every_kind(**more):
     return spring_of_masses().uncertain(parameters={fx.AddedMass("3:x"): 0.05}, **stated)
 
 
+@pytest.mark.slow
 def test_a_parameter_beside_modes_and_gains():
     """The matrices by hand: a heavier mass, and K and D changed along two modes."""
     M, K = np.eye(3), np.array([[4e5, -4e5, 0.0], [-4e5, 8e5, -4e5], [0.0, -4e5, 4e5]])

@@ -51,6 +51,7 @@ def dense_response(plate, damping_at):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_every_damping_beside_dense_solutions(plate):
     M, K = plate.M.toarray(), plate.K.toarray()
     R = plate.rigid_body

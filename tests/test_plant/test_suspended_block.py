@@ -97,6 +97,7 @@ def test_the_rigid_body_is_that_of_the_box(freq, exact):
     assert stage_weights(plant, 100.0).z["die:error"] is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("freq", [1.0, 10.0])
 def test_a_shaken_floor_moves_it_as_the_full_model_does(freq):
     shaken = plant_of(freq, w=(BaseAcceleration("floor", direction="z", asd=1e-6),))

@@ -81,6 +81,7 @@ def test_suspension_frequencies_are_those_of_a_rigid_body():
     np.testing.assert_allclose(modes.vector_omega, some_modes(0.0).vector_omega, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_springs_that_leave_a_motion_free_leave_its_mode_at_zero():
     line = [GroundSpring((L / 2, y, 0.0), STIFF, DAMP) for y in (0.1, 0.5)]
     for model in (some_modes(), reduced(), full()):
@@ -231,6 +232,7 @@ def test_a_feedthrough_needs_a_delay_and_something_to_replace():
                        residual=Feedthrough(above=0.01))  # fmt: skip
 
 
+@pytest.mark.slow
 def test_base_acceleration_of_suspended_modes_and_reduced_models():
     """Complex modes tell their mass too; what the floor does is -M r, in all three kinds."""
     w = [BaseAcceleration("floor", "z"), BaseAcceleration("tilt", "rx", about=(0.0, 0.1, 0.0))]

@@ -152,6 +152,7 @@ def test_a_fit_with_a_damper_gives_complex_modes_and_the_same_lft(rate):
     assert np.array_equal(changed.modal_blocks[others], plant.modal_blocks[others])
 
 
+@pytest.mark.slow
 def test_names_and_order_of_the_channels():
     plant = updated()
     uncertain = plant.uncertain(*fitted(), modes=[7, 6])
@@ -176,6 +177,7 @@ def propagated(fit, unknowns, wanted):
     return J @ fit.covariance @ J.T
 
 
+@pytest.mark.slow
 def test_the_covariance_of_the_parameters_goes_to_the_modes():
     fit, unknowns = fitted()
     plant = updated()
@@ -236,6 +238,7 @@ def test_machines_of_measured_modes_spread_as_measured():
     assert not within_monte_carlo(values, 2.0 * wanted)
 
 
+@pytest.mark.slow
 def test_seeds_belong_to_machines():
     plant = updated(0.1).discretized(RATE, delay=1)
     uncertain = plant.uncertain(*fitted(0.1), modes=[6])
@@ -372,6 +375,7 @@ def test_the_bound_on_neglected_modes_is_tight(count):
     assert np.median(np.array(ratio)[band]) < 10
 
 
+@pytest.mark.slow
 def test_neglected_modes_are_no_excuse_for_another_mass():
     fit, unknowns = fitted()
     plant = updated()
@@ -539,6 +543,7 @@ def damped_unevenly(model):
     return model.D + 60.0 * np.outer(row, row)
 
 
+@pytest.mark.slow
 def test_a_machine_that_cannot_be_is_named():
     fit, unknowns = fitted(0.1)
     huge = fit.replace(covariance=fit.covariance * 1e10)

@@ -123,6 +123,7 @@ def test_singular_values():
     assert len(fx.plot.singular_values(of_rank_one, freq=freq).get_lines()) == 1
 
 
+@pytest.mark.slow
 def test_systems_may_stand_in_a_list():
     g = system()
     for draw in (fx.plot.bode, fx.plot.singular_values, fx.plot.step, fx.plot.pole_map):

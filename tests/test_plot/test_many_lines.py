@@ -54,6 +54,7 @@ def test_loop_gains_and_sensitivities_of_six_axes():
         np.testing.assert_allclose(ax.get_lines()[0].get_ydata(), 20 * np.log10(size))
 
 
+@pytest.mark.slow
 def test_more_lines_than_looks_are_named_at_their_ends():
     ax = fx.plot.frf(systems(9), "out", "in", freq=np.geomspace(1.0, 1e3, 100))
     colours = [to_hex(line.get_color()) for line in ax.get_lines()]
@@ -113,6 +114,7 @@ def test_phase_coherence_and_deviation_beside_a_magnitude():
         fx.plot.frf(shown, "out", "in", also="phase", ax=top)
 
 
+@pytest.mark.slow
 def test_many_parameters_are_one_figure():
     modes = fx.solve_modes(fx.chain(masses=[1.0] * 4, stiffnesses=[4e5, 5e5, 6e5]), count=4)
     drawing = fx.reduce(modes, fx.DesiredDofs([f"{k}:x" for k in range(1, 5)]))

@@ -139,6 +139,7 @@ def test_response_chooses_a_prefix(size, prefix):
     assert ink(ax) > 0.005
 
 
+@pytest.mark.slow
 def test_response_gives_each_unit_a_panel():
     wave = np.sin(np.arange(50))
     data = [2e-6 * wave, 3e-7 * wave, 4.0 * wave, 5e-9 * wave]
@@ -223,6 +224,7 @@ def test_the_update():
     assert fx.plot.parameters(fit, axs=axs) == axs
 
 
+@pytest.mark.slow
 def test_what_is_drawn_later_has_the_unit_of_the_axes():
     """A second run of another size lies where its values are; another quantity is refused."""
     ax = plt.subplots()[1]

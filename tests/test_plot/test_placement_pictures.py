@@ -39,6 +39,7 @@ def test_the_curve_is_in_nanometres_and_its_bound_below():
         plot.pareto_curve(plant)
 
 
+@pytest.mark.slow
 def test_devices_on_a_mode_shape():
     plant, sensors, _ = stage()
     best = place_sensors(plant, sensors, 4, PoiVariance(), method=Exchange(1), rng=0)

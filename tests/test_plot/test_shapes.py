@@ -59,6 +59,7 @@ def test_the_surface_of_a_plate_with_a_hole_and_the_line_of_a_beam():
     assert length(line) == pytest.approx(1.0, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["full", "reduced", "complex"])
 def test_torsion_of_a_plate(kind):
     modes = {
@@ -86,6 +87,7 @@ def block_modes():
     return fx.solve_modes(block, count=8)
 
 
+@pytest.mark.slow
 def test_a_solid_moves_in_all_directions_on_both_sides(monkeypatch):
     """Through a period a mode goes from one end of its way to the other and back."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection

@@ -275,6 +275,7 @@ def test_static_moment_of_a_free_structure(plate):
     assert rom.n_dof == 7
 
 
+@pytest.mark.slow
 @settings(max_examples=10)
 @given(st.integers(0, 10**6), st.floats(1e-2, 1e3))
 def test_order_of_dofs_and_units_do_not_matter(seed, unit):

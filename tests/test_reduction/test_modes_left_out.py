@@ -37,6 +37,7 @@ def test_kept_and_left_out_are_all_modes(method):
     np.testing.assert_allclose(ours, theirs, atol=1e-9 * np.abs(theirs).max())
 
 
+@pytest.mark.slow
 def test_they_survive_saving_pickling_and_the_update(tmp_path):
     model = reduce(ALL, METHODS["desired"])
     assert model.truncated.n_modes == 21

@@ -181,6 +181,7 @@ def test_near_singular_partition_says_so(plate):
         reduce(four, DesiredDofs(line))
 
 
+@pytest.mark.slow
 def test_refusals(plate):
     modes = solve_modes(plate, count=24)
     with pytest.raises(LabelError, match="twice"):

@@ -63,6 +63,7 @@ def test_the_bound_is_reached_by_one_neglected_mode(modes):
     assert true_error(modes, model) == pytest.approx(model.bound.value, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [8, 16])
 def test_balanced_truncation_beats_the_lowest_modes(modes, count):
     low = reduce(modes, ModalTruncation(count, inputs=INTO, outputs=OUT))

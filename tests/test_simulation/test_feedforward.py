@@ -71,6 +71,7 @@ def test_the_gains_are_mass_delay_and_compliance(delay):
     np.testing.assert_allclose(held, wanted, rtol=1e-6, atol=0)
 
 
+@pytest.mark.slow
 def test_springs_to_ground_take_a_force_at_rest():
     """k_0 is the stiffness of the springs, k_2 the mass (but for what the plate bends)."""
     springs = [GroundSpring(p, 1e3) for p in CORNERS]
@@ -185,6 +186,7 @@ def test_gains_follow_the_place_of_the_poi():
     assert "3 places" in repr(along)
 
 
+@pytest.mark.slow
 def test_gains_along_a_path_take_the_error_of_a_poi_that_moves(model):
     """Of the loop: at each place those of the loop there; near a corner the die bends away."""
     steps = round(0.08 * RATE)

@@ -171,6 +171,7 @@ def sliding(stiffness, limit):
     )
 
 
+@pytest.mark.slow
 def test_friction_takes_four_times_its_level_over_the_stiffness_a_cycle():
     """Closed form of Coulomb's oscillator: in half a period the peak falls by 2 F / k."""
     run = sliding(1e5, 4.0)
@@ -180,6 +181,7 @@ def test_friction_takes_four_times_its_level_over_the_stiffness_a_cycle():
         assert peak == pytest.approx(0.1 - 2 * n * 4.0 / 800.0, abs=1.5e-4)
 
 
+@pytest.mark.slow
 def test_friction_that_yields_is_that_of_the_midpoint_rule():
     """Oracle: the motion with its yielding spring as a differential equation, by hand."""
     run, limit, stiffness, dt = sliding(2e3, 3.0), 3.0, 2e3, 1.25e-4

@@ -41,6 +41,7 @@ def test_standing_still_they_are_the_kalman_filter_there(plant):
     assert "die:z exact" in repr(found)
 
 
+@pytest.mark.slow
 def test_the_exact_filter_is_the_best_and_schedules_come_near(plant):
     found = fx.simulation.filters_along(plant, moving={"x": scan}, duration=0.125)
     assert np.all(found.exact <= found.scheduled * (1 + 1e-9))

@@ -193,6 +193,7 @@ def test_sensors_with_steps(loop):
     assert np.abs(run["y0"] - fx.simulate(loop, **options)["y0"]).max() > 1e-10
 
 
+@pytest.mark.slow
 def test_predicted_rms_of_a_machine_that_stands_is_its_budget(loop):
     found = fx.simulation.rms_along(loop, moving={"x": np.full(10, 0.05)}, duration=10 * H)
     there = fx.close_loop(loop.plant.at(x=0.05), *loop.blocks)

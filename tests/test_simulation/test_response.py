@@ -18,6 +18,7 @@ def response(signal, dt=1e-3):
     return Response(np.arange(signal.shape[-1]) * dt, signal[None], ["e"])
 
 
+@pytest.mark.slow
 @given(
     st.integers(1, 60).flatmap(
         lambda n: st.tuples(st.integers(1, n), st.lists(st.floats(-1, 1), min_size=n, max_size=n))
@@ -34,6 +35,7 @@ def test_moving_windows_are_exact(drawn):
     np.testing.assert_allclose(run.moving_std("e", window=count * 1e-3), deviation, atol=3e-8)
 
 
+@pytest.mark.slow
 def test_nanometres_on_top_of_decimetres_keep_their_digits():
     rng = np.random.default_rng(1)
     still = 1e-9 * rng.standard_normal(400)

@@ -37,6 +37,7 @@ def free_mass():
     return close_loop(plant, StateSpace([], [], [], [[0.0]], inputs=["y"], outputs=["u"]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["stage", "free mass"])
 def test_blocks_are_the_samples_one_by_one(kind):
     """With noise, a start that is not rest and more than one piece of blocks."""

@@ -84,6 +84,7 @@ def test_the_start_is_honoured(loop):
     assert short["die:z"][0] == pytest.approx(loop.plant.C1[0] @ x[:n], rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["amp", "sensors", "both"])
 def test_noise_has_the_variance_of_the_lyapunov_equation(source):
     """Every channel within three standard errors, those from its own autocovariance."""
@@ -177,6 +178,7 @@ def test_a_run_keeps_the_seed_that_gives_it_again(loop, tmp_path):
         )
 
 
+@pytest.mark.slow
 @given(st.floats(1e-3, 1e3), st.integers(0, 5))
 def test_linear_in_noise_and_reference(factor, seed):
     """All noises and the reference times a: all signals times a."""

@@ -95,6 +95,7 @@ def test_a_schedule_is_proven_with_its_places_as_nodes():
     assert set(schedule.places) <= set(proof.nodes.tolist())
 
 
+@pytest.mark.slow
 def test_a_speed_out_of_reach_is_refused_with_what_the_nodes_allow(loop):
     with pytest.raises(fx.errors.AssumptionError, match="nodes alone would allow"):
         fx.simulation.certify_speed(loop, 500.0, nodes=9)

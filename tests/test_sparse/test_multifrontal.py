@@ -91,6 +91,7 @@ def test_meshes(mesh, known):
     assert np.all(np.ptp(nodes[dissection.order].reshape(-1, 3), axis=1) == 0)
 
 
+@pytest.mark.slow
 def test_fill_is_that_of_nested_dissection():
     _, K, nodes, xyz, _ = meshes.plate(60)
     known = dissect(K, nodes, xyz)
@@ -111,6 +112,7 @@ def test_a_shell_rolled_up_is_cut_along_itself():
     assert dissect(K, nodes, rolled).n_factor < 1.15 * dissect(K, nodes, xyz).n_factor
 
 
+@pytest.mark.slow
 def test_a_solid_without_coordinates_and_bodies_that_do_not_touch():
     _, K, nodes, xyz, _ = meshes.solid(12, 9, 8)
     known = dissect(K, nodes, xyz).n_factor

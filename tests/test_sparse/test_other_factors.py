@@ -24,6 +24,7 @@ def method(request):
     return request.param
 
 
+@pytest.mark.slow
 def test_solutions(method):
     M, K = meshes.plate(12)[:2]
     A = sp.csc_array(K + 1e5 * M)

@@ -138,6 +138,7 @@ def test_freeing_what_is_held_is_refused():
         text.model(free="yes")
 
 
+@pytest.mark.slow
 @needs(NASTRAN)
 def test_the_aircraft_with_its_coordinates_becomes_a_free_model(tmp_path):
     """Six rigid-body modes at exactly 0, the others as the f06 prints them."""
@@ -201,6 +202,7 @@ def test_single_precision_that_happens_to_be_definite_warns():
     assert exact_in_single.rigid_body.shape[1] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["npz", "sparse npz", "npy", "mat v5", "mat v7.3"])
 def test_single_precision_in_files(tmp_path, kind):
     K = np.array([[2, -1.1], [-1.1, 3]], np.float32)

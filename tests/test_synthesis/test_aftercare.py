@@ -46,6 +46,7 @@ def designed(sampled=True):
     return weighted, fx.design_hinf(weighted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampled", [False, True])
 def test_a_reduced_controller_keeps_the_loop(sampled):
     """Fewer states, and margin and gamma of the loop closed by hand within the loss."""

@@ -158,6 +158,7 @@ def test_readmes_design_runs_in_c_against_the_virtual_machine(kind, tmp_path):
     agree(got, run, loop.driven, loop.watched, 1e-9)
 
 
+@pytest.mark.slow
 @compiles
 def test_an_observer_a_servo_and_feedforward_in_one_file_with_limits(tmp_path):
     """Saturated commands reach the observer, integrators return: as simulate has it."""
@@ -185,6 +186,7 @@ def test_an_observer_a_servo_and_feedforward_in_one_file_with_limits(tmp_path):
         )
 
 
+@pytest.mark.slow
 @compiles
 @pytest.mark.parametrize("single", [False, True])
 def test_the_c_file_gives_what_simulate_gives(single, tmp_path):
@@ -262,6 +264,7 @@ def test_a_bumpless_start(tmp_path):
     assert code([0.0])[0] == 0.0
 
 
+@pytest.mark.slow
 @compiles
 def test_limits_of_a_controller_by_itself(tmp_path):
     """Hanus' form by hand, and a controller that reads what is applied by its own name."""
@@ -291,6 +294,7 @@ def test_limits_of_a_controller_by_itself(tmp_path):
     )
 
 
+@pytest.mark.slow
 @compiles
 def test_a_schedule_interpolates_the_outputs(tmp_path):
     """Gains after an integrator by place: exact at places, linear between, held beyond."""
@@ -407,6 +411,7 @@ def test_a_wrong_block_is_found(monkeypatch, tmp_path):
         write_c(designed()[1], tmp_path / "a.c")
 
 
+@pytest.mark.slow
 @compiles
 @pytest.mark.parametrize("single", [False, True])
 def test_a_filter_in_c_does_not_drift(tmp_path, single):

@@ -58,6 +58,7 @@ def solved(A, B, C, D, u=1, y=1, dt=0.0, method=None):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 1e-2])
 def test_the_rounding_of_tustin_gives_no_rank(noise):
     """It keeps norms, so gamma; its D12 and D21 at half the rate are zero but for rounding."""
@@ -82,6 +83,7 @@ def test_singular_structures_sampled_with_a_hold_are_served(seed):
     assert best.lower * 0.99 <= found.gamma <= 1.1 * best.gamma
 
 
+@pytest.mark.slow
 def test_d12_and_d21_of_rounding_are_zero():
     A, B, C, D = structure(5, w=2)
     best = solved(A, B, C, D).gamma
@@ -125,6 +127,7 @@ def test_motions_in_nanometres_beside_efforts_in_kilonewtons():
     assert found.gamma == pytest.approx(alone.gamma, rel=1e-2, abs=0)
 
 
+@pytest.mark.slow
 def test_a_method_that_fails_leaves_the_problem_to_the_next(monkeypatch):
     plant = structure(5, w=2, noise=1e-2, effort=1e-2)
     best, plain = solved(*plant), Riccati.solve
@@ -143,6 +146,7 @@ def test_a_method_that_fails_leaves_the_problem_to_the_next(monkeypatch):
     assert found.lower == pytest.approx(best.lower, rel=1e-2, abs=0)
 
 
+@pytest.mark.slow
 def test_a_norm_that_rounding_raises_is_the_one_that_counts(monkeypatch):
     """Where no method keeps its promise, a stable loop is returned with the norm it has."""
     plant = structure(5, w=2)
@@ -179,6 +183,7 @@ def test_where_all_fail_each_says_why(monkeypatch):
     assert found.lower <= found.gamma == pytest.approx(norm, rel=1e-6, abs=0)
 
 
+@pytest.mark.slow
 def test_nothing_is_added_where_it_must_not_be():
     with pytest.raises(
         AssumptionError,
@@ -338,6 +343,7 @@ FAILURES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", FAILURES)
 def test_each_failure_names_assumption_channel_place_and_cure_at_once(case):
     plant, dt, method, words = FAILURES[case]

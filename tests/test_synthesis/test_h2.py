@@ -152,6 +152,7 @@ def test_cheap_control_and_clean_sensors_reach_their_limits(dt):
     assert "D21" in clean.notes[0]
 
 
+@pytest.mark.slow
 @TIMES
 @pytest.mark.parametrize("seed", [3, 5])
 def test_a_semidefinite_program_over_all_controllers_does_no_better(dt, seed):
@@ -186,6 +187,7 @@ def weighted(model, motion=1e8):
     return P.weighted(w=w, z=z)
 
 
+@pytest.mark.slow
 def test_the_stage_holds_its_die_and_the_modes_left_out_are_checked():
     """Rigid body, a sample of delay, SI units: claim, Gramians and a sum of impulses agree."""
     found = design_h2(weighted(reduced()))

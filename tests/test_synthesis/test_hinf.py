@@ -209,6 +209,7 @@ def test_the_controller_is_saved_whole(tmp_path):
 EFFORTS, NOISES = [f"u{i}:effort" for i in range(1, 5)], [f"y{i}:noise" for i in range(1, 5)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate", "side", "names", "message"),
     [
@@ -245,6 +246,7 @@ def test_weights_without_effort_or_noise_are_served_with_a_note(rate, side, name
     assert f"{found.certificate['added noise']:.0e}" in found.notes[0]
 
 
+@pytest.mark.slow
 def test_rigid_motions_that_no_sensor_sees_are_named():
     blind = ports(y=[Sensor("y1", at=CORNERS[0], asd=NOISE)], references=[])
     with pytest.raises(AssumptionError, match=r"y does not see the rigid-body .*rotation"):

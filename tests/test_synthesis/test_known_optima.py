@@ -66,6 +66,7 @@ def test_the_double_integrator_by_hand():
     assert best == pytest.approx(np.sqrt(4 + 2 * np.sqrt(2)), rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS, ids=["Riccati", "Lmi"])
 def test_sampled_by_the_bilinear_map(method):
     """It keeps norms, so the optimum; scipy's map, not ours."""

@@ -207,6 +207,7 @@ def test_where_every_setting_stops_early_the_error_is_ours(monkeypatch):
         design_hinf(P, Lmi(back_off=1e-3), u=u, y=y)
 
 
+@pytest.mark.slow
 def test_an_answer_that_cannot_be_read_is_named(monkeypatch):
     import cvxpy as cp
 
@@ -240,6 +241,7 @@ def test_sampled_plant_with_rigid_body_and_noise_free_sensor():
     assert found.gamma >= 1.0
 
 
+@pytest.mark.slow
 def test_back_off_is_what_the_loop_may_lose():
     P, u, y = system(scalar(-0.5, 1.0))
     tight, loose = (design_hinf(P, Lmi(back_off=b), u=u, y=y) for b in (0.01, 0.3))

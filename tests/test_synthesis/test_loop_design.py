@@ -40,6 +40,7 @@ def measured():
     return frf, {"before": axes.accelerations, "after": axes.to_motions}
 
 
+@pytest.mark.slow
 def test_a_law_for_each_decoupled_axis():
     """u = -T_u diag(laws) T_y (y), the reference taken from its axis; the loop is stable."""
     P, axes = plant(), decouple(plant())

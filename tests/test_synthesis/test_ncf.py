@@ -95,6 +95,7 @@ def test_what_does_not_go_together_is_refused():
         design_ncf(StateSpace([[0.0]], [[1.0]], [[1.0], [1.0]], [[0.0], [0.0]]), bandwidth=1.0)
 
 
+@pytest.mark.slow
 def test_the_stage_in_decoupled_axes():
     """Three rigid motions, four sensors and actuators, a sample of delay: one gain an axis."""
     P = sampled(reduced(), ports(references=[]))

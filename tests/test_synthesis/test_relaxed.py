@@ -142,7 +142,8 @@ def flexible(modes, seed=0):
     return named(A, B, C, D, 2, 2)
 
 
-@pytest.mark.parametrize("modes", [4, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("modes", [4, 12])
 def test_rigid_body_and_light_damping(modes):
     """Riccati equations beside the LMIs, each bound below what the other reaches."""
     P, u, y = flexible(modes)
@@ -156,6 +157,7 @@ def test_rigid_body_and_light_damping(modes):
     assert found.lower <= other.gamma
 
 
+@pytest.mark.slow
 def test_units_of_z_change_nothing():
     P, u, y = flexible(4)
     plain = design_hinf(P, u=u, y=y)

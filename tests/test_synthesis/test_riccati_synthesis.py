@@ -199,6 +199,7 @@ def test_a_sensitivity_that_infinite_gain_makes_zero_has_no_smallest_gamma(metho
         design_hinf(P, method, u=u, y=y)
 
 
+@pytest.mark.slow
 def test_lower_is_never_undercut_by_another_controller():
     """Designs for other weights, judged by this problem's loop, all stay above `lower`."""
     P, u, y = scalar(1.0)
@@ -321,6 +322,7 @@ def test_coordinates_and_units_of_time_change_nothing(name):
                 assert found.gamma == pytest.approx(best.gamma, rel=2e-3, abs=0)
 
 
+@pytest.mark.slow
 def test_a_gamma_that_hangs_on_the_last_digits_of_the_plant_is_refused():
     """Damping of 1e-6 in dense coordinates: what condition 1e4 keeps is lost at 1e5."""
     zeta = 1e-6

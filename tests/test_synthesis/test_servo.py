@@ -66,6 +66,7 @@ def pid(freq, bandwidth, *, rolloff=None, integrator=None, notches=(), rate=RATE
     return (2 * np.pi * bandwidth) ** 2 * shape(freq) / abs(shape(bandwidth))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("die", [(L / 2, L / 2, 0.0), (0.31, 0.1, 0.0)])
 @pytest.mark.parametrize("notches", [(), (459.0, 640.0)])
 def test_the_controller_in_closed_form(die, notches):
@@ -82,6 +83,7 @@ def test_the_controller_in_closed_form(die, notches):
         np.testing.assert_allclose(ref[:, 0], -K[:, 0], rtol=1e-9, atol=1e-15 * abs(K).max())
 
 
+@pytest.mark.slow
 def test_the_decoupling_takes_least_force():
     # oracle: the pseudo-inverse of F = m a; four actuators, three motions
     servo = design_servo(sampled(reduced()), bandwidth=50.0, notches=())
@@ -181,6 +183,7 @@ def test_the_loop_follows_a_constant_reference():
     np.testing.assert_allclose(still[rows, column], [1.0, 0.0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_one_of_several_pois_and_no_reference():
     axes = ("z", "rx", "ry")
     two = [Poi("die", at=(L / 2, L / 2, 0.0), axes=axes), Poi("edge", at=Z8, axes=axes)]
@@ -196,6 +199,7 @@ def test_one_of_several_pois_and_no_reference():
         design_servo(plant, bandwidth=50.0, poi="dye")
 
 
+@pytest.mark.slow
 def test_what_it_is():
     servo = design_servo(sampled(reduced()), bandwidth=50.0, notches=())
     assert isinstance(servo, Controller)
@@ -217,6 +221,7 @@ def test_bad_frequencies(name, bad):
         design_servo(sampled(some_modes()), **options)
 
 
+@pytest.mark.slow
 def test_a_fast_servo_keeps_its_rolloff_below_half_the_rate():
     plant = sampled(some_modes(), delay=0)
     with pytest.warns(FlexplantWarning, match=r"on the POI itself is unstable .*mode \d"):

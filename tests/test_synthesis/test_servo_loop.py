@@ -82,6 +82,7 @@ def test_the_certificate_is_of_the_loop_that_runs(which):
     assert dense(truth(), observer.system, servo.system) < 1
 
 
+@pytest.mark.slow
 def test_without_an_observer_the_loop_is_on_the_poi_itself():
     plant = updated()[0]
     servo = design_servo(plant, bandwidth=50.0)

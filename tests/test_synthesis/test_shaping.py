@@ -108,6 +108,7 @@ def test_two_degrees_of_freedom_follow_a_model():
     assert margins[1] < margins[0]
 
 
+@pytest.mark.slow
 def test_without_weight_the_two_are_the_one():
     """rho -> 0 leaves the problem of the coprime factors: gamma is its smallest."""
     found = shape_loop(BODY, bandwidth=1.0, model=1.0, weight=1e-3)
@@ -177,6 +178,7 @@ def test_what_does_not_go_together_is_refused():
             shape_loop(G, **({"bandwidth": 50.0} | {name: 12e3}))
 
 
+@pytest.mark.slow
 def test_what_is_rarely_meant_is_said():
     """A model above half the rate is refused; a low roll-off, a heavy weight are warned of."""
     sampled = discretized(BODY, 200.0)

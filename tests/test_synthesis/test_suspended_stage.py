@@ -174,6 +174,7 @@ def test_the_servo_is_the_free_ones_and_its_loop_too():
     assert soft_loop.modulus_margin == pytest.approx(free_loop.modulus_margin, rel=5e-2)
 
 
+@pytest.mark.slow
 def test_the_error_settles_on_springs():
     """After a step of the reference, integral action holds the body against its springs."""
     for _, loop in loops(some_modes):
@@ -183,6 +184,7 @@ def test_the_error_settles_on_springs():
         assert np.abs(error[-100:]).max() < 2e-9
 
 
+@pytest.mark.slow
 def test_the_loop_of_the_dense_rigid_plate_on_springs():
     """The certificate against eigenvalues of a rigid plate with springs, held and late."""
     from oracles_plant import hold
@@ -203,6 +205,7 @@ def test_the_loop_of_the_dense_rigid_plate_on_springs():
     assert radius < 1
 
 
+@pytest.mark.slow
 def test_springs_that_are_not_weak_beside_the_bandwidth_are_refused():
     plant = held(freq=4.0)  # rocks at 6.93 Hz
     assert design_servo(plant, bandwidth=21.0).certificate

@@ -69,6 +69,7 @@ def test_what_the_plain_design_does_not_tolerate_the_tolerant_one_does():
     assert min(margins) > 0.3
 
 
+@pytest.mark.slow
 def test_the_certificate_is_below_one_and_each_mode_holds_alone():
     share = design().certificate["all frequencies at once"]
     assert share < 1.0
@@ -76,6 +77,7 @@ def test_the_certificate_is_below_one_and_each_mode_holds_alone():
     assert np.abs(tolerances.stable).min() > SHARE
 
 
+@pytest.mark.slow
 def test_what_was_tried_is_in_the_result():
     assert list(design().tried) == ["before the scales were evened out", "after"]
     assert any("a channel for each of 12 modes" in note for note in design().notes)

@@ -33,6 +33,7 @@ def swing(M, K, count):
     return np.sqrt(la.eigh(K, M, eigvals_only=True)[3 : 3 + count]) / (2 * np.pi)
 
 
+@pytest.mark.slow
 def test_thin_it_is_kirchhoffs_plate():
     """Meshes of another formulation converge to it with the square of their size (Richardson)."""
     thin = PLATE | {"thickness": 1e-4}

@@ -108,6 +108,7 @@ def errors_on_the_machine(zeta, thickness=0.0272):
     return statistics_on_the_machine(zeta, thickness)[0]
 
 
+@pytest.mark.slow
 def test_poles(zeta):
     """notes.md's table to its digits; the paper's printed ones within 0.6 %."""
     found = stage(zeta).poles([6, 7])
@@ -120,6 +121,7 @@ def test_poles(zeta):
     assert np.all(np.diff(np.abs(more.poles)) > 0)
 
 
+@pytest.mark.slow
 def test_one_per_cent_of_thickness_moves_the_poles():
     # oracle: eigenvalues of the dense first-order form
     np.testing.assert_allclose(dense_poles(*machine(0.01, mass=0.5))[2:4], POLES[0.01], rtol=1e-6)

@@ -86,6 +86,7 @@ def test_damping_of_the_reduced_model_is_that_of_the_full_one(machine):
     np.testing.assert_allclose(T.T @ (full.M @ T), np.eye(wide.n_dof), atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_full_model_is_updated_in_a_basis():
     """495 DOFs, 0.4 kg: from poles that are solved densely."""
     full = kirchhoff_plate(

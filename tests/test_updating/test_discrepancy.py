@@ -90,7 +90,7 @@ def test_variances_are_those_of_balanced_groups():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("individual", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("individual", [1, 2])
 def test_no_mode_dictates_what_the_model_cannot_explain(individual):
     """0.5 kg: two poles alone, whose noise is 1e-5, gave 0.93 +- 0.04 and 0.85 +- 0.02."""
     two = fitted(individual, (6, 7), elastic=False)
@@ -106,6 +106,7 @@ def test_no_mode_dictates_what_the_model_cannot_explain(individual):
     assert 0.1 < off["damping"] < 0.6  # scattered by 30 %
 
 
+@pytest.mark.slow
 def test_intervals_hold_what_was_measured_and_are_joint():
     fit, data = fitted(1), measured(1)
     own = fit.uncertainty()
@@ -166,6 +167,7 @@ def test_intervals_over_many_machines():
             assert part[:, modes].mean() > 0.93
 
 
+@pytest.mark.slow
 def test_plants_are_as_uncertain_as_the_fit_says():
     fit, data = fitted(1), measured(1)
     plant = fx.assemble_plant(fit.model, ports()).discretized(RATE, delay=1)

@@ -206,6 +206,7 @@ def test_bounds_hold_and_are_flagged(chain):
     )
 
 
+@pytest.mark.slow
 def test_a_prior_is_one_more_measurement(chain):
     parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
     residuals = [Eigenvalues(measured(parts, 0.02))]
@@ -477,6 +478,7 @@ def test_localisation_beside_a_wrong_stiffness(plate):
         localise(rom, masses[:3], [data[0].select([4])], nuisance=masses[3:6])
 
 
+@pytest.mark.slow
 def test_localisation_says_when_nothing_changed(chain):
     data = Eigenvalues(measured(changed(chain), 1e-3, seed=4))
     found = localise(chain, [AddedMass(f"{i}:z") for i in range(1, 5)], [data])
@@ -583,6 +585,7 @@ def test_four_corner_sensors_do_not_pair_distant_modes(plate):
     assert "cannot distinguish" not in repr(seen)
 
 
+@pytest.mark.slow
 def test_a_fit_and_its_correlation_pair_alike(plate):
     """Shapes at four corners: the modes that the fit compares are those that are shown."""
     rom = plate.reduced(0.01, False)

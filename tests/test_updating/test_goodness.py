@@ -109,6 +109,7 @@ def test_a_bad_fit_warns_names_and_weighs_anew(chain):
     assert right.values[0] == pytest.approx(25.0, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_responses_that_a_model_does_not_explain_print_no_deviation(chain):
     """Coherent misfit of 45 lines is no noise: what +- would be is not known, and not printed."""
     K, noise = np.array(chain.K), np.random.default_rng(3).normal(size=(2, 4, 1, 45))
@@ -173,7 +174,7 @@ def changed_plate(plate, zeta, mass, stiffer):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("zeta", "mass", "stiffer"),
-    [(0.01, 0.7, -0.09), pytest.param(0.002, 0.6, 0.05, marks=pytest.mark.slow)],
+    [(0.01, 0.7, -0.09), (0.002, 0.6, 0.05)],
 )
 def test_responses_are_fitted_from_far_away(plate, zeta, mass, stiffer):
     """Peaks far from those of the model: by magnitude first it is found, at once it is not."""

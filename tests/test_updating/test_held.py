@@ -111,6 +111,7 @@ def test_a_slow_line_is_the_continuous_response_behind_half_a_sample(make):
     assert abs(both[1] / both[0] / turn - 1) < 1e-6
 
 
+@pytest.mark.slow
 def test_an_update_finds_what_the_sampled_machine_has(make):
     model = cases(make)["free"]
     truth = np.array([0.05, 0.1, 3.0])

@@ -59,6 +59,7 @@ def test_a_large_damper_to_the_ground_on_a_free_plate(plate):
     assert np.abs(sampled.system.poles()).max() < 1 + 1e-6
 
 
+@pytest.mark.slow
 def test_the_full_structure_takes_the_answer_too(plate):
     """The same damper and mass on the FEModel give the poles of the updated reduced model."""
     rom = plate.reduced(0.01, True)
@@ -74,6 +75,7 @@ def test_the_full_structure_takes_the_answer_too(plate):
     np.testing.assert_allclose(fit.values, [0.5, 60.0], rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_the_full_model_with_the_parameters_of_a_fit(plate):
     """M, D and K of the full FEModel are its own plus the estimated mass, damper and modulus."""
     rom = plate.reduced(0.01, True)

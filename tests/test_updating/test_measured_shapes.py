@@ -95,6 +95,7 @@ def test_scale_and_phase_do_not_matter_with_a_covariance(chain):
     assert size[0] > 1
 
 
+@pytest.mark.slow
 def test_noise_of_the_stated_covariance_counts_its_degrees_of_freedom(chain):
     """Shapes normalised to one at their largest entry, whose covariance is singular there."""
     poles, shapes = shapes_of(chain)

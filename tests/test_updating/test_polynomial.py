@@ -73,6 +73,7 @@ def test_three_per_cent_are_found(thickness, plate):
     assert deltas[0].scale == pytest.approx(wanted, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_gradients_of_all_residuals(thickness, plate):
     """Against central differences, far from p = 0, with an affine parameter beside it."""
     from flexplant.lti import Frf

@@ -61,6 +61,7 @@ def test_slopes_are_those_of_the_full_model(rom, quantity):
     np.testing.assert_allclose(S.sum(axis=1).imag / rom.modes().omega[3:8], whole, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_two_thicknesses_are_found(rom):
     truth = np.array([0.04, -0.03])
     omega = omegas("thickness", truth)[:6]

@@ -86,6 +86,7 @@ def normal(fit, truth):
     return np.abs((fit.values - truth) / fit.std)
 
 
+@pytest.mark.slow
 def test_a_trust_region_goes_on_where_gauss_newton_is_lost():
     """Of 300 such chains Gauss-Newton loses 4, this one with a mode that ceases to oscillate."""
     model, unknowns, data, truth = problem(131)

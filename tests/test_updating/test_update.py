@@ -95,6 +95,7 @@ def test_any_rotation_of_the_repeated_pair_gives_the_same(plate, attached):
     assert np.ptp(np.array(found), axis=0).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_updated_model_has_the_measured_poles(plate):
     target = oracle.truth(0.01)
     fit = fitted(plate, plate.reduced(0.01, True), target)
@@ -223,6 +224,7 @@ def test_triple_mode(make, node):
 # ---- rigid-body modes
 
 
+@pytest.mark.slow
 def test_a_mass_moves_the_centre_of_gravity_and_keeps_rigid_body_modes(plate):
     rom = plate.reduced(0.01, True)
     fit = fitted(plate, rom, oracle.truth(0.01))
@@ -323,6 +325,7 @@ def test_weights_pull_towards_their_pole(make):
     assert 0.21 < found[1] < 0.59
 
 
+@pytest.mark.slow
 def test_history_holds_every_iterate(plate):
     target = oracle.truth(0.01)
     rom = plate.reduced(0.01, True)
@@ -437,6 +440,7 @@ def test_covariance_is_that_of_repeated_measurements(make):
     np.testing.assert_allclose(fit.correlation, fit.covariance / np.outer(std, std))
 
 
+@pytest.mark.slow
 def test_without_measured_covariance_it_comes_from_the_residual(make):
     model = make([1, 2, 1.5], [(0, None, 90), (0, 1, 110), (1, 2, 70)], beta=2e-3)
     target = changed_poles(model, [(0, 1, 0.3)]) * [1.001, 1.0, 0.999]
@@ -470,6 +474,7 @@ def test_without_measured_covariance_it_comes_from_the_residual(make):
 # ---- the answer as a value, and bad input
 
 
+@pytest.mark.slow
 def test_result_reads_and_is_stored(plate, tmp_path):
     fit = fitted(plate, plate.reduced(0.01, True), oracle.truth(0.01))
     assert fit.parameters == (f"mass at {plate.z8}", f"damping at {plate.z8}")
@@ -531,6 +536,7 @@ def test_a_full_model_refuses_an_answer_that_is_not_physical(make):
         update(held, [AddedDamping("2:z")], [Eigenvalues(measured)])
 
 
+@pytest.mark.slow
 def test_a_search_ends_where_no_step_is_possible(make):
     """A free machine takes no negative spring to ground: K would be indefinite at any step."""
     free, part = make([1, 2, 1], [(0, 1, 90), (1, 2, 110)], beta=1e-3), AddedStiffness("2:z")
@@ -545,6 +551,7 @@ def test_a_search_ends_where_no_step_is_possible(make):
     assert fit.values == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_fit_that_does_not_converge_says_so(plate):
     with pytest.warns(FlexplantWarning, match="did not converge in 2 steps: max_iterations"):
         fit = fitted(plate, plate.reduced(0.01, True), oracle.truth(0.01), max_iterations=2)

@@ -43,6 +43,7 @@ def naive(frf, made, name):
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_the_loop_gain_line_by_line(frf, made):
     machine = on(frf, made)
     for opened in (None, "y1"):

@@ -62,6 +62,7 @@ def test_it_begins_with_a_law_that_is_stable_far_below_the_modes():
         assert {type(e).__name__ for e in bench.design.axes["y1"].elements} == {"Pid", "LowPass"}
 
 
+@pytest.mark.slow
 def test_a_slider_and_a_number_change_the_design_and_the_curves(page):
     before = page.views.sources["magnitude main"].data["y"].copy()
     number = numbers(page, 0)["zero"]
@@ -107,6 +108,7 @@ def test_elements_come_go_move_and_are_switched_off(page):
     assert down is not None
 
 
+@pytest.mark.slow
 def test_undo_redo_keep_and_go_back(page):
     first = page.design
     for place in (1.0, 1.1, 1.2):
@@ -309,6 +311,7 @@ def test_the_step_from_lines_is_that_of_the_model():
     np.testing.assert_allclose(exact[:200], found, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_with_a_plant_the_page_shows_the_error_and_the_modes_left_out():
     model = fx.chain(masses=[1.0] * 4, stiffnesses=[4e5] * 3)
     modes = fx.solve_modes(model, count=4, damping=fx.ModalDamping(0.01))
@@ -337,6 +340,7 @@ def test_with_a_plant_the_page_shows_the_error_and_the_modes_left_out():
     assert page.loop.margins.modulus_margin != high
 
 
+@pytest.mark.slow
 def test_a_measurement_over_its_model():
     plant = fx.testbeds.three_masses()
     frf = fx.frequency_response(plant.Gyu.select(["y1"]), np.linspace(0.5, 900.0, 1800))
@@ -369,6 +373,7 @@ def test_tuning_reports_can_be_stopped_and_is_taken():
     assert page.kept[0][1] is before
 
 
+@pytest.mark.slow
 def test_files_that_hold_a_plant(frf, tmp_path, capsys):
     frf.save(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", freq=frf.freq, data=frf.data)
