@@ -166,9 +166,9 @@ class StabilisationDiagram(Value):
         if not kept:
             where = f"over the orders {known[0]} to {known[-1]}" if known.size else "in the band"
             raise SolverError(
-                f"no pole stays {where}: raise the orders, "
-                "narrow the band to where resonances stand out of the noise, or pick poles by hand "
-                "with diagram.select(freq=[...])."
+                f"no pole stays {where}: take a band where resonances stand out of the noise, some "
+                "widths of them wide (few lines afford few orders), or pick poles by hand with "
+                "diagram.select(freq=[...])."
             )
         return self._chosen(kept)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.linalg as la
@@ -11,7 +11,7 @@ from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, attempted
 from ..tolerances import RANK, TINY
 from .line_weights import NARROW, Rejected, mains_multiple
-from .model_error import ALIKE, mac, strength, twin
+from .model_error import ALIKE, Disagreement, mac, strength, twin
 from .pole_test import pole_price, shared, unit
 from .refine import Fit, Lines, pivoted, refined
 
@@ -39,7 +39,7 @@ def gated(
         if found is None:
             break
         place, reason = found
-        listed.append(_entry(fit, place, reason))
+        listed.append(entry(fit, place, reason))
         if fit.poles.size == 1:
             raise SolverError(
                 f"no pole is left: {listed[-1][0]:.5g} Hz is {reason}. Widen the band, measure "
@@ -48,36 +48,53 @@ def gated(
         rest = np.delete(np.arange(fit.poles.size), place)
         fit = fitted(fit.poles[rest], fit.participation[:, rest])
     reasons = [_outside(lines, pole) for pole in fit.poles]
-    listed += [_entry(fit, k, why) for k, why in enumerate(reasons) if why]
+    listed += [entry(fit, k, why) for k, why in enumerate(reasons) if why]
     kept = np.array([k for k, why in enumerate(reasons) if why is None], dtype=np.int64)
     if not kept.size:
-        raise SolverError(
-            "no pole is left within the band: "
-            + "; ".join(f"{f:.5g} Hz is {why}" for f, _, why in listed[:3])
-            + ". Widen it."
-        )
+        raise _none_left(listed)
     return fit, kept, tuple(sorted(listed))
 
 
 def steady(
-    fit: Fit, reported: IntArray, spread: FloatArray
+    fit: Fit, reported: IntArray, apart: Disagreement
 ) -> tuple[IntArray, tuple[Rejected, ...]]:
     """Return which poles outputs (or inputs) that disagree share, and the others.
 
-    One beside another, whose damping at one of them is not known from zero (95 %) by its `spread`
-    (m,) over them, stands for what the outputs differ by.
+    One beside another, whose damping at one of them is not known from zero (95 %), stands for what
+    the outputs differ by; of one whose mean damping is known no better, nothing is known.
     """
+    damping, m = -fit.poles.real, fit.m
     beside = np.array([
         np.any(np.abs(np.delete(fit.poles.imag, k) - pole.imag) < -pole.real)
         for k, pole in enumerate(fit.poles)
     ])  # fmt: skip
-    vague = beside & (1.96 * spread > -fit.poles.real)
-    reason = f"not shared by the {fit.lines.side}: its damping differs by as much as it is"
-    out = tuple(_entry(fit, int(k), reason) for k in reported[vague[reported]])
-    return reported[~vague[reported]], out
+    differs = beside & (1.96 * apart.spread[:m] > damping)
+    unknown = apart.deviation[:m] >= -apart.poles.real
+    side, listed = fit.lines.side, []
+    for k in reported[(differs | unknown)[reported]]:
+        reason = (
+            f"not shared by the {side}: its damping differs by as much as it is"
+            if differs[k]
+            else f"without information: over the {side} the deviation of its damping exceeds it"
+        )
+        listed.append(entry(fit, int(k), reason))
+    kept = reported[~(differs | unknown)[reported]]
+    if not kept.size:
+        raise _none_left(listed)
+    return kept, tuple(listed)
 
 
-def _entry(fit: Fit, k: int, reason: str) -> Rejected:
+def _none_left(listed: Sequence[Rejected]) -> SolverError:
+    """Return the error of an answer without poles."""
+    return SolverError(
+        "no pole is left within the band: "
+        + "; ".join(f"{f:.5g} Hz is {why}" for f, _, why in listed[:3])
+        + ". Widen the band, measure longer, or average more."
+    )
+
+
+def entry(fit: Fit, k: int, reason: str) -> Rejected:
+    """Return the line of a list of what is not reported."""
     pole = complex(fit.poles[k])
     return abs(pole) / (2 * np.pi), -pole.real / abs(pole), reason
 

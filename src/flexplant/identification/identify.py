@@ -24,13 +24,14 @@ from ..errors import (
     ModelError,
     ShapeError,
     SolverError,
+    attempted,
     counted,
     require_known,
     warn,
 )
 from ..lti.frequency import Frf
 from ..parallel import Progress, expect, one_thread
-from ..tolerances import ROUNDING
+from ..tolerances import ROUNDING, TINY
 from .diagram import (
     PoleSelection,
     StabilisationDiagram,
@@ -40,9 +41,9 @@ from .diagram import (
     weighted_by_remainder,
 )
 from .frf_estimation import repetitions, stacked
-from .gate import gated, lesser, single, steady
-from .line_weights import PreparedLines, prepared
-from .model_error import ALIKE, NOISE, disagreement, outputs_disagree
+from .gate import entry, gated, lesser, single, steady
+from .line_weights import PreparedLines, Rejected, prepared
+from .model_error import ALIKE, NOISE, disagreement, outputs_disagree, strength
 from .pole_test import (
     UPPER,
     dropped,
@@ -73,6 +74,9 @@ MOST, MOST_POLES = 6, 60
 #: explained badly, and what is left of it is no other pole; and lines that a peak has beside it on
 #: either side, where the edge of the band shows one flank only
 REGION, FLANK = 20, 5
+#: power of the largest line for the middle one's, of a response that stands out: of noise in one
+#: channel, the largest of a million lines is 20 times the middle one
+STANDS_OUT = 20.0
 #: values of the FRF times (poles times references) squared, the products of a step of the fit, up
 #: to which it is made without a request: some seconds altogether
 CHEAP = 5e7
@@ -80,6 +84,8 @@ CHEAP = 5e7
 BUDGET = 5e10
 #: multiplications of a whole fit and of a first answer for those of a step, on average
 _REFINED, _FIRST = 6e3, 200.0
+#: misfit of a first answer that is warned of: deviations are enlarged by its square root
+LARGE = 4.0
 #: steps that compare fits: the diagram's poles are off by more than noise makes them
 QUICK = 2
 
@@ -219,7 +225,7 @@ def identify_modes(
         not where poles of each output's own leave noise alone and shared ones far more, as outputs
         that disagree do. False takes about a second.
     most : int
-        Poles that the fit may have.
+        Poles that the fit may have, the strongest; others of the diagram are in `rejected`.
     max_iterations : int
         Of the fit.
     progress : bool, optional
@@ -265,7 +271,9 @@ def identify_modes(
     most, steps = whole(most, "most"), whole(max_iterations, "max_iterations")
     if refine is not None and not isinstance(refine, bool):
         raise ModelError(f"refine is True, False or None, got {short(refine)}.")
-    runs: tuple[Any, ...] = repetitions(frf) if isinstance(frf, list | tuple) else (frf,)
+    runs: tuple[Any, ...] = tuple(frf) if isinstance(frf, list | tuple) else (frf,)
+    if len(runs) != 1:
+        runs = repetitions(runs)
     with one_thread():
         try:
             return _identified(
@@ -324,20 +332,31 @@ def _identified(
             setups=together if side == rows else (),
         )
 
-    diagram, at_peaks = None, False
+    diagram, at_peaks, alone = None, False, start is None
     if start is None:
         diagram = diagram_of(ready, affordable(listed, ready), (0.01, 0.05, 0.95), 0.2)
         try:
             chosen = diagram.automatic()
         except SolverError:
-            found = None if frf.window is not None or refine else _at_peaks(lines_of(ready))
+            if frf.window is not None or refine:
+                raise
+            lines = lines_of(ready)
+            found = _at_peaks(lines)
+            at_peaks = found is not None
+            found = found or _nearest(lines, diagram)
             if found is None:
                 raise
-            chosen, refine, at_peaks = found, False, True
+            chosen, alone, refine = found, False, False if at_peaks else refine
             warn(
                 "no pole stays over the orders of the stabilisation diagram: the poles are those "
-                "of the highest peaks, their damping is no more than its order of magnitude. A "
-                "transient that has not decayed or a single run looks so: average over more runs."
+                + (
+                    "of the highest peaks, their damping is no more than its order of magnitude "
+                    "and their deviations are half a width of the resonance. A transient that has "
+                    "not decayed or a single run looks so: average over more runs."
+                    if at_peaks
+                    else "nearest the largest response. Widen the band, or choose from the diagram "
+                    "by hand (start=)."
+                )
             )
     elif start.participation.shape[0] != ready.data.shape[1]:
         raise ShapeError(
@@ -346,7 +365,7 @@ def _identified(
         )
     else:
         chosen = start
-    alone, free = start is None and not at_peaks, upper is None
+    free = upper is None
     work = ready.data.size * (len(chosen) * ready.data.shape[1]) ** 2
     costly = work > CHEAP
     shown = True if refine and costly and progress is None else progress
@@ -356,10 +375,11 @@ def _identified(
         bar.advance()
         expect(work * (_REFINED if refine or (refine is None and not costly) else _FIRST))
         lines = lines_of(ready)
-        judged = refine is not False and alone
+        judged = refine is not False and not at_peaks
         # one step is as near to a machine as noise is; what outputs disagree in needs more
-        fit, reason = _first(lines, chosen, alone, QUICK if judged else 1), ""
-        if judged and lesser(fit, fit.participation, ALIKE):
+        fit, weaker = _first(lines, chosen, alone, QUICK if judged else int(alone))
+        reason = ""
+        if judged and alone and lesser(fit, fit.participation, ALIKE):
             less = single(lines, fit, fit.participation, QUICK)
             fit = less if outputs_disagree(less, fit.cost) else fit
         differ = judged and outputs_disagree(fit)
@@ -399,22 +419,43 @@ def _identified(
             excess = fit.cost - freedom(lines, fit.poles.size)
             apart = disagreement(lines, fit, own_price(lines, fit), excess)
             if apart is not None:
-                reported, others = steady(fit, reported, apart.spread[: fit.m])
+                reported, others = steady(fit, reported, apart)
                 fit = Fit(lines, apart.poles, fit.participation, fit.pivots)
                 rejected += others
-        if compare or budget.done > BUDGET:
+        # a first answer may leave some misfit, but not so much that deviations are twice as large
+        misfit = fit.cost / freedom(lines, fit.poles.size)
+        if compare or budget.done > BUDGET or (alone and misfit > LARGE):
             warned(unexplained(lines, fit), None if apart is None else (apart.size, lines.side))
         if side == RUNS:
             ready = ready.over_runs(len(runs))
             lines = replace(lines, data=ready.data, weight=ready.weight, setups=())
             fit = Fit(lines, fit.poles, fit.participation, fit.pivots)
-        listed_out = tuple(sorted(rejected + ready.mains))
+        listed_out = tuple(sorted(weaker + rejected + ready.mains))
         answered = answer(
             frf, ready, lines, fit, reported, labels, diagram, listed_out, reason, apart
         )
+        if at_peaks:
+            half = np.maximum(-answered.poles.real, np.pi * float(np.median(np.diff(lines.freq))))
+            answered = answered.replace(covariance=np.diag(np.tile(half, 2) ** 2))
         bar.advance(STAGES - bar.done)
     leakage_warned(frf, answered)
     return answered
+
+
+def _nearest(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection | None:
+    """Return the diagram's pole nearest the largest response, None where nothing stands out.
+
+    In a band little wider than its resonance, whose lines afford few orders, poles of outputs that
+    disagree are not the same from one order to the next.
+    """
+    power = np.sum(np.abs(lines.data * lines.weight) ** 2, axis=(0, 1))
+    inner = slice(FLANK, -FLANK)
+    place = int(np.argmax(power[inner]))
+    if power[inner][place] < STANDS_OUT * np.median(power):
+        return None
+    with attempted("a pole at the largest response", ModelError):
+        return diagram.select([float(lines.freq[inner][place])])
+    return None
 
 
 def _at_peaks(lines: Lines) -> PoleSelection | None:
@@ -449,12 +490,27 @@ def _turns(fit: Fit) -> bool:
     )
 
 
-def _first(lines: Lines, chosen: PoleSelection, alone: bool, steps: int) -> Fit:
-    """Return the fit near the poles chosen, with all residual terms and no search for others."""
+def _first(
+    lines: Lines, chosen: PoleSelection, alone: bool, steps: int
+) -> tuple[Fit, tuple[Rejected, ...]]:
+    """Return the fit near the poles chosen, with all residual terms and no search for others.
+
+    Of more poles than are requested the strongest are kept; the others are returned too.
+    """
     if not alone:
-        return Fit(lines, chosen.poles, chosen.participation)
+        fit = Fit(lines, chosen.poles, chosen.participation)
+        now = fit.poles, fit.participation
+        return (refined(lines, *now, steps=steps, strict=False) if steps else fit), ()
     fit = supported(lines, chosen.poles, chosen.participation)
-    return refined(lines, fit.poles, fit.participation, steps=steps, strict=False, first=fit)
+    height = strength(fit)
+    height[lesser(fit, fit.shapes, ALIKE)] *= TINY  # of two poles of one resonance one counts
+    places = np.argsort(-height, kind="stable")
+    keep, others = np.sort(places[: lines.most]), places[lines.most :]
+    weaker = tuple(entry(fit, int(k), f"weaker than the {lines.most} of most=") for k in others)
+    if weaker:
+        fit = pivoted(lines, fit.poles[keep], fit.participation[:, keep])
+    fit = refined(lines, fit.poles, fit.participation, steps=steps, strict=False, first=fit)
+    return fit, weaker
 
 
 def _refined(

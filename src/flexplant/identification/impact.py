@@ -13,6 +13,7 @@ from ..checks import ComplexArray, FloatArray, IntArray, Value, between, instanc
 from ..errors import ModelError, ShapeError, SolverError, counted, require_known, unknown_label
 from ..lti.frequency import Frf
 from ..tolerances import TINY
+from .line_weights import mains_multiple
 from .result import IdentifiedModes
 from .spectra import Records, dropouts_warned, error_statistics, records
 
@@ -118,7 +119,8 @@ class ImpactTest(Value):
     def corrected(self, found: IdentifiedModes) -> IdentifiedModes:
         r"""Return modes identified from `frf` without the window's damping.
 
-        Force and responses times ``exp(-t/tau)`` are those of ``H(s + 1/tau)``: poles move by
+        Poles whose damping beyond the window is within its deviation go to `rejected`. Force and
+        responses times ``exp(-t/tau)`` are those of ``H(s + 1/tau)``: poles move by
         -1/tau exactly, residues not at all. Of noise white in time, a fit of
         ``g = t exp(-(a + 1/tau) t)``, a pole's derivative, has the variance
 
@@ -135,26 +137,37 @@ class ImpactTest(Value):
 
         Raises
         ------
+        ModelError
+            When the window's damping was taken out of them before.
         SolverError
-            When no pole has damping beyond that of the window.
+            When no pole has damping beyond that of the window, and its deviation.
         """
         instance(found, IdentifiedModes, "found", "Pass identify_modes(test.frf).")
         if not np.isfinite(self.decay):
             return found
+        if found.undamped:
+            raise ModelError(
+                "the window's damping is out of these modes already: pass identify_modes(test.frf)."
+            )
         shift = 1.0 / self.decay
-        damped = np.flatnonzero(found.poles.real + shift < 0)
+        rate = -(found.poles.real + shift)
+        known = np.zeros(rate.size) if found.std is None else found.std.real
+        mains = [mains_multiple(freq, 1.0 / self.segment) for freq in found.freq.tolist()]
+        # a line of mains has none: by chance it is beyond one deviation in one of six
+        least = known * np.where([one is None for one in mains], 1.0, 2.0)
+        damped = np.flatnonzero((rate > 0) & (rate > least))
         listed = [(f, z - shift / (2 * np.pi * f), why) for f, z, why in found.rejected]
         for k in np.setdiff1d(np.arange(len(found)), damped):
-            left = -float(found.poles[k].real) - shift
-            zeta = left / abs(found.poles[k])
-            listed.append((float(found.freq[k]), float(zeta), "without damping beyond the window"))
+            why = mains[k] or (
+                f"without damping beyond the window: {rate[k]:.2g} +- {known[k]:.2g} rad/s"
+            )
+            listed.append((float(found.freq[k]), float(rate[k] / abs(found.poles[k])), why))
         if not damped.size:
             raise SolverError(
                 f"no pole has damping beyond the window's {shift:.3g} rad/s: they are disturbances "
                 "of one frequency, or the segments are too short. Take longer ones, segment=."
             )
-        kept = found.select(damped.tolist())
-        rate = -(kept.poles.real + shift)
+        kept, rate = found.select(damped.tolist()), rate[damped]
         share = (rate + shift) / (rate + 2 * shift)
         whole = 2 * self.segment * shift / -np.expm1(-2 * self.segment * shift)
         whole = whole / self.dependence
@@ -169,6 +182,7 @@ class ImpactTest(Value):
             ),
             unreported=(poles + shift, shapes, participation),
             rejected=tuple(sorted(listed)),
+            undamped=shift,
         )
 
 

@@ -25,6 +25,9 @@ LIMIT = 3.0
 NEXT_TO_NONE = 1e-3
 #: halvings of the interval of a variance: to nine digits
 BISECTIONS = 30
+#: the damping of an output's own pole for its usual one beyond which it is another thing: what a
+#: sensor adds changes frequencies, hardly the damping
+BROAD = 3.0
 #: lines, or half-widths, beside a pole over which misfit is compared
 NEAR, WIDE = 20.0, 3.0
 
@@ -150,8 +153,11 @@ def disagreement(lines: Lines, fit: Fit, least: float, excess: float) -> Disagre
     places = np.array([np.concatenate([one.poles.real, one.poles.imag]) for one in own])
     # an output that hardly sees a mode may have its own pole anywhere: known no better than there
     seen, alone = (np.array([_variance(one) for one in fits]) for fits in (_parted(fit), own))
-    variance = np.maximum(seen, alone) + np.tile(np.array([_strayed(fit, one) for one in own]), 2)
-    mean, spread, deviation, weighted = random_effects(places, variance)
+    elsewhere, broad = (np.tile(squares, 2) for squares in _strayed(fit, own))
+    variance = np.maximum(seen, alone) + elsewhere
+    # the spread is that of all outputs, broad poles too: it shows which poles are not shared
+    spread = random_effects(places, variance)[1]
+    mean, _, deviation, weighted = random_effects(places, variance + broad)
     power = np.sqrt(np.sum(weighted**2, axis=0))
     weighted = weighted / np.maximum(power, TINY)
     m, count = fit.poles.size, len(own)
@@ -175,11 +181,22 @@ def _variance(one: Fit) -> FloatArray:
     return np.asarray(one.lines.inflation * np.diag(inverse) / size**2)
 
 
-def _strayed(fit: Fit, one: Fit) -> FloatArray:
-    """Return the squares of how far own poles (m,) are that came nearer to another shared pole."""
-    away = np.abs(one.poles[:, None] - fit.poles)
-    near = np.argmin(away, axis=1) == np.arange(fit.m)
-    return np.where(near, 0.0, np.diag(away) ** 2)
+def _strayed(fit: Fit, own: list[Fit]) -> tuple[FloatArray, FloatArray]:
+    """Return the squares (n, m) of how far own poles are that stand for something else.
+
+    First of those that came nearer to another shared pole, then of those that are much broader
+    than in most outputs: where an output hardly sees a mode, its pole becomes a part of the smooth
+    remainder.
+    """
+    poles = np.array([one.poles for one in own])
+    away = np.abs(poles[:, :, None] - fit.poles)
+    other = np.argmin(away, axis=2) != np.arange(fit.m)
+    usual = np.median(poles.real, axis=0) + 1j * np.median(poles.imag, axis=0)
+    broad = -poles.real > BROAD * -usual.real
+    return (
+        np.where(other, np.einsum("okk->ok", away) ** 2, 0.0),
+        np.where(broad, np.abs(poles - usual) ** 2, 0.0),
+    )
 
 
 def random_effects(

@@ -322,6 +322,8 @@ class IdentifiedModes(MeasuredModes):
         poles are then means over these, and their covariance comes from how they differ.
     inconsistent : str
         Which of them disagree, "outputs", "inputs" or "runs", empty where none do.
+    undamped : float [rad/s]
+        What was taken out of the damping: that of an exponential window.
 
     Examples
     --------
@@ -352,6 +354,7 @@ class IdentifiedModes(MeasuredModes):
     first_answer: str = field(default="", kw_only=True)
     inconsistency: float | None = field(default=None, kw_only=True)
     inconsistent: str = field(default="", kw_only=True)
+    undamped: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
