@@ -86,6 +86,18 @@ def test_poles_of_a_ruler_picked_by_hand_stay_where_outputs_see_them():
         assert np.all(modes.std.real < 0.3 * -modes.poles.real)
 
 
+def test_one_odd_output_is_named():
+    rng, freq = np.random.default_rng(7), np.arange(20.0, 160.0, 0.25)
+    phi, drive, truth = rng.normal(size=(6, 3)), rng.normal(size=(1, 3)), np.array([33.0, 58.0, 91])
+    off = [2e-3 if o == 3 else 0.0 for o in range(6)]
+    parts = [pole(truth * (1 + one), np.full(3, 0.01)) for one in off]
+    H = np.array([modal_frf(freq, p, phi[[o]], drive)[0] for o, p in enumerate(parts)])
+    deviation = 1e-3 * np.sqrt(np.mean(np.abs(H) ** 2))
+    frf = Frf(freq, noisy(H, deviation, rng), variance=np.full(H.shape, deviation**2))
+    with pytest.warns(FlexplantWarning, match=r"y4 is off by 0\.2 %"):
+        assert len(identify_modes(frf)) == 3
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_band_little_wider_than_its_resonance(seed):

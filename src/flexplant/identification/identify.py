@@ -43,7 +43,7 @@ from .diagram import (
 from .frf_estimation import repetitions, stacked
 from .gate import entry, gated, lesser, single, steady
 from .line_weights import PreparedLines, Rejected, prepared
-from .model_error import ALIKE, NOISE, disagreement, outputs_disagree, strength
+from .model_error import ALIKE, NOISE, Disagreement, disagreement, outputs_disagree, strength
 from .pole_test import (
     UPPER,
     dropped,
@@ -425,7 +425,8 @@ def _identified(
         # a first answer may leave some misfit, but not so much that deviations are twice as large
         misfit = fit.cost / freedom(lines, fit.poles.size)
         if compare or budget.done > BUDGET or (alone and misfit > LARGE):
-            warned(unexplained(lines, fit), None if apart is None else (apart.size, lines.side))
+            differing = None if apart is None else (apart.size, lines.side, _odd(frf, lines, apart))
+            warned(unexplained(lines, fit), differing)
         if side == RUNS:
             ready = ready.over_runs(len(runs))
             lines = replace(lines, data=ready.data, weight=ready.weight, setups=())
@@ -440,6 +441,16 @@ def _identified(
         bar.advance(STAGES - bar.done)
     leakage_warned(frf, answered)
     return answered
+
+
+def _odd(frf: Frf, lines: Lines, apart: Disagreement) -> str:
+    """Return which output, input or run is off by far more than the others, empty where none is."""
+    if apart.odd is None:
+        return ""
+    place, off = apart.odd
+    names = frf.inputs if lines.side == "inputs" else frf.outputs
+    who = f"run {place + 1}" if lines.side == RUNS else names[int(lines.parts[place][0])]
+    return f"{who} is off by {100 * off:.2g} %, far more than the others: look at it. "
 
 
 def _nearest(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection | None:

@@ -28,6 +28,8 @@ BISECTIONS = 30
 #: the damping of an output's own pole for its usual one beyond which it is another thing: what a
 #: sensor adds changes frequencies, hardly the damping
 BROAD = 3.0
+#: deviations of the outputs' frequencies beyond which one output is another machine's
+ODD = 6.0
 #: lines, or half-widths, beside a pole over which misfit is compared
 NEAR, WIDE = 20.0, 3.0
 
@@ -124,7 +126,8 @@ class Disagreement:
     """By how much outputs differ in the frequencies (relative), and their mean poles (m,).
 
     `spread` (2 m,) of [Re lambda; Im lambda] is the deviation of an output from them, `deviation`
-    their own, `correlation` over the outputs.
+    their own, `correlation` over the outputs. `odd` is the one output (or set-up) that is off by
+    far more than the others, and by how much (relative), where there is one.
     """
 
     size: float
@@ -132,6 +135,7 @@ class Disagreement:
     spread: FloatArray
     deviation: FloatArray
     correlation: FloatArray
+    odd: tuple[int, float] | None = None
 
     def covariance(self, formal: FloatArray) -> FloatArray:
         """Return the covariance of the poles, with that of the noise alone (2 m, 2 m) in it."""
@@ -164,7 +168,10 @@ def disagreement(lines: Lines, fit: Fit, least: float, excess: float) -> Disagre
     poles = mean[:m] + 1j * mean[m:]
     away = (places[:, m:] - np.median(places[:, m:], axis=0)) / np.abs(poles)
     size = 1.4826 * float(np.median(np.abs(away))) * np.sqrt(count / (count - 1.0))
-    return Disagreement(size, poles, spread, deviation, weighted.T @ weighted)
+    off = np.median(away, axis=1)
+    worst = int(np.argmax(np.abs(off)))
+    odd = (worst, float(off[worst])) if abs(off[worst]) > ODD * size else None
+    return Disagreement(size, poles, spread, deviation, weighted.T @ weighted, odd)
 
 
 def _parted(fit: Fit) -> list[Fit]:

@@ -535,15 +535,19 @@ def unexplained(lines: Lines, fit: Fit) -> list[Peak]:
     return kept
 
 
-def warned(left: list[Peak], apart: tuple[float, str] | None) -> None:
-    """Warn of stretches that no pole explains, of single lines, or of outputs that disagree."""
+def warned(left: list[Peak], apart: tuple[float, str, str] | None) -> None:
+    """Warn of stretches that no pole explains, of single lines, or of outputs that disagree.
+
+    These by how much, what they are, and which one is off by far more than the others.
+    """
     stretches = [peak for peak in left if not peak.isolated]
     if apart is not None:
         warn(
             f"{apart[1]} disagree on the frequencies by {100 * apart[0]:.2g} % (standard "
             "deviation), which explains most of what is more than noise: a sensor or a hammer that "
             "moves and has mass, an amplitude or a temperature that changed between measurements. "
-            f"Poles are means over the {apart[1]}, their deviations come from how these differ."
+            f"{apart[2]}Poles are means over the {apart[1]}, their deviations come from how these "
+            "differ."
         )
     elif stretches:
         warn(
