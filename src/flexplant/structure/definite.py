@@ -36,13 +36,21 @@ _SLOW = 1e-2
 
 def check_semidefinite(matrix: Matrix, name: str) -> None:
     """Raise ModelError unless a symmetric matrix is positive semi-definite to rounding."""
-    if not _is_semidefinite(matrix):
+    if said := indefinite(matrix, name):
         raise ModelError(
-            f"{name} is not positive semi-definite: {lowest(matrix)}. The structure would "
-            f"{'be unstable' if name == 'K' else 'feed energy in'}. Look for a sign or "
-            "for swapped arguments (the order is M, K, D)."
+            f"{said} Look for a sign or for swapped arguments (the order is M, K, D)."
             + (" Magnets may only make rigid-body motions unstable." if name == "K" else "")
         )
+
+
+def indefinite(matrix: Matrix, name: str) -> str:
+    """Return in words that K or D is not positive semi-definite; empty when it is."""
+    if _is_semidefinite(matrix):
+        return ""
+    return (
+        f"{name} is not positive semi-definite: {lowest(matrix)}. The structure would "
+        f"{'be unstable' if name == 'K' else 'feed energy in'}."
+    )
 
 
 def symmetric(given: Any, name: str, n: int) -> Matrix:

@@ -43,7 +43,11 @@ class Point:
         where = self._where
         lost = [n for n in numbers if n not in where]
         if lost:
-            raise ModelError(f"modes {lost} cease to oscillate.")
+            raise ModelError(
+                f"modes {lost} cease to oscillate: with {self.family.text(self.p)} they have no "
+                "pole, or no shape, to compare with the measured one. Keep dampers to what is "
+                "possible (bounds=), or begin nearer to the answer (start=)."
+            )
         return [where[n] for n in numbers]
 
     def sensitivity(self, numbers: Sequence[int]) -> ComplexArray:

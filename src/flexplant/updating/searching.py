@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, TypeAlias, cast
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ..checks import FloatArray, Rng, generator, real_array, whole
-from ..errors import FlexplantError, LabelError, ModelError, ShapeError, SolverError, attempted
+from ..errors import (
+    FlexplantError,
+    LabelError,
+    ModelError,
+    ShapeError,
+    SolverError,
+    attempted,
+    counted,
+)
 from ..tolerances import TINY, divisor
 from .judgement.goodness import chance, chi_square, is_bad
 from .parameters.added import PointParameter
@@ -20,7 +29,7 @@ from .residuals.residual import Residual
 from .search import Objective, SearchEnd, TrustRegion, UpdateMethod
 from .search.update_method import Trail
 from .sensitivities import checked_values
-from .update_result import Starts
+from .update_result import Starts, changed_model
 
 #: the end of a search, or why there is none
 Reached: TypeAlias = SearchEnd | FlexplantError
@@ -111,6 +120,71 @@ NEARLY = 1e-6
 SAME_END = 1e-4
 
 
+class _Found(NamedTuple):
+    """An end, and how good it was where it was found."""
+
+    end: SearchEnd
+    #: whether its modes are paired from the start given or from the default
+    named: bool
+    #: whether another start may lead to a better one
+    improvable: bool
+    #: whether noise explains what is left, and the model is possible
+    likely: bool
+
+
+class _Tried:
+    """Searches from one start after the other; the objective is where the last one left it."""
+
+    def __init__(
+        self, objective: Objective, method: UpdateMethod, most: int | None, tolerance: float
+    ) -> None:
+        self.objective = objective
+        self.method = method
+        self.most = most
+        self.tolerance = tolerance
+        self.begins: list[FloatArray] = []
+        self.ends: list[Reached] = []
+        self.found: list[_Found] = []
+        #: difference of costs that rounding makes
+        self.rounding = 0.0
+
+    def add(self, begin: FloatArray, *, led: bool, named: bool = False) -> None:
+        """Search from a start; `led`: through easier problems first."""
+        best, search = self.best, _led if led else _direct
+        sound = best is not None and not best.improvable
+        limit = GLANCE if sound and self.most is None else self.most
+        enough = max(self.tolerance, NEARLY) if self.ends else self.tolerance
+        end = _attempt(search, self.objective, begin, self.method, limit, enough)
+        if isinstance(end, SearchEnd) and best is not None and limit != self.most:
+            near = end.cost < WORTH * best.end.cost
+            if near and not end.converged:
+                end = _attempt(_settled, self.objective, end, self.method, None, enough)
+        self.begins.append(begin)
+        self.ends.append(end)
+        if isinstance(end, SearchEnd):
+            if not self.found:
+                size = self.objective.size(self.objective.at(end.p))
+                self.rounding = (EXACT * float(np.linalg.norm(size))) ** 2
+            self.found.append(_judged(self.objective, end, named=named))
+
+    @property
+    def best(self) -> _Found | None:
+        """The end of least cost, of those that noise explains where one does; the earliest."""
+        # poles are only paired anew where that explains them: an outlier is no wrong pairing
+        pool = [one for one in self.found if one.named or not one.improvable] or self.found
+        pool = [one for one in pool if one.likely] or pool
+        best: _Found | None = None
+        for one in pool:
+            if best is None or one.end.cost < (1 - SAME_COST) * best.end.cost - self.rounding:
+                best = one
+        return best
+
+    @property
+    def alike(self) -> bool:
+        """Whether all starts met the same: more of them would as well."""
+        return not self.found and len({_head(end) for end in self.ends}) == 1
+
+
 def from_one_start(
     objective: Objective,
     begin: FloatArray,
@@ -119,52 +193,106 @@ def from_one_start(
     tolerance: float,
     rng: Rng,
     *,
-    led: bool,
+    given: bool,
 ) -> tuple[SearchEnd, list[FloatArray], list[Reached]]:
     """Return the best end, the objective being there, all starts that were tried and their ends.
 
-    A few other starts are always tried: a minimum does not show that there is another. Where the
-    end explains nothing of responses (a peak of the model lies on a wrong measured one), or is far
-    from poles alone (modes may have been paired wrongly), there are more. `led`: through easier
-    problems first.
+    A few other starts are always tried: a minimum does not show that there is another. The default
+    is the first of them where a start was given. There are more where no start leads to an end, or
+    the best one explains nothing of responses (a peak of the model lies on a wrong measured one),
+    or is far from poles alone (modes may have been paired wrongly).
     """
-    begins, ends = [begin], [_attempt(objective, begin, method, most, tolerance, led=led)]
-    first = ends[0]
-    best = first if isinstance(first, SearchEnd) else None
-    size = 0.0 if best is None else float(np.linalg.norm(objective.size(objective.at(best.p))))
-    rounding = (EXACT * size) ** 2
+    if given:
+        # a start that is no model is a mistake of the call
+        objective.family.at(begin)
+    default = objective.default_start
+    tried = _Tried(objective, method, most, tolerance)
+    tried.add(begin, led=not given, named=True)
+    # modes are numbered at each start
+    middles = [(begin, not given)]
+    if given and not np.array_equal(begin, default):
+        tried.add(default, led=True, named=True)
+        best = tried.best
+        well = best is not None and best.end is tried.ends[0] and not best.improvable
+        middles.insert(1 if well else 0, (default, True))
     small = len(objective.family.V) <= SMALL
     always, retries = (ALWAYS, RETRIES) if small else (ALWAYS_LARGE, RETRIES_LARGE)
-    for count, other in enumerate(scattered(objective, begin, retries, rng)):
-        sound = best is not None and not (led and _improvable(objective, best))
-        if count >= always and (best is None or sound):
+    others, led = _others(objective, middles, retries + 1 - len(tried.ends), rng)
+    for other in others:
+        best = tried.best
+        enough = tried.alike if best is None else not best.improvable
+        if len(tried.ends) > always and enough:
             break
-        limit = most if most is not None or not sound else GLANCE
-        found = _attempt(objective, other, method, limit, max(tolerance, NEARLY), led=led)
-        if sound and best is not None and isinstance(found, SearchEnd):
-            near = found.cost < WORTH * best.cost
-            if near and most is None and not found.converged:
-                found = _settled(objective, method, found, most, max(tolerance, NEARLY))
-        begins.append(other)
-        ends.append(found)
-        if not isinstance(found, SearchEnd):
-            continue
-        # poles are only paired anew where that explains them: an outlier is no wrong pairing
-        lower = best is None or found.cost < (1 - SAME_COST) * best.cost - rounding
-        if lower and not (objective.numbers and _improvable(objective, found)):
-            best = found
+        tried.add(other, led=led)
+    best = tried.best
     if best is None:
-        raise cast(FlexplantError, first)
+        raise none_found(objective, tried.begins, tried.ends)
+    end = best.end
+    if end is not tried.ends[0]:
+        settled = _attempt(_settled, objective, end, method, most, tolerance)
+        end = settled if isinstance(settled, SearchEnd) else end
     objective.path = []
-    if best is not first:
-        best = _settled(objective, method, best, most, tolerance)
-        objective.path = []
-    objective.follow(best.trail.p)
-    return best, begins, ends
+    objective.follow(end.trail.p)
+    return end, tried.begins, tried.ends
+
+
+def _others(
+    objective: Objective, middles: list[tuple[FloatArray, bool]], count: int, rng: Rng
+) -> tuple[list[FloatArray], bool]:
+    """Return starts around the first of some where the modes can be numbered, and its `led`."""
+    for middle, led in middles:
+        with attempted("starts around another", (ModelError, LabelError)):
+            return scattered(objective, middle, count, rng), led
+    return [], False
+
+
+def none_found(
+    objective: Objective, begins: list[FloatArray], ends: list[Reached]
+) -> FlexplantError:
+    """Return the error that no start leads to an end: what all of them met."""
+    failed = [end for end in ends if isinstance(end, FlexplantError)]
+    met = Counter(map(_head, failed))
+    if len(met) == 1:
+        # what is met at the default start is no matter of the values there
+        default = (np.array_equal(begin, objective.default_start) for begin in begins)
+        return next((end for end, one in zip(failed, default, strict=True) if one), failed[0])
+    said = "; ".join(f"{head} ({counted(count, 'start')})" for head, count in met.most_common())
+    error = SolverError(
+        f"none of {len(begins)} starts leads anywhere: {said}. Begin nearer to the answer (start=) "
+        "or keep the parameters to what is possible (bounds=); whether the measurement determines "
+        "them at all, identifiability(model, parameters, residuals) says. The notes of this error "
+        "have every start."
+    )
+    for begin, end in zip(begins, failed, strict=True):
+        error.add_note(f"from {objective.family.text(begin)}: {end}")
+    return error
+
+
+def _head(end: Reached) -> str:
+    """Return what a search met without where."""
+    return str(end).split(": ")[0]
+
+
+def _judged(objective: Objective, end: SearchEnd, *, named: bool) -> _Found:
+    """Return an end, where the objective is, with how good it is."""
+    point = objective.at(end.p)
+    chi2, dof = chi_square(objective, point, np.ones(end.p.size, dtype=bool))
+    explained = end.converged and chi2 is not None and not is_bad(chance(chi2, dof))
+    improvable = not explained and dof > 0 and _improvable(objective, end, point)
+    return _Found(end, named, improvable, explained and _is_possible(objective, end.p))
+
+
+def _is_possible(objective: Objective, p: FloatArray) -> bool:
+    """Return whether the model with the parameters at `p` is one."""
+    try:
+        changed_model(objective.family.model, objective.parameters, p, objective.family)
+    except ModelError:
+        return False
+    return True
 
 
 def _settled(
-    objective: Objective, method: UpdateMethod, end: SearchEnd, most: int | None, tolerance: float
+    objective: Objective, end: SearchEnd, method: UpdateMethod, most: int | None, tolerance: float
 ) -> SearchEnd:
     """Return the end of a search that goes on from another's."""
     objective.path = end.trail.p[:-1]
@@ -173,19 +301,10 @@ def _settled(
     return found
 
 
-def _attempt(
-    objective: Objective,
-    begin: FloatArray,
-    method: UpdateMethod,
-    most: int | None,
-    tolerance: float,
-    *,
-    led: bool,
-) -> Reached:
+def _attempt(search: Callable[..., SearchEnd], *given: Any) -> Reached:
     """Return the end of a search, or why there is none."""
-    search = _led if led else _direct
     try:
-        return search(objective, begin, method, most, tolerance)
+        return search(*given)
     except FlexplantError as error:
         return error
 
@@ -219,29 +338,18 @@ def _led(
     return found
 
 
-def _improvable(objective: Objective, end: SearchEnd) -> bool:
-    """Return whether another start may lead to a better end."""
+def _improvable(objective: Objective, end: SearchEnd, point: Point) -> bool:
+    """Return whether another start may lead to a better end than one that noise leaves open."""
     if not objective.numbers:
-        return _absurd(objective, end.p)
+        r, size = objective.values(point, prior=False), objective.size(point)
+        return bool(np.sum(r**2) > ABSURD * np.sum(size[: r.size] ** 2))
     poles = objective.poles_measured
     alone = all(isinstance(residual, Eigenvalues) for residual in objective.residuals)
-    if poles is None or not alone or end.p.size < 2:
+    if poles is None or not alone or point.p.size < 2:
         return False
-    point = objective.at(end.p)
     found = point.eigen.poles[point.columns(poles.numbers)]
-    if np.max(np.abs(found - poles.target) / np.abs(poles.target)) < FAR:
-        return False
-    chi2, dof = chi_square(objective, point, np.ones(end.p.size, dtype=bool))
-    return dof > 0 and (chi2 is None or is_bad(chance(chi2, dof)))
-
-
-def _absurd(objective: Objective, p: FloatArray) -> bool:
-    """Return whether a fit leaves far more than noise or a small error of the model would."""
-    point = objective.at(p)
-    r, size = objective.values(point, prior=False), objective.size(point)
-    chi2, dof = chi_square(objective, point, np.ones(p.size, dtype=bool))
-    likely = chi2 is not None and not is_bad(chance(chi2, dof))
-    return not likely and bool(np.sum(r**2) > ABSURD * np.sum(size[: r.size] ** 2))
+    far = np.max(np.abs(found - poles.target) / np.abs(poles.target)) >= FAR
+    return bool(far) or not end.converged
 
 
 def from_starts(
@@ -252,14 +360,10 @@ def from_starts(
     tolerance: float,
 ) -> tuple[SearchEnd, list[Reached]]:
     """Return the best end, the objective being there, and what every start led to."""
-    ends = [_attempt(objective, one, method, most, tolerance, led=False) for one in begins]
+    ends = [_attempt(_direct, objective, one, method, most, tolerance) for one in begins]
     reached = [found for found in ends if isinstance(found, SearchEnd)]
     if not reached:
-        failed = [end for end in ends if isinstance(end, FlexplantError)]
-        # a mode unknown from every start is a mistake of the call; from one, it ceased to oscillate
-        if len(begins) == 1 or all(isinstance(end, LabelError) for end in failed):
-            raise failed[0]
-        raise SolverError(f"none of {len(begins)} starts leads anywhere; the last: {failed[-1]}")
+        raise none_found(objective, begins, ends)
     best = min(reached, key=lambda found: found.cost)
     # the modes of the best end are numbered from its own start
     if len(begins) > 1:
@@ -347,7 +451,8 @@ def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> Fl
         chi2, _ = chi_square(objective, objective.follow(end.trail.p), free)
         found.append((chi2 or 0.0) - least)
     objective.follow(best.trail.p)
-    return np.array(found, dtype=np.float64)
+    above = np.array(found, dtype=np.float64)
+    return np.asarray(np.where(np.abs(above) < SAME_COST * least, 0.0, above), dtype=np.float64)
 
 
 def scattered(objective: Objective, middle: FloatArray, count: int, rng: Rng) -> list[FloatArray]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray, Rng, flag, generator, instance, positive, whole
-from ..errors import ModelError, counted, warn
+from ..errors import FlexplantError, ModelError, counted, warn
 from ..parallel import Progress
 from ..structure.model import FEModel
 from ..tolerances import TINY
@@ -75,11 +75,12 @@ def update(
         Values to begin with. When not given zeros, or the means of priors, inside the bounds; then
         complex responses are fitted by the logarithm of their magnitude first, all entries about
         equally weighted, and poles before shapes, since these converge from farther away. Four
-        other starts near it are always tried, two with a model of more than 100 DOFs, since a
-        minimum does not show that there is another; print(fit) names those of similar chi-square.
-        Where responses alone are fitted and a tenth of their power is left, or several parameters
-        to poles alone and a pole is 0.1 % off, which noise does not explain, up to 20 (or 4) are
-        tried (`UpdateResult.starts`).
+        other starts are always tried, two with a model of more than 100 DOFs, since a minimum does
+        not show that there is another; print(fit) names those of similar chi-square. The first of
+        them is the default where a start was given, the others are near the better of the two.
+        Where no start leads to an end, responses alone are fitted and a tenth of their power is
+        left, or several parameters to poles alone and a pole is 0.1 % off, which noise does not
+        explain, up to 20 (or 4) are tried (`UpdateResult.starts`).
     starts : int or (s, q) array, optional
         Search from these starts alone, or from so many that are drawn between the bounds (or from
         the priors), and keep the best; `start` is one of them. 1: from `start` alone.
@@ -114,7 +115,8 @@ def update(
     Warns
     -----
     FlexplantWarning
-        When the tolerance was not met; when the noise is known and the fit leaves more than noise
+        When the tolerance was not met; when no end is found from the `start` that was given, but
+        from another; when the noise is known and the fit leaves more than noise
         does in one of 10 000 cases: parameters, and for each kind of residual the standard
         deviation of what the model cannot explain, are then estimated together
         (`UpdateResult.discrepancy`; with responses the covariance is widened instead, by chi-square
@@ -125,7 +127,8 @@ def update(
     ------
     ModelError
         When the measured eigenvalues do not depend on a parameter or cannot distinguish some (S is
-        singular), or the matrices are indefinite at `start`.
+        singular), the matrices are indefinite at `start`, or the FEModel refuses the answer (a
+        damper came out negative: give it bounds).
     LabelError
         When a mode number or a place is unknown.
     SolverError
@@ -183,7 +186,7 @@ def update(
         # where an answer that is drawn to its start ends is no minimum of the misfit
         if starts is None and not method.penalised:
             best, begins, ends = from_one_start(
-                objective, begins[0], method, max_iterations, enough, rng, led=start is None
+                objective, begins[0], method, max_iterations, enough, rng, given=start is not None
             )
         else:
             best, ends = from_starts(objective, begins, method, max_iterations, enough)
@@ -198,6 +201,11 @@ def update(
             f"defect correction has not settled: round {len(estimates) - 1} still moved the "
             f"estimate by {moved(objective, best.p, estimates[-2]):.2g} standard deviations. "
             "Give more rounds=, or a reduced model with more modes."
+        )
+    if start is not None and starts is None and isinstance(ends[0], FlexplantError):
+        warn(
+            f"from the start that was given no end is found: {ends[0]} The answer is that from "
+            "another start (.starts has all of them)."
         )
     if not best.converged:
         error = best.trail.error
@@ -234,14 +242,16 @@ def _result(
         fitted &= best.p != begin
     chi2, dof = chi_square(objective, point, fitted)
     spread, correlation = covariance(objective, point)
+    spread = None if method.penalised else spread
+    std = None if spread is None else np.sqrt(np.diag(spread))
     trail = best.trail
     return UpdateResult(
         parameters=tuple(q.name for q in objective.parameters),
         units=tuple(q.unit for q in objective.parameters),
         values=best.p,
-        covariance=None if method.penalised else spread,
+        covariance=spread,
         correlation=correlation,
-        model=changed_model(model, objective.parameters, best.p, objective.family),
+        model=changed_model(model, objective.parameters, best.p, objective.family, std),
         history=History(*map(np.array, (trail.p, trail.poles, trail.error, trail.fraction))),
         converged=best.converged,
         reason=best.reason,

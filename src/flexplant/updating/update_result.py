@@ -26,6 +26,7 @@ from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
 from ..modes.normal_form import RIGID_DRAG
 from ..structure.attachments import summed
+from ..structure.definite import indefinite
 from ..structure.model import FEModel
 from ..structure.rigid import orthonormalised
 from .discrepancy import USUAL_DOF, Discrepancy
@@ -100,7 +101,8 @@ class Starts(Value):
         Other minima than the best, by rising cost.
     above : (r,) array
         By how much -2 ln of the likelihood is larger there than at the best: the difference of
-        chi-square where noise explains what is left, else ``n ln(cost / least cost)``.
+        chi-square where noise explains what is left, else ``n ln(cost / least cost)``. Below zero
+        where the FEModel refuses that one (a negative damper, say) and takes the best.
 
     Examples
     --------
@@ -290,7 +292,8 @@ class UpdateResult(Value):
                     self.parameters[:5], p.tolist(), self.units, strict=False
                 )
             )
-            lines.append(f"  ANOTHER MINIMUM, chi2 + {more:.3g}: {other}")
+            sign = "-" if more < 0 else "+"
+            lines.append(f"  ANOTHER MINIMUM, chi2 {sign} {abs(more):.3g}: {other}")
         if self.discrepancy:
             off = f"{self.discrepancy_text} (relative)"
             lines.append(f"  off by, beside noise: {off}; the +- count it")
@@ -504,14 +507,19 @@ class UpdateResult(Value):
 
 
 def changed_model(
-    model: Any, parameters: Sequence[Parameter], p: FloatArray, family: Family | None = None
+    model: Any,
+    parameters: Sequence[Parameter],
+    p: FloatArray,
+    family: Family | None = None,
+    std: FloatArray | None = None,
 ) -> Any:
     """Return the model with the parameters at `p`; a sparse FEModel stays sparse.
 
-    A reduced model has the rigid-body basis that is left; `family`: of the same parameters.
+    A reduced model has the rigid-body basis that is left; `family`: of the same parameters; `std`:
+    their standard deviations, for an error.
     """
     if isinstance(model, FEModel):
-        return _changed_structure(model, parameters, p)
+        return _changed_structure(model, parameters, p, std)
     family = Family(model, parameters) if family is None else family
     changes: dict[str, Any] = {
         name: summed(getattr(model, name), change if np.any(change) else None)
@@ -521,7 +529,7 @@ def changed_model(
         # Gram-Schmidt keeps translations first and moves the rotations to the new centre
         left = model.rigid_body @ family.rigid_left(p)
         changes["rigid_body"] = orthonormalised(changes["M"], left)
-    return _replaced(model, changes, parameters, p)
+    return _replaced(model, changes, parameters, p, std)
 
 
 def applied(model: Any, parameters: Sequence[Parameter], p: FloatArray) -> Any:
@@ -538,14 +546,16 @@ def applied(model: Any, parameters: Sequence[Parameter], p: FloatArray) -> Any:
     return changed_model(model, parameters, p)
 
 
-def _changed_structure(model: FEModel, parameters: Sequence[Parameter], p: FloatArray) -> FEModel:
+def _changed_structure(
+    model: FEModel, parameters: Sequence[Parameter], p: FloatArray, std: FloatArray | None
+) -> FEModel:
     total: dict[str, Matrix | None] = dict.fromkeys("MDK")
     for parameter, value in zip(parameters, p.tolist(), strict=True):
         for name, part in zip("MDK", parameter.change(model, value), strict=True):
             total[name] = summed(total[name], part)
     changes = {name: summed(getattr(model, name), change) for name, change in total.items()}
     try:
-        changed: FEModel = _replaced(model, changes, parameters, p)
+        changed: FEModel = _replaced(model, changes, parameters, p, std)
     except ModelError:
         found = _with_drag(model, changes)
         if found is None:
@@ -583,14 +593,43 @@ def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
 
 
 def _replaced(
-    model: Any, changes: dict[str, Any], parameters: Sequence[Parameter], p: FloatArray
+    model: Any,
+    changes: dict[str, Any],
+    parameters: Sequence[Parameter],
+    p: FloatArray,
+    std: FloatArray | None,
 ) -> Any:
     try:
         # how a machine was joined was checked with the matrices before
         gone = {"joining": None} if getattr(model, "joining", None) is not None else {}
         return model.replace(**changes, **gone)
     except ModelError as error:
-        text = ", ".join(q.text(v) for q, v in zip(parameters, p.tolist(), strict=True))
+        deviations = [None] * p.size if std is None else std.tolist()
+        found = zip(parameters, p.tolist(), deviations, strict=True)
+        text = ", ".join(q.text(v, deviation) for q, v, deviation in found)
+        why = _impossible(model, changes, parameters, p) or error
         raise ModelError(
-            f"the update ended at {text}, which the {type(model).__name__} refuses: {error}"
+            f"the update ended at {text}, which the {type(model).__name__} refuses: {why}"
         ) from None
+
+
+def _impossible(
+    model: Any, changes: dict[str, Any], parameters: Sequence[Parameter], p: FloatArray
+) -> str:
+    """Return in words that D or K is indefinite, by which parameters; empty when neither is."""
+    for name in "DK":
+        said = "" if changes[name] is None else indefinite(changes[name], name)
+        if not said:
+            continue
+        at = "MDK".index(name)
+        negative = [
+            q.name
+            for q, v in zip(parameters, p.tolist(), strict=True)
+            if v < 0 and q.change(model, v)[at] is not None
+        ]
+        keep = ", ".join(negative) or "the parameters"
+        return (
+            f"{said} The measurement alone does not keep {keep} to what is possible: give bounds=, "
+            "(0.0, None) for what can only be added, or measure more."
+        )
+    return ""

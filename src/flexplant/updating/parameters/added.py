@@ -10,7 +10,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
-from ...checks import FloatArray, Matrix, Value, real_array, short
+from ...checks import FloatArray, Matrix, Value, real_array, short, with_deviation
 from ...errors import LabelError, ModelError, require_known
 from ...labels import DIRECTIONS, Place
 
@@ -74,9 +74,10 @@ class Parameter(Value):
         bounds, prior = checked_bounds(self.bounds, self.name), checked_prior(self.prior, self.name)
         self._set(bounds=bounds, prior=prior)
 
-    def text(self, value: float) -> str:
-        """Return name, value and unit in one phrase."""
-        return f"{self.name} = {value:.6g} {self.unit}"
+    def text(self, value: float, deviation: float | None = None) -> str:
+        """Return name, value (with its standard deviation where there is one) and unit."""
+        said = f"{value:.6g}" if deviation is None else with_deviation(value, deviation)
+        return f"{self.name} = {said} {self.unit}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -123,13 +123,24 @@ def _step(
     length = np.linalg.norm(J, axis=0)
     names = [parameter.name for parameter in objective.parameters]
     reach = objective.family.strength(objective.omega(point)) / objective.omega(point)
+    # what holds there alone is no matter of the measurement
+    first = np.array_equal(point.p, objective.default_start)
+    there = "" if first else f"with {objective.family.text(point.p)}, "
     unseen = length <= UNSEEN * reach * float(np.max(objective.size(point)))
     if unseen.any():
         missed = [name for name, none in zip(names, unseen, strict=True) if none]
+        why = (
+            "(it sits on the nodal lines of these modes, say). Measure a mode that moves there, or "
+            "drop the parameter."
+        )
+        if there:
+            why = (
+                "(a mass or spring so large that its place stands still, say). Begin nearer to the "
+                "answer (start=), or keep the parameters to what is possible (bounds=)."
+            )
         raise ModelError(
-            f"{', '.join(missed)} cannot be found from {objective.text}: what is fitted does not "
-            "depend on it (it sits on the nodal lines of these modes, say). Measure a mode that "
-            "moves there, or drop the parameter."
+            f"{', '.join(missed)} cannot be found from {objective.text}: {there}what is fitted "
+            f"does not depend on it {why}"
         )
     U, s, Vt = np.linalg.svd(J / length, full_matrices=False)
     keep = s > max(truncate, SINGULAR) * s[0]
@@ -138,8 +149,8 @@ def _step(
         together = [name for name, part in zip(names, mixed, strict=True) if part > 0.1]
         raise ModelError(
             f"{', '.join(together)} cannot be distinguished by {objective.text} ({r.size} real "
-            f"equations, {counted(len(names), 'unknown')}, S is singular): some combination of "
-            "them changes nothing. Measure more modes, drop one of them, give priors, begin "
+            f"equations, {counted(len(names), 'unknown')}, S is singular): {there}some combination "
+            "of them changes nothing. Measure more modes, drop one of them, give priors, begin "
             "elsewhere (start=) or cut it off, updating.GaussNewton(truncate=1e-3). "
             "identifiability(...) "
             "shows which."
@@ -228,6 +239,9 @@ class Secured(UpdateMethod):
             settled = GaussNewton().search(objective, found.p, tolerance=tolerance)
         except SolverError:
             settled = found
+        except ModelError as error:
+            # where S was singular before, that is the reason
+            raise trouble if isinstance(trouble, ModelError) else error from None
         if settled is found or not settled.converged:
             objective.begin(found.p)
             return found

@@ -81,7 +81,11 @@ class Objective:
         path = [*self.path, p]
         if self._first is None or not np.array_equal(self._first.p, path[0]):
             point = first_point(self.family, path[0])
-            if self.numbers:
+            last = point.eigen.n_rigid + point.eigen.poles.size
+            stopped = (
+                np.any(path[0]) and last < max(self.numbers, default=0) <= self.family.massive.size
+            )
+            if self.numbers and not stopped:
                 mode_columns(self.numbers, point.eigen)
             self._first = self._assigned(self._turned(point))
         point = self._set(self._first, refer=True)

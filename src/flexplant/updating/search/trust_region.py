@@ -11,6 +11,7 @@ import scipy.linalg as la
 
 from ...checks import FloatArray, checked, one_of, positive
 from ...errors import ModelError
+from ...tolerances import divisor
 from .objective import Objective
 from .update_method import SearchEnd, Trail, UpdateMethod, units
 
@@ -22,6 +23,13 @@ EDGE = (
     "no step in the direction of descent is possible: with it the matrices are indefinite or a "
     "mode is lost (bounds= keep a parameter to what is possible)"
 )
+
+#: why a search ends at a jump of the cost, and the part of the cost that slopes promise there
+STUCK = (
+    "no step lowers the error as its slopes promise: other modes are paired on the other side, "
+    "say (begin elsewhere, start=)"
+)
+PROMISED = 1e-2
 
 #: rows (r, J) added to those of the objective
 Extra = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
@@ -185,7 +193,27 @@ def _within(
     reason = {0: stopped, 1: "gradient is zero", 2: "error no longer falls"}.get(
         answer.status, "step below the tolerance"
     )
-    return SearchEnd(p, float(answer.cost), trail, answer.status > 0, reason)
+    converged = answer.status > 0
+    if (
+        converged
+        and method.loss == "linear"
+        and _is_stuck(answer, objective.size(point), tolerance)
+    ):
+        converged, reason = False, STUCK
+    return SearchEnd(p, float(answer.cost), trail, converged, reason)
+
+
+def _is_stuck(answer: Any, size: FloatArray, tolerance: float) -> bool:
+    """Return whether slopes promise a lower cost, though every step was refused.
+
+    At a minimum they promise next to nothing; at a jump of the cost they do.
+    """
+    J = answer.jac[:, answer.active_mask == 0]
+    Q = la.qr(J / divisor(np.linalg.norm(J, axis=0)), mode="economic")[0]
+    change = Q @ (Q.T @ answer.fun)
+    if np.sum(change**2) <= PROMISED * np.sum(answer.fun**2):
+        return False
+    return bool(np.max(np.abs(change[: size.size]) / size) > tolerance)
 
 
 def _data_loss(name: Loss, rows: int) -> Callable[[FloatArray], FloatArray]:
