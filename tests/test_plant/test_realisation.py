@@ -8,7 +8,7 @@ from flexplant.labels import DofSet
 from flexplant.lti import frequency_response
 from flexplant.modes import solve_modes
 from flexplant.plant import assemble_plant
-from flexplant.plant.realisation import realised
+from flexplant.plant.realisation import natural, realised
 from flexplant.structure import FEModel, ModalDamping
 from oracles_plant import machine, motion_row, receptance
 from oracles_structure import poles as dense_poles
@@ -32,6 +32,14 @@ def oracle(zeta=0.01, freq=FREQ, **changes):
     see += [motion_row(x, y, "z") for x, y, _ in CORNERS]
     push = np.array([motion_row(x, y, "z") for x, y, _ in INSET])
     return receptance(M, D, K, np.array(see), push, 2 * np.pi * freq)
+
+
+def test_frequencies_and_dampings_of_blocks_are_those_of_the_modes():
+    zeta = [0.0, 0.0, 0.0, 0.01, 0.002]
+    modes = solve_modes(full(), count=5, damping=ModalDamping(zeta))
+    omega, found = natural(realised(modes).pairs)
+    np.testing.assert_allclose(omega[3:], 2 * np.pi * modes.freq[3:], rtol=1e-9)
+    np.testing.assert_allclose(found[3:], zeta[3:], rtol=1e-6)
 
 
 def close(found, wanted, tolerance):
