@@ -49,8 +49,14 @@ class Tab:
 
     def type(self, value, text):
         """Type into the box that shows a value."""
-        boxes = self.page.locator("input[type=text]")
-        self.until(lambda: value() in self.values)
-        box = boxes.nth(self.values.index(value()))
+        at = []
+
+        def shown():  # both are read once: they change while a drag is worked off
+            held, sought = self.values, value()
+            at[:] = [held.index(sought)] if sought in held else []
+            return bool(at)
+
+        self.until(shown)
+        box = self.page.locator("input[type=text]").nth(at[0])
         box.fill(text)
         box.press("Enter")

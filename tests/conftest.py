@@ -55,3 +55,11 @@ def pytest_ignore_collect(collection_path, config):
     """Leave out benchmarks, and the peers that they import, in a run that does not name them."""
     named = re.search(r"(?<!not )benchmark", config.option.markexpr)
     return True if collection_path.name == "benchmarks" and not named else None
+
+
+@pytest.fixture(autouse=True)
+def _no_figure_is_left():
+    """Close what a test draws: which files share a process is left to the scheduler."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")

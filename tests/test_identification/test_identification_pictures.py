@@ -37,7 +37,6 @@ def test_pictures_show_poles_and_responses():
         np.abs(found.frf(lines["identified"].get_xdata())["y1", "u2"]),
     )
     assert np.allclose(lines["standard deviation"].get_ydata(), deviation)
-    plt.close("all")
     with pytest.raises(ModelError):
         stabilisation(frf)
     with pytest.raises(ModelError):
@@ -80,4 +79,3 @@ def test_poles_are_picked_by_mouse(tmp_path):
     picker.pick(40.0)
     found = identify_modes(frf, start=picker.selection)
     np.testing.assert_allclose(found.freq, [40.0, 55.0, 70.0], rtol=1e-3)
-    plt.close("all")

@@ -1,6 +1,5 @@
 """Error budgets against dense Lyapunov equations, folded spectra, integrals and simulations."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.linalg as la
@@ -89,7 +88,6 @@ def test_sources_are_told_apart(plate):
     assert ax.get_ylim()[1] >= (1e9 * found.rms) ** 2 and "5 others" in str(
         [t.get_text() for t in ax.get_legend().get_texts()]
     )
-    plt.close("all")
 
 
 def test_spectra_of_samples_hold_what_folds_back():

@@ -13,12 +13,6 @@ from systems_lti import machine, system
 LAG = tf([1.0], [1.0, 1.0, 4.0])
 
 
-@pytest.fixture(autouse=True)
-def _closed():
-    yield
-    plt.close("all")
-
-
 def test_bode_is_that_of_scipy():
     freq = np.geomspace(0.01, 10.0, 50)
     ax = fx.plot.bode(LAG, freq=freq)

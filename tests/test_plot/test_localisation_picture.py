@@ -1,6 +1,5 @@
 """The picture of a localisation shows what its table says."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -27,8 +26,7 @@ def case():
         chosen_bic=10.0,
         nothing_bic=100.0,
     )
-    yield found, candidates, DofSet([1, 2, 3], ["z"] * 3, xyz)
-    plt.close("all")
+    return found, candidates, DofSet([1, 2, 3], ["z"] * 3, xyz)
 
 
 def test_bars_and_plan(case):

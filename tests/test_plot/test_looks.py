@@ -17,12 +17,6 @@ PLANT = tf([1.0], [1.0, 1.0, 0.0])
 CONTROLLER = (-6.0 * tf([0.5, 1.0], [0.02, 1.0])).replace(inputs=["out"], outputs=["in"])
 
 
-@pytest.fixture(autouse=True)
-def _closed():
-    yield
-    plt.close("all")
-
-
 def luminance(color):
     """Relative luminance (WCAG 2): what is left of a colour on a grey printer."""
     rgb = np.array(plt.matplotlib.colors.to_rgb(color))

@@ -15,12 +15,6 @@ from flexplant.simulation import Response, exposure_errors
 LAG = tf([9.0], [1.0, 0.6, 9.0])
 
 
-@pytest.fixture(autouse=True)
-def _closed():
-    yield
-    plt.close("all")
-
-
 def test_a_step_is_the_textbooks():
     """1 - e^(-zeta w t) (cos w_d t + zeta w / w_d sin w_d t), until 1 % is left of it."""
     ax = fx.plot.step({"lag": LAG, "held": fx.discretized(LAG, 5.0)})

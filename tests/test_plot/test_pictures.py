@@ -16,12 +16,6 @@ from stages import CORNERS, INSET, Z8, L, fitted, ports, reduced, sampled, some_
 POLES = np.array([-28.569 + 2883.567j, -39.451 + 3983.308j])
 
 
-@pytest.fixture(autouse=True)
-def _closed():
-    yield
-    plt.close("all")
-
-
 def ink(ax):
     """Share of pixels that are not background."""
     buffer = io.BytesIO()

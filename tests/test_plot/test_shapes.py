@@ -13,12 +13,6 @@ ALUMINIUM = {"density": 2700.0, "youngs_modulus": 70e9, "poisson_ratio": 0.33}
 POLES = np.array([-28.569 + 2883.567j, -39.451 + 3983.308j])
 
 
-@pytest.fixture(autouse=True)
-def _closed():
-    yield
-    plt.close("all")
-
-
 def area(skin):
     a, b, c = (skin.xyz[skin.triangles[:, k]] for k in range(3))
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()

@@ -1,6 +1,5 @@
 """MA and MSD over exposures, settling and maps, against sums by hand."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -82,7 +81,6 @@ def test_a_map_is_the_run_of_a_poi_at_each_point():
     assert "MSD of the error along z" in ax.figure.axes[1].get_ylabel()
     with pytest.raises(ModelError, match="'ma' or 'msd'"):
         fx.plot.error_map(found, what="rms")
-    plt.close("all")
 
 
 def test_what_is_no_exposure():

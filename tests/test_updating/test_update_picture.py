@@ -1,6 +1,5 @@
 """The one picture of an update holds what the update and the correlation say."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -71,7 +70,6 @@ def test_everything_is_in_it(case):
     assert set(lines) == {"measured", "before", "after"}
     np.testing.assert_allclose(lines["after"], lines["measured"], rtol=1e-3)
     assert np.abs(lines["before"] / lines["measured"] - 1).max() > 0.1
-    plt.close("all")
 
 
 def test_only_what_was_measured_is_in_it(case):
@@ -83,4 +81,3 @@ def test_only_what_was_measured_is_in_it(case):
     assert "response" in axs
     with pytest.raises(ModelError, match="update returned"):
         fx.plot.update(model, model, residuals)
-    plt.close("all")

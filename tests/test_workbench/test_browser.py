@@ -177,8 +177,14 @@ def drag(tab, freq, above):
         mouse.move(x + 4, y, steps=2)
         mouse.move(x + 9, y, steps=3)
         mouse.up()
+        reached = [0.0, 0.0, freq()]
+
+        def arrived(reached=reached):  # and every move of the mouse is worked off
+            reached.append(freq())
+            return above < reached[-1] == reached[-2] == reached[-3] == reached[-4]
+
         try:
-            return tab.until(lambda: freq() > above, 6.0)
+            return tab.until(arrived, 6.0)
         except AssertionError:
             continue
     raise AssertionError(f"the handle at {freq()} Hz does not move: {tab.verdict}")

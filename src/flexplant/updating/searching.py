@@ -19,6 +19,7 @@ from ..errors import (
     counted,
 )
 from ..tolerances import TINY, divisor
+from .changed_model import changed_model
 from .judgement.goodness import chance, chi_square, is_bad
 from .parameters.added import PointParameter
 from .point_model import Point
@@ -29,7 +30,7 @@ from .residuals.residual import Residual
 from .search import Objective, SearchEnd, TrustRegion, UpdateMethod
 from .search.update_method import Trail
 from .sensitivities import checked_values
-from .update_result import Starts, changed_model
+from .update_result import Starts
 
 #: the end of a search, or why there is none
 Reached: TypeAlias = SearchEnd | FlexplantError
@@ -120,7 +121,7 @@ NEARLY = 1e-6
 SAME_END = 1e-4
 
 
-class _Found(NamedTuple):
+class _GradedEnd(NamedTuple):
     """An end, and how good it was where it was found."""
 
     end: SearchEnd
@@ -144,7 +145,7 @@ class _Tried:
         self.tolerance = tolerance
         self.begins: list[FloatArray] = []
         self.ends: list[Reached] = []
-        self.found: list[_Found] = []
+        self.found: list[_GradedEnd] = []
         #: difference of costs that rounding makes
         self.rounding = 0.0
 
@@ -168,12 +169,12 @@ class _Tried:
             self.found.append(_judged(self.objective, end, named=named))
 
     @property
-    def best(self) -> _Found | None:
+    def best(self) -> _GradedEnd | None:
         """The end of least cost, of those that noise explains where one does; the earliest."""
         # poles are only paired anew where that explains them: an outlier is no wrong pairing
         pool = [one for one in self.found if one.named or not one.improvable] or self.found
         pool = [one for one in pool if one.likely] or pool
-        best: _Found | None = None
+        best: _GradedEnd | None = None
         for one in pool:
             if best is None or one.end.cost < (1 - SAME_COST) * best.end.cost - self.rounding:
                 best = one
@@ -273,13 +274,13 @@ def _head(end: Reached) -> str:
     return str(end).split(": ")[0]
 
 
-def _judged(objective: Objective, end: SearchEnd, *, named: bool) -> _Found:
+def _judged(objective: Objective, end: SearchEnd, *, named: bool) -> _GradedEnd:
     """Return an end, where the objective is, with how good it is."""
     point = objective.at(end.p)
     chi2, dof = chi_square(objective, point, np.ones(end.p.size, dtype=bool))
     explained = end.converged and chi2 is not None and not is_bad(chance(chi2, dof))
     improvable = not explained and dof > 0 and _improvable(objective, end, point)
-    return _Found(end, named, improvable, explained and _is_possible(objective, end.p))
+    return _GradedEnd(end, named, improvable, explained and _is_possible(objective, end.p))
 
 
 def _is_possible(objective: Objective, p: FloatArray) -> bool:

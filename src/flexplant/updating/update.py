@@ -12,6 +12,7 @@ from ..errors import FlexplantError, ModelError, counted, warn
 from ..parallel import Progress
 from ..structure.model import FEModel
 from ..tolerances import TINY
+from .changed_model import changed_model
 from .discrepancy import weighed
 from .full_basis import MOST_ROUNDS, FullBasis, is_large
 from .judgement.goodness import chi_square, covariance, is_bad, worst
@@ -23,7 +24,7 @@ from .search.objective import Defect
 from .search.update_method import ITERATIONS
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
 from .sensitivities import checked_parameters, checked_values
-from .update_result import History, UpdateResult, changed_model
+from .update_result import History, UpdateResult
 
 #: a parameter this close to its bound, relative to their distance, is at it
 AT_BOUND = 1e-6
