@@ -21,7 +21,7 @@ from .residuals.eigenvalues import Eigenvalues
 from .residuals.residual import Residual
 from .search import Objective, SearchEnd, Secured, TrustRegion, UpdateMethod, checked_residuals
 from .search.objective import Defect
-from .search.update_method import ITERATIONS
+from .search.update_method import ITERATIONS, units
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
 from .sensitivities import checked_parameters, checked_values
 from .update_result import History, UpdateResult
@@ -237,7 +237,7 @@ def _result(
 ) -> UpdateResult:
     """Return what the best search found and how well it is known."""
     point = objective.at(best.p)
-    at_bound = _at_bound(objective, best.p)
+    at_bound = _at_bound(objective, best.p, units(objective, objective.slopes(point, prior=False)))
     fitted = np.array([q.name not in at_bound for q in objective.parameters])
     if method.penalised:
         fitted &= best.p != begin
@@ -287,11 +287,11 @@ def _complaint(fit: UpdateResult, named: str) -> str:
     )
 
 
-def _at_bound(objective: Objective, p: FloatArray) -> tuple[str, ...]:
-    """Return the names of the parameters at one of their bounds."""
+def _at_bound(objective: Objective, p: FloatArray, unit: FloatArray) -> tuple[str, ...]:
+    """Return the names of the parameters at one of their bounds; `unit` counts as one change."""
     low, high = objective.lower, objective.upper
     width = high - low
-    near = AT_BOUND * np.where(np.isfinite(width), width, np.maximum(np.abs(p), 1e-12))
+    near = AT_BOUND * np.where(np.isfinite(width), width, np.maximum(np.abs(p), unit))
     at = (p - low <= near) | (high - p <= near)
     return tuple(q.name for q, there in zip(objective.parameters, at, strict=True) if there)
 
