@@ -70,6 +70,25 @@ def test_a_ruler_by_the_default_call_has_the_five_modes_picked_by_hand():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("low, high", [(20.0, 70.0), (28.0, 52.0), (30.0, 50.0)])
+def test_one_resonance_of_a_ruler_has_no_twin(low, high):
+    """A second pole at 40.0 Hz, zeta 1.4 %, shape of no plane: one hit proves no pair."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FlexplantWarning)
+        found = identify_modes(ruler(low, high))
+    assert found.freq.tolist() == pytest.approx([39.4], rel=2e-3)
+
+
+@pytest.mark.slow
+def test_a_first_answer_on_a_ruler_has_no_twins():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FlexplantWarning)
+        found = identify_modes(ruler(20.0, 400.0), refine=False)
+    assert found.freq.tolist() == pytest.approx([108.5, 212.5, 269.7, 352.3], rel=4e-3)
+    assert sum("twin" in reason for _, _, reason in found.rejected) == 2
+
+
+@pytest.mark.slow
 def test_poles_of_a_ruler_picked_by_hand_stay_where_outputs_see_them():
     """An output that hardly sees a mode has a broad pole of its own: zeta was 8 +- 9 %."""
     frf = ruler(20.0, 400.0)

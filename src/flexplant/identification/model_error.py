@@ -13,8 +13,10 @@ from .refine import Fit, Lines
 
 #: MAC from which two shapes are one: they differ by less than what a neighbour's tail makes
 ALIKE = 0.9
-#: half-widths (mean of two poles) within which poles of different shapes may be one resonance
-WITHIN = 1.5
+#: half-widths (geometric mean of two poles) within which poles of different shapes may be one
+#: resonance; and a bandwidth, where the weaker one is the broader: what is left of a circle that is
+#: not straight is broad, a resonance on a broad background is not
+WITHIN, BANDWIDTH = 1.5, 2.0
 #: part of a misfit that is most of it: a missed mode leaves about half, a shift less than 1e-3
 MOSTLY = 0.9
 #: misfit near a pole, with its correlation over lines, up to which it is noise
@@ -103,7 +105,8 @@ def twin(fit: Fit) -> tuple[int, int] | None:
                 continue
             apart, widths = abs(fit.poles[j].imag - fit.poles[k].imag), -fit.poles.real[[j, k]]
             same = min(mac(fit.shapes, j, k), mac(fit.participation, j, k)) > ALIKE
-            if apart > (widths.sum() if same else WITHIN * np.sqrt(widths.prod())):
+            reach = BANDWIDTH if widths[1] > widths[0] else WITHIN
+            if apart > (widths.sum() if same else reach * np.sqrt(widths.prod())):
                 continue
             single = fit.participation.shape[0] == 1
             if (single and (same or not fit.lines.known)) or (

@@ -294,7 +294,7 @@ class Fit:
         return np.asarray(self.modal + self.terms @ self.lines.smooth)
 
     def _moving(self, o: int) -> FloatArray:
-        """Return how rows (n_in, 2 n_freq, 4 m) of an output move, free of residual terms.
+        """Return how rows (n_in, 4 m, 2 n_freq) of an output move, what residual terms take too.
 
         With Re and Im of the poles, then with those of the participation of the row's own input.
         """
@@ -304,8 +304,7 @@ class Fit:
         c, d = shape * self.plus, shape.conj() * self.minus
         parts = np.concatenate([a + b, 1j * (a - b), np.zeros_like(a), np.zeros_like(a)], axis=1)
         parts[:, 2 * self.m : 3 * self.m], parts[:, 3 * self.m :] = c + d, 1j * (c - d)
-        columns = _real(parts * self.lines.weight[o][:, None, :])
-        return _off(self.lines.smooth_bases[o][0], columns).swapaxes(1, 2)
+        return _real(parts * self.lines.weight[o][:, None, :])
 
     @cached_property
     def _places(self) -> list[tuple[Any, Any]]:
@@ -333,8 +332,9 @@ class Fit:
         n_in = self.participation.shape[0]
         Q = self.bases[o][0]
         J = np.zeros((n_in, Q.shape[0] // n_in, 2 * self.m * n_in))
-        for own, D, (mine, at) in zip(J, self._moving(o), self._places, strict=True):
-            own[:, at] = D[:, mine]
+        moving = _off(self.lines.smooth_bases[o][0], self._moving(o))
+        for own, D, (mine, at) in zip(J, moving, self._places, strict=True):
+            own[:, at] = D[mine].T
         J = J.reshape(Q.shape[0], -1)
         common = Q.T @ J
         J -= Q @ common
@@ -350,8 +350,9 @@ class Fit:
         """J^T J and J^T e, and per output what the shapes take of J, Q^T D.
 
         ``J^T J = D^T D - (Q^T D)^T Q^T D`` and ``J^T e = D^T e``, summed over the inputs, whose
-        rows feel only their own participation. J itself is formed where the difference would lose
-        more than the least damping of a step makes up for.
+        rows feel only their own participation; Q of the residual terms and of the shapes, which
+        are free of them, as e is. J itself is formed where the difference would lose more than the
+        least damping of a step makes up for.
         """
         n_in = self.participation.shape[0]
         count = 2 * self.participation.size
@@ -361,13 +362,17 @@ class Fit:
             whole, common = np.zeros_like(N), np.zeros((2 * self.m, count))
             errors = error.reshape(n_in, -1)
             bases = Q.reshape(*errors.shape, 2 * self.m)
-            for D, basis, e, (mine, at) in zip(
-                self._moving(o), bases, errors, self._places, strict=True
+            left = np.zeros_like(N)
+            smooth = self.lines.smooth_bases[o][0]
+            for D, terms, basis, e, (mine, at) in zip(
+                self._moving(o), smooth, bases, errors, self._places, strict=True
             ):
-                whole[np.ix_(at, at)] += (D.T @ D)[np.ix_(mine, mine)]
-                g[at] += (e @ D)[mine]
-                common[:, at] += (basis.T @ D)[:, mine]
-            left = whole - common.T @ common
+                square, off = D @ D.T, D @ terms
+                whole[np.ix_(at, at)] += square[np.ix_(mine, mine)]
+                left[np.ix_(at, at)] += (square - off @ off.T)[np.ix_(mine, mine)]
+                g[at] += (D @ e)[mine]
+                common[:, at] += (D @ basis).T[:, mine]
+            left -= common.T @ common
             if np.any(np.diag(left) < OWN_SQUARE * np.diag(whole)):
                 J = self._jacobian(o)[0]
                 left = J.T @ J
