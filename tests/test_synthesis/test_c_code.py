@@ -415,16 +415,21 @@ def test_a_wrong_block_is_found(monkeypatch, tmp_path):
 @compiles
 @pytest.mark.parametrize("single", [False, True])
 def test_a_filter_in_c_does_not_drift(tmp_path, single):
-    """After a period its state is what it was, to the bit: so it will be after any number."""
+    """Its state is one that it had before, to the bit: so it will be after any number of periods.
+
+    Rounding may alternate between neighbours in the last bit; more than a few are drift.
+    """
     law = fx.design_kalman(fx.testbeds.three_masses()).system
     rng, period = np.random.default_rng(0), 50
     records = rng.standard_normal((period, len(law.inputs))) * [
         1e-6 if name.startswith("y") else 1.0 for name in law.inputs
     ]
     code = Compiled(tmp_path, law, single=single)
+    states = []
     for _ in range(300):
-        before, out = bytes(code.state), [code(sample) for sample in records]
-    assert bytes(code.state) == before
+        out = [code(sample) for sample in records]
+        states.append(bytes(code.state))
+    assert states[-1] in states[-9:-1]
     exact = periodic_answer(law, records)
     scale = np.abs(exact).max(axis=0)
     assert np.abs((np.array(out) - exact) / scale).max() < (1e-5 if single else 1e-11)

@@ -435,15 +435,17 @@ def _qr(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 #: least part of a column that is its own, above which it is known well from products, and the
-#: same of its square: rounding of 1e-16 is then 1e-10 of it, a damping of 1e-8 hides that
-OWN_PART, OWN_SQUARE = 1e-4, 1e-6
+#: same of its square: rounding of 1e-16 is then 1e-10 of it, a damping of 1e-8 hides that; from
+#: the third on one pass is exact to some 1e-14
+OWN_PART, OWN_SQUARE, FAR_APART = 1e-4, 1e-6, 0.1
 
 
 def _orthonormal(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return Q and R of columns of length one, whose memory runs along the columns.
 
-    Long columns are orthonormalised by the triangle of their products, twice: as exact as `_qr`
-    where no column is nearly a combination of the others, and many times as fast.
+    Long columns are orthonormalised by the triangle of their products, twice where they are not
+    far apart: as exact as `_qr` where no column is nearly a combination of the others, and many
+    times as fast.
     """
     rows, whole = columns.T, np.eye(columns.shape[1])
     for _ in range(2):
@@ -451,10 +453,13 @@ def _orthonormal(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
             triangle = la.cholesky(rows @ rows.T, lower=True)
         except la.LinAlgError:
             return _qr(columns)
-        if np.min(np.diag(triangle), initial=1.0) < OWN_PART:
+        own = np.min(np.diag(triangle), initial=1.0)
+        if own < OWN_PART:
             return _qr(columns)
         rows = la.inv(triangle) @ rows
         whole = whole @ triangle
+        if own > FAR_APART:
+            break
     return rows.T, whole.T
 
 
