@@ -12,7 +12,6 @@ from ..checks import FloatArray, Value, instance, positive
 from ..errors import ModelError
 from ..lti.discretisation import (
     acting,
-    block_diagonal,
     check_latency,
     check_rate,
     diagonal_pairs,
@@ -199,22 +198,41 @@ def sampled_motions(
     Sampled like the plant; the states are some of the plant's.
     """
     origin = plant.continuous.assembled
-    g, found = origin.physical.select(outputs, inputs), []
-    where = [g.states.index(name) for name in origin.realisation.names]
+    some, found = origin.replace(physical=origin.physical.select(outputs, inputs)), []
     for pairs in blocks:
-        A = np.array(g.A)
-        A[np.ix_(where, where)] = block_diagonal(pairs)
-        own = origin.replace(
-            physical=g.replace(A=A), realisation=origin.realisation.replace(pairs=pairs)
-        )
+        own = _with_modes(some, origin.realisation.replace(pairs=pairs))
         if not plant.dt:
             found.append(own.physical)
         elif _has_other_states(own):
-            silent = np.zeros(len(g.inputs))
+            silent = np.zeros(len(own.physical.inputs))
             found.append(_with_own_delays(own, 1.0 / plant.dt, plant.delay, silent)[0])
         else:
             found.append(held_exactly(own.physical, 1.0 / plant.dt, delay=plant.delay))
     return found
+
+
+def _with_modes(origin: Assembled, realisation: ModalRealisation) -> Assembled:
+    """Return an origin with A of a realisation, whose modes move and are driven as its own do."""
+    g = origin.physical
+    where = [g.states.index(name) for name in realisation.names]
+    A = np.array(g.A)
+    A[np.ix_(where, where)] = realisation.A
+    return origin.replace(physical=g.replace(A=A), realisation=realisation)
+
+
+def _moves_alike(own: Assembled, realisation: ModalRealisation) -> bool:
+    """Return whether modes differ from a plant's in their poles alone, and its ports by them in A.
+
+    What a velocity or an acceleration shows of a mode hangs on its poles.
+    """
+    before = own.realisation
+    same = all(
+        getattr(realisation, name) is value or np.array_equal(getattr(realisation, name), value)
+        for name, value in before._fields().items()
+        if name != "pairs"
+    )
+    held = set(before.names) <= set(own.physical.states)
+    return same and held and not any(sensor.order for sensor in own.ports.y)
 
 
 def _elastic(plant: Partition) -> FloatArray:
@@ -264,11 +282,14 @@ def rebuilt(
             before = own.continuous
             whole = None if before is None else rebuilt(before, ports=ports)
             return wired(type(plant), found.replace(continuous=whole))
-    fresh = continuous_plant(
-        type(plant),
-        own.realisation if realisation is None else realisation,
-        own.ports if ports is None else ports,
-    )
+    if ports is None and realisation is not None and _moves_alike(own, realisation):
+        fresh = wired(type(plant), _with_modes(plant.continuous.assembled, realisation))
+    else:
+        fresh = continuous_plant(
+            type(plant),
+            own.realisation if realisation is None else realisation,
+            own.ports if ports is None else ports,
+        )
     return sampled_like(plant, fresh)
 
 
