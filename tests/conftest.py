@@ -44,6 +44,12 @@ def pytest_configure(config):
         config.option.loadscopereorder = False
 
 
+def pytest_itemcollected(item):
+    """Count long tests among the slow ones."""
+    if item.get_closest_marker("long"):
+        item.add_marker("slow")
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items):
     """Put files that hold slow tests first, the most of them ahead: none is left for the end."""

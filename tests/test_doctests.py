@@ -43,7 +43,7 @@ def test_doctests():
     assert check([name for name in MODULES if not name.startswith(DESIGNS)]) > 500
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_doctests_of_designs():
     assert check([name for name in MODULES if name.startswith(DESIGNS)]) > 500
 

@@ -257,7 +257,7 @@ def of_folder(item):
     return on_the_scheduler(*item)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_study_waits_for_a_scheduler_that_dies_and_returns(tmp_path):
     distributed = pytest.importorskip("distributed")
     scheduler, calls = Scheduler(), tmp_path / "calls"

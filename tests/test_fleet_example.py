@@ -21,7 +21,7 @@ def fleet():
     return module
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_each_machine_with_its_own_model_is_faster_and_more_accurate(fleet, tmp_path):
     """A Ritz plate: what is promised is its own; both ways hold; reports are written."""
     machines = fleet.fleet(1)
@@ -58,7 +58,7 @@ def test_each_machine_with_its_own_model_is_faster_and_more_accurate(fleet, tmp_
     assert fleet.picture({"asked": 30.0, "tables": tables}, tmp_path).stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_whole_chain_from_a_measured_frf(fleet, tmp_path):
     """Identify, localise among three places, update, design, verify on the larger model."""
     machine = fx.testbeds.wafer_stage(
@@ -96,7 +96,7 @@ def test_the_whole_chain_from_a_measured_frf(fleet, tmp_path):
     assert chain.replace(candidates=()).report(poles, 1).measured.modes == poles.modes
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_virtual_machine_is_measured_with_the_options_given(fleet, monkeypatch):
     """Where it is not its poles that are taken; the identification has the band and the hold."""
 
@@ -116,7 +116,7 @@ def test_a_virtual_machine_is_measured_with_the_options_given(fleet, monkeypatch
     assert seen == {"band": (1.0, 2.0), "hold": 3.0, "frf": ("frf", 4, 0.5, 7)}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_chain_refuses_what_it_cannot_use(fleet):
     chain = fleet.pipeline()
     assert repr(chain) == "<MachinePipeline: 2 parameters updated, H-infinity, 60, 40 Hz>"

@@ -13,7 +13,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 #: [m] rms in closed loop in the middle and at the corner
 PINS = {"x": (2.24358e-9, 2.36432e-9), "z": (2.41497e-9, 4.07105e-9)}
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")

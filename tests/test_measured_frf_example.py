@@ -11,7 +11,7 @@ from shared_data import DATA
 
 FILE = Path(__file__).parents[1] / "examples" / "measured_frf.py"
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")

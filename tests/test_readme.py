@@ -175,7 +175,7 @@ def test_every_example_has_its_task():
     assert named == {path.name for path in (ROOT / "examples").glob("*.py")}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_code_runs(tmp_path, monkeypatch, capsys):
     """All python blocks, in order, in one namespace, as a reader would paste them.
 

@@ -10,7 +10,7 @@ import pytest
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="POSIX clocks, /dev/shm")
 def test_two_processes_give_the_run_of_simulate(tmp_path):
     with pytest.MonkeyPatch.context() as patch:

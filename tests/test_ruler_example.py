@@ -20,7 +20,7 @@ def example():
     return module
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_ruler_is_a_free_beam_and_its_own_responses_bear_the_controller_out(example, tmp_path):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "outputs disagree", FlexplantWarning)

@@ -58,7 +58,7 @@ def test_a_notebook_can_run_its_cells(path, monkeypatch):
     assert names["fx"] is importlib.import_module("flexplant")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_recorded_data(example, tmp_path, monkeypatch):
     """The densities are those that the record was made with; the filter they give is consistent."""
     story = example("recorded_data")
@@ -83,7 +83,7 @@ def test_recorded_data(example, tmp_path, monkeypatch):
     assert np.ptp(image.imread(story.picture(again, tmp_path))[..., :3]) > 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_moving_poi(example, tmp_path):
     """The path explains what a rigid body and a fixed POI do not; the stated error is the real."""
     story = example("moving_poi")
@@ -98,7 +98,7 @@ def test_moving_poi(example, tmp_path):
     assert np.ptp(image.imread(story.picture(result, tmp_path))[..., :3]) > 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_scanning_stage_with_one_short_run(example, tmp_path, monkeypatch):
     """Designs that follow keep their margin and their estimate on a machine of another kind."""
     story = example("scanning_stage")

@@ -164,7 +164,7 @@ def test_designs_are_the_same_under_any_names(names):
     assert fx.lti.feedback(g.select([y], [u])).inputs == (u,)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::flexplant.FlexplantWarning")
 @pytest.mark.parametrize("names", NAMES[6:], ids="-".join)
 def test_names_of_a_user_meet_none_of_ours(names, tmp_path):

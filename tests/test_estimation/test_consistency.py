@@ -315,7 +315,7 @@ def calibrated_stage(added_mass):
     return plant.discretized(machine.rate, delay=machine.delay), whole, machine
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_machine_of_another_formulation_that_has_changed_since_it_was_measured():
     """0.4 kg more on a Ritz plate: the modes that moved are named, and where they are.
 
@@ -340,7 +340,7 @@ def test_a_machine_of_another_formulation_that_has_changed_since_it_was_measured
     assert f"mode 6 is at {moved.measured.freq[moved.modes.index(6)]:.5g} Hz, not" in repr(moved)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_deviations_of_moved_modes_cover_in_closed_loop():
     """Runs with moves and 1 % damping: frequency and decay lie in their intervals."""
     moved = with_changes(machine(), [(Delta("f", 6, "freq", 1.0), 0.05)])
@@ -357,7 +357,7 @@ def test_deviations_of_moved_modes_cover_in_closed_loop():
     assert np.sum(np.square(z)) < 26.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_report_of_a_loop_names_the_mode_that_moved(tmp_path):
     """A run on a machine whose mode 6 is 2.5 % higher, beside the loop on the model."""
     moved = with_changes(machine(), [(Delta("f", 6, "freq", 1.0), 0.05)])

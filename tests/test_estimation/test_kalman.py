@@ -139,7 +139,7 @@ def test_any_other_gain_is_worse(column):
         assert observer_error(truth, other)[0] > best * (1 + 1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("zeta", [1e-2, 1e-3])
 def test_a_run_agrees_within_three_standard_errors(zeta):
     plant = plate_plant(zeta)

@@ -104,7 +104,7 @@ def test_a_filter_far_above_all_modes_changes_no_covariance():
     assert found[1] == pytest.approx(found[0], rel=1e-6, abs=0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_prediction_is_the_error_on_the_larger_plant_by_frequency():
     """Oracle: the integral of the error's density over all frequencies."""
     modes = all_modes("paper", 0.001).select(range(40))
@@ -142,7 +142,7 @@ def test_a_filter_that_knows_nothing_of_them_claims_too_little():
         assert "with 219 modes left out" in repr(knowing)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_modes_left_out_as_noise_forgive_what_is_not_known_of_them():
     """Above mode 24 frequencies off by 1 % and damping by 40 %: against a filter on 160 modes."""
     true = machine("paper", 0.001, ELEMENTS)

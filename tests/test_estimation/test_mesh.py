@@ -93,7 +93,7 @@ def test_a_coarse_mesh_is_warned_of_in_every_form_of_the_larger_model():
     assert shares == pytest.approx([shares[0]] * 3, abs=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_mesh_that_is_too_coarse_is_warned_of_and_one_that_is_fine_is_not():
     truth = sampled(solve_modes(plate(20), count=150))
     coarse, fine = plate(8), plate(12)

@@ -43,7 +43,7 @@ def test_pictures_show_poles_and_responses():
         identified(frf, frf, "y1", "u1")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_poles_are_picked_by_mouse(tmp_path):
     """Three resonances: two clicks take two, one with the other button gives one back."""
     freq, phi = np.arange(20.0, 100.0, 0.2), np.array([[1.0, -1.0, 0.5], [1.0, 0.5, -1.0]])

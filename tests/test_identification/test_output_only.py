@@ -33,7 +33,7 @@ def shaken(rng, count, noise=0.02):
     return motion + noise * np.std(motion) * rng.normal(size=motion.shape)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_poles_and_their_uncertainty():
     """12 records of 400 s: the errors are as large as the deviations that are stated."""
     scores = []

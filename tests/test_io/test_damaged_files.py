@@ -23,7 +23,7 @@ SCRIPT = Path(__file__).parents[1] / "fuzz_files.py"
 SECONDS = float(os.environ.get("FLEXPLANT_FUZZ", "0.1"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
 def test_readers_survive_random_damage():
     """Thousands of files of every format; the script runs each reader in a process of its own."""

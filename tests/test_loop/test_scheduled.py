@@ -78,7 +78,7 @@ def test_around_another_machine(schedule):
     assert np.all(np.isfinite(run["die:error"]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_feedforward_follows_the_path(plant):
     """Forces for a place lift another one askew: the lever arms have moved by 80 mm."""
     ports = plant.assembled.ports

@@ -210,7 +210,7 @@ def test_any_multiplicity_is_found(copies, count):
     assert certificate["counted"] == certificate["found"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_last_copies_of_many_modes_are_accurate():
     """Sixty free chains: the last copies of the third mode come late."""
     one = fx.chain(masses=np.ones(80), stiffnesses=np.full(79, 1e6))

@@ -94,7 +94,7 @@ def truths(plant, candidates, count, side):
     return best_subset(count, len(candidates), score)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("side", ["y", "u"])
 def test_optima_are_proven_and_no_bound_is_above_any_truth(case, side):
     plant, sensors, actuators, count = case

@@ -95,7 +95,7 @@ def _upper(plant, number):
     return pole.real, pole.imag
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("driven", [("1:x",), ("1:x", "3:x")])
 def test_shapes_spread_as_stated(driven):
     """60 noisy measurements of a held chain: mass-normalised shapes at all places, chi-square."""

@@ -49,7 +49,7 @@ def test_the_exact_filter_is_the_best_and_schedules_come_near(plant):
     assert np.sum(found.scheduled**2) < 1.05 * np.sum(found.exact**2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_predicted_errors_are_those_of_runs(plant):
     """Along a scan that repeats: 5 % of some 1300 independent errors."""
     observer = fx.design_kalman(plant)

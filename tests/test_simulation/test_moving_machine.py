@@ -217,7 +217,7 @@ def test_predicted_rms_of_a_repeated_scan_is_that_of_many_repetitions(loop):
     assert "largest die:error" in repr(once)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_predicted_rms_along_a_scan_is_that_of_runs(loop):
     """Beside the machine that stands, with the same noises: most of the scatter is in both."""
     paths = {"scan": lambda t: 0.09 * np.sin(2 * np.pi * 10.0 * t), "still": lambda t: 0.0 * t}

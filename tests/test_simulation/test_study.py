@@ -104,7 +104,7 @@ def marked(machine):
     return {"pid": os.getpid(), "mark": os.environ.get("STUDY_MARK", ""), "method": method}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("context", CONTEXTS)
 @pytest.mark.parametrize("limit", [False, True])
 def test_a_process_that_dies_or_hangs_takes_only_its_machine_with_it(context, limit):
@@ -331,7 +331,7 @@ def remembering(machine):
     return {"margin": loop.modulus_margin, "blocks": sys.getallocatedblocks()}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_machines():
     """But for the rows."""
     used = study(range(24), remembering)["blocks"]

@@ -20,7 +20,7 @@ def masses():
     return loop, fx.simulate(loop, reference=move, duration=0.5, rng=1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_few_bits_lose_the_loop_and_the_fewest_that_keep_it_are_found():
     loop, run = masses()
     found = fixed_point(loop, run, state_bits=32)
@@ -45,7 +45,7 @@ def test_few_bits_lose_the_loop_and_the_fewest_that_keep_it_are_found():
         fixed_point(loop, {"u1": run["u1"]})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_limit_cycles_are_named_and_shrink_with_the_words():
     """Each bit halves what is left; at the frequencies of the loop."""
     loop, run = masses()
@@ -59,7 +59,7 @@ def test_limit_cycles_are_named_and_shrink_with_the_words():
     assert 2**2 < sizes[16] / sizes[20] < 2**6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_budget_of_sections_and_bits():
     loop, run = masses()
     found = fixed_point(loop, run, sections=[3, 4, 6], state_bits=16)

@@ -13,7 +13,7 @@ def moving(places=(0.0, 0.5, 1.0)):
     return {x: machine(sight=0.4 - 0.6 * x) for x in places}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_controller_for_all_positions_beats_those_of_one():
     """Norms by dense matrices on machines made at each position, those between included."""
     found = fx.design_hinf(moving())

@@ -80,7 +80,7 @@ def test_the_measured_plant_gives_the_same_report():
         assert design_loops(plant(), law(gain=8.0)).report.unstable == fast.unstable
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_modes_left_out_are_checked():
     """Tuned on 12 modes up to 1.3 kHz: the loop reaches those above."""
     P = sampled(small(12), ports(references=[]))
@@ -126,7 +126,7 @@ def test_less_delay_or_a_lower_margin_buys_bandwidth(sign, cases):
     assert reached[1] > 1.2 * reached[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_on_springs_within_the_lines():
     """A suspension at 3 Hz: the model's own poles, or rigid=0 of an Frf; the same loop."""
     G = body(1, spring=3.0)
@@ -144,7 +144,7 @@ def test_on_springs_within_the_lines():
         tune_loops(frequency_response(G, lines), rate=RATE, hold=False)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tuned_on_the_measured_machine_stable_on_the_truth():
     """Noise, lines of 2 Hz, a hidden mass: no model but the rigid-body axes of the drawing."""
     machine = wafer_stage()

@@ -152,7 +152,7 @@ def test_refusals():
         worst_case_gain(uncertain(), lead(gain=15.0), w=[], z=["tip:x"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("sampled", [False, True])
 def test_dk_iteration_makes_every_machine_keep_the_weights(sampled):
     """mu falls below one, and so does the weighted gain of all corners, where LQG-like did not."""
@@ -171,7 +171,7 @@ def test_dk_iteration_makes_every_machine_keep_the_weights(sampled):
     assert robust_stability(deltas, found).upper < found.gamma
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_channel_a_mode_makes_every_machine_keep_the_weights():
     """Only frequencies are uncertain: mu is that of the machines, and of the general search."""
     deltas = plant(True).uncertain(frequency=0.03)

@@ -234,7 +234,7 @@ def test_one_controller_for_several_machines():
         design_structured([plants[0], machine(26.0, rate=400.0)], TunedLaws(law()))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_stage_with_decoupled_laws_at_two_poi_positions():
     """A stage in SI units, one law for each rigid-body axis; the modes left out are checked."""
     P = sampled(small(), ports())

@@ -15,7 +15,7 @@ def moving(places=(0.0, 0.5, 1.0)):
     return {x: machine(sight=0.4 - 0.6 * x) for x in places}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_law_for_all_positions_is_judged_between_them():
     """Norms by dense matrices on machines made at each position, those between included."""
     found = design_structured(moving(), TunedLaws(law()), starts=1)

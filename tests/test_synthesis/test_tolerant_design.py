@@ -93,7 +93,7 @@ def test_uncertainty_of_another_plant_is_refused():
         fx.design_hinf(weighted(), uncertain=0.005)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_stage_is_as_fast_as_its_uncertainty_allows():
     small = sampled(some_modes(ZETA, 8, attached=False), CHANNELS)
     sure = fx.design_stage(small.uncertain(frequency=0.001))

@@ -184,7 +184,7 @@ def test_fits_are_calibrated_too():
     assert (nearest < 1e-8 * np.abs(measured.poles)).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*modes that the plant left out")
 def test_what_is_promised_on_a_calibrated_model_is_kept_by_other_machines():
     """By its own poles; on this one (and another of eight) a shape at 244 Hz is not the model's.
@@ -211,7 +211,7 @@ def test_what_is_promised_on_a_calibrated_model_is_kept_by_other_machines():
         assert loop.modulus_margin > 0.9 * promised
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_search_judges_the_modes_left_out():
     """On a small thick plate these limit the bandwidth: without them the machine is unstable.
 

@@ -161,7 +161,7 @@ def held_response(T, freq, inputs=4):
 LINES = np.array([60.0, 240.0, 250.0, 360.0, 460.0, 630.0, 1500.0, 3000.0])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_measured_frf_is_the_truths_within_noise():
     """Under feedback; the error is that of the noise: ten times the force, a tenth of it."""
     wanted = held_response(truth(0.01), LINES)
@@ -235,7 +235,7 @@ def test_one_per_cent_of_thickness_moves_the_study():
     assert np.abs(thick[1:] / pins[1:] - 1).min() > 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_of_the_machine_is_its_closed_form(zeta):
     found = designs(zeta)
     holding = design_servo(found["plants"][0], bandwidth=10.0)

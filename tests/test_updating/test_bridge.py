@@ -18,7 +18,7 @@ def test_the_truth_is_reached_from_stored_starts(bridge):
     assert ends(bridge, bridge.starts[:2]).max() < 1e-8
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_noise_leaves_the_published_error_and_an_honest_doubt(bridge):
     error, score = noisy_fits(bridge, 8, bounds=(-1, 1))
     assert error < 0.11

@@ -147,7 +147,7 @@ def inside(individual):
     return held, damped
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_true_frequencies_and_dampings_lie_inside():
     """Of 2 machines here; of 100: 97 % of frequencies and 98 % of dampings."""
     found = np.array([inside(individual) for individual in range(3, 5)])

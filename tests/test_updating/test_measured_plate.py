@@ -19,7 +19,7 @@ def test_a_few_noisy_responses_find_the_mass():
     assert fits[0].std[0] < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_interval_from_poles_covers_the_mass(plate):
     rom = plate.reduced(0.01, True)
     poles = oracle.poles(*with_mass())[:6]

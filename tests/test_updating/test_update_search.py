@@ -88,7 +88,7 @@ def test_a_new_method_is_a_value_with_a_search(make):
     assert own.values[0] == pytest.approx(best.values[0], abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_poles_that_are_paired_wrongly_are_fitted_from_elsewhere(plate):
     """Three masses and poles alone: five of these machines end in a wrong minimum from zero."""
     modes = solve_modes(plate.model, count=25, damping=ModalDamping(0.01))

@@ -34,7 +34,7 @@ def poles_of(model, place, mass, rng, level=1e-3):
     return Eigenvalues(MeasuredModes(exact + noise, modes=range(1, 7), covariance=std**2))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_right_model_leaves_noise(chain):
     """Two modes are fitted, whose errors are those of two parameters: 60 trials, uniform p."""
     rng = np.random.default_rng(3)

@@ -352,7 +352,7 @@ def test_a_measurement_over_its_model():
     assert page.answer.time.size > 10
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tuning_reports_can_be_stopped_and_is_taken():
     plant = light()
     page = Page(fx.workbench(measured(plant), **SAMPLED, open_browser=False))
