@@ -2,36 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..checks import (
-    ComplexArray,
-    IntArray,
-    between,
-    instance,
-    positive,
-    real_array,
-    several,
-    short,
-    whole,
-)
-from ..errors import (
-    LabelError,
-    ModelError,
-    ShapeError,
-    SolverError,
-    attempted,
-    counted,
-    require_known,
-    warn,
-)
+from ..checks import IntArray, between, instance, positive, real_array, several, short, whole
+from ..errors import LabelError, ModelError, SolverError, require_known
 from ..lti.frequency import Frf
-from ..parallel import Progress, expect, one_thread
-from ..tolerances import ROUNDING, TINY
+from ..parallel import one_thread
+from ..tolerances import ROUNDING
 from .diagram import (
     PoleSelection,
     StabilisationDiagram,
@@ -41,53 +21,10 @@ from .diagram import (
     weighted_by_remainder,
 )
 from .frf_estimation import repetitions, stacked
-from .gate import entry, gated, lesser, single, steady
-from .line_weights import PreparedLines, Rejected, prepared
-from .model_error import ALIKE, NOISE, Disagreement, disagreement, outputs_disagree, strength
-from .pole_test import (
-    UPPER,
-    dropped,
-    fewer_terms,
-    freedom,
-    improved,
-    merged,
-    missed,
-    more_terms,
-    own_price,
-    relocated,
-    split,
-    supported,
-    unexplained,
-    unwindowed,
-    warned,
-)
-from .refine import Exhausted, Fit, Lines, Products, pivoted, refined
-from .result import IdentifiedModes, answer, hann_segment, leakage_warned, of_segments
-
-#: what poles of their own may belong to, beside outputs and inputs
-RUNS = "runs"
-#: of an identification, for its bar: the diagram, twice fit and growth, the answer
-STAGES = 6
-#: changes of one kind that are accepted, and poles that a fit may have
-MOST, MOST_POLES = 6, 60
-#: lines apart that poles at peaks have: a peak that is no resonance of a linear machine is
-#: explained badly, and what is left of it is no other pole; and lines that a peak has beside it on
-#: either side, where the edge of the band shows one flank only
-REGION, FLANK = 20, 5
-#: power of the largest line for the middle one's, of a response that stands out: of noise in one
-#: channel, the largest of a million lines is 20 times the middle one
-STANDS_OUT = 20.0
-#: values of the FRF times (poles times references) squared, the products of a step of the fit, up
-#: to which it is made without a request: some seconds altogether
-CHEAP = 5e7
-#: products that a refinement without a request may take in all, a minute or two
-BUDGET = 5e10
-#: multiplications of a whole fit and of a first answer for those of a step, on average
-_REFINED, _FIRST = 6e3, 200.0
-#: misfit of a first answer that is warned of: deviations are enlarged by its square root
-LARGE = 4.0
-#: steps that compare fits: the diagram's poles are off by more than noise makes them
-QUICK = 2
+from .line_weights import prepared
+from .pole_test import UPPER
+from .result import IdentifiedModes, of_segments
+from .stages import MOST_POLES, RUNS, Task, identified
 
 #: most residual terms on one side of the band: powers of a frequency beyond tell no more apart in
 #: double precision
@@ -268,7 +205,6 @@ def identify_modes(
     >>> found.freq.round(2), modes.freq.round(2)
     (array([ 34.46, 147.  ]), array([ 34.46, 147.  ]))
     """
-    most, steps = whole(most, "most"), whole(max_iterations, "max_iterations")
     if refine is not None and not isinstance(refine, bool):
         raise ModelError(f"refine is True, False or None, got {short(refine)}.")
     runs: tuple[Any, ...] = tuple(frf) if isinstance(frf, list | tuple) else (frf,)
@@ -276,288 +212,47 @@ def identify_modes(
         runs = repetitions(runs)
     with one_thread():
         try:
-            return _identified(
-                *(runs, band, orders, start, lower, upper, hold),
-                *((dofs, setups), (refine, most, steps), progress),
+            ready = prepared(stacked(runs) if len(runs) > 1 else runs[0], band)
+            rate = None if hold is None else positive(hold, "hold")
+            high = float(ready.freq[-1])
+            if rate is not None and high > rate / 2 * (1 + ROUNDING):
+                raise ModelError(
+                    f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together."
+                )
+            if start is not None:
+                instance(start, PoleSelection, "start", "Pass diagram.select(freq=[...]).")
+            side, together = _sides(setups, runs)
+            task = Task(
+                frf=runs[0],
+                runs=len(runs),
+                lower=whole(lower, "lower", minimum=0, maximum=MOST_TERMS),
+                upper=None
+                if upper is None
+                else whole(upper, "upper", minimum=0, maximum=MOST_TERMS),
+                terms=UPPER[-1],
+                hold=rate,
+                labels=checked_channels(dofs, runs[0]),
+                side=side,
+                together=together,
+                refine=refine,
+                most=whole(most, "most"),
+                steps=whole(max_iterations, "max_iterations"),
             )
+            listed = None if orders is None else checked_orders(orders)
+            return identified(task, ready, listed, start, progress)
         except SolverError as error:
             raise of_segments(runs[0], error) from None
 
 
-def _identified(
-    runs: tuple[Frf, ...],
-    band: tuple[float, float] | None,
-    orders: Iterable[int] | None,
-    start: PoleSelection | None,
-    lower: int,
-    upper: int | None,
-    hold: float | None,
-    channels: tuple[Any, Any],
-    limits: tuple[bool | None, int, int],
-    progress: bool | None,
-) -> IdentifiedModes:
-    frf = runs[0]
-    ready = prepared(stacked(runs) if len(runs) > 1 else frf, band)
-    high = float(ready.freq[-1])
-    lower = whole(lower, "lower", minimum=0, maximum=MOST_TERMS)
-    terms = UPPER[-1] if upper is None else whole(upper, "upper", minimum=0, maximum=MOST_TERMS)
-    rate = None if hold is None else positive(hold, "hold")
-    if rate is not None and high > rate / 2 * (1 + ROUNDING):
-        raise ModelError(f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together.")
-    labels = checked_channels(channels[0], frf)
-    side, together = checked_setups(channels[1], frf)
-    if len(runs) > 1:
-        if side:
-            raise ModelError("setups= are those of one measurement, got several: give one of them.")
-        side, together = RUNS, tuple(np.split(np.arange(len(runs) * len(frf.outputs)), len(runs)))
-    listed = None if orders is None else checked_orders(orders)
-    if start is not None:
-        instance(start, PoleSelection, "start", "Pass diagram.select(freq=[...]).")
-    if not ready.known:
-        ready = weighted_by_remainder(ready, affordable(listed, ready)[-1])
-    refine, most, steps = limits
-    budget = Products()
-
-    def lines_of(ready: PreparedLines) -> Lines:
-        rows = RUNS if side == RUNS and ready.side == "outputs" else ready.side
-        # with all residual terms, so that no pole is kept or moved to stand in for one
-        return Lines(
-            *(ready.freq, ready.data, ready.weight, lower, terms, rate, ready.known),
-            inflation=ready.inflation,
-            variance_freedom=frf.freedom,
-            segment=hann_segment(frf),
-            most=most,
-            work=budget,
-            side=rows,
-            setups=together if side == rows else (),
-        )
-
-    diagram, at_peaks, alone = None, False, start is None
-    if start is None:
-        diagram = diagram_of(ready, affordable(listed, ready), (0.01, 0.05, 0.95), 0.2)
-        try:
-            chosen = diagram.automatic()
-        except SolverError:
-            if frf.window is not None or refine:
-                raise
-            lines = lines_of(ready)
-            found = _at_peaks(lines)
-            at_peaks = found is not None
-            found = found or _nearest(lines, diagram)
-            if found is None:
-                raise
-            chosen, alone, refine = found, False, False if at_peaks else refine
-            warn(
-                "no pole stays over the orders of the stabilisation diagram: the poles are those "
-                + (
-                    "of the highest peaks, their damping is no more than its order of magnitude "
-                    "and their deviations are half a width of the resonance. A transient that has "
-                    "not decayed or a single run looks so: average over more runs."
-                    if at_peaks
-                    else "nearest the largest response. Widen the band, or choose from the diagram "
-                    "by hand (start=)."
-                )
-            )
-    elif start.participation.shape[0] != ready.data.shape[1]:
-        raise ShapeError(
-            f"start was chosen with {counted(start.participation.shape[0], 'reference')}, this FRF "
-            f"has {ready.data.shape[1]}: make the diagram from the same channels."
-        )
-    else:
-        chosen = start
-    free = upper is None
-    work = ready.data.size * (len(chosen) * ready.data.shape[1]) ** 2
-    costly = work > CHEAP
-    shown = True if refine and costly and progress is None else progress
-    name = f"modes, {work:.1e} operations a step" if costly else "modes"
-    advice = "Fewer lines (band=), fewer channels or refine=False take less."
-    with Progress(STAGES, name, progress=shown, advice=advice) as bar:
-        bar.advance()
-        expect(work * (_REFINED if refine or (refine is None and not costly) else _FIRST))
-        lines = lines_of(ready)
-        judged = refine is not False and not at_peaks
-        # one step is as near to a machine as noise is; what outputs disagree in needs more
-        fit, weaker = _first(lines, chosen, alone, QUICK if judged else int(alone))
-        reason = ""
-        if judged and alone and lesser(fit, fit.participation, ALIKE):
-            less = single(lines, fit, fit.participation, QUICK)
-            fit = less if outputs_disagree(less, fit.cost) else fit
-        differ = judged and outputs_disagree(fit)
-        asked = side not in ("", lines.side)
-        if asked or (not side and judged and not differ and _turns(fit)):
-            other = single(lines_of(ready.turned), fit, fit.shapes, QUICK)
-            differ = judged and outputs_disagree(other, np.inf if asked else fit.cost)
-            if differ or asked:
-                ready, lines, fit = ready.turned, other.lines, other
-        differ = differ and refine is None
-        if refine is False:
-            reason = "refine=True for more"
-        elif refine is None and costly:
-            reason = f"refine=True for more, {work:.1e} operations a step"
-        elif differ:
-            reason = f"a refinement comes no nearer to poles that {lines.side} do not share"
-        else:
-            budget.most = np.inf if refine else budget.done + BUDGET
-            try:
-                ready, lines, fit = _refined(ready, lines_of, fit, alone, free, steps, bar)
-            except Exhausted:
-                reason = f"more is left than shared poles explain after {BUDGET:.0e} operations"
-        budget.most, settled = np.inf, not reason
-
-        # poles that outputs are to share are known where a refinement, or own fits, were made
-        compare = settled or differ
-
-        def again(poles: ComplexArray, part: ComplexArray) -> Fit:
-            count = steps if settled else QUICK * int(compare)
-            return refined(lines, poles, part, steps=count, strict=False)
-
-        fit, reported, rejected = gated(lines, fit, again, alone=alone, compare=compare)
-        apart = None
-        if settled:
-            fit = refined(lines, fit.poles, fit.participation, steps=steps, fine=True)
-        if compare:
-            excess = fit.cost - freedom(lines, fit.poles.size)
-            apart = disagreement(lines, fit, own_price(lines, fit), excess)
-            if apart is not None:
-                reported, others = steady(fit, reported, apart)
-                fit = Fit(lines, apart.poles, fit.participation, fit.pivots)
-                rejected += others
-        # a first answer may leave some misfit, but not so much that deviations are twice as large
-        misfit = fit.cost / freedom(lines, fit.poles.size)
-        if compare or budget.done > BUDGET or (alone and misfit > LARGE):
-            differing = None if apart is None else (apart.size, lines.side, _odd(frf, lines, apart))
-            warned(unexplained(lines, fit), differing)
-        if side == RUNS:
-            ready = ready.over_runs(len(runs))
-            lines = replace(lines, data=ready.data, weight=ready.weight, setups=())
-            fit = Fit(lines, fit.poles, fit.participation, fit.pivots)
-        listed_out = tuple(sorted(weaker + rejected + ready.mains))
-        answered = answer(
-            frf, ready, lines, fit, reported, labels, diagram, listed_out, reason, apart
-        )
-        if at_peaks:
-            half = np.maximum(-answered.poles.real, np.pi * float(np.median(np.diff(lines.freq))))
-            answered = answered.replace(covariance=np.diag(np.tile(half, 2) ** 2))
-        bar.advance(STAGES - bar.done)
-    leakage_warned(frf, answered)
-    return answered
-
-
-def _odd(frf: Frf, lines: Lines, apart: Disagreement) -> str:
-    """Return which output, input or run is off by far more than the others, empty where none is."""
-    if apart.odd is None:
-        return ""
-    place, off = apart.odd
-    names = frf.inputs if lines.side == "inputs" else frf.outputs
-    who = f"run {place + 1}" if lines.side == RUNS else names[int(lines.parts[place][0])]
-    return f"{who} is off by {100 * off:.2g} %, far more than the others: look at it. "
-
-
-def _nearest(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection | None:
-    """Return the diagram's pole nearest the largest response, None where nothing stands out.
-
-    In a band little wider than its resonance, whose lines afford few orders, poles of outputs that
-    disagree are not the same from one order to the next.
-    """
-    power = np.sum(np.abs(lines.data * lines.weight) ** 2, axis=(0, 1))
-    inner = slice(FLANK, -FLANK)
-    place = int(np.argmax(power[inner]))
-    if power[inner][place] < STANDS_OUT * np.median(power):
-        return None
-    with attempted("a pole at the largest response", ModelError):
-        return diagram.select([float(lines.freq[inner][place])])
-    return None
-
-
-def _at_peaks(lines: Lines) -> PoleSelection | None:
-    """Return poles at the peaks of a response that no stable poles explain, as a grid finds them.
-
-    A response whose phase rises through a resonance (a transient that is not decayed, a record of
-    one run) has no pole that is stable there, and its peak is one all the same.
-    """
-    spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
-    none = np.zeros((lines.data.shape[1], 0), dtype=np.complex128)
-    fit = Fit(lines, none[0], none)
-    ends = 2 * np.pi * np.array([lines.freq[FLANK], lines.freq[-1 - FLANK]])
-    for _ in range(MOST):
-        trials = [one for rivals in missed(lines, fit) for one in rivals]
-        trials = [
-            one
-            for one in trials
-            if ends[0] < one.poles[-1].imag < ends[1]
-            and np.all(np.abs(one.poles[-1] - fit.poles) > REGION * spacing)
-        ]
-        best = max(trials, key=lambda trial: trial.gain - trial.least, default=None)
-        if best is None or best.gain < best.least:
-            break
-        fit = Fit(lines, best.poles, best.participation)
-    return PoleSelection(fit.poles, fit.participation) if fit.poles.size else None
-
-
-def _turns(fit: Fit) -> bool:
-    """Return whether references may disagree: more than noise is left, or poles stand beside."""
-    return len(fit.participation) > 1 and bool(
-        lesser(fit, fit.shapes, ALIKE) or fit.cost > NOISE * freedom(fit.lines, fit.m)
-    )
-
-
-def _first(
-    lines: Lines, chosen: PoleSelection, alone: bool, steps: int
-) -> tuple[Fit, tuple[Rejected, ...]]:
-    """Return the fit near the poles chosen, with all residual terms and no search for others.
-
-    Of more poles than are requested the strongest are kept; the others are returned too.
-    """
-    if not alone:
-        fit = Fit(lines, chosen.poles, chosen.participation)
-        now = fit.poles, fit.participation
-        return (refined(lines, *now, steps=steps, strict=False) if steps else fit), ()
-    fit = supported(lines, chosen.poles, chosen.participation)
-    height = strength(fit)
-    height[lesser(fit, fit.shapes, ALIKE)] *= TINY  # of two poles of one resonance one counts
-    places = np.argsort(-height, kind="stable")
-    keep, others = np.sort(places[: lines.most]), places[lines.most :]
-    weaker = tuple(entry(fit, int(k), f"weaker than the {lines.most} of most=") for k in others)
-    if weaker:
-        fit = pivoted(lines, fit.poles[keep], fit.participation[:, keep])
-    fit = refined(lines, fit.poles, fit.participation, steps=steps, strict=False, first=fit)
-    return fit, weaker
-
-
-def _refined(
-    ready: PreparedLines,
-    lines_of: Callable[[PreparedLines], Lines],
-    first: Fit,
-    alone: bool,
-    free: bool,
-    steps: int,
-    bar: Progress,
-) -> tuple[PreparedLines, Lines, Fit]:
-    """Return the maximum likelihood fit, with the poles and terms that the data support."""
-    poles, part = first.poles, first.participation
-    reducing = [(unwindowed, 1), (dropped, int(alone))]
-    reducing += [(merged, MOST * int(alone)), (fewer_terms, int(free))]
-    growing = [
-        *((missed, MOST), (merged, MOST), (more_terms, int(free))),
-        *((split, MOST), (relocated, MOST), (merged, MOST), (missed, MOST)),
-    ]
-    for _ in range(1 if ready.known else 2):
-        lines = lines_of(ready)
-        start = supported(lines, poles, part) if alone else pivoted(lines, poles, part)
-        # poles that turn out to be none may keep it from settling: judged at the end
-        fit = refined(
-            lines, start.poles, start.participation, steps=steps, strict=not alone, first=start
-        )
-        lines, fit = improved(lines, fit, reducing, steps=steps)
-        bar.advance()
-        if alone:
-            lines, fit = improved(lines, fit, growing, steps=steps, rough=True)
-            bar.advance()
-        poles, part = fit.poles, fit.participation
-        if not ready.known:
-            share = 1.0 - freedom(lines, poles.size) / (2 * fit.model.size)
-            ready = ready.from_residuals(ready.data - fit.model, share)
-    return ready, lines, fit
+def _sides(setups: Any, runs: Sequence[Frf]) -> tuple[str, tuple[IntArray, ...]]:
+    """Return what may have poles of its own where that was said, and which rows go together."""
+    side, together = checked_setups(setups, runs[0])
+    if len(runs) == 1:
+        return side, together
+    if side:
+        raise ModelError("setups= are those of one measurement, got several: give one of them.")
+    count = len(runs) * len(runs[0].outputs)
+    return RUNS, tuple(np.split(np.arange(count), len(runs)))
 
 
 def checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:

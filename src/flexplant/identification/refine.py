@@ -362,11 +362,9 @@ class Fit:
             whole, common = np.zeros_like(N), np.zeros((2 * self.m, count))
             errors = error.reshape(n_in, -1)
             bases = Q.reshape(*errors.shape, 2 * self.m)
-            left = np.zeros_like(N)
-            smooth = self.lines.smooth_bases[o][0]
-            for D, terms, basis, e, (mine, at) in zip(
-                self._moving(o), smooth, bases, errors, self._places, strict=True
-            ):
+            left, smooth = np.zeros_like(N), self.lines.smooth_bases[o][0]
+            parts = zip(self._moving(o), smooth, bases, errors, self._places, strict=True)
+            for D, terms, basis, e, (mine, at) in parts:
                 square, off = D @ D.T, D @ terms
                 whole[np.ix_(at, at)] += square[np.ix_(mine, mine)]
                 left[np.ix_(at, at)] += (square - off @ off.T)[np.ix_(mine, mine)]
@@ -434,10 +432,9 @@ def _qr(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(Q), np.asarray(R)
 
 
-#: least part of a column that is its own, above which it is known well from products, and the
-#: same of its square: rounding of 1e-16 is then 1e-10 of it, a damping of 1e-8 hides that; from
-#: the third on one pass is exact to some 1e-14
-OWN_PART, OWN_SQUARE, FAR_APART = 1e-4, 1e-6, 0.1
+#: least part of a column that is its own, above which products tell it well, and that for which one
+#: pass is exact to 1e-14; the same of its square, 1e-10 of rounding: a damping of 1e-8 hides that
+OWN_PART, FAR_APART, OWN_SQUARE = 1e-4, 0.1, 1e-6
 
 
 def _orthonormal(columns: FloatArray) -> tuple[FloatArray, FloatArray]:

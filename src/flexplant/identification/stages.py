@@ -1,0 +1,396 @@
+"""The stages of an identification: first poles, a first fit, a refinement, the gate, the answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..checks import ComplexArray, IntArray
+from ..errors import ModelError, ShapeError, SolverError, attempted, counted, warn
+from ..lti.frequency import Frf
+from ..parallel import Progress, expect
+from ..tolerances import TINY
+from .diagram import (
+    PoleSelection,
+    StabilisationDiagram,
+    affordable,
+    diagram_of,
+    weighted_by_remainder,
+)
+from .gate import entry, gated, lesser, single, steady
+from .line_weights import PreparedLines, Rejected
+from .model_error import ALIKE, NOISE, Disagreement, disagreement, outputs_disagree, strength
+from .pole_test import (
+    dropped,
+    fewer_terms,
+    freedom,
+    improved,
+    merged,
+    missed,
+    more_terms,
+    own_price,
+    relocated,
+    split,
+    supported,
+    unexplained,
+    unwindowed,
+    warned,
+)
+from .refine import Exhausted, Fit, Lines, Products, pivoted, refined
+from .result import IdentifiedModes, answer, hann_segment, leakage_warned
+
+#: what poles of their own may belong to, beside outputs and inputs
+RUNS = "runs"
+#: of an identification, for its bar: the diagram, twice fit and growth, the answer
+STAGES = 6
+#: changes of one kind that are accepted, and poles that a fit may have
+MOST, MOST_POLES = 6, 60
+#: lines apart that poles at peaks have: a peak that is no resonance of a linear machine is
+#: explained badly, and what is left of it is no other pole; and lines that a peak has beside it on
+#: either side, where the edge of the band shows one flank only
+REGION, FLANK = 20, 5
+#: power of the largest line for the middle one's, of a response that stands out: of noise in one
+#: channel, the largest of a million lines is 20 times the middle one
+STANDS_OUT = 20.0
+#: values of the FRF times (poles times references) squared, the products of a step of the fit, up
+#: to which it is made without a request: some seconds altogether
+CHEAP = 5e7
+#: products that a refinement without a request may take in all, a minute or two
+BUDGET = 5e10
+#: multiplications of a whole fit and of a first answer for those of a step, on average
+_REFINED, _FIRST = 6e3, 200.0
+#: misfit of a first answer that is warned of: deviations are enlarged by its square root
+LARGE = 4.0
+#: steps that compare fits: the diagram's poles are off by more than noise makes them
+QUICK = 2
+
+
+@dataclass(frozen=True)
+class Task:
+    """What an identification is to do, checked."""
+
+    frf: Frf
+    runs: int
+    #: residual terms of modes below the band; of modes above, None where the data choose
+    lower: int
+    upper: int | None
+    #: those of modes above that a fit has at first
+    terms: int
+    hold: float | None
+    labels: Mapping[str, str]
+    #: what may have poles of its own (outputs, inputs, runs), empty where the data are to say it,
+    #: and which of its rows were measured together
+    side: str
+    together: tuple[IntArray, ...]
+    refine: bool | None
+    most: int
+    steps: int
+    budget: Products = field(default_factory=Products)
+
+    def lines(self, ready: PreparedLines) -> Lines:
+        """Return lines with all residual terms: no pole is kept or moved to stand in for one."""
+        rows = RUNS if self.side == RUNS and ready.side == "outputs" else ready.side
+        return Lines(
+            *(ready.freq, ready.data, ready.weight, self.lower),
+            *(self.terms if self.upper is None else self.upper, self.hold, ready.known),
+            inflation=ready.inflation,
+            variance_freedom=self.frf.freedom,
+            segment=hann_segment(self.frf),
+            most=self.most,
+            work=self.budget,
+            side=rows,
+            setups=self.together if self.side == rows else (),
+        )
+
+
+class _Begin(NamedTuple):
+    """The poles that a fit begins with."""
+
+    poles: PoleSelection
+    diagram: StabilisationDiagram | None = None
+    #: the diagram's own choice, which a fit may add to and take from
+    alone: bool = False
+    #: of peaks, which no fit makes better
+    at_peaks: bool = False
+
+
+class _Stage(NamedTuple):
+    """Lines and their fit."""
+
+    ready: PreparedLines
+    fit: Fit
+
+    @property
+    def lines(self) -> Lines:
+        return self.fit.lines
+
+
+def identified(
+    task: Task,
+    ready: PreparedLines,
+    orders: list[int] | None,
+    start: PoleSelection | None,
+    progress: bool | None,
+) -> IdentifiedModes:
+    """Return the modes of prepared lines; `start`: poles chosen by hand."""
+    listed = affordable(orders, ready)
+    if not ready.known:
+        ready = weighted_by_remainder(ready, listed[-1])
+    begin = _begin(task, ready, listed) if start is None else _by_hand(ready, start)
+    refine = False if begin.at_peaks else task.refine
+    work = ready.data.size * (len(begin.poles) * ready.data.shape[1]) ** 2
+    costly = work > CHEAP
+    with Progress(
+        STAGES,
+        f"modes, {work:.1e} operations a step" if costly else "modes",
+        progress=True if refine and costly and progress is None else progress,
+        advice="Fewer lines (band=), fewer channels or refine=False take less.",
+    ) as bar:
+        bar.advance()
+        expect(work * (_REFINED if refine or (refine is None and not costly) else _FIRST))
+        # one step is as near to a machine as noise is; what outputs disagree in needs more
+        judged = refine is not False and not begin.at_peaks
+        quick = QUICK if judged else int(begin.alone)
+        fit, weaker = _first(task.lines(ready), begin.poles, begin.alone, quick)
+        now, differ = _by_rows(task, _Stage(ready, fit), begin.alone, judged)
+        differ = differ and refine is None
+        if refine is False:
+            reason = "refine=True for more"
+        elif refine is None and costly:
+            reason = f"refine=True for more, {work:.1e} operations a step"
+        elif differ:
+            reason = f"a refinement comes no nearer to poles that {now.lines.side} do not share"
+        else:
+            now, reason = _second(task, now, begin.alone, bar)
+        found = _answered(task, now, begin, weaker, reason, differ)
+        bar.advance(STAGES - bar.done)
+    leakage_warned(task.frf, found)
+    return found
+
+
+def _by_hand(ready: PreparedLines, start: PoleSelection) -> _Begin:
+    """Return poles that were chosen by hand."""
+    if start.participation.shape[0] != ready.data.shape[1]:
+        raise ShapeError(
+            f"start was chosen with {counted(start.participation.shape[0], 'reference')}, this FRF "
+            f"has {ready.data.shape[1]}: make the diagram from the same channels."
+        )
+    return _Begin(start)
+
+
+def _begin(task: Task, ready: PreparedLines, orders: list[int]) -> _Begin:
+    """Return the poles that stay over the orders of the diagram, else those of the peaks."""
+    diagram = diagram_of(ready, orders, (0.01, 0.05, 0.95), 0.2)
+    try:
+        return _Begin(diagram.automatic(), diagram, alone=True)
+    except SolverError:
+        if task.frf.window is not None or task.refine:
+            raise
+        lines = task.lines(ready)
+        peaks = _at_peaks(lines)
+        found = peaks or _nearest(lines, diagram)
+        if found is None:
+            raise
+    warn(
+        "no pole stays over the orders of the stabilisation diagram: the poles are those "
+        + (
+            "of the highest peaks, their damping is no more than its order of magnitude "
+            "and their deviations are half a width of the resonance. A transient that has "
+            "not decayed or a single run looks so: average over more runs."
+            if peaks
+            else "nearest the largest response. Widen the band, or choose from the diagram "
+            "by hand (start=)."
+        )
+    )
+    return _Begin(found, diagram, at_peaks=peaks is not None)
+
+
+def _by_rows(task: Task, now: _Stage, alone: bool, judged: bool) -> tuple[_Stage, bool]:
+    """Return the fit of shared poles where outputs, inputs or runs disagree, and whether they do.
+
+    Inputs that disagree are compared with inputs and outputs exchanged.
+    """
+    ready, fit = now
+    lines = fit.lines
+    if judged and alone and lesser(fit, fit.participation, ALIKE):
+        less = single(lines, fit, fit.participation, QUICK)
+        fit = less if outputs_disagree(less, fit.cost) else fit
+    differ = judged and outputs_disagree(fit)
+    asked = task.side not in ("", lines.side)
+    if asked or (not task.side and judged and not differ and _turns(fit)):
+        other = single(task.lines(ready.turned), fit, fit.shapes, QUICK)
+        differ = judged and outputs_disagree(other, np.inf if asked else fit.cost)
+        if differ or asked:
+            return _Stage(ready.turned, other), differ
+    return _Stage(ready, fit), differ
+
+
+def _second(task: Task, first: _Stage, alone: bool, bar: Progress) -> tuple[_Stage, str]:
+    """Return the refined fit, or the first one and the reason."""
+    task.budget.most = np.inf if task.refine else task.budget.done + BUDGET
+    try:
+        return _refined(task, first, alone, bar), ""
+    except Exhausted:
+        return first, f"more is left than shared poles explain after {BUDGET:.0e} operations"
+    finally:
+        task.budget.most = np.inf
+
+
+def _answered(
+    task: Task,
+    now: _Stage,
+    begin: _Begin,
+    weaker: tuple[Rejected, ...],
+    reason: str,
+    differ: bool,
+) -> IdentifiedModes:
+    """Return the modes of a fit that pass the gate; `reason`: why it was not refined."""
+    ready, lines, settled = now.ready, now.lines, not reason
+    # poles that outputs are to share are known where a refinement, or own fits, were made
+    compare = settled or differ
+
+    def again(poles: ComplexArray, part: ComplexArray) -> Fit:
+        count = task.steps if settled else QUICK * int(compare)
+        return refined(lines, poles, part, steps=count, strict=False)
+
+    fit, reported, rejected = gated(lines, now.fit, again, alone=begin.alone, compare=compare)
+    apart = None
+    if settled:
+        fit = refined(lines, fit.poles, fit.participation, steps=task.steps, fine=True)
+    if compare:
+        excess = fit.cost - freedom(lines, fit.poles.size)
+        apart = disagreement(lines, fit, own_price(lines, fit), excess)
+        if apart is not None:
+            reported, others = steady(fit, reported, apart)
+            fit = Fit(lines, apart.poles, fit.participation, fit.pivots)
+            rejected += others
+    # a first answer may leave some misfit, but not so much that deviations are twice as large
+    misfit = fit.cost / freedom(lines, fit.poles.size)
+    if compare or task.budget.done > BUDGET or (begin.alone and misfit > LARGE):
+        odd = None if apart is None else (apart.size, lines.side, _odd(task.frf, lines, apart))
+        warned(unexplained(lines, fit), odd)
+    if task.side == RUNS:
+        ready = ready.over_runs(task.runs)
+        lines = replace(lines, data=ready.data, weight=ready.weight, setups=())
+        fit = Fit(lines, fit.poles, fit.participation, fit.pivots)
+    found = answer(
+        *(task.frf, ready, lines, fit, reported, task.labels, begin.diagram),
+        *(tuple(sorted(weaker + rejected + ready.mains)), reason, apart),
+    )
+    if begin.at_peaks:
+        half = np.maximum(-found.poles.real, np.pi * float(np.median(np.diff(lines.freq))))
+        found = found.replace(covariance=np.diag(np.tile(half, 2) ** 2))
+    return found
+
+
+def _odd(frf: Frf, lines: Lines, apart: Disagreement) -> str:
+    """Return which output, input or run is off by far more than the others, empty where none is."""
+    if apart.odd is None:
+        return ""
+    place, off = apart.odd
+    names = frf.inputs if lines.side == "inputs" else frf.outputs
+    who = f"run {place + 1}" if lines.side == RUNS else names[int(lines.parts[place][0])]
+    return f"{who} is off by {100 * off:.2g} %, far more than the others: look at it. "
+
+
+def _nearest(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection | None:
+    """Return the diagram's pole nearest the largest response, None where nothing stands out.
+
+    In a band little wider than its resonance, whose lines afford few orders, poles of outputs that
+    disagree are not the same from one order to the next.
+    """
+    power = np.sum(np.abs(lines.data * lines.weight) ** 2, axis=(0, 1))
+    inner = slice(FLANK, -FLANK)
+    place = int(np.argmax(power[inner]))
+    if power[inner][place] < STANDS_OUT * np.median(power):
+        return None
+    with attempted("a pole at the largest response", ModelError):
+        return diagram.select([float(lines.freq[inner][place])])
+    return None
+
+
+def _at_peaks(lines: Lines) -> PoleSelection | None:
+    """Return poles at the peaks of a response that no stable poles explain, as a grid finds them.
+
+    A response whose phase rises through a resonance (a transient that is not decayed, a record of
+    one run) has no pole that is stable there, and its peak is one all the same.
+    """
+    spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
+    none = np.zeros((lines.data.shape[1], 0), dtype=np.complex128)
+    fit = Fit(lines, none[0], none)
+    ends = 2 * np.pi * np.array([lines.freq[FLANK], lines.freq[-1 - FLANK]])
+    for _ in range(MOST):
+        trials = [one for rivals in missed(lines, fit) for one in rivals]
+        trials = [
+            one
+            for one in trials
+            if ends[0] < one.poles[-1].imag < ends[1]
+            and np.all(np.abs(one.poles[-1] - fit.poles) > REGION * spacing)
+        ]
+        best = max(trials, key=lambda trial: trial.gain - trial.least, default=None)
+        if best is None or best.gain < best.least:
+            break
+        fit = Fit(lines, best.poles, best.participation)
+    return PoleSelection(fit.poles, fit.participation) if fit.poles.size else None
+
+
+def _turns(fit: Fit) -> bool:
+    """Return whether references may disagree: more than noise is left, or poles stand beside."""
+    return len(fit.participation) > 1 and bool(
+        lesser(fit, fit.shapes, ALIKE) or fit.cost > NOISE * freedom(fit.lines, fit.m)
+    )
+
+
+def _first(
+    lines: Lines, chosen: PoleSelection, alone: bool, steps: int
+) -> tuple[Fit, tuple[Rejected, ...]]:
+    """Return the fit near the poles chosen, with all residual terms and no search for others.
+
+    Of more poles than are requested the strongest are kept; the others are returned too.
+    """
+    if not alone:
+        fit = Fit(lines, chosen.poles, chosen.participation)
+        now = fit.poles, fit.participation
+        return (refined(lines, *now, steps=steps, strict=False) if steps else fit), ()
+    fit = supported(lines, chosen.poles, chosen.participation)
+    height = strength(fit)
+    height[lesser(fit, fit.shapes, ALIKE)] *= TINY  # of two poles of one resonance one counts
+    places = np.argsort(-height, kind="stable")
+    keep, others = np.sort(places[: lines.most]), places[lines.most :]
+    weaker = tuple(entry(fit, int(k), f"weaker than the {lines.most} of most=") for k in others)
+    if weaker:
+        fit = pivoted(lines, fit.poles[keep], fit.participation[:, keep])
+    fit = refined(lines, fit.poles, fit.participation, steps=steps, strict=False, first=fit)
+    return fit, weaker
+
+
+def _refined(task: Task, first: _Stage, alone: bool, bar: Progress) -> _Stage:
+    """Return the maximum likelihood fit, with the poles and terms that the data support."""
+    (ready, fit), free, steps = first, task.upper is None, task.steps
+    poles, part = fit.poles, fit.participation
+    reducing = [(unwindowed, 1), (dropped, int(alone))]
+    reducing += [(merged, MOST * int(alone)), (fewer_terms, int(free))]
+    growing = [
+        *((missed, MOST), (merged, MOST), (more_terms, int(free))),
+        *((split, MOST), (relocated, MOST), (merged, MOST), (missed, MOST)),
+    ]
+    for _ in range(1 if ready.known else 2):
+        lines = task.lines(ready)
+        start = supported(lines, poles, part) if alone else pivoted(lines, poles, part)
+        # poles that turn out to be none may keep it from settling: judged at the end
+        fit = refined(
+            lines, start.poles, start.participation, steps=steps, strict=not alone, first=start
+        )
+        lines, fit = improved(lines, fit, reducing, steps=steps)
+        bar.advance()
+        if alone:
+            lines, fit = improved(lines, fit, growing, steps=steps, rough=True)
+            bar.advance()
+        poles, part = fit.poles, fit.participation
+        if not ready.known:
+            share = 1.0 - freedom(lines, poles.size) / (2 * fit.model.size)
+            ready = ready.from_residuals(ready.data - fit.model, share)
+    return _Stage(ready, fit)
