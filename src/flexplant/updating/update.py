@@ -197,24 +197,8 @@ def update(
             best, estimates = corrected(
                 objective, basis, method, best, rounds=rounds, most=max_iterations, tolerance=enough
             )
-    if basis is not None and moved(objective, best.p, estimates[-2]) > UNSETTLED:
-        warn(
-            f"defect correction has not settled: round {len(estimates) - 1} still moved the "
-            f"estimate by {moved(objective, best.p, estimates[-2]):.2g} standard deviations. "
-            "Give more rounds=, or a reduced model with more modes."
-        )
-    if start is not None and starts is None and isinstance(ends[0], FlexplantError):
-        warn(
-            f"from the start that was given no end is found: {ends[0]} The answer is that from "
-            "another start (.starts has all of them)."
-        )
-    if not best.converged:
-        error = best.trail.error
-        warn(
-            f"the update did not converge in {counted(len(best.trail.p) - 1, 'step')}: "
-            f"{best.reason}, error {error[-1]:.3g} from {error[0]:.3g}. Look at .history; try "
-            "other mode numbers, start=, starts= or more iterations."
-        )
+    lost = ends[0] if start is not None and starts is None else None
+    _ends_warned(objective, best, estimates, lost if isinstance(lost, FlexplantError) else None)
     fit = _result(model, objective, method, best, begins[0])
     fit = fit.replace(starts=tried, rounds=np.array(estimates), residuals=given)
     if not method.least_squares or not is_bad(fit.p_value):
@@ -230,6 +214,36 @@ def update(
         fit = fit.replace(covariance=fit.covariance * (fit.chi2 / fit.dof))
     warn(_complaint(fit, named))
     return fit
+
+
+def _ends_warned(
+    objective: Objective,
+    best: SearchEnd,
+    estimates: list[FloatArray],
+    lost: FlexplantError | None,
+) -> None:
+    """Warn of rounds that have not settled, of a start that leads nowhere, of a search cut short.
+
+    `estimates`: the first and that of each round; `lost`: why the start given has no end.
+    """
+    if len(estimates) > 1 and (still := moved(objective, best.p, estimates[-2])) > UNSETTLED:
+        warn(
+            f"defect correction has not settled: round {len(estimates) - 1} still moved the "
+            f"estimate by {still:.2g} standard deviations. Give more rounds=, or a reduced model "
+            "with more modes."
+        )
+    if lost is not None:
+        warn(
+            f"from the start that was given no end is found: {lost} The answer is that from "
+            "another start (.starts has all of them)."
+        )
+    if not best.converged:
+        error = best.trail.error
+        warn(
+            f"the update did not converge in {counted(len(best.trail.p) - 1, 'step')}: "
+            f"{best.reason}, error {error[-1]:.3g} from {error[0]:.3g}. Look at .history; try "
+            "other mode numbers, start=, starts= or more iterations."
+        )
 
 
 def _result(
