@@ -116,7 +116,7 @@ class Value(metaclass=_Kind):
         """Return the kind with its fields and their units; None and empty ones are left out."""
         shown = []
         for field in fields(self):  # type: ignore[arg-type]
-            text, unit = _shown(getattr(self, field.name)), field.metadata.get("unit")
+            text, unit = _field_text(getattr(self, field.name)), field.metadata.get("unit")
             if text not in ("None", "''", "[]", "{}"):
                 shown.append(f"{field.name}={text}{' ' + unit if unit else ''}")
         return f"{type(self).__name__}({', '.join(shown)})"
@@ -161,14 +161,14 @@ class Value(metaclass=_Kind):
         save(self, path)
 
 
-def _shown(value: Any) -> str:
+def _field_text(value: Any) -> str:
     """Return a field's value for a repr: large arrays by their shape, long lists by their ends."""
     if isinstance(value, float):
         return f"{value:g}"
     if sp.issparse(value) or (isinstance(value, np.ndarray) and not 0 < value.size <= 6):
         return f"array {value.shape}" if value.size else "[]"  # type: ignore[union-attr]
     if isinstance(value, tuple):
-        listed = [_shown(part) for part in value]
+        listed = [_field_text(part) for part in value]
         if len(listed) > 4:
             listed[3:-1] = [f"... {len(listed) - 4} more ..."]
         return f"[{', '.join(listed)}]"

@@ -20,7 +20,7 @@ from flexplant.identification import (
     stabilisation_diagram,
 )
 from flexplant.identification.line_weights import prepared
-from flexplant.identification.pole_test import improved, missed, split, unexplained
+from flexplant.identification.pole_test import improved, missed, split_proposals, unexplained
 from flexplant.identification.refine import LEAST, Fit, Lines, refined
 from flexplant.lti import Frf
 from flexplant.store import load
@@ -187,10 +187,10 @@ def test_a_repeated_pole_that_passed_for_one_is_taken_apart(seed):
     assert np.sum(np.abs(found.freq - 120.0) < 0.3) == 2
     ready = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), 2, 5, None)
     one = refined(ready, found.poles[:5], found.participation[:, :5], steps=150)
-    _, two = improved(ready, one, [(split, 6)], steps=150)
+    _, two = improved(ready, one, [(split_proposals, 6)], steps=150)
     assert two.poles.size == 6
     assert np.abs(np.sort(np.abs(two.poles)) / np.abs(PAIRS) - 1).max() < 2e-3
-    assert improved(ready, two, [(split, 6)], steps=150)[1].poles.size == 6
+    assert improved(ready, two, [(split_proposals, 6)], steps=150)[1].poles.size == 6
 
 
 def test_a_pair_is_taken_apart_with_one_input():
@@ -199,7 +199,7 @@ def test_a_pair_is_taken_apart_with_one_input():
     ready = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), 2, 3, None)
     merged = refined(ready, truth[1:], np.ones((1, 2), dtype=complex), steps=150)
     assert merged.poles.size == 2
-    _, apart = improved(ready, merged, [(split, 6)], steps=150)
+    _, apart = improved(ready, merged, [(split_proposals, 6)], steps=150)
     assert apart.poles.size == 3
     assert np.abs(np.sort_complex(apart.poles.imag + 0j) / truth.imag - 1).max() < 1e-3
 

@@ -179,7 +179,7 @@ class SampledModes(NamedTuple):
         return f"mode {self.numbers[i]} ({self.freq[i]:.4g} Hz"
 
 
-def modes_of(plant: StandardPlant) -> SampledModes:
+def sampled_modes(plant: StandardPlant) -> SampledModes:
     """Return the elastic modes of a plant."""
     if plant.is_assembled:
         omega = np.sqrt(np.abs(np.linalg.det(plant.modal_blocks)))[plant.n_rigid :]
@@ -222,7 +222,7 @@ def peak_verdicts(
     highest peak any cause, of the others only whether a kept mode has changed.
     """
     plant, rate = observer.plant, 1.0 / observer.plant.dt
-    kept = modes_of(plant)
+    kept = sampled_modes(plant)
     seen = folded(kept.freq, rate)
     if not plant.is_assembled:  # its modes cannot be changed one by one
         highest = max(peaks, key=lambda one: one.height)
@@ -286,7 +286,7 @@ def _beyond(
     top = np.max(kept.freq[kept.freq < 0.5 * rate], initial=0.0)
     highest = max(peaks, key=lambda one: one.height)
     at = highest.freq * rate
-    found = None if whole is None else _named(observer, left_modes(*whole), at)
+    found = None if whole is None else _left_out_mode(observer, left_modes(*whole), at)
     if found is not None:
         return LikelyCause(found.cause, f"{_said(highest, rate)}: {found.text}")
     # modes left out above those of the plant make peaks among these too: their compliance lacks
@@ -317,12 +317,12 @@ def _said(peak: ExcessPeak, rate: float) -> str:
 
 def left_modes(whole: StandardPlant, numbers: IntArray) -> SampledModes:
     """Return the modes left out of a larger plant."""
-    every = modes_of(whole)
+    every = sampled_modes(whole)
     at = np.flatnonzero(np.isin(every.numbers, numbers))
     return SampledModes(every.numbers[at], every.freq[at])
 
 
-def _named(observer: KalmanEstimator, left: SampledModes, at: float) -> LikelyCause | None:
+def _left_out_mode(observer: KalmanEstimator, left: SampledModes, at: float) -> LikelyCause | None:
     """Return which mode left out appears at a frequency [Hz], or None."""
     rate = 1.0 / observer.plant.dt
     seen = folded(left.freq, rate)

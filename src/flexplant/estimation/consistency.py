@@ -22,11 +22,11 @@ from .causes import (
     folded,
     known_verdict,
     left_modes,
-    modes_of,
     offset,
     outlier_text,
     outliers,
     peak_verdicts,
+    sampled_modes,
     settling,
 )
 from .estimate import Estimate
@@ -272,7 +272,7 @@ def consistency(
     moved, changes = None, [one.change for one in verdicts if one.change is not None]
     if changes and known:
         before = examined([one.freq for one in rest.peaks], whole)
-        moved, left = _moved(observer, estimate, changes, single, alpha, before)
+        moved, left = _moved_modes(observer, estimate, changes, single, alpha, before)
         said += left
     gated = int(estimate.gated.sum())
     without = f" {counted(gated, 'sample')} beyond the gate left out." if gated else ""
@@ -296,7 +296,7 @@ def consistency(
     )
 
 
-def _moved(
+def _moved_modes(
     observer: KalmanEstimator,
     estimate: Estimate,
     changes: Sequence[ModeChange],
@@ -347,7 +347,7 @@ def _spectra(observer: KalmanEstimator, facts: _Facts) -> dict[int, tuple[float,
     plant, lines = observer.plant, facts.lines.freq
     if not plant.is_assembled:
         return {}
-    kept, found = modes_of(plant), {}
+    kept, found = sampled_modes(plant), {}
     rate, step = 1.0 / float(plant.dt), float(lines[0])
     blocks = plant.modal_blocks[plant.n_rigid :]
     decay = -0.5 * np.trace(blocks, axis1=1, axis2=2) / (2.0 * np.pi)
@@ -420,7 +420,7 @@ def _tested(
         if whole is None
         else expected(observer, whole, lines.samples)
     )
-    levels = _levels(parts.pooled, pooled.density)
+    levels = _fitted_levels(parts.pooled, pooled.density)
     found = peaks(pooled._replace(density=pooled.density / (levels @ parts.pooled)), alpha)
     ratios = np.sqrt(np.mean(normal[there] ** 2, axis=0))
     return _Facts(
@@ -488,7 +488,7 @@ def _level_text(facts: _Facts, names: Any) -> str:
     return f"{text}. Scale the densities by this, or estimate them from the record."
 
 
-def _levels(parts: FloatArray, density: FloatArray) -> FloatArray:
+def _fitted_levels(parts: FloatArray, density: FloatArray) -> FloatArray:
     """Return the levels (process, sensors) of the parts (2, m) that explain a density best.
 
     By Whittle's likelihood, ``sum log m + I / m`` with m the sum of both at their levels, by

@@ -165,7 +165,7 @@ def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | No
     drive[n:, : factor.shape[1]] += observer.B @ at_once
     if k:
         entering = np.vstack([g.A[np.ix_(rest, rigid)], observer.B @ C2[:, rigid]])
-        V = _followed(A, n, entering, g.A[np.ix_(rigid, rigid)])
+        V = _solve_sylvester(A, n, entering, g.A[np.ix_(rigid, rigid)])
         back = np.zeros((k, n + m))
         back[:, :n] = g.A[np.ix_(rigid, rest)]
         seen = C1[:, rigid] - observer.D @ C2[:, rigid] + E @ V
@@ -236,7 +236,7 @@ def moving_parts(plant: StandardPlant) -> tuple[IntArray, IntArray]:
     return kept, np.flatnonzero(reached)
 
 
-def _followed(A: FloatArray, n: int, entering: FloatArray, kept: FloatArray) -> FloatArray:
+def _solve_sylvester(A: FloatArray, n: int, entering: FloatArray, kept: FloatArray) -> FloatArray:
     """Return V of ``A V - V A_rr = -entering``; n states stand before the observer's."""
     V = np.zeros_like(entering)
     start = 0 if np.any(entering[:n]) else n
@@ -337,7 +337,7 @@ def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop
     own = [block for block in loop.blocks if set(hats) & set(block.outputs)]
     if not own:
         loop = close_loop(loop.plant, *loop.blocks, estimator)
-    elif not all(_same(block, estimator) for block in own):
+    elif not all(_equal_systems(block, estimator) for block in own):
         raise ModelError(
             f"the loop has {', '.join(hats)} from another estimator. Close it with this one: "
             "close_loop(machine, observer, servo)."
@@ -353,7 +353,7 @@ def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop
     return np.array([source_variances(error, row, noises)[0].sum() for row in range(len(hats))])
 
 
-def _same(one: StateSpace, other: StateSpace) -> bool:
+def _equal_systems(one: StateSpace, other: StateSpace) -> bool:
     pairs = ((one.A, other.A), (one.B, other.B), (one.C, other.C), (one.D, other.D))
     return all(np.array_equal(a, b) for a, b in pairs)
 

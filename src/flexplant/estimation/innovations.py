@@ -201,14 +201,14 @@ def whitening(observer: KalmanEstimator, freq: FloatArray) -> ComplexArray:
     """Return ``W (I - C (z I - A + K C)^-1 K)`` (m, p, p): from y to the whitened innovations."""
     m, K = observer.model, observer.predictor_gain
     back = np.eye(K.shape[1]) - seen_from_states(m.A - K @ m.C2, m.C2, freq) @ K
-    return np.asarray(np.linalg.solve(_unit(observer), back))
+    return np.asarray(np.linalg.solve(_cholesky(observer), back))
 
 
 def steady_gain(observer: KalmanEstimator) -> FloatArray:
     """Return the whitened innovations (p, p) that constant offsets of the sensors make."""
     m, K = observer.model, observer.predictor_gain
     moved = np.linalg.solve(np.eye(len(m.A)) - m.A + K @ m.C2, K)
-    return np.asarray(np.linalg.solve(_unit(observer), np.eye(K.shape[1]) - m.C2 @ moved))
+    return np.asarray(np.linalg.solve(_cholesky(observer), np.eye(K.shape[1]) - m.C2 @ moved))
 
 
 def impulse(observer: KalmanEstimator, count: int) -> FloatArray:
@@ -219,7 +219,7 @@ def impulse(observer: KalmanEstimator, count: int) -> FloatArray:
     found[0] = np.eye(K.shape[1])
     for k in range(1, count):
         found[k], x = -m.C2 @ x, closed @ x
-    return np.asarray(np.linalg.solve(_unit(observer), found))
+    return np.asarray(np.linalg.solve(_cholesky(observer), found))
 
 
 def parts_of(
@@ -277,7 +277,7 @@ def expected(observer: KalmanEstimator, plant: StandardPlant, samples: int) -> I
     return InnovationParts(seen(found.process), seen(found.sensors))
 
 
-def _unit(observer: KalmanEstimator) -> FloatArray:
+def _cholesky(observer: KalmanEstimator) -> FloatArray:
     S = observer.model.innovation(observer.predicted_covariance)
     return np.asarray(np.linalg.cholesky(0.5 * (S + S.T)))
 

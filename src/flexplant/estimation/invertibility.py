@@ -153,7 +153,7 @@ def invertibility(plant: StandardPlant | System, inputs: Sequence[str]) -> Inver
     """
     plant = checked_plant(plant)
     names = unknown_names(plant, inputs)
-    return judged(filter_model(plant), entry(plant, names), names)
+    return ranks_and_zeros(filter_model(plant), entry(plant, names), names)
 
 
 def unknown_names(plant: StandardPlant, inputs: Sequence[str]) -> tuple[str, ...]:
@@ -182,7 +182,7 @@ def entry(plant: StandardPlant, names: Sequence[str]) -> InputEntry:
     return InputEntry(g.B[:, columns], *(g.D[np.ix_(row, columns)] for row in rows))
 
 
-def judged(model: FilterModel, d: InputEntry, names: tuple[str, ...]) -> Invertibility:
+def ranks_and_zeros(model: FilterModel, d: InputEntry, names: tuple[str, ...]) -> Invertibility:
     """Return ranks and zeros; see `invertibility`."""
     out = 1.0 / np.sqrt(np.maximum(model.R.diagonal(), TINY))[:, None]
     C, H = out * model.C2, out * d.H

@@ -207,7 +207,7 @@ def design_multirate(
     gains, predictors, variances = [], [], []
     moved = np.eye(len(P))
     for read in measured:
-        gain, predictor, after, ahead = _step(model, P, read)
+        gain, predictor, after, ahead = _joseph_step(model, P, read)
         gains.append(gain)
         predictors.append(predictor)
         variances.append(np.sum((model.C1 @ after) * model.C1, axis=1))
@@ -283,7 +283,7 @@ def _lifted(
     return C, 0.5 * (Q + Q.T), 0.5 * (R + R.T), S, A
 
 
-def _step(
+def _joseph_step(
     m: FilterModel, P: FloatArray, read: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return L, K, P[k|k] and P[k+1|k] of one sample, in Joseph's form."""

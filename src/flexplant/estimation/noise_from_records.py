@@ -119,10 +119,10 @@ def estimate_noise(
     True
     """
     plant = checked_plant(plant)
-    channels, whole = _channels(plant), _whole(plant, larger)
+    channels, whole = _noise_channels(plant), _whole(plant, larger)
     ratios, first = np.ones(len(channels)), np.zeros(0)
     for _ in range(_PASSES):
-        now = _levels(whole, channels, ratios)
+        now = _scaled(whole, channels, ratios)
         observer = design_kalman(now, larger=now)
         estimate = observer.estimate(records, gate=gate)
         innovations = _steady(observer, estimate)
@@ -147,7 +147,7 @@ def estimate_noise(
             f"by {np.max(np.abs(np.sqrt(found.variances) - 1.0)):.2g}. "
             f"{_cure(observer, estimate, larger)}"
         )
-    now = _levels(whole, channels, ratios)
+    now = _scaled(whole, channels, ratios)
     final = design_kalman(now, larger=now)
     verdict = consistency(final, final.estimate(records, gate=gate), level=_LEVEL)
     if not verdict.holds:
@@ -180,7 +180,7 @@ def _cure(observer: KalmanEstimator, estimate: Estimate, larger: Any) -> str:
     return f"With the last ones {said.text}{_LARGER if larger is None else ''}"
 
 
-def _channels(plant: StandardPlant) -> tuple[str, ...]:
+def _noise_channels(plant: StandardPlant) -> tuple[str, ...]:
     noises = tuple(f"{name}:noise" for name in sensors(plant))
     silent = [name for name in noises if not plant.asd.get(name, 0.0) > 0]
     if silent:
@@ -194,7 +194,7 @@ def _channels(plant: StandardPlant) -> tuple[str, ...]:
     return *forces, *noises
 
 
-def _levels(plant: StandardPlant, channels: tuple[str, ...], ratios: FloatArray) -> StandardPlant:
+def _scaled(plant: StandardPlant, channels: tuple[str, ...], ratios: FloatArray) -> StandardPlant:
     none = np.zeros((len(channels), len(channels)))
     return NoiseLevels(plant, channels, ratios, none, ratios, 0.0, 1.0, 0).plant
 

@@ -294,9 +294,9 @@ class _Walk:
             x = self._steadily(at.start, at.stop, x)
             moved = faded(self.steady.F, Y, count)
             C = m.C2 @ moved[:-1]
-            found = shown(g.W @ C, self.whitened[at])
+            found = accumulate(g.W @ C, self.whitened[at])
             before, after = found.value[:-1], found.value[1:]
-            enter = seen(self.steady, self.sight.part(at), moved[:-1], predict=self.predict)
+            enter = eta_effect(self.steady, self.sight.part(at), moved[:-1], predict=self.predict)
             value, covariance = (before, found.covariance[:-1])
             if not self.predict:
                 value, covariance = after, found.covariance[1:]
@@ -412,7 +412,7 @@ def faded(F: FloatArray, Y: FloatArray, samples: int) -> FloatArray:
     return moved
 
 
-def shown(rows: FloatArray, white: FloatArray) -> ShownSoFar:
+def accumulate(rows: FloatArray, white: FloatArray) -> ShownSoFar:
     """Return what whitened innovations ``white = rows eta + noise`` (k, ny) show of eta."""
     count, _, r = rows.shape
     information, values = np.zeros((count + 1, r, r)), np.zeros((count + 1, r))
@@ -424,7 +424,7 @@ def shown(rows: FloatArray, white: FloatArray) -> ShownSoFar:
     return ShownSoFar(np.einsum("krs,ks->kr", covariance, np.cumsum(values, axis=0)), covariance)
 
 
-def seen(steady: Steady, here: Sight, moved: FloatArray, *, predict: bool) -> FloatArray:
+def eta_effect(steady: Steady, here: Sight, moved: FloatArray, *, predict: bool) -> FloatArray:
     """Return how eta enters the estimates (k, nz, r)."""
     n = moved.shape[1]
     enter = steady.entering(steady.gains, predict=predict)

@@ -69,7 +69,7 @@ def _back(
     steady, at = passage.steady, slice(*span)
     g, F, here = steady.gains, steady.F, sight.part(at)
     onward = steady.onward(steady.P, g)
-    added, r = _adjoint(steady, here, passage.white[at], [onward], r)
+    added, r = _adjoint_pass(steady, here, passage.white[at], [onward], r)
     hat[at] += added[0]
     C = g.W @ steady.model.C2
     information = C.T @ C
@@ -91,7 +91,7 @@ def _back(
     return r, M
 
 
-def _adjoint(
+def _adjoint_pass(
     steady: Steady, here: Sight, white: FloatArray, rows: list[FloatArray], r: FloatArray
 ) -> tuple[list[FloatArray], FloatArray]:
     """Return ``c rows r[k]`` (N, nz) of a stationary stretch, and r before it."""
@@ -125,12 +125,12 @@ def lagged(passage: Passage, sight: Sight, lag: int) -> tuple[FloatArray, FloatA
         later = onward @ np.linalg.matrix_power(steady.F.T, lag)
         zero = np.zeros(steady.F.shape[0])
         if here.c.shape[0] == 1:
-            (now, then), _ = _adjoint(
+            (now, then), _ = _adjoint_pass(
                 steady, here, passage.white[first:last], [onward, later], zero
             )
             hat[at] += now[:-lag] - then[lag:]
         else:
-            (r,), _ = _adjoint(
+            (r,), _ = _adjoint_pass(
                 steady, Sight(np.eye(zero.size)[None], here.D1, here.V),
                 passage.white[first:last], [np.eye(zero.size)], zero,
             )  # fmt: skip
@@ -141,7 +141,7 @@ def lagged(passage: Passage, sight: Sight, lag: int) -> tuple[FloatArray, FloatA
         variance[at] -= np.einsum("kzi,ij,kzj->kz", T, known, T)
     listed = np.flatnonzero(slow)
     for start in range(0, listed.size, _TOGETHER):
-        _followed(passage, sight, listed[start : start + _TOGETHER], lag, hat, variance)
+        _smooth_transient(passage, sight, listed[start : start + _TOGETHER], lag, hat, variance)
     hat[np.isinf(variance)] = np.nan
     return hat, variance
 
@@ -156,7 +156,7 @@ def _known(steady: Steady, lag: int) -> FloatArray:
     return total
 
 
-def _followed(
+def _smooth_transient(
     passage: Passage,
     sight: Sight,
     ks: IntArray,

@@ -228,7 +228,7 @@ def built_diagram(
         flag = np.zeros(result.poles.size, dtype=np.int64)
         track = np.full(result.poles.size, -1, dtype=np.int64)
         if before is not None and before.poles.size and result.poles.size:
-            old, flag = _followed(before, result, tolerances)
+            old, flag = _continued_poles(before, result, tolerances)
             track = np.where(old >= 0, tracks[-1][old], -1)
         fresh = track < 0
         track[fresh] = count + np.arange(fresh.sum())
@@ -246,7 +246,7 @@ def built_diagram(
     )
 
 
-def _followed(
+def _continued_poles(
     old: OrderPoles, new: OrderPoles, tolerances: tuple[float, float, float]
 ) -> tuple[IntArray, IntArray]:
     """Return which old pole each new one continues, -1 for none, and the flags of the new ones."""
@@ -365,7 +365,7 @@ class Moments:
         taken = self.taken[:, :n, : n * m]
         rows = taken.reshape(-1, n * m)
         big = self.big[: n * m, : n * m] - rows.conj().T @ rows
-        free: Any = -_solved(big[m:, m:], big[m:, :m])
+        free: Any = -_solve_hermitian(big[m:, m:], big[m:, :m])
         A = np.concatenate([np.eye(m, dtype=np.complex128), free])
         B = -self.inverse[:, :n, :n].conj().swapaxes(1, 2) @ (taken @ A)
         return A.reshape(n, m, m), B
@@ -384,7 +384,7 @@ def _null_vectors(z: ComplexArray, matrices: ComplexArray) -> tuple[ComplexArray
     return U[first, :, place].conj(), Vh[first, place].conj()
 
 
-def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray:
+def _solve_hermitian(matrix: ComplexArray, right: ComplexArray) -> ComplexArray:
     factor, info = la.lapack.zpotrf(matrix)
     if info == 0 and la.lapack.zpocon(factor, np.linalg.norm(matrix, 1))[0] > REGULAR:
         return np.asarray(la.lapack.zpotrs(factor, right)[0])

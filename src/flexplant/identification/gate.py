@@ -11,7 +11,7 @@ from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, attempted
 from ..tolerances import RANK, TINY
 from .line_weights import NARROW, Rejected, mains_multiple
-from .model_error import ALIKE, Disagreement, mac, strength, twin
+from .model_error import ALIKE, Disagreement, column_mac, strength, twin
 from .pole_test import pole_price, shared, unit
 from .refine import Fit, Lines, pivoted, refined
 
@@ -118,7 +118,7 @@ def _needless(
     found = twin(fit)
     if found is not None:
         other, place = found
-        alike = mac(fit.shapes, other, place) > ALIKE
+        alike = column_mac(fit.shapes, other, place) > ALIKE
         if not compare or alike or not _shared(lines, fit, fitted, place):
             return place, f"a twin of the pole at {size[other] / (2 * np.pi):.5g} Hz"
     for place in lesser(fit, fit.shapes) if compare else []:
@@ -153,7 +153,7 @@ def lesser(fit: Fit, vectors: ComplexArray, alike: float = 0.0) -> list[int]:
     for k in np.argsort(height):
         reach = BESIDE * (-fit.poles.real - fit.poles.real[k])
         near = (np.abs(fit.poles - fit.poles[k]) < reach) & (height > height[k])
-        if any(mac(vectors, int(j), int(k)) >= alike for j in np.flatnonzero(near)):
+        if any(column_mac(vectors, int(j), int(k)) >= alike for j in np.flatnonzero(near)):
             found.append(int(k))
     return found
 

@@ -55,7 +55,7 @@ from .pole_test import (
     more_terms,
     own_price,
     relocated,
-    split,
+    split_proposals,
     supported,
     unexplained,
     unwindowed,
@@ -377,7 +377,7 @@ def _identified(
         lines = lines_of(ready)
         judged = refine is not False and not at_peaks
         # one step is as near to a machine as noise is; what outputs disagree in needs more
-        fit, weaker = _first(lines, chosen, alone, QUICK if judged else int(alone))
+        fit, weaker = _first_fit(lines, chosen, alone, QUICK if judged else int(alone))
         reason = ""
         if judged and alone and lesser(fit, fit.participation, ALIKE):
             less = single(lines, fit, fit.participation, QUICK)
@@ -501,7 +501,7 @@ def _turns(fit: Fit) -> bool:
     )
 
 
-def _first(
+def _first_fit(
     lines: Lines, chosen: PoleSelection, alone: bool, steps: int
 ) -> tuple[Fit, tuple[Rejected, ...]]:
     """Return the fit near the poles chosen, with all residual terms and no search for others.
@@ -539,7 +539,7 @@ def _refined(
     reducing += [(merged, MOST * int(alone)), (fewer_terms, int(free))]
     growing = [
         *((missed, MOST), (merged, MOST), (more_terms, int(free))),
-        *((split, MOST), (relocated, MOST), (merged, MOST), (missed, MOST)),
+        *((split_proposals, MOST), (relocated, MOST), (merged, MOST), (missed, MOST)),
     ]
     for _ in range(1 if ready.known else 2):
         lines = lines_of(ready)

@@ -10,7 +10,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, positive, real_array, whole
 from ..errors import ModelError, SolverError
-from ..modes.matching import assigned, mac
+from ..modes.matching import assigned, mac_matrix
 from ..parallel import Progress, tick
 from .diagram import OrderPoles, built_diagram, checked_orders
 from .measured import MeasuredModes
@@ -133,7 +133,7 @@ def identify_output_only(
             "give fewer blocks= or lags=."
         )
     with Progress(2 * parts, PARTS, progress=progress):
-        each = np.array([_hankel(block, count) for block in _blocks(y, parts)])
+        each = np.array([_hankel(block, count) for block in _record_pieces(y, parts)])
         mean = each.mean(axis=0)
         U, sizes, _ = la.svd(mean)
         inside = (low, high)
@@ -168,7 +168,7 @@ def identify_output_only(
     return MeasuredModes(found.poles[kept], covariance=covariance, shapes=shapes, dofs=names)
 
 
-def _blocks(y: FloatArray, parts: int) -> list[FloatArray]:
+def _record_pieces(y: FloatArray, parts: int) -> list[FloatArray]:
     """Return about `parts` pieces (n_channel, n_time) of the records."""
     share = max(1, round(parts / y.shape[0]))
     pieces = [piece for record in y for piece in np.array_split(record, share, axis=1)]
@@ -246,7 +246,7 @@ def _like(found: OrderPoles, other: OrderPoles) -> ComplexArray:
     if not other.poles.size:
         return moved
     far = np.abs(other.poles - found.poles[:, None]) / np.abs(found.poles)[:, None]
-    like = assigned(far / NEAR - mac(found.shapes, other.shapes))
+    like = assigned(far / NEAR - mac_matrix(found.shapes, other.shapes))
     same = (like >= 0) & (far[np.arange(like.size), like] < NEAR)
     moved[same] = other.poles[like[same]]
     return moved

@@ -135,7 +135,7 @@ def frf_of_periods(
     G = G.transpose(0, 2, 1)
     variance: FloatArray | None = None
     correlation: ComplexArray | None = None
-    left, freedom = _noise(Y, U, G, periods)
+    left, freedom = _noise_spectrum(Y, U, G, periods)
     if freedom > 0:
         # the excitation's part of the inputs: U X^H (X X^H)^-1 X U^H
         inverse: Any = np.linalg.inv(back @ np.linalg.solve(x @ xh, back.conj().transpose(0, 2, 1)))
@@ -192,7 +192,7 @@ def _excited(spectra: ComplexArray) -> Any:
     return singular > EXCITED * singular.max(initial=0.0)
 
 
-def _noise(
+def _noise_spectrum(
     Y: ComplexArray, U: ComplexArray, G: ComplexArray, periods: int
 ) -> tuple[ComplexArray, int]:
     """Return the noise spectrum of a mean period (lines, n_out, n_out) and its freedom."""

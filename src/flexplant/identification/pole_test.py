@@ -314,7 +314,7 @@ def more_terms(lines: Lines, fit: Fit) -> Proposals:
     yield [trial for trial in trials if trial.gain > trial.least]
 
 
-def split(lines: Lines, fit: Fit) -> Proposals:
+def split_proposals(lines: Lines, fit: Fit) -> Proposals:
     r"""Propose to take those poles apart that are two.
 
     A pole of two modes, repeated or so close that one pole passes for both, requires residues
@@ -551,7 +551,7 @@ def warned(left: list[Peak], apart: tuple[float, str, str] | None) -> None:
         )
     elif stretches:
         warn(
-            f"more than noise is left near {_listed(stretches)}: a mode may be missed or merged "
+            f"more than noise is left near {_peak_list(stretches)}: a mode may be missed or merged "
             "there, and its neighbours be off by more than their stated deviation. Look at "
             "plot.identified and plot.stabilisation, choose poles by hand (start=), or narrow the "
             "band."
@@ -559,12 +559,12 @@ def warned(left: list[Peak], apart: tuple[float, str, str] | None) -> None:
     single = [peak for peak in left if peak.isolated]
     if single and apart is None:
         warn(
-            f"single lines hold more than noise, with noise alone around them: {_listed(single)}. "
-            "No pole was fitted to them: a disturbance of one frequency (mains, a pump) or a "
+            f"single lines hold more than noise, with noise alone around them: {_peak_list(single)}"
+            ". No pole was fitted to them: a disturbance of one frequency (mains, a pump) or a "
             "variance from few segments looks so, and so does a mode narrower than the lines are "
             "apart. Measure with longer segments to distinguish them, or average more."
         )
 
 
-def _listed(left: list[Peak]) -> str:
+def _peak_list(left: list[Peak]) -> str:
     return ", ".join(f"{peak.freq:.4g} Hz ({peak.height:.0f} sigma)" for peak in left[:4])

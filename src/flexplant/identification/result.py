@@ -46,7 +46,7 @@ def answer(
     inputs = tuple(labels.get(name, name) for name in frf.inputs)
     shared = [(outputs.index(dof), i) for i, dof in enumerate(inputs) if dof in outputs]
     raw, unscaled = shapes, part
-    shapes, part, normalised = _scaled(fit.poles, shapes, part, shared if labels else [])
+    shapes, part, normalised = _scaled_shapes(fit.poles, shapes, part, shared if labels else [])
     if ready.swapped:
         turned = np.roll(np.arange(spread.shape[1]), -len(fit.shapes))
         spread = spread[:, turned][:, :, turned]
@@ -178,7 +178,7 @@ def _inner(left: ComplexArray, right: ComplexArray | None) -> Any:
     return (left.reshape(-1, left.shape[2]).conj().T @ right.reshape(-1, right.shape[2])).real
 
 
-def _scaled(
+def _scaled_shapes(
     poles: ComplexArray, shapes: ComplexArray, part: ComplexArray, shared: list[tuple[int, int]]
 ) -> tuple[ComplexArray, ComplexArray, bool]:
     """Return shapes mass-normalised by shared DOFs, or with a largest entry of 1."""

@@ -32,7 +32,7 @@ from .links import (
     eliminated,
     links_of,
     machine_size,
-    rows_of,
+    stretch_rows,
     warn_of_missing_statics,
 )
 
@@ -150,7 +150,7 @@ def joined(
     warn_of_missing_statics(links, parts)
     rigid = [link for link in links if link.joint.is_rigid]
     soft = [link for link in links if not link.joint.is_rigid]
-    B, S = rows_of(rigid, parts), rows_of(soft, parts)
+    B, S = stretch_rows(rigid, parts), stretch_rows(soft, parts)
     _check_stiffness(soft, S, parts)
     owners = np.repeat(np.arange(len(parts)), [part.n for part in parts])
     done = eliminated(B, _coordinate_reach(parts), owners)

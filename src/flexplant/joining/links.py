@@ -122,7 +122,7 @@ def _check_balance(joint: Joint, axis: str, carried: FloatArray, size: float) ->
     warn(said)
 
 
-def rows_of(links: Sequence[Link], parts: Sequence[Component]) -> sp.csr_array:
+def stretch_rows(links: Sequence[Link], parts: Sequence[Component]) -> sp.csr_array:
     """Return the stretches of links (m, n) by the coordinates of all components."""
     starts = np.concatenate([[0], np.cumsum([part.n for part in parts])])
     data, rows, columns = [np.zeros(0)], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]

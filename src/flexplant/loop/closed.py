@@ -20,7 +20,7 @@ from ..lti.responses import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant, standard_plant
 from ..plant.uncertainty.uncertain_plant import UncertainPlant
-from .blocks import as_block, check_inputs, commands, drives, joined, tapped, with_known
+from .blocks import as_block, check_inputs, commands, drives, driving_blocks, tapped, with_known
 from .broken import BrokenLoop, Path, plant_path
 from .budget import (
     ErrorBudget,
@@ -554,7 +554,7 @@ def close_loop(
     plant = with_known(plant, systems)
     driven, watched = drives(plant, systems, resting)
     check_inputs(plant, systems)
-    controller = joined(plant, systems, driven, watched)
+    controller = driving_blocks(plant, systems, driven, watched)
     loop = ClosedLoop(
         plant, systems, controller, resting, None if larger is None else with_known(larger, systems)
     )

@@ -205,7 +205,7 @@ def mode_tolerances(
     margin = positive(margin, "margin")
     if margin >= 1.0:
         raise ModelError(f"margin must be below 1, the largest that a loop can keep, got {margin}.")
-    modes, freq, zeta = _elastic(plant)
+    modes, freq, zeta = _swinging_modes(plant)
     if broken.is_unstable:
         raise AssumptionError(
             "the loop is unstable as it is: no mode has a tolerance. Stabilise it first."
@@ -268,7 +268,7 @@ def reported_tolerances(loop: Any) -> ModeTolerances | None:
     """
     uncertain = loop.plant.uncertainty
     if uncertain is None:
-        sure = loop.plant.has_own_modes and loop.is_stable and _elastic(loop.plant)[0].size
+        sure = loop.plant.has_own_modes and loop.is_stable and _swinging_modes(loop.plant)[0].size
         return _within(loop, {}) if sure else None
     whole_loop = loop.completed or loop
     if not uncertain.frequencies or not whole_loop.is_stable:
@@ -290,7 +290,7 @@ def _within(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:
         return None
 
 
-def _elastic(plant: StandardPlant) -> tuple[IntArray, FloatArray, FloatArray]:
+def _swinging_modes(plant: StandardPlant) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return numbers, frequencies [Hz] and damping ratios of the modes that swing below Nyquist."""
     realisation = plant.assembled.realisation
     omega, zeta = natural(realisation.pairs)

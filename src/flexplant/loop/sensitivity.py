@@ -18,7 +18,7 @@ from ..lti.responses import remembered, responder
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
 from ..tolerances import SAME
-from .broken import BrokenLoop, inverted, largest, moved
+from .broken import BrokenLoop, inverted, largest, movable_outputs
 from .closed import ClosedLoop
 
 #: a closed loop; a plant (StandardPlant, StateSpace or measured Frf) and a controller; a loop gain
@@ -200,7 +200,7 @@ def taken_apart(loop: Loop) -> BrokenLoop:
         if unread:
             raise unknown_label("y for the controller", unread[0], plant.y, "the plant")
         driven = [name for name in controller.outputs if name in plant.u]
-        fed = moved(plant.system.select(plant.y, driven))
+        fed = movable_outputs(plant.system.select(plant.y, driven))
         read = [name for name in controller.inputs if name in fed]
         plant, controller = plant.system.select(read, driven), controller.select(driven, read)
     elif not isinstance(plant, StateSpace):
@@ -310,10 +310,10 @@ def _measured(plant: Frf, controller: StateSpace, quantities: dict[str, str]) ->
 
 def _prepared(loop: Loop, freq: npt.ArrayLike | None) -> tuple[BrokenLoop, FloatArray]:
     parts = taken_apart(loop)
-    return parts, parts.grid if freq is None else _checked(parts, freq)
+    return parts, parts.grid if freq is None else _checked_freq(parts, freq)
 
 
-def _checked(parts: BrokenLoop, freq: npt.ArrayLike) -> FloatArray:
+def _checked_freq(parts: BrokenLoop, freq: npt.ArrayLike) -> FloatArray:
     """Return frequencies that were given."""
     grid = sampled_freq(freq, parts.dt)
     if not grid.size:

@@ -113,7 +113,7 @@ class SpillOver(Value):
     @property
     def named_modes(self) -> str:
         """The modes that take part in what grows or peaks, in words."""
-        return named(self.modes, self.freq)
+        return modes_in_words(self.modes, self.freq)
 
     def __repr__(self) -> str:
         return f"<SpillOver: {self.summary}>"
@@ -137,7 +137,7 @@ def _db(margin: float) -> str:
     return f"{-20.0 * np.log10(margin):.3g} dB"
 
 
-def named(modes: Sequence[int], freq: Sequence[float]) -> str:
+def modes_in_words(modes: Sequence[int], freq: Sequence[float]) -> str:
     """Return modes in words, the first few of many."""
     listed = [f"mode {n} ({f:.4g} Hz)" for n, f in zip(modes, freq, strict=True)]
     more = len(listed) - _NAMED

@@ -125,12 +125,12 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     at = between(at, "at", 0.0, 0.5 * rate, "It is in Hz, below half the rate.", ends="[")
     if not g.n_states:
         return g.replace(dt=h)
-    wanted = _gain(g, 2j * np.pi * at, at)
+    wanted = _finite_gain(g, 2j * np.pi * at, at)
     zeros = np.exp(g.zeros() * h)
     poles = np.exp(g.poles() * h)
     zeros = np.concatenate([zeros, -np.ones(poles.size - zeros.size)])
     filtered = StateSpace(**zpk_fields(zeros, poles, 1.0, h), dt=h)
-    ratio = wanted / _gain(filtered, np.exp(2j * np.pi * at * h), at)
+    ratio = wanted / _finite_gain(filtered, np.exp(2j * np.pi * at * h), at)
     gain = abs(ratio) * (-1.0 if ratio.real < 0 else 1.0)
     return filtered.replace(
         C=gain * filtered.C,
@@ -142,7 +142,7 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     )
 
 
-def _gain(g: StateSpace, s: complex, at: float) -> complex:
+def _finite_gain(g: StateSpace, s: complex, at: float) -> complex:
     try:
         value = complex(g.evaluated(s)[0, 0])
     except ModelError:  # a pole

@@ -103,7 +103,7 @@ def _refined(
 ) -> FloatArray:
     """Halve intervals until the middle of each is as its ends say, those over gaps left alone."""
     find = responder(g)
-    values = _seen(find(grid))
+    values = _log_channels(find(grid))
     left = np.arange(grid.size - 1)  # intervals [left, right] that are not settled, by their ends
     right = left + 1
     whole = np.searchsorted(gaps, grid[left]) == np.searchsorted(gaps, grid[right])
@@ -114,7 +114,7 @@ def _refined(
         left, right, middle = left[open_], right[open_], middle[open_]
         if not middle.size:
             break
-        there = _seen(find(middle))
+        there = _log_channels(find(middle))
         wrong = _wrong(values[:, left], there, values[:, right])
         worst = np.argsort(wrong)[::-1][: points - grid.size]
         worst = worst[wrong[worst] > tolerance]
@@ -128,7 +128,7 @@ def _refined(
     return np.sort(grid)
 
 
-def _seen(data: ComplexArray) -> ComplexArray:
+def _log_channels(data: ComplexArray) -> ComplexArray:
     """Return log H (n_channel, n_freq), what is negligible beside its row and column flattened."""
     size = np.abs(data)
     scale = np.sqrt(size.max(axis=1, keepdims=True) * size.max(axis=0, keepdims=True))

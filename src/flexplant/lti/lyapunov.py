@@ -273,14 +273,14 @@ def _check(residual: float, equation: str) -> None:
 def controllability_factor(g: StateSpace) -> FloatArray:
     """Return L (n, n) with ``P = L L'``, the controllability Gramian of a stable system."""
     d = state_scale(g.A, g.B, g.C)
-    return d[:, None] * _factor(*_continuous(g.A * d / d[:, None], g.B / d[:, None], g.dt))
+    return d[:, None] * _hammarling(*_continuous(g.A * d / d[:, None], g.B / d[:, None], g.dt))
 
 
 def observability_factor(g: StateSpace) -> FloatArray:
     """Return L (n, n) with ``Q = L L'``, the observability Gramian of a stable system."""
     d = state_scale(g.A, g.B, g.C)
     scaled = (g.A * d / d[:, None]).T
-    return _factor(*_continuous(scaled, (g.C * d).T, g.dt)) / d[:, None]
+    return _hammarling(*_continuous(scaled, (g.C * d).T, g.dt)) / d[:, None]
 
 
 def compressed(L: FloatArray) -> FloatArray:
@@ -298,7 +298,7 @@ def _continuous(A: FloatArray, B: FloatArray, dt: float) -> tuple[FloatArray, Fl
     return inverse @ (A - np.eye(A.shape[0])), np.sqrt(2.0) * inverse @ B
 
 
-def _factor(A: FloatArray, B: FloatArray) -> FloatArray:
+def _hammarling(A: FloatArray, B: FloatArray) -> FloatArray:
     """Solve ``A L L' + L L' A' + B B' = 0`` for L column by column of the Schur form.
 
     Hammarling's method: P is never formed, so that its small eigenvalues keep their digits. With S

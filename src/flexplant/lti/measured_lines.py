@@ -261,10 +261,10 @@ def hidden_modes(freq: FloatArray, plant: ComplexArray, controller: ComplexArray
                 np.abs(p - q) * tail / (np.maximum(np.abs(p), 0.5 * wide) * np.abs(beside))
                 for q, _, tail in fits
             ]
-    return _judged(freq, F, np.array(poles), np.array(moves), np.max(others, axis=0))
+    return _hidden_modes(freq, F, np.array(poles), np.array(moves), np.max(others, axis=0))
 
 
-def _judged(
+def _hidden_modes(
     freq: FloatArray, F: ComplexArray, p: ComplexArray, d: ComplexArray, other: FloatArray
 ) -> HiddenModes:
     """Return what fits (k, n - 1) say: poles p from the middle of each interval, moved by d."""

@@ -85,7 +85,7 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     tol = between(tol, "tol", 0.0, 1.0, "Try 1e-9.")
     if not g.n_states:
         return g
-    groups = _groups(g)
+    groups = _pole_groups(g)
     kept = [_Group(_less(group.part, tol), group.omega) for group in _visible(groups, g.dt, tol)]
     kept = [group for group in kept if group.part.n_states]
     n = sum(group.part.n_states for group in kept)
@@ -110,7 +110,7 @@ class _Group:
     omega: FloatArray  # [rad/s], 0 for a rigid-body mode or an integrator
 
 
-def _groups(g: StateSpace) -> list[_Group]:
+def _pole_groups(g: StateSpace) -> list[_Group]:
     """Return the system, but for its feedthrough, as a sum of groups of modes of equal poles."""
     if not is_block_diagonal(g):
         return _dense_groups(g)

@@ -167,11 +167,11 @@ def _proved(g: StateSpace, model: Residues | None) -> tuple[float, float] | None
         return None
     omega = found[1]
     freq = float(np.arctan(omega) / (np.pi * g.dt) if g.dt else omega / (2.0 * np.pi))
-    gain = _gain(g, freq)
+    gain = _gain_at(g, freq)
     return (gain, freq) if abs(found[0] - gain) <= AGREEMENT * gain else None
 
 
-def _gain(g: StateSpace, freq: float) -> float:
+def _gain_at(g: StateSpace, freq: float) -> float:
     """Return the largest singular value at a frequency [Hz]."""
     if g.blocks is not None:
         return float(np.linalg.norm(responder(g)(np.array([freq]))[:, :, 0], 2))

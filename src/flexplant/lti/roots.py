@@ -149,7 +149,7 @@ def invariant_zeros(g: Any) -> ComplexArray:
     are the zeros; those at infinity have left with the compressed states.
     [EmamiNaeiniVanDooren1982]_.
     """
-    A, B, C, D = _even(*_scaled(g))
+    A, B, C, D = _even(*_scaled_matrices(g))
     A, B, C, D = _compressed(A, B, C, D)
     A, C, B, D = (part.T for part in _compressed(A.T, C.T, B.T, D.T))
     n, m = B.shape
@@ -209,7 +209,7 @@ def axis_zeros(g: Any) -> ComplexArray:
     their compression.
     """
     n, m = g.n_states, len(g.inputs)
-    A, B, C, D = _scaled(g)
+    A, B, C, D = _scaled_matrices(g)
     mixing = np.linalg.qr(np.random.default_rng(0).standard_normal((C.shape[0], m)))[0].T
     pencil = np.block([[A, B], [mixing @ C, mixing @ D]])
     E = np.zeros((n + m, n + m))
@@ -241,7 +241,7 @@ def _speed(g: Any) -> float:
     return 1.0 if g.dt else mean_speed(g.poles())
 
 
-def _scaled(g: Any) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _scaled_matrices(g: Any) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the matrices with time in units of the poles, inputs and outputs of unit size."""
     A, B = g.A / _speed(g), g.B / _speed(g)
     into = reciprocal(np.linalg.norm(B, axis=0) + 0.0)

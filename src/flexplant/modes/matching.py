@@ -28,7 +28,7 @@ _RANK = 1e-12
 _FREQUENCY = 0.1
 
 
-def mac(X: Any, Y: Any) -> FloatArray:
+def mac_matrix(X: Any, Y: Any) -> FloatArray:
     """Return the modal assurance criterion of each column of X with each of Y, from 0 to 1."""
     sizes = np.outer(np.sum(np.abs(X) ** 2, axis=0), np.sum(np.abs(Y) ** 2, axis=0))
     return np.asarray(np.abs(X.conj().T @ Y) ** 2 / sizes, dtype=np.float64)

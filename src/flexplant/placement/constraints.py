@@ -375,7 +375,7 @@ class MinimumDistance(Constraint):
         return LinearRows(pairs, np.zeros(first.size), np.ones(first.size))
 
 
-def rows_of(constraints: Any, places: Places, side: str) -> LinearRows:
+def constraint_rows(constraints: Any, places: Places, side: str) -> LinearRows:
     """Return the rows of all constraints, OffPoi() among them for sensors unless one is given."""
     return LinearRows.stacked([c.rows(places) for c in all_of(constraints, side)], places.total)
 

@@ -48,13 +48,13 @@ def checked_names(given: Any, name: str) -> tuple[str, ...] | Mapping[str, float
     return named if isinstance(given, Mapping) else tuple(named)
 
 
-def shown(poi: Named, axes: Named) -> list[str]:
+def poi_arguments(poi: Named, axes: Named) -> list[str]:
     """Return POIs and their axes as arguments, for a repr."""
-    parts = [] if poi is None else [repr(_plain(poi))]
-    return parts if axes is None else [*parts, f"axes={_plain(axes)!r}"]
+    parts = [] if poi is None else [repr(_unwrap(poi))]
+    return parts if axes is None else [*parts, f"axes={_unwrap(axes)!r}"]
 
 
-def _plain(named: Any) -> Any:
+def _unwrap(named: Any) -> Any:
     if isinstance(named, Mapping):
         return dict(named)
     return named[0] if isinstance(named, tuple) and len(named) == 1 else named
@@ -242,7 +242,7 @@ class PoiVariance(Criterion):
             )
 
     def __repr__(self) -> str:
-        given = shown(self.poi, self.axes)
+        given = poi_arguments(self.poi, self.axes)
         given += [f"measure={self.measure!r}"] if self.measure != "sum" else []
         given += [f"lag={self.lag!r}"] if self.lag is not None else []
         given += ["larger=..."] if self.larger is not None else []

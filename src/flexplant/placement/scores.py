@@ -18,7 +18,7 @@ from ..plant.ports import Quantity
 from ..structure import Disc, Rectangle
 from ..work import Work
 from .candidates import Port, Side, checked_plant, known_candidates, places_of, with_side
-from .constraints import Constraint, all_of, constraints_of, rows_of
+from .constraints import Constraint, all_of, constraint_rows, constraints_of
 from .criterion import Criterion, in_words
 from .layouts import layouts_of
 from .problem import Placement
@@ -496,7 +496,7 @@ def sensor_map(
         for i, place in enumerate(places, 1)
     ]
     where = places_of(plant, (*own, *tried))
-    free = rows_of(constraints, where, "y").added(range(len(own)))[len(own) :]
+    free = constraint_rows(constraints, where, "y").added(range(len(own)))[len(own) :]
     if not np.any(free):
         raise ModelError(
             "there is no point to try: give at least one"

@@ -18,7 +18,7 @@ from ..work import Work
 from .branch_and_bound import Exchange
 from .candidates import Port, checked_plant, known_candidates, places_of, side_of
 from .closed_loop_h2 import Separation
-from .constraints import Budget, Constraint, rows_of
+from .constraints import Budget, Constraint, constraint_rows
 from .criterion import Criterion, in_words
 from .layouts import layouts_of
 from .problem import Found, Placement, Problem, Search
@@ -342,7 +342,7 @@ def problem_of(
     side: Any = "".join(wanted)
     layouts = layouts_of(plant, side, ports, criterion)
     layouts.require_any()
-    rows = rows_of(constraints, places_of(plant, ports), side)
+    rows = constraint_rows(constraints, places_of(plant, ports), side)
     if len(wanted) > 1:
         rows = rows.and_(_shares(ports, counts))
         if isinstance(layouts.scorer, Separation):

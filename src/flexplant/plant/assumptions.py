@@ -73,7 +73,7 @@ class AssumptionReport(Value):
 
     def __repr__(self) -> str:
         lines = [f"<AssumptionReport: {'all hold' if self.ok else 'NOT all hold'}>"]
-        lines += _lines(self.assumptions)
+        lines += _assumption_lines(self.assumptions)
         if self.plant.form.startswith("dense"):
             lines.append(f"  note the plant is {self.plant.form}")
         if self.plant.unstable_modes:
@@ -114,11 +114,11 @@ class AssumptionReport(Value):
             # what was said is not said again
             short = [item.replace(finding="as said.", remedy="") for item in failed]
             listed = tuple(short[failed.index(i)] if i in failed else i for i in known)
-            table = "\n".join(["The plant's assumptions:", *_lines(listed)])
+            table = "\n".join(["The plant's assumptions:", *_assumption_lines(listed)])
             raise AssumptionError(f"{purpose} is not possible: {said}\n{table}")
 
 
-def _lines(items: tuple[Assumption, ...]) -> list[str]:
+def _assumption_lines(items: tuple[Assumption, ...]) -> list[str]:
     return [
         f"  {'yes' if item.holds else 'NO '} {item.key}: {item.finding}"
         + (f" {item.remedy}" if item.remedy else "")

@@ -45,7 +45,7 @@ class Seen(NamedTuple):
     carried: FloatArray = np.zeros(6)
 
 
-def seen(
+def observed(
     realisation: ModalRealisation,
     row: FloatArray,
     order: int = 0,
@@ -194,7 +194,7 @@ class SensorPort(Value):
     def see(self, realisation: ModalRealisation) -> Seen:
         """Return what it measures of the states, and of forces at once."""
         along = self.carried(realisation) if self.inertial else None
-        return seen(realisation, self.row(realisation), self.order, along)
+        return observed(realisation, self.row(realisation), self.order, along)
 
 
 def static_gain(part: StateSpace | None) -> float:

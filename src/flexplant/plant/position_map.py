@@ -17,7 +17,7 @@ from .assumptions import WEAK, mode_visibility
 from .partition import Partition
 from .rigid.decoupling import Decoupling, decouple
 from .rigid.rigid_body import rigid_body_of
-from .rigid.rigid_motion import projected
+from .rigid.rigid_motion import rigid_parts
 from .scheduling import values_over
 
 logger = logging.getLogger(__name__)
@@ -144,7 +144,7 @@ def position_map(plant: Any, judge: Any, points: Any) -> PositionMap:
         shares = [one for one in mode_visibility(there) if one.freq < most]
         modes = tuple(f"mode {one.mode} ({one.freq:.4g} Hz)" for one in shares)
         sees, pushes = ([one.shares.get(side, 0.0) for one in shares] for side in "yu")
-        rows.append((_errors(own, there), sees, pushes, list(_judged(judges, there, values))))
+        rows.append((_errors(own, there), sees, pushes, list(_figures_at(judges, there, values))))
     shape = tuple(values.size for values in grid.values())
     decoupling, seen, reached, judged = (
         np.array(part, dtype=float) for part in zip(*rows, strict=True)
@@ -172,7 +172,7 @@ def _judges(judge: Any) -> dict[str, Callable[[Any], float]]:
     }
 
 
-def _judged(
+def _figures_at(
     judges: Mapping[str, Callable[[Any], float]], plant: Partition, values: tuple[float, ...]
 ) -> Iterator[float]:
     """Return figures of a plant; each is one number."""
@@ -202,8 +202,8 @@ def _errors(own: Decoupling | None, plant: Any) -> tuple[float, float]:
     rows = [body.axes.index(axis) for axis in own.axes]
     scale = inertia[rows][:, None] / inertia
     sensors = [sensor for sensor in ports.y if sensor.order == 0]
-    see = projected([sensor.static_row(realisation) for sensor in sensors], body.motions)
-    push = projected([port.static_push(realisation) for port in ports.u], body.motions).T
+    see = rigid_parts([sensor.static_row(realisation) for sensor in sensors], body.motions)
+    push = rigid_parts([port.static_push(realisation) for port in ports.u], body.motions).T
     one = np.eye(len(body.axes))[rows]
     seen, pushed = scale * (own.T_y @ see - one), scale * (own.T_u.T @ push.T - one)
     return float(np.linalg.norm(seen, 2)), float(np.linalg.norm(pushed, 2))

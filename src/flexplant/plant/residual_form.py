@@ -111,7 +111,7 @@ class Feedthrough(ResidualForm):
         )
 
 
-def modes_of(
+def plant_modes(
     model: Structure | ModalRealisation, residual: ResidualForm | None = None
 ) -> ModalRealisation:
     """Return the modes of a structure as a plant takes them; FastStates where nothing is given."""

@@ -73,7 +73,7 @@ def sampled_physical(
     A = np.zeros((layout.size, layout.size))
     B = np.zeros((layout.size, len(g.inputs)))
     C = np.zeros((len(g.outputs), layout.size))
-    E, new, old = _moved(held, inputs, h)
+    E, new, old = _flow_at(held, inputs, h)
     A[states, states] = E
     layout.enter(A, B, states, new, old)
     layout.shift_inputs(A, B)
@@ -94,7 +94,7 @@ def sampled_physical(
             A[row], B[row] = now[0][j], now[1][j]
             continue
         t = h - float(outputs.fraction[j])
-        E, new, old = _moved(held, inputs, t)
+        E, new, old = _flow_at(held, inputs, t)
         direct_new, direct_old = _direct(g.D[j : j + 1], inputs, t)
         A[row, states] = g.C[j] @ E
         layout.enter(A, B, row, g.C[j] @ new + direct_new, g.C[j] @ old + direct_old)
@@ -102,7 +102,7 @@ def sampled_physical(
     if g.blocks is not None:
         blocks = [*[1] * first, *g.blocks, *[1] * (layout.size - first - n)]
     system = g.replace(A=A, B=B, C=C, D=D, dt=h, states=layout.names, blocks=blocks)
-    return Sampled(system, _noise(g, Flow(g.A, head, pairs), asd, h, layout, outputs))
+    return Sampled(system, _sampled_noise(g, Flow(g.A, head, pairs), asd, h, layout, outputs))
 
 
 class _Layout:
@@ -153,7 +153,7 @@ class _Layout:
                 A[state, self.pushed[age - 1, i]] = 1.0
 
 
-def _moved(held: HeldFlow, inputs: Late, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _flow_at(held: HeldFlow, inputs: Late, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return E(t), and the effects of the new and the old sample of each input."""
     E, whole = held.at(t)
     new, old = whole.copy(), np.zeros_like(whole)
@@ -187,7 +187,7 @@ def _check_noise(g: StateSpace, asd: FloatArray, outputs: Late) -> None:
         )
 
 
-def _noise(
+def _sampled_noise(
     g: StateSpace, flow: Flow, asd: FloatArray, h: float, layout: _Layout, outputs: Late
 ) -> FloatArray:
     """Return G (N, r), ``G G'`` the covariance that white inputs add in one sample."""

@@ -297,7 +297,7 @@ def frf(
     below = [part for part in _ALSO if part in more and part != "deviation"]
     if ax is not None and below:
         raise ModelError(f"{' and '.join(below)} take panels of their own: leave ax out.")
-    given, panels = ax is not None, _stacked(ax, len(below))
+    given, panels = ax is not None, _magnitude_axes(ax, len(below))
     ax = panels[0]
     plain = role_of(drawn[0].label) is None and "marker" not in drawn[0].line
     wide = {"linewidth": 3.2, "alpha": 0.5} if len(drawn) > 1 and plain else {}
@@ -344,7 +344,7 @@ def frf(
 _ALSO = ("phase", "coherence", "deviation")
 
 
-def _stacked(ax: Axes | None, count: int) -> list[Axes]:
+def _magnitude_axes(ax: Axes | None, count: int) -> list[Axes]:
     """Return axes for a magnitude and so many lower panels below it."""
     if ax is not None or not count:
         return [axes(ax, figsize=(9.0, 4.5))]

@@ -217,13 +217,13 @@ def _ports_table(plant: StandardPlant) -> str:
             at = getattr(port, "at", "")
             where = ", ".join(f"{x:g}" for x in at) if _point(at) else str(at)
             asd = getattr(port, "asd", 0.0)
-            density = with_unit(asd, _density(plant, port.name, units.get(side, ""))) if asd else ""
+            density = with_unit(asd, _unit(plant, port.name, units.get(side, ""))) if asd else ""
             along = getattr(port, "direction", None) or " ".join(getattr(port, "axes", ()))
             rows.append([port.name, kind, where, str(along), density])
     return table(["channel", "kind", "place [m]", "along", "noise density"], rows)
 
 
-def _density(plant: StandardPlant, name: str, otherwise: str) -> str:
+def _unit(plant: StandardPlant, name: str, otherwise: str) -> str:
     own = plant.units.get(name)
     return f"{own}/√Hz" if own else otherwise
 

@@ -88,7 +88,7 @@ def quality_of(
     ):
         bound = None
     return ReductionQuality(
-        **_compared(full, modes, own, count, high),
+        **_mode_comparison(full, modes, own, count, high),
         check_freq=grid,
         frf_error=frf,
         resonance_error=_largest_error(at_peaks, np.isin(grid, peaks)),
@@ -158,7 +158,7 @@ def _full_modes(full: FEModel | Modes, count: int | None, high: float) -> Modes:
     return modes_reaching(full, high, least=number)
 
 
-def _compared(
+def _mode_comparison(
     full: FEModel | Modes, modes: Modes, found: Modes, count: int | None, high: float
 ) -> dict[str, Any]:
     """Return the pairs of full and reduced modes, and how alike they are."""

@@ -19,7 +19,7 @@ from ..structure import FEModel, ModalDamping
 from ..tolerances import SAME
 from .condensation import kept_columns, mode_numbers
 from .methods import ReductionMethod, inner
-from .ranking import ErrorBound, channels, peak_gains, rank_modes
+from .ranking import ErrorBound, modal_channels, peak_gains, rank_modes
 from .reduced import STATIC, ReducedModel
 
 _SUM = "sum of the peaks of the neglected modes"
@@ -132,7 +132,7 @@ class ModalTruncation(ReductionMethod):
 
     def _bound(self, model: FEModel, kept: Modes) -> ErrorBound | None:
         law = self.damping
-        into, out, force, seen = channels(kept, self.inputs, self.outputs)
+        into, out, force, seen = modal_channels(kept, self.inputs, self.outputs)
         if not isinstance(law, ModalDamping) or not isinstance(law.ratio, float) or not law.ratio:
             return None
         pushed = places(self.inputs)
@@ -256,7 +256,7 @@ def truncated(
     bound = None
     if bound_of is not None:
         gone = Modes(omega[others], zeta[others], basis[:, others], modes.dofs)
-        into, out, _, _ = channels(gone, *bound_of)
+        into, out, _, _ = modal_channels(gone, *bound_of)
         terms, missed = _channel_terms(gone, bound_of)
         vectors, given = _channel_terms(_vectors(kept), bound_of)
         at_rest = float(np.linalg.norm(missed - given, 2)) if others.size else 0.0
@@ -312,7 +312,7 @@ def _vectors(kept: Modes) -> Modes:
 
 def _channel_terms(modes: Modes, bound_of: tuple[Any, Any]) -> tuple[FloatArray, FloatArray]:
     """Return gain, frequency and damping (k, 3) of modes between channels, and their static sum."""
-    _, _, force, seen = channels(modes, *bound_of)
+    _, _, force, seen = modal_channels(modes, *bound_of)
     gain = np.linalg.norm(force, axis=1) * np.linalg.norm(seen, axis=0)
     return np.column_stack([gain, modes.omega, modes.zeta]), (seen / modes.omega**2) @ force
 

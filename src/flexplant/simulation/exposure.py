@@ -387,7 +387,7 @@ def error_map(
     names = [f"map|{i}" for i in range(1, len(places) + 1)]
     pois = [Poi(name, at=tuple(p), axes=(axis,)) for name, p in zip(names, places, strict=True)]
     wide = loop.plant.with_ports(ports.replace(z=[*ports.z, *pois]))
-    followed = "" if reference is None else _followed(ports, axis)
+    followed = "" if reference is None else _map_reference(ports, axis)
     run = simulate(
         close_loop(wide, *loop.blocks, idle=loop.idle),
         duration=duration,
@@ -404,7 +404,7 @@ def error_map(
     return ErrorMap(axis, unit, places, found.values[:, 0], found.values[:, 2], found.window)
 
 
-def _followed(ports: Ports, axis: str) -> str:
+def _map_reference(ports: Ports, axis: str) -> str:
     """Return the reference that a map along an axis follows: the only one, or that of the axis."""
     found = ports.followed
     if len(found) > 1:

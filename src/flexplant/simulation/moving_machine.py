@@ -119,11 +119,11 @@ class MovingPlant:
         _require_plain(plant, moves)
         moving = {id(port) for port in moves}
         h = float(plant.dt)
-        self.forces = [_late(plant, port, noise) for port in ports.forces if id(port) in moving]
+        self.forces = [_force_at(plant, port, noise) for port in ports.forces if id(port) in moving]
         sensors: tuple[Any, ...] = tuple(ports.y)
         self.seen = [(s, s.direction, [plant.y.index(s.name)]) for s in sensors if id(s) in moving]
         self.shown = [
-            (poi, axis, _rows(plant, poi, axis)) for poi in ports.z if id(poi) in moving
+            (poi, axis, _axis_channels(plant, poi, axis)) for poi in ports.z if id(poi) in moving
             for axis in poi.axes
         ]  # fmt: skip
         self.rule = _Rule(own.pairs, h)
@@ -381,14 +381,14 @@ def _motions(
     return np.asarray(sum(weight * realisation.model.rows(at, axis) for weight, at in terms))
 
 
-def _rows(plant: StandardPlant, poi: Poi, axis: str) -> list[tuple[int, float]]:
+def _axis_channels(plant: StandardPlant, poi: Poi, axis: str) -> list[tuple[int, float]]:
     """Return the channels of z that show an axis of a POI, with their sign."""
     found = [(plant.z.index(poi.channel(axis)), 1.0)]
     error = poi.derived(axis, "error")
     return [*found, (plant.z.index(error), -1.0)] if error in plant.z else found
 
 
-def _late(plant: StandardPlant, port: Any, noise: bool) -> _Force:
+def _force_at(plant: StandardPlant, port: Any, noise: bool) -> _Force:
     """Return a force that moves, with its delay."""
     is_actuator = isinstance(port, Actuator)
     samples = plant.delay + port.latency / plant.dt if is_actuator else 0.0

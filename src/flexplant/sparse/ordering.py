@@ -86,7 +86,7 @@ def dissect(
     graph itself (`_graph_cut`), which costs eight times the time.
     """
     if nodes is None:
-        nodes = _alike(matrix)
+        nodes = _supervariables(matrix)
     _, first, member = np.unique(nodes, return_index=True, return_inverse=True)
     width = np.bincount(member)
     graph = _node_graph(matrix, member, width.size)
@@ -105,7 +105,7 @@ def dissect(
     return _fronts(graph, _bisect(graph, width, hubs, leaf, cut), place, member, width)
 
 
-def _alike(matrix: sp.csc_array) -> IntArray:
+def _supervariables(matrix: sp.csc_array) -> IntArray:
     """Return a number for each DOF, the same where DOFs touch each other and the same others.
 
     So are the DOFs of a node; sums of a random integer for each DOF touched tell them apart.

@@ -205,14 +205,14 @@ def _digits(found: Facts) -> list[Line]:
             )
         ]
     notes: list[Line] = []
-    for one in (said, _held(found, digits)):
+    for one in (said, _rounding_warning(found, digits)):
         if one:
             text, _, following = one.partition(" Export")
             notes.append(("note", "digits", text, f"export{following}"))
     return notes or [("ok", "digits", f"{digits} digits are enough", "")]
 
 
-def _held(found: Facts, digits: int) -> str | None:
+def _rounding_warning(found: Facts, digits: int) -> str | None:
     """Return what `FEMatrices.model` warns of, where rounding alone holds rigid-body motions."""
     given = found.given
     if given.dofs is None or not given.located or found.motions is None:

@@ -15,7 +15,7 @@ from ..checks import FloatArray, Matrix, Value, frozen, instance, real_array
 from ..errors import ModelError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite, with_pattern_of
-from .attachments import HeldShape, Part, added_matrices, summed
+from .attachments import HeldShape, Part, added_matrices, matrix_sum
 from .damping import Damping, Rayleigh, damping_matrix
 from .definite import (
     MatrixLike,
@@ -299,7 +299,7 @@ class FEModel(Placed, Value):
         added = added_matrices(self.dofs, parts)
         # sums of definite matrices are definite: nothing to check again
         return self._with(
-            **{name: frozen(summed(getattr(self, name), more)) for name, more in added.items()}
+            **{name: frozen(matrix_sum(getattr(self, name), more)) for name, more in added.items()}
         )
 
     def fixed(self, labels: Iterable[str]) -> FEModel:

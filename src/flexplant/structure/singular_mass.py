@@ -67,7 +67,7 @@ def left_out(motions: FloatArray, M: Any) -> IntArray:
     return np.sort(np.asarray(pivots[: motions.shape[1]], dtype=np.int64))
 
 
-def projected(
+def condense_massless(
     K: Any, M: Any, D: Any, motions: FloatArray, names: Callable[[IntArray], tuple[str, ...]]
 ) -> tuple[FloatArray, FloatArray, FloatArray | None, IntArray]:
     """Return K, M, D on the motions that M can accelerate, in n - q of the DOFs, and which.
@@ -155,7 +155,7 @@ def inertial(
                 "which is exact: model(massless='condense'); or give them their inertia."
             )
         left = rows
-        K, M, D, kept = projected(K, M, D, motions, lambda some: names(left[some]))
+        K, M, D, kept = condense_massless(K, M, D, motions, lambda some: names(left[some]))
         rows = rows[kept]
         notes = (*notes, f"{counted(count, 'motion')} without inertia condensed")
     return Inertial(K, M, D, rows, notes)

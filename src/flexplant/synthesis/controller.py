@@ -164,7 +164,7 @@ def reached_norms(P: StandardPlant, loop: StateSpace, respond: Responder) -> dic
     # groups by the names that `assemble_plant` gives; empty for other plants
     if not P.is_assembled:
         return {}
-    gain = respond(_grid(loop))
+    gain = respond(_loop_grid(loop))
     w = {"references": ":ref", "noises": ":noise"}
     sides = [_grouped(P.z, {"efforts": ":effort"}, "motions"), _grouped(P.w, w, "disturbances")]
     return {
@@ -190,11 +190,11 @@ def swept_norm(loop: StateSpace, respond: Responder | None = None) -> float:
     if not loop.n_states:
         return float(np.linalg.norm(loop.D, 2))
     respond = respond or responder(loop)
-    swept, _ = highest(lambda freq: gains(respond(freq)), _grid(loop), 3)
+    swept, _ = highest(lambda freq: gains(respond(freq)), _loop_grid(loop), 3)
     return swept if loop.dt else max(swept, float(np.linalg.norm(loop.D, 2)))
 
 
-def _grid(loop: StateSpace) -> FloatArray:
+def _loop_grid(loop: StateSpace) -> FloatArray:
     """Return frequencies [Hz] from 0 up, dense around the resonances of a loop with states."""
     return np.append(0.0, resonance_grid(loop.poles(), loop.dt, around=_AROUND))
 

@@ -115,7 +115,7 @@ def wafer_stage(
     """
     mass = positive(added_mass, "added_mass", zero=True)
     fast = positive(rate, "rate")
-    drawing = _drawn(size, thickness)
+    drawing = _plate_drawing(size, thickness)
     mass_at: dict[tuple[float, ...], float] = {_spot(drawing): mass}
     if elements is None:
         late = positive(LATENCY if delay is None else delay, "delay", zero=True)
@@ -133,7 +133,7 @@ def wafer_stage(
     return WaferStage(truth, fast, late, drawing=drawing)
 
 
-def _drawn(size: Any, thickness: Any) -> Mapping[str, Any]:
+def _plate_drawing(size: Any, thickness: Any) -> Mapping[str, Any]:
     """Return the drawing of a plate of this size."""
     sides = tuple(size) if isinstance(size, Sequence) and not isinstance(size, str) else ()
     if len(sides) != 2:

@@ -166,7 +166,7 @@ class _Tried:
             if not self.found:
                 size = self.objective.size(self.objective.at(end.p))
                 self.rounding = (EXACT * float(np.linalg.norm(size))) ** 2
-            self.found.append(_judged(self.objective, end, named=named))
+            self.found.append(_graded_end(self.objective, end, named=named))
 
     @property
     def best(self) -> _GradedEnd | None:
@@ -274,7 +274,7 @@ def _head(end: Reached) -> str:
     return str(end).split(": ")[0]
 
 
-def _judged(objective: Objective, end: SearchEnd, *, named: bool) -> _GradedEnd:
+def _graded_end(objective: Objective, end: SearchEnd, *, named: bool) -> _GradedEnd:
     """Return an end, where the objective is, with how good it is."""
     point = objective.at(end.p)
     chi2, dof = chi_square(objective, point, np.ones(end.p.size, dtype=bool))
@@ -387,7 +387,7 @@ def all_starts(objective: Objective, start: Any, starts: Any, rng: Rng) -> list[
         return [first]
     if np.ndim(starts) == 0:
         others = whole(starts, "starts") - 1
-        return [first, *_drawn(objective, others, rng)] if others else [first]
+        return [first, *_random_starts(objective, others, rng)] if others else [first]
     values = real_array(starts, "starts")
     if values.ndim != 2 or values.shape[1] != first.size or not values.shape[0]:
         raise ShapeError(f"starts must have shape (any, {first.size}), got {values.shape}.")
@@ -478,7 +478,7 @@ def scattered(objective: Objective, middle: FloatArray, count: int, rng: Rng) ->
     return found
 
 
-def _drawn(objective: Objective, count: int, rng: Rng) -> FloatArray:
+def _random_starts(objective: Objective, count: int, rng: Rng) -> FloatArray:
     from scipy.stats import qmc
 
     low = np.where(objective.has_prior, objective.prior_mean - 2 * objective.prior_std, -np.inf)

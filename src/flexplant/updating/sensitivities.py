@@ -35,7 +35,7 @@ def group_derivatives(family: Family, eigen: Eigen) -> GroupDerivatives:
     ]
 
 
-def split(groups: GroupDerivatives, eigen: Eigen, direction: FloatArray) -> Rotation:
+def split_rotation(groups: GroupDerivatives, eigen: Eigen, direction: FloatArray) -> Rotation:
     """Return exactly repeated modes turned to the eigenvectors of their derivative.
 
     Along `direction`; the modes of a group come in the order of the frequencies they move to.
@@ -133,7 +133,7 @@ def eigenvalue_sensitivities(
     numbers = range(eigen.n_rigid + 1, eigen.n_rigid + eigen.poles.size + 1)
     columns = mode_columns(numbers if modes is None else modes, eigen)
     growing = 1 / _nonzero(family.strength(float(np.abs(eigen.poles[0]))))
-    rotation = split(group_derivatives(family, eigen), eigen, growing)
+    rotation = split_rotation(group_derivatives(family, eigen), eigen, growing)
     S = family.sensitivity(rotation.eigen, columns)
     for group in repeated_groups(eigen.poles):
         if set(group) & set(columns):

@@ -197,11 +197,11 @@ def update(
             best, estimates = corrected(
                 objective, basis, method, best, rounds=rounds, most=max_iterations, tolerance=enough
             )
-    if basis is not None and moved(objective, best.p, estimates[-2]) > UNSETTLED:
+    if basis is not None and normalised_step(objective, best.p, estimates[-2]) > UNSETTLED:
         warn(
             f"defect correction has not settled: round {len(estimates) - 1} still moved the "
-            f"estimate by {moved(objective, best.p, estimates[-2]):.2g} standard deviations. "
-            "Give more rounds=, or a reduced model with more modes."
+            f"estimate by {normalised_step(objective, best.p, estimates[-2]):.2g} standard "
+            "deviations. Give more rounds=, or a reduced model with more modes."
         )
     if start is not None and starts is None and isinstance(ends[0], FlexplantError):
         warn(
@@ -339,12 +339,12 @@ def corrected(
         end = method.search(objective, begin, most=most, tolerance=tolerance)
         end.trail = end.trail if method.penalised else before.joined(end.trail)
         estimates.append(end.p)
-        if moved(objective, end.p, estimates[-2]) < STILL:
+        if normalised_step(objective, end.p, estimates[-2]) < STILL:
             break
     return end, estimates
 
 
-def moved(objective: Objective, p: FloatArray, before: FloatArray) -> float:
+def normalised_step(objective: Objective, p: FloatArray, before: FloatArray) -> float:
     """Return how far an estimate moved, in standard deviations: ``|J dp| / sqrt(q)``.
 
     Of residuals of unit variance where the noise is known; else relative to what is left of them.

@@ -170,14 +170,14 @@ class Evaluator:
         others = tuple(axis for n, axis in design.axes.items() if n != name)
         key = id(machine), name
         known = self._kept.get(key)
-        if known and known[0] is machine and all(map(_same, known[1], others)):
+        if known and known[0] is machine and all(map(_same_axis, known[1], others)):
             return known[2]
         found = _closed_around(machine, design, name)
         self._kept[key] = machine, others, found
         return found
 
 
-def _same(one: ShapedAxis, other: ShapedAxis) -> bool:
+def _same_axis(one: ShapedAxis, other: ShapedAxis) -> bool:
     return one is other or (not one.closed and not other.closed)
 
 

@@ -408,7 +408,7 @@ class Page:
         answer = self.answer
         fresh = self._answered == self._serial
         rms = answer.rms if answer is not None and fresh else None
-        self.judged.object = style.judged(list(self.limits.judged(self.loop, rms)))
+        self.judged.object = style.limit_verdicts(list(self.limits.judged(self.loop, rms)))
         rows: list[tuple[str, str, bool | None]] = []
         if len(self.fleet) > 1:
             least = 1.0 / self.limits.peak

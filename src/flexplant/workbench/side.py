@@ -13,7 +13,7 @@ from ..errors import FlexplantError
 from ..synthesis import ShapedAxis
 from ..synthesis.laws.hand_design import TERMS
 from . import exports, style
-from .fields import parsed, shown
+from .fields import digits, parsed
 
 #: limits of the page: field of LoopLimits, label, unit; those in dB are typed so
 _LIMITS = (
@@ -98,7 +98,7 @@ class SideCards:
         value = getattr(self.page.limits, name)
         if value is None:
             return ""
-        return f"{20.0 * np.log10(value):.3g} dB" if unit == "dB" else shown(value, unit)
+        return f"{20.0 * np.log10(value):.3g} dB" if unit == "dB" else digits(value, unit)
 
     def _put_limit(self, name: str, text: str) -> None:
         value = parsed(text) if text.strip() else None

@@ -73,7 +73,7 @@ def headline(loop: AxisLoop) -> str:
     )
 
 
-def judged(limits: Sequence[Judged]) -> str:
+def limit_verdicts(limits: Sequence[Judged]) -> str:
     """Return each limit with whether it is met."""
     parts = []
     for one in limits:

@@ -45,7 +45,7 @@ def thinned(freq: FloatArray, values: FloatArray, points: int = _PALE) -> tuple[
     return freq[keep], values[keep]
 
 
-def joined(curves: Sequence[tuple[Any, Any]]) -> dict[str, Any]:
+def gapped_line(curves: Sequence[tuple[Any, Any]]) -> dict[str, Any]:
     """Return curves as one line with gaps: one array to send for all machines."""
     gap = np.array([np.nan])
     x = [part for f, _ in curves for part in (f, gap)]
@@ -307,7 +307,7 @@ class Views:
         self._put(f"S {name}", x=f, y=decibel(loop.S))
         self._put(f"KS {name}", x=f, y=decibel(loop.KS))
         self._put(f"PS {name}", x=f, y=decibel(loop.PS))
-        near = _bounded(L)
+        near = _clipped_curve(L)
         if name == "main":  # on the wrong side of -1
             color = RED if loop.is_stable is False else BLUE
             self._drawn["nyquist main"].glyph.line_color = color
@@ -329,7 +329,7 @@ class Views:
             "nyquist": lambda one: _near(one),
         }
         for figure, curve in pick.items():
-            self._put(f"{figure} fleet", **joined([curve(one) for one in loops]))
+            self._put(f"{figure} fleet", **gapped_line([curve(one) for one in loops]))
 
     def show_coupling(
         self, freq: FloatArray, others: Mapping[str, FloatArray], loop: AxisLoop
@@ -371,7 +371,7 @@ class Views:
     def fit(self, loop: AxisLoop) -> None:
         """Choose all ranges for a loop: at the start, and anew by a button."""
         f = loop.freq
-        low = f[0] if loop.machine.is_measured else max(f[0], 0.02 * _lowest(loop))
+        low = f[0] if loop.machine.is_measured else max(f[0], 0.02 * _first_crossover(loop))
         self.freq_range.start, self.freq_range.end = float(low), float(f[-1])
         inside = f >= low
         for name, values in (("magnitude", loop.L), ("KS", loop.KS), ("PS", loop.PS)):
@@ -388,7 +388,7 @@ class Views:
         (fig.x_range.start, fig.x_range.end), (fig.y_range.start, fig.y_range.end) = _NYQUIST
 
 
-def _lowest(loop: AxisLoop) -> float:
+def _first_crossover(loop: AxisLoop) -> float:
     return float(loop.margins.crossovers[0]) if loop.margins.crossovers else float(loop.freq[0])
 
 
@@ -399,7 +399,7 @@ def _wrapped(L: Any) -> FloatArray:
     return np.asarray(np.where(jump, np.nan, phase))
 
 
-def _bounded(L: Any) -> Any:
+def _clipped_curve(L: Any) -> Any:
     """Return a curve that ends on a circle far outside the picture."""
     size = np.abs(L)
     return L * np.minimum(1.0, _EDGE / np.maximum(size, 1e-300))

@@ -191,7 +191,7 @@ def _full(model: FEModel, springs: list[GroundSpring]) -> FEModel:
 
 def _modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
     if np.iscomplexobj(modes.phi):
-        return _complex(modes, springs)
+        return _suspend_complex(modes, springs)
     basis = np.real(modes.basis)
     b = basis.shape[1]
     places = np.array([modes.row(s.at, s.direction) for s in springs])
@@ -235,7 +235,7 @@ def _modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
     )
 
 
-def _complex(modes: Modes, springs: list[GroundSpring]) -> Modes:
+def _suspend_complex(modes: Modes, springs: list[GroundSpring]) -> Modes:
     if modes.n_unstable:
         raise ModelError(
             "complex modes with an unstable pair cannot be suspended once more: suspend the "

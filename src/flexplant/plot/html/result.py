@@ -38,7 +38,7 @@ def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | N
         return None
     name, loop = next(iter(loops.items()))
     main = _main(loop, channel)
-    compared = _compared(loops, main)
+    compared = _loop_figures(loops, main)
     found, why = _budget(loop, main)
     parts = [tiles([_error_tile(main, found), *_stability(loop), *_margins(compared.rows[name])])]
     for verdict in design.of(Verdict).values():
@@ -88,7 +88,7 @@ def loops_section(design: Design, gallery: Gallery, channel: str | None) -> Chap
     if not loops:
         return None
     parts = []
-    compared = _compared(loops, _main(next(iter(loops.values())), channel))
+    compared = _loop_figures(loops, _main(next(iter(loops.values())), channel))
     stable = {name: loop for name, loop in loops.items() if compared.rows[name].stable}
     if compared.channel and stable:
         name, first = next(iter(stable.items()))
@@ -110,7 +110,7 @@ def loops_section(design: Design, gallery: Gallery, channel: str | None) -> Chap
     return Chapter("Loop", "".join(parts))
 
 
-def _compared(loops: Mapping[str, ClosedLoop], channel: str) -> LoopComparison:
+def _loop_figures(loops: Mapping[str, ClosedLoop], channel: str) -> LoopComparison:
     """Return the figures of loops, of S from the reference of an error, else from the first."""
     known = references(next(iter(loops.values())).plant)
     own = f"{channel.removesuffix(':error')}:ref"

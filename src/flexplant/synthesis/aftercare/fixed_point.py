@@ -192,7 +192,7 @@ def fixed_point(
     best: tuple[int, int, _WordForm, StateSpace, LoopFacts] | None = None
     for count in counts:
         try:
-            own = _reduced(closed, K, count, allowed)
+            own = _fewer_sections(closed, K, count, allowed)
         except FlexplantError as error:
             tried[f"{count} sections"] = str(error)
             continue
@@ -258,7 +258,7 @@ def _record(run: Any, name: str) -> FloatArray:
     return np.asarray(values.reshape(-1, values.shape[-1])[0])
 
 
-def _reduced(loop: ClosedLoop, K: StateSpace, count: Any, loss: float) -> StateSpace:
+def _fewer_sections(loop: ClosedLoop, K: StateSpace, count: Any, loss: float) -> StateSpace:
     """Return the controller of so many sections."""
     if count is None or 2 * whole(count, "sections") >= K.n_states:
         return K

@@ -90,7 +90,7 @@ def two_state_form(
     the values of the first `inputs`.
     """
     most, error = (_SINGLE if single else _DOUBLE), np.inf
-    for form, sizes in _blocks(K):
+    for form, sizes in _block_forms(K):
         found = _arranged(form, sizes, driven, inputs)
         found = _rounded(found) if single else found
         error = min(error, away := _difference(K, found))
@@ -136,7 +136,7 @@ def scheduled_form(
     return TwoStateForm(found[0].pairs, rest, B, C, D, start[:, 0], error)
 
 
-def _blocks(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
+def _block_forms(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
     """Yield the system with A block diagonal and the sizes of its blocks, the smallest first."""
     try:
         modal = modal_form(K)
@@ -152,7 +152,7 @@ def _blocks(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
     real, imag = la.lapack.dtrsen(np.zeros(len(T)), T, Z, job="N")[2:4]
     values = real + 1j * imag  # in the order of T
     for near in _NEAR:
-        owner = _groups(values, near)
+        owner = _cluster_numbers(values, near)
         sizes = np.bincount(owner).tolist()
         bases = [
             la.lapack.dtrsen(owner == k, T, Z, job="N")[1][:, :size] for k, size in enumerate(sizes)
@@ -166,7 +166,7 @@ def _blocks(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
         yield K.replace(A=new, B=B, C=C, blocks=None), sizes
 
 
-def _groups(values: ComplexArray, near: float) -> IntArray:
+def _cluster_numbers(values: ComplexArray, near: float) -> IntArray:
     """Return the group of each pole: those within a distance of each other, and conjugates."""
     folded = values.real + 1j * np.abs(values.imag)
     owner = np.full(values.size, -1)

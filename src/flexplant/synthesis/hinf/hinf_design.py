@@ -176,7 +176,7 @@ def design_hinf(
             middle = list(posed_at.values())[len(posed_at) // 2]
             weights = stage_weights(middle, bandwidth)
             posed_at = {x: one.weighted(weights) for x, one in posed_at.items()}
-        return over_positions(posed_at, lambda one: _designed(one, method, progress), progress)
+        return over_positions(posed_at, lambda one: _design_one(one, method, progress), progress)
     plant = posed(plant, u, y, "H-infinity synthesis")
     if bandwidth is not None:
         plant = plant.weighted(stage_weights(plant, bandwidth, uncertainty=uncertain))
@@ -186,7 +186,7 @@ def design_hinf(
     if known is not None:
         found = tolerant(plant, known, method, progress, damped_below)
         return with_left_out(found, plant, larger)
-    return with_left_out(_designed(plant, method, progress), plant, larger)
+    return with_left_out(_design_one(plant, method, progress), plant, larger)
 
 
 def tolerant(
@@ -201,10 +201,10 @@ def tolerant(
     instance(uncertain, UncertainPlant, "uncertain", "Make it by plant.uncertain(frequency=0.005).")
     if solved is None:
         channels, first = _even_channels(plant, uncertain, method, progress, damped_below)
-        answer = _designed(with_channels(plant, channels), method, progress)
+        answer = _design_one(with_channels(plant, channels), method, progress)
     else:
         channels, first = solved.channels, solved.first
-        answer = _designed(with_channels(plant, channels), None, progress, solved.found)
+        answer = _design_one(with_channels(plant, channels), None, progress, solved.found)
     scales = {one.mode: one.D for one in channels}
     stated = [one.replace(D=scales[one.mode]) for one in mode_channels(plant, uncertain)]
     share = tolerated(stated, with_channels(plant, stated), answer.system)
@@ -259,7 +259,7 @@ def _even_channels(
     return channels, first
 
 
-def _designed(
+def _design_one(
     plant: StandardPlant,
     method: SynthesisMethod | None,
     progress: bool | None,
@@ -377,7 +377,7 @@ class Answer(NamedTuple):
 
 def answered(plant: StandardPlant, problem: Prepared, method: SynthesisMethod) -> Answer:
     """Return the answer of one method, verified on the plant."""
-    one = _verified(plant, problem, method, method.solve(problem))
+    one = _verified_answer(plant, problem, method, method.solve(problem))
     known = max(one.lower, pointwise_bound(problem))
     return one._replace(lower=raised_bound(problem, one.gamma, known))
 
@@ -410,7 +410,7 @@ def best_answer(
             failures[name] = error
             continue
         try:
-            one = _verified(plant, problem, method, found)
+            one = _verified_answer(plant, problem, method, found)
         except FlexplantError as error:
             failures[name] = error
             broken.append((method, found))
@@ -444,7 +444,7 @@ def _beyond_claim(
     plant: StandardPlant, problem: Prepared, method: SynthesisMethod, found: SolvedController
 ) -> Answer:
     """Return an answer whose norm is only what was verified, with a note."""
-    one = _verified(plant, problem, method, found._replace(gamma=np.inf))
+    one = _verified_answer(plant, problem, method, found._replace(gamma=np.inf))
     note = (
         f"rounding costs {100 * (one.gamma / found.gamma - 1.0):.2g} % of gamma: "
         f"{found.gamma:.6g} was found for the scaled plant, {one.gamma:.6g} verified for this "
@@ -469,7 +469,7 @@ def idle_answer(plant: StandardPlant, problem: Prepared, failure: FlexplantError
     return one._replace(lower=min(pointwise_bound(problem), one.gamma))
 
 
-def _verified(
+def _verified_answer(
     plant: StandardPlant, problem: Prepared, method: SynthesisMethod, found: SolvedController
 ) -> Answer:
     K = problem.restored(found.A, found.B, found.C, found.D)

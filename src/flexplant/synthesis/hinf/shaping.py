@@ -166,7 +166,7 @@ def shape_loop(
     for _ in range(_STEPS):
         shaping = _shaping(axes, freq, rolloff)
         shaped = series(shaping, axes.plant)
-        found = _designed(shaped, T_ref, rho, back_off)
+        found = _shaped_controller(shaped, T_ref, rho, back_off)
         K = series(found.K, shaping)
         inner = K.select(inputs=K.inputs[-len(axes.names) :])
         inner = inner.replace(inputs=axes.names, outputs=axes.before.inputs)
@@ -228,7 +228,7 @@ class _Designed:
     certificate: dict[str, float]
 
 
-def _designed(
+def _shaped_controller(
     shaped: StateSpace, model: StateSpace | None, rho: float, back_off: float
 ) -> _Designed:
     """Return the controller with one degree of freedom, or with two where there is a model."""

@@ -323,7 +323,7 @@ class JointSearch:
                 # second-order correction: the bounds are curved, and steps along them short
                 bent = program.at(found) - program.slopes @ step
                 step = program.step(bent, radius)[0]
-            if gained > 0.1 * expected and all(map(_alike, couplings, gains, there)):
+            if gained > 0.1 * expected and all(map(_same_winding, couplings, gains, there)):
                 x, gains, rooms, lowest = x + step, there, found, low
                 radius *= 2.0 if gained > 0.7 * expected and radius < _RADIUS else 1.0
             else:
@@ -444,7 +444,7 @@ def _critical(room: FloatArray) -> IntArray:
     return np.unique(near[(near >= 0) & (near < room.size)])
 
 
-def _alike(one: Coupling, before: ComplexArray, after: ComplexArray) -> bool:
+def _same_winding(one: Coupling, before: ComplexArray, after: ComplexArray) -> bool:
     """Return whether ``det(I + P C)`` of two laws with the same unstable poles turns as often."""
     ratio = one.turns(after) / one.turns(before)
     return bool(abs(np.sum(np.angle(ratio[1:] / ratio[:-1]))) < 0.5 * np.pi)

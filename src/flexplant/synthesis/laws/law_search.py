@@ -217,7 +217,7 @@ def starts(of: AxisLaw, notches: int) -> list[FloatArray]:
     """Return numbers near the highest bandwidths, with and without notches at the modes."""
     if not of.lowest < of.highest:
         return []
-    rows = _rows(of)
+    rows = _axis_points(of)
     sets = _sets(of, notches)
     found: list[list[_Start]] = [[] for _ in sets]
     for w in np.geomspace(of.highest, of.lowest, _TRIALS).tolist():
@@ -275,7 +275,7 @@ def _turns_stably(L: ComplexArray, at_zero: int) -> npt.NDArray[np.bool_]:
     return np.asarray(np.abs(low + turned - last - 0.5 * np.pi * at_zero) < 0.5 * np.pi)
 
 
-def _rows(of: AxisLaw) -> IntArray:
+def _axis_points(of: AxisLaw) -> IntArray:
     """Return points that show the axis: even ones, and those around its modes."""
     freq = of.axis.points[0]
     even = np.searchsorted(freq, np.geomspace(freq[0], freq[-1], _GRID_POINTS))

@@ -118,7 +118,7 @@ def design_lmi(
     True
     """
     given = standard_plant(plant)
-    _checked(given, minimize, subject_to, whole(max_states, "max_states"))
+    _check_specifications(given, minimize, subject_to, whole(max_states, "max_states"))
     require_stabilisable(given, prepared(given.system, given.u, given.y), "synthesis by LMIs")
     require_reachable(given, subject_to)
     scaled = _prepared(given)
@@ -130,7 +130,7 @@ def design_lmi(
         bound = factor * claim
         try:
             K = problem.controller(bound, rate)
-            reached = _verified(given, K, minimize, subject_to)
+            reached = _verified_values(given, K, minimize, subject_to)
         except (SolverError, CertificateError, InfeasibleError, np.linalg.LinAlgError) as error:
             failures.append(error)
             continue
@@ -148,7 +148,7 @@ def design_lmi(
     )
 
 
-def _checked(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) -> None:
+def _check_specifications(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) -> None:
     """Refuse specifications that do not fit."""
     if not isinstance(minimize, _KINDS) or minimize.below is not None:
         raise ModelError(
@@ -243,7 +243,7 @@ def _best_rate(problem: ObjectivePrograms) -> tuple[float, float]:
     return values[best], best
 
 
-def _verified(
+def _verified_values(
     plant: StandardPlant, K: StateSpace, minimize: Any, subject_to: Sequence[Any]
 ) -> dict[str, float]:
     """Return what every objective reaches, computed from the closed loop."""

@@ -244,7 +244,7 @@ def _ascended(
 ) -> tuple[float, Perturbation]:
     """Return the largest gain in a band, real Deltas moved one after the other to an end or 0."""
     one = one._replace(vectors=one.vectors[:-1])
-    best = _gain(gains, where, one)
+    best = _perturbed_gain(gains, where, one)
     for _ in range(_ROUNDS):
         before = best
         for i, number in enumerate(one.scalars):
@@ -253,7 +253,7 @@ def _ascended(
                     continue
                 scalars = (*one.scalars[:i], complex(value), *one.scalars[i + 1 :])
                 moved = one._replace(scalars=scalars)
-                gain = _gain(gains, where, moved)
+                gain = _perturbed_gain(gains, where, moved)
                 if gain > best:
                     best, one = gain, moved
         if best <= before * (1.0 + 1e-4):
@@ -261,7 +261,7 @@ def _ascended(
     return best, one
 
 
-def _gain(gains: ComplexArray, where: list[Any], one: Perturbation) -> float:
+def _perturbed_gain(gains: ComplexArray, where: list[Any], one: Perturbation) -> float:
     """Return the largest gain over a band of the loop with a perturbation."""
     performance = where[-1]
     delta = matrix_of(one, where[:-1])

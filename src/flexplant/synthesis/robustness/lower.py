@@ -48,41 +48,41 @@ def power_iteration(
     [Young1990]_; [PackardDoyle1993]_.
     """
     n = M.shape[1]
-    b, w = (_unit(_drawn(rng, n)) for _ in range(2))
+    b, w = (_unit_vector(_random_complex(rng, n)) for _ in range(2))
     q = {i: 1.0 + 0j for i, p in enumerate(where) if isinstance(p.block, RepeatedScalar)}
     old, a = b, M @ b
     for _ in range(_STEPS):
         a = M @ b
         if not np.any(a):
             break
-        a = _unit(a)
+        a = _unit_vector(a)
         left = np.zeros(M.shape[0], dtype=np.complex128)
         for i, p in enumerate(where):
-            left[p.z] = _left(p, q, i, a, b, w)
+            left[p.z] = _next_left(p, q, i, a, b, w)
         w = M.conj().T @ left
         if not np.any(w):
             break
-        w = _unit(w)
+        w = _unit_vector(w)
         b = np.zeros(n, dtype=np.complex128)
         for i, p in enumerate(where):
             b[p.w] = _right(p, q, i, a, old, w)
-        b = _unit(b)
+        b = _unit_vector(b)
         if la.norm(b - old) < _SETTLED:
             break
         old = b
     full = [p for p in where if isinstance(p.block, FullBlock)]
-    vectors = [(_unit(a[p.z]), _unit(w[p.w])) for p in full]
+    vectors = [(_unit_vector(a[p.z]), _unit_vector(w[p.w])) for p in full]
     return Perturbation(tuple(q.values()), tuple(vectors), omega)
 
 
-def _left(
+def _next_left(
     p: Place, q: dict[int, complex], i: int, a: ComplexArray, b: ComplexArray, w: ComplexArray
 ) -> ComplexArray:
     """Return the block of the next left vector."""
     if isinstance(p.block, FullBlock):
         return np.asarray(a[p.z] * (la.norm(w[p.w]) / max(la.norm(a[p.z]), TINY)))
     if p.block.real:
-        q[i] = _real(q[i].real, a[p.z], b[p.w], w[p.w])
+        q[i] = _real_scalar(q[i].real, a[p.z], b[p.w], w[p.w])
         return np.asarray(q[i] * w[p.w])
     inner = np.vdot(w[p.w], a[p.z])
     return np.asarray(inner / (abs(inner) or 1.0) * w[p.w])
@@ -95,25 +95,25 @@ def _right(
     if isinstance(p.block, FullBlock):
         return np.asarray(w[p.w] * (la.norm(a[p.z]) / max(la.norm(w[p.w]), TINY)))
     if p.block.real:
-        q[i] = _real(q[i].real, a[p.z], b[p.w], w[p.w])
+        q[i] = _real_scalar(q[i].real, a[p.z], b[p.w], w[p.w])
         return np.asarray(q[i] * a[p.z])
     inner = np.vdot(a[p.z], w[p.w])
     q[i] = complex(inner / (abs(inner) or 1.0))
     return np.asarray(q[i] * a[p.z])
 
 
-def _real(q: float, a: ComplexArray, b: ComplexArray, w: ComplexArray) -> float:
+def _real_scalar(q: float, a: ComplexArray, b: ComplexArray, w: ComplexArray) -> float:
     """Return the next number of a real scalar, on its interval."""
     sign = 1.0 if q >= 0 else -1.0
     moved = sign * la.norm(b) / max(la.norm(a), TINY) + float(np.vdot(a, w).real)
     return float(np.clip(moved, -1.0, 1.0))
 
 
-def _drawn(rng: np.random.Generator, n: int) -> ComplexArray:
+def _random_complex(rng: np.random.Generator, n: int) -> ComplexArray:
     return np.asarray(rng.standard_normal(n) + 1j * rng.standard_normal(n))
 
 
-def _unit(v: ComplexArray) -> ComplexArray:
+def _unit_vector(v: ComplexArray) -> ComplexArray:
     size = la.norm(v)
     if not size > 0:
         v = np.zeros_like(v)

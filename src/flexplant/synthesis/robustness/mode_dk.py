@@ -80,7 +80,7 @@ def by_mode_channels(
             bar.advance(int(number > 0))
             step = None
             with attempted(f"step {number + 1} of the D-K iteration"):
-                step = _step(weighted, channels, level, method)
+                step = _dk_iteration(weighted, channels, level, method)
             if step is None:
                 break
             found.append(step.mu)
@@ -103,7 +103,7 @@ def by_mode_channels(
     )
 
 
-def _step(
+def _dk_iteration(
     weighted: StandardPlant,
     channels: Sequence[ModeChannel],
     level: float,
@@ -149,7 +149,7 @@ def _tried(uncertain: UncertainPlant[Any], best: _Step, w: Any, z: Any) -> float
         ends = size * chance.choice([-1.0, 1.0], len(names))
         machine = uncertain.lft(dict(zip(names, ends.tolist(), strict=True)))
         loop = lft(_weighted(machine, w, z).system, best.controller)
-        most = max(most, _gain(loop) / best.mu if loop.is_stable else np.inf)
+        most = max(most, _grid_peak(loop) / best.mu if loop.is_stable else np.inf)
     if most > 1.0 + _BEYOND:
         raise CertificateError(
             f"of machines within {size:.3g} of the uncertainty one has {most:.4g} times the gain "
@@ -159,7 +159,7 @@ def _tried(uncertain: UncertainPlant[Any], best: _Step, w: Any, z: Any) -> float
     return most
 
 
-def _gain(loop: StateSpace) -> float:
+def _grid_peak(loop: StateSpace) -> float:
     """Return the largest singular value over a grid through the resonances."""
     freq: FloatArray = resonance_grid(loop.poles(), loop.dt)
     return float(np.linalg.norm(np.moveaxis(responder(loop)(freq), 2, 0), 2, axis=(1, 2)).max())

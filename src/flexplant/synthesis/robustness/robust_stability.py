@@ -194,7 +194,7 @@ def robust_stability(
     certificate["intervals by Hamiltonians"] = float(found.intervals * found.by_hamiltonian)
     if loop.dt:
         certificate["distance of channels"] = loop.channels.distance
-    values, shown, lower = _shown(loop, worst)
+    values, shown, lower = _worst_machine(loop, worst)
     left_out = _left_out(loop.loop, larger)
     if left_out is not None:
         certificate |= left_out.certificate
@@ -236,7 +236,7 @@ def _worst(
     return best
 
 
-def _shown(
+def _worst_machine(
     loop: UncertainLoop, worst: Destabilising | None
 ) -> tuple[dict[str, float], StandardPlant | None, float]:
     """Return the Deltas of the worst machine, that machine and one over its size.

@@ -162,7 +162,7 @@ def open_plant(
     before, behind = _checked_weights(weights_in, plant.dt), _checked_weights(weights_out, plant.dt)
     system = _with_weights(
         g.select(outputs, inputs), inputs, outputs,
-        *(_images(part, plant.dt) for part in (before, behind)),
+        *(_bilinear_images(part, plant.dt) for part in (before, behind)),
     )  # fmt: skip
     return OpenPlant(
         uncertain, channels, system, tuple(listed), tuple(w_names), tuple(z_names), before, behind
@@ -228,7 +228,7 @@ def _checked_weights(given: Mapping[str, Any], dt: float) -> dict[str, StateSpac
     return found
 
 
-def _images(weights: Mapping[str, StateSpace], dt: float) -> dict[str, StateSpace]:
+def _bilinear_images(weights: Mapping[str, StateSpace], dt: float) -> dict[str, StateSpace]:
     """Return the bilinear images of sampled weights."""
     return {
         name: bilinear(one, 1.0 / dt) if dt and one.n_states else one

@@ -298,8 +298,8 @@ def realised(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
             parts.append(as_statespace(number.real * np.eye(p.block.size)))
         else:
             one = [_all_pass(number, found.omega) for _ in range(p.block.size)]
-            parts.append(_stacked(one))
-    return _stacked(parts)
+            parts.append(_block_diagonal(one))
+    return _block_diagonal(parts)
 
 
 def _all_pass(number: complex, omega: float) -> StateSpace:
@@ -316,7 +316,7 @@ def _all_pass(number: complex, omega: float) -> StateSpace:
     return StateSpace([[-p]], [[root]], [[-sign * root]], [[sign * size]])
 
 
-def _stacked(parts: Sequence[StateSpace]) -> StateSpace:
+def _block_diagonal(parts: Sequence[StateSpace]) -> StateSpace:
     D = la.block_diag(*[g.D for g in parts])
     n = sum(g.n_states for g in parts)
     A, B, C = np.zeros((n, n)), np.zeros((n, D.shape[1])), np.zeros((D.shape[0], n))
@@ -332,7 +332,7 @@ def _rank_one(a: ComplexArray, b: ComplexArray, omega: float) -> StateSpace:
     """Return ``b(s) a(s)'`` with the values b and conj(a) at omega."""
     into = [_all_pass(complex(v), omega) for v in a.conj()]
     out = [_all_pass(complex(v), omega) for v in b]
-    first, second = _stacked(into), _stacked(out)
+    first, second = _block_diagonal(into), _block_diagonal(out)
     ones_in, ones_out = np.ones((1, len(into))), np.ones((len(out), 1))
     row = StateSpace(first.A, first.B, ones_in @ first.C, ones_in @ first.D)
     column = StateSpace(second.A, second.B @ ones_out, second.C, second.D @ ones_out)

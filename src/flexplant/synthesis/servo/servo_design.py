@@ -12,8 +12,8 @@ import numpy as np
 from ...checks import FloatArray, between, positive, real_array
 from ...errors import AssumptionError, LabelError, ModelError, SolverError, counted, warn
 from ...loop import ClosedLoop
-from ...loop.blocks import drives, joined
-from ...loop.spill_over import growing_modes, named
+from ...loop.blocks import drives, driving_blocks
+from ...loop.spill_over import growing_modes, modes_in_words
 from ...lti.interconnection import loop_poles
 from ...lti.joining import stacked
 from ...lti.statespace import StateSpace
@@ -227,7 +227,7 @@ def servo_bandwidth(
 
 def _refuse(closed: ClosedLoop, bandwidth: float, observed: bool, advice: str) -> None:
     """Raise SolverError for the loop that will run, warn of a loop on the POI itself."""
-    modes = named(*growing_modes(closed.monitored, closed.plant.system.states))
+    modes = modes_in_words(*growing_modes(closed.monitored, closed.plant.system.states))
     what = "with its observer" if observed else "on the POI itself"
     text = (
         f"the servo's loop at {bandwidth:g} Hz {what} is unstable (spectral radius "
@@ -312,7 +312,7 @@ class ServoTask:
 
         def found(axis: Axis) -> ClosedLoop:
             blocks = (*before, self.controller(axis))
-            controller = joined(plant, blocks, *drives(plant, blocks, ()))
+            controller = driving_blocks(plant, blocks, *drives(plant, blocks, ()))
             return ClosedLoop(plant, blocks, controller, larger=larger)
 
         return cache(found)

@@ -239,7 +239,7 @@ def decrease_left(pieces: Pieces, radius: float) -> tuple[float, float]:
     return slope, gained
 
 
-def joined(parts: Sequence[Pieces]) -> Pieces:
+def joined_pieces(parts: Sequence[Pieces]) -> Pieces:
     """Return the pieces of several functions, such as the gains of several plants."""
     every = parts[0]
     for one in parts[1:]:

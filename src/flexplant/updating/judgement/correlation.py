@@ -49,7 +49,7 @@ def mac(X: Any, Y: Any) -> FloatArray:
     left, right = _shapes(X, "X"), _shapes(Y, "Y")
     if left.shape[0] != right.shape[0]:
         raise ShapeError(f"X has {left.shape[0]} rows and Y {right.shape[0]}.")
-    return matching.mac(left, right)
+    return matching.mac_matrix(left, right)
 
 
 def frac(H: Any, G: Any) -> FloatArray:

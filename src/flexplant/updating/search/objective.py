@@ -14,7 +14,7 @@ from ..parameters.added import Parameter
 from ..point_model import Point, first_point
 from ..residuals.eigenvalues import BoundEigenvalues
 from ..residuals.residual import Bound, Residual
-from ..sensitivities import GroupDerivatives, group_derivatives, mode_columns, split
+from ..sensitivities import GroupDerivatives, group_derivatives, mode_columns, split_rotation
 
 
 class Defect(NamedTuple):
@@ -130,7 +130,7 @@ class Objective:
 
     def _turned(self, point: Point) -> Point:
         """Return the point with exactly repeated modes turned to the split of the next step."""
-        return point if self.poles_measured is None else turned(point, self.poles_measured)
+        return point if self.poles_measured is None else split_point(point, self.poles_measured)
 
     def values(self, point: Point, *, prior: bool = True) -> FloatArray:
         """Return the residuals, then those of the priors."""
@@ -241,7 +241,7 @@ class PoleRows:
         return np.concatenate(found)
 
 
-def turned(point: Point, data: PoleRows) -> Point:
+def split_point(point: Point, data: PoleRows) -> Point:
     """Return the point with exactly repeated modes turned to the split of the next step.
 
     How repeated modes split depends on the step, and the step on how they split: try both
@@ -304,6 +304,6 @@ def _along(
     direction: FloatArray,
 ) -> tuple[ComplexArray, Eigen]:
     """Return S with the rows of repeated modes as they split along a direction, and the modes."""
-    rotation = split(groups, eigen, direction)
+    rotation = split_rotation(groups, eigen, direction)
     rows = [rotation.sensitivity.get(c, row) for c, row in zip(columns, S, strict=True)]
     return np.array(rows), rotation.eigen
