@@ -386,7 +386,7 @@ def _started(*_functions: Any) -> None:
 
 
 #: shorter work than this shows no bar [s]
-PATIENCE = 2.0
+BAR_DELAY = 2.0
 #: a bar that nothing advances is drawn anew after this long, for the time it shows [s]
 _AGAIN = 1.0
 #: with more than this left to do, advice on how to have less is worth its words [s]
@@ -437,7 +437,7 @@ class Progress:
                 total=total,
                 desc=description,
                 bar_format=None if total != 0 else "{desc}: {elapsed}",
-                delay=0.0 if progress else PATIENCE,
+                delay=0.0 if progress else BAR_DELAY,
                 leave=bool(progress),
                 file=self._stream or sys.stderr,
             )
@@ -486,14 +486,14 @@ class Progress:
 
     def expects(self, seconds: float) -> None:
         """Say at once how long all of it will take, the first time that this is two seconds."""
-        if self._expected or seconds < PATIENCE or not (self._unseen or self.bar is not None):
+        if self._expected or seconds < BAR_DELAY or not (self._unseen or self.bar is not None):
             return
         self._expected = seconds
         self._write(f"some {float(f'{seconds:.1g}'):g} s expected", seconds)
 
     def _shown(self) -> None:
         """Draw the bar while the first item, or any later one, takes its time."""
-        wait, advised = PATIENCE, not self.advice
+        wait, advised = BAR_DELAY, not self.advice
         while not self._over.wait(wait):
             left = self._left()
             if not advised and left > LONG:
@@ -505,12 +505,12 @@ class Progress:
 
     def _said(self) -> None:
         """Say what runs, and how long it will take, as soon as one item of several is done."""
-        if self._over.wait(PATIENCE) or self._expected:
+        if self._over.wait(BAR_DELAY) or self._expected:
             return
         self._say()
         if self._total and not self._left():
             while not self._left():
-                if self._over.wait(min(PATIENCE, _AGAIN)):
+                if self._over.wait(min(BAR_DELAY, _AGAIN)):
                     return
             self._say()
 
@@ -561,7 +561,7 @@ def expect(multiplications: float = 0.0, *, seconds: float = 0.0) -> None:
     """
     bars = _open_bars()
     if bars:
-        if multiplications * _LEAST > PATIENCE * 1e-2:
+        if multiplications * _LEAST > BAR_DELAY * 1e-2:
             seconds += multiplications * _seconds_each()
         bars[0].expects(seconds)
 

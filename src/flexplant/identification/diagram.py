@@ -192,7 +192,7 @@ class StabilisationDiagram(Value):
         centres = np.array([np.median(self.freq[self.tracks == track]) for track in known])
         lengths = np.array([np.sum(self.tracks == track) for track in known])
         away: Any = np.abs(centres[None, :] / np.maximum(wanted, TINY)[:, None] - 1.0)
-        # a long track is meant rather than a short one a hair nearer
+        # a long track is meant rather than a short one slightly nearer
         cost = np.where(away < 0.03, away + 0.01 / np.maximum(lengths, 1)[None, :], 1e3)
         if cost.shape[1] < wanted.size:
             raise ModelError(f"{wanted.size} frequencies, but only {known.size} poles are there.")

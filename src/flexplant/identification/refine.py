@@ -20,7 +20,7 @@ RUNAWAY = 5.0
 #: squares of the standard deviations by which a full step may still move a fit that has settled
 FINE, COARSE, ROUGH = 1e-5, 1e-2, 0.3
 #: steps after which a fit may be given up, and how often the gain of a full step is waited for
-PATIENCE, HOPE = 4, 20.0
+TRIAL_STEPS, GAINS_AHEAD = 4, 20.0
 #: steps of a fit of one output: its poles begin near
 OWN = 20
 #: least damping ratio of a pole, and how many times farther from zero than the highest line it may
@@ -178,7 +178,7 @@ def refined(
         # a step of so few standard deviations of what is left is none
         if predicted <= enough * now.cost / (2 * lines.data.size):
             break
-        if number >= PATIENCE and now.cost - HOPE * predicted > below:
+        if number >= TRIAL_STEPS and now.cost - GAINS_AHEAD * predicted > below:
             raise unsettled(poles.size, number)
         # a gain of rounding, thrice; or all that is there is explained, to 1e-12 of an amplitude
         idle = idle + 1 if gained <= 1e-12 * now.cost else 0

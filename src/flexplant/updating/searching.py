@@ -100,7 +100,7 @@ def _magnitude(residual: FrfResidual) -> FrfResidual:
 
 
 #: part of the measured power that a minimum leaves which has little to do with the measurement
-ABSURD = 0.1
+POOR_FIT = 0.1
 #: relative distance of a pole from the measured one, beyond noise, that a wrong pairing may leave
 FAR = 1e-3
 #: starts that are always tried beside the first, for models of up to so many DOFs and larger ones;
@@ -343,7 +343,7 @@ def _improvable(objective: Objective, end: SearchEnd, point: Point) -> bool:
     """Return whether another start may lead to a better end than one that noise leaves open."""
     if not objective.numbers:
         r, size = objective.values(point, prior=False), objective.size(point)
-        return bool(np.sum(r**2) > ABSURD * np.sum(size[: r.size] ** 2))
+        return bool(np.sum(r**2) > POOR_FIT * np.sum(size[: r.size] ** 2))
     poles = objective.poles_measured
     alone = all(isinstance(residual, Eigenvalues) for residual in objective.residuals)
     if poles is None or not alone or point.p.size < 2:

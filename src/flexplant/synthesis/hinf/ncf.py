@@ -29,7 +29,7 @@ _INTEGRAL = 0.1
 #: claim and margin, and the smallest gamma by two computations, agree to this
 AGREEMENT = 1e-4
 #: smallest gamma of a shaped plant above which its bandwidth is out of reach
-_HOPELESS = 1e3
+_LARGEST_GAMMA = 1e3
 
 
 @one_thread()
@@ -214,7 +214,7 @@ def verified_controller(
         cause = (
             "the shaped plant is too badly conditioned to trust. Bring its gains at u and y to "
             "size 1, and leave out states that are hardly reached or seen"
-            if least < _HOPELESS
+            if least < _LARGEST_GAMMA
             else "no controller has more than a tiny margin. The delay or the resonances allow no "
             "loop of that bandwidth: lower it"
         )
