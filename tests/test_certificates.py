@@ -165,7 +165,7 @@ class Unstable:
 #: what is made wrong, how, what is called then, and what is said
 WRONG = {
     "error of an observer, its dual": (
-        "estimation.error._dual", larger(1.02),
+        "estimation.error._gain_trace", larger(1.02),
         lambda: estimate().rms("die", on=masses()), "its dual differ",
     ),
     "minimax filter": (
@@ -178,7 +178,7 @@ WRONG = {
         lambda: fx.estimation.design_multirate(masses(), {"y2": 2}), "one period",
     ),
     "H-infinity filter": (
-        "estimation.robust_filter._at", larger(1.003, 1),
+        "estimation.robust_filter._central_gains", larger(1.003, 1),
         lambda: fx.estimation.design_hinf_filter(masses()), "more than the level",
     ),
     "unknown inputs": (
@@ -225,7 +225,7 @@ WRONG = {
         "times the weights",
     ),
     "reduced controller": (
-        "synthesis.aftercare.order.kept", lambda _: lambda *_: "too much",
+        "synthesis.aftercare.order.loss_text", lambda _: lambda *_: "too much",
         lambda: reducer(loss=0.1), "no controller of fewer states",
     ),
     "blocks for C, of several places": (
@@ -260,7 +260,7 @@ WRONG = {
         "a mode was hidden",
     ),
     "no feedback": (
-        "synthesis.hinf.hinf_design._of_loop", unproven,
+        "synthesis.hinf.hinf_design._certified_answer", unproven,
         lambda: import_module("flexplant.synthesis.hinf.hinf_design").idle_answer(
             problem(), None, ""
         ), "cannot be verified",
@@ -272,7 +272,7 @@ WRONG = {
         ), "was claimed",
     ),
     "largest gain": (
-        "synthesis.robustness.gain._reached", larger(100.0, 0),
+        "synthesis.robustness.gain._machine_gain", larger(100.0, 0),
         lambda: fx.synthesis.worst_case_gain(off_by(0.01), lead(), w=["d"], z=["tip:x"]),
         "was proven as largest",
     ),

@@ -251,7 +251,7 @@ def test_dense_loops_run_on_one_thread(monkeypatch, module, inner, call):
 
     def now():
         """Threads of the BLAS of NumPy and SciPy: other packages bring libraries of their own."""
-        return max(lib["num_threads"] for lib in flexplant.parallel._controller().info())
+        return max(lib["num_threads"] for lib in flexplant.parallel._thread_pools().info())
 
     def noted(*arguments, **options):
         used.append(now())

@@ -42,7 +42,7 @@ PROBE = 0.05
 
 
 @cache
-def _controller() -> Any:
+def _thread_pools() -> Any:
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
@@ -66,7 +66,7 @@ def one_thread() -> Iterator[None]:
         yield
         return
     with _lock:  # the number of threads may belong to each thread, or to all
-        limited = _controller().limit(limits=1, user_api="blas")
+        limited = _thread_pools().limit(limits=1, user_api="blas")
         _original = limited if _inside == 0 else _original
         _inside += 1
     _depth.value = 1
@@ -144,7 +144,7 @@ def mapped(
                 seconds = (perf_counter() - start) / done
                 _send(function, left[done:], seconds, executor, keep)
                 break
-            keep(number, _call(function, call))
+            keep(number, _call_seeded(function, call))
         return [results[i] for i in range(len(calls))]
 
 
@@ -171,10 +171,10 @@ def _send(
 
 def _chunk(function: Callable[..., Result], calls: Sequence[tuple[Any, ...]]) -> list[Result]:
     with one_thread(), Progress(None, "chunk", progress=False):  # no bars inside
-        return [_call(function, call) for call in calls]
+        return [_call_seeded(function, call) for call in calls]
 
 
-def _call(function: Callable[..., Result], call: tuple[Any, ...]) -> Result:
+def _call_seeded(function: Callable[..., Result], call: tuple[Any, ...]) -> Result:
     item, *seed = call
     return function(item, np.random.default_rng(seed[0])) if seed else function(item)
 
@@ -299,7 +299,7 @@ def _single(
 
     def start() -> None:
         process = _one_like(executor)
-        out[process.submit(_started, function, first)] = process, None, inf
+        out[process.submit(_started_process, function, first)] = process, None, inf
 
     def send(process: ProcessPoolExecutor, number: int) -> None:
         try:
@@ -326,7 +326,7 @@ def _single(
                 late = not future.done()
                 error = None if late else future.exception()
                 if late or isinstance(error, BrokenExecutor):
-                    _end(process)
+                    _end_pool(process)
                     if number is None:
                         raise SolverError(
                             "a process like those of the executor ends while it starts. Check the "
@@ -343,7 +343,7 @@ def _single(
                         start()
                     continue
                 if error is not None:
-                    _end(process)
+                    _end_pool(process)
                     raise error
                 if waiting:
                     send(process, waiting.pop())
@@ -353,7 +353,7 @@ def _single(
                     yield number, future.result()
     finally:  # interrupted too: no process stays
         for process, _, _ in out.values():
-            _end(process)
+            _end_pool(process)
 
 
 def _one_like(executor: Executor) -> ProcessPoolExecutor:
@@ -374,14 +374,14 @@ def _one_like(executor: Executor) -> ProcessPoolExecutor:
     )
 
 
-def _end(process: ProcessPoolExecutor) -> None:
+def _end_pool(process: ProcessPoolExecutor) -> None:
     """End a pool of one process, whatever it is doing."""
     for one in list((getattr(process, "_processes", None) or {}).values()):
         one.kill()
     process.shutdown(cancel_futures=True)
 
 
-def _started(*_functions: Any) -> None:
+def _started_process(*_functions: Any) -> None:
     """Return at once: the process has started, and imported what some functions need."""
 
 

@@ -393,10 +393,10 @@ def as_html(text: str) -> str:
         parts.append(f"<div><b>{escape(first[:end])}</b>{escape(first[end:])}</div>")
     else:
         rest = [first, *rest]
-    for shape, lines in groupby(rest, key=_kind):
+    for shape, lines in groupby(rest, key=_line_kind):
         part = list(lines)
         if shape == "entry":
-            rows = "".join(_row(line) for line in part)
+            rows = "".join(_html_row(line) for line in part)
             parts.append(f'<table style="border-collapse:collapse"><tbody>{rows}</tbody></table>')
         elif shape == "text":
             parts += [f"<div>{escape(line.strip())}</div>" for line in part]
@@ -406,7 +406,7 @@ def as_html(text: str) -> str:
     return f'<div class="flexplant">{"".join(parts)}</div>'
 
 
-def _kind(line: str) -> str:
+def _line_kind(line: str) -> str:
     """Return whether a line is a named entry, a sentence, or part of a table."""
     if _ENTRY.match(line):
         return "entry"
@@ -414,7 +414,7 @@ def _kind(line: str) -> str:
     return "text" if indent <= 2 and "  " not in line.strip() else "table"
 
 
-def _row(line: str) -> str:
+def _html_row(line: str) -> str:
     name, text = cast(re.Match[str], _ENTRY.match(line)).groups()
     return (
         f'<tr><th style="{_CELL};font-weight:600">{escape(name.strip())}</th>'

@@ -204,7 +204,7 @@ class Checkpoint:
             )
         self.header = found
         for line in lines:
-            self.rows.update(_entries(line.decode(errors="replace")))
+            self.rows.update(_parsed_results(line.decode(errors="replace")))
         if lines[-1]:  # cut off: what is appended has a line of its own
             self._append(file, b"\n")
 
@@ -255,7 +255,7 @@ def _is_locked_now(file: IO[bytes]) -> bool:
     return True
 
 
-def _entries(line: str) -> dict[int, Any]:
+def _parsed_results(line: str) -> dict[int, Any]:
     """Return the results of a line whose check sums are right, wherever they begin in it."""
     found: dict[int, Any] = {}
     at = 0

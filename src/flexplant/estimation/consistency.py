@@ -38,12 +38,12 @@ from .innovations import (
     InnovationParts,
     Statistic,
     cumulative_periodogram,
+    excess_peaks,
     expected,
+    innovation_parts,
     level_test,
     lines_of,
     ljung_box,
-    parts_of,
-    peaks,
 )
 from .kalman import design_kalman
 from .left_out import left_out
@@ -264,7 +264,7 @@ def consistency(
     if constant is not None:
         said.append(LikelyCause("offset", constant.text))
         white = settled - constant.mean  # what an offset does at first is no constant
-    whole = _whole(observer, larger)
+    whole = _larger_plant(observer, larger)
     if said or whole is not None:
         rest = _tested(observer, white, normal, whole, alpha, u)
     verdicts = _verdicts(observer, rest, whole, estimate.sensors, examined([], whole))
@@ -393,7 +393,7 @@ class _Facts(NamedTuple):
         count = 2 * beside.density.size * beside.channels
         total = level_test(count * float(np.mean(beside.density)), count)
         p = min(total.p_value, cumulative_periodogram(beside).p_value)
-        return p >= _AGREES and not peaks(beside, _AGREES)
+        return p >= _AGREES and not excess_peaks(beside, _AGREES)
 
 
 def _tested(
@@ -416,12 +416,12 @@ def _tested(
     commands = np.where(missing, np.nan, u[-len(last) :])
     pooled = lines.pooled
     parts = (
-        parts_of(observer, None, lines.freq)
+        innovation_parts(observer, None, lines.freq)
         if whole is None
         else expected(observer, whole, lines.samples)
     )
     levels = _fitted_levels(parts.pooled, pooled.density)
-    found = peaks(pooled._replace(density=pooled.density / (levels @ parts.pooled)), alpha)
+    found = excess_peaks(pooled._replace(density=pooled.density / (levels @ parts.pooled)), alpha)
     ratios = np.sqrt(np.mean(normal[there] ** 2, axis=0))
     return _Facts(
         nis, box, cumulative_periodogram(pooled), found, lines, parts, levels, ratios, count, alpha,
@@ -429,7 +429,7 @@ def _tested(
     )  # fmt: skip
 
 
-def _whole(observer: KalmanEstimator, larger: Any) -> StandardPlant | None:
+def _larger_plant(observer: KalmanEstimator, larger: Any) -> StandardPlant | None:
     """Return the plant with the modes left out, read like the observer's, or None."""
     plant = observer.plant
     if larger is None:

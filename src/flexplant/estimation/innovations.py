@@ -95,7 +95,7 @@ class ExcessPeak(NamedTuple):
     p_value: float
 
 
-def peaks(found: PooledSpectrum, alpha: float) -> list[ExcessPeak]:
+def excess_peaks(found: PooledSpectrum, alpha: float) -> list[ExcessPeak]:
     """Return where the spectrum exceeds its mean, the most significant ones first.
 
     Averages over b lines of p channels are chi-square with 2 b p degrees of freedom; each of the
@@ -222,7 +222,7 @@ def impulse(observer: KalmanEstimator, count: int) -> FloatArray:
     return np.asarray(np.linalg.solve(_cholesky(observer), found))
 
 
-def parts_of(
+def innovation_parts(
     observer: KalmanEstimator,
     plant: StandardPlant | None,
     freq: FloatArray,
@@ -238,7 +238,7 @@ def parts_of(
     p = len(observer.sensors)
     process = np.empty((freq.size, p, p), dtype=np.complex128)
     sensors = np.empty_like(process)
-    for at in _pieces(freq.size):
+    for at in _slices(freq.size):
         V = whitening(observer, freq[at]) if white is None else white[at]
         if plant is None:
             sensors[at] = _squared(V @ np.linalg.cholesky(observer.model.R))
@@ -273,7 +273,7 @@ def expected(observer: KalmanEstimator, plant: StandardPlant, samples: int) -> I
         covariance = np.fft.irfft(whole, 2 * samples, axis=0)
         return np.asarray(np.fft.rfft(covariance * weight, axis=0)[at])
 
-    found = parts_of(observer, plant, freq)
+    found = innovation_parts(observer, plant, freq)
     return InnovationParts(seen(found.process), seen(found.sensors))
 
 
@@ -286,6 +286,6 @@ def _squared(part: ComplexArray) -> ComplexArray:
     return np.asarray(part @ np.conj(np.swapaxes(part, 1, 2)))
 
 
-def _pieces(count: int) -> Iterator[slice]:
+def _slices(count: int) -> Iterator[slice]:
     for start in range(0, count, _PIECE):
         yield slice(start, start + _PIECE)

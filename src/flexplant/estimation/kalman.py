@@ -25,7 +25,7 @@ from .filter_model import (
     error_of,
     filter_model,
     filter_system,
-    weighed,
+    weigh,
 )
 from .left_out import left_out
 
@@ -161,9 +161,9 @@ def _filter_design(model: FilterModel) -> _Design:
     solution = solve_dare(model.A, model.C2, Q=model.Q, R=model.R, S=model.S)
     P = solution.P
     innovation = model.innovation(P)
-    gain = weighed(P @ model.C2.T, innovation)
-    predictor = model.A @ gain + weighed(model.S, innovation)
-    poi_gain = weighed(model.C1 @ P @ model.C2.T + model.N, innovation)
+    gain = weigh(P @ model.C2.T, innovation)
+    predictor = model.A @ gain + weigh(model.S, innovation)
+    poi_gain = weigh(model.C1 @ P @ model.C2.T + model.N, innovation)
     covariance = model.updated(P, gain)
     variances = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
     radius, difference = error_of(model, gain, predictor, covariance)

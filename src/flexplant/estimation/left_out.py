@@ -94,7 +94,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
             f"the larger model has {counted(all_modes.omega.size, 'elastic mode')}, the plant "
             f"{genuine.size}: it is not larger. Pass more modes of the full structure."
         )
-    rows, columns = _paired(kept, all_modes, genuine)
+    rows, columns = _same_modes(kept, all_modes, genuine)
     others = np.setdiff1d(np.arange(all_modes.omega.size), columns)
     if not others.size:
         return None
@@ -104,7 +104,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     # an acceleration has no static part: what modes answer at once they take back at rest
     moving = [i for i, sensor in enumerate(ports.y) if sensor.order == 2]
     flexibility[[len(flexibility) - len(ports.y) + i for i in moving]] = 0.0
-    covariance = _covariance(all_modes, others, others_own.ports)
+    covariance = _motion_covariance(all_modes, others, others_own.ports)
     nz = covariance.shape[0] - len(ports.y)
     y = plant.unweighted.y
     read = plant.reading_gain[np.ix_(
@@ -170,7 +170,7 @@ def _of_vectors(realisation: ModalRealisation) -> IntArray:
     return np.sort(np.argsort(part)[part.size - model.n_vectors :])
 
 
-def _paired(kept: _Blocks, larger: _Blocks, genuine: IntArray) -> tuple[IntArray, IntArray]:
+def _same_modes(kept: _Blocks, larger: _Blocks, genuine: IntArray) -> tuple[IntArray, IntArray]:
     """Return the modes of both that are the same ones, by frequency and by compliance."""
     one, two = kept.static[genuine], larger.static
     size = np.maximum(np.abs(two).max(axis=0, initial=0.0), TINY)
@@ -196,7 +196,7 @@ def _may_follow(plant: StandardPlant, ports: Ports) -> FloatArray:
     )
 
 
-def _covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> FloatArray:
+def _motion_covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> FloatArray:
     """Return the stationary covariance of the motions of some modes."""
     poles = blocks.poles[chosen].reshape(-1)
     if np.any(poles.real >= 0):

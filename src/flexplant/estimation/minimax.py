@@ -112,7 +112,7 @@ def design_minimax_filter(
     spread = kalman.covariance.diagonal() / scale**2
     units = _Units.of(part(start).sight, model.innovation(P), spread, (scale, unit))
     with Progress(None, STEPS, progress=progress):
-        found, slope = _searched(errors, part, units, start, steps)
+        found, slope = _best_gains(errors, part, units, start, steps)
     values = np.array([error.value(part(found)) for error in errors])
     system = filter_system(plant, model, found.K, found.L_z, "minimax_filter")
     truth = _means(others, system, sizes)
@@ -203,7 +203,7 @@ class _Units(NamedTuple):
         return np.concatenate([one.reshape(-1) for one in both])
 
 
-def _searched(
+def _best_gains(
     errors: Sequence[MachineError],
     part: Callable[[Gains], FilterPart],
     units: _Units,

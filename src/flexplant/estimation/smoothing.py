@@ -34,7 +34,7 @@ def smoothed(passage: Passage, sight: Sight) -> tuple[FloatArray, FloatArray]:
     rest = np.zeros((n, count))
     for first, last, stationary in passage.whole():
         if stationary:
-            r, M = _back(passage, sight, (first, last), r, M, hat, variance)
+            r, M = _backward(passage, sight, (first, last), r, M, hat, variance)
             continue
         for k in range(last - 1, first - 1, -1):
             moment = passage.moments[k]
@@ -56,7 +56,7 @@ def smoothed(passage: Passage, sight: Sight) -> tuple[FloatArray, FloatArray]:
     return hat, variance
 
 
-def _back(
+def _backward(
     passage: Passage,
     sight: Sight,
     span: tuple[int, int],
@@ -136,7 +136,7 @@ def lagged(passage: Passage, sight: Sight, lag: int) -> tuple[FloatArray, FloatA
             )  # fmt: skip
             moved = r[:-lag] @ onward.T - r[lag:] @ later.T
             hat[at] += here.part(slice(0, last - lag - first)).applied(moved)
-        known = _known(steady, lag)
+        known = _information(steady, lag)
         T = sight.part(at).c @ onward
         variance[at] -= np.einsum("kzi,ij,kzj->kz", T, known, T)
     listed = np.flatnonzero(slow)
@@ -146,7 +146,7 @@ def lagged(passage: Passage, sight: Sight, lag: int) -> tuple[FloatArray, FloatA
     return hat, variance
 
 
-def _known(steady: Steady, lag: int) -> FloatArray:
+def _information(steady: Steady, lag: int) -> FloatArray:
     """Return what `lag` measurements say, ``sum_j F'^j C2' S^-1 C2 F^j`` over j < lag."""
     C = steady.gains.W @ steady.model.C2
     part, total = C, np.zeros_like(steady.F)

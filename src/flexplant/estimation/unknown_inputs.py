@@ -19,8 +19,8 @@ from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..tolerances import TINY, divisor
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of
-from .filter_model import AGREEMENT, FilterModel, check_noises, filter_model, weighed
-from .invertibility import InputEntry, Invertibility, entry, ranks_and_zeros, unknown_names
+from .filter_model import AGREEMENT, FilterModel, check_noises, filter_model, weigh
+from .invertibility import InputEntry, Invertibility, input_entry, ranks_and_zeros, unknown_names
 from .noise_from_records import with_densities
 
 #: variance of white inputs at the start of the search, beside what the sensors resolve
@@ -147,9 +147,9 @@ def design_input_estimator(
     )
     plant = checked_plant(plant)
     names = unknown_names(plant, inputs)
-    quiet = _without(plant, names)
+    quiet = _without_noise(plant, names)
     check_noises(quiet)
-    model, d = filter_model(quiet), entry(plant, names)
+    model, d = filter_model(quiet), input_entry(plant, names)
     found = ranks_and_zeros(model, d, names)
     design = _unbiased(model, d, found) if isinstance(method, Unbiased) else None
     if design is None:
@@ -186,7 +186,7 @@ def _unbiased(model: FilterModel, d: InputEntry, found: Invertibility) -> _Input
         for _ in range(_STEPS):
             found_gains = gains(model, d, P)
             last, P = P, found_gains.covariance(model)
-            if _change(last, P) < _SETTLED:
+            if _relative_gap(last, P) < _SETTLED:
                 break
     except SolverError as error:
         raise AssumptionError(
@@ -200,13 +200,13 @@ def _unbiased(model: FilterModel, d: InputEntry, found: Invertibility) -> _Input
 def _initial_covariance(m: FilterModel, d: InputEntry, late: bool) -> FloatArray:
     """Return a covariance to start at: that with white inputs of a large variance."""
     F, spread = (m.C2 @ d.G, m.C2 @ m.Q @ m.C2.T + m.R) if late else (d.H, m.R)
-    left = _weighted(F, spread)
+    left = _weighted_inverse(F, spread)
     size = _LARGE * np.sum((left @ spread) * left, axis=1)
     G, H = d.G * size, d.H * size
     return solve_dare(m.A, m.C2, Q=m.Q + G @ d.G.T, R=m.R + H @ d.H.T, S=m.S + G @ d.H.T).P
 
 
-def _change(one: FloatArray, two: FloatArray) -> float:
+def _relative_gap(one: FloatArray, two: FloatArray) -> float:
     size = divisor(two.diagonal())
     return float(np.max(np.abs(one - two).diagonal() / size))
 
@@ -236,11 +236,11 @@ class _InputGains(NamedTuple):
 def _direct_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
     """Return the gains with feedthrough; P is the covariance of x[k|k-1]."""
     spread = m.innovation(P)
-    M = _weighted(d.H, spread)
+    M = _weighted_inverse(d.H, spread)
     rest = np.eye(len(spread)) - d.H @ M
-    L_x = weighed(P @ m.C2.T, spread) @ rest
+    L_x = weigh(P @ m.C2.T, spread) @ rest
     # noise that reaches state and sensors together: what the innovation shows of it beside d
-    K = m.A @ L_x + d.G @ M + weighed(m.S, spread) @ rest
+    K = m.A @ L_x + d.G @ M + weigh(m.S, spread) @ rest
     L = np.vstack([m.C1 @ L_x + d.at_pois @ M, M])
     C = np.vstack([m.C1, np.zeros((len(M), len(P)))])
     bias = max(_max_abs(M @ d.H - np.eye(len(M))), _max_abs((K @ d.H - d.G) / _column_sizes(d.G)))
@@ -250,8 +250,8 @@ def _direct_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
 def _late_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
     """Return the gains without feedthrough; P is that of x[k|k-1], the input left out."""
     spread, F = m.innovation(P), m.C2 @ d.G
-    M = _weighted(F, spread)
-    plain = weighed(P @ m.C2.T, spread)
+    M = _weighted_inverse(F, spread)
+    plain = weigh(P @ m.C2.T, spread)
     L_x = plain + (d.G - plain @ F) @ M
     still = np.eye(len(P)) - L_x @ m.C2
     L = np.vstack([m.C1 @ L_x, M])
@@ -281,8 +281,8 @@ def _augmented(
             f"assumptions: {found.text}. Add a sensor, or give Augmented a corner above 0."
         ) from error
     spread = larger.innovation(P)
-    gain = weighed(P @ C2.T, spread)
-    K = A @ gain + weighed(larger.S, spread)
+    gain = weigh(P @ C2.T, spread)
+    K = A @ gain + weigh(larger.S, spread)
     gains = _InputGains(A, C, K, C @ gain, A - K @ C2, larger.driven(K), False, 0.0)
     return _input_design(larger, gains, P, gains.covariance(larger))
 
@@ -338,7 +338,7 @@ def _system(
     )
 
 
-def _without(plant: StandardPlant, names: Sequence[str]) -> StandardPlant:
+def _without_noise(plant: StandardPlant, names: Sequence[str]) -> StandardPlant:
     """Return the plant without the white noise of some disturbances."""
     loud = [name for name in names if plant.asd.get(name, 0.0) > 0]
     if not loud:
@@ -351,7 +351,7 @@ def _without(plant: StandardPlant, names: Sequence[str]) -> StandardPlant:
     return with_densities(plant, dict.fromkeys(loud, 0.0))
 
 
-def _weighted(F: FloatArray, spread: FloatArray) -> FloatArray:
+def _weighted_inverse(F: FloatArray, spread: FloatArray) -> FloatArray:
     """Return ``(F' S^-1 F)^-1 F' S^-1``, sensors and inputs of unit size inside."""
     size = np.sqrt(spread.diagonal())
     scaled = F / size[:, None]

@@ -340,7 +340,7 @@ class Moments:
         keep = wanted(poles)
         z, poles = z[keep], poles[keep]
         powers = z[:, None] ** np.arange(order + 1)
-        left, right = _null_vectors(z, np.tensordot(powers, A, axes=1))
+        left, right = _pole_vectors(z, np.tensordot(powers, A, axes=1))
         values = np.einsum("kom,km->ok", np.tensordot(powers, B, axes=(1, 1)), right)
         size = np.linalg.norm(values, axis=0)
         seen = size > 0
@@ -371,7 +371,7 @@ class Moments:
         return A.reshape(n, m, m), B
 
 
-def _null_vectors(z: ComplexArray, matrices: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+def _pole_vectors(z: ComplexArray, matrices: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """Return (n, m) left and right null vectors l, r of A(z) (n, m, m): l A = 0, A r = 0.
 
     Those of a pole that is repeated but for rounding are independent.
@@ -476,8 +476,8 @@ def diagram_of(
     found = []
     for window in windows(ready):
         freq = ready.freq[window.seen]
-        moments = _moments(ready, window, orders[-1])
-        inside = partial(_inside, band=(float(freq[0]), float(freq[-1])), max_zeta=max_zeta)
+        moments = _moments_in(ready, window, orders[-1])
+        inside = partial(_in_band, band=(float(freq[0]), float(freq[-1])), max_zeta=max_zeta)
         results = [moments.solve(order, inside) for order in orders]
         diagram = built_diagram(results, np.array([low, high]), tolerances)
         ends = (
@@ -511,19 +511,19 @@ def weighted_by_remainder(ready: PreparedLines, order: int) -> PreparedLines:
         parts = windows(now)
         for window in parts:
             own = slice(window.first, window.last)
-            fitted: ComplexArray = _moments(now, window, order).response(order, now.freq[own])
+            fitted: ComplexArray = _moments_in(now, window, order).response(order, now.freq[own])
             error[:, :, own] = np.abs(now.data[:, :, own] - fitted) ** 2
         share = (order + 1) * len(parts) / n_freq * (1 + n_in / n_out)
         now = now.from_errors(error, min(0.5, share))
     return now
 
 
-def _moments(ready: PreparedLines, window: Window, order: int) -> Moments:
+def _moments_in(ready: PreparedLines, window: Window, order: int) -> Moments:
     seen = window.seen
     return Moments(ready.freq[seen], ready.data[:, :, seen], ready.line_weight[:, seen], order)
 
 
-def _inside(poles: ComplexArray, band: tuple[float, float], max_zeta: float) -> BoolArray:
+def _in_band(poles: ComplexArray, band: tuple[float, float], max_zeta: float) -> BoolArray:
     """Return which poles count in a part of the band."""
     freq = np.abs(poles) / (2 * np.pi)
     zeta = -poles.real / np.abs(poles)

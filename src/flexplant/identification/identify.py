@@ -40,9 +40,9 @@ from .diagram import (
     diagram_of,
     weighted_by_remainder,
 )
-from .frf_estimation import repetitions, stacked
-from .gate import entry, gated, lesser, single, steady
-from .line_weights import PreparedLines, Rejected, prepared
+from .frf_estimation import repetitions, stacked_runs
+from .gate import gated, lesser, rejected, single, steady
+from .line_weights import PreparedLines, Rejected, prepared_lines
 from .model_error import ALIKE, NOISE, Disagreement, disagreement, outputs_disagree, strength
 from .pole_test import (
     UPPER,
@@ -51,7 +51,7 @@ from .pole_test import (
     freedom,
     improved,
     merged,
-    missed,
+    missed_poles,
     more_terms,
     own_price,
     relocated,
@@ -155,7 +155,7 @@ def stabilisation_diagram(
             f"{tolerances!r}."
         )
     top = between(max_zeta, "max_zeta", 0.0, 1.0, "From 1 on nothing oscillates: pass 0.2, say.")
-    ready, listed = prepared(frf, band), None if orders is None else checked_orders(orders)
+    ready, listed = prepared_lines(frf, band), None if orders is None else checked_orders(orders)
     if not ready.known:
         ready = weighted_by_remainder(ready, affordable(listed, ready)[-1])
     with one_thread():
@@ -297,7 +297,7 @@ def _identified(
     progress: bool | None,
 ) -> IdentifiedModes:
     frf = runs[0]
-    ready = prepared(stacked(runs) if len(runs) > 1 else frf, band)
+    ready = prepared_lines(stacked_runs(runs) if len(runs) > 1 else frf, band)
     high = float(ready.freq[-1])
     lower = whole(lower, "lower", minimum=0, maximum=MOST_TERMS)
     terms = UPPER[-1] if upper is None else whole(upper, "upper", minimum=0, maximum=MOST_TERMS)
@@ -343,7 +343,7 @@ def _identified(
             lines = lines_of(ready)
             found = _at_peaks(lines)
             at_peaks = found is not None
-            found = found or _nearest(lines, diagram)
+            found = found or _highest_pole(lines, diagram)
             if found is None:
                 raise
             chosen, alone, refine = found, False, False if at_peaks else refine
@@ -384,7 +384,7 @@ def _identified(
             fit = less if outputs_disagree(less, fit.cost) else fit
         differ = judged and outputs_disagree(fit)
         asked = side not in ("", lines.side)
-        if asked or (not side and judged and not differ and _turns(fit)):
+        if asked or (not side and judged and not differ and _may_disagree(fit)):
             other = single(lines_of(ready.turned), fit, fit.shapes, QUICK)
             differ = judged and outputs_disagree(other, np.inf if asked else fit.cost)
             if differ or asked:
@@ -399,7 +399,7 @@ def _identified(
         else:
             budget.most = np.inf if refine else budget.done + BUDGET
             try:
-                ready, lines, fit = _refined(ready, lines_of, fit, alone, free, steps, bar)
+                ready, lines, fit = _likeliest_fit(ready, lines_of, fit, alone, free, steps, bar)
             except Exhausted:
                 reason = f"more is left than shared poles explain after {BUDGET:.0e} operations"
         budget.most, settled = np.inf, not reason
@@ -453,7 +453,7 @@ def _odd(frf: Frf, lines: Lines, apart: Disagreement) -> str:
     return f"{who} is off by {100 * off:.2g} %, far more than the others: look at it. "
 
 
-def _nearest(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection | None:
+def _highest_pole(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection | None:
     """Return the diagram's pole nearest the largest response, None where nothing stands out.
 
     In a band little wider than its resonance, whose lines afford few orders, poles of outputs that
@@ -480,7 +480,7 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
     fit = Fit(lines, none[0], none)
     ends = 2 * np.pi * np.array([lines.freq[FLANK], lines.freq[-1 - FLANK]])
     for _ in range(MOST):
-        trials = [one for rivals in missed(lines, fit) for one in rivals]
+        trials = [one for rivals in missed_poles(lines, fit) for one in rivals]
         trials = [
             one
             for one in trials
@@ -494,7 +494,7 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
     return PoleSelection(fit.poles, fit.participation) if fit.poles.size else None
 
 
-def _turns(fit: Fit) -> bool:
+def _may_disagree(fit: Fit) -> bool:
     """Return whether references may disagree: more than noise is left, or poles stand beside."""
     return len(fit.participation) > 1 and bool(
         lesser(fit, fit.shapes, ALIKE) or fit.cost > NOISE * freedom(fit.lines, fit.m)
@@ -517,14 +517,14 @@ def _first_fit(
     height[lesser(fit, fit.shapes, ALIKE)] *= TINY  # of two poles of one resonance one counts
     places = np.argsort(-height, kind="stable")
     keep, others = np.sort(places[: lines.most]), places[lines.most :]
-    weaker = tuple(entry(fit, int(k), f"weaker than the {lines.most} of most=") for k in others)
+    weaker = tuple(rejected(fit, int(k), f"weaker than the {lines.most} of most=") for k in others)
     if weaker:
         fit = pivoted(lines, fit.poles[keep], fit.participation[:, keep])
     fit = refined(lines, fit.poles, fit.participation, steps=steps, strict=False, first=fit)
     return fit, weaker
 
 
-def _refined(
+def _likeliest_fit(
     ready: PreparedLines,
     lines_of: Callable[[PreparedLines], Lines],
     first: Fit,
@@ -538,8 +538,8 @@ def _refined(
     reducing = [(unwindowed, 1), (dropped, int(alone))]
     reducing += [(merged, MOST * int(alone)), (fewer_terms, int(free))]
     growing = [
-        *((missed, MOST), (merged, MOST), (more_terms, int(free))),
-        *((split_proposals, MOST), (relocated, MOST), (merged, MOST), (missed, MOST)),
+        *((missed_poles, MOST), (merged, MOST), (more_terms, int(free))),
+        *((split_proposals, MOST), (relocated, MOST), (merged, MOST), (missed_poles, MOST)),
     ]
     for _ in range(1 if ready.known else 2):
         lines = lines_of(ready)

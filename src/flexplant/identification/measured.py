@@ -405,13 +405,13 @@ def numbered(
             f"{alike[worst, int(np.argmin(distance[worst]))]:.2f}. Add modes to the model, loosen "
             "tolerance=, or leave these poles out with partial=True."
         )
-    _in_order(pairs, measured.freq, modes.omega)
+    _sort_families(pairs, measured.freq, modes.omega)
     kept = sorted(pairs)
     chosen = measured if len(kept) == len(measured) else measured.select(kept)
     return chosen.replace(modes=tuple(pairs[i] for i in kept))
 
 
-def _in_order(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -> None:
+def _sort_families(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -> None:
     """Give the numbers of each family of modes to its poles by frequency; rounding chose else."""
     free = sorted(pairs, key=lambda i: pairs[i])
     while free:

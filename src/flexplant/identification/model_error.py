@@ -91,7 +91,7 @@ def strength(fit: Fit) -> FloatArray:
     return np.asarray(height * np.linalg.norm(fit.participation, axis=0))
 
 
-def twin(fit: Fit) -> tuple[int, int] | None:
+def twin_poles(fit: Fit) -> tuple[int, int] | None:
     """Return two poles within a bandwidth with the same shape and participation, the weak one last.
 
     One resonance that is no straight circle (leakage, an amplitude that matters) becomes such a

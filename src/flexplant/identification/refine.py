@@ -500,7 +500,7 @@ def _smooth_step(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     decay = np.exp(-far)
     value = (1.0 - decay) / far
     slope = (decay * (1.0 + far) - 1.0) / far**2
-    return _joined(x, near, value, slope, 1)
+    return _with_series(x, near, value, slope, 1)
 
 
 def _ramp(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
@@ -510,10 +510,10 @@ def _ramp(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     decay = np.exp(-far)
     value = (far - 1.0 + decay) / far**2
     slope = ((1.0 - decay) / far - 2.0 * value) / far
-    return _joined(x, near, value, slope, 2)
+    return _with_series(x, near, value, slope, 2)
 
 
-def _joined(
+def _with_series(
     x: ComplexArray,
     near: npt.NDArray[np.bool_],
     value: ComplexArray,

@@ -102,16 +102,16 @@ def _covariances(fit: Fit, ready: PreparedLines) -> tuple[FloatArray, ComplexArr
     held = np.zeros((n_out, n_out, 2 * m, 2 * m))
     if ready.independent:
         for a, own in enumerate(direct):
-            held[a, a] = _inner(own, own)
+            held[a, a] = _inner_product(own, own)
     else:
         gains = [np.einsum("ifp,qp->ifq", J, inverse) for J in fit.jacobians()]
         common = np.zeros_like(inverse)
         for a in range(n_out):
             for b in range(n_out):
                 other = ready.spread(a, b, direct[b])
-                common = common + _inner(gains[a], ready.spread(a, b, gains[b]))
-                mixed[b] += _inner(gains[a], other)
-                held[a, b] = _inner(direct[a], other)
+                common = common + _inner_product(gains[a], ready.spread(a, b, gains[b]))
+                mixed[b] += _inner_product(gains[a], other)
+                held[a, b] = _inner_product(direct[a], other)
     slopes = np.concatenate([slopes, _free_entries(fit)])
     mixed = mixed.reshape(n_out, -1, 2, m)
     held = held.reshape(n_out, n_out, 2, m, 2, m)
@@ -171,7 +171,7 @@ def _scale_errors(
     return np.asarray(T)
 
 
-def _inner(left: ComplexArray, right: ComplexArray | None) -> Any:
+def _inner_product(left: ComplexArray, right: ComplexArray | None) -> Any:
     """Return Re(left^H right), summed over inputs and lines; zero where right is None."""
     if right is None:
         return 0.0

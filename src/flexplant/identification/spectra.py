@@ -13,7 +13,7 @@ from ..errors import ModelError, ShapeError, warn
 from ..lti.frequency import Frf
 from ..lti.measured_lines import checked_overlap, checked_window
 from ..tolerances import ROUNDING, TINY
-from .feedback import feedback, feedback_warned
+from .feedback import feedback_bias, feedback_warned
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -223,7 +223,7 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
         overlap=method.overlap,
     )
     if data.r is None:
-        feedback_warned(feedback(frf))
+        feedback_warned(feedback_bias(frf))
     return frf
 
 

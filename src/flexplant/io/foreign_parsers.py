@@ -135,7 +135,7 @@ def run(name: str, path: str) -> tuple[str, Any]:
         return type(error).__name__, str(error)
 
 
-def answered(request: tuple[list[str], str, str]) -> bytes:
+def outcome_of(request: tuple[list[str], str, str]) -> bytes:
     """Return the pickled outcome of a request (sys.path, function, file)."""
     sys.path[:], name, path = request
     try:
@@ -155,7 +155,7 @@ def main() -> None:
             request = pickle.load(sys.stdin.buffer)
         except EOFError:
             return
-        answers.write(answered(request))
+        answers.write(outcome_of(request))
         answers.flush()
 
 

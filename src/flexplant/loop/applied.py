@@ -35,10 +35,10 @@ def applied_law(loop: ClosedLoop, recovery: float | None) -> tuple[StateSpace, F
         )
     if recovery is None:
         return law, np.zeros((law.n_states, nu))
-    return law, _back(loop, law.A, law.C[:nu], float(np.exp(-1.0 / recovery)))
+    return law, _mirror_gain(loop, law.A, law.C[:nu], float(np.exp(-1.0 / recovery)))
 
 
-def _back(loop: ClosedLoop, A: FloatArray, C: FloatArray, radius: float) -> FloatArray:
+def _mirror_gain(loop: ClosedLoop, A: FloatArray, C: FloatArray, radius: float) -> FloatArray:
     """Return L that mirrors the slow poles of the driving blocks at a circle.
 
     Only poles beyond the circle move: with V a basis of their invariant subspace, ``A V = V S``

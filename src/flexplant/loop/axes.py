@@ -9,7 +9,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, flag, instance, positive
 from ..errors import ModelError, ShapeError, counted
 from ..lti.frequency import Frf
-from ..lti.measured_lines import followed
+from ..lti.measured_lines import on_lines
 from ..lti.statespace import StateSpace, System, as_statespace
 
 #: degrees of freedom above which a variance is taken as it is
@@ -72,7 +72,7 @@ def in_axes(
     data = np.einsum("ay,yuf,ub->abf", last.D, chosen.data, first.D)
     variance = line_variance(chosen)
     if variance is not None:
-        variance = _carried(last.D, first.D, variance, chosen.correlation)
+        variance = _error_variance(last.D, first.D, variance, chosen.correlation)
     freq, late = frf.freq, positive(delay, "delay", zero=True)
     held = flag(hold, "hold")
     if rate is None and late:
@@ -129,7 +129,7 @@ def _near_mean(values: FloatArray, reach: int) -> FloatArray:
     return np.asarray((total[..., high] - total[..., low]) / (high - low))
 
 
-def _carried(
+def _error_variance(
     after: FloatArray, before: FloatArray, variance: FloatArray, correlation: ComplexArray | None
 ) -> FloatArray:
     """Return the variance of ``after G before``; errors of different inputs are independent."""
@@ -165,7 +165,7 @@ def _sampled_response(
         at = np.abs(moved)
         known = (at >= lines[0]) & (at <= lines[-1])
         G = np.zeros(total.shape, dtype=complex)
-        G[..., known] = followed(lines, data, at[known])
+        G[..., known] = on_lines(lines, data, at[known])
         hold = np.sinc(moved / rate) * np.exp(-2j * np.pi * moved * (0.5 + late) / rate)
         total += np.where(moved < 0.0, G.conj(), G) * hold
     return total

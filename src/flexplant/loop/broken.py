@@ -130,7 +130,7 @@ def inverted(L: ComplexArray) -> ComplexArray:
         return np.asarray(np.linalg.inv(eye - (1.0 - _BESIDE) * L))
 
 
-def largest(S: ComplexArray) -> FloatArray:
+def largest_singular(S: ComplexArray) -> FloatArray:
     """Return the largest singular value at each frequency: the root of an eigenvalue of S* S."""
     return np.asarray(np.sqrt(np.linalg.eigvalsh(S.conj().swapaxes(1, 2) @ S)[:, -1]))
 
@@ -205,7 +205,7 @@ def scaled_size(S: ComplexArray) -> FloatArray:
     [Skogestad2005]_, section 8.8, whatever the units of the axes. Where it cannot be the
     largest it is a bound from above.
     """
-    log = _balanced(S)
+    log = _log_scaling(S)
     size = _scaled_norms(S, log)
     if S.shape[-1] < 3:  # the product of both singular values is fixed: balanced is optimal
         return size
@@ -227,7 +227,7 @@ def _d_scaled(S: ComplexArray, log: FloatArray) -> ComplexArray:
     return np.asarray(S * np.exp(log[:, :, None] - log[:, None, :]))
 
 
-def _balanced(S: ComplexArray) -> FloatArray:
+def _log_scaling(S: ComplexArray) -> FloatArray:
     """Return log D (k, n) of the least Frobenius norm: each row as large as its column."""
     k, n = S.shape[:2]
     power, log = np.abs(S) ** 2, np.zeros((k, n))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..certificates import in_words
+from ..certificates import one_line
 from ..checks import ComplexArray, FloatArray, Value, name_list, whole
 from ..errors import ModelError, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
@@ -103,7 +103,7 @@ class ClosedLoop(Value):
             lines.append(f"  with the modes left out: {self.left_out.summary}")
         if self.tolerances is not None:
             found = self.tolerances.certificate
-            lines.append(f"  {in_words(found) if found else self.tolerances.summary}")
+            lines.append(f"  {one_line(found) if found else self.tolerances.summary}")
         return "\n".join(lines)
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks import FloatArray, Value, instance, short
 from ..errors import LabelError, ModelError, require_known
-from ..lti.frequency_sweep import climbed
+from ..lti.frequency_sweep import climbed_grid
 from .blocks import references
 from .closed import ClosedLoop
 from .sensitivity import first_above
@@ -201,7 +201,7 @@ def error_sensitivity(
             )
         reference, error = pair
     gain = loop.gain(reference, error)
-    return climbed(lambda freq: np.abs(gain(freq)[0, 0]), loop.broken.grid, 4)
+    return climbed_grid(lambda freq: np.abs(gain(freq)[0, 0]), loop.broken.grid, 4)
 
 
 def axis_sensitivities(loop: ClosedLoop) -> dict[str, tuple[FloatArray, FloatArray]]:

@@ -124,7 +124,7 @@ def balanced(
     left, values, right = np.linalg.svd(Lq.T @ Lp)
     rank = int(np.sum(values > RANK * values[0])) if values.size and values[0] > 0 else 0
     n_kept = split.rest.n_states
-    r = min(_order(order, tol, values, n_kept), rank)
+    r = min(_reduced_order(order, tol, values, n_kept), rank)
     W = Lq @ left[:, :rank] / np.sqrt(values[:rank])
     T = Lp @ right[:rank].T / np.sqrt(values[:rank])
     reduced = _project(stable, W, T, r, residual=match_dc)
@@ -139,7 +139,7 @@ def balanced(
     return BalancedReduction(_rejoined(g, split, reduced), values, bound, error, freq, n_kept)
 
 
-def _order(order: int | None, tol: float | None, values: FloatArray, n_kept: int) -> int:
+def _reduced_order(order: int | None, tol: float | None, values: FloatArray, n_kept: int) -> int:
     """Return the number of stable states."""
     if order is not None:
         r = int(order) - n_kept

@@ -173,7 +173,7 @@ def second_order(b2: float, b1: float, b0: float, omega: float, zeta: float) -> 
     )
 
 
-def _number(gain: float) -> float:
+def _checked_gain(gain: float) -> float:
     return float(real_array(gain, "gain", ()))
 
 
@@ -205,7 +205,7 @@ def lowpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     >>> round(abs(fx.lowpass(100.0)(2j * 3.141592653589793 * 100.0)), 4)
     0.7071
     """
-    return _butterworth(freq, order, 0.0, _number(gain))
+    return _butterworth(freq, order, 0.0, _checked_gain(gain))
 
 
 def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
@@ -237,7 +237,7 @@ def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     >>> round(abs(high(2j * np.pi * 10.0)), 4), round(abs(high(0.0)), 4)
     (0.7071, 0.0)
     """
-    return _butterworth(freq, order, _number(gain), 0.0)
+    return _butterworth(freq, order, _checked_gain(gain), 0.0)
 
 
 def _butterworth(freq: float, order: int, high: float, low: float) -> StateSpace:
@@ -311,7 +311,7 @@ def leadlag(zero: float, pole: float, *, gain: float = 1.0) -> StateSpace:
     >>> round(float(np.angle(lead(2j * np.pi * 30.0), deg=True)), 1)
     53.1
     """
-    ratio, gain = positive(pole, "pole") / positive(zero, "zero"), _number(gain)
+    ratio, gain = positive(pole, "pole") / positive(zero, "zero"), _checked_gain(gain)
     return first_order(gain * ratio, gain, 2.0 * np.pi * pole)
 
 

@@ -127,7 +127,7 @@ def solve_dare(
     >>> print(f"{solve_dare(one, one, Q=one, R=one).P[0, 0]:.12f}")  # the golden ratio
     1.618033988750
     """
-    return _solve_riccati(_problem(A, C, Q, R, S, discrete=True))
+    return _solve_riccati(_riccati_problem(A, C, Q, R, S, discrete=True))
 
 
 def solve_care(
@@ -169,7 +169,7 @@ def solve_care(
     >>> found.P.round(9), found.poles.real.round(9)  # p^2 = 4
     (array([[2.]]), array([-2.]))
     """
-    return _solve_riccati(_problem(A, C, Q, R, S, discrete=False))
+    return _solve_riccati(_riccati_problem(A, C, Q, R, S, discrete=False))
 
 
 def control_dare(
@@ -268,7 +268,7 @@ def _dual(
     return solution.replace(gain=solution.gain.T)
 
 
-def _problem(
+def _riccati_problem(
     A: FloatArray,
     C: FloatArray,
     Q: FloatArray,
@@ -495,14 +495,14 @@ def _defect(p: RiccatiProblem) -> str:
             distinct.append(complex(value))
     for value in distinct:
         shifted = p.A - value * np.eye(p.A.shape[0])
-        missed = _unseen(shifted, p.G)
+        missed = _hidden(shifted, p.G)
         if missed:
             return (
                 f"{missed} mode(s) of A at {value:.6g} (rigid-body or unstable) cannot be seen in "
                 "the outputs (reached by the inputs, in the control form), so their error is "
                 "unbounded. Add or move sensors (actuators)."
             )
-        missed = _unseen(shifted.conj().T, p.Q) if _growth(p, np.array(value)) < SPLIT * size else 0
+        missed = _hidden(shifted.conj().T, p.Q) if _growth(p, np.array(value)) < SPLIT * size else 0
         if missed:
             return (
                 f"{missed} mode(s) of A at {value:.6g} (rigid-body) are not excited by the noise Q "
@@ -512,7 +512,7 @@ def _defect(p: RiccatiProblem) -> str:
     return ""
 
 
-def _unseen(shifted: ComplexArray, weight: FloatArray) -> int:
+def _hidden(shifted: ComplexArray, weight: FloatArray) -> int:
     """Return how many directions of the null space of `shifted` the quadratic form misses."""
     _, sizes, right = la.svd(shifted)
     null = right[sizes < EDGE * max(1.0, float(sizes[0]))].conj().T

@@ -383,7 +383,7 @@ def of_sensors(p: Separation) -> Quadratic:
     """Return the cost as a function of the sensors beside all actuators of the problem."""
     S, V = p.control(tuple(range(len(p.actuators))))
     constant = float(np.sum(S * p.W) + np.sum(V * p.ahead(np.zeros_like(p.A))))
-    looks = _root(V) @ np.linalg.matrix_power(p.A, p.delay)
+    looks = _semidefinite_root(V) @ np.linalg.matrix_power(p.A, p.delay)
     return quadratic(p.A.T, p.W, looks, p.sensors, constant=constant)
 
 
@@ -394,14 +394,14 @@ def of_actuators(p: Separation) -> Quadratic:
     """
     P = p.covariance(tuple(range(len(p.sensors))))
     power = np.linalg.matrix_power(p.A, p.delay)
-    innovations = _root(power @ (p.A @ P @ p.A.T + p.W - P) @ power.T)
+    innovations = _semidefinite_root(power @ (p.A @ P @ p.A.T + p.W - P) @ power.T)
     seen = innovations @ p.rows.T
     constant = float(np.einsum("ij,jk,ik->", p.rows, p.ahead(P), p.rows) + np.sum(seen**2))
     H = p.rows.T @ p.rows
     return quadratic(p.A, H, innovations @ p.A.T, p.actuators, constant=constant)
 
 
-def _root(X: FloatArray) -> FloatArray:
+def _semidefinite_root(X: FloatArray) -> FloatArray:
     """Return r with ``r' r = X``, which is positive semidefinite apart from rounding."""
     size = np.sqrt(np.maximum(X.diagonal(), 0.0))
     unit = divisor(size)

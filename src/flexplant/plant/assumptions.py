@@ -218,7 +218,7 @@ def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
     pairs = plant.modal_blocks[n_rigid:count]
     omega = np.sqrt(np.abs(np.linalg.det(pairs)))
     zeta = -0.5 * np.trace(pairs, axis1=1, axis2=2) / omega
-    swinging = _swinging(pairs)
+    swinging = _undamped_pairs(pairs)
     # filters of ports act at the pole; one that does not swing stands for its frequency
     wanted = omega * (-zeta + 1j * np.sqrt(np.maximum(1.0 - zeta**2, 0.0)))
     wanted = np.where(zeta < 1.0, wanted, 1j * omega)
@@ -249,12 +249,12 @@ def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
             motions = np.array(seen).reshape(omega.size, len(names))
         sides[side] = names, np.abs(motions)
     return tuple(
-        _entry(n_rigid + 1 + k, float(omega[k]), float(zeta[k]), k, sides)
+        _visibility(n_rigid + 1 + k, float(omega[k]), float(zeta[k]), k, sides)
         for k in range(omega.size)
     )
 
 
-def _swinging(pairs: FloatArray) -> FloatArray:
+def _undamped_pairs(pairs: FloatArray) -> FloatArray:
     """Return the pairs, those of real modes without their damping: it is no part of the shape."""
     real = pairs[:, 0, 0] == 0.0
     swinging = pairs.copy()
@@ -262,7 +262,7 @@ def _swinging(pairs: FloatArray) -> FloatArray:
     return swinging
 
 
-def _entry(
+def _visibility(
     number: int,
     omega: float,
     zeta: float,

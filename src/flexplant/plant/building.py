@@ -35,7 +35,7 @@ from .sampling import sampled_physical
 from .sensors import Poi
 
 
-def selected(own: Assembled, ports: Ports) -> Assembled | None:
+def with_ports_of(own: Assembled, ports: Ports) -> Assembled | None:
     """Return a plant's origin with some of its sensors, actuators and POIs in their order."""
     # None for ports that are others or in another order, or whose noise the states hold mixed
     if not _among(ports, own.ports):
@@ -59,14 +59,14 @@ def selected(own: Assembled, ports: Ports) -> Assembled | None:
 
 def _among(ports: Ports, own: Ports) -> bool:
     """Return whether the ports are some of a plant's own, in their order, without lost noise."""
-    some = _in_order(ports.u, own.u) and _in_order(ports.y, own.y)
-    same = len(ports.w) == len(own.w) and _in_order(ports.w, own.w)
+    some = _is_subsequence(ports.u, own.u) and _is_subsequence(ports.y, own.y)
+    same = len(ports.w) == len(own.w) and _is_subsequence(ports.w, own.w)
     noisy = own.input_noises.keys() == ports.input_noises.keys()
     known = {poi.name: poi for poi in own.z}
     return some and same and noisy and all(_is_part(poi, known.get(poi.name)) for poi in ports.z)
 
 
-def _in_order(ports: Sequence[Value], own: Sequence[Value]) -> bool:
+def _is_subsequence(ports: Sequence[Value], own: Sequence[Value]) -> bool:
     """Return whether all of some ports are among others, in their order."""
     left = iter(own)
     return all(any(port is other for other in left) for port in ports)
@@ -259,7 +259,7 @@ def rebuilt(
         )
     own = plant.assembled
     if isinstance(ports, Ports) and realisation is None:
-        found = selected(own, ports)
+        found = with_ports_of(own, ports)
         if found is not None:
             before = own.continuous
             whole = None if before is None else rebuilt(before, ports=ports)

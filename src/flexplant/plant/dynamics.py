@@ -58,7 +58,7 @@ def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
         realisation.A,
         np.array([realisation.force(load) for load in own.push]).T,
         np.array([one.row for one in own.seen]),
-        np.array([followed(*one, own.push, own.ground) for one in both]) + own.added,
+        np.array([direct_effect(*one, own.push, own.ground) for one in both]) + own.added,
         inputs=own.inputs,
         outputs=own.outputs,
         states=realisation.names,
@@ -134,7 +134,7 @@ class Parts(NamedTuple):
     after: dict[str, StateSpace]
 
 
-def followed(one: Seen, order: int, push: FloatArray, ground: FloatArray) -> FloatArray:
+def direct_effect(one: Seen, order: int, push: FloatArray, ground: FloatArray) -> FloatArray:
     """Return what a channel shows at once (m,) of loads `push` (m, n) and of `ground` (m, 6)."""
     # an accelerometer on a free body shows none of the ground's: the load -M r takes back what it
     # adds
@@ -170,7 +170,7 @@ def with_ground(parts: Parts, carried: Mapping[str, Carried]) -> Parts:
                 raise ModelError(_unbounded(output, one.order, name, left, found))
             if left:
                 needed.setdefault(name, set()).add(left)
-            entries[own, _channel(name, left)] = gain
+            entries[own, _ground_name(name, left)] = gain
     for name, lefts in needed.items():
         before[name] = _with_integrals(before[name], name, sorted(lefts))
     inputs = [name for part in before.values() for name in part.outputs]
@@ -179,7 +179,7 @@ def with_ground(parts: Parts, carried: Mapping[str, Carried]) -> Parts:
     return Parts(wider, before, after)
 
 
-def _channel(name: str, times: int) -> str:
+def _ground_name(name: str, times: int) -> str:
     """Return the name of the ground's acceleration, integrated some times."""
     return name if not times else f"{name}:{QUANTITIES[2 - times]}"
 
@@ -216,7 +216,7 @@ def _with_integrals(part: StateSpace, name: str, times: list[int]) -> StateSpace
     return part.replace(
         C=np.vstack([part.C, *rows]),
         D=np.vstack([part.D, np.zeros((len(times), 1))]),
-        outputs=[name, *(_channel(name, count) for count in times)],
+        outputs=[name, *(_ground_name(name, count) for count in times)],
         units={},
     )
 

@@ -132,7 +132,7 @@ def position_map(plant: Any, judge: Any, points: Any) -> PositionMap:
             "the plant has no positions: nothing of it moves. Give ports moves={'x': (-1, 0, 0)} "
             "and Ports(..., positions=[fx.plant.Position('x', range=(-0.1, 0.1))])."
         )
-    judges = _judges(judge)
+    judges = _named_judges(judge)
     grid = values_over(positions, points)
     own = _decoupled(plant)
     rows: list[tuple[Any, ...]] = []
@@ -144,7 +144,7 @@ def position_map(plant: Any, judge: Any, points: Any) -> PositionMap:
         shares = [one for one in mode_visibility(there) if one.freq < most]
         modes = tuple(f"mode {one.mode} ({one.freq:.4g} Hz)" for one in shares)
         sees, pushes = ([one.shares.get(side, 0.0) for one in shares] for side in "yu")
-        rows.append((_errors(own, there), sees, pushes, list(_figures_at(judges, there, values))))
+        rows.append((_misses(own, there), sees, pushes, list(_figures_at(judges, there, values))))
     shape = tuple(values.size for values in grid.values())
     decoupling, seen, reached, judged = (
         np.array(part, dtype=float) for part in zip(*rows, strict=True)
@@ -160,7 +160,7 @@ def position_map(plant: Any, judge: Any, points: Any) -> PositionMap:
     )
 
 
-def _judges(judge: Any) -> dict[str, Callable[[Any], float]]:
+def _named_judges(judge: Any) -> dict[str, Callable[[Any], float]]:
     """Return named functions of a plant."""
     hint = "Pass a function of a plant, or {'margin': function}."
     if judge is None:
@@ -192,7 +192,7 @@ def _decoupled(plant: Any) -> Decoupling | None:
         return None
 
 
-def _errors(own: Decoupling | None, plant: Any) -> tuple[float, float]:
+def _misses(own: Decoupling | None, plant: Any) -> tuple[float, float]:
     """Return by what transformations miss the identity at another place: of sensors, actuators."""
     if own is None:
         return np.nan, np.nan

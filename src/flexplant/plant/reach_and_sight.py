@@ -56,7 +56,7 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
     poles = _persistent(bare.system)
     rate = 1.0 / plant.dt if plant.dt and not bare.dt else 0.0
     sampled, apart = _alias_groups(poles, rate), [[pole] for pole in poles]
-    words = _counted(bare, poles)
+    words = _undamped_kinds(bare, poles)
     found = []
     for case in _cases(bare, poles, plant):
         groups = sampled if case.held else apart
@@ -75,7 +75,7 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
     return found
 
 
-def _counted(plant: Partition, poles: list[_Pole]) -> list[str]:
+def _undamped_kinds(plant: Partition, poles: list[_Pole]) -> list[str]:
     """Return, in words, how many modes of each kind do not decay."""
     rigid, pairs = plant.n_rigid, len(plant.unstable_modes)
     every = f"all {rigid} rigid-body modes" if rigid > 1 else "the rigid-body mode"
@@ -210,12 +210,12 @@ def _lacks(plant: Partition, group: list[_Pole], case: _Case, rate: float) -> li
             parts.append(part * (size if size > _ALIKE else 0.0))
         else:
             parts.append(_modal_rows(g.C[g.output_index(case.names)], basis))
-    missing = _missing(np.hstack(parts).T)  # one column for each channel
+    missing = _null_combinations(np.hstack(parts).T)  # one column for each channel
     if not missing.shape[1]:
         return []
     if rigid.size:
         shapes = (bases[0] @ missing)[rigid].real
-        return [f"{case.verb} the rigid-body {' and '.join(_described(plant, shapes))}"]
+        return [f"{case.verb} the rigid-body {' and '.join(_axes_in_words(plant, shapes))}"]
     grows = any(pole.value.real > 0 and not pole.value.imag for pole in group)
     fate = "grows" if grows else "does not decay"
     names = list(dict.fromkeys(_pole_name(plant, pole.value) for pole in group))
@@ -275,7 +275,7 @@ def _weights_without(plant: Partition, key: str) -> list[str]:
     return texts
 
 
-def _missing(matrix: ComplexArray | FloatArray) -> ComplexArray:
+def _null_combinations(matrix: ComplexArray | FloatArray) -> ComplexArray:
     """Return the combinations (r, missing) that no channel has part in."""
     sizes = np.linalg.norm(matrix, axis=0)
     scaled = matrix[:, sizes > 0] / sizes[sizes > 0]
@@ -285,7 +285,7 @@ def _missing(matrix: ComplexArray | FloatArray) -> ComplexArray:
     return np.asarray(U[:, np.count_nonzero(s > _ABSENT * s[0]) :])
 
 
-def _described(plant: Partition, combinations: FloatArray) -> list[str]:
+def _axes_in_words(plant: Partition, combinations: FloatArray) -> list[str]:
     """Return rigid-body combinations (r, missing) in words, `translation z`, `rotation rx`."""
     realisation = plant.assembled.realisation
     model = realisation.model

@@ -77,7 +77,7 @@ def sampled_physical(
     A[states, states] = E
     layout.enter(A, B, states, new, old)
     layout.shift_inputs(A, B)
-    D_new, D_old = _direct(g.D, inputs, 0.0)
+    D_new, D_old = _acting_sample(g.D, inputs, 0.0)
     now = np.zeros((len(g.outputs), layout.size)), np.zeros_like(g.D)
     now[0][:, states] = g.C
     layout.enter(now[0], now[1], slice(None), D_new, D_old)
@@ -95,7 +95,7 @@ def sampled_physical(
             continue
         t = h - float(outputs.fraction[j])
         E, new, old = _flow_at(held, inputs, t)
-        direct_new, direct_old = _direct(g.D[j : j + 1], inputs, t)
+        direct_new, direct_old = _acting_sample(g.D[j : j + 1], inputs, t)
         A[row, states] = g.C[j] @ E
         layout.enter(A, B, row, g.C[j] @ new + direct_new, g.C[j] @ old + direct_old)
     blocks = None
@@ -168,7 +168,7 @@ def _flow_at(held: HeldFlow, inputs: Late, t: float) -> tuple[FloatArray, FloatA
     return E, new, old
 
 
-def _direct(D: FloatArray, inputs: Late, t: float) -> tuple[FloatArray, FloatArray]:
+def _acting_sample(D: FloatArray, inputs: Late, t: float) -> tuple[FloatArray, FloatArray]:
     """Return which sample of each input acts at t within the sample: the new or the old one."""
     new = np.where(inputs.fraction <= t, D, 0.0)
     return new, D - new

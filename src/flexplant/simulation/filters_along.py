@@ -324,14 +324,14 @@ def estimate_along(
     u = slice(len(plant.w), None)
     y, commands = data[: len(sensors)], data[len(sensors) :]
     for k, sample in enumerate(filters.machine.each(count)):
-        x, P = _corrected(sample, filters, x, P, y[:, k], one)
+        x, P = _measurement_update(sample, filters, x, P, y[:, k], one)
         found[:, k] = sample.C[filters.z] @ x
         x = sample.A @ x + sample.B[:, u] @ commands[:, k]
         P = symmetrised(sample.A @ P @ sample.A.T + sample.G @ sample.G.T)
     return dict(zip(filters.names, found, strict=True))
 
 
-def _corrected(
+def _measurement_update(
     sample: Sample, filters: _Filters, x: FloatArray, P: FloatArray, y: FloatArray, one: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return state and covariance corrected by a measurement."""

@@ -191,7 +191,7 @@ class MovingPlant:
         values = self.path.at(time)
         found = []
         for force in self.forces:
-            rows = _motions(self.realisation, force.port, force.port.direction, values)
+            rows = _rows_along(self.realisation, force.port, force.port.direction, values)
             columns = rows @ self.realisation.inputs
             found.append(np.stack([columns[:-2:2], columns[1:-1:2], columns[2::2]], axis=1))
         return found
@@ -210,10 +210,10 @@ class MovingPlant:
         values = self.path.at(time)
         nz, found = len(self.plant.z), []
         for port, axis, at in self.shown:
-            rows = _motions(self.realisation, port, axis, values) @ self.realisation.outputs
+            rows = _rows_along(self.realisation, port, axis, values) @ self.realisation.outputs
             found.append((at, rows))
         for sensor, axis, places in self.seen:
-            rows = _motions(self.realisation, sensor, axis, values) @ self.realisation.outputs
+            rows = _rows_along(self.realisation, sensor, axis, values) @ self.realisation.outputs
             found.append(([(nz + places[0], 1.0)], rows))
         return found
 
@@ -373,7 +373,7 @@ class _Rule:
         )
 
 
-def _motions(
+def _rows_along(
     realisation: Any, port: Any, axis: str, values: Mapping[str, FloatArray]
 ) -> FloatArray:
     """Return rows (n, DOFs) of a port's place along an axis at values (n,) of the positions."""

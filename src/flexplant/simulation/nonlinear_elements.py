@@ -24,7 +24,7 @@ from ..plant import StandardPlant
 from ..tolerances import divisor
 
 
-def _limit(value: Any, name: str) -> float:
+def _upper_limit(value: Any, name: str) -> float:
     """Return a limit, which may be infinite."""
     return np.inf if isinstance(value, float) and value == np.inf else positive(value, name)
 
@@ -69,7 +69,7 @@ class Saturation(Value):
     0.001
     """
 
-    limit: float = field(default=np.inf, metadata=checked(_limit))
+    limit: float = field(default=np.inf, metadata=checked(_upper_limit))
     rate: float | None = field(default=None, metadata=checked(positive))
     least: float | None = field(default=None, metadata=checked(_lower_limit))
 

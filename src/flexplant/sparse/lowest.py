@@ -17,7 +17,7 @@ from ..errors import SolverError, attempted
 from ..parallel import one_thread
 from .factor import DENSE_LIMIT, by_rows, dense, diagonal, negative_pivots, symmetric_lu
 from .lanczos import VALUE, BlockLanczos, beyond, iterated, rayleigh_ritz
-from .multifrontal import MultifrontalCholesky, assembled, in_single
+from .multifrontal import MultifrontalCholesky, assembled_fronts, in_single
 from .ordering import Dissection, Front, dissect
 
 #: rounding let pass in the energies that accompany a count
@@ -140,7 +140,7 @@ def _eliminated(lower: Any, dissection: Dissection) -> Iterator[tuple[Front, _Pi
     of_lapack: Any = lapack.get_lapack_funcs(("potrf",), dtype=lower.dtype)
     of_blas: Any = blas.get_blas_funcs(("syrk",), dtype=lower.dtype)
     (potrf,), (syrk,) = of_lapack, of_blas
-    for front, block, below, rest in assembled(lower, dissection):
+    for front, block, below, rest in assembled_fronts(lower, dissection):
         kept = block.copy(order="F")
         _, info = potrf(block, lower=1, overwrite_a=1, clean=0)
         pivots = _SignedPivots(kept) if info else _Pivots(block, np.ones(len(block), block.dtype))

@@ -15,9 +15,9 @@ from ..checks import (
     Matrix,
     Value,
     checked,
+    floats_of,
     instance,
     number,
-    numbers,
     positive,
     real_array,
 )
@@ -30,7 +30,7 @@ def plain_place(at: Any, name: str) -> Any:
     if isinstance(at, str | Mapping):
         return at
     try:
-        return numbers(at, "at", 3)
+        return floats_of(at, "at", 3)
     except ValueError:
         raise LabelError(
             f"{name} must be at a DOF label like '41:z', a point (x, y, z) in metres or a mapping "

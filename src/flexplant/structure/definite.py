@@ -36,14 +36,14 @@ _SLOW = 1e-2
 
 def check_semidefinite(matrix: Matrix, name: str) -> None:
     """Raise ModelError unless a symmetric matrix is positive semi-definite to rounding."""
-    if said := indefinite(matrix, name):
+    if said := why_indefinite(matrix, name):
         raise ModelError(
             f"{said} Look for a sign or for swapped arguments (the order is M, K, D)."
             + (" Magnets may only make rigid-body motions unstable." if name == "K" else "")
         )
 
 
-def indefinite(matrix: Matrix, name: str) -> str:
+def why_indefinite(matrix: Matrix, name: str) -> str:
     """Return in words that K or D is not positive semi-definite; empty when it is."""
     if _is_semidefinite(matrix):
         return ""
@@ -53,7 +53,7 @@ def indefinite(matrix: Matrix, name: str) -> str:
     )
 
 
-def symmetric(given: Any, name: str, n: int) -> Matrix:
+def symmetric_matrix(given: Any, name: str, n: int) -> Matrix:
     """Return a finite symmetric (n, n) matrix, dense or sparse."""
     value, matrix = given, cast(Any, None)
     if sp.issparse(given):

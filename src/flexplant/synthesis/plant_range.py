@@ -31,7 +31,7 @@ def _position(pair: tuple[float, Any]) -> float:
     return pair[0]
 
 
-def between(systems: Sequence[StateSpace], places: FloatArray, x: float) -> StateSpace:
+def system_at(systems: Sequence[StateSpace], places: FloatArray, x: float) -> StateSpace:
     """Return the system at a position, its matrices linear between the nearest two."""
     i = int(np.clip(np.searchsorted(places, x, side="right") - 1, 0, max(len(places) - 2, 0)))
     if x == places[i] or len(places) == 1:
@@ -78,7 +78,7 @@ class PlantRange:
         if known.size:
             return self.plants[int(known[0])]
         first = self.plants[0]
-        found = between([one.system for one in self.plants], self.places, x)
+        found = system_at([one.system for one in self.plants], self.places, x)
         sides = {side: getattr(first, side) for side in "wuzy"}
         return StandardPlant.from_statespace(found, **sides)
 

@@ -12,7 +12,7 @@ from ..errors import ModelError, attempted, warn
 from ..modes import solve_modes
 from ..modes.normal_form import RIGID_DRAG
 from ..structure.attachments import matrix_sum
-from ..structure.definite import indefinite
+from ..structure.definite import why_indefinite
 from ..structure.model import FEModel
 from ..structure.rigid import orthonormalised
 from .family import Family
@@ -131,7 +131,7 @@ def _impossible(
 ) -> str:
     """Return in words that D or K is indefinite, by which parameters; empty when neither is."""
     for name in "DK":
-        said = "" if changes[name] is None else indefinite(changes[name], name)
+        said = "" if changes[name] is None else why_indefinite(changes[name], name)
         if not said:
             continue
         at = "MDK".index(name)

@@ -22,7 +22,7 @@ from .parameters.added import Parameter, PointParameter
 from .point_model import Point, pair
 from .residuals.residual import Residual
 from .search import Objective
-from .search.objective import numbers
+from .search.objective import compared_modes
 
 #: modes of the basis for each coordinate of the reduced model
 WIDER = 4
@@ -144,7 +144,7 @@ class FullBasis:
         n = model.n_dof
         if self.reduced is not None:
             return _lowest_modes(model, min(WIDER * self.reduced.n_dof, n))[1]
-        highest = max((number for r in self.residuals for number in numbers(r)), default=6)
+        highest = max((number for r in self.residuals for number in compared_modes(r)), default=6)
         top = WIDER * max(residual.top for residual in self.residuals)
         omega, phi = _lowest_modes(model, min(WIDER * highest, n))
         if omega.size < n and omega[-1] < top:

@@ -152,7 +152,7 @@ def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntAr
     found = assigned(-score)
     for cluster in close:
         members = cluster[found[cluster] >= 0]
-        found[members] = _inside(shapes, members, found[members])
+        found[members] = _match_cluster(shapes, members, found[members])
     return found
 
 
@@ -167,7 +167,7 @@ def measured_pairs(
     return assigned(NEARNESS * far - mac_matrix(psi, X))
 
 
-def _inside(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:
+def _match_cluster(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:
     """Return the new modes of a cluster in the order of its old ones."""
     s = old.size
     new = np.sort(new)

@@ -151,15 +151,15 @@ class _Tried:
 
     def add(self, begin: FloatArray, *, led: bool, named: bool = False) -> None:
         """Search from a start; `led`: through easier problems first."""
-        best, search = self.best, _led if led else _direct
+        best, search = self.best, _led if led else _direct_search
         sound = best is not None and not best.improvable
         limit = GLANCE if sound and self.most is None else self.most
         enough = max(self.tolerance, NEARLY) if self.ends else self.tolerance
-        end = _attempt(search, self.objective, begin, self.method, limit, enough)
+        end = _try_search(search, self.objective, begin, self.method, limit, enough)
         if isinstance(end, SearchEnd) and best is not None and limit != self.most:
             near = end.cost < WORTH * best.end.cost
             if near and not end.converged:
-                end = _attempt(_settled, self.objective, end, self.method, None, enough)
+                end = _try_search(_continue_search, self.objective, end, self.method, None, enough)
         self.begins.append(begin)
         self.ends.append(end)
         if isinstance(end, SearchEnd):
@@ -183,7 +183,7 @@ class _Tried:
     @property
     def alike(self) -> bool:
         """Whether all starts met the same: more of them would as well."""
-        return not self.found and len({_head(end) for end in self.ends}) == 1
+        return not self.found and len({_message(end) for end in self.ends}) == 1
 
 
 def from_one_start(
@@ -218,7 +218,7 @@ def from_one_start(
         middles.insert(1 if well else 0, (default, True))
     small = len(objective.family.V) <= SMALL
     always, retries = (ALWAYS, RETRIES) if small else (ALWAYS_LARGE, RETRIES_LARGE)
-    others, led = _others(objective, middles, retries + 1 - len(tried.ends), rng)
+    others, led = _other_starts(objective, middles, retries + 1 - len(tried.ends), rng)
     for other in others:
         best = tried.best
         enough = tried.alike if best is None else not best.improvable
@@ -230,14 +230,14 @@ def from_one_start(
         raise none_found(objective, tried.begins, tried.ends)
     end = best.end
     if end is not tried.ends[0]:
-        settled = _attempt(_settled, objective, end, method, most, tolerance)
+        settled = _try_search(_continue_search, objective, end, method, most, tolerance)
         end = settled if isinstance(settled, SearchEnd) else end
     objective.path = []
     objective.follow(end.trail.p)
     return end, tried.begins, tried.ends
 
 
-def _others(
+def _other_starts(
     objective: Objective, middles: list[tuple[FloatArray, bool]], count: int, rng: Rng
 ) -> tuple[list[FloatArray], bool]:
     """Return starts around the first of some where the modes can be numbered, and its `led`."""
@@ -252,7 +252,7 @@ def none_found(
 ) -> FlexplantError:
     """Return the error that no start leads to an end: what all of them met."""
     failed = [end for end in ends if isinstance(end, FlexplantError)]
-    met = Counter(map(_head, failed))
+    met = Counter(map(_message, failed))
     if len(met) == 1:
         # what is met at the default start is no matter of the values there
         default = (np.array_equal(begin, objective.default_start) for begin in begins)
@@ -269,7 +269,7 @@ def none_found(
     return error
 
 
-def _head(end: Reached) -> str:
+def _message(end: Reached) -> str:
     """Return what a search met without where."""
     return str(end).split(": ")[0]
 
@@ -292,7 +292,7 @@ def _is_possible(objective: Objective, p: FloatArray) -> bool:
     return True
 
 
-def _settled(
+def _continue_search(
     objective: Objective, end: SearchEnd, method: UpdateMethod, most: int | None, tolerance: float
 ) -> SearchEnd:
     """Return the end of a search that goes on from another's."""
@@ -302,7 +302,7 @@ def _settled(
     return found
 
 
-def _attempt(search: Callable[..., SearchEnd], *given: Any) -> Reached:
+def _try_search(search: Callable[..., SearchEnd], *given: Any) -> Reached:
     """Return the end of a search, or why there is none."""
     try:
         return search(*given)
@@ -310,7 +310,7 @@ def _attempt(search: Callable[..., SearchEnd], *given: Any) -> Reached:
         return error
 
 
-def _direct(
+def _direct_search(
     objective: Objective,
     begin: FloatArray,
     method: UpdateMethod,
@@ -361,7 +361,7 @@ def from_starts(
     tolerance: float,
 ) -> tuple[SearchEnd, list[Reached]]:
     """Return the best end, the objective being there, and what every start led to."""
-    ends = [_attempt(_direct, objective, one, method, most, tolerance) for one in begins]
+    ends = [_try_search(_direct_search, objective, one, method, most, tolerance) for one in begins]
     reached = [found for found in ends if isinstance(found, SearchEnd)]
     if not reached:
         raise none_found(objective, begins, ends)
@@ -411,13 +411,13 @@ def summary(
         np.array(begins),
         np.array([end.p if isinstance(end, SearchEnd) else nan for end in ends]),
         np.array([end.cost if isinstance(end, SearchEnd) else np.inf for end in ends]),
-        tuple(_said(end) for end in ends),
+        tuple(_ending(end) for end in ends),
         np.array([end.p for end in minima]).reshape(-1, best.p.size),
         above,
     )
 
 
-def _said(end: Reached) -> str:
+def _ending(end: Reached) -> str:
     """Return how a search ended, in words."""
     if not isinstance(end, SearchEnd):
         return str(end)

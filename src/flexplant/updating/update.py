@@ -13,7 +13,7 @@ from ..parallel import Progress
 from ..structure.model import FEModel
 from ..tolerances import TINY
 from .changed_model import changed_model
-from .discrepancy import weighed
+from .discrepancy import weigh_discrepancy
 from .full_basis import MOST_ROUNDS, FullBasis, is_large
 from .judgement.goodness import chi_square, covariance, is_bad, worst
 from .parameters.added import Parameter
@@ -21,7 +21,7 @@ from .residuals.eigenvalues import Eigenvalues
 from .residuals.residual import Residual
 from .search import Objective, SearchEnd, Secured, TrustRegion, UpdateMethod, checked_residuals
 from .search.objective import Defect
-from .search.update_method import ITERATIONS, units
+from .search.update_method import ITERATIONS, steps
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
 from .sensitivities import checked_parameters, checked_values
 from .update_result import History, UpdateResult
@@ -220,7 +220,7 @@ def update(
     if not method.least_squares or not is_bad(fit.p_value):
         return fit
     named = worst(objective, objective.at(best.p))
-    end, found = weighed(objective, method, best, most=max_iterations, tolerance=enough)
+    end, found = weigh_discrepancy(objective, method, best, most=max_iterations, tolerance=enough)
     if found:
         again = _result(model, objective, method, end, begins[0])
         kept = {"starts": fit.starts, "rounds": fit.rounds, "residuals": given}
@@ -237,7 +237,7 @@ def _result(
 ) -> UpdateResult:
     """Return what the best search found and how well it is known."""
     point = objective.at(best.p)
-    at_bound = _at_bound(objective, best.p, units(objective, objective.slopes(point, prior=False)))
+    at_bound = _at_bound(objective, best.p, steps(objective, objective.slopes(point, prior=False)))
     fitted = np.array([q.name not in at_bound for q in objective.parameters])
     if method.penalised:
         fitted &= best.p != begin

@@ -17,7 +17,7 @@ from ..loop.broken import BrokenLoop
 from ..loop.report import NyquistCount, broken_count, broken_margins
 from ..loop.sensitivity import broken_bandwidth
 from ..lti.interconnection import loop_poles, side_by_side
-from ..lti.measured_lines import followed, low_slope
+from ..lti.measured_lines import low_slope, on_lines
 from ..synthesis import LoopDesign, ShapedAxis
 from ..synthesis.laws.law import Law
 from .machine import BenchMachine
@@ -148,7 +148,7 @@ class Evaluator:
 
         def plant(freq: FloatArray) -> ComplexArray:
             if machine.is_measured:
-                return followed(machine.freq, others.G, freq)[None, None]
+                return on_lines(machine.freq, others.G, freq)[None, None]
             return others.respond(freq)[None, None]
 
         def poles() -> ComplexArray:
@@ -196,12 +196,12 @@ def _closed_around(machine: BenchMachine, design: LoopDesign, name: str) -> Othe
         fed = np.linalg.solve(np.moveaxis(back, 2, 0), np.moveaxis(G[np.ix_(o, [a])], 2, 0))
         return np.asarray(G[a, a] - np.einsum("of,fo->f", G[a, o] * C, fed[:, :, 0]))
 
-    count = _others(machine, design, o, laws) if machine.is_measured else _NONE
+    count = _count_others(machine, design, o, laws) if machine.is_measured else _NONE
     G = reduced(machine.freq, machine.G)
     return OthersClosed(G, lambda f: reduced(f, machine.respond(f)), count, closed)
 
 
-def _others(
+def _count_others(
     machine: BenchMachine, design: LoopDesign, o: list[int], laws: list[Law]
 ) -> NyquistCount:
     """Return the count of the other axes of a measured plant, this one open."""

@@ -163,7 +163,7 @@ def with_element(axis: ShapedAxis, at: int, element: SingleElement) -> ShapedAxi
     return axis.replace(elements=(*axis.elements[:at], element, *axis.elements[at + 1 :]))
 
 
-def added(axis: ShapedAxis, element: SingleElement) -> ShapedAxis:
+def with_new(axis: ShapedAxis, element: SingleElement) -> ShapedAxis:
     """Return an axis with one more element, at the end."""
     return axis.replace(elements=(*axis.elements, element), on=(*axis.on, True))
 

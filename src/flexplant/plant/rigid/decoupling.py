@@ -123,7 +123,7 @@ def decouple(plant: Partition, *, axes: Sequence[str] | None = None) -> Decoupli
     sensors = [s for s in ports.y if s.order == 0]
     see = rigid_parts([s.static_row(realisation) for s in sensors], body.motions)
     push = rigid_parts([port.static_push(realisation) for port in ports.u], body.motions).T
-    length = _length(body)
+    length = _axis_units(body)
     T_y = _left_inverse(see, length, pick)
     T_u = _left_inverse(push.T, 1.0 / length, pick).T
     _check_identity(T_y @ see, pick, wanted, body, length, "sensors", [s.name for s in sensors])
@@ -132,16 +132,16 @@ def decouple(plant: Partition, *, axes: Sequence[str] | None = None) -> Decoupli
     forces = [f"cog:{axis}:force" for axis in wanted]
     pushes = [f"cog:{axis}:acceleration" for axis in wanted]
     return Decoupling(
-        _static(T_u, forces, plant.u, plant),
-        _static(T_y, [s.name for s in sensors], [f"cog:{axis}" for axis in wanted], plant),
-        _static(T_u @ mass, pushes, plant.u, plant),
+        _gain_system(T_u, forces, plant.u, plant),
+        _gain_system(T_y, [s.name for s in sensors], [f"cog:{axis}" for axis in wanted], plant),
+        _gain_system(T_u @ mass, pushes, plant.u, plant),
         mass,
         body.centre,
         wanted,
     )
 
 
-def _length(body: RigidBody) -> FloatArray:
+def _axis_units(body: RigidBody) -> FloatArray:
     """Return units (r,) in which rotations and translations move the structure alike."""
     return np.asarray(1.0 / np.linalg.norm(body.motions, axis=0))
 
@@ -177,7 +177,7 @@ def _check_identity(
         )
 
 
-def _static(
+def _gain_system(
     gain: FloatArray, inputs: Sequence[str], outputs: Sequence[str], plant: Partition
 ) -> StateSpace:
     units = plant.units

@@ -78,7 +78,7 @@ def _rigid_body(model: Structure) -> tuple[RigidBody | None, str]:
         for i, axis in enumerate(DIRECTIONS)
         if np.any(everywhere[:, i]) and (axis in model.full_dofs.directions or axis.startswith("r"))
     ]
-    exists = _independent(everywhere, [i for i in moving if missed[i] < SPANNED])
+    exists = _drop_dependent(everywhere, [i for i in moving if missed[i] < SPANNED])
     lost = {DIRECTIONS[i]: float(missed[i]) for i in moving if missed[i] >= SPANNED}
     if not exists:
         why = (
@@ -129,7 +129,7 @@ def _lost_shares(lost: Mapping[str, float]) -> str:
     return ", ".join(f"{100 * part:.2g} % of {axis}" for axis, part in lost.items())
 
 
-def _independent(motions: FloatArray, exists: list[int]) -> list[int]:
+def _drop_dependent(motions: FloatArray, exists: list[int]) -> list[int]:
     """Drop axes that are combinations of earlier ones (few DOFs)."""
     kept: list[int] = []
     for i in exists:

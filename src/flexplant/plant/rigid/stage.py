@@ -67,7 +67,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     ports = plant.assembled.ports
     if not ports.references:
         raise AssumptionError("the plant has no reference: add Reference(...) to the ports.")
-    followed = ports.poi(_chosen([r.poi for r in ports.references], poi, "POI with a reference"))
+    followed = ports.poi(_only_poi([r.poi for r in ports.references], poi, "POI with a reference"))
     sensors = [s.name for s in ports.y if s.order == 0]
     if not sensors:
         kinds = ", ".join(sorted({s.quantity for s in ports.y})) or "none"
@@ -98,7 +98,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     )
 
 
-def _chosen(names: list[str], poi: str | None, kind: str) -> str:
+def _only_poi(names: list[str], poi: str | None, kind: str) -> str:
     """Return the POI that is meant: the one named, or the only one."""
     if poi is None:
         if len(names) > 1:
@@ -206,7 +206,7 @@ def stage_weights(
     ports = plant.assembled.ports
     if not ports.z or not ports.u or not ports.y:
         raise AssumptionError("stage weights need a POI, actuators and sensors in the ports.")
-    scale = ports.poi(_chosen([port.name for port in ports.z], poi, "POI"))
+    scale = ports.poi(_only_poi([port.name for port in ports.z], poi, "POI"))
     first = scale.channel(scale.axes[0])
     push = np.linalg.norm(rigid_gain(plant, motions, [first], [port.name for port in ports.u]))
     crossing = _HEADROOM * positive(bandwidth, "bandwidth")

@@ -149,9 +149,9 @@ def _bounding(pair: Pair, follow: int) -> NeglectedModes:
     pair, mirrored = _distinct(*pair)
     if not pair[0].outputs or not pair[0].inputs:
         raise ModelError("the larger model does not differ from the plant: nothing is neglected.")
-    poles = _swinging(*pair)
+    poles = _upper_poles(*pair)
     grid = _resonance_grid(poles)
-    gap = _gap(pair, grid)
+    gap = _deviation(pair, grid)
     scales, gap = _evened(gap)
     tall = np.sqrt(gap.shape[0])  # all rows may be at their bound at once, at one resonance
     rows = [covering(grid, tall * np.linalg.norm(row, axis=0), poles, follow) for row in gap]
@@ -160,7 +160,7 @@ def _bounding(pair: Pair, follow: int) -> NeglectedModes:
     factor = _MARGIN * float(height.max())
     weights = weights.replace(C=factor * weights.C, D=factor * weights.D)
     fine = _verifying(grid, poles)
-    found = _height(weights, _gap(pair, fine) * scales[:, None], fine)
+    found = _height(weights, _deviation(pair, fine) * scales[:, None], fine)
     tightest = float(found.max())
     if not tightest <= 1.0:
         worst = fine[int(np.argmax(found))]
@@ -183,7 +183,7 @@ def _bounding(pair: Pair, follow: int) -> NeglectedModes:
     )
 
 
-def opened(system: StateSpace, neglected: NeglectedModes, deltas: int) -> StateSpace:
+def with_neglected(system: StateSpace, neglected: NeglectedModes, deltas: int) -> StateSpace:
     """Return a system with the channels of neglected modes after its first, those of Deltas.
 
     Inputs `y1:neglected:w` pass the weights and add to the outputs; outputs `u1:neglected:z` are
@@ -246,8 +246,8 @@ def _same_body(one: FloatArray, other: FloatArray) -> None:
 
 def _distinct(small: StateSpace, big: StateSpace) -> tuple[Pair, dict[str, str]]:
     """Return the pair with the channels that differ, each output once, and which are mirrored."""
-    probe = _resonance_grid(_swinging(small, big))[1::7]
-    gap = _gap((small, big), probe)
+    probe = _resonance_grid(_upper_poles(small, big))[1::7]
+    gap = _deviation((small, big), probe)
     size = np.abs(_bilinear_response(big, probe))
     moved = np.abs(gap).max(axis=2) > _ROUNDING * size.max(axis=2).max(initial=0.0)
     rows, columns = np.flatnonzero(moved.any(axis=1)), np.flatnonzero(moved.any(axis=0))
@@ -264,7 +264,7 @@ def _distinct(small: StateSpace, big: StateSpace) -> tuple[Pair, dict[str, str]]
     return (small.select(*names), big.select(*names)), mirrored
 
 
-def _swinging(small: StateSpace, big: StateSpace) -> ComplexArray:
+def _upper_poles(small: StateSpace, big: StateSpace) -> ComplexArray:
     """Return the poles of both in the upper half plane, slowest first, each once."""
     poles = np.concatenate([_poles(big), _poles(small)])
     # the rounding of delays at z = 0 has no frequency
@@ -306,7 +306,7 @@ def _bilinear_response(g: StateSpace, grid: FloatArray) -> ComplexArray:
     return frequency_response(g, image_freq(2.0 * np.pi * grid, g.dt)).data
 
 
-def _gap(pair: Pair, grid: FloatArray) -> ComplexArray:
+def _deviation(pair: Pair, grid: FloatArray) -> ComplexArray:
     """Return the difference of the responses (n_out, n_in, n_freq)."""
     return _bilinear_response(pair[1], grid) - _bilinear_response(pair[0], grid)
 
@@ -354,7 +354,7 @@ def covering(
     is a rational function of x, positive for x >= 0; w has its zeros and poles ``s = -sqrt(-x)``.
     """
     unit = 2 * np.pi * freq[-1]
-    own = _standing_out(freq, height, poles)[:resonances] / unit
+    own = _peak_poles(freq, height, poles)[:resonances] / unit
     corners = np.geomspace(20 * np.pi * freq[1] / unit, 1.0, _SMOOTH)
     terms = [_Term(0, (pole,)) for pole in own]
     terms += [_Term(0, (corner * np.exp(0.75j * np.pi),)) for corner in corners[::2]]
@@ -407,7 +407,7 @@ class _Term:
         return found
 
 
-def _standing_out(freq: FloatArray, height: FloatArray, poles: ComplexArray) -> ComplexArray:
+def _peak_poles(freq: FloatArray, height: FloatArray, poles: ComplexArray) -> ComplexArray:
     """Return the poles at which the curve is far above what it is half an eighth away."""
     at = np.log(np.maximum(freq, freq[1]))
     line = np.log(height + TINY)

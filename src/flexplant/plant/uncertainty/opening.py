@@ -25,7 +25,7 @@ from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
 from ..realisation import ModalRealisation
 from .delta_channels import require_exact, system_matrix, with_channels, with_gain_channels
 from .mode_deltas import KNOWN, SAME_MODEL, check_poles, correlated_deltas, stated
-from .neglected import NeglectedModes, neglected_modes, opened
+from .neglected import NeglectedModes, neglected_modes, with_neglected
 from .shape_channels import shape_deltas, with_shape_channels
 from .uncertain_plant import (
     Delta,
@@ -116,7 +116,7 @@ def uncertain(
     # measured: poles that were typed
     limit, name = (SAME_MODEL, "fit") if fitted else (0.1, "measurement")
     check_poles(realisation, numbers, poles, limit, name)
-    G = _relative(poles)
+    G = _log_derivatives(poles)
     covariance = G @ covariance @ G.T
     scale = many * np.sqrt(np.diag(covariance))
     kinds: tuple[Literal["freq", "damping"], ...] = ("freq", "damping")
@@ -207,7 +207,7 @@ def _with_deltas(
     if neglected is not None:
         known = isinstance(neglected, NeglectedModes)
         weight = neglected if known else neglected_modes(plant, neglected)
-        system = opened(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
+        system = with_neglected(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
     return UncertainPlant(
         plant, system, (*deltas, *shapes), covariance, deviations, weight, fit, parameters
     )
@@ -237,7 +237,7 @@ def _by_parameters(
     weight = None
     if neglected is not None:
         weight = neglected_modes(plant, neglected)
-        system = opened(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
+        system = with_neglected(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
     own = la.block_diag(covariance / np.outer(std, std), np.eye(len(beside))) / deviations**2
     deltas = (*deltas[: len(parameters)], *modes, *(one for one in beside if not one.mode))
     return UncertainPlant(plant, system, deltas, own, deviations, weight, fit, every)
@@ -401,7 +401,7 @@ def _measured_poles(
     return tuple(chosen), measured.poles[at], measured.covariance[np.ix_(both, both)]
 
 
-def _relative(poles: ComplexArray) -> FloatArray:
+def _log_derivatives(poles: ComplexArray) -> FloatArray:
     """Return the derivatives of [log omega^2; log 2 zeta omega] to [Re lambda; Im lambda]."""
     size = np.abs(poles) ** 2
     damped = np.where(poles.real != 0, poles.real, np.inf)

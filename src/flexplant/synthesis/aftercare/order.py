@@ -157,7 +157,7 @@ def reduce_controller(
         after = loop_facts(given, found)
         required(before, after, allowed, "Choose a higher order, leave order out, or raise loss.")
     else:
-        found, error, after = _smallest(given, problem, before, allowed)
+        found, error, after = _fewest_states(given, problem, before, allowed)
     was = {f"{name} before": value for name, value in before.certificate.items()}
     answer = Controller(
         found,
@@ -168,7 +168,7 @@ def reduce_controller(
     return with_left_out(answer, given, larger)
 
 
-def _smallest(
+def _fewest_states(
     plant: StandardPlant, problem: _FactoredController, before: LoopFacts, loss: float
 ) -> tuple[StateSpace, float, LoopFacts]:
     """Return the reduced controller of the fewest states that keeps the loop, from halvings."""
@@ -183,7 +183,7 @@ def _smallest(
             lost = str(failure)
             return False
         after = loop_facts(plant, found)
-        lost = kept(before, after, loss)
+        lost = loss_text(before, after, loss)
         if not lost and (best is None or found.n_states < best[0].n_states):
             best = found, error, after
         return not lost
@@ -295,7 +295,7 @@ def loop_facts(plant: StandardPlant, controller: StateSpace) -> LoopFacts:
     return LoopFacts(bool(dt), stability(poles, dt), float(freq), stable, margin, gamma)
 
 
-def kept(before: LoopFacts, after: LoopFacts, loss: float) -> str:
+def loss_text(before: LoopFacts, after: LoopFacts, loss: float) -> str:
     """Return what was lost in words; empty when nothing was."""
     if not after.is_stable:
         return f"the loop becomes unstable ({after.why})"
@@ -314,7 +314,7 @@ def kept(before: LoopFacts, after: LoopFacts, loss: float) -> str:
 
 def required(before: LoopFacts, after: LoopFacts, loss: float, cure: str) -> None:
     """Raise CertificateError when a loop lost more than is allowed."""
-    lost = kept(before, after, loss)
+    lost = loss_text(before, after, loss)
     if lost:
         raise CertificateError(f"{lost}: the controller is refused. {cure}")
 

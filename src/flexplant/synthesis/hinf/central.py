@@ -93,7 +93,7 @@ def require_shown(p: Prepared) -> None:
         raise _missed_by_w(p, found) from found
 
 
-def quadratic(p: Prepared) -> StateSpace:
+def h2_controller(p: Prepared) -> StateSpace:
     """Return the controller of least H2 norm, feedthrough apart (gamma without bound)."""
     rows, columns = p.B2.shape[1], p.C2.shape[0]
     require_shown(p)
@@ -150,7 +150,7 @@ def _axis_freq(p: Prepared, found: OnAxisError) -> str:
     return f"{p.frequency(omega if omega > 1e-6 else 0.0):.3g} Hz"
 
 
-def indefinite(X: FloatArray, size: float) -> bool:
+def is_indefinite(X: FloatArray, size: float) -> bool:
     """Return whether X has a negative eigenvalue beyond rounding; size is what X comes from."""
     values = la.eigvalsh(X) if X.size else np.zeros(1)
     # an accurate X to 1e-6 of its size (the residual), and beyond what its equation rounds

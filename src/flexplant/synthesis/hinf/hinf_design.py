@@ -45,7 +45,7 @@ from .mode_channels import (
     mode_channels,
     rebalanced,
     tolerated,
-    with_channels,
+    with_mode_channels,
 )
 from .moved_design import over_positions
 from .singular import ADDED
@@ -201,13 +201,13 @@ def tolerant(
     instance(uncertain, UncertainPlant, "uncertain", "Make it by plant.uncertain(frequency=0.005).")
     if solved is None:
         channels, first = _even_channels(plant, uncertain, method, progress, damped_below)
-        answer = _design_one(with_channels(plant, channels), method, progress)
+        answer = _design_one(with_mode_channels(plant, channels), method, progress)
     else:
         channels, first = solved.channels, solved.first
-        answer = _design_one(with_channels(plant, channels), None, progress, solved.found)
+        answer = _design_one(with_mode_channels(plant, channels), None, progress, solved.found)
     scales = {one.mode: one.D for one in channels}
     stated = [one.replace(D=scales[one.mode]) for one in mode_channels(plant, uncertain)]
-    share = tolerated(stated, with_channels(plant, stated), answer.system)
+    share = tolerated(stated, with_mode_channels(plant, stated), answer.system)
     return answer.replace(
         certificate=dict(answer.certificate or {}) | {TOLERATED: share},
         reached={},  # of the weights beside the channels of modes
@@ -232,7 +232,7 @@ def tolerant_system(
 ) -> tuple[StateSpace, Solved]:
     """Return the controller that `tolerant` verifies, by itself, and what led to it."""
     channels, first = _even_channels(plant, uncertain, None, False, damped_below)
-    open_plant = with_channels(plant, channels)
+    open_plant = with_mode_channels(plant, channels)
     problem = prepared(open_plant.system, open_plant.u, open_plant.y)
     found = Riccati(progress=False).solve(problem)
     system = problem.restored(found.A, found.B, found.C, found.D)
@@ -248,7 +248,7 @@ def _even_channels(
 ) -> tuple[tuple[ModeChannel, ...], float]:
     """Return channels for the modes, scaled in closed loop, and gamma before they were."""
     channels = mode_channels(plant, uncertain, damped_below)
-    open_plant = with_channels(plant, channels)
+    open_plant = with_mode_channels(plant, channels)
     problem = prepared(open_plant.system, open_plant.u, open_plant.y)
     first = np.inf
     # only the scales hang on it: where it fails, the design itself says all
@@ -276,7 +276,7 @@ def _design_one(
         else:
             if progress is not None and isinstance(method, (Riccati, Lmi)):
                 method = method.replace(progress=progress)
-            answer = answered(plant, problem, method)
+            answer = answer_of(plant, problem, method)
         _require_known(plant, problem, answer)
     except (AssumptionError, InfeasibleError, SolverError, CertificateError) as error:
         blamed = _blamed(problem, error)
@@ -375,7 +375,7 @@ class Answer(NamedTuple):
         return self.gamma <= _CLOSE * self.lower
 
 
-def answered(plant: StandardPlant, problem: Prepared, method: SynthesisMethod) -> Answer:
+def answer_of(plant: StandardPlant, problem: Prepared, method: SynthesisMethod) -> Answer:
     """Return the answer of one method, verified on the plant."""
     one = _verified_answer(plant, problem, method, method.solve(problem))
     known = max(one.lower, pointwise_bound(problem))
@@ -463,7 +463,7 @@ def idle_answer(plant: StandardPlant, problem: Prepared, failure: FlexplantError
     parts = np.zeros((0, 0)), np.zeros((0, n_y)), np.zeros((n_u, 0)), np.zeros((n_u, n_y))
     K = StateSpace(*parts, plant.system.dt, inputs=plant.y, outputs=plant.u)
     found = SolvedController(*parts, np.inf, 0.0, {}, (note,))
-    one = _of_loop(plant, None, found, K.replace(name="hinf", units=plant.units))
+    one = _certified_answer(plant, None, found, K.replace(name="hinf", units=plant.units))
     if not np.isfinite(one.gamma):  # the poles are stable by no more than their rounding
         raise CertificateError("the norm of the plant without feedback cannot be verified.")
     return one._replace(lower=min(pointwise_bound(problem), one.gamma))
@@ -473,10 +473,10 @@ def _verified_answer(
     plant: StandardPlant, problem: Prepared, method: SynthesisMethod, found: SolvedController
 ) -> Answer:
     K = problem.restored(found.A, found.B, found.C, found.D)
-    return _of_loop(plant, method, found, K.replace(name="hinf", units=plant.units))
+    return _certified_answer(plant, method, found, K.replace(name="hinf", units=plant.units))
 
 
-def _of_loop(
+def _certified_answer(
     plant: StandardPlant,
     method: SynthesisMethod | None,
     found: SolvedController,

@@ -27,7 +27,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ..controller import SolvedController
 from ..reach import beyond_rounding
-from .central import central, indefinite, quadratic, riccati_solutions
+from .central import central, h2_controller, is_indefinite, riccati_solutions
 from .lower_bound import parrott
 from .singular import LEVELS, Regularised, made_regular, missing_ranks, require_ranks
 
@@ -124,7 +124,7 @@ class Riccati(Value):
     def _regular(self, problem: Prepared, back_off: float) -> SolvedController:
         # the least quadratic cost stabilises: its norm is where the search for less begins
         try:
-            least = quadratic(problem)
+            least = h2_controller(problem)
             unit = _resonance_gain(problem, least)
         except (la.LinAlgError, SolverError):
             unit = np.inf
@@ -211,7 +211,7 @@ def quick_answer(problem: Prepared) -> SolvedController:
     """
     regular = Regularised(problem, LEVELS[0]) if missing_ranks(problem) else None
     given = problem if regular is None else regular.problem
-    least = quadratic(given)
+    least = h2_controller(given)
     unit = _resonance_gain(given, least)
     if not np.isfinite(unit):
         raise SolverError("no controller of least quadratic cost stabilises in rounding.")
@@ -326,7 +326,7 @@ def _attempt(problem: Prepared, gamma: float) -> _Attempt:
     speed = float(np.linalg.norm(problem.A)) or 1.0
     sizes = (float(np.linalg.norm(part)) ** 2 / speed for part in (problem.C1, problem.B1))
     # as accurate as X and Y are
-    if any(map(indefinite, (X, Y), sizes)) or coupling > gamma**2 * (1.0 + 1e-5):
+    if any(map(is_indefinite, (X, Y), sizes)) or coupling > gamma**2 * (1.0 + 1e-5):
         return _Attempt(None, True)
     try:
         return _Attempt(central(problem, gamma, X, F, Y, H))

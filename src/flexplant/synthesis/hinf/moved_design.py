@@ -45,7 +45,7 @@ def over_positions(
     """
     moving = PlantRange.of(given)
     search = _Search(moving, design)
-    mean = _mean(moving)
+    mean = _mean_plant(moving)
     motion = _MotionChannels(moving, mean)
     with Progress(_MOST, _DESIGNS, progress=progress):
         first = search.tried_with("the mean plant", mean)
@@ -131,7 +131,7 @@ class _Search:
         )
 
 
-def _mean(moving: PlantRange) -> StandardPlant:
+def _mean_plant(moving: PlantRange) -> StandardPlant:
     """Return the plant with the mean matrices."""
     systems = [one.system for one in moving.plants]
     mixed = {m: np.mean([getattr(g, m) for g in systems], axis=0) for m in "ABCD"}

@@ -104,7 +104,7 @@ def tune_loops(
         rigid = len(axes.names) if measured else _free_modes(axes.plant)
     rigid = whole(rigid, "rigid", minimum=0)
     most = whole(notches, "notches", minimum=0)
-    plants = _plants(plant, axes, rigid, larger, {"rate": rate, "delay": delay, "hold": hold})
+    plants = _joint_plants(plant, axes, rigid, larger, {"rate": rate, "delay": delay, "hold": hold})
     tuner = _Tuner(axes, _axes_response(plants[-1], axes), float(peak), rigid, most)
     with Progress(len(axes.names), "axes", progress=progress) as bar:
         alone = tuner.each_alone(bar)
@@ -170,7 +170,7 @@ class _Tuner:
         return MeasuredAxis(self.axes.names[i], self.frf.freq, G, self.axes.rate, free, variance)
 
 
-def _plants(
+def _joint_plants(
     plant: Any, axes: Axes, rigid: int, larger: Any, measured: Mapping[str, Any]
 ) -> list[JointPlant]:
     """Return the plant in its own channels, and the one with the modes left out where known."""

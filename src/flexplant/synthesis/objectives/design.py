@@ -121,7 +121,7 @@ def design_lmi(
     _check_specifications(given, minimize, subject_to, whole(max_states, "max_states"))
     require_stabilisable(given, prepared(given.system, given.u, given.y), "synthesis by LMIs")
     require_reachable(given, subject_to)
-    scaled = _prepared(given)
+    scaled = _balanced_plant(given)
     problem = ObjectivePrograms(given, scaled, minimize, tuple(subject_to))
     claim, rate = _best_rate(problem)
     failures: list[Exception] = []
@@ -182,7 +182,7 @@ def _check_specifications(plant: StandardPlant, minimize: Any, subject_to: Any, 
         )
 
 
-def _prepared(plant: StandardPlant) -> Plant:
+def _balanced_plant(plant: StandardPlant) -> Plant:
     """Return the plant in balanced states and units of its own, its w and z as they are."""
     g = plant.system
     d = state_scale(g.A, g.B, g.C)

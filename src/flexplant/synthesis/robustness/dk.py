@@ -21,7 +21,7 @@ from ..hinf.hinf_design import design_hinf
 from .mode_dk import by_mode_channels
 from .sweep import covered
 from .uncertain_loop import OpenPlant, UncertainLoop, open_plant, require_uncertain, uncertain_loop
-from .uncertainty_blocks import FullBlock, Scalings, osborne, places
+from .uncertainty_blocks import FullBlock, Scalings, block_places, osborne
 from .upper import upper_level
 
 #: frequencies at which D is found
@@ -201,7 +201,7 @@ def _robust_step(uncertain: UncertainPlant[Any], K: StateSpace, w: Any, z: Any) 
 def _scales_of(plant: OpenPlant, loop: UncertainLoop, order: int) -> _DFilters:
     """Return D of a loop as filters: one for each block, its Delta taken as complex."""
     blocks = [FullBlock(block.w, block.z) for block in (*loop.blocks, loop.performance)]
-    scalings, where = Scalings(blocks), places(blocks)
+    scalings, where = Scalings(blocks), block_places(blocks)
     omega = _fit_grid(loop.system)
     rows = []
     for one in omega:

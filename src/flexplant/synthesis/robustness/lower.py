@@ -18,9 +18,9 @@ from .uncertainty_blocks import (
     Perturbation,
     Place,
     RepeatedScalar,
+    block_places,
     matrix_of,
-    places,
-    realised,
+    realised_delta,
 )
 
 #: steps of a power iteration; change at which it has settled
@@ -141,13 +141,13 @@ def smallest_multiple(
 
     The loop's eigenvalues decide: on the size before it is stable, on this one it is not.
     """
-    delta = realised(found, blocks)
+    delta = realised_delta(found, blocks)
     ladder = least * _LADDER
     if most < ladder[-1]:  # one loop decides whether this perturbation is worse than the best
         ladder = np.array([most])
     stable, unstable = 0.0, np.inf
     for t in ladder:
-        if _growth(M, delta, t)[0] >= 0:
+        if _abscissa(M, delta, t)[0] >= 0:
             unstable = float(t)
             break
         stable = float(t)
@@ -156,11 +156,11 @@ def smallest_multiple(
     stable = max(stable, 0.99 * least)
     while unstable - stable > _FINE * unstable:
         middle = 0.5 * (stable + unstable)
-        if _growth(M, delta, middle)[0] >= 0:
+        if _abscissa(M, delta, middle)[0] >= 0:
             unstable = middle
         else:
             stable = middle
-    return Destabilising(unstable, found, _growth(M, delta, unstable)[1])
+    return Destabilising(unstable, found, _abscissa(M, delta, unstable)[1])
 
 
 def crossing_multiple(
@@ -274,7 +274,7 @@ def loop_matrix(M: StateSpace, delta: StateSpace, t: float) -> FloatArray:
     ])  # fmt: skip
 
 
-def _growth(M: StateSpace, delta: StateSpace, t: float) -> tuple[float, float]:
+def _abscissa(M: StateSpace, delta: StateSpace, t: float) -> tuple[float, float]:
     """Return the largest real part of the loop, and the frequency [rad/s] of that pole."""
     poles = la.eigvals(loop_matrix(M, delta, t))
     worst = int(np.argmax(poles.real))
@@ -288,7 +288,7 @@ def worse_signs(
 
     The pole with the largest real part, or the one near some value. None where nothing changes.
     """
-    delta = realised(one.found, blocks)
+    delta = realised_delta(one.found, blocks)
     A = loop_matrix(M, delta, one.size)
     eigen: Any = la.eig(A, left=True, right=True)
     values, left, right = eigen
@@ -303,7 +303,7 @@ def worse_signs(
     into = into + own_l[n:].conj() @ delta.B @ back @ M.D
     scalars = []
     numbers = iter(one.found.scalars)
-    for p in places(blocks):
+    for p in block_places(blocks):
         if isinstance(p.block, FullBlock):
             continue
         number = next(numbers)
@@ -323,7 +323,7 @@ def destabilising(
     rng: np.random.Generator,
 ) -> Destabilising | None:
     """Return the smallest perturbation found that makes a loop unstable."""
-    where = places(blocks)
+    where = block_places(blocks)
     least = 1.0 / max(level, TINY)
     best: Destabilising | None = None
     for omega in omegas:
@@ -332,7 +332,7 @@ def destabilising(
         first = Destabilising(0.0, starts[0], omega)
         signs = worse_signs(M, blocks, first, near=1j * omega)
         for start in [*starts, *([] if signs is None else [signs])]:
-            best = _ascended(M, blocks, start, least, best)
+            best = _worse_signs(M, blocks, start, least, best)
             if best is not None and best.size < 1.001 * least:
                 return best
     return _at_corners(M, blocks, least, best)
@@ -354,9 +354,9 @@ def _at_corners(
     ]
     for corner in corners:
         most = 100.0 * least if best is None else best.size * (1 - 1e-6)
-        delta = realised(corner, blocks)
+        delta = realised_delta(corner, blocks)
         for t in np.geomspace(least, most, _LOOPS // len(corners) + 1)[1:].tolist():
-            if _growth(M, delta, t)[0] >= 0:
+            if _abscissa(M, delta, t)[0] >= 0:
                 found = smallest_multiple(M, blocks, corner, least, t)
                 if found is not None and (best is None or found.size < best.size):
                     best = found
@@ -364,7 +364,7 @@ def _at_corners(
     return best
 
 
-def _ascended(
+def _worse_signs(
     M: StateSpace,
     blocks: Sequence[Block],
     start: Perturbation,

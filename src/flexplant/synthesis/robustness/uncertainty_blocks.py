@@ -76,7 +76,7 @@ class FullBlock(Value):
 Block: TypeAlias = RepeatedScalar | FullBlock
 
 
-def checked_blocks(blocks: Any, w: int, z: int) -> tuple[Block, ...]:
+def filled_blocks(blocks: Any, w: int, z: int) -> tuple[Block, ...]:
     """Return blocks that fill w outputs and z inputs of an uncertainty."""
     if not isinstance(blocks, Sequence) or not blocks or any(
         not isinstance(block, RepeatedScalar | FullBlock) for block in blocks
@@ -103,7 +103,7 @@ class Place(NamedTuple):
     z: slice
 
 
-def places(blocks: Sequence[Block]) -> list[Place]:
+def block_places(blocks: Sequence[Block]) -> list[Place]:
     """Return each block with its channels."""
     found, w, z = [], 0, 0
     for block in blocks:
@@ -127,7 +127,7 @@ class Scalings:
     """
 
     def __init__(self, blocks: Sequence[Block], leveled: Sequence[bool] | None = None) -> None:
-        self.places = places(blocks)
+        self.places = block_places(blocks)
         self.w, self.z = sum(b.w for b in blocks), sum(b.z for b in blocks)
         chosen = [True] * len(blocks) if leveled is None else list(leveled)
         self.skewed = not all(chosen)
@@ -279,13 +279,13 @@ def matrix_of(found: Perturbation, where: Sequence[Place]) -> ComplexArray:
     return total
 
 
-def realised(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
+def realised_delta(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
     """Return a real, stable system Delta(s) of norm one with the perturbation at its frequency.
 
     Each entry of a and b is a number times an all-pass ``+-(s - p) / (s + p)`` of its phase, so
     that the gain is one at all frequencies.
     """
-    where = places(blocks)
+    where = block_places(blocks)
     scalars, vectors = iter(found.scalars), iter(found.vectors)
     parts: list[StateSpace] = []
     for p in where:

@@ -170,7 +170,7 @@ def centred(
         _add_of_D(scalings, x, gradient, hessian)
         gradient += 2.0 * wide * x
         hessian.reshape(-1)[:: len(x) + 1] += 2.0 * wide
-        step, decrement = _newton(hessian, gradient, trace)
+        step, decrement = _newton_step(hessian, gradient, trace)
         # the value is off by the square of it
         if not decrement > 1e-6:
             break
@@ -255,7 +255,7 @@ def _skewed(
             level_gradient, level_curve = gradient[fixed], hessian[fixed, fixed]
             _add_of_D(scalings, x, gradient, hessian)
             gradient[fixed], hessian[fixed, fixed] = level_gradient + t, level_curve
-            step, decrement = _newton(hessian, gradient)
+            step, decrement = _newton_step(hessian, gradient)
             size = 1.0 if decrement < _CENTRED else 1.0 / (1.0 + decrement)
             # shorter steps are rounding of x
             while size > 1e-10:
@@ -278,7 +278,7 @@ def _skewed(
     return Certified(max(best.level, 0.0), best.x)
 
 
-def _newton(
+def _newton_step(
     hessian: FloatArray, gradient: FloatArray, trace: FloatArray | None = None
 ) -> tuple[FloatArray, float]:
     """Return the Newton step, one that keeps a trace where there is one, and its decrement."""

@@ -15,7 +15,7 @@ from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
 from ...loop.spill_over import growing_modes, modes_in_words
 from ...lti.interconnection import loop_poles
-from ...lti.joining import stacked
+from ...lti.joining import block_matrix
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import Poi, StandardPlant, larger_plant, standard_plant
@@ -295,7 +295,7 @@ class ServoTask:
     def controller(self) -> Callable[[Axis], StateSpace]:
         """The function of an axis that gives [ref, hats] -> u: errors, axes and decoupling."""
         T_u = decoupling(self.plant, self.poi)
-        return cache(lambda axis: _joined(self.plant, self.poi, axis.system, T_u))
+        return cache(lambda axis: _servo_law(self.plant, self.poi, axis.system, T_u))
 
     def is_stable(self, axis: Axis) -> bool:
         """Return whether the loop is stable with the modes that the plant has."""
@@ -455,7 +455,7 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
     return ports.poi(name if name is not None else ports.z[0].name)
 
 
-def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, T_u: FloatArray) -> StateSpace:
+def _servo_law(plant: StandardPlant, poi: Poi, axis: StateSpace, T_u: FloatArray) -> StateSpace:
     """Return [refs, hats] -> u: ``T_u (I x c) E``, E the errors, c the controller of an axis."""
     refs = [poi.derived(name, "ref") for name in poi.axes]
     inputs = [name for name in refs if name in plant.y]
@@ -463,7 +463,7 @@ def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, T_u: FloatArray) -
     errors = -np.eye(len(hats), len(hats) + len(inputs), len(inputs))
     for column, name in enumerate(inputs):
         errors[refs.index(name), column] = 1.0
-    A, B, C, D = (stacked([one] * len(hats)) for one in (axis.A, axis.B, axis.C, axis.D))
+    A, B, C, D = (block_matrix([one] * len(hats)) for one in (axis.A, axis.B, axis.C, axis.D))
     return StateSpace(
         A,
         B @ errors,

@@ -181,7 +181,7 @@ def design_structured(
             f"{claim:.6g} in the scaled problem: it is too badly conditioned to trust. Bring "
             "the weights closer together."
         )
-    kind = _kind(objectives)
+    kind = _measure_word(objectives)
     reached = {}
     if kind == "H-infinity":
         reached = reached_norms(plants[worst], closed[worst], responder(closed[worst]))
@@ -266,7 +266,7 @@ def _objectives(given: Any) -> list[LoopObjective]:
     return every
 
 
-def _kind(objectives: Sequence[LoopObjective]) -> str:
+def _measure_word(objectives: Sequence[LoopObjective]) -> str:
     """Return what is minimised, in a word."""
     if len(objectives) > 1:
         return "several objectives"
@@ -283,7 +283,7 @@ def _judges(
     order: int,
 ) -> _Judged:
     """Return the judges of all plants."""
-    if _kind(objectives) == "H-infinity":  # the problems are ready
+    if _measure_word(objectives) == "H-infinity":  # the problems are ready
         return [(GainJudge(problem, order), 1.0) for problem in problems]
     return [
         (judge, one.below or 1.0)
@@ -315,7 +315,7 @@ def _verified_loop(
     plant: StandardPlant, loop: StateSpace, objectives: Sequence[LoopObjective], claim: float
 ) -> dict[str, float]:
     """Return what was verified of a closed loop: `norm` is the largest, over its bound."""
-    if _kind(objectives) == "H-infinity":
+    if _measure_word(objectives) == "H-infinity":
         return certified_norm(loop, claim)
     least = stability(loop.poles(), loop.dt)
     if not least < (1.0 if loop.dt else 0.0):

@@ -183,7 +183,7 @@ class Subsets:
                 J = self.whole.slopes(point)
                 if not subset:
                     self.linear = _alone(J[:, : self.count], J[:, fixed], r)
-                return _share(J[:, : self.count], J[:, fixed], r)
+                return _explained(J[:, : self.count], J[:, fixed], r)
             # slopes of repeated modes depend on the candidate: each by itself
             return np.array([self._alone(b, subset, r) for b in range(self.count)])
         except ModelError:
@@ -195,7 +195,7 @@ class Subsets:
         fixed = [*subset, *self.beside]
         alone = self._objective([candidate, *fixed])
         J = alone.slopes(self._end_of(alone, range(1, len(fixed) + 1), subset))
-        return float(_share(J[:, :1], J[:, 1:], r)[0])
+        return float(_explained(J[:, :1], J[:, 1:], r)[0])
 
     def _end_of(self, objective: Objective, rows: Sequence[int], subset: Subset) -> Point:
         """Return the end of the fit of a subset as a point of `objective`.
@@ -285,7 +285,7 @@ class Subsets:
             few = self._objective(picked, B)
             found, way = self._searched(few, subset)
             made = few.at(found.p)
-            point = lifted(exact.family, B, made, exact.numbers)
+            point = lifted_point(exact.family, B, made, exact.numbers)
             r = exact.values(point)
             off = float(np.sum((r - few.values(made)) ** 2))
             close = off <= max(FAITHFUL**2 * float(r @ r), NEGLIGIBLE**2 * self.error_without)
@@ -376,7 +376,7 @@ def _alone(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
     return np.asarray(-(J.T @ r) / np.where(length > 0, length, np.inf))
 
 
-def _share(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
+def _explained(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
     whole = np.sum(J**2, axis=0)
     J, r = _beside(J, beside, r)
     length = np.sum(J**2, axis=0)
@@ -456,7 +456,7 @@ def is_physical(family: Family, p: FloatArray) -> bool:
     return softest > -NEARLY * float(elastic)
 
 
-def lifted(family: Family, B: FloatArray, point: Point, numbers: Sequence[int]) -> Point:
+def lifted_point(family: Family, B: FloatArray, point: Point, numbers: Sequence[int]) -> Point:
     r"""Return a point of few coordinates in all those of `family`, corrected to second order.
 
     What the coordinates miss, :math:`\rho = P(\lambda) B x`, moves the shape by

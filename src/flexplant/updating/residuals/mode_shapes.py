@@ -110,7 +110,7 @@ class ModeShapes(Residual):
         if covariance is not None:
             if std is not None:
                 raise ModelError("std and covariance say the same thing: give one of them.")
-            covariance = _checked_covariance(covariance, (shape[1], shape[0]))
+            covariance = _hermitian_stack(covariance, (shape[1], shape[0]))
         self._set(shapes=shapes, at=tuple(at), std=std, covariance=covariance)
         self._set(assign=flag(self.assign, "assign"))
 
@@ -283,7 +283,7 @@ def _checked_places(at: Any, direction: str) -> list[Place]:
     return [named_place(place, direction)[0] for place in at]
 
 
-def _checked_covariance(value: Any, size: tuple[int, int]) -> Any:
+def _hermitian_stack(value: Any, size: tuple[int, int]) -> Any:
     shape = (size[0], size[1], size[1])
     real = real_array(np.real(value), "covariance", shape)
     imag = real_array(np.imag(value), "the imaginary part of covariance", shape)

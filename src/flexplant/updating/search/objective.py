@@ -45,7 +45,7 @@ class Objective:
     ) -> None:
         self.parameters = tuple(parameters)
         self.residuals = checked_residuals(residuals)
-        own = [n for r in self.residuals for n in numbers(r)]
+        own = [n for r in self.residuals for n in compared_modes(r)]
         if family is None:
             family = Family(model, parameters, highest=max(own, default=6))
         self.family = family
@@ -211,7 +211,7 @@ def _from_bounds(parameter: Parameter) -> tuple[float, float] | None:
     return mean, max(high - mean, mean - low) / 3
 
 
-def numbers(residual: Residual) -> tuple[int, ...]:
+def compared_modes(residual: Residual) -> tuple[int, ...]:
     """Return the numbers of the modes a residual compares."""
     measured = getattr(residual, "measured", None)
     return tuple(getattr(measured, "modes", None) or ())
@@ -281,7 +281,7 @@ def _best_split(
     best = (np.inf, S, point.eigen)
     groups = group_derivatives(family, point.eigen)
     for way in np.vstack([np.eye(scale.size), -np.eye(scale.size)]) / scale:
-        S, eigen = _along(groups, point.eigen, columns, S, way)
+        S, eigen = _split_along(groups, point.eigen, columns, S, way)
         # rounding in the row of a vector that stays would give a step without bounds
         felt = np.where(np.abs(S) > UNSEEN * scale, S, 0.0)
         scaled, *_ = np.linalg.lstsq(
@@ -289,14 +289,14 @@ def _best_split(
         )
         step = scaled / scale
         if np.any(step):
-            S, eigen = _along(groups, point.eigen, columns, S, step)
+            S, eigen = _split_along(groups, point.eigen, columns, S, step)
         left = float(np.sum(data.whitened(gap - S @ step) ** 2))
         if left < best[0]:
             best = (left, S, eigen)
     return best[1], best[2]
 
 
-def _along(
+def _split_along(
     groups: GroupDerivatives,
     eigen: Eigen,
     columns: list[int],
