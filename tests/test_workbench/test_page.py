@@ -262,10 +262,7 @@ def test_what_is_exported_is_the_controller(page, tmp_path):
         found = by_c(io.BytesIO(exports.c_code(page.design)), tmp_path, error)
         np.testing.assert_allclose(found, wanted, rtol=1e-7)
     table = np.genfromtxt(
-        io.BytesIO(exports.section_table(page.design)),
-        delimiter=",",
-        skip_header=1,
-        usecols=range(2, 8),
+        io.BytesIO(exports.sections(page.design)), delimiter=",", skip_header=1, usecols=range(2, 8)
     )
     np.testing.assert_allclose(-signal.sosfilt(table, error), wanted, rtol=1e-6)
     mat = scipy.io.loadmat(io.BytesIO(exports.matlab_file(page.design)), squeeze_me=True)

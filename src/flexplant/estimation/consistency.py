@@ -38,9 +38,9 @@ from .innovations import (
     InnovationParts,
     Statistic,
     cumulative_periodogram,
+    density_of,
     excess_peaks,
     expected,
-    innovation_parts,
     level_test,
     lines_of,
     ljung_box,
@@ -416,7 +416,7 @@ def _tested(
     commands = np.where(missing, np.nan, u[-len(last) :])
     pooled = lines.pooled
     parts = (
-        innovation_parts(observer, None, lines.freq)
+        density_of(observer, None, lines.freq)
         if whole is None
         else expected(observer, whole, lines.samples)
     )

@@ -222,7 +222,7 @@ def impulse(observer: KalmanEstimator, count: int) -> FloatArray:
     return np.asarray(np.linalg.solve(_cholesky(observer), found))
 
 
-def innovation_parts(
+def density_of(
     observer: KalmanEstimator,
     plant: StandardPlant | None,
     freq: FloatArray,
@@ -273,7 +273,7 @@ def expected(observer: KalmanEstimator, plant: StandardPlant, samples: int) -> I
         covariance = np.fft.irfft(whole, 2 * samples, axis=0)
         return np.asarray(np.fft.rfft(covariance * weight, axis=0)[at])
 
-    found = innovation_parts(observer, plant, freq)
+    found = density_of(observer, plant, freq)
     return InnovationParts(seen(found.process), seen(found.sensors))
 
 

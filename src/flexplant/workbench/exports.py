@@ -48,7 +48,7 @@ def matlab_file(design: LoopDesign) -> bytes:
     return _written("design.mat", lambda path: write_mat(path, values))
 
 
-def section_table(design: LoopDesign) -> bytes:
+def sections(design: LoopDesign) -> bytes:
     """Return the second-order sections of each law as a table."""
     rows = ["axis,section,b0,b1,b2,a0,a1,a2"]
     for name, law in design.laws.items():

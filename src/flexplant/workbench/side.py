@@ -139,7 +139,7 @@ class SideCards:
             ("design", "design.npz", lambda: exports.design_file(page.design)),
             ("C99", "loops.zip", lambda: exports.c_code(page.design)),
             ("MATLAB", "loops.mat", lambda: exports.matlab_file(page.design)),
-            ("sections", "sections.csv", lambda: exports.section_table(page.design)),
+            ("sections", "sections.csv", lambda: exports.sections(page.design)),
             ("Python", "loops.py", lambda: exports.script(page.design, page.bench.source)),
             ("report", "loops.html", self._report),
         )
