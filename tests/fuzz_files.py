@@ -451,7 +451,7 @@ def forked(function, path, *, keep=""):
                 null = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(null, 1)
                 os.dup2(null, 2)
-                answer.write(foreign_parsers.answered((sys.path, function, str(path))))
+                answer.write(foreign_parsers.outcome_of((sys.path, function, str(path))))
                 answer.flush()
             os._exit(0)
         code = os.waitpid(process, 0)[1]

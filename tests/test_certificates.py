@@ -165,7 +165,7 @@ class Unstable:
 #: what is made wrong, how, what is called then, and what is said
 WRONG = {
     "error of an observer, its dual": (
-        "estimation.error._dual", larger(1.02),
+        "estimation.error._gain_trace", larger(1.02),
         lambda: estimate().rms("die", on=masses()), "its dual differ",
     ),
     "minimax filter": (
@@ -174,15 +174,15 @@ WRONG = {
         "those of the filter in closed form differ",
     ),
     "filter of several rates": (
-        "estimation.multirate._step", larger(1.001, 3),
+        "estimation.multirate._joseph_step", larger(1.001, 3),
         lambda: fx.estimation.design_multirate(masses(), {"y2": 2}), "one period",
     ),
     "H-infinity filter": (
-        "estimation.robust_filter._at", larger(1.003, 1),
+        "estimation.robust_filter._central_gains", larger(1.003, 1),
         lambda: fx.estimation.design_hinf_filter(masses()), "more than the level",
     ),
     "unknown inputs": (
-        "estimation.unknown_inputs._judged", given(1.001, 2),
+        "estimation.unknown_inputs._input_design", given(1.001, 2),
         lambda: fx.estimation.design_input_estimator(
             masses(), ["amp"], fx.estimation.Augmented(drift=1.0)
         ), "variances differ",
@@ -225,7 +225,7 @@ WRONG = {
         "times the weights",
     ),
     "reduced controller": (
-        "synthesis.aftercare.order.kept", lambda _: lambda *_: "too much",
+        "synthesis.aftercare.order.loss_text", lambda _: lambda *_: "too much",
         lambda: reducer(loss=0.1), "no controller of fewer states",
     ),
     "blocks for C, of several places": (
@@ -235,11 +235,11 @@ WRONG = {
         ), "moves the response",
     ),
     "H2 claim": (
-        "synthesis.h2._solved", larger(1.001, 4),
+        "synthesis.h2._solve_regular", larger(1.001, 4),
         lambda: fx.design_h2(masses()), "by the synthesis",
     ),
     "H2 stability": (
-        "synthesis.h2._solved", opposite, lambda: fx.design_h2(masses()), "is not stable",
+        "synthesis.h2._solve_regular", opposite, lambda: fx.design_h2(masses()), "is not stable",
     ),
     "inverse of a plant": (
         "simulation.feedforward.responder", lambda function: lambda g: larger(1.001)(function(g)),
@@ -260,7 +260,7 @@ WRONG = {
         "a mode was hidden",
     ),
     "no feedback": (
-        "synthesis.hinf.hinf_design._of_loop", unproven,
+        "synthesis.hinf.hinf_design._certified_answer", unproven,
         lambda: import_module("flexplant.synthesis.hinf.hinf_design").idle_answer(
             problem(), None, ""
         ), "cannot be verified",
@@ -272,12 +272,12 @@ WRONG = {
         ), "was claimed",
     ),
     "largest gain": (
-        "synthesis.robustness.gain._reached", larger(100.0, 0),
+        "synthesis.robustness.gain._machine_gain", larger(100.0, 0),
         lambda: fx.synthesis.worst_case_gain(off_by(0.01), lead(), w=["d"], z=["tip:x"]),
         "was proven as largest",
     ),
     "mu of one channel a mode": (
-        "synthesis.robustness.mode_dk._gain", larger(100.0),
+        "synthesis.robustness.mode_dk._grid_peak", larger(100.0),
         lambda: fx.synthesis.design_mu(
             off_by(0.01), w=["d", "y1:noise"], z=["tip:x", "u1:effort"], iterations=1
         ), "times the gain",
@@ -287,7 +287,7 @@ WRONG = {
         lambda: fx.synthesis.robust_stability(off_by(0.01), lead(), machines=8), "is unstable",
     ),
     "structured claim": (
-        "synthesis.structured.structured_design._norm", larger(1.001),
+        "synthesis.structured.structured_design._end_norm", larger(1.001),
         lambda: fx.synthesis.design_structured(problem(), FixedOrder(0), starts=1),
         "in the scaled problem",
     ),
@@ -311,13 +311,13 @@ def test_a_loop_is_held_to_each_objective():
     plant, found = problem(), fx.design_hinf(problem())
     norm = fx.synthesis.Hinf(below=0.9 * found.gamma)
     with pytest.raises(CertificateError, match="in the closed loop"):
-        design._verified(plant, found.system, norm, ())
+        design._verified_values(plant, found.system, norm, ())
     region = PoleRegion(decay=1e6)
     with pytest.raises(CertificateError, match="outside its region"):
-        design._verified(plant, found.system, fx.synthesis.Hinf(), (region,))
+        design._verified_values(plant, found.system, fx.synthesis.Hinf(), (region,))
     with pytest.raises(CertificateError, match="not stable"):
         wrong = found.system.replace(C=-1e3 * found.system.C, D=-1e3 * found.system.D)
-        design._verified(plant, wrong, fx.synthesis.Hinf(), ())
+        design._verified_values(plant, wrong, fx.synthesis.Hinf(), ())
 
 
 def test_a_simpler_controller_may_lose_what_is_allowed_and_no_more():
@@ -333,7 +333,7 @@ def test_a_structured_loop_that_is_not_stable_has_no_h2_norm():
     structured = import_module("flexplant.synthesis.structured.structured_design")
     loop = fx.StateSpace([[0.1]], [[1.0]], [[1.0]], [[0.0]])
     with pytest.raises(CertificateError, match="is not stable"):
-        structured._verified(two_masses(), loop, (fx.synthesis.H2(),), 1.0)
+        structured._verified_loop(two_masses(), loop, (fx.synthesis.H2(),), 1.0)
 
 
 @pytest.mark.slow
@@ -355,4 +355,4 @@ def test_an_unstable_loop_at_one_of_the_positions_has_no_norm():
     idle = fx.StateSpace([], [], [], np.zeros((len(plant.u), len(plant.y))), plant.dt,
                          inputs=plant.y, outputs=plant.u)  # fmt: skip
     with pytest.raises(CertificateError, match="not stable"):
-        moved._norm(plant, idle)
+        moved._position_norm(plant, idle)

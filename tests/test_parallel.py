@@ -234,7 +234,7 @@ def loaded(g):
         (lyapunov, "symmetric", lambda g: solve_stein(0.1 * g.A, np.eye(2))),
         (lyapunov, "is_block_diagonal", controllability_gramian),
         (balancing, "split_stable", lambda g: balanced(g, order=1)),
-        (kalman, "_designed", lambda g: flexplant.design_kalman(machines.stage())),
+        (kalman, "_filter_design", lambda g: flexplant.design_kalman(machines.stage())),
         (
             servo,
             "servo_task",
@@ -251,7 +251,7 @@ def test_dense_loops_run_on_one_thread(monkeypatch, module, inner, call):
 
     def now():
         """Threads of the BLAS of NumPy and SciPy: other packages bring libraries of their own."""
-        return max(lib["num_threads"] for lib in flexplant.parallel._controller().info())
+        return max(lib["num_threads"] for lib in flexplant.parallel._thread_pools().info())
 
     def noted(*arguments, **options):
         used.append(now())

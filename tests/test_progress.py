@@ -74,7 +74,7 @@ def child(code, stream):
 
 
 SHOWN = """
-progress.PATIENCE = 0.0
+progress.BAR_DELAY = 0.0
 for work in WORK.values():
     tried(work)
 print("done")
@@ -195,7 +195,7 @@ def test_a_notebook_is_somebody(monkeypatch, capsys):
 
     shell = types.SimpleNamespace(get_ipython=ZMQInteractiveShell)
     monkeypatch.setitem(sys.modules, "IPython", shell)
-    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "BAR_DELAY", 0.0)
     with Progress(3, "modes") as bar:
         bar.advance()
     said = capsys.readouterr()
@@ -204,7 +204,7 @@ def test_a_notebook_is_somebody(monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_where_nobody_looks_one_line_says_how_long(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "PATIENCE", 0.05)
+    monkeypatch.setattr(progress, "BAR_DELAY", 0.05)
     for total, said in ((4, r"modes: 0 s, 1 of 4 done, some 0 s more\n"), (None, r"modes: 0 s\n")):
         with Progress(total, "modes:") as bar:
             bar.advance()
@@ -223,7 +223,7 @@ def test_where_nobody_looks_one_line_says_how_long(monkeypatch, capsys):
 @pytest.mark.slow
 def test_a_long_first_item_and_a_long_rest(monkeypatch, capsys):
     """As soon as one is done it is said how long all take; of much, what would make it less."""
-    monkeypatch.setattr(progress, "PATIENCE", 0.05)
+    monkeypatch.setattr(progress, "BAR_DELAY", 0.05)
     for most, more in ((20.0, ""), (0.0, r"\. Take fewer\.")):
         monkeypatch.setattr(progress, "LONG", most)
         with Progress(4, "machines", advice="Take fewer.") as bar:
@@ -251,7 +251,7 @@ def test_what_is_known_before_is_said_before(monkeypatch, capsys):
         expect(seconds=1e4)
     expect(seconds=1e4)  # of no work
     assert not capsys.readouterr().err
-    monkeypatch.setattr(progress, "PATIENCE", 0.05)
+    monkeypatch.setattr(progress, "BAR_DELAY", 0.05)
     with Progress(100, "machines") as bar:
         bar.advance(90, known=True)
         bar.advance()
@@ -262,7 +262,7 @@ def test_what_is_known_before_is_said_before(monkeypatch, capsys):
 
 def test_advice_on_a_terminal(monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(progress, "PATIENCE", 0.02)
+    monkeypatch.setattr(progress, "BAR_DELAY", 0.02)
     monkeypatch.setattr(progress, "LONG", 0.0)
     with Progress(1000, "machines", advice="Take fewer.") as bar:
         bar.advance()
@@ -275,7 +275,7 @@ def test_advice_on_a_terminal(monkeypatch, capsys):
 @pytest.mark.parametrize("name", ["modes", "identification", "placement", "response"])
 def test_estimates_before_the_start_hold_to_a_factor(name, monkeypatch, capsys):
     """What is said before is right within five times, whatever the machine."""
-    monkeypatch.setattr(progress, "PATIENCE", 0.1)
+    monkeypatch.setattr(progress, "BAR_DELAY", 0.1)
     rng = np.random.default_rng(0)
     if name == "modes":
         block = fx.solid_block(
@@ -320,7 +320,7 @@ def test_estimates_before_the_start_hold_to_a_factor(name, monkeypatch, capsys):
 def test_the_outermost_work_has_the_bar(monkeypatch, capsys):
     """Also for what runs in the threads of a pool; a tick counts for its own work only."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "BAR_DELAY", 0.0)
 
     def inner(item):
         with Progress(2, "inner") as bar:
@@ -364,7 +364,7 @@ def test_what_compiled_code_does_not_look_for():
 
 def test_a_bar_is_drawn_while_the_first_item_takes_its_time(monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(progress, "PATIENCE", 0.02)
+    monkeypatch.setattr(progress, "BAR_DELAY", 0.02)
     with Progress(1, "one long program"):
         for _ in range(500):
             time.sleep(0.01)

@@ -5,7 +5,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 import flexplant as fx
-from flexplant.certificates import in_words
+from flexplant.certificates import one_line
 from flexplant.store import as_html
 from flexplant.versions import versions
 from stages import RATE, ports, reduced
@@ -29,9 +29,9 @@ def test_entries_become_rows_and_tables_keep_their_columns():
 def test_certificates_in_words():
     found = {"norm": 1.234567, "spectral radius": 0.99998, "largest real part": -0.62661}
     assert (
-        in_words(found) == "norm 1.235, spectral radius 0.999980, largest real part -0.6266 rad/s"
+        one_line(found) == "norm 1.235, spectral radius 0.999980, largest real part -0.6266 rad/s"
     )
-    assert in_words({"spectral_radius": 1.0, "left_out": None}) == "spectral radius 1.0000"
+    assert one_line({"spectral_radius": 1.0, "left_out": None}) == "spectral radius 1.0000"
     plant = fx.assemble_plant(reduced(), ports()).discretized(RATE, delay=1)
     observer = fx.design_kalman(plant)
     assert repr(observer.certificate).startswith("<KalmanCertificate: spectral radius 0.99")

@@ -80,7 +80,7 @@ def explanation(
     unknown = [name for name in named if name not in taken]
     if unknown and not any(p.kind is p.VAR_KEYWORD for p in taken.values()):
         return unknown_keyword(called.__name__, unknown[0], taken)
-    outward = [(one, _given(one, *of)) for one, *of in reversed(inner)]
+    outward = [(one, _annotated_arguments(one, *of)) for one, *of in reversed(inner)]
     for strict in (False, True):
         for one, given in outward:
             for name, (value, hint) in given.items():
@@ -99,7 +99,7 @@ def explanation(
     return None
 
 
-def _given(called: Any, args: Any, named: Any) -> dict[str, tuple[Any, Any]]:
+def _annotated_arguments(called: Any, args: Any, named: Any) -> dict[str, tuple[Any, Any]]:
     """Return the arguments of a call by name, each with its annotation."""
     taken = signature(called)
     try:

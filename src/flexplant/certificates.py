@@ -15,7 +15,7 @@ class Certificate(Value):
     """The base of certificates with fields; prints them as a line of words and numbers."""
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__}: {in_words(self._fields())}>"
+        return f"<{type(self).__name__}: {one_line(self._fields())}>"
 
 
 def stability_name(sampled: Any) -> str:
@@ -29,7 +29,7 @@ def stability(poles: ComplexArray, sampled: Any) -> float:
     return float(np.max(size, initial=0.0 if sampled else -np.inf))
 
 
-def in_words(found: Mapping[str, Any]) -> str:
+def one_line(found: Mapping[str, Any]) -> str:
     """Return the numbers of a certificate as one line; what is None is left out."""
     return ", ".join(_worded(name, value) for name, value in found.items() if value is not None)
 

@@ -79,7 +79,7 @@ def real_array(
         )
     ):
         got = str(array.shape) if array.ndim else f"the number {array:g}"
-        raise ShapeError(f"{name} must {_form(shape)}, got {got}. Pass it in that form.")
+        raise ShapeError(f"{name} must {_shape_text(shape)}, got {got}. Pass it in that form.")
     if array.size and not -limit < array.min() <= array.max() < limit:
         raise _no_finite(array, name, masked=_masks(value))
     return array
@@ -178,7 +178,7 @@ def _no_numbers(value: Any, name: str, shape: tuple[int | None, ...] | None) -> 
     return ModelError(f"{name} must {form}, got {short(value)}. Pass numbers, in SI units.")
 
 
-def _form(shape: tuple[int | None, ...]) -> str:
+def _shape_text(shape: tuple[int | None, ...]) -> str:
     """Return in words what a shape requires."""
     if not shape:
         return "be one number"
@@ -229,7 +229,7 @@ def number(value: Any, name: str) -> float:
     return float(real_array(value, name, ()))
 
 
-def numbers(value: Any, name: str, count: int) -> tuple[float, ...]:
+def floats_of(value: Any, name: str, count: int) -> tuple[float, ...]:
     """Return so many finite numbers as a tuple."""
     return tuple(real_array(value, name, (count,)).tolist())
 

@@ -119,7 +119,7 @@ def rooms() -> dict[str, ModuleType]:
     return {name: import_module(f"flexplant.{name}") for name in (*names, *_MORE)}
 
 
-def _shown(name: str, room: ModuleType) -> list[str]:
+def _page_names(name: str, room: ModuleType) -> list[str]:
     """Return the names that the page of a room lists."""
     if name == "errors":
         raised = (n for n, item in vars(room).items() if inspect.isclass(item))
@@ -132,7 +132,7 @@ class _Site:
 
     def __init__(self) -> None:
         self.rooms = rooms()
-        self.names = {n: _shown(n, room) for n, room in self.rooms.items()}
+        self.names = {n: _page_names(n, room) for n, room in self.rooms.items()}
         self.where: dict[str, str] = {}
         for room, names in self.names.items():
             for name in names:

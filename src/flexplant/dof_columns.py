@@ -70,7 +70,7 @@ def columns_of(
                 f"{str(table)!r:.80} is no CSV file: {error}. Write it as text in UTF-8."
             ) from None
     else:
-        rows = listed(table, "a DOF table", "a CSV file or a list of mappings")
+        rows = as_list(table, "a DOF table", "a CSV file or a list of mappings")
     if not rows or not all(isinstance(row, Mapping) for row in rows):
         raise LabelError(
             "a DOF table needs rows with columns node, direction, x, y, z, got "
@@ -84,13 +84,13 @@ def columns_of(
             "Name the columns so; where a line is cut short, complete it."
         )
     return (
-        node_numbers([_number(row, "node", i) for i, row in enumerate(rows)]),
+        node_numbers([_cell_number(row, "node", i) for i, row in enumerate(rows)]),
         tuple(str(row["direction"]).strip() for row in rows),
-        np.array([[_number(row, c, i) for c in "xyz"] for i, row in enumerate(rows)]),
+        np.array([[_cell_number(row, c, i) for c in "xyz"] for i, row in enumerate(rows)]),
     )
 
 
-def _number(row: Mapping[str, Any], column: str, line: int) -> float:
+def _cell_number(row: Mapping[str, Any], column: str, line: int) -> float:
     try:
         return float(row[column])
     except (TypeError, ValueError):
@@ -100,7 +100,7 @@ def _number(row: Mapping[str, Any], column: str, line: int) -> float:
         ) from None
 
 
-def listed(items: Any, name: str, form: str) -> list[Any]:
+def as_list(items: Any, name: str, form: str) -> list[Any]:
     """Return items as a list; LabelError when there is nothing to list."""
     if not several(items):
         raise LabelError(f"{name} must be {form}, got {items!r:.60}. Pass it in [...].")
@@ -133,7 +133,7 @@ def direction_names(directions: Any) -> tuple[str, ...]:
             f"[{directions!r}] * n."
         )
     # the million of a large model are strings already, and few different ones
-    given = tuple(listed(directions, "directions", "a list with one for each DOF"))
+    given = tuple(as_list(directions, "directions", "a list with one for each DOF"))
     try:
         if all(type(d) is str for d in set(given)):
             return given

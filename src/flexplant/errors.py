@@ -167,7 +167,7 @@ def unknown_attribute(owner: str, name: str, known: Iterable[str]) -> AttributeE
     Response has no 'plot'. Pictures are functions: flexplant.plot. dir() of it lists all.
     """
     listed = sorted(n for n in known if not n.startswith("_"))
-    near = f" Close matches: {', '.join(close)}." if (close := _near(name, listed)) else ""
+    near = f" Close matches: {', '.join(close)}." if (close := _similar_names(name, listed)) else ""
     if name.startswith("plot"):
         near = " Pictures are functions: flexplant.plot."
     return AttributeError(f"{owner} has no {name!r}.{near} dir() of it lists all.")
@@ -182,13 +182,13 @@ def unknown_keyword(owner: str, name: str, known: Iterable[str]) -> TypeError:
     Pid takes no argument 'kp'. Close matches: p. It takes p, i, d, pole.
     """
     listed = list(known)
-    near = f" Close matches: {', '.join(close)}." if (close := _near(name, listed)) else ""
+    near = f" Close matches: {', '.join(close)}." if (close := _similar_names(name, listed)) else ""
     return TypeError(
         f"{owner} takes no argument {name!r}.{near} It takes {', '.join(listed) or 'none'}."
     )
 
 
-def _near(name: str, listed: list[str]) -> list[str]:
+def _similar_names(name: str, listed: list[str]) -> list[str]:
     """Return up to four names of a list that look like another, or contain it."""
     stem = name.rstrip("s").lower()
     within = [n for n in listed if len(stem) > 2 and (stem in n or n.rstrip("s") in name)]

@@ -180,7 +180,7 @@ class _Contents:
         read: set[str] = set()
         words: set[str] = set()
         imports: set[tuple[str, tuple[str, ...]]] = set()
-        for one in _inner(code):
+        for one in _nested_code(code):
             words.update(one.co_names)
             steps = [s for s in dis.get_instructions(one) if s.opname != "EXTENDED_ARG"]
             for i, step in enumerate(steps):
@@ -306,12 +306,12 @@ def _text(value: Any) -> bytes:
     return repr(value).encode("utf-8", "surrogatepass")
 
 
-def _inner(code: CodeType) -> Iterator[CodeType]:
+def _nested_code(code: CodeType) -> Iterator[CodeType]:
     """Yield code and that of all functions inside it."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            yield from _inner(constant)
+            yield from _nested_code(constant)
 
 
 def _is_found(item: Any) -> bool:
@@ -338,10 +338,10 @@ def _is_installed(name: str | None) -> bool:
     place = file or next(iter(folders), None)
     if place is None:
         return top in sys.stdlib_module_names or top in sys.builtin_module_names
-    return _is_below(place)
+    return _is_in_packages(place)
 
 
 @functools.cache
-def _is_below(place: str) -> bool:
+def _is_in_packages(place: str) -> bool:
     folders = Path(place).resolve().parents
     return any(one in _INSTALLED or one.name in _PACKAGES for one in folders)

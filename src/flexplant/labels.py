@@ -15,11 +15,11 @@ from .checks import FloatArray, IntArray, Value, frozen, instance, name_list, re
 from .dof_columns import DIRECTIONS as DIRECTIONS
 from .dof_columns import (
     DofIndex,
+    as_list,
     columns_of,
     component_columns,
     direction_names,
     in_box,
-    listed,
     node_numbers,
     rotation_hint,
     unknown_dof,
@@ -216,7 +216,7 @@ class DofSet(Value):
         """Return the rows of several DOFs, in the order given."""
         if isinstance(labels, str):
             labels = [labels]
-        labels = listed(labels, "labels", "a list of DOF labels such as '41:z'")
+        labels = as_list(labels, "labels", "a list of DOF labels such as '41:z'")
         return np.array([self.index(label) for label in labels], dtype=np.int64)
 
     def select(self, labels: Iterable[str]) -> DofSet:

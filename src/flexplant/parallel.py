@@ -42,7 +42,7 @@ PROBE = 0.05
 
 
 @cache
-def _controller() -> Any:
+def _thread_pools() -> Any:
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
@@ -66,7 +66,7 @@ def one_thread() -> Iterator[None]:
         yield
         return
     with _lock:  # the number of threads may belong to each thread, or to all
-        limited = _controller().limit(limits=1, user_api="blas")
+        limited = _thread_pools().limit(limits=1, user_api="blas")
         _original = limited if _inside == 0 else _original
         _inside += 1
     _depth.value = 1
@@ -144,7 +144,7 @@ def mapped(
                 seconds = (perf_counter() - start) / done
                 _send(function, left[done:], seconds, executor, keep)
                 break
-            keep(number, _call(function, call))
+            keep(number, _call_seeded(function, call))
         return [results[i] for i in range(len(calls))]
 
 
@@ -171,10 +171,10 @@ def _send(
 
 def _chunk(function: Callable[..., Result], calls: Sequence[tuple[Any, ...]]) -> list[Result]:
     with one_thread(), Progress(None, "chunk", progress=False):  # no bars inside
-        return [_call(function, call) for call in calls]
+        return [_call_seeded(function, call) for call in calls]
 
 
-def _call(function: Callable[..., Result], call: tuple[Any, ...]) -> Result:
+def _call_seeded(function: Callable[..., Result], call: tuple[Any, ...]) -> Result:
     item, *seed = call
     return function(item, np.random.default_rng(seed[0])) if seed else function(item)
 
@@ -299,7 +299,7 @@ def _single(
 
     def start() -> None:
         process = _one_like(executor)
-        out[process.submit(_started, function, first)] = process, None, inf
+        out[process.submit(_started_process, function, first)] = process, None, inf
 
     def send(process: ProcessPoolExecutor, number: int) -> None:
         try:
@@ -326,7 +326,7 @@ def _single(
                 late = not future.done()
                 error = None if late else future.exception()
                 if late or isinstance(error, BrokenExecutor):
-                    _end(process)
+                    _end_pool(process)
                     if number is None:
                         raise SolverError(
                             "a process like those of the executor ends while it starts. Check the "
@@ -343,7 +343,7 @@ def _single(
                         start()
                     continue
                 if error is not None:
-                    _end(process)
+                    _end_pool(process)
                     raise error
                 if waiting:
                     send(process, waiting.pop())
@@ -353,7 +353,7 @@ def _single(
                     yield number, future.result()
     finally:  # interrupted too: no process stays
         for process, _, _ in out.values():
-            _end(process)
+            _end_pool(process)
 
 
 def _one_like(executor: Executor) -> ProcessPoolExecutor:
@@ -374,19 +374,19 @@ def _one_like(executor: Executor) -> ProcessPoolExecutor:
     )
 
 
-def _end(process: ProcessPoolExecutor) -> None:
+def _end_pool(process: ProcessPoolExecutor) -> None:
     """End a pool of one process, whatever it is doing."""
     for one in list((getattr(process, "_processes", None) or {}).values()):
         one.kill()
     process.shutdown(cancel_futures=True)
 
 
-def _started(*_functions: Any) -> None:
+def _started_process(*_functions: Any) -> None:
     """Return at once: the process has started, and imported what some functions need."""
 
 
 #: shorter work than this shows no bar [s]
-PATIENCE = 2.0
+BAR_DELAY = 2.0
 #: a bar that nothing advances is drawn anew after this long, for the time it shows [s]
 _AGAIN = 1.0
 #: with more than this left to do, advice on how to have less is worth its words [s]
@@ -437,7 +437,7 @@ class Progress:
                 total=total,
                 desc=description,
                 bar_format=None if total != 0 else "{desc}: {elapsed}",
-                delay=0.0 if progress else PATIENCE,
+                delay=0.0 if progress else BAR_DELAY,
                 leave=bool(progress),
                 file=self._stream or sys.stderr,
             )
@@ -486,14 +486,14 @@ class Progress:
 
     def expects(self, seconds: float) -> None:
         """Say at once how long all of it will take, the first time that this is two seconds."""
-        if self._expected or seconds < PATIENCE or not (self._unseen or self.bar is not None):
+        if self._expected or seconds < BAR_DELAY or not (self._unseen or self.bar is not None):
             return
         self._expected = seconds
         self._write(f"some {float(f'{seconds:.1g}'):g} s expected", seconds)
 
     def _shown(self) -> None:
         """Draw the bar while the first item, or any later one, takes its time."""
-        wait, advised = PATIENCE, not self.advice
+        wait, advised = BAR_DELAY, not self.advice
         while not self._over.wait(wait):
             left = self._left()
             if not advised and left > LONG:
@@ -505,12 +505,12 @@ class Progress:
 
     def _said(self) -> None:
         """Say what runs, and how long it will take, as soon as one item of several is done."""
-        if self._over.wait(PATIENCE) or self._expected:
+        if self._over.wait(BAR_DELAY) or self._expected:
             return
         self._say()
         if self._total and not self._left():
             while not self._left():
-                if self._over.wait(min(PATIENCE, _AGAIN)):
+                if self._over.wait(min(BAR_DELAY, _AGAIN)):
                     return
             self._say()
 
@@ -561,7 +561,7 @@ def expect(multiplications: float = 0.0, *, seconds: float = 0.0) -> None:
     """
     bars = _open_bars()
     if bars:
-        if multiplications * _LEAST > PATIENCE * 1e-2:
+        if multiplications * _LEAST > BAR_DELAY * 1e-2:
             seconds += multiplications * _seconds_each()
         bars[0].expects(seconds)
 

@@ -116,7 +116,7 @@ class Value(metaclass=_Kind):
         """Return the kind with its fields and their units; None and empty ones are left out."""
         shown = []
         for field in fields(self):  # type: ignore[arg-type]
-            text, unit = _shown(getattr(self, field.name)), field.metadata.get("unit")
+            text, unit = _field_text(getattr(self, field.name)), field.metadata.get("unit")
             if text not in ("None", "''", "[]", "{}"):
                 shown.append(f"{field.name}={text}{' ' + unit if unit else ''}")
         return f"{type(self).__name__}({', '.join(shown)})"
@@ -161,14 +161,14 @@ class Value(metaclass=_Kind):
         save(self, path)
 
 
-def _shown(value: Any) -> str:
+def _field_text(value: Any) -> str:
     """Return a field's value for a repr: large arrays by their shape, long lists by their ends."""
     if isinstance(value, float):
         return f"{value:g}"
     if sp.issparse(value) or (isinstance(value, np.ndarray) and not 0 < value.size <= 6):
         return f"array {value.shape}" if value.size else "[]"  # type: ignore[union-attr]
     if isinstance(value, tuple):
-        listed = [_shown(part) for part in value]
+        listed = [_field_text(part) for part in value]
         if len(listed) > 4:
             listed[3:-1] = [f"... {len(listed) - 4} more ..."]
         return f"[{', '.join(listed)}]"
@@ -393,10 +393,10 @@ def as_html(text: str) -> str:
         parts.append(f"<div><b>{escape(first[:end])}</b>{escape(first[end:])}</div>")
     else:
         rest = [first, *rest]
-    for shape, lines in groupby(rest, key=_kind):
+    for shape, lines in groupby(rest, key=_line_kind):
         part = list(lines)
         if shape == "entry":
-            rows = "".join(_row(line) for line in part)
+            rows = "".join(_html_row(line) for line in part)
             parts.append(f'<table style="border-collapse:collapse"><tbody>{rows}</tbody></table>')
         elif shape == "text":
             parts += [f"<div>{escape(line.strip())}</div>" for line in part]
@@ -406,7 +406,7 @@ def as_html(text: str) -> str:
     return f'<div class="flexplant">{"".join(parts)}</div>'
 
 
-def _kind(line: str) -> str:
+def _line_kind(line: str) -> str:
     """Return whether a line is a named entry, a sentence, or part of a table."""
     if _ENTRY.match(line):
         return "entry"
@@ -414,7 +414,7 @@ def _kind(line: str) -> str:
     return "text" if indent <= 2 and "  " not in line.strip() else "table"
 
 
-def _row(line: str) -> str:
+def _html_row(line: str) -> str:
     name, text = cast(re.Match[str], _ENTRY.match(line)).groups()
     return (
         f'<tr><th style="{_CELL};font-weight:600">{escape(name.strip())}</th>'

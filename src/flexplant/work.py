@@ -169,7 +169,7 @@ class Checkpoint:
         self.rows[number] = result
         if self._file is not None:
             text = _dumped([number, result])
-            self._append(self._file, f"{text[:-1]}, {_sum(text)}]\n".encode())
+            self._append(self._file, f"{text[:-1]}, {_crc(text)}]\n".encode())
 
     def _resume(self, file: IO[bytes], kind: str, free: set[str]) -> None:
         """Take what the file has; write the header where there is nothing."""
@@ -204,7 +204,7 @@ class Checkpoint:
             )
         self.header = found
         for line in lines:
-            self.rows.update(_entries(line.decode(errors="replace")))
+            self.rows.update(_parsed_results(line.decode(errors="replace")))
         if lines[-1]:  # cut off: what is appended has a line of its own
             self._append(file, b"\n")
 
@@ -255,7 +255,7 @@ def _is_locked_now(file: IO[bytes]) -> bool:
     return True
 
 
-def _entries(line: str) -> dict[int, Any]:
+def _parsed_results(line: str) -> dict[int, Any]:
     """Return the results of a line whose check sums are right, wherever they begin in it."""
     found: dict[int, Any] = {}
     at = 0
@@ -265,7 +265,7 @@ def _entries(line: str) -> dict[int, Any]:
             entry, end = json.JSONDecoder().raw_decode(line, begin.start())
         except ValueError:
             continue
-        if len(entry) == 3 and isinstance(entry[0], int) and entry[2] == _sum(_dumped(entry[:2])):
+        if len(entry) == 3 and isinstance(entry[0], int) and entry[2] == _crc(_dumped(entry[:2])):
             found[entry[0]] = entry[1]
             at = end
     return found
@@ -275,5 +275,5 @@ def _dumped(entry: Any) -> str:
     return json.dumps(entry, default=lambda value: value.tolist())
 
 
-def _sum(text: str) -> int:
+def _crc(text: str) -> int:
     return zlib.crc32(text.encode())

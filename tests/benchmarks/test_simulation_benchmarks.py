@@ -11,7 +11,7 @@ from timing import best
 import flexplant as fx
 from flexplant.loop.budget import white_noise
 from flexplant.parallel import one_thread
-from flexplant.simulation.runs import Drawn, SampleBySample, machine
+from flexplant.simulation.runs import Drawn, SampleBySample, machine_of
 from stages import L, ports
 
 COUNT = 100_000
@@ -42,7 +42,7 @@ def test_a_linear_loop():
 
     def plain():
         silent = loop.plant.replace(asd={})
-        single = SampleBySample(loop, machine(loop), Drawn(white_noise(silent), silent))
+        single = SampleBySample(loop, machine_of(loop), Drawn(white_noise(silent), silent))
         single.begin(np.zeros(g.n_states), [np.random.default_rng(0)])
         data = np.zeros((1, len(g.outputs), COUNT))
         with one_thread():

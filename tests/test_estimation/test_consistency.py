@@ -11,7 +11,7 @@ from test_robust import one_state
 
 from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import consistency, design_kalman
-from flexplant.estimation.innovations import cumulative_periodogram, lines_of, ljung_box, parts_of
+from flexplant.estimation.innovations import cumulative_periodogram, density_of, lines_of, ljung_box
 from flexplant.identification import MeasuredModes
 from flexplant.loop import close_loop
 from flexplant.modes import solve_modes
@@ -261,9 +261,9 @@ def test_the_innovations_on_its_own_plant_have_unit_density():
     observer = design_kalman(machine(), larger=machine())
     freq = np.geomspace(1e-4, 0.499, 300)
     for other in (machine(), None):
-        parts = parts_of(observer, other, freq)
+        parts = density_of(observer, other, freq)
         np.testing.assert_allclose(parts.both, np.broadcast_to(np.eye(4), (300, 4, 4)), atol=1e-6)
-    own, filtered = parts_of(observer, machine(), freq), parts_of(observer, None, freq)
+    own, filtered = density_of(observer, machine(), freq), density_of(observer, None, freq)
     np.testing.assert_allclose(own.pooled, filtered.pooled, atol=1e-6)
 
 

@@ -277,7 +277,7 @@ def test_mode_by_mode_and_all_at_once_give_the_same_variances(monkeypatch):
     whole = sampled(modes)
     observer = design_kalman(sampled(modes.select(range(12))), larger=modes).system
     fast = error_variances(whole, observer).values
-    monkeypatch.setattr("flexplant.estimation.error._eigen", lambda *_: None)
+    monkeypatch.setattr("flexplant.estimation.error._plant_modes", lambda *_: None)
     np.testing.assert_allclose(fast, error_variances(whole, observer).values, rtol=1e-8)
 
 

@@ -19,8 +19,8 @@ from flexplant.identification import (
     identify_modes,
     stabilisation_diagram,
 )
-from flexplant.identification.line_weights import prepared
-from flexplant.identification.pole_test import improved, missed, split, unexplained
+from flexplant.identification.line_weights import prepared_lines
+from flexplant.identification.pole_test import improved, missed_poles, split_proposals, unexplained
 from flexplant.identification.refine import LEAST, Fit, Lines, refined
 from flexplant.lti import Frf
 from flexplant.store import load
@@ -105,7 +105,7 @@ def test_a_missed_mode_is_warned_of_and_a_merged_one_added():
     lines = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), 2, 3, None)
     fit = refined(lines, CLOSE[[2]], PHI[:3, [2]].astype(complex), steps=150)
     assert unexplained(lines, fit)[0].freq == pytest.approx(90.04, abs=0.1)
-    _, fit = improved(lines, fit, [(missed, 6)], steps=150)
+    _, fit = improved(lines, fit, [(missed_poles, 6)], steps=150)
     assert not unexplained(lines, fit)
     assert fit.poles.size == 2
     found = identify_modes(frf, orders=range(2, 21))
@@ -187,10 +187,10 @@ def test_a_repeated_pole_that_passed_for_one_is_taken_apart(seed):
     assert np.sum(np.abs(found.freq - 120.0) < 0.3) == 2
     ready = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), 2, 5, None)
     one = refined(ready, found.poles[:5], found.participation[:, :5], steps=150)
-    _, two = improved(ready, one, [(split, 6)], steps=150)
+    _, two = improved(ready, one, [(split_proposals, 6)], steps=150)
     assert two.poles.size == 6
     assert np.abs(np.sort(np.abs(two.poles)) / np.abs(PAIRS) - 1).max() < 2e-3
-    assert improved(ready, two, [(split, 6)], steps=150)[1].poles.size == 6
+    assert improved(ready, two, [(split_proposals, 6)], steps=150)[1].poles.size == 6
 
 
 def test_a_pair_is_taken_apart_with_one_input():
@@ -199,7 +199,7 @@ def test_a_pair_is_taken_apart_with_one_input():
     ready = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), 2, 3, None)
     merged = refined(ready, truth[1:], np.ones((1, 2), dtype=complex), steps=150)
     assert merged.poles.size == 2
-    _, apart = improved(ready, merged, [(split, 6)], steps=150)
+    _, apart = improved(ready, merged, [(split_proposals, 6)], steps=150)
     assert apart.poles.size == 3
     assert np.abs(np.sort_complex(apart.poles.imag + 0j) / truth.imag - 1).max() < 1e-3
 
@@ -543,7 +543,7 @@ def test_weights_are_those_of_the_noise_whatever_share_of_it_was_fitted():
     """Residuals of a fit that has taken half of the noise's power: the variance stays."""
     rng, freq = np.random.default_rng(1), np.arange(1.0, 4001.0)
     noise = 0.3 * (rng.standard_normal((1, 1, 4000)) + 1j * rng.standard_normal((1, 1, 4000)))
-    lines = prepared(Frf(freq, 1.0 + noise, ["y"], ["u"]), None)
+    lines = prepared_lines(Frf(freq, 1.0 + noise, ["y"], ["u"]), None)
     for share in (0.0, 0.5):
         weight = lines.from_residuals(np.sqrt(1.0 - share) * noise, share).weight
         # of real and imaginary part each

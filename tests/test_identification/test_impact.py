@@ -9,7 +9,7 @@ import scipy.signal as ss
 
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.identification import identify_modes, impact_frf
-from flexplant.testbeds.ritz_plate import elastic_modes, ritz_plate
+from flexplant.testbeds.ritz_plate import plate_modes, ritz_plate
 from flexplant.testbeds.wafer_stage import DRAWING
 from oracles_identification import pole
 
@@ -22,7 +22,7 @@ ZETA = np.array([0.003, 0.002, 0.004, 0.0025, 0.003])
 @cache
 def plate():
     bare = ritz_plate(**DRAWING)
-    omega, phi = elastic_modes(bare)
+    omega, phi = plate_modes(bare)
     rows = np.array([bare.dofs.row(np.array([x, y, 0.0]), "z") for x, y in PLACES])
     return pole(omega[:5] / 2 / np.pi, ZETA), (rows @ phi)[:, :5]
 

@@ -490,14 +490,14 @@ def test_what_is_refused(monkeypatch):
 def test_the_certificate_can_fail(monkeypatch):
     """A gap, and a count that is wrong, are found."""
     half = plate(2, 0.3)
-    good = join_module.rows_of
+    good = join_module.stretch_rows
 
     def wrong(some, parts):
         found = good(some, parts)
         found.data[:1] *= 1.001
         return found
 
-    monkeypatch.setattr(join_module, "rows_of", wrong)
+    monkeypatch.setattr(join_module, "stretch_rows", wrong)
     with pytest.raises(CertificateError, match="fails its check"):
         fx.joined({"left": half, "right": half}, seam(half), placed=RIGHT)
     monkeypatch.undo()

@@ -10,7 +10,7 @@ from flexplant.errors import ModelError
 from flexplant.lti import StateSpace, h2_norm, hinf_norm, lft, norms, peak_gain, peaks
 from flexplant.lti import norms as level_set
 from flexplant.lti.discretisation import discretized
-from flexplant.lti.peaks import Peaks, climbed, exceeding, proved_peak, residues
+from flexplant.lti.peaks import Peaks, exceeding, newton_maxima, proved_peak, residues
 from flexplant.parallel import Progress
 from oracles_lti import largest_gain, lyapunov, peak_by_search, stein, sweep
 from shared_data import DATA
@@ -189,7 +189,7 @@ def test_the_level_set_alone_finds_the_peak(monkeypatch, start, feedthrough, del
     def poor(g, find, top):
         return largest_gain(g.A, g.B, g.C, g.D, g.dt, np.array([start])), start
 
-    monkeypatch.setattr(level_set, "_searched", poor)
+    monkeypatch.setattr(level_set, "_swept_peak", poor)
     monkeypatch.setattr(norms, "residues", lambda g: (None, None))
     assert hinf_norm(g) == pytest.approx(expected, rel=1e-8, abs=0)
 
@@ -236,7 +236,7 @@ def test_the_proof_by_intervals_agrees_with_the_level_set(seed):
     freq = np.arctan(above) / (np.pi * g.dt) if g.dt else above / (2 * np.pi)
     assert above.size and largest_gain(g.A, g.B, g.C, g.D, g.dt, freq) >= 0.999 * gain * (1 - 1e-9)
     # what lies around a peak: nothing higher; further away there may be
-    omega, height, zone = climbed(model, np.array([omega]), 1e-9)
+    omega, height, zone = newton_maxima(model, np.array([omega]), 1e-9)
     around = model.series(omega + zone * np.linspace(-1, 1, 401), 0)[0]
     assert zone > 0 and np.linalg.norm(around, 2, axis=(1, 2)).max() <= height * (1 + 1e-9)
 

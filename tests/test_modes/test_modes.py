@@ -8,7 +8,7 @@ import pytest
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.labels import DofSet
 from flexplant.modes import Modes, solve_modes
-from flexplant.modes.matching import mac
+from flexplant.modes.matching import mac_matrix
 from flexplant.store import load
 from flexplant.structure import ModalDamping
 from plates import make_plate
@@ -129,4 +129,4 @@ def test_residual_is_that_of_the_equation():
 
 def test_mac_is_one_for_a_scaled_shape_and_zero_for_an_orthogonal_one():
     X = np.array([[1.0, 0.0], [1j, 0.0], [0.0, 2.0]])
-    np.testing.assert_allclose(mac(X, X * (3 - 4j)), np.eye(2), atol=1e-15)
+    np.testing.assert_allclose(mac_matrix(X, X * (3 - 4j)), np.eye(2), atol=1e-15)

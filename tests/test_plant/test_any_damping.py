@@ -33,7 +33,7 @@ from flexplant.plant import (
     decouple,
     suspend,
 )
-from flexplant.plant.realisation import ILL_CONDITIONED, realised
+from flexplant.plant.realisation import ILL_CONDITIONED, realise
 from flexplant.structure import FEModel
 from oracles_plant import delayed_run, first_order, machine, receptance, z_row
 from oracles_ports import noise_of_late_outputs
@@ -307,7 +307,7 @@ def switching():
     low, high = 10.0, critical()
     for _ in range(60):
         middle = 0.5 * (low + high)
-        blocks = realised(model_of(M, D + np.diag([0, 0, middle, 0]), K)).form == "modal blocks"
+        blocks = realise(model_of(M, D + np.diag([0, 0, middle, 0]), K)).form == "modal blocks"
         low, high = (middle, high) if blocks else (low, middle)
     return low, high
 

@@ -8,7 +8,7 @@ import pytest
 from flexplant.errors import LabelError, ModelError
 from flexplant.lti import frequency_response
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Reference, Sensor, assemble_plant
-from flexplant.plant.realisation import realised
+from flexplant.plant.realisation import realise
 from oracles_plant import first_order, hold, machine, motion_row, receptance, z_row
 from stages import AXES, INSET, OFF_NODE, Z8, L, full, ports, reduced, some_modes
 
@@ -19,7 +19,7 @@ S = 2j * np.pi * FREQ
 @cache
 def heavy():
     """The full model with its mass, solved once."""
-    return realised(full(mass=0.5))
+    return realise(full(mass=0.5))
 
 
 def one(at, *, direction="z", model=None, freq=FREQ, quantity="displacement", push=INSET[0]):
@@ -132,7 +132,7 @@ def test_a_poi_at_a_label_takes_its_axes_there():
     np.testing.assert_allclose(there.system.C, point.system.C, rtol=1e-9, atol=1e-12)
     mean = {full().dofs.nearest(p, "z"): 0.5 for p in INSET[:2]}
     plant = assemble_plant(full(), Ports(u=u, z=[Poi("p", at=mean)]))
-    rows = [one(p, model=realised(full())) for p in INSET[:2]]
+    rows = [one(p, model=realise(full())) for p in INSET[:2]]
     agree(frequency_response(plant.Gzu, FREQ)["p:z", "u"], 0.5 * (rows[0] + rows[1]), 1e-9)
 
 

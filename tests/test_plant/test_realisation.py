@@ -8,7 +8,7 @@ from flexplant.labels import DofSet
 from flexplant.lti import frequency_response
 from flexplant.modes import solve_modes
 from flexplant.plant import assemble_plant
-from flexplant.plant.realisation import natural, realised
+from flexplant.plant.realisation import natural, realise
 from flexplant.structure import FEModel, ModalDamping
 from oracles_plant import machine, motion_row, receptance
 from oracles_structure import poles as dense_poles
@@ -37,7 +37,7 @@ def oracle(zeta=0.01, freq=FREQ, **changes):
 def test_frequencies_and_dampings_of_blocks_are_those_of_the_modes():
     zeta = [0.0, 0.0, 0.0, 0.01, 0.002]
     modes = solve_modes(full(), count=5, damping=ModalDamping(zeta))
-    omega, found = natural(realised(modes).pairs)
+    omega, found = natural(realise(modes).pairs)
     np.testing.assert_allclose(omega[3:], 2 * np.pi * modes.freq[3:], rtol=1e-9)
     np.testing.assert_allclose(found[3:], zeta[3:], rtol=1e-6)
 
@@ -73,7 +73,7 @@ def test_truncated_modes_with_an_attachment_vector_are_near_it():
     low = FREQ[:-1]
     assert close(gain(some_modes(), low), oracle(freq=low), 0.4)
     model = some_modes()
-    assert realised(model).pairs.shape[0] == 25
+    assert realise(model).pairs.shape[0] == 25
     assert assemble_plant(model, ports()).system.states[-2:] == ("residual1:q", "residual1:v")
 
 
@@ -162,8 +162,8 @@ def test_state_names_and_blocks():
 
 
 def test_a_realisation_passes_through():
-    shared = realised(some_modes())
-    assert realised(shared) is shared
+    shared = realise(some_modes())
+    assert realise(shared) is shared
     again = assemble_plant(shared, ports())
     assert np.array_equal(again.system.A, assemble_plant(some_modes(), ports()).system.A)
 
@@ -171,17 +171,17 @@ def test_a_realisation_passes_through():
 def test_an_undamped_model():
     dofs = DofSet([1, 2], ["z", "z"], [[0, 0, 0], [1, 0, 0]])
     two = FEModel(np.diag([2.0, 1.0]), np.array([[50.0, -50.0], [-50.0, 50.0]]), dofs=dofs)
-    poles = realised(two).pairs
+    poles = realise(two).pairs
     np.testing.assert_allclose(np.linalg.eigvals(poles[1]).imag, [75**0.5, -(75**0.5)])
 
 
 def test_other_models_and_large_ones_are_refused():
     with pytest.raises(ModelError, match=r"FEModel, Modes or ReducedModel, got str.*from_state"):
-        realised("plate")
+        realise("plate")
     n = 2600
     dofs = DofSet(np.arange(n), ["z"] * n, np.column_stack([np.arange(n), np.zeros((n, 2))]))
     import scipy.sparse as sp
 
     big = FEModel(sp.eye_array(n, format="csc"), sp.eye_array(n, format="csc"), dofs=dofs)
     with pytest.raises(ModelError, match=r"dense eigenproblem.*solve_modes"):
-        realised(big)
+        realise(big)

@@ -8,7 +8,7 @@ import oracles_reduction as oracle
 import oracles_structure
 from flexplant.errors import ModelError
 from flexplant.modes import solve_modes
-from flexplant.modes.matching import paired
+from flexplant.modes.matching import pair_modes
 from flexplant.reduction import CraigBampton, Guyan, ModalBalanced, ModalTruncation, reduce
 from flexplant.structure import Damper, ModalDamping, Rayleigh
 from plates import make_plate
@@ -94,7 +94,7 @@ def shapes(n, m, seed=3):
 
 
 def pairs_of(freq, other_freq, phi, psi, n_rigid=0):
-    return paired(freq, other_freq, phi.T @ phi, phi.T @ psi, psi.T @ psi, n_rigid=n_rigid)
+    return pair_modes(freq, other_freq, phi.T @ phi, phi.T @ psi, psi.T @ psi, n_rigid=n_rigid)
 
 
 def test_pairs_follow_shapes_and_alike_shapes_follow_frequency():

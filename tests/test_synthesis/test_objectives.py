@@ -12,7 +12,7 @@ from flexplant.errors import AssumptionError, InfeasibleError, LabelError, Model
 from flexplant.lti import StateSpace, lft
 from flexplant.lti.discretisation import held_exactly
 from flexplant.synthesis import H2, Hinf, PeakGain, PoleRegion, design_lmi
-from flexplant.synthesis.objectives.design import _prepared
+from flexplant.synthesis.objectives.design import _balanced_plant
 from flexplant.synthesis.objectives.lmis import ObjectivePrograms, damped, within
 
 pytestmark = pytest.mark.slow
@@ -158,7 +158,7 @@ def test_the_rate_of_decay_is_searched():
     """The least over 40 rates, each given to PeakGain, is found without naming one."""
     given = mass()
     found = design_lmi(given, minimize=PeakGain()).certificate["LMI optimum"]
-    plant = _prepared(given)
+    plant = _balanced_plant(given)
     single = [
         ObjectivePrograms(given, plant, PeakGain(decay=rate * plant.speed), ()).smallest(1.0)
         for rate in np.geomspace(0.05, 2.0, 40)

@@ -11,7 +11,7 @@ from flexplant.lti.preparation import prepared
 from flexplant.plant import StandardPlant
 from flexplant.synthesis import H2, FixedOrder, Hinf, PeakGain, TunedLaws, design_h2
 from flexplant.synthesis import design_structured as design
-from flexplant.synthesis.structured.judges import H2Judge, PeakJudge, selected
+from flexplant.synthesis.structured.judges import H2Judge, PeakJudge, problem_on
 
 
 def first_order(effort, dt=0.0):
@@ -100,7 +100,7 @@ def test_gradients_by_differences(kind, sampled):
     plant = resonant(0.1 if sampled else 0.0)
     spec = H2() if kind is H2Judge else PeakGain(w=["w0"], z=["z0"])
     w, z = spec.chosen(plant)
-    judge = kind(selected(plant, w, z), 2)
+    judge = kind(problem_on(plant, w, z), 2)
     family = FixedOrder(2, direct=sampled).family(plant, prepared(plant.system, plant.u, plant.y))
     rng = np.random.default_rng(1)
     theta = family.first + 0.1 * rng.standard_normal(family.first.size)

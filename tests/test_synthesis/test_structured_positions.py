@@ -7,7 +7,7 @@ from test_structured import judged, law, machine
 from flexplant.errors import ModelError
 from flexplant.lti import StateSpace
 from flexplant.synthesis import TunedLaws, design_structured
-from flexplant.synthesis.plant_range import between
+from flexplant.synthesis.plant_range import system_at
 
 
 def moving(places=(0.0, 0.5, 1.0)):
@@ -43,5 +43,5 @@ def test_plants_of_several_machines_are_no_range():
 def test_between_two_places_matrices_are_linear():
     one = StateSpace([[-1.0]], [[1.0]], [[2.0]], [[0.0]])
     two = StateSpace([[-3.0]], [[5.0]], [[4.0]], [[8.0]])
-    found = between([one, two], np.array([0.0, 4.0]), 1.0)
+    found = system_at([one, two], np.array([0.0, 4.0]), 1.0)
     assert [getattr(found, m).item() for m in "ABCD"] == [-1.5, 2.0, 2.5, 2.0]

@@ -16,7 +16,7 @@ from flexplant.updating import (
 )
 from flexplant.updating.family import Family
 from flexplant.updating.judgement import subsets
-from flexplant.updating.judgement.subsets import coordinates, lifted, load_vectors
+from flexplant.updating.judgement.subsets import coordinates, lifted_point, load_vectors
 from flexplant.updating.point_model import first_point
 
 
@@ -51,7 +51,7 @@ def test_few_coordinates_give_the_modes_of_all(family):
     B = coordinates(family, loads, top)
     assert B.shape[1] < 0.7 * B.shape[0]
     few = first_point(chosen.confined(B), p)
-    made = lifted(chosen, B, few, numbers).eigen
+    made = lifted_point(chosen, B, few, numbers).eigen
     before, after = (np.abs(e.poles[:5] / exact.poles[:5] - 1).max() for e in (few.eigen, made))
     assert after < 1e-9
     assert after < before

@@ -11,7 +11,7 @@ from flexplant.identification import MeasuredModes
 from flexplant.lti import frequency_response
 from flexplant.modes import solve_modes
 from flexplant.plant import assemble_plant
-from flexplant.plant.realisation import realised
+from flexplant.plant.realisation import realise
 from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
 from flexplant.updating import (
     AddedDamping,
@@ -129,7 +129,7 @@ def test_a_slightly_negative_drag_is_no_obstacle(zeta):
     fit = update(reduced(zeta), [AddedMass(at), AddedDamping(at)], [Eigenvalues(measured)])
     assert fit.values[1] < 0
     whole = fit.applied_to(full(zeta))
-    found = realised(whole)
+    found = realise(whole)
     assert found.n_rigid == 3
     poles = np.linalg.eigvals(found.pairs[3:]).reshape(-1)
     poles = poles[poles.imag > 0]

@@ -8,7 +8,7 @@ from bench_plants import RATE, closed_poles, coupled, design, law, light, lines,
 from flexplant.workbench.evaluation import Evaluator, coupling
 from flexplant.workbench.limits import LoopLimits
 from flexplant.workbench.machine import BenchMachine
-from flexplant.workbench.verdict import of_fleet, stability
+from flexplant.workbench.verdict import of_fleet, stability_verdict
 
 SAMPLED = {"rate": RATE, "hold": False}
 
@@ -98,7 +98,7 @@ def test_a_notch_on_a_mode_of_a_thousandth_makes_it_stable_also_by_its_lines():
         assert loop.is_stable is bool(size < 1.0)
         states.append(loop.is_stable)
     assert states == [False, True]
-    assert stability(loop)[0] == "stable"
+    assert stability_verdict(loop)[0] == "stable"
 
 
 def test_the_other_axes_count_too(frf, made):

@@ -265,13 +265,13 @@ def test_what_is_exported_is_the_controller(page, tmp_path):
         io.BytesIO(exports.sections(page.design)), delimiter=",", skip_header=1, usecols=range(2, 8)
     )
     np.testing.assert_allclose(-signal.sosfilt(table, error), wanted, rtol=1e-6)
-    mat = scipy.io.loadmat(io.BytesIO(exports.matlab(page.design)), squeeze_me=True)
+    mat = scipy.io.loadmat(io.BytesIO(exports.matlab_file(page.design)), squeeze_me=True)
     assert np.array_equal(np.atleast_2d(mat["controller"]["A"].item()), K.A)
     made = {}
     exec(exports.script(page.design), made)
     assert np.array_equal(made["controller"].A, K.A)
     assert made["controller"].inputs == K.inputs
-    text = exports.report(page.design, page.machine.given).decode()
+    text = exports.report_page(page.design, page.machine.given).decode()
     assert "LoopDesign" in text
     assert "y1" in text
 

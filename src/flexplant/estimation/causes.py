@@ -179,7 +179,7 @@ class SampledModes(NamedTuple):
         return f"mode {self.numbers[i]} ({self.freq[i]:.4g} Hz"
 
 
-def modes_of(plant: StandardPlant) -> SampledModes:
+def sampled_modes(plant: StandardPlant) -> SampledModes:
     """Return the elastic modes of a plant."""
     if plant.is_assembled:
         omega = np.sqrt(np.abs(np.linalg.det(plant.modal_blocks)))[plant.n_rigid :]
@@ -222,13 +222,13 @@ def peak_verdicts(
     highest peak any cause, of the others only whether a kept mode has changed.
     """
     plant, rate = observer.plant, 1.0 / observer.plant.dt
-    kept = modes_of(plant)
+    kept = sampled_modes(plant)
     seen = folded(kept.freq, rate)
     if not plant.is_assembled:  # its modes cannot be changed one by one
         highest = max(peaks, key=lambda one: one.height)
         near = _modes_near(seen, highest.freq * rate, _NEAR)
         if near.size:
-            return [LikelyCause("frequency", _wrong(highest, rate, kept.named(int(near[0]))))]
+            return [LikelyCause("frequency", _wrong_mode(highest, rate, kept.named(int(near[0]))))]
     causes: list[LikelyCause] = []
     handled: set[int] = set()
     for rank, peak in enumerate(sorted(peaks, key=lambda one: -one.height)[:_PEAKS]):
@@ -247,7 +247,7 @@ def peak_verdicts(
             straight = abs(mode - rate * np.round(mode / rate) - seen[i]) <= SAME * rate
             change = explained_by_change(observer, band, number, mode, 1.0 if straight else -1.0)
             if change is not None:
-                text = _wrong(peak, rate, kept.named(i))
+                text = _wrong_mode(peak, rate, kept.named(i))
                 if any(one.change is not None for one in causes):
                     text = (
                         f"likewise {peak.height:.3g} times at {at:.4g} Hz, near {kept.named(i)})."
@@ -257,7 +257,7 @@ def peak_verdicts(
                 break
         else:
             if not rank:
-                causes.append(_beyond(observer, peaks, kept, near, whole))
+                causes.append(_other_cause(observer, peaks, kept, near, whole))
     return causes
 
 
@@ -267,14 +267,14 @@ def _modes_near(seen: FloatArray, at: float, reach: float) -> IntArray:
     return near[np.argsort(np.abs(seen[near] - at))]
 
 
-def _wrong(peak: ExcessPeak, rate: float, mode: str) -> str:
+def _wrong_mode(peak: ExcessPeak, rate: float, mode: str) -> str:
     return (
-        f"{_said(peak, rate)}, near {mode} in the plant): its frequency or damping is not the "
+        f"{_phrase(peak, rate)}, near {mode} in the plant): its frequency or damping is not the "
         "machine's. Update the model."
     )
 
 
-def _beyond(
+def _other_cause(
     observer: KalmanEstimator,
     peaks: list[ExcessPeak],
     kept: SampledModes,
@@ -286,9 +286,9 @@ def _beyond(
     top = np.max(kept.freq[kept.freq < 0.5 * rate], initial=0.0)
     highest = max(peaks, key=lambda one: one.height)
     at = highest.freq * rate
-    found = None if whole is None else _named(observer, left_modes(*whole), at)
+    found = None if whole is None else _left_out_mode(observer, left_modes(*whole), at)
     if found is not None:
-        return LikelyCause(found.cause, f"{_said(highest, rate)}: {found.text}")
+        return LikelyCause(found.cause, f"{_phrase(highest, rate)}: {found.text}")
     # modes left out above those of the plant make peaks among these too: their compliance lacks
     above = [one for one in peaks if one.freq * rate > top]
     shown = max(above, key=lambda one: one.height, default=highest)
@@ -299,16 +299,16 @@ def _beyond(
     lacks = "or a disturbance that the plant lacks. Keep more modes, or add the disturbance."
     if above:
         out = f"a mode left out (above {nyquist} it appears folded)"
-        return LikelyCause("truncation", f"{_said(shown, rate)}, {where}: {out}, {lacks}")
+        return LikelyCause("truncation", f"{_phrase(shown, rate)}, {where}: {out}, {lacks}")
     return LikelyCause(
         "folding",
-        f"{_said(shown, rate)}, {where}; it has modes up to {top:.4g} Hz: one left out that lies "
+        f"{_phrase(shown, rate)}, {where}; it has modes up to {top:.4g} Hz: one left out that lies "
         f"above {nyquist} and appears folded (from {rate - at:.5g} or {rate + at:.5g} Hz, say), "
         + lacks,
     )
 
 
-def _said(peak: ExcessPeak, rate: float) -> str:
+def _phrase(peak: ExcessPeak, rate: float) -> str:
     return (
         f"the innovations have {peak.height:.3g} times the density that noise explains at "
         f"{peak.freq * rate:.4g} Hz"
@@ -317,12 +317,12 @@ def _said(peak: ExcessPeak, rate: float) -> str:
 
 def left_modes(whole: StandardPlant, numbers: IntArray) -> SampledModes:
     """Return the modes left out of a larger plant."""
-    every = modes_of(whole)
+    every = sampled_modes(whole)
     at = np.flatnonzero(np.isin(every.numbers, numbers))
     return SampledModes(every.numbers[at], every.freq[at])
 
 
-def _named(observer: KalmanEstimator, left: SampledModes, at: float) -> LikelyCause | None:
+def _left_out_mode(observer: KalmanEstimator, left: SampledModes, at: float) -> LikelyCause | None:
     """Return which mode left out appears at a frequency [Hz], or None."""
     rate = 1.0 / observer.plant.dt
     seen = folded(left.freq, rate)

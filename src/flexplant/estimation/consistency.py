@@ -22,11 +22,11 @@ from .causes import (
     folded,
     known_verdict,
     left_modes,
-    modes_of,
     offset,
     outlier_text,
     outliers,
     peak_verdicts,
+    sampled_modes,
     settling,
 )
 from .estimate import Estimate
@@ -38,12 +38,12 @@ from .innovations import (
     InnovationParts,
     Statistic,
     cumulative_periodogram,
+    density_of,
+    excess_peaks,
     expected,
     level_test,
     lines_of,
     ljung_box,
-    parts_of,
-    peaks,
 )
 from .kalman import design_kalman
 from .left_out import left_out
@@ -264,7 +264,7 @@ def consistency(
     if constant is not None:
         said.append(LikelyCause("offset", constant.text))
         white = settled - constant.mean  # what an offset does at first is no constant
-    whole = _whole(observer, larger)
+    whole = _larger_plant(observer, larger)
     if said or whole is not None:
         rest = _tested(observer, white, normal, whole, alpha, u)
     verdicts = _verdicts(observer, rest, whole, estimate.sensors, examined([], whole))
@@ -272,7 +272,7 @@ def consistency(
     moved, changes = None, [one.change for one in verdicts if one.change is not None]
     if changes and known:
         before = examined([one.freq for one in rest.peaks], whole)
-        moved, left = _moved(observer, estimate, changes, single, alpha, before)
+        moved, left = _moved_modes(observer, estimate, changes, single, alpha, before)
         said += left
     gated = int(estimate.gated.sum())
     without = f" {counted(gated, 'sample')} beyond the gate left out." if gated else ""
@@ -296,7 +296,7 @@ def consistency(
     )
 
 
-def _moved(
+def _moved_modes(
     observer: KalmanEstimator,
     estimate: Estimate,
     changes: Sequence[ModeChange],
@@ -347,7 +347,7 @@ def _spectra(observer: KalmanEstimator, facts: _Facts) -> dict[int, tuple[float,
     plant, lines = observer.plant, facts.lines.freq
     if not plant.is_assembled:
         return {}
-    kept, found = modes_of(plant), {}
+    kept, found = sampled_modes(plant), {}
     rate, step = 1.0 / float(plant.dt), float(lines[0])
     blocks = plant.modal_blocks[plant.n_rigid :]
     decay = -0.5 * np.trace(blocks, axis1=1, axis2=2) / (2.0 * np.pi)
@@ -393,7 +393,7 @@ class _Facts(NamedTuple):
         count = 2 * beside.density.size * beside.channels
         total = level_test(count * float(np.mean(beside.density)), count)
         p = min(total.p_value, cumulative_periodogram(beside).p_value)
-        return p >= _AGREES and not peaks(beside, _AGREES)
+        return p >= _AGREES and not excess_peaks(beside, _AGREES)
 
 
 def _tested(
@@ -416,12 +416,12 @@ def _tested(
     commands = np.where(missing, np.nan, u[-len(last) :])
     pooled = lines.pooled
     parts = (
-        parts_of(observer, None, lines.freq)
+        density_of(observer, None, lines.freq)
         if whole is None
         else expected(observer, whole, lines.samples)
     )
-    levels = _levels(parts.pooled, pooled.density)
-    found = peaks(pooled._replace(density=pooled.density / (levels @ parts.pooled)), alpha)
+    levels = _fitted_levels(parts.pooled, pooled.density)
+    found = excess_peaks(pooled._replace(density=pooled.density / (levels @ parts.pooled)), alpha)
     ratios = np.sqrt(np.mean(normal[there] ** 2, axis=0))
     return _Facts(
         nis, box, cumulative_periodogram(pooled), found, lines, parts, levels, ratios, count, alpha,
@@ -429,7 +429,7 @@ def _tested(
     )  # fmt: skip
 
 
-def _whole(observer: KalmanEstimator, larger: Any) -> StandardPlant | None:
+def _larger_plant(observer: KalmanEstimator, larger: Any) -> StandardPlant | None:
     """Return the plant with the modes left out, read like the observer's, or None."""
     plant = observer.plant
     if larger is None:
@@ -488,7 +488,7 @@ def _level_text(facts: _Facts, names: Any) -> str:
     return f"{text}. Scale the densities by this, or estimate them from the record."
 
 
-def _levels(parts: FloatArray, density: FloatArray) -> FloatArray:
+def _fitted_levels(parts: FloatArray, density: FloatArray) -> FloatArray:
     """Return the levels (process, sensors) of the parts (2, m) that explain a density best.
 
     By Whittle's likelihood, ``sum log m + I / m`` with m the sum of both at their levels, by

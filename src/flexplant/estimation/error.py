@@ -73,7 +73,7 @@ def error_variances(
         primal = np.sum((joint.E @ X) * joint.E, axis=1)
         dual = np.array([_dual_dense(joint, row) for row in joint.E])
     else:
-        primal, dual = _primal(joint), _dual(joint)
+        primal, dual = _primal(joint), _gain_trace(joint)
     size = divisor(primal)
     # both have the same poles: how far rounding moves their damping shows in neither
     rounded = np.sum(missed.variances * (np.finfo(np.float64).eps / missed.gap), axis=1)
@@ -165,7 +165,7 @@ def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | No
     drive[n:, : factor.shape[1]] += observer.B @ at_once
     if k:
         entering = np.vstack([g.A[np.ix_(rest, rigid)], observer.B @ C2[:, rigid]])
-        V = _followed(A, n, entering, g.A[np.ix_(rigid, rigid)])
+        V = _solve_sylvester(A, n, entering, g.A[np.ix_(rigid, rigid)])
         back = np.zeros((k, n + m))
         back[:, :n] = g.A[np.ix_(rigid, rest)]
         seen = C1[:, rigid] - observer.D @ C2[:, rigid] + E @ V
@@ -173,7 +173,7 @@ def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | No
         A = A - V @ back
         drive[:, : factor.shape[1]] -= V @ factor[rigid]
     direct = np.sum((observer.D @ np.hstack([noise, at_once])) ** 2, axis=1)
-    return _Joint(A, drive, E, direct, n, _eigen(A[:n, :n], A[:n, n:]))
+    return _Joint(A, drive, E, direct, n, _plant_modes(A[:n, :n], A[:n, n:]))
 
 
 def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
@@ -236,7 +236,7 @@ def moving_parts(plant: StandardPlant) -> tuple[IntArray, IntArray]:
     return kept, np.flatnonzero(reached)
 
 
-def _followed(A: FloatArray, n: int, entering: FloatArray, kept: FloatArray) -> FloatArray:
+def _solve_sylvester(A: FloatArray, n: int, entering: FloatArray, kept: FloatArray) -> FloatArray:
     """Return V of ``A V - V A_rr = -entering``; n states stand before the observer's."""
     V = np.zeros_like(entering)
     start = 0 if np.any(entering[:n]) else n
@@ -256,7 +256,7 @@ def _check_seen(plant: StandardPlant, seen: FloatArray, motion: FloatArray) -> N
         )
 
 
-def _eigen(block: FloatArray, above: FloatArray) -> ModalMap | None:
+def _plant_modes(block: FloatArray, above: FloatArray) -> ModalMap | None:
     """Return the modes of a plant whose modes are uncoupled, or None."""
     pairs = None if np.any(above) else uncoupled_pairs(block)
     if pairs is None:
@@ -277,13 +277,13 @@ def _primal(joint: _Joint) -> FloatArray:
     cross = shifted_columns(A, values.conj(), entering * values.conj() + noise @ driven.conj().T)
     half = A @ cross @ coupling.conj().T
     entered = np.real(entering @ coupling.conj().T) + noise @ noise.T
-    own = _own(A, entered + np.real(half + half.conj().T), _sizes(joint))
+    own = _stein_solution(A, entered + np.real(half + half.conj().T), _state_sizes(joint))
     see, keep = modes.seen(joint.E[:, :n]), joint.E[:, n:]
     total = np.sum((see @ inner + 2 * keep @ cross) * see.conj(), axis=1).real
     return np.asarray(total + np.sum((keep @ own) * keep, axis=1))
 
 
-def _sizes(joint: _Joint) -> FloatArray:
+def _state_sizes(joint: _Joint) -> FloatArray:
     """Return the sizes of the observer's states by the sensor noise alone, powers of two.
 
     Of all states alike, also of those that the POIs do not see: the dual's are their inverses.
@@ -292,19 +292,19 @@ def _sizes(joint: _Joint) -> FloatArray:
     return scale_of(accumulated(A, noise @ noise.T))
 
 
-def _own(A: FloatArray, load: FloatArray, d: FloatArray) -> FloatArray:
+def _stein_solution(A: FloatArray, load: FloatArray, d: FloatArray) -> FloatArray:
     """Return X of ``X = A X A' + load`` in states of sizes d; the load may be indefinite."""
     As, Qs = A * d / d[:, None], 0.5 * (load + load.T) / d / d[:, None]
     return np.asarray(stein(As, Qs) * d * d[:, None])
 
 
-def _dual(joint: _Joint) -> FloatArray:
+def _gain_trace(joint: _Joint) -> FloatArray:
     """Return ``trace(noise' Y noise)`` with ``Y = A' Y A + row' row`` for each row of E."""
     modes, A, coupling, driven, noise = joint.parts
     values, n = modes.poles, joint.n_elastic
     see, keep = modes.seen(joint.E[:, :n]), joint.E[:, n:]
-    sizes = 1.0 / _sizes(joint)
-    own = np.array([_own(A.T, np.outer(row, row), sizes) for row in keep])
+    sizes = 1.0 / _state_sizes(joint)
+    own = np.array([_stein_solution(A.T, np.outer(row, row), sizes) for row in keep])
     right = A.T @ own @ coupling + keep[:, :, None] * see[:, None, :]
     # the columns of all rows side by side, by one Schur form
     cross = shifted_columns(A.T, np.tile(values, len(keep)), np.hstack(list(right)))
@@ -337,7 +337,7 @@ def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop
     own = [block for block in loop.blocks if set(hats) & set(block.outputs)]
     if not own:
         loop = close_loop(loop.plant, *loop.blocks, estimator)
-    elif not all(_same(block, estimator) for block in own):
+    elif not all(_equal_systems(block, estimator) for block in own):
         raise ModelError(
             f"the loop has {', '.join(hats)} from another estimator. Close it with this one: "
             "close_loop(machine, observer, servo)."
@@ -353,7 +353,7 @@ def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop
     return np.array([source_variances(error, row, noises)[0].sum() for row in range(len(hats))])
 
 
-def _same(one: StateSpace, other: StateSpace) -> bool:
+def _equal_systems(one: StateSpace, other: StateSpace) -> bool:
     pairs = ((one.A, other.A), (one.B, other.B), (one.C, other.C), (one.D, other.D))
     return all(np.array_equal(a, b) for a, b in pairs)
 
@@ -436,7 +436,7 @@ def nodes_per_wavelength(
     """
     dofs = model.full_dofs if isinstance(model, ReducedModel) else model.dofs
     count = np.count_nonzero(np.isin(dofs.directions, _MOVES))
-    i, j = _coupled(model) if isinstance(model, FEModel) else (_NONE, _NONE)
+    i, j = _mass_coupling(model) if isinstance(model, FEModel) else (_NONE, _NONE)
     if not i.size:  # masses are lumped, or not known
         i, j = _side_by_side(dofs)
     if not i.size or 4 * i.size > count * (count - 1):
@@ -457,7 +457,7 @@ def _nodes_of(model: Any, outputs: FloatArray) -> FloatArray | None:
     return nodes_per_wavelength(model, outputs.reshape(len(outputs), -1, 2))
 
 
-def _coupled(model: FEModel) -> tuple[IntArray, IntArray]:
+def _mass_coupling(model: FEModel) -> tuple[IntArray, IntArray]:
     """Return the translations that the mass matrix couples."""
     M, directions = sp.coo_matrix(model.M), np.array(model.dofs.directions)
     alike = np.isin(directions, _MOVES)[M.row] & (directions[M.row] == directions[M.col])
@@ -472,12 +472,12 @@ def _side_by_side(dofs: DofSet) -> tuple[IntArray, IntArray]:
     for direction in _MOVES:
         for part in np.unique(owner):
             rows = np.flatnonzero((kinds == direction) & (owner == part))
-            found.append(rows[_triangulated(dofs.xyz[rows])])
+            found.append(rows[_neighbours(dofs.xyz[rows])])
     i, j = np.hstack(found)
     return i, j
 
 
-def _triangulated(xyz: FloatArray) -> IntArray:
+def _neighbours(xyz: FloatArray) -> IntArray:
     """Return pairs (2, e) of nodes side by side on a line, in a plane or in space."""
     offset = xyz - xyz.mean(axis=0) if len(xyz) else xyz
     _, size, axes = np.linalg.svd(offset, full_matrices=False)

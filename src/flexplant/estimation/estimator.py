@@ -18,7 +18,7 @@ from .error import NODES, NOTED, PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels
 from .filter_model import FilterModel, KalmanCertificate, Sight, filter_model
-from .lag_report import LAGS, Filter, Lag, LagReport, lag_report
+from .lag_report import LAGS, Filter, Lag, LagReport, lag_errors
 from .left_out import LeftOut, left_out
 
 #: relative difference between two ways to a variance from which it is stated beside the rms: six
@@ -277,7 +277,7 @@ class KalmanEstimator(PoiFilter):
         steady, sight, _, _ = in_unit_states(self.model, self.predicted_covariance)
         filtered = steady.variances(sight, steady.P, steady.gains, predict=False)[0]
         whole = self.variances if self.left_out is not None else filtered
-        return lag_report(self.plant, steady, sight, np.sqrt(whole), lags, poi_channels(self.plant))
+        return lag_errors(self.plant, steady, sight, np.sqrt(whole), lags, poi_channels(self.plant))
 
     def to_control(self) -> Any:
         """Return the filter as a `control.StateSpace`, sensors and u to estimates, same names."""
@@ -291,7 +291,7 @@ class KalmanEstimator(PoiFilter):
         `rts_smoother` takes no u: it is right for u = 0;
         `estimate(records, Smoother())` is right for any.
         """
-        return twin(self.model, self.predicted_covariance)
+        return filterpy_twin(self.model, self.predicted_covariance)
 
 
 #: points of a path that are assembled together
@@ -356,7 +356,7 @@ def _model_at(
     return filter_model(moved, left_out(moved, whole))
 
 
-def twin(model: FilterModel, covariance: FloatArray) -> Any:
+def filterpy_twin(model: FilterModel, covariance: FloatArray) -> Any:
     """Return filterpy's filter of a model; P is the covariance of x[k|k-1], x is at rest."""
     if np.any(model.D2):
         raise ModelError(
@@ -415,7 +415,7 @@ def twin_class() -> Any:
             return found
 
         def __reduce__(self) -> tuple[Any, ...]:
-            return _restored, (self.__dict__,)
+            return _unpickled, (self.__dict__,)
 
     return Twin
 
@@ -444,7 +444,7 @@ def _column(value: Any, count: int, name: str) -> FloatArray:
     return found.reshape(count, 1)
 
 
-def _restored(fields: dict[str, Any]) -> Any:
+def _unpickled(fields: dict[str, Any]) -> Any:
     """Return an unpickled filter: pickle finds no class that is made inside a function."""
     kind = twin_class()
     twin = kind.__new__(kind)

@@ -76,14 +76,14 @@ def same_pois(plant: StandardPlant, on: StandardPlant | System) -> StandardPlant
 
 def estimates(channels: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the estimates, such as `die:hat` and `die:rx:hat`."""
-    return tuple(_derived(channels, "hat"))
+    return tuple(_estimate_names(channels, "hat"))
 
 
 def row_of(channels: Sequence[str], name: str) -> int:
     """Return which POI channel a name means: `die`, `die:z`, `die:hat` and `die:error` are one."""
     known: dict[str, int] = {}
     for kind in ("hat", "error"):
-        known |= {alias: i for i, alias in enumerate(_derived(channels, kind))}
+        known |= {alias: i for i, alias in enumerate(_estimate_names(channels, kind))}
     known |= _firsts(channels)
     known |= {channel: i for i, channel in enumerate(channels)}
     if not isinstance(name, str) or name not in known:
@@ -98,7 +98,7 @@ def _firsts(channels: Sequence[str]) -> Mapping[str, int]:
     return first
 
 
-def _derived(channels: Sequence[str], kind: str) -> list[str]:
+def _estimate_names(channels: Sequence[str], kind: str) -> list[str]:
     first = _firsts(channels)
     names = []
     for i, channel in enumerate(channels):
@@ -150,8 +150,8 @@ def recorded(records: Any, model: Any) -> Recorded:
                 else "A command that was not given is an array of zeros"
             )
             raise LabelError(f"{missing} {what}: the filter needs all of its channels.")
-    y = [_channel(records[name], name, missing=True) for name in model.sensors]
-    u = [_channel(records[name], name) for name in model.commands]
+    y = [_run_values(records[name], name, missing=True) for name in model.sensors]
+    u = [_run_values(records[name], name) for name in model.commands]
     sizes = {name: part.size for name, part in zip(model.sensors, y, strict=True)}
     sizes |= {name: part.size for name, part in zip(model.commands, u, strict=True)}
     if len(set(sizes.values())) > 1:
@@ -171,7 +171,7 @@ def recorded(records: Any, model: Any) -> Recorded:
     return Recorded(_time(records, known, count, model.dt), both, len(y), complete)
 
 
-def _channel(values: Any, name: str, *, missing: bool = False) -> FloatArray:
+def _run_values(values: Any, name: str, *, missing: bool = False) -> FloatArray:
     array = floats(values, f"channel {name!r}")
     if array.ndim != 1:
         raise ShapeError(

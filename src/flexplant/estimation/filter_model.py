@@ -105,7 +105,7 @@ class FilterModel(Value):
         return np.asarray(0.5 * (added + added.T))
 
 
-def weighed(part: FloatArray, spread: FloatArray) -> FloatArray:
+def weigh(part: FloatArray, spread: FloatArray) -> FloatArray:
     """Return ``part S^-1`` of a covariance S, its channels of unit size inside."""
     size = np.sqrt(spread.diagonal())
     return np.asarray(np.linalg.solve(spread / size / size[:, None], (part / size).T).T / size)
@@ -263,7 +263,7 @@ class FilterGains(NamedTuple):
     W: FloatArray
 
 
-def gains(model: FilterModel, P: FloatArray, seen: FloatArray) -> FilterGains:
+def filter_gains(model: FilterModel, P: FloatArray, seen: FloatArray) -> FilterGains:
     """Return the gains of a covariance P before the measurement, for the sensors that are there."""
     M = P @ model.C2.T
     S = model.C2 @ M + model.R
@@ -282,7 +282,7 @@ class Steady:
 
     def __init__(self, model: FilterModel, P: FloatArray) -> None:
         self.model, self.P = model, P
-        self.gains = gains(model, P, np.ones(model.C2.shape[0], dtype=bool))
+        self.gains = filter_gains(model, P, np.ones(model.C2.shape[0], dtype=bool))
         self.F = model.A - self.gains.K @ model.C2
 
     def variances(

@@ -95,7 +95,7 @@ class ExcessPeak(NamedTuple):
     p_value: float
 
 
-def peaks(found: PooledSpectrum, alpha: float) -> list[ExcessPeak]:
+def excess_peaks(found: PooledSpectrum, alpha: float) -> list[ExcessPeak]:
     """Return where the spectrum exceeds its mean, the most significant ones first.
 
     Averages over b lines of p channels are chi-square with 2 b p degrees of freedom; each of the
@@ -201,14 +201,14 @@ def whitening(observer: KalmanEstimator, freq: FloatArray) -> ComplexArray:
     """Return ``W (I - C (z I - A + K C)^-1 K)`` (m, p, p): from y to the whitened innovations."""
     m, K = observer.model, observer.predictor_gain
     back = np.eye(K.shape[1]) - seen_from_states(m.A - K @ m.C2, m.C2, freq) @ K
-    return np.asarray(np.linalg.solve(_unit(observer), back))
+    return np.asarray(np.linalg.solve(_cholesky(observer), back))
 
 
 def steady_gain(observer: KalmanEstimator) -> FloatArray:
     """Return the whitened innovations (p, p) that constant offsets of the sensors make."""
     m, K = observer.model, observer.predictor_gain
     moved = np.linalg.solve(np.eye(len(m.A)) - m.A + K @ m.C2, K)
-    return np.asarray(np.linalg.solve(_unit(observer), np.eye(K.shape[1]) - m.C2 @ moved))
+    return np.asarray(np.linalg.solve(_cholesky(observer), np.eye(K.shape[1]) - m.C2 @ moved))
 
 
 def impulse(observer: KalmanEstimator, count: int) -> FloatArray:
@@ -219,10 +219,10 @@ def impulse(observer: KalmanEstimator, count: int) -> FloatArray:
     found[0] = np.eye(K.shape[1])
     for k in range(1, count):
         found[k], x = -m.C2 @ x, closed @ x
-    return np.asarray(np.linalg.solve(_unit(observer), found))
+    return np.asarray(np.linalg.solve(_cholesky(observer), found))
 
 
-def parts_of(
+def density_of(
     observer: KalmanEstimator,
     plant: StandardPlant | None,
     freq: FloatArray,
@@ -238,7 +238,7 @@ def parts_of(
     p = len(observer.sensors)
     process = np.empty((freq.size, p, p), dtype=np.complex128)
     sensors = np.empty_like(process)
-    for at in _pieces(freq.size):
+    for at in _slices(freq.size):
         V = whitening(observer, freq[at]) if white is None else white[at]
         if plant is None:
             sensors[at] = _squared(V @ np.linalg.cholesky(observer.model.R))
@@ -273,11 +273,11 @@ def expected(observer: KalmanEstimator, plant: StandardPlant, samples: int) -> I
         covariance = np.fft.irfft(whole, 2 * samples, axis=0)
         return np.asarray(np.fft.rfft(covariance * weight, axis=0)[at])
 
-    found = parts_of(observer, plant, freq)
+    found = density_of(observer, plant, freq)
     return InnovationParts(seen(found.process), seen(found.sensors))
 
 
-def _unit(observer: KalmanEstimator) -> FloatArray:
+def _cholesky(observer: KalmanEstimator) -> FloatArray:
     S = observer.model.innovation(observer.predicted_covariance)
     return np.asarray(np.linalg.cholesky(0.5 * (S + S.T)))
 
@@ -286,6 +286,6 @@ def _squared(part: ComplexArray) -> ComplexArray:
     return np.asarray(part @ np.conj(np.swapaxes(part, 1, 2)))
 
 
-def _pieces(count: int) -> Iterator[slice]:
+def _slices(count: int) -> Iterator[slice]:
     for start in range(0, count, _PIECE):
         yield slice(start, start + _PIECE)

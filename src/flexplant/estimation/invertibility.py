@@ -153,7 +153,7 @@ def invertibility(plant: StandardPlant | System, inputs: Sequence[str]) -> Inver
     """
     plant = checked_plant(plant)
     names = unknown_names(plant, inputs)
-    return judged(filter_model(plant), entry(plant, names), names)
+    return ranks_and_zeros(filter_model(plant), input_entry(plant, names), names)
 
 
 def unknown_names(plant: StandardPlant, inputs: Sequence[str]) -> tuple[str, ...]:
@@ -174,7 +174,7 @@ def unknown_names(plant: StandardPlant, inputs: Sequence[str]) -> tuple[str, ...
     return names
 
 
-def entry(plant: StandardPlant, names: Sequence[str]) -> InputEntry:
+def input_entry(plant: StandardPlant, names: Sequence[str]) -> InputEntry:
     """Return how disturbances, held over each sample, enter states, sensors and POIs."""
     g, m = plant.system, filter_model(plant)
     columns = g.input_index(names)
@@ -182,7 +182,7 @@ def entry(plant: StandardPlant, names: Sequence[str]) -> InputEntry:
     return InputEntry(g.B[:, columns], *(g.D[np.ix_(row, columns)] for row in rows))
 
 
-def judged(model: FilterModel, d: InputEntry, names: tuple[str, ...]) -> Invertibility:
+def ranks_and_zeros(model: FilterModel, d: InputEntry, names: tuple[str, ...]) -> Invertibility:
     """Return ranks and zeros; see `invertibility`."""
     out = 1.0 / np.sqrt(np.maximum(model.R.diagonal(), TINY))[:, None]
     C, H = out * model.C2, out * d.H
@@ -277,7 +277,7 @@ def check_bias(plant: StandardPlant | System, inputs: Sequence[str]) -> None:
     plant = checked_plant(plant)
     names = unknown_names(plant, inputs)
     plant.check().require(("detectable",), "an estimate of a bias")
-    missing = _unseen(plant, names)
+    missing = _unseen_forces(plant, names)
     if not missing.shape[1]:
         return
     listed = []
@@ -294,9 +294,9 @@ def check_bias(plant: StandardPlant | System, inputs: Sequence[str]) -> None:
     )
 
 
-def _unseen(plant: StandardPlant, names: Sequence[str]) -> FloatArray:
+def _unseen_forces(plant: StandardPlant, names: Sequence[str]) -> FloatArray:
     """Return the combinations (m, k) of constant forces that leave y at zero, in reduced form."""
-    m, d = filter_model(plant), entry(plant, names)
+    m, d = filter_model(plant), input_entry(plant, names)
     n = len(m.A)
     noise = 1.0 / np.sqrt(np.maximum(m.R.diagonal(), TINY))[:, None]
     whole = np.block([[m.A - np.eye(n), d.G], [noise * m.C2, noise * d.H]])

@@ -25,7 +25,7 @@ from .filter_model import (
     error_of,
     filter_model,
     filter_system,
-    weighed,
+    weigh,
 )
 from .left_out import left_out
 
@@ -104,7 +104,7 @@ def design_kalman(
     found = None if whole is None else left_out(plant, whole)
     model = filter_model(plant, found)
     try:
-        design = _designed(model)
+        design = _filter_design(model)
     except (SolverError, CertificateError) as error:
         check_precision(model, error)
         raise
@@ -139,7 +139,7 @@ def redesigned(
     if found is not None:
         found = found.replace(plant=change(found.plant))
     model = filter_model(plant, found)
-    design = _designed(model)
+    design = _filter_design(model)
     own = plant if found is None else found.plant
     system = filter_system(own, model, design.predictor, design.poi_gain, "kalman")
     return KalmanEstimator(
@@ -156,14 +156,14 @@ class _Design(NamedTuple):
     certificate: KalmanCertificate
 
 
-def _designed(model: FilterModel) -> _Design:
+def _filter_design(model: FilterModel) -> _Design:
     """Return the gains of a model whose sensors may have the noise of modes left out as well."""
     solution = solve_dare(model.A, model.C2, Q=model.Q, R=model.R, S=model.S)
     P = solution.P
     innovation = model.innovation(P)
-    gain = weighed(P @ model.C2.T, innovation)
-    predictor = model.A @ gain + weighed(model.S, innovation)
-    poi_gain = weighed(model.C1 @ P @ model.C2.T + model.N, innovation)
+    gain = weigh(P @ model.C2.T, innovation)
+    predictor = model.A @ gain + weigh(model.S, innovation)
+    poi_gain = weigh(model.C1 @ P @ model.C2.T + model.N, innovation)
     covariance = model.updated(P, gain)
     variances = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
     radius, difference = error_of(model, gain, predictor, covariance)

@@ -106,7 +106,7 @@ class LagReport(Value):
 
 
 @one_thread()
-def lag_report(
+def lag_errors(
     plant: StandardPlant,
     steady: Steady,
     sight: Sight,
@@ -136,7 +136,7 @@ def lag_report(
     for k in range(1, longest + 1):
         curve[k] = curve[k - 1] - np.sum((w @ seen.T) ** 2, axis=1)
         w = w @ F.T
-    static, note = _static(plant, channels)
+    static, note = _static_errors(plant, channels)
     table = [static**2, predicted, base, *(curve[k] for k in counts.values()), smooth]
     shown = np.unique(np.geomspace(1, longest + 1, _POINTS).astype(np.int64)) - 1
     return LagReport(
@@ -151,7 +151,7 @@ def lag_report(
     )
 
 
-def _static(plant: StandardPlant, channels: Sequence[str]) -> tuple[FloatArray, str]:
+def _static_errors(plant: StandardPlant, channels: Sequence[str]) -> tuple[FloatArray, str]:
     try:
         static = design_static(plant)
         return np.array([static.rms(name) for name in channels]), ""

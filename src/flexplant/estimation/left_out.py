@@ -86,7 +86,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     """
     own, others_own = plant.assembled, larger.assembled
     small, big, ports = own.realisation, others_own.realisation, own.ports
-    kept, all_modes = _blocks(small, ports), _blocks(big, others_own.ports)
+    kept, all_modes = _mode_blocks(small, ports), _mode_blocks(big, others_own.ports)
     kept_omega, kept_static = kept.omega, kept.static
     genuine = np.setdiff1d(np.arange(kept_omega.size), _of_vectors(small))
     if genuine.size > all_modes.omega.size:
@@ -94,7 +94,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
             f"the larger model has {counted(all_modes.omega.size, 'elastic mode')}, the plant "
             f"{genuine.size}: it is not larger. Pass more modes of the full structure."
         )
-    rows, columns = _paired(kept, all_modes, genuine)
+    rows, columns = _same_modes(kept, all_modes, genuine)
     others = np.setdiff1d(np.arange(all_modes.omega.size), columns)
     if not others.size:
         return None
@@ -104,7 +104,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     # an acceleration has no static part: what modes answer at once they take back at rest
     moving = [i for i, sensor in enumerate(ports.y) if sensor.order == 2]
     flexibility[[len(flexibility) - len(ports.y) + i for i in moving]] = 0.0
-    covariance = _covariance(all_modes, others, others_own.ports)
+    covariance = _motion_covariance(all_modes, others, others_own.ports)
     nz = covariance.shape[0] - len(ports.y)
     y = plant.unweighted.y
     read = plant.reading_gain[np.ix_(
@@ -135,7 +135,7 @@ class _Blocks:
         return np.asarray(np.sqrt(np.abs(np.prod(self.poles, axis=1))))
 
 
-def _blocks(realisation: ModalRealisation, ports: Ports) -> _Blocks:
+def _mode_blocks(realisation: ModalRealisation, ports: Ports) -> _Blocks:
     g, r = structure_system(realisation, ports), realisation.n_rigid
     n = g.n_states // 2 - r
     A, B, C = g.A[2 * r :, 2 * r :], g.B[2 * r :], g.C[:, 2 * r :]
@@ -170,7 +170,7 @@ def _of_vectors(realisation: ModalRealisation) -> IntArray:
     return np.sort(np.argsort(part)[part.size - model.n_vectors :])
 
 
-def _paired(kept: _Blocks, larger: _Blocks, genuine: IntArray) -> tuple[IntArray, IntArray]:
+def _same_modes(kept: _Blocks, larger: _Blocks, genuine: IntArray) -> tuple[IntArray, IntArray]:
     """Return the modes of both that are the same ones, by frequency and by compliance."""
     one, two = kept.static[genuine], larger.static
     size = np.maximum(np.abs(two).max(axis=0, initial=0.0), TINY)
@@ -196,7 +196,7 @@ def _may_follow(plant: StandardPlant, ports: Ports) -> FloatArray:
     )
 
 
-def _covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> FloatArray:
+def _motion_covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> FloatArray:
     """Return the stationary covariance of the motions of some modes."""
     poles = blocks.poles[chosen].reshape(-1)
     if np.any(poles.real >= 0):
@@ -206,27 +206,27 @@ def _covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> FloatArray:
         )
     omega = np.asarray(1j * np.repeat(blocks.omega[chosen], 2), dtype=np.complex128)
     drive = blocks.push[chosen].reshape(poles.size, -1)
-    density = [_density(port, omega) for port in ports.forces]  # of actuators: their input noise
+    density = [_root_asd(port, omega) for port in ports.forces]  # of actuators: their input noise
     drive = drive * np.array(density).reshape(-1, poles.size).T
     see = blocks.see[:, chosen].reshape(-1, poles.size).copy()
     turn = np.where(poles.imag >= 0, omega, -omega)
     first = see.shape[0] - len(ports.y)
     for row, sensor in enumerate(ports.y, first):
-        see[row] *= np.exp(-turn * sensor.latency) * _gain(sensor.filter, turn)
+        see[row] *= np.exp(-turn * sensor.latency) * _siso_response(sensor.filter, turn)
     X = -(drive @ drive.conj().T) / np.add.outer(poles, poles.conj())
     return np.asarray(np.real(see @ X @ see.conj().T))
 
 
-def _density(port: Any, omega: ComplexArray) -> FloatArray:
+def _root_asd(port: Any, omega: ComplexArray) -> FloatArray:
     """Return the root of a disturbance's two-sided density at frequencies."""
     asd = port.asd
     shape = port.filter
     if shape is None:
         return np.full(omega.size, asd / np.sqrt(2.0))
-    return np.asarray(asd / np.sqrt(2.0) * np.abs(_gain(shape, omega)))
+    return np.asarray(asd / np.sqrt(2.0) * np.abs(_siso_response(shape, omega)))
 
 
-def _gain(part: StateSpace | None, at: ComplexArray) -> ComplexArray:
+def _siso_response(part: StateSpace | None, at: ComplexArray) -> ComplexArray:
     if part is None:
         return np.ones(at.size, dtype=np.complex128)
     return np.array([part.evaluated(s)[0, 0] for s in at])

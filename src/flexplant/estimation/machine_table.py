@@ -128,13 +128,13 @@ def errors_on_machines(
         )
     first = next(iter(given.values())).plant
     name = poi_channels(first)[row_of(poi_channels(first), channel)]
-    nominal = [_error(one, one.plant, name, blocks) for one in given.values()]
+    nominal = [_rms(one, one.plant, name, blocks) for one in given.values()]
     values = []
     for one in given.values():
         row = []
         for machine in listed:
             try:
-                row.append(_error(one, machine, name, blocks))
+                row.append(_rms(one, machine, name, blocks))
             except AssumptionError:
                 if not blocks:
                     raise
@@ -145,7 +145,7 @@ def errors_on_machines(
     )
 
 
-def _error(estimator: Any, machine: StandardPlant, channel: str, blocks: Sequence[Any]) -> float:
+def _rms(estimator: Any, machine: StandardPlant, channel: str, blocks: Sequence[Any]) -> float:
     if not blocks:
         return float(estimator.rms(channel, on=machine))
     with warnings.catch_warnings():  # the table itself says which loops are unstable

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks import FloatArray, members, whole
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
-from ..lti.equations import powers, scale_of, summed, sylvester
+from ..lti.equations import powers, scale_of, stein_sum, sylvester
 from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace, System
 from ..parallel import Progress, one_thread, tick
@@ -100,7 +100,7 @@ def design_minimax_filter(
     kalman = design_kalman(plant, larger=plant)  # type: ignore[arg-type]
     plant, model = kalman.plant, kalman.model
     sizes = np.sqrt(kalman.variances)
-    others = _checked(plant, machines)
+    others = _alike_machines(plant, machines)
     start = Gains(kalman.predictor_gain, model.C1 @ kalman.gain)
     P = kalman.predicted_covariance
     scale, unit = scale_of(P.diagonal()), np.sqrt(sizes.size) * sizes[:, None]
@@ -112,7 +112,7 @@ def design_minimax_filter(
     spread = kalman.covariance.diagonal() / scale**2
     units = _Units.of(part(start).sight, model.innovation(P), spread, (scale, unit))
     with Progress(None, STEPS, progress=progress):
-        found, slope = _searched(errors, part, units, start, steps)
+        found, slope = _best_gains(errors, part, units, start, steps)
     values = np.array([error.value(part(found)) for error in errors])
     system = filter_system(plant, model, found.K, found.L_z, "minimax_filter")
     truth = _means(others, system, sizes)
@@ -140,7 +140,7 @@ def design_minimax_filter(
     )
 
 
-def _checked(plant: StandardPlant, machines: Sequence[StandardPlant]) -> list[StandardPlant]:
+def _alike_machines(plant: StandardPlant, machines: Sequence[StandardPlant]) -> list[StandardPlant]:
     """Return the machines as plants with the sensors and POIs of the nominal one."""
     if isinstance(machines, UncertainPlant):
         raise ModelError(
@@ -203,7 +203,7 @@ class _Units(NamedTuple):
         return np.concatenate([one.reshape(-1) for one in both])
 
 
-def _searched(
+def _best_gains(
     errors: Sequence[MachineError],
     part: Callable[[Gains], FilterPart],
     units: _Units,
@@ -288,7 +288,7 @@ def filter_part(m: FilterModel, gains: Gains, scale: FloatArray, unit: FloatArra
     K, L, C0 = gains.K / scale[:, None], gains.L_z / unit, m.C2 * scale
     repeated = powers(m.A * scale / scale[:, None] - K @ C0)
     E = m.C1 * scale / unit - L @ C0
-    return FilterPart(K, L, repeated, C0, E, summed(repeated, repeated, E.T @ E, turned=True))
+    return FilterPart(K, L, repeated, C0, E, stein_sum(repeated, repeated, E.T @ E, turned=True))
 
 
 class MachineError(NamedTuple):
@@ -326,10 +326,10 @@ class MachineError(NamedTuple):
         N[:, own:] -= self.driven
         E = self.C1e - part.L @ self.C
         entering = B @ self.X
-        X_oe = summed(part.powers, powers, entering @ A.T + N[:, own:] @ self.G.T)
+        X_oe = stein_sum(part.powers, powers, entering @ A.T + N[:, own:] @ self.G.T)
         half = A_o @ X_oe @ B.T
-        X_oo = summed(part.powers, part.powers, entering @ B.T + half + half.T + N @ N.T)
-        Y_oe = summed(part.powers, powers, A_o.T @ Y @ B - part.E.T @ E, turned=True)
+        X_oo = stein_sum(part.powers, part.powers, entering @ B.T + half + half.T + N @ N.T)
+        Y_oe = stein_sum(part.powers, powers, A_o.T @ Y @ B - part.E.T @ E, turned=True)
         direct = part.L @ self.root
         to_e, to_o = E @ self.X - part.E @ X_oe, E @ X_oe.T - part.E @ X_oo
         value = float(np.sum(to_e * E) - np.sum(to_o * part.E) + np.sum(direct**2))
@@ -372,7 +372,7 @@ def machine_error(
             V_e = sylvester(A, rr, er)
             C_r, C1_r, G, A = C_r + C @ V_e, C1_r + C1e @ V_e, G - V_e @ G_all[rigid], A - V_e @ re
         V = sylvester(m.A - start.K @ m.C2, rr, start.K @ C_r)
-        missed = [(m.C2 @ V - C_r) / _size(C_r), (m.C1 @ V - C1_r) / _size(C1_r)]
+        missed = [(m.C2 @ V - C_r) / _row_norms(C_r), (m.C1 @ V - C1_r) / _row_norms(C1_r)]
         if max(float(np.max(np.abs(part))) for part in missed) > _MISSED:
             raise AssumptionError(
                 "a rigid-body motion (or undamped mode) of a machine is not one of the plant: a "
@@ -397,5 +397,5 @@ def machine_error(
     )
 
 
-def _size(rows: FloatArray) -> FloatArray:
+def _row_norms(rows: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), TINY))

@@ -16,7 +16,7 @@ from ..plant import StandardPlant
 from ..plant.uncertainty.uncertain_plant import Delta, with_changes
 from .estimate import Estimate
 from .estimator import KalmanEstimator
-from .innovations import InnovationLines, parts_of, whitening
+from .innovations import InnovationLines, density_of, whitening
 from .kalman import redesigned
 from .lag_report import Filter
 
@@ -285,7 +285,7 @@ def explained_by_change(
     plant, p = observer.plant, band.X.shape[1]
     lines = band.freq * plant.dt
     V, before = whitening(observer, lines), _commanded(observer, plant, band.freq)
-    usual = parts_of(observer, plant, lines, V).both
+    usual = density_of(observer, plant, lines, V).both
     driven = bool(np.any(band.U))
 
     def change(x: FloatArray) -> ModeChange:
@@ -296,7 +296,7 @@ def explained_by_change(
         if not -0.5 <= x[0] <= 1.5:
             return np.inf  # another peak than this one
         machine = with_changes(plant, change(x).amounts)
-        S = parts_of(observer, machine, lines, V).both - usual + np.eye(p)[None]
+        S = density_of(observer, machine, lines, V).both - usual + np.eye(p)[None]
         left = band.X
         if driven:
             shown = V @ (before - _commanded(observer, machine, band.freq)) @ band.U[:, :, None]

@@ -18,7 +18,7 @@ from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..tolerances import TINY
 from .estimator_channels import checked_plant, estimates, poi_channels, recorded, row_of, sensors
-from .filter_model import AGREEMENT, FilterModel, check_noises, filter_model, filter_system, weighed
+from .filter_model import AGREEMENT, FilterModel, check_noises, filter_model, filter_system, weigh
 
 #: longest period [samples], and most measurements in one
 _LONGEST, _MOST = 1000, 2000
@@ -199,7 +199,7 @@ def design_multirate(
     model = filter_model(plant)
     check_noises(plant)
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")
-    measured = _measured(model.sensors, every)
+    measured = _reading_times(model.sensors, every)
     period = len(measured)
     C, Q, R, S, A = _lifted(model, measured)
     solution = solve_dare(A, C, Q=Q, R=R, S=S)
@@ -207,7 +207,7 @@ def design_multirate(
     gains, predictors, variances = [], [], []
     moved = np.eye(len(P))
     for read in measured:
-        gain, predictor, after, ahead = _step(model, P, read)
+        gain, predictor, after, ahead = _joseph_step(model, P, read)
         gains.append(gain)
         predictors.append(predictor)
         variances.append(np.sum((model.C1 @ after) * model.C1, axis=1))
@@ -234,7 +234,7 @@ def design_multirate(
     )
 
 
-def _measured(names: tuple[str, ...], every: Any) -> FloatArray:
+def _reading_times(names: tuple[str, ...], every: Any) -> FloatArray:
     """Return which sensors are read in which sample of the common period (T, ny)."""
     instance(every, Mapping, "every", "Pass {sensor: samples}, such as {'y3': 10}.")
     intervals, offsets = dict.fromkeys(names, 1), dict.fromkeys(names, 0)
@@ -283,7 +283,7 @@ def _lifted(
     return C, 0.5 * (Q + Q.T), 0.5 * (R + R.T), S, A
 
 
-def _step(
+def _joseph_step(
     m: FilterModel, P: FloatArray, read: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return L, K, P[k|k] and P[k+1|k] of one sample, in Joseph's form."""
@@ -292,8 +292,8 @@ def _step(
     if rows.size:
         C, R = m.C2[rows], m.R[np.ix_(rows, rows)]
         innovation = C @ P @ C.T + R
-        gain[:, rows] = weighed(P @ C.T, innovation)
-        predictor[:, rows] = m.A @ gain[:, rows] + weighed(m.S[:, rows], innovation)
+        gain[:, rows] = weigh(P @ C.T, innovation)
+        predictor[:, rows] = m.A @ gain[:, rows] + weigh(m.S[:, rows], innovation)
     closed = m.A - predictor @ m.C2
     ahead = closed @ P @ closed.T + m.driven(predictor)
     return gain, predictor, m.updated(P, gain), 0.5 * (ahead + ahead.T)

@@ -119,14 +119,14 @@ def estimate_noise(
     True
     """
     plant = checked_plant(plant)
-    channels, whole = _channels(plant), _whole(plant, larger)
+    channels, whole = _noise_channels(plant), _whole_plant(plant, larger)
     ratios, first = np.ones(len(channels)), np.zeros(0)
     for _ in range(_PASSES):
-        now = _levels(whole, channels, ratios)
+        now = _scaled(whole, channels, ratios)
         observer = design_kalman(now, larger=now)
         estimate = observer.estimate(records, gate=gate)
-        innovations = _steady(observer, estimate)
-        spectrum = _spectrum(observer, _sources(now, channels), innovations)
+        innovations = _longest_stretch(observer, estimate)
+        spectrum = _level_spectrum(observer, _sources(now, channels), innovations)
         if not first.size:
             begin = _least_squares(spectrum)
             first = np.sqrt(begin)
@@ -135,7 +135,7 @@ def estimate_noise(
             begin = np.ones(len(channels))
         found = _scored(spectrum, begin, np.minimum(_LOW / ratios**2, 1.0))
         ratios = ratios * np.sqrt(found.variances)
-        covariance = _covariance(found, channels)
+        covariance = _level_covariance(found, channels)
         # of a variance, which is known to this even where it may be 0 and its logarithm is not
         deviation = 2 * found.variances * np.sqrt(covariance.diagonal())
         # what is known to a few percent only is settled well within that
@@ -145,9 +145,9 @@ def estimate_noise(
         raise SolverError(
             f"the noise levels still change after {_PASSES} designs of the filter, the last one "
             f"by {np.max(np.abs(np.sqrt(found.variances) - 1.0)):.2g}. "
-            f"{_cure(observer, estimate, larger)}"
+            f"{_advice(observer, estimate, larger)}"
         )
-    now = _levels(whole, channels, ratios)
+    now = _scaled(whole, channels, ratios)
     final = design_kalman(now, larger=now)
     verdict = consistency(final, final.estimate(records, gate=gate), level=_LEVEL)
     if not verdict.holds:
@@ -162,7 +162,7 @@ def estimate_noise(
     )  # fmt: skip
 
 
-def _whole(plant: StandardPlant, larger: Any) -> StandardPlant:
+def _whole_plant(plant: StandardPlant, larger: Any) -> StandardPlant:
     """Return the plant with the modes left out, with the densities of the given one."""
     found = None if larger is plant else larger_plant(plant, larger)
     if found is None:
@@ -172,7 +172,7 @@ def _whole(plant: StandardPlant, larger: Any) -> StandardPlant:
     return read_alike(plant, found)
 
 
-def _cure(observer: KalmanEstimator, estimate: Estimate, larger: Any) -> str:
+def _advice(observer: KalmanEstimator, estimate: Estimate, larger: Any) -> str:
     """Return what the record says of the plant where its levels are not found, and what to do."""
     said = consistency(observer, estimate, level=_LEVEL)
     if said.cause in ("none", "noise level", "noise ratio"):
@@ -180,7 +180,7 @@ def _cure(observer: KalmanEstimator, estimate: Estimate, larger: Any) -> str:
     return f"With the last ones {said.text}{_LARGER if larger is None else ''}"
 
 
-def _channels(plant: StandardPlant) -> tuple[str, ...]:
+def _noise_channels(plant: StandardPlant) -> tuple[str, ...]:
     noises = tuple(f"{name}:noise" for name in sensors(plant))
     silent = [name for name in noises if not plant.asd.get(name, 0.0) > 0]
     if silent:
@@ -194,7 +194,7 @@ def _channels(plant: StandardPlant) -> tuple[str, ...]:
     return *forces, *noises
 
 
-def _levels(plant: StandardPlant, channels: tuple[str, ...], ratios: FloatArray) -> StandardPlant:
+def _scaled(plant: StandardPlant, channels: tuple[str, ...], ratios: FloatArray) -> StandardPlant:
     none = np.zeros((len(channels), len(channels)))
     return NoiseLevels(plant, channels, ratios, none, ratios, 0.0, 1.0, 0).plant
 
@@ -225,7 +225,7 @@ def _sources(plant: StandardPlant, channels: tuple[str, ...]) -> list[_Source]:
     return found
 
 
-def _steady(observer: KalmanEstimator, estimate: Estimate) -> FloatArray:
+def _longest_stretch(observer: KalmanEstimator, estimate: Estimate) -> FloatArray:
     """Return the longest stretch (N, ny) of innovations without gaps, its start-up left out."""
     e = estimate.innovations.T
     there = np.concatenate([[False], np.all(np.isfinite(e), axis=1), [False]])
@@ -247,7 +247,7 @@ class _LevelSpectrum(NamedTuple):
     parts: ComplexArray
 
 
-def _spectrum(
+def _level_spectrum(
     observer: KalmanEstimator, sources: list[_Source], innovations: FloatArray
 ) -> _LevelSpectrum:
     """Return the periodogram of innovations and what each channel adds to it."""
@@ -340,7 +340,7 @@ def _likelihood(spectrum: _LevelSpectrum, t: FloatArray) -> tuple[float, FloatAr
     return float(value), slope * t, information * np.outer(t, t)
 
 
-def _covariance(found: _Scored, channels: tuple[str, ...]) -> FloatArray:
+def _level_covariance(found: _Scored, channels: tuple[str, ...]) -> FloatArray:
     """Return the covariance of the logarithms of the densities, when the channels can be separated.
 
     Densities are roots of variances: a quarter of the inverse of the information in log t.

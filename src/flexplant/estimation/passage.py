@@ -13,7 +13,7 @@ from ..lti.equations import sylvester
 from ..lti.lyapunov import solve_stein
 from ..lti.recursion import Recursion
 from .estimator_channels import Recorded
-from .filter_model import FilterGains, FilterModel, Sight, Steady, gains
+from .filter_model import FilterGains, FilterModel, Sight, Steady, filter_gains
 
 #: the gain counts as stationary when all that its last changes would still do to the estimates and
 #: innovations, summed over time, is this part of their variances
@@ -191,7 +191,7 @@ class _Walk:
         self._innovate(k, e, m.innovation(P), C, before)
         there = self.there[k]
         e = np.where(there, e, 0.0)
-        g = gains(m, P, there)
+        g = filter_gains(m, P, there)
         here = self.sight.part(slice(k, k + 1))
         c = here.c[0]
         enter = self.steady.entering(g, predict=self.predict)
@@ -294,9 +294,9 @@ class _Walk:
             x = self._steadily(at.start, at.stop, x)
             moved = faded(self.steady.F, Y, count)
             C = m.C2 @ moved[:-1]
-            found = shown(g.W @ C, self.whitened[at])
+            found = accumulate(g.W @ C, self.whitened[at])
             before, after = found.value[:-1], found.value[1:]
-            enter = seen(self.steady, self.sight.part(at), moved[:-1], predict=self.predict)
+            enter = eta_effect(self.steady, self.sight.part(at), moved[:-1], predict=self.predict)
             value, covariance = (before, found.covariance[:-1])
             if not self.predict:
                 value, covariance = after, found.covariance[1:]
@@ -313,7 +313,7 @@ class _Walk:
                 continue
             x = x + moved[-1] @ found.value[-1]
             Y = moved[-1] @ np.linalg.cholesky(found.covariance[-1])
-            Y = kept(self._weight[0], Y)
+            Y = lasting_part(self._weight[0], Y)
             k, length = at.stop, min(2 * length, LONGEST)
         return k, x, self.steady.P + Y @ Y.T, not Y.shape[1]
 
@@ -393,10 +393,10 @@ def excess(
     # beside the rounding of the terms
     if np.sum((weight @ below) * below) > FADED + 1e-13 * np.sum(np.abs(weight * steady.P)):
         return None
-    return kept(weight, vectors[:, sizes > 0] * np.sqrt(sizes[sizes > 0]))
+    return lasting_part(weight, vectors[:, sizes > 0] * np.sqrt(sizes[sizes > 0]))
 
 
-def kept(weight: FloatArray, Y: FloatArray) -> FloatArray:
+def lasting_part(weight: FloatArray, Y: FloatArray) -> FloatArray:
     """Return the combinations of columns of Y that still matter to later estimates."""
     sizes, mix = np.linalg.eigh(Y.T @ weight @ Y)
     gone = np.cumsum(np.maximum(sizes, 0.0)) < FADED
@@ -412,7 +412,7 @@ def faded(F: FloatArray, Y: FloatArray, samples: int) -> FloatArray:
     return moved
 
 
-def shown(rows: FloatArray, white: FloatArray) -> ShownSoFar:
+def accumulate(rows: FloatArray, white: FloatArray) -> ShownSoFar:
     """Return what whitened innovations ``white = rows eta + noise`` (k, ny) show of eta."""
     count, _, r = rows.shape
     information, values = np.zeros((count + 1, r, r)), np.zeros((count + 1, r))
@@ -424,7 +424,7 @@ def shown(rows: FloatArray, white: FloatArray) -> ShownSoFar:
     return ShownSoFar(np.einsum("krs,ks->kr", covariance, np.cumsum(values, axis=0)), covariance)
 
 
-def seen(steady: Steady, here: Sight, moved: FloatArray, *, predict: bool) -> FloatArray:
+def eta_effect(steady: Steady, here: Sight, moved: FloatArray, *, predict: bool) -> FloatArray:
     """Return how eta enters the estimates (k, nz, r)."""
     n = moved.shape[1]
     enter = steady.entering(steady.gains, predict=predict)

@@ -19,7 +19,7 @@ from ..plant import StandardPlant
 from ..tolerances import TINY
 from .error import PoiFilter
 from .estimator_channels import poi_channels
-from .filter_model import FilterModel, error_system, filter_system, own_variances, weighed
+from .filter_model import FilterModel, error_system, filter_system, own_variances, weigh
 from .kalman import design_kalman
 
 
@@ -201,7 +201,7 @@ def design_hinf_filter(plant: StandardPlant | System, *, accuracy: float = 1e-3)
     lower, upper, best = 1.0, peak * (1 + accuracy), None
     while best is None or upper > lower * (1 + accuracy):
         level = upper if best is None else float(np.sqrt(lower * upper))
-        found = _at(scaled, level)
+        found = _central_gains(scaled, level)
         if found is not None:
             upper, best = level, found
         elif best is None:
@@ -237,7 +237,7 @@ class _HinfGains(NamedTuple):
     L_z: FloatArray
 
 
-def _at(m: FilterModel, gamma: float) -> _HinfGains | None:
+def _central_gains(m: FilterModel, gamma: float) -> _HinfGains | None:
     """Return the gains of the central filter of a level, None when there is none."""
     rows, nz = np.vstack([m.C2, m.C1]), len(m.C1)
     weight = la.block_diag(m.R, -(gamma**2) * np.eye(nz))
@@ -251,7 +251,7 @@ def _at(m: FilterModel, gamma: float) -> _HinfGains | None:
     if np.min(np.linalg.eigvalsh(P / unit / unit[:, None])) < -1e-9:
         return None
     innovation = m.innovation(P)
-    gain, shift = (weighed(part, innovation) for part in (P @ m.C2.T, m.S))
+    gain, shift = (weigh(part, innovation) for part in (P @ m.C2.T, m.S))
     left = m.C1 @ (P - gain @ m.C2 @ P) @ m.C1.T
     if np.max(np.linalg.eigvalsh(0.5 * (left + left.T))) >= gamma**2:
         return None

@@ -34,7 +34,7 @@ def smoothed(passage: Passage, sight: Sight) -> tuple[FloatArray, FloatArray]:
     rest = np.zeros((n, count))
     for first, last, stationary in passage.whole():
         if stationary:
-            r, M = _back(passage, sight, (first, last), r, M, hat, variance)
+            r, M = _backward(passage, sight, (first, last), r, M, hat, variance)
             continue
         for k in range(last - 1, first - 1, -1):
             moment = passage.moments[k]
@@ -56,7 +56,7 @@ def smoothed(passage: Passage, sight: Sight) -> tuple[FloatArray, FloatArray]:
     return hat, variance
 
 
-def _back(
+def _backward(
     passage: Passage,
     sight: Sight,
     span: tuple[int, int],
@@ -69,7 +69,7 @@ def _back(
     steady, at = passage.steady, slice(*span)
     g, F, here = steady.gains, steady.F, sight.part(at)
     onward = steady.onward(steady.P, g)
-    added, r = _adjoint(steady, here, passage.white[at], [onward], r)
+    added, r = _adjoint_pass(steady, here, passage.white[at], [onward], r)
     hat[at] += added[0]
     C = g.W @ steady.model.C2
     information = C.T @ C
@@ -91,7 +91,7 @@ def _back(
     return r, M
 
 
-def _adjoint(
+def _adjoint_pass(
     steady: Steady, here: Sight, white: FloatArray, rows: list[FloatArray], r: FloatArray
 ) -> tuple[list[FloatArray], FloatArray]:
     """Return ``c rows r[k]`` (N, nz) of a stationary stretch, and r before it."""
@@ -125,28 +125,28 @@ def lagged(passage: Passage, sight: Sight, lag: int) -> tuple[FloatArray, FloatA
         later = onward @ np.linalg.matrix_power(steady.F.T, lag)
         zero = np.zeros(steady.F.shape[0])
         if here.c.shape[0] == 1:
-            (now, then), _ = _adjoint(
+            (now, then), _ = _adjoint_pass(
                 steady, here, passage.white[first:last], [onward, later], zero
             )
             hat[at] += now[:-lag] - then[lag:]
         else:
-            (r,), _ = _adjoint(
+            (r,), _ = _adjoint_pass(
                 steady, Sight(np.eye(zero.size)[None], here.D1, here.V),
                 passage.white[first:last], [np.eye(zero.size)], zero,
             )  # fmt: skip
             moved = r[:-lag] @ onward.T - r[lag:] @ later.T
             hat[at] += here.part(slice(0, last - lag - first)).applied(moved)
-        known = _known(steady, lag)
+        known = _information(steady, lag)
         T = sight.part(at).c @ onward
         variance[at] -= np.einsum("kzi,ij,kzj->kz", T, known, T)
     listed = np.flatnonzero(slow)
     for start in range(0, listed.size, _TOGETHER):
-        _followed(passage, sight, listed[start : start + _TOGETHER], lag, hat, variance)
+        _smooth_transient(passage, sight, listed[start : start + _TOGETHER], lag, hat, variance)
     hat[np.isinf(variance)] = np.nan
     return hat, variance
 
 
-def _known(steady: Steady, lag: int) -> FloatArray:
+def _information(steady: Steady, lag: int) -> FloatArray:
     """Return what `lag` measurements say, ``sum_j F'^j C2' S^-1 C2 F^j`` over j < lag."""
     C = steady.gains.W @ steady.model.C2
     part, total = C, np.zeros_like(steady.F)
@@ -156,7 +156,7 @@ def _known(steady: Steady, lag: int) -> FloatArray:
     return total
 
 
-def _followed(
+def _smooth_transient(
     passage: Passage,
     sight: Sight,
     ks: IntArray,

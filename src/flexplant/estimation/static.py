@@ -12,7 +12,7 @@ from ..errors import AssumptionError, ModelError
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
-from ..plant.rigid.rigid_motion import seen
+from ..plant.rigid.rigid_motion import rigid_rows
 from .error import error_variances
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 
@@ -136,7 +136,7 @@ def design_static(
     orders = {s.name: s.order for s in ports.y}
     used = [name for name in sensors(plant) if orders.get(name) == 0]
     channels = poi_channels(plant)
-    R_y, R_z = seen(plant, motions, used), seen(plant, motions, channels)
+    R_y, R_z = rigid_rows(plant, motions, used), rigid_rows(plant, motions, channels)
     gain = R_z @ np.linalg.pinv(R_y, rcond=_MISSED)
     missed = np.linalg.norm(R_z - gain @ R_y, axis=1)
     # displacements of a static solution have nine digits

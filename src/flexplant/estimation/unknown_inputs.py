@@ -19,8 +19,8 @@ from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..tolerances import TINY, divisor
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of
-from .filter_model import AGREEMENT, FilterModel, check_noises, filter_model, weighed
-from .invertibility import InputEntry, Invertibility, entry, judged, unknown_names
+from .filter_model import AGREEMENT, FilterModel, check_noises, filter_model, weigh
+from .invertibility import InputEntry, Invertibility, input_entry, ranks_and_zeros, unknown_names
 from .noise_from_records import with_densities
 
 #: variance of white inputs at the start of the search, beside what the sensors resolve
@@ -147,14 +147,14 @@ def design_input_estimator(
     )
     plant = checked_plant(plant)
     names = unknown_names(plant, inputs)
-    quiet = _without(plant, names)
+    quiet = _without_noise(plant, names)
     check_noises(quiet)
-    model, d = filter_model(quiet), entry(plant, names)
-    found = judged(model, d, names)
+    model, d = filter_model(quiet), input_entry(plant, names)
+    found = ranks_and_zeros(model, d, names)
     design = _unbiased(model, d, found) if isinstance(method, Unbiased) else None
     if design is None:
         design = _augmented(model, d, method, found)  # type: ignore[arg-type]
-    _check(design.certificate)
+    _check_certificate(design.certificate)
     return InputEstimator(
         _system(plant, model, design, names),
         plant,
@@ -181,12 +181,12 @@ def _unbiased(model: FilterModel, d: InputEntry, found: Invertibility) -> _Input
             "estimation.Augmented(drift=...)."
         )
     gains = _late_gains if late else _direct_gains
-    P = _first(model, d, late)
+    P = _initial_covariance(model, d, late)
     try:
         for _ in range(_STEPS):
             found_gains = gains(model, d, P)
             last, P = P, found_gains.covariance(model)
-            if _change(last, P) < _SETTLED:
+            if _relative_gap(last, P) < _SETTLED:
                 break
     except SolverError as error:
         raise AssumptionError(
@@ -194,19 +194,19 @@ def _unbiased(model: FilterModel, d: InputEntry, found: Invertibility) -> _Input
             f"{', '.join(found.inputs)} to the sensors lies too close to the unit circle. Add a "
             "sensor, or use estimation.Augmented(drift=...)."
         ) from error
-    return _judged(model, found_gains, last, P)
+    return _input_design(model, found_gains, last, P)
 
 
-def _first(m: FilterModel, d: InputEntry, late: bool) -> FloatArray:
+def _initial_covariance(m: FilterModel, d: InputEntry, late: bool) -> FloatArray:
     """Return a covariance to start at: that with white inputs of a large variance."""
     F, spread = (m.C2 @ d.G, m.C2 @ m.Q @ m.C2.T + m.R) if late else (d.H, m.R)
-    left = _weighted(F, spread)
+    left = _weighted_inverse(F, spread)
     size = _LARGE * np.sum((left @ spread) * left, axis=1)
     G, H = d.G * size, d.H * size
     return solve_dare(m.A, m.C2, Q=m.Q + G @ d.G.T, R=m.R + H @ d.H.T, S=m.S + G @ d.H.T).P
 
 
-def _change(one: FloatArray, two: FloatArray) -> float:
+def _relative_gap(one: FloatArray, two: FloatArray) -> float:
     size = divisor(two.diagonal())
     return float(np.max(np.abs(one - two).diagonal() / size))
 
@@ -236,27 +236,27 @@ class _InputGains(NamedTuple):
 def _direct_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
     """Return the gains with feedthrough; P is the covariance of x[k|k-1]."""
     spread = m.innovation(P)
-    M = _weighted(d.H, spread)
+    M = _weighted_inverse(d.H, spread)
     rest = np.eye(len(spread)) - d.H @ M
-    L_x = weighed(P @ m.C2.T, spread) @ rest
+    L_x = weigh(P @ m.C2.T, spread) @ rest
     # noise that reaches state and sensors together: what the innovation shows of it beside d
-    K = m.A @ L_x + d.G @ M + weighed(m.S, spread) @ rest
+    K = m.A @ L_x + d.G @ M + weigh(m.S, spread) @ rest
     L = np.vstack([m.C1 @ L_x + d.at_pois @ M, M])
     C = np.vstack([m.C1, np.zeros((len(M), len(P)))])
-    bias = max(_largest(M @ d.H - np.eye(len(M))), _largest((K @ d.H - d.G) / _size(d.G)))
+    bias = max(_max_abs(M @ d.H - np.eye(len(M))), _max_abs((K @ d.H - d.G) / _column_sizes(d.G)))
     return _InputGains(m.A, C, K, L, m.A - K @ m.C2, m.driven(K), False, bias)
 
 
 def _late_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
     """Return the gains without feedthrough; P is that of x[k|k-1], the input left out."""
     spread, F = m.innovation(P), m.C2 @ d.G
-    M = _weighted(F, spread)
-    plain = weighed(P @ m.C2.T, spread)
+    M = _weighted_inverse(F, spread)
+    plain = weigh(P @ m.C2.T, spread)
     L_x = plain + (d.G - plain @ F) @ M
     still = np.eye(len(P)) - L_x @ m.C2
     L = np.vstack([m.C1 @ L_x, M])
     C = np.vstack([m.C1, np.zeros((len(M), len(P)))])
-    bias = max(_largest(M @ F - np.eye(len(M))), _largest((L_x @ F - d.G) / _size(d.G)))
+    bias = max(_max_abs(M @ F - np.eye(len(M))), _max_abs((L_x @ F - d.G) / _column_sizes(d.G)))
     driven = still @ m.Q @ still.T + L_x @ m.R @ L_x.T
     return _InputGains(m.A, C, m.A @ L_x, L, still @ m.A, driven, True, bias)
 
@@ -281,10 +281,10 @@ def _augmented(
             f"assumptions: {found.text}. Add a sensor, or give Augmented a corner above 0."
         ) from error
     spread = larger.innovation(P)
-    gain = weighed(P @ C2.T, spread)
-    K = A @ gain + weighed(larger.S, spread)
+    gain = weigh(P @ C2.T, spread)
+    K = A @ gain + weigh(larger.S, spread)
     gains = _InputGains(A, C, K, C @ gain, A - K @ C2, larger.driven(K), False, 0.0)
-    return _judged(larger, gains, P, gains.covariance(larger))
+    return _input_design(larger, gains, P, gains.covariance(larger))
 
 
 class _InputDesign(NamedTuple):
@@ -295,7 +295,7 @@ class _InputDesign(NamedTuple):
     certificate: InputCertificate
 
 
-def _judged(m: FilterModel, g: _InputGains, claim: FloatArray, P: FloatArray) -> _InputDesign:
+def _input_design(m: FilterModel, g: _InputGains, claim: FloatArray, P: FloatArray) -> _InputDesign:
     """Return the design with the variances of its errors, and what was checked about it."""
     left, noise = g.C - g.L @ m.C2, np.sum((g.L @ m.R) * g.L, axis=1)
     both = [np.sum((left @ X) * left, axis=1) + noise for X in (claim, P)]
@@ -306,7 +306,7 @@ def _judged(m: FilterModel, g: _InputGains, claim: FloatArray, P: FloatArray) ->
     return _InputDesign(g, m.C2, both[1][:nz], both[1][nz:], certificate)
 
 
-def _check(found: InputCertificate) -> None:
+def _check_certificate(found: InputCertificate) -> None:
     if found.spectral_radius >= 1 or max(found.bias, found.difference) > AGREEMENT:
         raise CertificateError(
             f"the estimator of unknown inputs fails its check: spectral radius "
@@ -338,7 +338,7 @@ def _system(
     )
 
 
-def _without(plant: StandardPlant, names: Sequence[str]) -> StandardPlant:
+def _without_noise(plant: StandardPlant, names: Sequence[str]) -> StandardPlant:
     """Return the plant without the white noise of some disturbances."""
     loud = [name for name in names if plant.asd.get(name, 0.0) > 0]
     if not loud:
@@ -351,7 +351,7 @@ def _without(plant: StandardPlant, names: Sequence[str]) -> StandardPlant:
     return with_densities(plant, dict.fromkeys(loud, 0.0))
 
 
-def _weighted(F: FloatArray, spread: FloatArray) -> FloatArray:
+def _weighted_inverse(F: FloatArray, spread: FloatArray) -> FloatArray:
     """Return ``(F' S^-1 F)^-1 F' S^-1``, sensors and inputs of unit size inside."""
     size = np.sqrt(spread.diagonal())
     scaled = F / size[:, None]
@@ -362,11 +362,11 @@ def _weighted(F: FloatArray, spread: FloatArray) -> FloatArray:
     return np.asarray(inverse / columns[:, None])
 
 
-def _size(G: FloatArray) -> FloatArray:
+def _column_sizes(G: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(np.abs(G).max(axis=0), TINY))
 
 
-def _largest(matrix: FloatArray) -> float:
+def _max_abs(matrix: FloatArray) -> float:
     return float(np.max(np.abs(matrix), initial=0.0))
 
 

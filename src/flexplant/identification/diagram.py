@@ -192,7 +192,7 @@ class StabilisationDiagram(Value):
         centres = np.array([np.median(self.freq[self.tracks == track]) for track in known])
         lengths = np.array([np.sum(self.tracks == track) for track in known])
         away: Any = np.abs(centres[None, :] / np.maximum(wanted, TINY)[:, None] - 1.0)
-        # a long track is meant rather than a short one a hair nearer
+        # a long track is meant rather than a short one slightly nearer
         cost = np.where(away < 0.03, away + 0.01 / np.maximum(lengths, 1)[None, :], 1e3)
         if cost.shape[1] < wanted.size:
             raise ModelError(f"{wanted.size} frequencies, but only {known.size} poles are there.")
@@ -228,7 +228,7 @@ def built_diagram(
         flag = np.zeros(result.poles.size, dtype=np.int64)
         track = np.full(result.poles.size, -1, dtype=np.int64)
         if before is not None and before.poles.size and result.poles.size:
-            old, flag = _followed(before, result, tolerances)
+            old, flag = _continued_poles(before, result, tolerances)
             track = np.where(old >= 0, tracks[-1][old], -1)
         fresh = track < 0
         track[fresh] = count + np.arange(fresh.sum())
@@ -246,7 +246,7 @@ def built_diagram(
     )
 
 
-def _followed(
+def _continued_poles(
     old: OrderPoles, new: OrderPoles, tolerances: tuple[float, float, float]
 ) -> tuple[IntArray, IntArray]:
     """Return which old pole each new one continues, -1 for none, and the flags of the new ones."""
@@ -340,7 +340,7 @@ class Moments:
         keep = wanted(poles)
         z, poles = z[keep], poles[keep]
         powers = z[:, None] ** np.arange(order + 1)
-        left, right = _null_vectors(z, np.tensordot(powers, A, axes=1))
+        left, right = _pole_vectors(z, np.tensordot(powers, A, axes=1))
         values = np.einsum("kom,km->ok", np.tensordot(powers, B, axes=(1, 1)), right)
         size = np.linalg.norm(values, axis=0)
         seen = size > 0
@@ -365,13 +365,13 @@ class Moments:
         taken = self.taken[:, :n, : n * m]
         rows = taken.reshape(-1, n * m)
         big = self.big[: n * m, : n * m] - rows.conj().T @ rows
-        free: Any = -_solved(big[m:, m:], big[m:, :m])
+        free: Any = -_solve_hermitian(big[m:, m:], big[m:, :m])
         A = np.concatenate([np.eye(m, dtype=np.complex128), free])
         B = -self.inverse[:, :n, :n].conj().swapaxes(1, 2) @ (taken @ A)
         return A.reshape(n, m, m), B
 
 
-def _null_vectors(z: ComplexArray, matrices: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+def _pole_vectors(z: ComplexArray, matrices: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """Return (n, m) left and right null vectors l, r of A(z) (n, m, m): l A = 0, A r = 0.
 
     Those of a pole that is repeated but for rounding are independent.
@@ -384,7 +384,7 @@ def _null_vectors(z: ComplexArray, matrices: ComplexArray) -> tuple[ComplexArray
     return U[first, :, place].conj(), Vh[first, place].conj()
 
 
-def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray:
+def _solve_hermitian(matrix: ComplexArray, right: ComplexArray) -> ComplexArray:
     factor, info = la.lapack.zpotrf(matrix)
     if info == 0 and la.lapack.zpocon(factor, np.linalg.norm(matrix, 1))[0] > REGULAR:
         return np.asarray(la.lapack.zpotrs(factor, right)[0])
@@ -476,8 +476,8 @@ def diagram_of(
     found = []
     for window in windows(ready):
         freq = ready.freq[window.seen]
-        moments = _moments(ready, window, orders[-1])
-        inside = partial(_inside, band=(float(freq[0]), float(freq[-1])), max_zeta=max_zeta)
+        moments = _moments_in(ready, window, orders[-1])
+        inside = partial(_in_band, band=(float(freq[0]), float(freq[-1])), max_zeta=max_zeta)
         results = [moments.solve(order, inside) for order in orders]
         diagram = built_diagram(results, np.array([low, high]), tolerances)
         ends = (
@@ -511,19 +511,19 @@ def weighted_by_remainder(ready: PreparedLines, order: int) -> PreparedLines:
         parts = windows(now)
         for window in parts:
             own = slice(window.first, window.last)
-            fitted: ComplexArray = _moments(now, window, order).response(order, now.freq[own])
+            fitted: ComplexArray = _moments_in(now, window, order).response(order, now.freq[own])
             error[:, :, own] = np.abs(now.data[:, :, own] - fitted) ** 2
         share = (order + 1) * len(parts) / n_freq * (1 + n_in / n_out)
         now = now.from_errors(error, min(0.5, share))
     return now
 
 
-def _moments(ready: PreparedLines, window: Window, order: int) -> Moments:
+def _moments_in(ready: PreparedLines, window: Window, order: int) -> Moments:
     seen = window.seen
     return Moments(ready.freq[seen], ready.data[:, :, seen], ready.line_weight[:, seen], order)
 
 
-def _inside(poles: ComplexArray, band: tuple[float, float], max_zeta: float) -> BoolArray:
+def _in_band(poles: ComplexArray, band: tuple[float, float], max_zeta: float) -> BoolArray:
     """Return which poles count in a part of the band."""
     freq = np.abs(poles) / (2 * np.pi)
     zeta = -poles.real / np.abs(poles)

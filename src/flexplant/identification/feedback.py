@@ -35,7 +35,7 @@ class Feedback:
     deviations: float
 
 
-def feedback(frf: Frf) -> Feedback | None:
+def feedback_bias(frf: Frf) -> Feedback | None:
     r"""Return where an FRF is most biased by feedback, None where nothing shows it.
 
     With ``u = r - K y`` and noise v on y the direct estimate tends to
@@ -71,7 +71,7 @@ def feedback(frf: Frf) -> Feedback | None:
     spread = np.abs(np.fft.fft(window) / size) ** 2
     both = np.concatenate([power, power[..., -2:0:-1]], axis=-1)
     noise = np.fft.irfft(np.fft.rfft(both) * np.fft.rfft(spread), size)[..., : n + 2]
-    seen, noise, whole = (_smooth(x) for x in (seen, noise, np.abs(spectrum) ** 2))
+    seen, noise, whole = (_moving_mean(x) for x in (seen, noise, np.abs(spectrum) ** 2))
     ratio = seen / np.maximum(noise, TINY)
     share = np.sqrt(seen / np.maximum(whole, TINY))
     score: Any = np.where((ratio > SEEN) & (share > LEAST), ratio, 0.0)[..., 1:-1]
@@ -92,7 +92,7 @@ def _taper(x: FloatArray) -> FloatArray:
     return np.asarray(np.interp(x, np.linspace(0.0, 1.0, 1025), both[1024:]))
 
 
-def _smooth(power: FloatArray) -> FloatArray:
+def _moving_mean(power: FloatArray) -> FloatArray:
     import scipy.ndimage as ndi
 
     return np.asarray(ndi.uniform_filter1d(power, STRETCH, axis=-1, mode="nearest"))

@@ -247,7 +247,7 @@ def repetitions(repeated: Iterable[Frf]) -> tuple[Frf, ...]:
     return frfs
 
 
-def stacked(runs: tuple[Frf, ...]) -> Frf:
+def stacked_runs(runs: tuple[Frf, ...]) -> Frf:
     """Return the outputs of all runs as outputs of one measurement."""
     first = runs[0]
     variances = [run.variance for run in runs if run.variance is not None]

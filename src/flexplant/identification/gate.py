@@ -11,7 +11,7 @@ from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import SolverError, attempted
 from ..tolerances import RANK, TINY
 from .line_weights import NARROW, Rejected, mains_multiple
-from .model_error import ALIKE, Disagreement, mac, strength, twin
+from .model_error import ALIKE, Disagreement, column_mac, strength, twin_poles
 from .pole_test import pole_price, shared, unit
 from .refine import Fit, Lines, pivoted, refined
 
@@ -39,7 +39,7 @@ def gated(
         if found is None:
             break
         place, reason = found
-        listed.append(entry(fit, place, reason))
+        listed.append(rejection(fit, place, reason))
         if fit.poles.size == 1:
             raise SolverError(
                 f"no pole is left: {listed[-1][0]:.5g} Hz is {reason}. Widen the band, measure "
@@ -47,8 +47,8 @@ def gated(
             )
         rest = np.delete(np.arange(fit.poles.size), place)
         fit = fitted(fit.poles[rest], fit.participation[:, rest])
-    reasons = [_outside(lines, pole) for pole in fit.poles]
-    listed += [entry(fit, k, why) for k, why in enumerate(reasons) if why]
+    reasons = [_rejection(lines, pole) for pole in fit.poles]
+    listed += [rejection(fit, k, why) for k, why in enumerate(reasons) if why]
     kept = np.array([k for k, why in enumerate(reasons) if why is None], dtype=np.int64)
     if not kept.size:
         raise _none_left(listed)
@@ -77,7 +77,7 @@ def steady(
             if differs[k]
             else f"without information: over the {side} the deviation of its damping exceeds it"
         )
-        listed.append(entry(fit, int(k), reason))
+        listed.append(rejection(fit, int(k), reason))
     kept = reported[~(differs | unknown)[reported]]
     if not kept.size:
         raise _none_left(listed)
@@ -93,7 +93,7 @@ def _none_left(listed: Sequence[Rejected]) -> SolverError:
     )
 
 
-def entry(fit: Fit, k: int, reason: str) -> Rejected:
+def rejection(fit: Fit, k: int, reason: str) -> Rejected:
     """Return the line of a list of what is not reported."""
     pole = complex(fit.poles[k])
     return abs(pole) / (2 * np.pi), -pole.real / abs(pole), reason
@@ -109,25 +109,25 @@ def _needless(
     """Return a pole that is to be left out, and why."""
     size, std = np.abs(fit.poles), _deviations(lines, fit)
     unknown = np.maximum(std[1] / size, std[0] / np.maximum(-fit.poles.real, TINY))
-    inside = [k for k in range(size.size) if _outside(lines, fit.poles[k]) is None]
+    inside = [k for k in range(size.size) if _rejection(lines, fit.poles[k]) is None]
     worst = max(inside, key=lambda k: float(unknown[k]), default=None)
     if worst is not None and unknown[worst] >= 1.0:
         return worst, "without information: its deviation of frequency or damping exceeds it"
     if not alone:
         return None
-    found = twin(fit)
+    found = twin_poles(fit)
     if found is not None:
         other, place = found
-        alike = mac(fit.shapes, other, place) > ALIKE
-        if not compare or alike or not _shared(lines, fit, fitted, place):
+        alike = column_mac(fit.shapes, other, place) > ALIKE
+        if not compare or alike or not _is_shared(lines, fit, fitted, place):
             return place, f"a twin of the pole at {size[other] / (2 * np.pi):.5g} Hz"
     for place in lesser(fit, fit.shapes) if compare else []:
-        if not _shared(lines, fit, fitted, place):
+        if not _is_shared(lines, fit, fitted, place):
             return place, f"not shared by the {lines.side}: it stands for what they differ by"
     return None
 
 
-def _shared(
+def _is_shared(
     lines: Lines, fit: Fit, fitted: Callable[[ComplexArray, ComplexArray], Fit], place: int
 ) -> bool:
     """Return whether the outputs share a pole of the fit, true where there is no fit without it."""
@@ -153,7 +153,7 @@ def lesser(fit: Fit, vectors: ComplexArray, alike: float = 0.0) -> list[int]:
     for k in np.argsort(height):
         reach = BESIDE * (-fit.poles.real - fit.poles.real[k])
         near = (np.abs(fit.poles - fit.poles[k]) < reach) & (height > height[k])
-        if any(mac(vectors, int(j), int(k)) >= alike for j in np.flatnonzero(near)):
+        if any(column_mac(vectors, int(j), int(k)) >= alike for j in np.flatnonzero(near)):
             found.append(int(k))
     return found
 
@@ -171,7 +171,7 @@ def single(lines: Lines, fit: Fit, vectors: ComplexArray, steps: int) -> Fit:
     return refined(lines, *now, steps=steps, strict=False, poles_only=True, first=start)
 
 
-def _outside(lines: Lines, pole: complex) -> str | None:
+def _rejection(lines: Lines, pole: complex) -> str | None:
     """Return why a pole of the fit is not reported, None where it is."""
     freq, width = abs(pole) / (2 * np.pi), -2.0 * pole.real / (2 * np.pi)
     low, high = float(lines.freq[0]), float(lines.freq[-1])

@@ -20,8 +20,8 @@ from .diagram import (
     diagram_of,
     weighted_by_remainder,
 )
-from .frf_estimation import repetitions, stacked
-from .line_weights import prepared
+from .frf_estimation import repetitions, stacked_runs
+from .line_weights import prepared_lines
 from .pole_test import UPPER
 from .result import IdentifiedModes, of_segments
 from .stages import MOST_POLES, RUNS, Task, identified
@@ -92,7 +92,7 @@ def stabilisation_diagram(
             f"{tolerances!r}."
         )
     top = between(max_zeta, "max_zeta", 0.0, 1.0, "From 1 on nothing oscillates: pass 0.2, say.")
-    ready, listed = prepared(frf, band), None if orders is None else checked_orders(orders)
+    ready, listed = prepared_lines(frf, band), None if orders is None else checked_orders(orders)
     if not ready.known:
         ready = weighted_by_remainder(ready, affordable(listed, ready)[-1])
     with one_thread():
@@ -212,7 +212,7 @@ def identify_modes(
         runs = repetitions(runs)
     with one_thread():
         try:
-            ready = prepared(stacked(runs) if len(runs) > 1 else runs[0], band)
+            ready = prepared_lines(stacked_runs(runs) if len(runs) > 1 else runs[0], band)
             rate = None if hold is None else positive(hold, "hold")
             high = float(ready.freq[-1])
             if rate is not None and high > rate / 2 * (1 + ROUNDING):

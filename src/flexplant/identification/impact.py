@@ -366,7 +366,7 @@ def _blows(
     begins = [pulse[0] for pulse in pulses]
     for k, (begin, end, i) in enumerate(pulses):
         start = begin - before
-        reason = _reason(begins, k, start, length, f.shape[2], data.rate)
+        reason = _unusable(begins, k, start, length, f.shape[2], data.rate)
         over = [name for name, at in limited.items() if at[max(start, 0) : start + length].any()]
         if not reason and over:
             reason = f"{over[0]} is at the limit of its range"
@@ -404,7 +404,7 @@ def _pulses(force: FloatArray, level: float, largest: float) -> list[tuple[int, 
     return found
 
 
-def _reason(begins: list[int], k: int, start: int, length: int, n_time: int, rate: float) -> str:
+def _unusable(begins: list[int], k: int, start: int, length: int, n_time: int, rate: float) -> str:
     """Return why a blow cannot be used, nothing where it can."""
     if k and begins[k] < begins[k - 1] + length - (begins[k] - start):
         return f"a blow came {(begins[k] - begins[k - 1]) / rate:.3g} s before"
@@ -437,13 +437,13 @@ def _limited(
         moving = steps[steps > 0]
         if moving.size:
             for extreme in (signal.max(), signal.min()):
-                at |= _flat(signal == extreme, steps, STEEP * float(moving.min()))
+                at |= _flat_runs(signal == extreme, steps, STEEP * float(moving.min()))
         if at.any():
             found[name] = at
     return found
 
 
-def _flat(extreme: Any, steps: FloatArray, steep: float) -> Any:
+def _flat_runs(extreme: Any, steps: FloatArray, steep: float) -> Any:
     """Return runs of `extreme` that begin after a step larger than `steep`, of FLAT samples."""
     edges = np.diff(np.concatenate([[0], extreme.astype(np.int8), [0]]))
     at = np.zeros(extreme.size, dtype=np.bool_)

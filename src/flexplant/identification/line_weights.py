@@ -120,7 +120,7 @@ class PreparedLines:
         return replace(self, weight=np.sqrt(2.0 / variance))
 
 
-def prepared(frf: Any, band: Any) -> PreparedLines:
+def prepared_lines(frf: Any, band: Any) -> PreparedLines:
     """Return what is fitted of an FRF, checked."""
     instance(frf, Frf, "frf", "Pass estimate_frf(...) of records, or Frf(freq, data).")
     low, high = checked_band(band, frf.freq)
@@ -181,7 +181,7 @@ def without_mains(ready: PreparedLines, tapered: bool) -> PreparedLines:
         if reason is None or seen.start < 0 or seen.stop > freq.size:
             continue
         d = (freq[seen] - freq[k]) / spacing
-        lines = _standing_out(ready.data[..., seen], d, CHANCE / len(at), tapered)
+        lines = _disturbed(ready.data[..., seen], d, CHANCE / len(at), tapered)
         if np.any(lines):
             keep[seen] &= ~lines
             found.append((float(freq[k]), 0.0, reason))
@@ -199,7 +199,7 @@ def without_mains(ready: PreparedLines, tapered: bool) -> PreparedLines:
     )
 
 
-def _standing_out(data: ComplexArray, d: FloatArray, chance: float, tapered: bool) -> BoolArray:
+def _disturbed(data: ComplexArray, d: FloatArray, chance: float, tapered: bool) -> BoolArray:
     r"""Return which of some lines hold a disturbance of the frequency in their middle.
 
     The lines aside are fitted by :math:`(1 + g d) H = a + b d + c d^2 + r/d`, d the distance in

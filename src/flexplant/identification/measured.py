@@ -160,11 +160,11 @@ class MeasuredModes(Value):
         return int(self.poles.size)
 
     def __repr__(self) -> str:
-        known = "" if self.modes is None else ", modes " + _listed(self.modes, "d")
+        known = "" if self.modes is None else ", modes " + _number_list(self.modes, "d")
         spread = "" if self.covariance is None else ", with covariance"
         return (
             f"<MeasuredModes: {counted(len(self), 'pole')}{known} at "
-            f"{_listed(self.freq, '.1f')} Hz{spread}>"
+            f"{_number_list(self.freq, '.1f')} Hz{spread}>"
         )
 
     @property
@@ -220,7 +220,7 @@ class MeasuredModes(Value):
         }
 
 
-def _listed(numbers: Iterable[float], form: str) -> str:
+def _number_list(numbers: Iterable[float], form: str) -> str:
     items = list(numbers)
     shown = ", ".join(format(item, form) for item in items[:6])
     return shown + (", ..." if len(items) > 6 else "")
@@ -405,24 +405,24 @@ def numbered(
             f"{alike[worst, int(np.argmin(distance[worst]))]:.2f}. Add modes to the model, loosen "
             "tolerance=, or leave these poles out with partial=True."
         )
-    _in_order(pairs, measured.freq, modes.omega)
+    _sort_families(pairs, measured.freq, modes.omega)
     kept = sorted(pairs)
     chosen = measured if len(kept) == len(measured) else measured.select(kept)
     return chosen.replace(modes=tuple(pairs[i] for i in kept))
 
 
-def _in_order(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -> None:
+def _sort_families(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -> None:
     """Give the numbers of each family of modes to its poles by frequency; rounding chose else."""
     free = sorted(pairs, key=lambda i: pairs[i])
     while free:
         first = pairs[free[0]] - 1
         family = [i for i in free if omega[pairs[i] - 1] <= omega[first] * (1.0 + FAMILY)]
         free = free[len(family) :]
-        numbers = _lowest([pairs[i] for i in family], omega, set(pairs.values()))
+        numbers = _free_numbers([pairs[i] for i in family], omega, set(pairs.values()))
         pairs.update(zip(sorted(family, key=lambda i: float(freq[i])), numbers, strict=True))
 
 
-def _lowest(numbers: list[int], omega: FloatArray, taken: set[int]) -> list[int]:
+def _free_numbers(numbers: list[int], omega: FloatArray, taken: set[int]) -> list[int]:
     """Return rising numbers, each the lowest free one of the modes of its frequency."""
     lowest = []
     for number in numbers:

@@ -91,7 +91,7 @@ def strength(fit: Fit) -> FloatArray:
     return np.asarray(height * np.linalg.norm(fit.participation, axis=0))
 
 
-def twin(fit: Fit) -> tuple[int, int] | None:
+def twin_poles(fit: Fit) -> tuple[int, int] | None:
     """Return two poles within a bandwidth with the same shape and participation, the weak one last.
 
     One resonance that is no straight circle (leakage, an amplitude that matters) becomes such a
@@ -104,7 +104,7 @@ def twin(fit: Fit) -> tuple[int, int] | None:
             if height[j] <= height[k]:
                 continue
             apart, widths = abs(fit.poles[j].imag - fit.poles[k].imag), -fit.poles.real[[j, k]]
-            same = min(mac(fit.shapes, j, k), mac(fit.participation, j, k)) > ALIKE
+            same = min(column_mac(fit.shapes, j, k), column_mac(fit.participation, j, k)) > ALIKE
             reach = BANDWIDTH if widths[1] > widths[0] else WITHIN
             if apart > (widths.sum() if same else reach * np.sqrt(widths.prod())):
                 continue
@@ -116,7 +116,7 @@ def twin(fit: Fit) -> tuple[int, int] | None:
     return None
 
 
-def mac(vectors: ComplexArray, j: int, k: int) -> float:
+def column_mac(vectors: ComplexArray, j: int, k: int) -> float:
     """Return the MAC of two columns."""
     a, b = vectors[:, j], vectors[:, k]
     return float(

@@ -10,7 +10,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, positive, real_array, whole
 from ..errors import ModelError, SolverError
-from ..modes.matching import assigned, mac
+from ..modes.matching import assigned, mac_matrix
 from ..parallel import Progress, tick
 from .diagram import OrderPoles, built_diagram, checked_orders
 from .measured import MeasuredModes
@@ -133,23 +133,23 @@ def identify_output_only(
             "give fewer blocks= or lags=."
         )
     with Progress(2 * parts, PARTS, progress=progress):
-        each = np.array([_hankel(block, count) for block in _blocks(y, parts)])
+        each = np.array([_hankel(block, count) for block in _record_pieces(y, parts)])
         mean = each.mean(axis=0)
         U, sizes, _ = la.svd(mean)
         inside = (low, high)
-        results = [_poles(U, sizes, y.shape[1], order, step, inside) for order in listed]
+        results = [_order_poles(U, sizes, y.shape[1], order, step, inside) for order in listed]
         chosen = built_diagram(results, np.array(inside), TOLERANCES).automatic().poles
-        bases = [_without(mean, one, parts) for one in each]
+        bases = [_leave_one_out(mean, one, parts) for one in each]
         best: tuple[OrderPoles, FloatArray, Any] | None = None
         for result in results:
             found = _those(result, chosen)
             if found.poles.size <= (0 if best is None else best[2].size):
                 continue
             again = (
-                _poles(left, values, y.shape[1], result.order, step, (0.0, np.inf))
+                _order_poles(left, values, y.shape[1], result.order, step, (0.0, np.inf))
                 for left, values, _ in bases
             )
-            spread, kept = _spread(found, list(again))
+            spread, kept = _jackknife(found, list(again))
             if best is None or kept.size > best[2].size:
                 best = found, spread, kept
     if best is None or not best[2].size:
@@ -168,14 +168,14 @@ def identify_output_only(
     return MeasuredModes(found.poles[kept], covariance=covariance, shapes=shapes, dofs=names)
 
 
-def _blocks(y: FloatArray, parts: int) -> list[FloatArray]:
+def _record_pieces(y: FloatArray, parts: int) -> list[FloatArray]:
     """Return about `parts` pieces (n_channel, n_time) of the records."""
     share = max(1, round(parts / y.shape[0]))
     pieces = [piece for record in y for piece in np.array_split(record, share, axis=1)]
     return [piece - piece.mean(axis=1, keepdims=True) for piece in pieces]
 
 
-def _without(mean: FloatArray, one: FloatArray, parts: int) -> Any:
+def _leave_one_out(mean: FloatArray, one: FloatArray, parts: int) -> Any:
     """Return the singular value decomposition of the mean without one of the parts."""
     tick(PARTS)
     return la.svd((parts * mean - one) / (parts - 1))
@@ -193,7 +193,7 @@ def _hankel(y: FloatArray, count: int) -> FloatArray:
     return np.vstack(rows).reshape(count * n, count * n)
 
 
-def _poles(
+def _order_poles(
     U: FloatArray,
     sizes: FloatArray,
     n: int,
@@ -229,7 +229,7 @@ def _those(result: OrderPoles, chosen: ComplexArray) -> OrderPoles:
     )
 
 
-def _spread(found: OrderPoles, again: list[OrderPoles]) -> tuple[FloatArray, Any]:
+def _jackknife(found: OrderPoles, again: list[OrderPoles]) -> tuple[FloatArray, Any]:
     """Return deviations (2, parts, m) of Re and Im, squared their variance, and which are small."""
     moved = np.array([_like(found, other) for other in again])
     centred = moved - moved.mean(axis=0)
@@ -246,7 +246,7 @@ def _like(found: OrderPoles, other: OrderPoles) -> ComplexArray:
     if not other.poles.size:
         return moved
     far = np.abs(other.poles - found.poles[:, None]) / np.abs(found.poles)[:, None]
-    like = assigned(far / NEAR - mac(found.shapes, other.shapes))
+    like = assigned(far / NEAR - mac_matrix(found.shapes, other.shapes))
     same = (like >= 0) & (far[np.arange(like.size), like] < NEAR)
     moved[same] = other.poles[like[same]]
     return moved

@@ -128,14 +128,14 @@ def frf_of_periods(
 ) -> Frf:
     """Return ``Y X^H (U X^H)^-1`` of `line_spectra` with its variance, correlation, coherence."""
     n_in = U.shape[1]
-    y, u, x = _mean(Y), _mean(U), _mean(X)
+    y, u, x = _mean_spectra(Y), _mean_spectra(U), _mean_spectra(X)
     xh = x.conj().transpose(0, 2, 1)
     back = u @ xh
     G: Any = np.linalg.solve(back.transpose(0, 2, 1), (y @ xh).transpose(0, 2, 1))
     G = G.transpose(0, 2, 1)
     variance: FloatArray | None = None
     correlation: ComplexArray | None = None
-    left, freedom = _noise(Y, U, G, periods)
+    left, freedom = _noise_spectrum(Y, U, G, periods)
     if freedom > 0:
         # the excitation's part of the inputs: U X^H (X X^H)^-1 X U^H
         inverse: Any = np.linalg.inv(back @ np.linalg.solve(x @ xh, back.conj().transpose(0, 2, 1)))
@@ -182,17 +182,17 @@ def _each_period(signals: FloatArray, samples: int) -> ComplexArray:
     return np.asarray(spectra[..., 1 : (samples + 1) // 2])
 
 
-def _mean(spectra: ComplexArray) -> ComplexArray:
+def _mean_spectra(spectra: ComplexArray) -> ComplexArray:
     """Return those of the mean period (lines, n_channel, n_exp)."""
     return np.asarray(spectra[:, :, 0].transpose(2, 1, 0))
 
 
 def _excited(spectra: ComplexArray) -> Any:
-    singular = np.linalg.svd(_mean(spectra), compute_uv=False)[:, -1]
+    singular = np.linalg.svd(_mean_spectra(spectra), compute_uv=False)[:, -1]
     return singular > EXCITED * singular.max(initial=0.0)
 
 
-def _noise(
+def _noise_spectrum(
     Y: ComplexArray, U: ComplexArray, G: ComplexArray, periods: int
 ) -> tuple[ComplexArray, int]:
     """Return the noise spectrum of a mean period (lines, n_out, n_out) and its freedom."""
@@ -333,7 +333,7 @@ def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: flo
     n_time = x.shape[2]
     if n_time < 2 * samples:
         return True
-    change = _change(x)
+    change = _differences(x)
     here = float(change[samples])
     lags = np.arange(samples // 2, 3 * n_time // 4)
     best = int(lags[np.argmin(change[lags])])
@@ -391,7 +391,7 @@ def averages_advised(x: FloatArray, rate: float, window: Any) -> None:
 
 def _period(x: FloatArray) -> int:
     """Return the shortest period of at most half the record [samples], 0 where there is none."""
-    change = _change(x)[: x.shape[2] // 2 + 1]
+    change = _differences(x)[: x.shape[2] // 2 + 1]
     # neighbouring samples of slow signals are alike too
     apart = np.flatnonzero(change > 0.5)
     if not apart.size:
@@ -403,7 +403,7 @@ def _period(x: FloatArray) -> int:
     return int(run[np.argmin(change[run])])
 
 
-def _change(x: FloatArray) -> FloatArray:
+def _differences(x: FloatArray) -> FloatArray:
     """Return D(L) for all L."""
     n_time = x.shape[2]
     size = 2 * n_time

@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray
 from ..errors import SolverError, attempted, warn
 from ..tolerances import RANK
-from .model_error import coherence, own_cost, twin
+from .model_error import coherence, own_cost, twin_poles
 from .refine import Fit, Lines, pivoted, refined
 
 #: probability that noise anywhere in the band passes for a pole
@@ -197,7 +197,7 @@ def _accepted(lines: Lines, fit: Fit, trial: Trial, steps: int) -> tuple[Lines, 
         return None
     if more_poles and not (
         corroborated(lines, fit.model, more.model)
-        and added(fit, more) not in (twin(more) or ())
+        and newest_pole(fit, more) not in (twin_poles(more) or ())
         and shared(lines, fit, more, trial.least)
     ):
         return None
@@ -211,7 +211,7 @@ def shared(lines: Lines, fit: Fit, more: Fit, least: float) -> bool:
     and where outputs do not agree on the poles, also that of fits with poles of their own at each
     output, which have no need of a pole for the sake of these differences.
     """
-    new = added(fit, more)
+    new = newest_pole(fit, more)
     least = max(least, pole_price(lines) * coherence(lines, more.model, more.poles[new]))
     if fit.cost - more.cost < least:
         return False
@@ -242,7 +242,7 @@ def _proven(fit: Fit, more: Fit, least: float) -> bool:
     return False
 
 
-def added(fit: Fit, more: Fit) -> int:
+def newest_pole(fit: Fit, more: Fit) -> int:
     """Return which pole of a fit of more poles is farthest from those before."""
     away = [np.min(np.abs(pole - fit.poles), initial=np.inf) for pole in more.poles]
     return int(np.argmax(away))
@@ -280,13 +280,13 @@ def dropped(lines: Lines, fit: Fit) -> Proposals:
 
 def merged(lines: Lines, fit: Fit) -> Proposals:
     """Propose the fit without the weaker one of two poles of one resonance."""
-    pair = twin(fit)
+    pair = twin_poles(fit)
     if pair is not None:
         rest = np.delete(np.arange(fit.poles.size), pair[1])
         yield [Trial(lines, fit.poles[rest], fit.participation[:, rest], np.inf, -np.inf)]
 
 
-def _terms(lines: Lines, fit: Fit, upper: int, chance: float) -> Trial:
+def _refit_terms(lines: Lines, fit: Fit, upper: int, chance: float) -> Trial:
     """Return the fit with another number of residual terms of modes above the band."""
     other, count = replace(lines, upper=upper), upper - lines.upper
     channels = lines.data.shape[0] * lines.data.shape[1]
@@ -297,7 +297,7 @@ def _terms(lines: Lines, fit: Fit, upper: int, chance: float) -> Trial:
 
 def fewer_terms(lines: Lines, fit: Fit) -> Proposals:
     """Propose the fewest residual terms that the data let pass."""
-    trials = (_terms(lines, fit, upper, FEW) for upper in UPPER if upper < lines.upper)
+    trials = (_refit_terms(lines, fit, upper, FEW) for upper in UPPER if upper < lines.upper)
     yield [trial for trial in trials if trial.gain > trial.least]
 
 
@@ -310,11 +310,11 @@ def more_terms(lines: Lines, fit: Fit) -> Proposals:
     """
     count = lines.freq.size
     afforded = [u for u in MORE if u > lines.upper and count >= 8 * (u + lines.lower)]
-    trials = (_terms(lines, fit, upper, CHANCE) for upper in afforded)
+    trials = (_refit_terms(lines, fit, upper, CHANCE) for upper in afforded)
     yield [trial for trial in trials if trial.gain > trial.least]
 
 
-def split(lines: Lines, fit: Fit) -> Proposals:
+def split_proposals(lines: Lines, fit: Fit) -> Proposals:
     r"""Propose to take those poles apart that are two.
 
     A pole of two modes, repeated or so close that one pole passes for both, requires residues
@@ -372,7 +372,7 @@ def relocated(lines: Lines, fit: Fit) -> Proposals:
         ]
 
 
-def missed(lines: Lines, fit: Fit) -> Proposals:
+def missed_poles(lines: Lines, fit: Fit) -> Proposals:
     """Propose a pole at the highest peaks of what is left, single lines apart."""
     least = pole_price(lines) * unit(lines, fit)
     for peak in [peak for peak in unexplained(lines, fit) if not peak.isolated][:TRIED]:
@@ -406,7 +406,7 @@ class Peak:
     isolated: bool = False  # one or two lines, and noise alone around them
 
 
-def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
+def residual_peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
     r"""Return the stretches whose residual is more than noise, the highest first.
 
     Over L lines of c channels the sum of :math:`2 |e|^2/\sigma^2` is chi-square with 2 c L degrees
@@ -419,7 +419,7 @@ def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
     found: list[Peak] = []
     if exact(lines, model):
         return found
-    noiseless = not lines.known and _smooth(lines, model)
+    noiseless = not lines.known and _is_smooth(lines, model)
     measured = np.sum(np.abs(lines.data * lines.weight) ** 2, axis=(0, 1))
     for length in STRETCHES:
         if 4 * length > power.size:
@@ -486,7 +486,7 @@ def exact(lines: Lines, model: ComplexArray) -> bool:
     return bool(la.norm(lines.data - model) < ROUNDING * la.norm(lines.data))
 
 
-def _smooth(lines: Lines, model: ComplexArray) -> bool:
+def _is_smooth(lines: Lines, model: ComplexArray) -> bool:
     """Whether neighbouring lines are off alike nearly everywhere: noise does not do that."""
     error = (lines.data - model) * lines.weight
     alike = np.sum(error[..., 1:] * error[..., :-1].conj(), axis=(0, 1)).real
@@ -529,7 +529,7 @@ def unexplained(lines: Lines, fit: Fit) -> list[Peak]:
     """Return the peaks of what a fit leaves, each once, the highest first."""
     used = 1.0 - freedom(lines, fit.poles.size) / (2 * fit.model.size)
     kept: list[Peak] = []
-    for peak in peaks(lines, fit.model, used):
+    for peak in residual_peaks(lines, fit.model, used):
         if all(abs(peak.freq - other.freq) > max(peak.width, other.width) for other in kept):
             kept.append(peak)
     return kept
@@ -551,7 +551,7 @@ def warned(left: list[Peak], apart: tuple[float, str, str] | None) -> None:
         )
     elif stretches:
         warn(
-            f"more than noise is left near {_listed(stretches)}: a mode may be missed or merged "
+            f"more than noise is left near {_peak_list(stretches)}: a mode may be missed or merged "
             "there, and its neighbours be off by more than their stated deviation. Look at "
             "plot.identified and plot.stabilisation, choose poles by hand (start=), or narrow the "
             "band."
@@ -559,12 +559,12 @@ def warned(left: list[Peak], apart: tuple[float, str, str] | None) -> None:
     single = [peak for peak in left if peak.isolated]
     if single and apart is None:
         warn(
-            f"single lines hold more than noise, with noise alone around them: {_listed(single)}. "
-            "No pole was fitted to them: a disturbance of one frequency (mains, a pump) or a "
+            f"single lines hold more than noise, with noise alone around them: {_peak_list(single)}"
+            ". No pole was fitted to them: a disturbance of one frequency (mains, a pump) or a "
             "variance from few segments looks so, and so does a mode narrower than the lines are "
             "apart. Measure with longer segments to distinguish them, or average more."
         )
 
 
-def _listed(left: list[Peak]) -> str:
+def _peak_list(left: list[Peak]) -> str:
     return ", ".join(f"{peak.freq:.4g} Hz ({peak.height:.0f} sigma)" for peak in left[:4])

@@ -20,7 +20,7 @@ RUNAWAY = 5.0
 #: squares of the standard deviations by which a full step may still move a fit that has settled
 FINE, COARSE, ROUGH = 1e-5, 1e-2, 0.3
 #: steps after which a fit may be given up, and how often the gain of a full step is waited for
-PATIENCE, HOPE = 4, 20.0
+TRIAL_STEPS, GAINS_AHEAD = 4, 20.0
 #: steps of a fit of one output: its poles begin near
 OWN = 20
 #: least damping ratio of a pole, and how many times farther from zero than the highest line it may
@@ -96,7 +96,7 @@ class Lines:
         """Per output Q (n_in, 2 n_freq, n_terms) and R of the weighted residual terms."""
         found = []
         for w in self.weight:
-            pairs = [_qr(_real(self.smooth * row).T) for row in w]
+            pairs = [_qr(_real_and_imag(self.smooth * row).T) for row in w]
             found.append((np.array([Q for Q, _ in pairs]), np.array([R for _, R in pairs])))
         return found
 
@@ -105,7 +105,7 @@ class Lines:
         """Per output the weighted data (n_in 2 n_freq,) that no residual term explains."""
         found = []
         for (Q, _), data, w in zip(self.smooth_bases, self.data, self.weight, strict=True):
-            found.append(_off(Q, _real(data * w)[:, None, :]).ravel())
+            found.append(_off(Q, _real_and_imag(data * w)[:, None, :]).ravel())
         return found
 
 
@@ -153,11 +153,11 @@ def refined(
         scaled[held], scaled[:, held], slope[held] = 0.0, 0.0, 0.0
         scaled[held, held] = 1.0
         # what a full step would gain: a damped one is short, and says nothing of being there
-        predicted = float(slope @ _step(scaled, slope, 1e-8))
+        predicted = float(slope @ _damped_step(scaled, slope, 1e-8))
         better, gained = None, 0.0
         for _ in range(12):
-            step = _step(scaled, slope, damping) / size
-            trial = _moved(poles, participation, pivots, step)
+            step = _damped_step(scaled, slope, damping) / size
+            trial = _apply_step(poles, participation, pivots, step)
             near = np.abs(trial[0]).max() < farthest and np.abs(trial[1]).max() < 1e6
             if near and np.all(trial[0].imag > 0):
                 better = Fit(lines, *trial, pivots)
@@ -178,7 +178,7 @@ def refined(
         # a step of so few standard deviations of what is left is none
         if predicted <= enough * now.cost / (2 * lines.data.size):
             break
-        if number >= PATIENCE and now.cost - HOPE * predicted > below:
+        if number >= TRIAL_STEPS and now.cost - GAINS_AHEAD * predicted > below:
             raise unsettled(poles.size, number)
         # a gain of rounding, thrice; or all that is there is explained, to 1e-12 of an amplitude
         idle = idle + 1 if gained <= 1e-12 * now.cost else 0
@@ -242,7 +242,7 @@ class Fit:
         first, second = l * self.plus, l.conj() * self.minus
         both = np.concatenate([first + second, 1j * (first - second)], axis=1)
         for (Q, _), w in zip(self.lines.smooth_bases, self.lines.weight, strict=True):
-            columns = _off(Q, _real(both * w[:, None, :]))
+            columns = _off(Q, _real_and_imag(both * w[:, None, :]))
             yield columns.swapaxes(0, 1).reshape(2 * self.m, w.shape[0] * columns.shape[2]).T
 
     @cached_property
@@ -280,7 +280,7 @@ class Fit:
     @cached_property
     def terms(self) -> FloatArray:
         """The coefficients (n_out, n_in, n_terms) of the residual terms."""
-        left = _real((self.lines.data - self.modal) * self.lines.weight)
+        left = _real_and_imag((self.lines.data - self.modal) * self.lines.weight)
         return np.array(
             [
                 [la.lstsq(R, Q.T @ row)[0] for Q, R, row in zip(Qs, Rs, rows, strict=True)]
@@ -304,7 +304,7 @@ class Fit:
         c, d = shape * self.plus, shape.conj() * self.minus
         parts = np.concatenate([a + b, 1j * (a - b), np.zeros_like(a), np.zeros_like(a)], axis=1)
         parts[:, 2 * self.m : 3 * self.m], parts[:, 3 * self.m :] = c + d, 1j * (c - d)
-        return _real(parts * self.lines.weight[o][:, None, :])
+        return _real_and_imag(parts * self.lines.weight[o][:, None, :])
 
     @cached_property
     def _places(self) -> list[tuple[Any, Any]]:
@@ -407,7 +407,7 @@ def free_inputs(pivots: Any, n_in: int) -> IntArray:
     return np.asarray(others + (others >= pivots))
 
 
-def _moved(
+def _apply_step(
     poles: ComplexArray, participation: ComplexArray, pivots: Any, step: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
     n_in, m = participation.shape
@@ -417,11 +417,11 @@ def _moved(
     return np.minimum(real, -LEAST * np.abs(imag)) + 1j * imag, moved
 
 
-def _step(N: FloatArray, g: FloatArray, damping: float) -> FloatArray:
+def _damped_step(N: FloatArray, g: FloatArray, damping: float) -> FloatArray:
     return np.asarray(la.solve(N + damping * np.eye(g.size), g, assume_a="pos"))
 
 
-def _real(values: Any) -> FloatArray:
+def _real_and_imag(values: Any) -> FloatArray:
     return np.concatenate([values.real, values.imag], axis=-1)
 
 
@@ -502,7 +502,7 @@ def _smooth_step(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     decay = np.exp(-far)
     value = (1.0 - decay) / far
     slope = (decay * (1.0 + far) - 1.0) / far**2
-    return _joined(x, near, value, slope, 1)
+    return _with_series(x, near, value, slope, 1)
 
 
 def _ramp(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
@@ -512,10 +512,10 @@ def _ramp(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     decay = np.exp(-far)
     value = (far - 1.0 + decay) / far**2
     slope = ((1.0 - decay) / far - 2.0 * value) / far
-    return _joined(x, near, value, slope, 2)
+    return _with_series(x, near, value, slope, 2)
 
 
-def _joined(
+def _with_series(
     x: ComplexArray,
     near: npt.NDArray[np.bool_],
     value: ComplexArray,

@@ -46,7 +46,7 @@ def answer(
     inputs = tuple(labels.get(name, name) for name in frf.inputs)
     shared = [(outputs.index(dof), i) for i, dof in enumerate(inputs) if dof in outputs]
     raw, unscaled = shapes, part
-    shapes, part, normalised = _scaled(fit.poles, shapes, part, shared if labels else [])
+    shapes, part, normalised = _scaled_shapes(fit.poles, shapes, part, shared if labels else [])
     if ready.swapped:
         turned = np.roll(np.arange(spread.shape[1]), -len(fit.shapes))
         spread = spread[:, turned][:, :, turned]
@@ -102,16 +102,16 @@ def _covariances(fit: Fit, ready: PreparedLines) -> tuple[FloatArray, ComplexArr
     held = np.zeros((n_out, n_out, 2 * m, 2 * m))
     if ready.independent:
         for a, own in enumerate(direct):
-            held[a, a] = _inner(own, own)
+            held[a, a] = _inner_product(own, own)
     else:
         gains = [np.einsum("ifp,qp->ifq", J, inverse) for J in fit.jacobians()]
         common = np.zeros_like(inverse)
         for a in range(n_out):
             for b in range(n_out):
                 other = ready.spread(a, b, direct[b])
-                common = common + _inner(gains[a], ready.spread(a, b, gains[b]))
-                mixed[b] += _inner(gains[a], other)
-                held[a, b] = _inner(direct[a], other)
+                common = common + _inner_product(gains[a], ready.spread(a, b, gains[b]))
+                mixed[b] += _inner_product(gains[a], other)
+                held[a, b] = _inner_product(direct[a], other)
     slopes = np.concatenate([slopes, _free_entries(fit)])
     mixed = mixed.reshape(n_out, -1, 2, m)
     held = held.reshape(n_out, n_out, 2, m, 2, m)
@@ -171,14 +171,14 @@ def _scale_errors(
     return np.asarray(T)
 
 
-def _inner(left: ComplexArray, right: ComplexArray | None) -> Any:
+def _inner_product(left: ComplexArray, right: ComplexArray | None) -> Any:
     """Return Re(left^H right), summed over inputs and lines; zero where right is None."""
     if right is None:
         return 0.0
     return (left.reshape(-1, left.shape[2]).conj().T @ right.reshape(-1, right.shape[2])).real
 
 
-def _scaled(
+def _scaled_shapes(
     poles: ComplexArray, shapes: ComplexArray, part: ComplexArray, shared: list[tuple[int, int]]
 ) -> tuple[ComplexArray, ComplexArray, bool]:
     """Return shapes mass-normalised by shared DOFs, or with a largest entry of 1."""

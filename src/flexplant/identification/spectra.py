@@ -13,7 +13,7 @@ from ..errors import ModelError, ShapeError, warn
 from ..lti.frequency import Frf
 from ..lti.measured_lines import checked_overlap, checked_window
 from ..tolerances import ROUNDING, TINY
-from .feedback import feedback, feedback_warned
+from .feedback import feedback_bias, feedback_warned
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -189,7 +189,7 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
         )
     if data.r is None:
         G = _open_loop(found, method)
-        explained = _solved(found.block("u", "u"), found.block("u", "y"))
+        explained = _divide(found.block("u", "u"), found.block("u", "y"))
         inverse = _inverse(found.block("u", "u"))
         coherent = np.einsum("fyu,fuy->fy", found.block("y", "u"), explained).real
     else:
@@ -201,8 +201,8 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
         back = found.block("u", "r")
         weak_references_warned(found)
         G = _right_divided(found.block("y", "r"), back)
-        explained = _solved(found.block("r", "r"), found.block("r", "y"))
-        inverse = _inverse(back @ _solved(found.block("r", "r"), back.conj().transpose(0, 2, 1)))
+        explained = _divide(found.block("r", "r"), found.block("r", "y"))
+        inverse = _inverse(back @ _divide(found.block("r", "r"), back.conj().transpose(0, 2, 1)))
         coherent = np.einsum("fyu,fuy->fy", found.block("y", "r"), explained).real
     power = np.einsum("fyy->fy", found.block("y", "y")).real
     coherence = np.clip(coherent / np.maximum(power, TINY), 0.0, 1.0)
@@ -223,7 +223,7 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
         overlap=method.overlap,
     )
     if data.r is None:
-        feedback_warned(feedback(frf))
+        feedback_warned(feedback_bias(frf))
     return frf
 
 
@@ -235,7 +235,7 @@ STRONG = 8.0
 def weak_references_warned(found: Averages) -> None:
     """Warn of lines at which references hardly move the inputs: the quotient is not known there."""
     back, power = found.block("u", "r"), np.einsum("fuu->fu", found.block("u", "u")).real
-    moved = _solved(found.block("r", "r"), back.conj().transpose(0, 2, 1))
+    moved = _divide(found.block("r", "r"), back.conj().transpose(0, 2, 1))
     explained = np.einsum("fur,fru->fu", back, moved).real
     strength = found.count * explained / np.maximum(power - explained, TINY * power)
     weak = found.freq[np.min(strength, axis=1) < STRONG]
@@ -269,7 +269,7 @@ def _left_over(found: Averages, G: ComplexArray, *, with_reference: bool) -> Com
     S = found.S[:, :n, :n]
     if with_reference:
         known = found.S[:, n:, :n]
-        S = S - known.conj().transpose(0, 2, 1) @ _solved(found.block("r", "r"), known)
+        S = S - known.conj().transpose(0, 2, 1) @ _divide(found.block("r", "r"), known)
     row = np.concatenate(
         [np.broadcast_to(np.eye(found.n_out), G.shape[:1] + (found.n_out,) * 2), -G], 2
     )
@@ -317,14 +317,14 @@ def _effective(window: FloatArray, hop: int, count: int) -> float:
 
 
 def _right_divided(a: ComplexArray, b: ComplexArray) -> ComplexArray:
-    return _solved(b.transpose(0, 2, 1), a.transpose(0, 2, 1)).transpose(0, 2, 1)
+    return _divide(b.transpose(0, 2, 1), a.transpose(0, 2, 1)).transpose(0, 2, 1)
 
 
 def _inverse(a: ComplexArray) -> ComplexArray:
-    return _solved(a, np.broadcast_to(np.eye(a.shape[1], dtype=np.complex128), a.shape))
+    return _divide(a, np.broadcast_to(np.eye(a.shape[1], dtype=np.complex128), a.shape))
 
 
-def _solved(a: ComplexArray, b: ComplexArray) -> ComplexArray:
+def _divide(a: ComplexArray, b: ComplexArray) -> ComplexArray:
     size = np.linalg.svd(a, compute_uv=False)
     if np.any(size[:, -1] <= ROUNDING * size[:, 0]):
         raise ModelError(

@@ -20,7 +20,7 @@ from .diagram import (
     diagram_of,
     weighted_by_remainder,
 )
-from .gate import entry, gated, lesser, single, steady
+from .gate import gated, lesser, rejection, single, steady
 from .line_weights import PreparedLines, Rejected
 from .model_error import ALIKE, NOISE, Disagreement, disagreement, outputs_disagree, strength
 from .pole_test import (
@@ -29,11 +29,11 @@ from .pole_test import (
     freedom,
     improved,
     merged,
-    missed,
+    missed_poles,
     more_terms,
     own_price,
     relocated,
-    split,
+    split_proposals,
     supported,
     unexplained,
     unwindowed,
@@ -154,7 +154,7 @@ def identified(
         # one step is as near to a machine as noise is; what outputs disagree in needs more
         judged = refine is not False and not begin.at_peaks
         quick = QUICK if judged else int(begin.alone)
-        fit, weaker = _first(task.lines(ready), begin.poles, begin.alone, quick)
+        fit, weaker = _first_fit(task.lines(ready), begin.poles, begin.alone, quick)
         now, differ = _by_rows(task, _Stage(ready, fit), begin.alone, judged)
         differ = differ and refine is None
         if refine is False:
@@ -191,7 +191,7 @@ def _begin(task: Task, ready: PreparedLines, orders: list[int]) -> _Begin:
             raise
         lines = task.lines(ready)
         peaks = _at_peaks(lines)
-        found = peaks or _nearest(lines, diagram)
+        found = peaks or _highest_pole(lines, diagram)
         if found is None:
             raise
     warn(
@@ -220,7 +220,7 @@ def _by_rows(task: Task, now: _Stage, alone: bool, judged: bool) -> tuple[_Stage
         fit = less if outputs_disagree(less, fit.cost) else fit
     differ = judged and outputs_disagree(fit)
     asked = task.side not in ("", lines.side)
-    if asked or (not task.side and judged and not differ and _turns(fit)):
+    if asked or (not task.side and judged and not differ and _may_disagree(fit)):
         other = single(task.lines(ready.turned), fit, fit.shapes, QUICK)
         differ = judged and outputs_disagree(other, np.inf if asked else fit.cost)
         if differ or asked:
@@ -232,7 +232,7 @@ def _second(task: Task, first: _Stage, alone: bool, bar: Progress) -> tuple[_Sta
     """Return the refined fit, or the first one and the reason."""
     task.budget.most = np.inf if task.refine else task.budget.done + BUDGET
     try:
-        return _refined(task, first, alone, bar), ""
+        return _likeliest_fit(task, first, alone, bar), ""
     except Exhausted:
         return first, f"more is left than shared poles explain after {BUDGET:.0e} operations"
     finally:
@@ -296,7 +296,7 @@ def _odd(frf: Frf, lines: Lines, apart: Disagreement) -> str:
     return f"{who} is off by {100 * off:.2g} %, far more than the others: look at it. "
 
 
-def _nearest(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection | None:
+def _highest_pole(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection | None:
     """Return the diagram's pole nearest the largest response, None where nothing stands out.
 
     In a band little wider than its resonance, whose lines afford few orders, poles of outputs that
@@ -323,7 +323,7 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
     fit = Fit(lines, none[0], none)
     ends = 2 * np.pi * np.array([lines.freq[FLANK], lines.freq[-1 - FLANK]])
     for _ in range(MOST):
-        trials = [one for rivals in missed(lines, fit) for one in rivals]
+        trials = [one for rivals in missed_poles(lines, fit) for one in rivals]
         trials = [
             one
             for one in trials
@@ -337,14 +337,14 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
     return PoleSelection(fit.poles, fit.participation) if fit.poles.size else None
 
 
-def _turns(fit: Fit) -> bool:
+def _may_disagree(fit: Fit) -> bool:
     """Return whether references may disagree: more than noise is left, or poles stand beside."""
     return len(fit.participation) > 1 and bool(
         lesser(fit, fit.shapes, ALIKE) or fit.cost > NOISE * freedom(fit.lines, fit.m)
     )
 
 
-def _first(
+def _first_fit(
     lines: Lines, chosen: PoleSelection, alone: bool, steps: int
 ) -> tuple[Fit, tuple[Rejected, ...]]:
     """Return the fit near the poles chosen, with all residual terms and no search for others.
@@ -360,22 +360,22 @@ def _first(
     height[lesser(fit, fit.shapes, ALIKE)] *= TINY  # of two poles of one resonance one counts
     places = np.argsort(-height, kind="stable")
     keep, others = np.sort(places[: lines.most]), places[lines.most :]
-    weaker = tuple(entry(fit, int(k), f"weaker than the {lines.most} of most=") for k in others)
+    weaker = tuple(rejection(fit, int(k), f"weaker than the {lines.most} of most=") for k in others)
     if weaker:
         fit = pivoted(lines, fit.poles[keep], fit.participation[:, keep])
     fit = refined(lines, fit.poles, fit.participation, steps=steps, strict=False, first=fit)
     return fit, weaker
 
 
-def _refined(task: Task, first: _Stage, alone: bool, bar: Progress) -> _Stage:
+def _likeliest_fit(task: Task, first: _Stage, alone: bool, bar: Progress) -> _Stage:
     """Return the maximum likelihood fit, with the poles and terms that the data support."""
     (ready, fit), free, steps = first, task.upper is None, task.steps
     poles, part = fit.poles, fit.participation
     reducing = [(unwindowed, 1), (dropped, int(alone))]
     reducing += [(merged, MOST * int(alone)), (fewer_terms, int(free))]
     growing = [
-        *((missed, MOST), (merged, MOST), (more_terms, int(free))),
-        *((split, MOST), (relocated, MOST), (merged, MOST), (missed, MOST)),
+        *((missed_poles, MOST), (merged, MOST), (more_terms, int(free))),
+        *((split_proposals, MOST), (relocated, MOST), (merged, MOST), (missed_poles, MOST)),
     ]
     for _ in range(1 if ready.known else 2):
         lines = task.lines(ready)

@@ -102,7 +102,7 @@ def structural_modes(
     >>> found.freq.round(1)
     array([ 34.5, 147. ])
     """
-    at, dofs, rows = places_of(measured, dofs, over)
+    at, dofs, rows = measured_places(measured, dofs, over)
     free, labels = flag(rigid, "rigid"), at.labels
     shapes = at.shapes()
     imaginary = float(np.max(_imaginary(shapes)))
@@ -145,7 +145,7 @@ def structural_modes(
     )
 
 
-def places_of(
+def measured_places(
     measured: Any, dofs: Any, over: Modes | None
 ) -> tuple[MeasuredPlaces, DofSet, IntArray]:
     """Return the places of an identification's channels, the DOFs and their rows among these."""
@@ -266,7 +266,7 @@ class MeasuredPlaces:
         S = np.zeros((r, r))
         for (i, j), value in zip(pairs, found.tolist(), strict=True):
             S[i, j] = S[j, i] = value
-        return U @ _root(
+        return U @ _noisy_cholesky(
             S,
             "the term in 1/s^2 of the measurement is no rigid-body motion of positive mass. Pass "
             "rigid=False for a held structure; begin the band of a free one lower.",
@@ -292,7 +292,7 @@ def _imaginary(shapes: ComplexArray) -> FloatArray:
     return np.asarray(np.linalg.norm(shapes.imag, axis=0) / divisor(size))
 
 
-def _root(S: FloatArray, trouble: str) -> FloatArray:
+def _noisy_cholesky(S: FloatArray, trouble: str) -> FloatArray:
     """Return L with ``S = L L^T`` but for noise."""
     values, vectors = la.eigh(S)
     if not values.size or values[-1] <= 0 or values[0] < -NEGATIVE * values[-1]:
@@ -383,7 +383,7 @@ def shape_deviations(
     >>> fx.identification.shape_deviations(measured, model.dofs, count=1).shape
     (2, 2, 1)
     """
-    at, dofs, rows = places_of(measured, dofs, over)
+    at, dofs, rows = measured_places(measured, dofs, over)
     kept = whole(count, "count")
     if measured.channel_covariance is None:
         raise ModelError(

@@ -20,7 +20,7 @@ from .numbers import decimal, printed_digits, rows_of_numbers, wrong_line
 from .paths import (
     FORMATS,
     Format,
-    check_size,
+    check_count,
     check_whole,
     defined_twice,
     file_path,
@@ -105,7 +105,7 @@ def read_abaqus(
         np.concatenate([code for part in there for code in (part.rows, part.columns)])
     )
     if not there[0].named:
-        check_size(int(order[-1] >> 4), file_path(stiffness).stat().st_size, stiffness)
+        check_count(int(order[-1] >> 4), file_path(stiffness).stat().st_size, stiffness)
         order = np.arange(16, 16 * (order[-1] >> 4) + 1, 16)
     K, M, D = (None if part is None else part.matrix(order) for part in parts)
     assert K is not None  # noqa: S101 - its file is no option

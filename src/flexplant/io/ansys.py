@@ -89,7 +89,7 @@ def read_ansys(
     numbers, kinds = numbers[order], kinds[order]
     xyz, angles = np.zeros((numbers.size, 3)), dict(rotations or {})
     if nodes is not None:
-        xyz, found = _placed(nodes, numbers)
+        xyz, found = _coordinates(nodes, numbers)
         angles = found | angles
     dofs = DofSet(numbers, tuple(DIRECTIONS[kind] for kind in kinds.tolist()), xyz)
     result = assembled(
@@ -137,7 +137,7 @@ def read_parsed(function: str, path: Path) -> dict[str, Any]:
     return content
 
 
-def _placed(nodes: Any, wanted: IntArray) -> tuple[FloatArray, dict[int, FloatArray]]:
+def _coordinates(nodes: Any, wanted: IntArray) -> tuple[FloatArray, dict[int, FloatArray]]:
     """Return coordinates (n, 3) of the wanted nodes, and cosines of those with local systems."""
     if isinstance(nodes, Mapping):
         known = np.array(list(nodes), dtype=np.int64)

@@ -33,7 +33,7 @@ def in_child(function: str, path: str | Path, *, keep: str = "") -> tuple[str, A
     if child is not None and child.poll() is not None:
         _close(child)
         child = None
-    child = child or _started()
+    child = child or _start_child()
     if child is None:
         return foreign_parsers.run(function, str(file))
     assert child.stdin is not None and child.stdout is not None  # noqa: S101 - both are pipes
@@ -56,7 +56,7 @@ def in_child(function: str, path: str | Path, *, keep: str = "") -> tuple[str, A
     return outcome
 
 
-def _started() -> subprocess.Popen[bytes] | None:
+def _start_child() -> subprocess.Popen[bytes] | None:
     """Return a new child; None where there is no Python interpreter to start."""
     if "python" not in Path(sys.executable or "").name.lower():
         return None

@@ -103,7 +103,7 @@ def read_dmig(
     order = np.unique(np.concatenate(codes))
     nodes = None if bdf is None else read_nodes(bdf)
     ids = set((order >> 4).tolist())
-    dofs = _dofs(order, nodes, scalar_direction, str(path))
+    dofs = _matrix_dofs(order, nodes, scalar_direction, str(path))
     found = FEMatrices(
         K.matrix(order, str(path)),
         None if M is None else M.matrix(order, str(path)),
@@ -176,7 +176,7 @@ def _read_blocks(lines: list[bytes], path: str) -> dict[str, _Block]:
     blocks: dict[str, _Block] = {}
     heads = [i for i, line in enumerate(lines) if line[:4].upper() == b"DMIG" and _is_head(line)]
     for at, head in enumerate(heads):
-        fields, first = _head(lines, head)
+        fields, first = _first_fields(lines, head)
         last = heads[at + 1] if at + 1 < len(heads) else len(lines)
         try:
             name, form, kind = fields[0].strip(), int(fields[2]), int(fields[3])
@@ -196,18 +196,18 @@ def _read_blocks(lines: list[bytes], path: str) -> dict[str, _Block]:
 
 
 def _is_head(line: bytes) -> bool:
-    fields = _split(line)
+    fields = _split_card(line)
     return len(fields) > 1 and fields[1].strip() == b"0"
 
 
-def _head(lines: list[bytes], at: int) -> tuple[list[str], int]:
-    fields = [field.decode("latin-1") for field in _split(lines[at])]
+def _first_fields(lines: list[bytes], at: int) -> tuple[list[str], int]:
+    fields = [field.decode("latin-1") for field in _split_card(lines[at])]
     if b"*" in lines[at][:8] and at + 1 < len(lines):
-        return fields + [field.decode("latin-1") for field in _split(lines[at + 1])], at + 2
+        return fields + [field.decode("latin-1") for field in _split_card(lines[at + 1])], at + 2
     return fields, at + 1
 
 
-def _split(line: bytes) -> list[bytes]:
+def _split_card(line: bytes) -> list[bytes]:
     if b"," in line:
         return line.split(b",")[1:]
     width = 16 if b"*" in line[:8] else 8
@@ -295,7 +295,7 @@ def _any(part: list[bytes], first: int, name: str, real: bool, path: str) -> Any
         bare = line.split(b"$")[0].rstrip()
         if not bare:
             continue
-        fields = [field.strip() for field in _split(bare)]
+        fields = [field.strip() for field in _split_card(bare)]
         try:
             if bare[:4].upper() == b"DMIG":
                 if fields[0].decode("latin-1") != name:
@@ -334,7 +334,7 @@ def _codes(nodes: IntArray, components: IntArray, path: str) -> IntArray:
     return np.asarray(16 * nodes + components, dtype=np.int64)
 
 
-def _dofs(order: IntArray, nodes: Nodes | None, scalar: str | None, path: str) -> DofSet:
+def _matrix_dofs(order: IntArray, nodes: Nodes | None, scalar: str | None, path: str) -> DofSet:
     ids, components = order >> 4, order & 15
     if np.any(components == 0) and scalar is None:
         raise ModelError(

@@ -106,7 +106,7 @@ def read_shapes(
 ) -> tuple[FloatArray, FloatArray, DofSet]:
     """Return frequencies [rad/s], shapes and DOFs of a file, as `read_exodus_modes` does."""
     one_of(times, "times", ("frequency", "omega", "eigenvalue"))
-    with opened(path) as file:
+    with open_exodus(path) as file:
         xyz, ids = file.nodes()
         chosen = _motion_variables(file.variables(), variables, str(path))
         values = np.asarray(file.array("time_whole"), dtype=np.float64)
@@ -154,7 +154,7 @@ def _motion_variables(
 
 
 @contextlib.contextmanager
-def opened(path: str | Path) -> Iterator[ExodusFile]:
+def open_exodus(path: str | Path) -> Iterator[ExodusFile]:
     """Return an Exodus file, netCDF-3 or netCDF-4, to be used in a `with` block."""
     with file_path(path).open("rb") as raw:
         is_hdf = raw.read(8) == b"\x89HDF\r\n\x1a\n"

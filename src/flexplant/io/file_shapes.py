@@ -47,7 +47,7 @@ class ModesFormat:
     read: Callable[[Path, Path | None], FileShapes]
 
 
-def modes_of(
+def scaled_modes(
     shapes: FileShapes,
     *,
     zeta: float | FloatArray | None,

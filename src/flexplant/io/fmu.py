@@ -174,7 +174,7 @@ def _compiled(sources: dict[str, str], name: str, version: str) -> tuple[str, by
         return f"binaries/{folder}/{name}{end}", library.read_bytes()
 
 
-def channels(K: StateSpace) -> tuple[list[str], list[str]]:
+def variable_names(K: StateSpace) -> tuple[list[str], list[str]]:
     """Return the names of inputs and outputs as variables, all different."""
     for name in (*K.inputs, *K.outputs):
         if name == "time" or not name.isprintable():
@@ -191,7 +191,7 @@ def _description(
 ) -> str:
     """Return modelDescription.xml."""
     K = program.system
-    inputs, outputs = channels(K)
+    inputs, outputs = variable_names(K)
     units = [K.units.get(one) for one in (*K.inputs, *K.outputs)]
     head = f'modelName={_quoted(K.name or name)} generationTool="flexplant"'
     shared = f'modelIdentifier={_quoted(name)} canHandleVariableCommunicationStepSize="true"'
@@ -208,7 +208,7 @@ def _description(
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', f"<fmiModelDescription {first}>", side]
     known = sorted({unit for unit in units if unit})
     if known:
-        lines += ["  <UnitDefinitions>", *map(_unit, known), "  </UnitDefinitions>"]
+        lines += ["  <UnitDefinitions>", *map(_unit_definition, known), "  </UnitDefinitions>"]
     lines += [f'  <DefaultExperiment startTime="0" stepSize="{K.dt:.17g}"/>', "  <ModelVariables>"]
     if three:
         lines.append(
@@ -246,7 +246,7 @@ def _description(
     return "\n".join([*lines, "  </ModelStructure>", "</fmiModelDescription>", ""])
 
 
-def _unit(unit: str) -> str:
+def _unit_definition(unit: str) -> str:
     """Return the definition of a unit, with its exponents of base units where these are known."""
     total = [0] * 5
     for side, part in zip((1, -1), unit.split("/"), strict=False):

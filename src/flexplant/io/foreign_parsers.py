@@ -26,7 +26,7 @@ def matlab(path: str) -> dict[str, Any]:
     # deflated data grow a thousand times at most
     _bound_memory(path, 1100)
     content = scipy.io.matlab.loadmat(path, struct_as_record=False, spmatrix=False)
-    return {name: _plain(value) for name, value in content.items() if name[:2] != "__"}
+    return {name: _plain_value(value) for name, value in content.items() if name[:2] != "__"}
 
 
 def ansys_full(path: str) -> dict[str, Any]:
@@ -74,21 +74,21 @@ def ansys_modes(path: str) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def _plain_value(value: Any) -> Any:
     import numpy as np
     import scipy.sparse as sp
 
     fields = getattr(value, "_fieldnames", None)
     if fields is not None:
-        return {name: _plain(getattr(value, name)) for name in fields}
+        return {name: _plain_value(getattr(value, name)) for name in fields}
     if sp.issparse(value):
         return sound(value)
     if isinstance(value, np.ndarray) and value.dtype == object:
         if value.size == 1 and hasattr(value.flat[0], "_fieldnames"):
-            return _plain(value.flat[0])
+            return _plain_value(value.flat[0])
         cells = np.empty(value.shape, dtype=object)
         for place in np.ndindex(value.shape):
-            cells[place] = _plain(value[place])
+            cells[place] = _plain_value(value[place])
         return cells
     return np.array(value) if isinstance(value, np.ndarray) else value
 
@@ -135,7 +135,7 @@ def run(name: str, path: str) -> tuple[str, Any]:
         return type(error).__name__, str(error)
 
 
-def answered(request: tuple[list[str], str, str]) -> bytes:
+def outcome_of(request: tuple[list[str], str, str]) -> bytes:
     """Return the pickled outcome of a request (sys.path, function, file)."""
     sys.path[:], name, path = request
     try:
@@ -155,7 +155,7 @@ def main() -> None:
             request = pickle.load(sys.stdin.buffer)
         except EOFError:
             return
-        answers.write(answered(request))
+        answers.write(outcome_of(request))
         answers.flush()
 
 

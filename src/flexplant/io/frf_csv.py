@@ -136,7 +136,7 @@ def read_frf_csv(path: str | Path) -> Frf:
         raise refused(path, "has a resolution or overlap that is no number", f"{error}.") from None
     first = len(comments) + 1
     rows = list(csv.reader(line for line in lines if not line.startswith("#")))
-    keys = _header(rows[0] if rows else [], str(path))
+    keys = _column_keys(rows[0] if rows else [], str(path))
     values = []
     for line, row in enumerate(rows[1:], first + 1):
         try:
@@ -181,7 +181,7 @@ def read_frf_csv(path: str | Path) -> Frf:
     )
 
 
-def _header(cells: list[str], path: str) -> list[tuple[str, str, str]]:
+def _column_keys(cells: list[str], path: str) -> list[tuple[str, str, str]]:
     if not cells or cells[0].strip() != _FREQ or len(cells) < 3:
         raise FlexplantError(
             f"{path!r} has no header as {_FREQ!r}, 'y1 <- u1 real', 'y1 <- u1 imag', got "

@@ -15,7 +15,7 @@ from ..structure import FEMatrices
 from .assembled import one_matrix_each
 from .foreign_parsers import sound
 from .numbers import fixed_numbers, printed_digits, spaced_numbers
-from .paths import FORMATS, Format, check_size, check_whole, parsing, refused, unread
+from .paths import FORMATS, Format, check_count, check_whole, parsing, refused, unread
 
 #: lines whose digits are counted
 _SAMPLE = 4000
@@ -78,13 +78,13 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
         kind = lines[2][:3].decode("ascii").upper()
         n_rows, n_columns, n_entries = (int(lines[2][i : i + 14]) for i in (14, 28, 42))
         formats = lines[3].decode("ascii")
-        forms = [_form(formats[a:b]) for a, b in ((0, 16), (16, 32), (32, 52))]
+        forms = [_fortran_format(formats[a:b]) for a, b in ((0, 16), (16, 32), (32, 52))]
         if min(*counts, n_rows, n_columns, n_entries) < 0:
             raise ValueError("a count below 0")
     except (IndexError, ValueError, UnicodeDecodeError) as error:
         what = f"is no Harwell-Boeing file: its header cannot be read ({error})"
         raise refused(path, what, "Write it again, or give its format another suffix.") from None
-    check_size(max(n_rows, n_columns), sum(map(len, lines)), path)
+    check_count(max(n_rows, n_columns), sum(map(len, lines)), path)
     if kind[:1] not in ("R", "I") or kind[1:2] not in ("S", "U") or kind[2:] != "A":
         do = (
             "Only real or integer (R, I), symmetric or unsymmetric (S, U), assembled (A) matrices "
@@ -117,7 +117,7 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
     return matrix, printed_digits(words)
 
 
-def _form(text: str) -> tuple[int, int]:
+def _fortran_format(text: str) -> tuple[int, int]:
     """Return numbers a line and the width of one from a Fortran format such as (1P,4E20.12)."""
     match = _FORMAT.search(text)
     if match is None:

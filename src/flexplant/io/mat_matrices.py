@@ -15,7 +15,7 @@ from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, chosen, missing_extra
 from .child import in_child
-from .paths import FORMATS, USUAL, Format, check_size, file_path, parsing
+from .paths import FORMATS, USUAL, Format, check_count, file_path, parsing
 
 #: a byte of a compressed file holds no more bytes than this
 _DEFLATED = 1100
@@ -128,7 +128,7 @@ def _numpy(path: Path, name: str) -> dict[str, Any]:
         arrays = {key: content[key] for key in content.files}
     if "format" in arrays and "shape" in arrays:
         with parsing(path, do):
-            check_size(int(np.max(arrays["shape"])), path.stat().st_size, path)
+            check_count(int(np.max(arrays["shape"])), path.stat().st_size, path)
             return {name: sp.load_npz(path)}
     if name != "K":
         if len(arrays) != 1:
@@ -188,13 +188,13 @@ def _version73(path: Path, wanted: Mapping[str, str | None]) -> dict[str, Any]:
 def _hdf5(item: Any, path: Path, size: int) -> Any:
     """Return a dense (MATLAB stores columns first) or sparse (data, ir, jc) matrix."""
     if "MATLAB_sparse" not in item.attrs:
-        check_size(item.size, _DEFLATED * size, path)
+        check_count(item.size, _DEFLATED * size, path)
         return np.asarray(item[()]).T
     for part in item.values():
-        check_size(part.size, _DEFLATED * size, path)
+        check_count(part.size, _DEFLATED * size, path)
     columns = np.asarray(item["jc"][()], dtype=np.int64)
     shape = (int(item.attrs["MATLAB_sparse"]), columns.size - 1)
-    check_size(shape[0], size, path)
+    check_count(shape[0], size, path)
     if "data" not in item:
         return sp.csc_array(shape)
     return sp.csc_array(

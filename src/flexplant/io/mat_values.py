@@ -118,16 +118,16 @@ def read_mat(path: str | Path, name: str | None = None) -> MatValue:
     named = {key: item for key, item in content.items() if isinstance(item, dict)}
     if name is not None:
         require_known("structure", [name], named, repr(str(path)))
-        return _value(named[name], f"{name!r} of {str(path)!r}")
+        return _mat_value(named[name], f"{name!r} of {str(path)!r}")
     if not _value_kind(content) and len(named) == 1:
-        return _value(next(iter(named.values())), repr(str(path)))
+        return _mat_value(next(iter(named.values())), repr(str(path)))
     if not _value_kind(content) and named:
         raise LabelError(
             f"{str(path)!r} holds several values, {sorted(named)[:8]}. Say which: "
             "io.read_mat(path, "
             f"{min(named)!r}), or read all: io.read_mat_values(path)."
         )
-    return _value(content, repr(str(path)))
+    return _mat_value(content, repr(str(path)))
 
 
 def read_mat_values(path: str | Path) -> dict[str, MatValue]:
@@ -169,7 +169,7 @@ def read_mat_values(path: str | Path) -> dict[str, MatValue]:
             f"{str(path)!r} holds no structures of values, but {sorted(content)[:8]}. One value in "
             "plain variables is read by io.read_mat(path)."
         )
-    return {key: _value(item, f"{key!r} of {str(path)!r}") for key, item in found.items()}
+    return {key: _mat_value(item, f"{key!r} of {str(path)!r}") for key, item in found.items()}
 
 
 def _check_name(name: Any) -> None:
@@ -197,7 +197,7 @@ def _value_kind(content: Mapping[str, Any]) -> str:
     return next((kind for kind, names in kinds.items() if set(names) <= set(content)), "")
 
 
-def _value(content: Mapping[str, Any], where: str) -> MatValue:
+def _mat_value(content: Mapping[str, Any], where: str) -> MatValue:
     kind = _value_kind(content)
     if not kind:
         missing = [name for name in "ABCD" if name not in content]

@@ -19,7 +19,7 @@ from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import one_matrix_each
 from .numbers import printed_digits, rows_of_numbers, wrong_line
-from .paths import FORMATS, Format, check_size, check_whole, damaged, unread, wrong_line_of
+from .paths import FORMATS, Format, check_count, check_whole, damaged, unread, wrong_line_of
 
 #: lines whose digits are counted
 _SAMPLE = 4000
@@ -154,7 +154,7 @@ def _header(content: bytes, path: Path) -> _Header:
     n, m = sizes[:2]
     if symmetry == "symmetric" and n != m:
         raise ShapeError(f"{str(path)!r} is called symmetric and is not square: {n} x {m}.")
-    check_size(max(n, m), len(content), path)
+    check_count(max(n, m), len(content), path)
     full = n * (n + 1) // 2 if symmetry == "symmetric" else n * m
     return _Header(
         form == "coordinate",

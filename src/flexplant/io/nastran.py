@@ -73,10 +73,10 @@ def read_nodes(path: str | Path) -> Nodes:
         except ValueError as error:
             raise FlexplantError(f"{str(path)!r}, GRID {node}: {error}.") from None
         parsed[node] = [into, place, moves]
-    return nodes_of(parsed, systems, str(path))
+    return basic_nodes(parsed, systems, str(path))
 
 
-def nodes_of(
+def basic_nodes(
     grids: Mapping[int, Sequence[Any]],
     systems: dict[int, tuple[str, list[str]]],
     path: str,
@@ -289,7 +289,7 @@ def shapes_at(
         scalar = counted(int(np.count_nonzero(~grid)), "scalar point")
         notes = (f"without a place, left out: {scalar}",)
     ids, values = ids[grid], np.array(values[grid])
-    xyz, axes = _places(ids, nodes, path)
+    xyz, axes = _node_places(ids, nodes, path)
     local_rows = [] if turned else [i for i, node in enumerate(ids.tolist()) if node in axes]
     for row in local_rows:
         local = axes[int(ids[row])]
@@ -303,7 +303,7 @@ def shapes_at(
     return FileShapes(omega, phi, dofs, masses=masses, notes=notes)
 
 
-def _places(ids: Any, nodes: Nodes | Path | None, path: str) -> tuple[FloatArray, Any]:
+def _node_places(ids: Any, nodes: Nodes | Path | None, path: str) -> tuple[FloatArray, Any]:
     if isinstance(nodes, Path):
         if not nodes.name.lower().endswith(_BULK):
             known, xyz = read_nodes_table(nodes)

@@ -63,7 +63,7 @@ def spaced_numbers(text: bytes, count: int | None = None) -> FloatArray | None:
     before = seen[signs]
     if np.any((before >= ord("0")) & (before <= ord("9")) | (before == ord("."))):
         clean = _BARE.sub(rb"\1e\2", clean)
-    numbers = _parsed(clean)
+    numbers = _parse_numbers(clean)
     return None if numbers is None or (count is not None and numbers.size != count) else numbers
 
 
@@ -96,7 +96,7 @@ def wrong_line(lines: Iterable[bytes], width: int) -> int | None:
 _LETTERS = bytes.maketrans(b"DdEQ", b"eeee")
 
 
-def _parsed(text: bytes) -> FloatArray | None:
+def _parse_numbers(text: bytes) -> FloatArray | None:
     with warnings.catch_warnings():
         # what NumPy says when it stops before the end
         warnings.simplefilter("error", DeprecationWarning)

@@ -12,7 +12,7 @@ import numpy as np
 from ..checks import FloatArray, IntArray
 from ..errors import FlexplantError, ModelError
 from .file_shapes import FileShapes, ModesFormat
-from .nastran import Nodes, nodes_of, shapes_at
+from .nastran import Nodes, basic_nodes, shapes_at
 from .paths import damaged, defined_twice
 
 
@@ -45,7 +45,7 @@ def blocks(content: bytes, path: str) -> Iterator[Block]:
     word are keys: above 0 as many words follow as the next record, below 0 a logical record ends,
     0 ends a data block, and once more the file. Each logical record begins with its kind.
     """
-    order, size = _layout(content, path)
+    order, size = _word_layout(content, path)
     at, pieces, records = 0, list[bytes](), list[bytes]()
     while at < len(content):
         piece, at = _record(content, at, order, path)
@@ -74,7 +74,7 @@ def blocks(content: bytes, path: str) -> Iterator[Block]:
         raise damaged(path, f"byte {at}: the file ends inside of a data block: cut off")
 
 
-def _layout(content: bytes, path: str) -> tuple[str, int]:
+def _word_layout(content: bytes, path: str) -> tuple[str, int]:
     """Return byte order and bytes of a word: the first record is a key of one word."""
     for order, name in (("<", "little"), (">", "big")):
         size = int.from_bytes(content[:4], name)  # type: ignore[arg-type]
@@ -207,7 +207,7 @@ def _geometry_nodes(found: list[Block], path: str) -> Nodes | None:
                 else:
                     texts = [repr(number) for number in numbers[4:]]
                     systems[integers[0]] = (kind, [str(integers[0]), str(integers[3]), *texts])
-    return nodes_of(grids, systems, path) if grids else None
+    return basic_nodes(grids, systems, path) if grids else None
 
 
 OUTPUT2 = ModesFormat((".op2",), read_op2_shapes)

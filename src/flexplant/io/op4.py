@@ -19,7 +19,7 @@ from ..structure.matrices import FEMatrices, completed
 from ..structure.precision import digits_of
 from .nastran import named_matrices
 from .numbers import fixed_numbers
-from .paths import FORMATS, USUAL, Format, check_size, damaged, file_path
+from .paths import FORMATS, USUAL, Format, check_count, damaged, file_path
 
 
 @dataclass(frozen=True)
@@ -419,7 +419,7 @@ _TIMES = 16
 
 def check_shape(columns: int, rows: int, held: int, path: str) -> None:
     """Refuse a size of a matrix that a file of `held` bytes cannot hold."""
-    check_size(max(columns, abs(rows)), held, path)
+    check_count(max(columns, abs(rows)), held, path)
 
 
 def is_thin(shape: tuple[int, int], held: int) -> bool:

@@ -106,7 +106,7 @@ def parsing(path: object, do: str = "Write it again.") -> Iterator[None]:
         raise damaged(path, f"{type(error).__name__}: {error}", do) from None
 
 
-def check_size(size: int, held: int, path: object) -> None:
+def check_count(size: int, held: int, path: object) -> None:
     """Refuse a number of rows or columns that a damaged count has made."""
     if size > max(2**20, held):
         raise damaged(path, f"a matrix of {size} rows or columns in {held} bytes")

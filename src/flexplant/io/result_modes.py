@@ -14,7 +14,7 @@ from ..modes import Modes
 from ..structure import FEMatrices, FEModel
 from ..structure.units import units as unit_system
 from . import ansys, exodus, op2, uff
-from .file_shapes import FileShapes, ModesFormat, check_mass, modes_of
+from .file_shapes import FileShapes, ModesFormat, check_mass, scaled_modes
 from .nastran import shapes_at
 from .numbers import decimal
 from .paths import damaged, ends, file_path, three_units, wrong_line_of
@@ -177,7 +177,7 @@ def read_modes(
         )
     shapes = form.read(path, None if nodes is None else file_path(nodes, "nodes"))
     system = shapes.units or unit_system() if units is None else unit_system(*sizes)
-    modes = modes_of(shapes, zeta=zeta, rigid_below=rigid_below, system=system, path=str(path))
+    modes = scaled_modes(shapes, zeta=zeta, rigid_below=rigid_below, system=system, path=str(path))
     if matrices is None:
         return modes
     instance(matrices, FEMatrices | FEModel, "matrices", "read_matrices(...) reads them.")

@@ -13,12 +13,12 @@ from ..errors import FlexplantError, ModelError, ShapeError, counted
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from .assembled import from_triplets
-from .exodus import opened
+from .exodus import open_exodus
 from .numbers import printed_digits, rows_of_numbers, wrong_line
 from .paths import (
     FORMATS,
     Format,
-    check_size,
+    check_count,
     check_whole,
     damaged,
     file_path,
@@ -91,7 +91,7 @@ def read_sierra(
     files = [stiffness, *(file for file in (mass, damping) if file is not None)]
     tables = {str(file): _read_numbers(file, 3) for file in files}
     n = max(int(table[:, :2].max()) for table, _ in tables.values())
-    check_size(n, sum(file_path(file).stat().st_size for file in files), stiffness)
+    check_count(n, sum(file_path(file).stat().st_size for file in files), stiffness)
 
     def matrix(file: str | Path | None) -> sp.csc_array | None:
         if file is None:
@@ -151,14 +151,14 @@ def _read_numbers(path: str | Path, width: int) -> tuple[FloatArray, int | None]
     return table, printed_digits(shown)
 
 
-def _vector(path: str | Path) -> IntArray:
+def _map_vector(path: str | Path) -> IntArray:
     """Return the whole numbers of a vector: one bracketed, or filled entry by entry."""
     content = file_path(path).read_bytes()
     size = _ZEROS.search(content)
     if size is None:
         return _read_numbers(path, 1)[0].ravel().astype(np.int64)
     count = int(size[1])
-    check_size(count, 9 * len(content), path)
+    check_count(count, 9 * len(content), path)
     body = content[size.end() :].lstrip(b" \t;,").splitlines()
     lines = [line.split(b"%")[0].strip() for line in body]
     wrong = next((line for line in lines if line and not _ASSIGNED.fullmatch(line)), None)
@@ -177,14 +177,14 @@ def _mesh(path: str | Path | None) -> tuple[FloatArray | None, IntArray | None]:
     if path is None:
         return None, None
     if file_path(path).suffix.lower() == ".m":
-        return None, _vector(path)
-    with opened(path) as file:
+        return None, _map_vector(path)
+    with open_exodus(path) as file:
         return file.nodes()
 
 
 def _read_row_names(path: str | Path, exodus: str | Path | None, n: int) -> tuple[DofSet, bool]:
     """Return the rows, and whether they have coordinates."""
-    places = _vector(path)
+    places = _map_vector(path)
     if sorted(places[places > 0].tolist()) != list(range(1, n + 1)):
         raise ShapeError(
             f"{str(path)!r} maps {int(np.count_nonzero(places > 0))} of {places.size} entries, but "

@@ -242,8 +242,8 @@ def record_scale(
     part: dict[str, Any], factors: dict[str, Any] | None, quantity: str | None, path: str
 ) -> float:
     """Return the factor that brings a response of dataset 58 to SI."""
-    above = _label(part, "ordinate_axis_units_lab")
-    below = _label(part, "orddenom_axis_units_lab")
+    above = _clean_text(part, "ordinate_axis_units_lab")
+    below = _clean_text(part, "orddenom_axis_units_lab")
     if "/" in above and not below:  # all in one label: m/s^2/N
         head, _, last = above.rpartition("/")
         if last.lower() in _FORCES and not _SECONDS.fullmatch(last):
@@ -270,7 +270,7 @@ def record_scale(
     return to_length / to_force
 
 
-def _label(part: dict[str, Any], name: str) -> str:
+def _clean_text(part: dict[str, Any], name: str) -> str:
     text = str(part.get(name) or "").strip().strip("[]").replace(" ", "")
     return "" if text.upper() in ("NONE", "UNKNOWN", "-") else text
 
@@ -375,7 +375,7 @@ def _of_55(part: dict[str, Any], path: Path) -> AnalysisData:
 
 def read_analysis(path: Path) -> list[AnalysisData]:
     """Return all motions at nodes in the datasets 2414 of a file; other results are passed over."""
-    found = [_parsed(lines, place, path) for place, lines in _response_blocks(path)]
+    found = [_parse_2414(lines, place, path) for place, lines in _response_blocks(path)]
     return [part for part in found if part is not None]
 
 
@@ -397,7 +397,7 @@ def _response_blocks(path: Path) -> Iterator[tuple[int, list[bytes]]]:
             lines = None
 
 
-def _parsed(lines: list[bytes], place: int, path: Path) -> AnalysisData | None:
+def _parse_2414(lines: list[bytes], place: int, path: Path) -> AnalysisData | None:
     what = f"dataset {place} (type 2414)"
     head = [_line_numbers(line, path, what) for line in (lines[2:3] + lines[8:_HEAD])]
     if len(head) < 6 or not head[0].size or head[1].size < 6 or head[2].size < 8:

@@ -92,7 +92,7 @@ def _static_rows(model: Model, pose: Pose) -> FloatArray:
             rows.append(model.full_dofs.row(at))
     if not rows:
         return np.zeros((0, len(model.full_dofs)))
-    C: Any = turned(model.full_dofs, pose)[1]
+    C: Any = turned_dofs(model.full_dofs, pose)[1]
     return np.asarray((C @ np.array(rows).T).T)
 
 
@@ -104,7 +104,7 @@ def placed_model(model: Model, pose: Pose) -> Model:
     if np.array_equal(pose.rotation, np.eye(3)) and not np.any(pose.shift):
         return model
     full = model.full_dofs
-    dofs, C = turned(full, pose)
+    dofs, C = turned_dofs(full, pose)
     if full.interpolation is not None:
         dofs = dofs.replace(interpolation=PlacedShape(full.interpolation, pose, C))
     if isinstance(model, ReducedModel):
@@ -132,7 +132,7 @@ def _placed_reduced(model: ReducedModel, full: DofSet, C: Any, pose: Pose) -> Re
     T, k = np.asarray(C @ model.T), model.n_dof
     changes: dict[str, Any] = {"T": T, "full_dofs": full, "truncated": None}
     try:
-        own, turn = turned(model.dofs, pose)
+        own, turn = turned_dofs(model.dofs, pose)
     except ModelError:  # oblique: what they are stays, their names do not
         names = [f"own {name}" for name in model.coordinates]
         return model.replace(dofs=full.select(()), coordinates=names, **changes)
@@ -397,7 +397,7 @@ class Pose(Value):
         return np.block([[back, back @ cross], [np.zeros((3, 3)), back]])
 
 
-def turned(dofs: DofSet, pose: Pose) -> tuple[DofSet, sp.csc_array]:
+def turned_dofs(dofs: DofSet, pose: Pose) -> tuple[DofSet, sp.csc_array]:
     """Return DOFs in the directions and places of the machine, and C with ``q = C q_own``.
 
     The interpolation is left out. C is orthogonal: it turns each node's displacements, and its
@@ -409,7 +409,7 @@ def turned(dofs: DofSet, pose: Pose) -> tuple[DofSet, sp.csc_array]:
         there = np.flatnonzero((dofs.kinds >= first) & (dofs.kinds < first + 3))
         # by node, then by direction
         there = there[np.lexsort((dofs.kinds[there], dofs.node_index[there]))]
-        for own, group in _groups(dofs, there, first):
+        for own, group in _direction_groups(dofs, there, first):
             R = pose.rotation[:, own]
             made = np.flatnonzero(np.any(np.abs(R) > _ORTHOGONAL, axis=1))
             if made.size != own.size:
@@ -426,7 +426,7 @@ def turned(dofs: DofSet, pose: Pose) -> tuple[DofSet, sp.csc_array]:
     return placed, sp.csc_array(entries, shape=(n, n))
 
 
-def _groups(dofs: DofSet, rows: IntArray, first: int) -> list[tuple[IntArray, IntArray]]:
+def _direction_groups(dofs: DofSet, rows: IntArray, first: int) -> list[tuple[IntArray, IntArray]]:
     """Return, for nodes with the same directions, these (k,) and their rows (m, k)."""
     if not rows.size:
         return []

@@ -14,12 +14,12 @@ from ..lti import Frf
 from ..tolerances import divisor
 from .frf_joints import (
     FrfLink,
+    all_channels,
     channel_rows,
-    channels_of,
+    channels_as_dofs,
     frf_links,
     independent,
     known_places,
-    parts_of,
     softness,
     warn_of_bending,
 )
@@ -39,7 +39,7 @@ class MeasuredParts(NamedTuple):
     inputs: list[str]
 
 
-def side_by_side(frfs: Mapping[str, Frf], signs: Mapping[str, float]) -> MeasuredParts:
+def joined_parts(frfs: Mapping[str, Frf], signs: Mapping[str, float]) -> MeasuredParts:
     """Return responses in one matrix, channels behind the prefixes that name them.
 
     A response without a variance has none: computed ones have no errors.
@@ -129,14 +129,14 @@ def joined_frfs(
     multipliers (LM-FBS). [deKlerk2008]_, [vanderSeijs2013]_.
     """
     _same_lines(frfs)
-    parts, listed = parts_of(frfs, dofs), _joint_list(joints)
+    parts, listed = all_channels(frfs, dofs), _joint_list(joints)
     links = frf_links(listed, parts)
     warn_of_bending(listed, parts, frfs)
     first = next(iter(frfs.values()))
     prefixed = {f"{name}/": frf for name, frf in frfs.items()}
-    Y = side_by_side(prefixed, dict.fromkeys(prefixed, 1.0))
+    Y = joined_parts(prefixed, dict.fromkeys(prefixed, 1.0))
     every = np.arange(len(Y.outputs)), np.arange(len(Y.inputs))
-    data, error = _coupled(Y, links, first.freq, first.quantity, every)
+    data, error = _coupled_response(Y, links, first.freq, first.quantity, every)
     variance = None if Y.variance is None else error
     if variance is not None:
         done = "the joints take nearly all of a component's motion away"
@@ -235,10 +235,10 @@ def uncoupled(
     rest_out = [machine.outputs[i] for i in kept_out]
     units = {name: unit for name, unit in machine.units.items() if name in {*rest_in, *rest_out}}
     whole = {"": machine, **{f"{_KNOWN}{name}/": frf for name, frf in known.items()}}
-    Y = side_by_side(whole, {name: -1.0 if name else 1.0 for name in whole})
+    Y = joined_parts(whole, {name: -1.0 if name else 1.0 for name in whole})
     kept = np.array(kept_out), np.array(kept_in)
-    more = _shared(Y, known) if extended else None
-    data, error = _coupled(Y, links, machine.freq, machine.quantity, kept, more)
+    more = _shared_rows(Y, known) if extended else None
+    data, error = _coupled_response(Y, links, machine.freq, machine.quantity, kept, more)
     variance = None if Y.variance is None else error
     done = "the answer is a small difference of the machine and what is taken out"
     warn_of_errors(data, error, machine.freq, known=variance is not None, done=done)
@@ -256,9 +256,9 @@ def _taken_out(
     labels = [*machine.outputs, *machine.inputs]
     names = dict.fromkeys([*known, *(x.partition("/")[0] for x in labels if "/" in x)])
     places = known_places(dofs, names)
-    there = [channels_of(name, machine, places.get(name), inside=True) for name in names]
+    there = [channels_as_dofs(name, machine, places.get(name), inside=True) for name in names]
     alone = [
-        channels_of(part.name, known[part.name], places.get(part.name))
+        channels_as_dofs(part.name, known[part.name], places.get(part.name))
         if part.name in known
         else part
         for part in there
@@ -293,7 +293,7 @@ def _taken_out(
     return found
 
 
-def _coupled(
+def _coupled_response(
     parts: MeasuredParts,
     links: Sequence[FrfLink],
     freq: FloatArray,
@@ -381,7 +381,7 @@ def _check_gap(
         )
 
 
-def _shared(Y: MeasuredParts, known: Mapping[str, Frf]) -> tuple[FloatArray, FloatArray]:
+def _shared_rows(Y: MeasuredParts, known: Mapping[str, Frf]) -> tuple[FloatArray, FloatArray]:
     """Return rows over outputs and over inputs for channels that the machine and its parts have."""
     found = []
     for names in (Y.outputs, Y.inputs):

@@ -47,13 +47,13 @@ class FrfLink(NamedTuple):
 
 def frf_links(joints: Sequence[Any], parts: Sequence[Channels]) -> list[FrfLink]:
     """Return all axes of joints between responses."""
-    return [link for joint in joints for link in _links(joint, parts)]
+    return [link for joint in joints for link in _frf_links(joint, parts)]
 
 
-def _links(joint: Any, parts: Sequence[Channels]) -> list[FrfLink]:
+def _frf_links(joint: Any, parts: Sequence[Channels]) -> list[FrfLink]:
     instance(joint, Joint, "a joint", "Pass Joint('stage/41:z', 'frame/7:z').")
     given = [joint.first] if joint.second is None else [joint.first, joint.second]
-    owners = [_owner(end, parts) for end in given]
+    owners = [_component_of(end, parts) for end in given]
     for end, owner in zip(given, owners, strict=True):
         if isinstance(end, tuple):
             raise ModelError(
@@ -79,14 +79,14 @@ def _links(joint: Any, parts: Sequence[Channels]) -> list[FrfLink]:
             )
             for sign, owner, out, into in zip((1.0, -1.0), owners, seen, pushed, strict=False)
         )
-        if len(ends) > 1 and ends[0].owner == ends[1].owner and not _summed(ends, "outputs"):
+        if len(ends) > 1 and ends[0].owner == ends[1].owner and not _weights_of(ends, "outputs"):
             raise ModelError(f"both ends of {joint!r} are one channel: it would do nothing.")
         stiffness = None if joint.is_rigid else float(k)
         found.append(FrfLink(f"{joint!r} along {axis}", ends, stiffness, float(c)))
     return found
 
 
-def _owner(end: Any, parts: Sequence[Channels]) -> Channels:
+def _component_of(end: Any, parts: Sequence[Channels]) -> Channels:
     name = end.component if isinstance(end, Patch) else end[0]
     if isinstance(end, str):
         name = end.partition("/")[0]
@@ -101,7 +101,7 @@ def _end(parts: Sequence[Channels], end: Any, side: str) -> JointEnd:
     size = np.ptp(np.vstack([part.dofs.xyz for part in sides]), axis=0).max(initial=0.0)
     try:
         if isinstance(end, Patch):
-            end = _measured_patch(end, _owner(end, parts), side)
+            end = _measured_patch(end, _component_of(end, parts), side)
         return JointEnd(
             sides, end, float(size) or 1.0, [rigid_motions(part.dofs) for part in sides]
         )
@@ -129,7 +129,7 @@ def _measured_patch(patch: Patch, owner: Channels, side: str) -> Patch:
     return patch.replace(nodes=[nodes[i] for i in kept], weights=weights)
 
 
-def _summed(ends: Sequence[FrfEnd], side: str) -> dict[str, float]:
+def _weights_of(ends: Sequence[FrfEnd], side: str) -> dict[str, float]:
     """Return the weights of machine's channels in a stretch, those that are not zero."""
     total: dict[str, float] = {}
     for end in ends:
@@ -144,7 +144,7 @@ def channel_rows(links: Sequence[FrfLink], names: Sequence[str], side: str) -> F
     place = {name: i for i, name in enumerate(names)}
     B = np.zeros((len(links), len(names)))
     for row, link in zip(B, links, strict=True):
-        for name, weight in _summed(link.ends, side).items():
+        for name, weight in _weights_of(link.ends, side).items():
             row[place[name]] = weight
     return B
 
@@ -157,7 +157,7 @@ def warn_of_bending(
         for end in (joint.first, joint.second):
             if not isinstance(end, Patch):
                 continue
-            owner = _owner(end, parts)
+            owner = _component_of(end, parts)
             side, frf, patch = (
                 owner.outputs,
                 frfs[owner.name],
@@ -240,7 +240,7 @@ class Channels(NamedTuple):
         return {side.channels[i]: float(row[i]) for i in np.flatnonzero(row)}
 
 
-def channels_of(name: str, frf: Frf, dofs: DofSet | None, *, inside: bool = False) -> Channels:
+def channels_as_dofs(name: str, frf: Frf, dofs: DofSet | None, *, inside: bool = False) -> Channels:
     """Return the channels of a component that are DOFs."""
     if dofs is not None:
         instance(dofs, DofSet, f"dofs of {name!r}", "Pass DofSet(nodes, directions, xyz).")
@@ -282,10 +282,10 @@ def _side(name: str, names: Sequence[str], dofs: DofSet | None, *, inside: bool)
     return Side(name, found, tuple(channels))
 
 
-def parts_of(frfs: Mapping[str, Frf], dofs: Mapping[str, DofSet] | None) -> list[Channels]:
+def all_channels(frfs: Mapping[str, Frf], dofs: Mapping[str, DofSet] | None) -> list[Channels]:
     """Return the channels of all components."""
     places = known_places(dofs, frfs)
-    return [channels_of(name, frf, places.get(name)) for name, frf in frfs.items()]
+    return [channels_as_dofs(name, frf, places.get(name)) for name, frf in frfs.items()]
 
 
 def known_places(dofs: object, names: Mapping[str, object] | Sequence[str]) -> dict[str, DofSet]:

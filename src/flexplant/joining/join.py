@@ -32,7 +32,7 @@ from .links import (
     eliminated,
     links_of,
     machine_size,
-    rows_of,
+    stretch_rows,
     warn_of_missing_statics,
 )
 
@@ -150,7 +150,7 @@ def joined(
     warn_of_missing_statics(links, parts)
     rigid = [link for link in links if link.joint.is_rigid]
     soft = [link for link in links if not link.joint.is_rigid]
-    B, S = rows_of(rigid, parts), rows_of(soft, parts)
+    B, S = stretch_rows(rigid, parts), stretch_rows(soft, parts)
     _check_stiffness(soft, S, parts)
     owners = np.repeat(np.arange(len(parts)), [part.n for part in parts])
     done = eliminated(B, _coordinate_reach(parts), owners)
@@ -168,7 +168,7 @@ def joined(
     certificate = certified(parts, links, done, matrices, groups, rigid_body, expected, patches)
     common = {"joint_motions": motions, "joining": certificate}
     if not any(part.is_reduced for part in parts):
-        return _full(parts, done, matrices | common, name)
+        return _joined_model(parts, done, matrices | common, name)
     return _joined_reduced_model(parts, done, matrices | common, rigid_body)
 
 
@@ -265,7 +265,7 @@ def _all_dofs(parts: Sequence[Component]) -> DofSet:
     )
 
 
-def _full(
+def _joined_model(
     parts: Sequence[Component], done: Elimination, fields: dict[str, Any], name: str | None
 ) -> FEModel:
     shape = JoinedShape(
@@ -377,7 +377,7 @@ def left_motions(
         stretch = np.asarray(rows @ motions)
         most = np.asarray(abs(rows) @ np.abs(motions)).max(axis=1, initial=0.0)
         stretch[np.abs(stretch) <= _NONE * most[:, None]] = 0.0  # rounding of what cancels
-        allowed = null_space(stretch)
+        allowed = rigid_null_space(stretch)
         beside = np.linalg.norm(whole - allowed @ (allowed.T @ whole), axis=0)
         size = np.linalg.norm(whole, axis=0)
         clean = (missed < SPANNED) & (size > 0) & (beside <= _NONE * size)
@@ -396,7 +396,7 @@ def _own_motions(part: Component, *, free: bool) -> FloatArray:
     return rigid if rigid.shape[1] == every.shape[1] else every
 
 
-def null_space(stretch: FloatArray) -> FloatArray:
+def rigid_null_space(stretch: FloatArray) -> FloatArray:
     """Return an orthonormal basis (r, q) of the motions (r,) that stretch (m, r) nothing."""
     if not stretch.size:
         return np.eye(stretch.shape[1])

@@ -12,7 +12,7 @@ from ..checks import FloatArray, IntArray, Value
 from ..errors import CertificateError, counted
 from ..tolerances import TINY, divisor
 from .component import Component
-from .links import Elimination, Link, machine_size, rows_of
+from .links import Elimination, Link, machine_size, stretch_rows
 
 #: largest gap, imbalance and error of the inertia, relative
 _LIMIT = 1e-7
@@ -102,7 +102,7 @@ def certified(
     patches: Mapping[str, float],
 ) -> JoiningCertificate:
     """Return the checks of a joined machine."""
-    B = rows_of([link for link in links if link.joint.is_rigid], parts)
+    B = stretch_rows([link for link in links if link.joint.is_rigid], parts)
     opening: Any = abs(B @ done.T).max(axis=1)
     most: Any = (abs(B) @ abs(done.T)).max(axis=1)
     opening, most = (np.asarray(part.todense()).ravel() for part in (opening, most))

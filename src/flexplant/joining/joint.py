@@ -74,8 +74,8 @@ class Joint(Value):
         if axes is not None and (not axes or len(set(axes)) < len(axes)):
             raise LabelError(f"axes of a joint must be different ones, got {axes!r}: name each.")
         self._set(
-            first=_check_end(self.first),
-            second=None if self.second is None else _check_end(self.second),
+            first=_checked_end(self.first),
+            second=None if self.second is None else _checked_end(self.second),
             axes=axes,
             stiffness=_axis_numbers(self.stiffness, "stiffness of a joint"),
             rate=_axis_numbers(self.rate, "rate of a joint"),
@@ -134,7 +134,7 @@ class Joint(Value):
         return found[0], found[1]
 
 
-def _check_end(end: Any) -> Any:
+def _checked_end(end: Any) -> Any:
     if isinstance(end, Patch):
         return end
     if isinstance(end, str) and all(end.partition("/")):

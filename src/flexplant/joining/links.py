@@ -122,7 +122,7 @@ def _check_balance(joint: Joint, axis: str, carried: FloatArray, size: float) ->
     warn(said)
 
 
-def rows_of(links: Sequence[Link], parts: Sequence[Component]) -> sp.csr_array:
+def stretch_rows(links: Sequence[Link], parts: Sequence[Component]) -> sp.csr_array:
     """Return the stretches of links (m, n) by the coordinates of all components."""
     starts = np.concatenate([[0], np.cumsum([part.n for part in parts])])
     data, rows, columns = [np.zeros(0)], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
@@ -288,7 +288,7 @@ def eliminated(B: sp.csr_array, size: FloatArray, order: IntArray) -> Eliminatio
     n = B.shape[1]
     lead = _own_followers(B, size, order)
     plain = lead >= 0
-    first = _by_blocks(B[~plain], size, order)
+    first = _block_motions(B[~plain], size, order)
     # those that one constraint alone names follow it, whatever the others say
     leads = lead[plain]
     some = sp.csr_array(B[plain])
@@ -319,7 +319,7 @@ def _own_followers(B: Any, size: FloatArray, order: IntArray) -> IntArray:
     return found
 
 
-def _by_blocks(B: Any, size: FloatArray, order: IntArray) -> Elimination:
+def _block_motions(B: Any, size: FloatArray, order: IntArray) -> Elimination:
     """Return the motions that fulfil constraints, solved apart where they share no coordinate."""
     n = B.shape[1]
     touched = np.unique(B.indices).astype(np.int64)

@@ -10,7 +10,7 @@ from ..errors import AssumptionError, ModelError
 from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace
 from ..tolerances import TINY
-from .blocks import joined
+from .blocks import driving_blocks
 from .closed import ClosedLoop
 
 #: smallest part of the largest observability of slow states by the commands that counts
@@ -24,7 +24,7 @@ def applied_law(loop: ClosedLoop, recovery: float | None) -> tuple[StateSpace, F
     return within `recovery` [samples]; L is zero without.
     """
     plant, driven = loop.plant, list(loop.driven)
-    law = joined(plant, loop.blocks, driven, list(loop.watched), applied=True)
+    law = driving_blocks(plant, loop.blocks, driven, list(loop.watched), applied=True)
     ny, nu = len(plant.y), len(driven)
     if np.any(law.D[:nu, ny:]):
         i, j = np.argwhere(law.D[:nu, ny:])[0]
@@ -35,10 +35,10 @@ def applied_law(loop: ClosedLoop, recovery: float | None) -> tuple[StateSpace, F
         )
     if recovery is None:
         return law, np.zeros((law.n_states, nu))
-    return law, _back(loop, law.A, law.C[:nu], float(np.exp(-1.0 / recovery)))
+    return law, _mirror_gain(loop, law.A, law.C[:nu], float(np.exp(-1.0 / recovery)))
 
 
-def _back(loop: ClosedLoop, A: FloatArray, C: FloatArray, radius: float) -> FloatArray:
+def _mirror_gain(loop: ClosedLoop, A: FloatArray, C: FloatArray, radius: float) -> FloatArray:
     """Return L that mirrors the slow poles of the driving blocks at a circle.
 
     Only poles beyond the circle move: with V a basis of their invariant subspace, ``A V = V S``

@@ -9,7 +9,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, flag, instance, positive
 from ..errors import ModelError, ShapeError, counted
 from ..lti.frequency import Frf
-from ..lti.measured_lines import followed
+from ..lti.measured_lines import on_lines
 from ..lti.statespace import StateSpace, System, as_statespace
 
 #: degrees of freedom above which a variance is taken as it is
@@ -72,7 +72,7 @@ def in_axes(
     data = np.einsum("ay,yuf,ub->abf", last.D, chosen.data, first.D)
     variance = line_variance(chosen)
     if variance is not None:
-        variance = _carried(last.D, first.D, variance, chosen.correlation)
+        variance = _error_variance(last.D, first.D, variance, chosen.correlation)
     freq, late = frf.freq, positive(delay, "delay", zero=True)
     held = flag(hold, "hold")
     if rate is None and late:
@@ -84,7 +84,7 @@ def in_axes(
                 f"all lines, from {frf.freq[0]:.4g} Hz, lie above half the rate, {0.5 * rate:g} "
                 "Hz: a loop cannot be judged there. Check that rate is in Hz, or measure lower."
             )
-        data = _sampled(frf.freq, data, freq, rate, late, held)
+        data = _sampled_response(frf.freq, data, freq, rate, late, held)
         if variance is not None:
             aliased = _aliased(frf.freq, variance, freq, rate)
             variance = aliased if held else variance[..., : freq.size]
@@ -129,7 +129,7 @@ def _near_mean(values: FloatArray, reach: int) -> FloatArray:
     return np.asarray((total[..., high] - total[..., low]) / (high - low))
 
 
-def _carried(
+def _error_variance(
     after: FloatArray, before: FloatArray, variance: FloatArray, correlation: ComplexArray | None
 ) -> FloatArray:
     """Return the variance of ``after G before``; errors of different inputs are independent."""
@@ -143,9 +143,9 @@ def _carried(
 
 
 def _aliased(lines: FloatArray, variance: FloatArray, freq: FloatArray, rate: float) -> FloatArray:
-    """Return the variance of `_sampled`: aliases add theirs."""
+    """Return the variance of `_sampled_response`: aliases add theirs."""
     total = np.zeros((*variance.shape[:2], freq.size))
-    for moved in _images(lines, freq, rate):
+    for moved in _alias_frequencies(lines, freq, rate):
         at = np.abs(moved)
         hold = np.sinc(moved / rate) ** 2
         for i, j in np.ndindex(variance.shape[:2]):
@@ -153,7 +153,7 @@ def _aliased(lines: FloatArray, variance: FloatArray, freq: FloatArray, rate: fl
     return total
 
 
-def _sampled(
+def _sampled_response(
     lines: FloatArray, data: ComplexArray, freq: FloatArray, rate: float, late: float, held: bool
 ) -> ComplexArray:
     """Return a measured plant as its samples show it, with delay and aliases (held=True)."""
@@ -161,17 +161,17 @@ def _sampled(
         turned = np.exp(-2j * np.pi * freq * late / rate)
         return np.asarray(data[:, :, : freq.size] * turned)
     total = np.zeros((*data.shape[:2], freq.size), dtype=complex)
-    for moved in _images(lines, freq, rate):
+    for moved in _alias_frequencies(lines, freq, rate):
         at = np.abs(moved)
         known = (at >= lines[0]) & (at <= lines[-1])
         G = np.zeros(total.shape, dtype=complex)
-        G[..., known] = followed(lines, data, at[known])
+        G[..., known] = on_lines(lines, data, at[known])
         hold = np.sinc(moved / rate) * np.exp(-2j * np.pi * moved * (0.5 + late) / rate)
         total += np.where(moved < 0.0, G.conj(), G) * hold
     return total
 
 
-def _images(lines: FloatArray, freq: FloatArray, rate: float) -> list[FloatArray]:
+def _alias_frequencies(lines: FloatArray, freq: FloatArray, rate: float) -> list[FloatArray]:
     """Return the frequencies, negative ones too, that a sampler shows at some frequencies."""
     reach = int(np.ceil(lines[-1] / rate))
     return [freq + k * rate for k in range(-reach, reach + 1)]

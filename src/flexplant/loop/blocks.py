@@ -16,7 +16,7 @@ from ..plant import StandardPlant
 from ..tolerances import SAME
 
 
-def joined(
+def driving_blocks(
     plant: StandardPlant,
     systems: Sequence[StateSpace],
     driven: list[str],

@@ -130,7 +130,7 @@ def inverted(L: ComplexArray) -> ComplexArray:
         return np.asarray(np.linalg.inv(eye - (1.0 - _BESIDE) * L))
 
 
-def largest(S: ComplexArray) -> FloatArray:
+def largest_singular(S: ComplexArray) -> FloatArray:
     """Return the largest singular value at each frequency: the root of an eigenvalue of S* S."""
     return np.asarray(np.sqrt(np.linalg.eigvalsh(S.conj().swapaxes(1, 2) @ S)[:, -1]))
 
@@ -144,14 +144,14 @@ def sensitivity_size(L: ComplexArray) -> FloatArray:
     """
     gain = np.sqrt(np.sum(L.real**2 + L.imag**2, axis=(1, 2)))
     size, acts = 1.0 / (1.0 + gain), gain >= _SMALL
-    size[acts] = _bounded(L[acts])
+    size[acts] = _norm_or_bound(L[acts])
     acts = ~acts & (size.max(initial=0.0) * (1.0 - gain) < 1.0)
     if acts.any():
-        size[acts] = _bounded(L[acts])
+        size[acts] = _norm_or_bound(L[acts])
     return np.asarray(size)
 
 
-def _bounded(L: ComplexArray) -> FloatArray:
+def _norm_or_bound(L: ComplexArray) -> FloatArray:
     """Return sigma_max of S where it may come near the largest, else its lower bound."""
     S, n = inverted(L), L.shape[-1]
     square = S.conj().swapaxes(1, 2) @ S
@@ -177,11 +177,11 @@ class Path(NamedTuple):
 def plant_path(plant: StandardPlant, driven: tuple[str, ...]) -> Path:
     """Return what lies between some actuators and y."""
     system = plant.system.select(plant.y, driven)
-    fed_back = moved(system)
+    fed_back = movable_outputs(system)
     return Path(system, fed_back, responder(system.select(fed_back)))
 
 
-def moved(g: StateSpace) -> tuple[str, ...]:
+def movable_outputs(g: StateSpace) -> tuple[str, ...]:
     """Return the outputs that can move: their rows see a state or an input."""
     moves = np.any(g.C != 0, axis=1) | np.any(g.D != 0, axis=1)
     return tuple(name for name, one in zip(g.outputs, moves, strict=True) if one)
@@ -205,8 +205,8 @@ def scaled_size(S: ComplexArray) -> FloatArray:
     [Skogestad2005]_, section 8.8, whatever the units of the axes. Where it cannot be the
     largest it is a bound from above.
     """
-    log = _balanced(S)
-    size = _largest(S, log)
+    log = _log_scaling(S)
+    size = _scaled_norms(S, log)
     if S.shape[-1] < 3:  # the product of both singular values is fixed: balanced is optimal
         return size
     best, order = 0.0, np.argsort(-size, kind="stable")
@@ -219,15 +219,15 @@ def scaled_size(S: ComplexArray) -> FloatArray:
     return size
 
 
-def _largest(S: ComplexArray, log: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.norm(_scaled(S, log), 2, axis=(1, 2)))
+def _scaled_norms(S: ComplexArray, log: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(_d_scaled(S, log), 2, axis=(1, 2)))
 
 
-def _scaled(S: ComplexArray, log: FloatArray) -> ComplexArray:
+def _d_scaled(S: ComplexArray, log: FloatArray) -> ComplexArray:
     return np.asarray(S * np.exp(log[:, :, None] - log[:, None, :]))
 
 
-def _balanced(S: ComplexArray) -> FloatArray:
+def _log_scaling(S: ComplexArray) -> FloatArray:
     """Return log D (k, n) of the least Frobenius norm: each row as large as its column."""
     k, n = S.shape[:2]
     power, log = np.abs(S) ** 2, np.zeros((k, n))
@@ -251,7 +251,7 @@ def _optimised(S: ComplexArray, log: FloatArray, size: FloatArray) -> FloatArray
     """Return the size after log D has gone down the slope of ``sum sigma^(2 p)``, p growing."""
     for power in _POWERS:
         for _ in range(_STEPS):
-            left, sigma, right = np.linalg.svd(_scaled(S, log))
+            left, sigma, right = np.linalg.svd(_d_scaled(S, log))
             size = np.minimum(size, sigma[:, 0])
             weight = (sigma / sigma[:, :1]) ** (2 * power)
             rows = np.einsum("kis,ks->ki", np.abs(left) ** 2, weight)

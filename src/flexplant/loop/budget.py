@@ -427,7 +427,7 @@ def sources(plant: StandardPlant, monitored: StateSpace) -> list[Source]:
     """Return the white noises of a plant as they enter its closed loop, each by itself."""
     white, sensors = white_names(plant)
     found = []
-    for name, factor in _factors(plant, white).items() if plant.dt else ():
+    for name, factor in _disturbance_factors(plant, white).items() if plant.dt else ():
         G = np.zeros((monitored.n_states, factor.shape[1]))
         G[: factor.shape[0]] = factor
         found.append(Source(name, G, np.zeros((len(monitored.outputs), G.shape[1]))))
@@ -439,7 +439,7 @@ def sources(plant: StandardPlant, monitored: StateSpace) -> list[Source]:
     return found
 
 
-def _factors(plant: StandardPlant, white: list[str]) -> dict[str, FloatArray]:
+def _disturbance_factors(plant: StandardPlant, white: list[str]) -> dict[str, FloatArray]:
     """Return G of each white disturbance; of all together where they cannot be separated."""
     if not white:
         return {}

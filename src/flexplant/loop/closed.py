@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..certificates import in_words
+from ..certificates import one_line
 from ..checks import ComplexArray, FloatArray, Value, name_list, whole
 from ..errors import ModelError, require_known, warn
 from ..lti.frequency import Frf, sampled_freq
@@ -20,7 +20,7 @@ from ..lti.responses import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant, standard_plant
 from ..plant.uncertainty.uncertain_plant import UncertainPlant
-from .blocks import as_block, check_inputs, commands, drives, joined, tapped, with_known
+from .blocks import as_block, check_inputs, commands, drives, driving_blocks, tapped, with_known
 from .broken import BrokenLoop, Path, plant_path
 from .budget import (
     ErrorBudget,
@@ -103,7 +103,7 @@ class ClosedLoop(Value):
             lines.append(f"  with the modes left out: {self.left_out.summary}")
         if self.tolerances is not None:
             found = self.tolerances.certificate
-            lines.append(f"  {in_words(found) if found else self.tolerances.summary}")
+            lines.append(f"  {one_line(found) if found else self.tolerances.summary}")
         return "\n".join(lines)
 
     @property
@@ -554,7 +554,7 @@ def close_loop(
     plant = with_known(plant, systems)
     driven, watched = drives(plant, systems, resting)
     check_inputs(plant, systems)
-    controller = joined(plant, systems, driven, watched)
+    controller = driving_blocks(plant, systems, driven, watched)
     loop = ClosedLoop(
         plant, systems, controller, resting, None if larger is None else with_known(larger, systems)
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks import FloatArray, Value, instance, short
 from ..errors import LabelError, ModelError, require_known
-from ..lti.frequency_sweep import climbed
+from ..lti.frequency_sweep import climbed_grid
 from .blocks import references
 from .closed import ClosedLoop
 from .sensitivity import first_above
@@ -144,7 +144,7 @@ def compare_loops(
     wrong = [loop for loop in loops.values() if not isinstance(loop, ClosedLoop)]
     if wrong:
         raise ModelError(f"need closed loops, got {short(wrong[0])}. Use close_loop(plant, ...).")
-    pair = _channels(next(iter(loops.values())), reference, error)
+    pair = _reference_pair(next(iter(loops.values())), reference, error)
     for name, loop in loops.items():
         if pair and (pair[0] not in loop.plant.w or pair[1] not in loop.plant.z):
             raise LabelError(
@@ -171,7 +171,7 @@ def compare_loops(
     return LoopComparison(rows, f"{pair[0]} to {pair[1]}" if pair else "", sampled)
 
 
-def _channels(loop: ClosedLoop, reference: str | None, error: str | None) -> tuple[str, ...]:
+def _reference_pair(loop: ClosedLoop, reference: str | None, error: str | None) -> tuple[str, ...]:
     """Return reference and error, or nothing when the loop has no reference."""
     for name, given in (("reference", reference), ("error", error)):
         instance(given, str | None, name, "Pass the name of a channel.", LabelError)
@@ -193,7 +193,7 @@ def error_sensitivity(
 ) -> tuple[FloatArray, FloatArray]:
     """Return frequencies [Hz] and |S| from reference to error, refined where it is largest."""
     if reference is None or error is None:
-        pair = _channels(loop, reference, error)
+        pair = _reference_pair(loop, reference, error)
         if not pair:
             raise LabelError(
                 "the loop has no reference, so no sensitivity from it to an error: add "
@@ -201,7 +201,7 @@ def error_sensitivity(
             )
         reference, error = pair
     gain = loop.gain(reference, error)
-    return climbed(lambda freq: np.abs(gain(freq)[0, 0]), loop.broken.grid, 4)
+    return climbed_grid(lambda freq: np.abs(gain(freq)[0, 0]), loop.broken.grid, 4)
 
 
 def axis_sensitivities(loop: ClosedLoop) -> dict[str, tuple[FloatArray, FloatArray]]:

@@ -27,7 +27,7 @@ from ..plant import StandardPlant
 from ..plant.building import sampled_motions
 from ..plant.uncertainty.uncertain_plant import Delta, changed_pairs
 from ..tolerances import SAME, SETTLED, TINY
-from .broken import BrokenLoop, inverted, largest
+from .broken import BrokenLoop, inverted, largest_singular
 
 #: largest relative change of a frequency whose polynomials are exact
 LIMIT = 0.05
@@ -65,7 +65,7 @@ class ModeChanges(NamedTuple):
     def at(self, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return A and T of each mode for a change of each (modes,)."""
         each = delta[:, None, None]
-        return _value(self.A, each), _value(self.T, each)
+        return _horner(self.A, each), _horner(self.T, each)
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ class SweptModes(NamedTuple):
         mode, rest = self.mode[near], Yqe[near]
         H = -A[:, mode] - T[:, mode] @ rest
         H[0] = start[near]
-        found[near] = _roots(H)
+        found[near] = _least_root(H)
         return found
 
     def take(self, where: BoolArray) -> SweptModes:
@@ -298,7 +298,7 @@ def _determinant(H: ComplexArray) -> ComplexArray:
     return np.asarray(H[..., 0, 0] * H[..., 1, 1] - H[..., 0, 1] * H[..., 1, 0])
 
 
-def _roots(H: ComplexArray) -> ComplexArray:
+def _least_root(H: ComplexArray) -> ComplexArray:
     """Return the change (n,) nearest to none at which det H, of H (k, n, 2, 2) by powers, is 0."""
     powers = np.arange(2 * len(H) - 1)
     det = np.zeros((powers.size, H.shape[1]), dtype=np.complex128)
@@ -309,7 +309,7 @@ def _roots(H: ComplexArray) -> ComplexArray:
     delta = np.zeros(det.shape[1], dtype=np.complex128)
     for _ in range(12):
         with np.errstate(divide="ignore", invalid="ignore"):
-            moved = _value(det, delta) / _value(slope, delta)
+            moved = _horner(det, delta) / _horner(slope, delta)
         moved = np.where(np.isfinite(moved), moved, 0.0)
         delta = delta - moved
         if np.all(np.abs(moved) <= SETTLED * np.abs(delta)):
@@ -319,7 +319,7 @@ def _roots(H: ComplexArray) -> ComplexArray:
     return delta
 
 
-def _value(polynomial: Any, at: Any) -> Any:
+def _horner(polynomial: Any, at: Any) -> Any:
     """Return a polynomial's value by Horner's rule, its coefficients along the first axis."""
     found = polynomial[-1]
     for coefficient in polynomial[-2::-1]:
@@ -327,7 +327,7 @@ def _value(polynomial: Any, at: Any) -> Any:
     return found
 
 
-def crossings(
+def axis_crossings(
     swept: SweptLoop, modes: SweptModes, freq: FloatArray, kind: str, ends: FloatArray
 ) -> FloatArray:
     """Return the real changes (modes, 2) next to none, down and up, at which a pole crosses.
@@ -339,7 +339,7 @@ def crossings(
     delta = modes.changes(kind, limits)
     inside = (delta.real > ends[modes.mode, 0]) & (delta.real < ends[modes.mode, 1])
     same = modes.mode[:-1] == modes.mode[1:]
-    low = np.flatnonzero(_turns(delta.imag) & inside[:-1] & inside[1:] & same)
+    low = np.flatnonzero(_sign_changes(delta.imag) & inside[:-1] & inside[1:] & same)
     edges, mode = np.stack([freq[low], freq[low + 1]], axis=1), modes.mode[low]
     value = np.zeros(0)
     for _ in range(_DIVISIONS):
@@ -352,7 +352,7 @@ def crossings(
         delta = each.changes(kind, np.repeat(np.abs(ends).max(axis=1)[mode], _WITHIN))
         delta = delta.reshape(fine.shape)
         good = (delta.real > ends[mode, :1]) & (delta.real < ends[mode, 1:])
-        turns = _turns(delta.imag) & good[:, :-1] & good[:, 1:]
+        turns = _sign_changes(delta.imag) & good[:, :-1] & good[:, 1:]
         real = np.any(turns, axis=1)
         mode, fine, delta, k = mode[real], fine[real], delta[real], turns[real].argmax(axis=1)
         row = np.arange(mode.size)
@@ -367,7 +367,7 @@ def crossings(
     return found
 
 
-def _turns(imag: FloatArray) -> BoolArray:
+def _sign_changes(imag: FloatArray) -> BoolArray:
     """Return between which neighbours along the last axis the sign changes."""
     return np.asarray(np.sign(imag[..., :-1]) * np.sign(imag[..., 1:]) < 0)
 
@@ -387,7 +387,7 @@ def size_reached(
     that come near the size at an end. `freq` [Hz] of each pair, rising within a mode.
     """
     count = len(limits)
-    high = largest(swept.S) >= size
+    high = largest_singular(swept.S) >= size
     every = _Sized(modes, SizeBound.of(np.where(high[:, None, None], 0.0, swept.S), modes, size))
     ends = np.minimum(np.abs(stable), limits[:, None])
     near = passed.copy()

@@ -16,7 +16,7 @@ from ..plant.uncertainty.uncertain_plant import UncertainPlant, modal_realisatio
 from ..plant.uncertainty.whole_machines import draws_with_left_out
 from ..tolerances import TINY
 from .broken import BrokenLoop
-from .mode_crossings import LIMIT, ModeLoops, crossings, size_reached
+from .mode_crossings import LIMIT, ModeLoops, axis_crossings, size_reached
 from .spill_over import MachineDraws
 
 #: points of the grid around a mode to a half-width of its resonance, and how many at most aside
@@ -163,7 +163,7 @@ class ModeTolerances(Value):
         known = "" if self.known is None else "     known to"
         lines.append(f"  mode       Hz   |S| at u of {1 / self.margin:.3g}       unstable{known}")
         for i in np.argsort(self.least, kind="stable")[:_SHOWN]:
-            row = [_ends(ends, self.limit[i]) for ends in (self.within[i], self.stable[i])]
+            row = [_percent(ends, self.limit[i]) for ends in (self.within[i], self.stable[i])]
             own = "" if self.known is None else f"{100 * self.known[i]:10.2g} %"
             mark = "  !" if self.modes[i] in self.critical else ""
             lines.append(
@@ -176,7 +176,7 @@ class ModeTolerances(Value):
         return "\n".join(lines) + ">"
 
 
-def _ends(ends: FloatArray, limit: float) -> str:
+def _percent(ends: FloatArray, limit: float) -> str:
     """Return two ends of a range in percent."""
     low, high = (
         f"{100 * end:+.2g}" if np.isfinite(end) else f"{sign}>{100 * limit:.2g}"
@@ -205,7 +205,7 @@ def mode_tolerances(
     margin = positive(margin, "margin")
     if margin >= 1.0:
         raise ModelError(f"margin must be below 1, the largest that a loop can keep, got {margin}.")
-    modes, freq, zeta = _elastic(plant)
+    modes, freq, zeta = _swinging_modes(plant)
     if broken.is_unstable:
         raise AssumptionError(
             "the loop is unstable as it is: no mode has a tolerance. Stabilise it first."
@@ -217,7 +217,7 @@ def mode_tolerances(
     else:
         most = np.full(modes.size, limit)
     limits = np.minimum(most, _ASIDE / _TO_A_WIDTH * zeta)
-    own = _known(known, modes)
+    own = _uncertainties(known, modes)
     if not modes.size:
         none = np.zeros((0, 2))
         return ModeTolerances(modes, freq, none, none, none, margin, limits, own)
@@ -231,8 +231,8 @@ def mode_tolerances(
     swept = loops.swept(every)
     each = swept.swept_modes(at, mode)
     ends = np.outer(limits, [-1.0, 1.0])
-    stable = crossings(swept, each, every[at], "freq", ends)
-    damping = crossings(swept, each, every[at], "damping", np.tile(_DAMPINGS, (modes.size, 1)))
+    stable = axis_crossings(swept, each, every[at], "freq", ends)
+    damping = axis_crossings(swept, each, every[at], "damping", np.tile(_DAMPINGS, (modes.size, 1)))
     passed = np.abs(every[at] / freq[mode] - 1.0) <= _PASSED * limits[mode]
     within = size_reached(swept, each, every[at], passed, stable, limits, 1.0 / margin)
     return ModeTolerances(modes, freq, stable, within, damping, margin, limits, own)
@@ -268,16 +268,16 @@ def reported_tolerances(loop: Any) -> ModeTolerances | None:
     """
     uncertain = loop.plant.uncertainty
     if uncertain is None:
-        sure = loop.plant.has_own_modes and loop.is_stable and _elastic(loop.plant)[0].size
-        return _within(loop, {}) if sure else None
+        sure = loop.plant.has_own_modes and loop.is_stable and _swinging_modes(loop.plant)[0].size
+        return _tolerances(loop, {}) if sure else None
     whole_loop = loop.completed or loop
     if not uncertain.frequencies or not whole_loop.is_stable:
         return None
-    found = _within(whole_loop, uncertain.frequencies)
+    found = _tolerances(whole_loop, uncertain.frequencies)
     return found and found.replace(draws=machine_draws(loop, uncertain, MARGIN, _DRAWS))
 
 
-def _within(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:
+def _tolerances(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:
     """Return the tolerances of a stable loop to the changes that a report follows."""
     limit = min(max(_FOLLOWED, BEYOND * _SAFE * max(known.values(), default=0.0)), LIMIT)
     try:
@@ -290,7 +290,7 @@ def _within(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:
         return None
 
 
-def _elastic(plant: StandardPlant) -> tuple[IntArray, FloatArray, FloatArray]:
+def _swinging_modes(plant: StandardPlant) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return numbers, frequencies [Hz] and damping ratios of the modes that swing below Nyquist."""
     realisation = plant.assembled.realisation
     omega, zeta = natural(realisation.pairs)
@@ -309,7 +309,7 @@ def _around(freq: float, zeta: float, limit: float, grid: FloatArray, dt: float)
     return np.asarray(near[near < 0.5 / dt] if dt else near)
 
 
-def _known(given: Any, modes: IntArray) -> FloatArray | None:
+def _uncertainties(given: Any, modes: IntArray) -> FloatArray | None:
     """Return the relative uncertainty of each frequency, zero where nothing is said of it."""
     if given is None:
         return None

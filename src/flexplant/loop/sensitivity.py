@@ -13,12 +13,12 @@ from ..errors import AssumptionError, LabelError, ModelError, ShapeError, unknow
 from ..lti.frequency import Frf, frequency_response, sampled_freq
 from ..lti.frequency_sweep import crossings
 from ..lti.interconnection import loop_poles
-from ..lti.measured_lines import followed
+from ..lti.measured_lines import on_lines
 from ..lti.responses import remembered, responder
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
 from ..tolerances import SAME
-from .broken import BrokenLoop, inverted, largest, moved
+from .broken import BrokenLoop, inverted, largest_singular, movable_outputs
 from .closed import ClosedLoop
 
 #: a closed loop; a plant (StandardPlant, StateSpace or measured Frf) and a controller; a loop gain
@@ -63,8 +63,8 @@ def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u",
     >>> bool(abs(S.data - 1 / (1 - L.data)).max() < 1e-9)
     True
     """
-    parts, grid = _prepared(loop, freq)
-    return _frf(grid, parts.gain(grid, at), parts, at, at)
+    parts, grid = _loop_and_grid(loop, freq)
+    return _loop_frf(grid, parts.gain(grid, at), parts, at, at)
 
 
 def sensitivity(
@@ -101,8 +101,8 @@ def sensitivity(
     >>> abs(S.data[0, 0]).round(3)  # small at low frequency, one at high
     array([0., 1.])
     """
-    parts, grid = _prepared(loop, freq)
-    return _frf(grid, inverted(parts.gain(grid, at)), parts, at, at)
+    parts, grid = _loop_and_grid(loop, freq)
+    return _loop_frf(grid, inverted(parts.gain(grid, at)), parts, at, at)
 
 
 def complementary_sensitivity(
@@ -139,9 +139,9 @@ def complementary_sensitivity(
     >>> abs(T.data[0, 0]).round(3)
     array([1.])
     """
-    parts, grid = _prepared(loop, freq)
+    parts, grid = _loop_and_grid(loop, freq)
     L = parts.gain(grid, at)
-    return _frf(grid, -L @ inverted(L), parts, at, at)
+    return _loop_frf(grid, -L @ inverted(L), parts, at, at)
 
 
 def control_sensitivity(loop: Loop, *, freq: npt.ArrayLike | None = None) -> Frf:
@@ -176,9 +176,9 @@ def control_sensitivity(loop: Loop, *, freq: npt.ArrayLike | None = None) -> Frf
     >>> KS.outputs, KS.inputs
     (('u1',), ('y1', 'y2'))
     """
-    parts, grid = _prepared(loop, freq)
+    parts, grid = _loop_and_grid(loop, freq)
     K, P = parts.respond(grid)
-    return _frf(grid, inverted(K @ P) @ K, parts, "u", "y")
+    return _loop_frf(grid, inverted(K @ P) @ K, parts, "u", "y")
 
 
 def taken_apart(loop: Loop) -> BrokenLoop:
@@ -190,17 +190,17 @@ def taken_apart(loop: Loop) -> BrokenLoop:
     if len(loop) != 2:
         raise ModelError(f"need a tuple (plant, controller), got {short(loop)}.")
     plant: Any = loop[0]
-    controller = _controller(loop[1])
+    controller = _law_system(loop[1])
     if hasattr(plant, "frdata"):  # python-control's
         plant = Frf.from_control(plant)
     if isinstance(plant, Frf):
-        return _measured(plant, controller, _quantities(loop[1]))
+        return _measured_loop(plant, controller, _quantities(loop[1]))
     if isinstance(plant, StandardPlant):
         unread = [name for name in controller.inputs if name not in plant.y]
         if unread:
             raise unknown_label("y for the controller", unread[0], plant.y, "the plant")
         driven = [name for name in controller.outputs if name in plant.u]
-        fed = moved(plant.system.select(plant.y, driven))
+        fed = movable_outputs(plant.system.select(plant.y, driven))
         read = [name for name in controller.inputs if name in fed]
         plant, controller = plant.system.select(read, driven), controller.select(driven, read)
     elif not isinstance(plant, StateSpace):
@@ -256,7 +256,7 @@ def _modelled(
     )  # fmt: skip
 
 
-def _controller(law: Any) -> StateSpace:
+def _law_system(law: Any) -> StateSpace:
     """Return the system y -> u of a controller; of a closed loop, its own."""
     if isinstance(law, ClosedLoop):
         return law.controller.select(law.driven, law.fed_back)
@@ -277,7 +277,7 @@ def _quantities(law: Any) -> dict[str, str]:
     return {sensor.name: sensor.quantity for sensor in plant.assembled.ports.y}
 
 
-def _measured(plant: Frf, controller: StateSpace, quantities: dict[str, str]) -> BrokenLoop:
+def _measured_loop(plant: Frf, controller: StateSpace, quantities: dict[str, str]) -> BrokenLoop:
     for name in controller.inputs:
         if name not in plant.outputs:
             error = unknown_label("measured output", name, plant.outputs, "the Frf")
@@ -300,7 +300,7 @@ def _measured(plant: Frf, controller: StateSpace, quantities: dict[str, str]) ->
         tuple(driven),
         tuple(controller.inputs),
         lambda freq: frequency_response(controller, freq).data,
-        lambda freq: followed(np.asarray(plant.freq), P, freq),
+        lambda freq: on_lines(np.asarray(plant.freq), P, freq),
         controller.poles,
         controller.dt,
         np.array(plant.freq),
@@ -308,12 +308,12 @@ def _measured(plant: Frf, controller: StateSpace, quantities: dict[str, str]) ->
     )
 
 
-def _prepared(loop: Loop, freq: npt.ArrayLike | None) -> tuple[BrokenLoop, FloatArray]:
+def _loop_and_grid(loop: Loop, freq: npt.ArrayLike | None) -> tuple[BrokenLoop, FloatArray]:
     parts = taken_apart(loop)
-    return parts, parts.grid if freq is None else _checked(parts, freq)
+    return parts, parts.grid if freq is None else _checked_freq(parts, freq)
 
 
-def _checked(parts: BrokenLoop, freq: npt.ArrayLike) -> FloatArray:
+def _checked_freq(parts: BrokenLoop, freq: npt.ArrayLike) -> FloatArray:
     """Return frequencies that were given."""
     grid = sampled_freq(freq, parts.dt)
     if not grid.size:
@@ -327,7 +327,7 @@ def _checked(parts: BrokenLoop, freq: npt.ArrayLike) -> FloatArray:
     return grid
 
 
-def _frf(freq: FloatArray, data: ComplexArray, parts: BrokenLoop, to: str, fro: str) -> Frf:
+def _loop_frf(freq: FloatArray, data: ComplexArray, parts: BrokenLoop, to: str, fro: str) -> Frf:
     names = {"u": parts.u, "y": parts.y}
     return Frf(
         freq, np.moveaxis(data, 0, -1), inputs=names[fro], outputs=names[to], units=parts.units
@@ -445,4 +445,4 @@ def first_above(size: FloatArray) -> int | None:
 
 def _sensitivity_along(acting: ComplexArray, parts: BrokenLoop, grid: FloatArray) -> FloatArray:
     """Return sigma_max of S_u in the space of some orthonormal directions of u (columns)."""
-    return largest(inverted(acting.conj().T @ parts.gain(grid) @ acting))
+    return largest_singular(inverted(acting.conj().T @ parts.gain(grid) @ acting))

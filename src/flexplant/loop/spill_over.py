@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..certificates import in_words, stability_name
+from ..certificates import one_line, stability_name
 from ..checks import FloatArray, IntArray, Value, checked, floats
 from ..errors import ModelError
 from ..lti.statespace import StateSpace
@@ -113,7 +113,7 @@ class SpillOver(Value):
     @property
     def named_modes(self) -> str:
         """The modes that take part in what grows or peaks, in words."""
-        return named(self.modes, self.freq)
+        return modes_in_words(self.modes, self.freq)
 
     def __repr__(self) -> str:
         return f"<SpillOver: {self.summary}>"
@@ -121,7 +121,7 @@ class SpillOver(Value):
     @property
     def summary(self) -> str:
         """The finding in one line."""
-        found = in_words({self._measure: self.stability})
+        found = one_line({self._measure: self.stability})
         if not self.is_stable:
             return f"unstable ({self.states} states), {found}: {self.named_modes}"
         there = f"stable ({self.states} states), {found}, |S| at u up to {_db(self.modulus_margin)}"
@@ -137,7 +137,7 @@ def _db(margin: float) -> str:
     return f"{-20.0 * np.log10(margin):.3g} dB"
 
 
-def named(modes: Sequence[int], freq: Sequence[float]) -> str:
+def modes_in_words(modes: Sequence[int], freq: Sequence[float]) -> str:
     """Return modes in words, the first few of many."""
     listed = [f"mode {n} ({f:.4g} Hz)" for n, f in zip(modes, freq, strict=True)]
     more = len(listed) - _NAMED
@@ -155,7 +155,7 @@ def growing_modes(
 ) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Return the numbers of the modes that take part in what grows, and its frequencies [Hz]."""
     # by participation factors |left_k right_k| [PerezArriaga1982]_, whatever the units of states
-    numbers = _numbers(states, loop.n_states)
+    numbers = _mode_of_state(states, loop.n_states)
     if not np.any(numbers):
         return (), ()
     eigen: Any = la.eig(loop.A, left=True, right=True)
@@ -171,14 +171,14 @@ def growing_modes(
     found: dict[int, float] = {}
     for i in looked_at:
         part = np.abs(left[:, i] * right[:, i])
-        share = _summed(part, numbers)
+        share = _mode_shares(part, numbers)
         pole = np.log(values[i]) / loop.dt if loop.dt else values[i]
         for number in np.flatnonzero(share >= max(_TAKES_PART * share.max(), TINY)).tolist():
             found.setdefault(number, float(abs(pole.imag) / (2.0 * np.pi)))
     return tuple(found), tuple(found.values())
 
 
-def _numbers(states: Sequence[str], size: int) -> IntArray:
+def _mode_of_state(states: Sequence[str], size: int) -> IntArray:
     """Return the mode that each state belongs to, 0 for other states."""
     numbers = np.zeros(size, dtype=np.int64)
     for i, name in enumerate(states):
@@ -188,7 +188,7 @@ def _numbers(states: Sequence[str], size: int) -> IntArray:
     return numbers
 
 
-def _summed(part: FloatArray, numbers: IntArray) -> FloatArray:
+def _mode_shares(part: FloatArray, numbers: IntArray) -> FloatArray:
     share = np.bincount(numbers, weights=part)
     share[0] = 0.0
     return np.asarray(share)

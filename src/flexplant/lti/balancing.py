@@ -117,29 +117,29 @@ def balanced(
     g = as_statespace(sys)
     if (order is None) == (tol is None):
         raise ModelError("balanced needs either order= (states) or tol= (relative error bound).")
-    before, after = _weight(input_weight, g, "input"), _weight(output_weight, g, "output")
+    before, after = _as_weight(input_weight, g, "input"), _as_weight(output_weight, g, "output")
     split = split_stable(g)
     stable = split.stable
     Lp, Lq = _controllability(stable, before), _observability(stable, after)
     left, values, right = np.linalg.svd(Lq.T @ Lp)
     rank = int(np.sum(values > RANK * values[0])) if values.size and values[0] > 0 else 0
     n_kept = split.rest.n_states
-    r = min(_order(order, tol, values, n_kept), rank)
+    r = min(_reduced_order(order, tol, values, n_kept), rank)
     W = Lq @ left[:, :rank] / np.sqrt(values[:rank])
     T = Lp @ right[:rank].T / np.sqrt(values[:rank])
-    reduced = _reduced(stable, W, T, r, residual=match_dc)
+    reduced = _project(stable, W, T, r, residual=match_dc)
     if (problem := obstacle(reduced)) is not None:
         raise SolverError(
             f"the weighted reduction to {counted(r, 'stable state')} is {problem.reason}: with "
             "weights on both sides stability is not guaranteed. Take another order or one weight."
         )
-    error, freq = _error(stable, reduced, before, after)
+    error, freq = _error_norm(stable, reduced, before, after)
     weighted = before is not None or after is not None
     bound = float("nan") if weighted else 2.0 * float(np.sum(values[r:]))
     return BalancedReduction(_rejoined(g, split, reduced), values, bound, error, freq, n_kept)
 
 
-def _order(order: int | None, tol: float | None, values: FloatArray, n_kept: int) -> int:
+def _reduced_order(order: int | None, tol: float | None, values: FloatArray, n_kept: int) -> int:
     """Return the number of stable states."""
     if order is not None:
         r = int(order) - n_kept
@@ -154,7 +154,7 @@ def _order(order: int | None, tol: float | None, values: FloatArray, n_kept: int
     return int(np.argmax(tails <= limit))
 
 
-def _reduced(g: StateSpace, W: FloatArray, T: FloatArray, r: int, *, residual: bool) -> StateSpace:
+def _project(g: StateSpace, W: FloatArray, T: FloatArray, r: int, *, residual: bool) -> StateSpace:
     A, B, C, D = W.T @ g.A @ T, W.T @ g.B, g.C @ T, g.D
     if residual and r < A.shape[0]:
         # the discarded states at rest: 0 = A21 x1 + A22 x2 + B2 u (x2 = ... when sampled)
@@ -177,7 +177,7 @@ def _rejoined(g: StateSpace, split: Split, reduced: StateSpace) -> StateSpace:
     return both.replace(states=[*names, *kept], name=g.name)
 
 
-def _weight(weight: System | None, g: StateSpace, side: str) -> StateSpace | None:
+def _as_weight(weight: System | None, g: StateSpace, side: str) -> StateSpace | None:
     """Return a weight with its channels named so that it fits, or None."""
     if weight is None:
         return None
@@ -207,7 +207,7 @@ def _observability(g: StateSpace, after: StateSpace | None) -> FloatArray:
     return compressed(observability_factor(joined)[joined.n_states - g.n_states :])
 
 
-def _error(
+def _error_norm(
     g: StateSpace, reduced: StateSpace, before: StateSpace | None, after: StateSpace | None
 ) -> tuple[float, float]:
     difference = parallel(g, reduced.replace(C=-reduced.C, D=-reduced.D))

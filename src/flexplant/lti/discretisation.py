@@ -345,7 +345,7 @@ def bilinear_matrices(matrices: Matrices, a: float) -> Matrices:
 
 
 #: times half the rate: where even the lowest mode lies above this, the rate is in another unit
-_HOPELESS = 10.0
+_OTHER_UNIT = 10.0
 #: samples: a delay between 0 and this changes nothing that can be measured
 _NO_DELAY = 0.01
 #: samples: a delay beyond this is in another unit, of a loop, an actuator or a sensor
@@ -375,7 +375,7 @@ def check_rate(modes: FloatArray, rate: float, delay: float) -> None:
         f"half the sampling rate ({0.5 * rate:g} Hz): in its samples they look like slow ones. The "
         "rate is in Hz"
     )
-    if modes.min() > 0.5 * _HOPELESS * rate:
+    if modes.min() > 0.5 * _OTHER_UNIT * rate:
         raise ModelError(f"{said}{_meant(rate, float(modes.min()))}.")
     said = f"{said}, the model in SI units: are both?"
     warn(said)

@@ -121,7 +121,7 @@ def stein(A: FloatArray, Q: FloatArray) -> FloatArray:
 
 
 def powers(A: FloatArray) -> list[FloatArray]:
-    """Return A, A^2, A^4, ... until they vanish: for many Stein equations of one A (`summed`)."""
+    """Return A, A^2, A^4, ... until they vanish: for Stein equations of one A (`stein_sum`)."""
     found = [A]
     while not (size := np.linalg.norm(found[-1])) < _LAST:
         if len(found) > DOUBLINGS or not np.isfinite(size):
@@ -130,7 +130,7 @@ def powers(A: FloatArray) -> list[FloatArray]:
     return found
 
 
-def summed(
+def stein_sum(
     left: list[FloatArray], right: list[FloatArray], first: FloatArray, *, turned: bool = False
 ) -> FloatArray:
     """Return the sum of ``A^j first B'^j`` (``A'^j first B^j`` when turned) by doubling."""

@@ -125,12 +125,12 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     at = between(at, "at", 0.0, 0.5 * rate, "It is in Hz, below half the rate.", ends="[")
     if not g.n_states:
         return g.replace(dt=h)
-    wanted = _gain(g, 2j * np.pi * at, at)
+    wanted = _finite_gain(g, 2j * np.pi * at, at)
     zeros = np.exp(g.zeros() * h)
     poles = np.exp(g.poles() * h)
     zeros = np.concatenate([zeros, -np.ones(poles.size - zeros.size)])
     filtered = StateSpace(**zpk_fields(zeros, poles, 1.0, h), dt=h)
-    ratio = wanted / _gain(filtered, np.exp(2j * np.pi * at * h), at)
+    ratio = wanted / _finite_gain(filtered, np.exp(2j * np.pi * at * h), at)
     gain = abs(ratio) * (-1.0 if ratio.real < 0 else 1.0)
     return filtered.replace(
         C=gain * filtered.C,
@@ -142,7 +142,7 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     )
 
 
-def _gain(g: StateSpace, s: complex, at: float) -> complex:
+def _finite_gain(g: StateSpace, s: complex, at: float) -> complex:
     try:
         value = complex(g.evaluated(s)[0, 0])
     except ModelError:  # a pole
@@ -173,7 +173,7 @@ def second_order(b2: float, b1: float, b0: float, omega: float, zeta: float) -> 
     )
 
 
-def _number(gain: float) -> float:
+def _checked_gain(gain: float) -> float:
     return float(real_array(gain, "gain", ()))
 
 
@@ -205,7 +205,7 @@ def lowpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     >>> round(abs(fx.lowpass(100.0)(2j * 3.141592653589793 * 100.0)), 4)
     0.7071
     """
-    return _butterworth(freq, order, 0.0, _number(gain))
+    return _butterworth(freq, order, 0.0, _checked_gain(gain))
 
 
 def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
@@ -237,7 +237,7 @@ def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     >>> round(abs(high(2j * np.pi * 10.0)), 4), round(abs(high(0.0)), 4)
     (0.7071, 0.0)
     """
-    return _butterworth(freq, order, _number(gain), 0.0)
+    return _butterworth(freq, order, _checked_gain(gain), 0.0)
 
 
 def _butterworth(freq: float, order: int, high: float, low: float) -> StateSpace:
@@ -311,7 +311,7 @@ def leadlag(zero: float, pole: float, *, gain: float = 1.0) -> StateSpace:
     >>> round(float(np.angle(lead(2j * np.pi * 30.0), deg=True)), 1)
     53.1
     """
-    ratio, gain = positive(pole, "pole") / positive(zero, "zero"), _number(gain)
+    ratio, gain = positive(pole, "pole") / positive(zero, "zero"), _checked_gain(gain)
     return first_order(gain * ratio, gain, 2.0 * np.pi * pole)
 
 

@@ -77,8 +77,8 @@ def _operand(given: Any, frf: Any) -> Operand:
     own: Any = given
     if own.freq.shape != frf.freq.shape or not np.allclose(own.freq, frf.freq, rtol=SAME, atol=0.0):
         raise ShapeError(
-            f"responses are combined line by line, but one has {_lines(frf)} and the other "
-            f"{_lines(own)}. Compute or measure both at the same frequencies."
+            f"responses are combined line by line, but one has {_line_range(frf)} and the other "
+            f"{_line_range(own)}. Compute or measure both at the same frequencies."
         )
     parts = (own.data, own.variance, own.inputs, own.outputs, own.channel_units, own.quantity)
     return Operand(*parts)
@@ -91,7 +91,7 @@ def _multiple(frf: Any, factor: complex) -> Any:
     return frf.replace(data=factor * frf.data, variance=variance)
 
 
-def _product(frf: Any, one: Operand, two: Operand) -> Any:
+def _matrix_product(frf: Any, one: Operand, two: Operand) -> Any:
     """Return the product of two matrices of responses, line by line."""
     if len(one.inputs) != len(two.outputs):
         raise ShapeError(
@@ -103,7 +103,7 @@ def _product(frf: Any, one: Operand, two: Operand) -> Any:
     def product(a: Any, b: Any) -> Any:
         return None if a is None or b is None else np.einsum("ijf,jkf->ikf", a, b)
 
-    variance = _sum(
+    variance = _optional_sum(
         product(one.variance, np.abs(two.data) ** 2), product(np.abs(one.data) ** 2, two.variance)
     )
     units = {name: two.units[name] for name in two.inputs if name in two.units}
@@ -120,7 +120,7 @@ def _computed(frf: Any, data: ComplexArray, variance: FloatArray | None, **field
     return frf.replace(data=data, variance=variance, overlap=0.0, **dict.fromkeys(lost), **fields)
 
 
-def _sum(a: FloatArray | None, b: FloatArray | None) -> FloatArray | None:
+def _optional_sum(a: FloatArray | None, b: FloatArray | None) -> FloatArray | None:
     return b if a is None else a if b is None else a + b
 
 
@@ -128,7 +128,7 @@ def _sides(one: Operand) -> str:
     return f"{short_list(one.inputs)} -> {short_list(one.outputs)}"
 
 
-def _lines(frf: Any) -> str:
+def _line_range(frf: Any) -> str:
     span = f" from {frf.freq[0]:.4g} to {frf.freq[-1]:.4g} Hz" if frf.freq.size else ""
     return f"{counted(frf.freq.size, 'line')}{span}"
 
@@ -319,7 +319,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
                 f"a sum needs the same channels, got {_sides(one)} and {_sides(two)}. Select or "
                 "rename them first."
             )
-        variance = _sum(one.variance, two.variance)
+        variance = _optional_sum(one.variance, two.variance)
         quantity = one.quantity if two.quantity in (None, one.quantity) else None
         return _computed(self, one.data + two.data, variance, quantity=quantity)
 
@@ -337,13 +337,13 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         """Return ``G1 G2``, the second one's outputs driving this one's inputs; or a multiple."""
         if isinstance(other, _NUMBERS):
             return _multiple(self, complex(other))
-        return _product(self, _operand(self, self), _operand(other, self))
+        return _matrix_product(self, _operand(self, self), _operand(other, self))
 
     def __rmul__(self, other: Any) -> Any:
         """Return a multiple, or the product of a system before this one."""
         if isinstance(other, _NUMBERS):
             return _multiple(self, complex(other))
-        return _product(self, _operand(other, self), _operand(self, self))
+        return _matrix_product(self, _operand(other, self), _operand(self, self))
 
     def __truediv__(self, other: Any) -> Any:
         """Return the responses divided by a number, or by a response of one channel."""

@@ -95,15 +95,15 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     grid = grid[(grid >= low) & (grid <= high)]
     if grid.size > points:
         grid = grid[np.round(np.linspace(0, grid.size - 1, points)).astype(int)]
-    return _refined(g, grid, points, tolerance, np.array(sorted(undamped)))
+    return _halve_intervals(g, grid, points, tolerance, np.array(sorted(undamped)))
 
 
-def _refined(
+def _halve_intervals(
     g: StateSpace, grid: FloatArray, points: int, tolerance: float, gaps: FloatArray
 ) -> FloatArray:
     """Halve intervals until the middle of each is as its ends say, those over gaps left alone."""
     find = responder(g)
-    values = _seen(find(grid))
+    values = _log_channels(find(grid))
     left = np.arange(grid.size - 1)  # intervals [left, right] that are not settled, by their ends
     right = left + 1
     whole = np.searchsorted(gaps, grid[left]) == np.searchsorted(gaps, grid[right])
@@ -114,8 +114,8 @@ def _refined(
         left, right, middle = left[open_], right[open_], middle[open_]
         if not middle.size:
             break
-        there = _seen(find(middle))
-        wrong = _wrong(values[:, left], there, values[:, right])
+        there = _log_channels(find(middle))
+        wrong = _line_error(values[:, left], there, values[:, right])
         worst = np.argsort(wrong)[::-1][: points - grid.size]
         worst = worst[wrong[worst] > tolerance]
         fresh = grid.size + np.arange(worst.size)
@@ -128,7 +128,7 @@ def _refined(
     return np.sort(grid)
 
 
-def _seen(data: ComplexArray) -> ComplexArray:
+def _log_channels(data: ComplexArray) -> ComplexArray:
     """Return log H (n_channel, n_freq), what is negligible beside its row and column flattened."""
     size = np.abs(data)
     scale = np.sqrt(size.max(axis=1, keepdims=True) * size.max(axis=0, keepdims=True))
@@ -137,15 +137,15 @@ def _seen(data: ComplexArray) -> ComplexArray:
     return np.asarray(np.log(shown).reshape(-1, data.shape[2]))
 
 
-def _wrong(left: ComplexArray, middle: ComplexArray, right: ComplexArray) -> FloatArray:
+def _line_error(left: ComplexArray, middle: ComplexArray, right: ComplexArray) -> FloatArray:
     """Return how wrong a line from left to right is in the middle, the worst channel of each."""
     bent = np.abs(middle.real - 0.5 * (left.real + right.real))
-    turned = np.maximum(_turn(left, middle), _turn(middle, right))
+    turned = np.maximum(_phase_step(left, middle), _phase_step(middle, right))
     bent = np.where(turned > TURN, np.maximum(bent, turned), bent)
     return np.asarray(bent.max(axis=0, initial=0.0))
 
 
-def _turn(a: ComplexArray, b: ComplexArray) -> FloatArray:
+def _phase_step(a: ComplexArray, b: ComplexArray) -> FloatArray:
     step = np.abs(b.imag - a.imag)
     return np.asarray(np.minimum(step, 2 * np.pi - step))
 
@@ -190,7 +190,7 @@ def _between(grid: FloatArray, tops: IntArray, parts: int = 8) -> FloatArray:
     return np.setdiff1d((left[:, None] + (right - left)[:, None] * share).ravel(), grid)
 
 
-def climbed(
+def climbed_grid(
     find: Callable[[FloatArray], FloatArray], grid: FloatArray, rounds: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return frequencies and values of a function of them, refined where it is highest."""
@@ -241,7 +241,7 @@ def _vertex(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return inside, np.asarray(0.5 * slope * way)
 
 
-def gains(H: ComplexArray) -> FloatArray:
+def largest_gains(H: ComplexArray) -> FloatArray:
     """Return the largest singular values of responses (p, m, n): lower bounds off the peak."""
     # between the Frobenius norm over the root of the rank and the Frobenius norm: few need an SVD
     size, root = np.sqrt(np.sum(H.real**2 + H.imag**2, axis=(0, 1))), np.sqrt(min(H.shape[:2]))

@@ -12,7 +12,7 @@ from ..checks import ComplexArray, FloatArray, inner_names, instance, name_list,
 from ..errors import LabelError, ModelError, ShapeError, require_known
 from ..tolerances import ROUNDING
 from .equations import balanced_matrix
-from .joining import Matrices, common_dt, common_fields, joined_units, stacked, state_names
+from .joining import Matrices, block_matrix, common_dt, common_fields, joined_units, state_names
 from .statespace import StateSpace, System, as_statespace
 
 
@@ -42,10 +42,10 @@ def append(*systems: System) -> StateSpace:
     """
     parts = [as_statespace(sys) for sys in systems]
     return StateSpace(
-        stacked([p.A for p in parts]),
-        stacked([p.B for p in parts]),
-        stacked([p.C for p in parts]),
-        stacked([p.D for p in parts]),
+        block_matrix([p.A for p in parts]),
+        block_matrix([p.B for p in parts]),
+        block_matrix([p.C for p in parts]),
+        block_matrix([p.D for p in parts]),
         inputs=[name for p in parts for name in p.inputs],
         outputs=[name for p in parts for name in p.outputs],
         **common_fields(parts),
@@ -323,7 +323,7 @@ def connect(
         np.array([[float(a == b) for b in fro] for a in to]).reshape(len(to), len(fro))
         for to, fro in ((needed, produced), (needed, outer), (outputs, produced), (outputs, outer))
     )
-    A, B, C, D = (stacked([getattr(p, part) for p in parts]) for part in "ABCD")
+    A, B, C, D = (block_matrix([getattr(p, part) for p in parts]) for part in "ABCD")
     # block outputs v = C x + D e with e = route v + enter w  =>  v = X (C x + D enter w)
     X = _well_posed(D @ route)
     v_x, v_w = X @ C, X @ D @ enter

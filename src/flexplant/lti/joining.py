@@ -61,7 +61,7 @@ def in_parallel(g1: Any, g2: Any) -> dict[str, Any]:
             "first."
         )
     return {
-        "A": stacked([g1.A, g2.A]),
+        "A": block_matrix([g1.A, g2.A]),
         "B": np.vstack([g1.B, g2.B]),
         "C": np.hstack([g1.C, g2.C]),
         "D": g1.D + g2.D,
@@ -86,7 +86,7 @@ def joined_units(parts: Sequence[Any]) -> dict[str, str]:
     return {name: unit for part in reversed(parts) for name, unit in part.units.items()}
 
 
-def stacked(matrices: Sequence[FloatArray]) -> FloatArray:
+def block_matrix(matrices: Sequence[FloatArray]) -> FloatArray:
     """Block diagonal that keeps the widths of empty matrices (scipy's drops them)."""
     out = np.zeros((sum(m.shape[0] for m in matrices), sum(m.shape[1] for m in matrices)))
     row = col = 0

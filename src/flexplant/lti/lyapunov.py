@@ -64,7 +64,7 @@ def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     >>> fx.lti.solve_stein([[0.5]], [[3.0]]).round(9)  # x = x / 4 + 3
     array([[4.]])
     """
-    A, Q = _square(A, Q)
+    A, Q = _square_pair(A, Q)
     if not A.size:
         return Q
     d = scale_of(accumulated(A, Q))
@@ -105,7 +105,7 @@ def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     >>> fx.lti.solve_lyapunov([[-2.0]], [[4.0]]).round(9)  # -2 x - 2 x + 4 = 0
     array([[1.]])
     """
-    A, Q = _square(A, Q)
+    A, Q = _square_pair(A, Q)
     if not A.size:
         return Q
     # A alone: a chain of lags is solved to 1e-16 in the units that make it even, to 1e-11 beside Q
@@ -117,7 +117,7 @@ def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     return X * d * d[:, None]
 
 
-def _square(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _square_pair(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
     A = real_array(A, "A", (None, None))
     return real_array(A, "A", (A.shape[0], A.shape[0])), symmetric(Q, "Q", A.shape[0])
 
@@ -273,14 +273,14 @@ def _check(residual: float, equation: str) -> None:
 def controllability_factor(g: StateSpace) -> FloatArray:
     """Return L (n, n) with ``P = L L'``, the controllability Gramian of a stable system."""
     d = state_scale(g.A, g.B, g.C)
-    return d[:, None] * _factor(*_continuous(g.A * d / d[:, None], g.B / d[:, None], g.dt))
+    return d[:, None] * _hammarling(*_bilinear(g.A * d / d[:, None], g.B / d[:, None], g.dt))
 
 
 def observability_factor(g: StateSpace) -> FloatArray:
     """Return L (n, n) with ``Q = L L'``, the observability Gramian of a stable system."""
     d = state_scale(g.A, g.B, g.C)
     scaled = (g.A * d / d[:, None]).T
-    return _factor(*_continuous(scaled, (g.C * d).T, g.dt)) / d[:, None]
+    return _hammarling(*_bilinear(scaled, (g.C * d).T, g.dt)) / d[:, None]
 
 
 def compressed(L: FloatArray) -> FloatArray:
@@ -290,7 +290,7 @@ def compressed(L: FloatArray) -> FloatArray:
     return np.asarray(la.qr(L.T, mode="r")[0][: L.shape[0]].T)
 
 
-def _continuous(A: FloatArray, B: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+def _bilinear(A: FloatArray, B: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
     """Map ``P = A P A' + B B'`` to a Lyapunov equation with the same P (bilinear map)."""
     if not dt:
         return A, B
@@ -298,7 +298,7 @@ def _continuous(A: FloatArray, B: FloatArray, dt: float) -> tuple[FloatArray, Fl
     return inverse @ (A - np.eye(A.shape[0])), np.sqrt(2.0) * inverse @ B
 
 
-def _factor(A: FloatArray, B: FloatArray) -> FloatArray:
+def _hammarling(A: FloatArray, B: FloatArray) -> FloatArray:
     """Solve ``A L L' + L L' A' + B B' = 0`` for L column by column of the Schur form.
 
     Hammarling's method: P is never formed, so that its small eigenvalues keep their digits. With S

@@ -75,7 +75,7 @@ def line_correlation(
     for apart in range(1, min(n, FARTHEST)):
         distance = np.round((freq[apart:] - freq[:-apart]) / resolution, 6)
         values, places = np.unique(distance, return_inverse=True)
-        shares = _correlation(values, checked_window(window), overlap)[places]
+        shares = _window_overlap(values, checked_window(window), overlap)[places]
         if values.size and values.min() > FARTHEST:
             break
         if np.any(shares > LEAST):
@@ -85,7 +85,7 @@ def line_correlation(
     return sp.csr_array(sp.diags_array(diagonals, offsets=offsets, shape=(n, n)))
 
 
-def _correlation(distance: FloatArray, window: Any, overlap: float) -> FloatArray:
+def _window_overlap(distance: FloatArray, window: Any, overlap: float) -> FloatArray:
     from scipy.signal import get_window
 
     w = np.asarray(get_window(window, SAMPLES), dtype=np.float64)
@@ -120,12 +120,12 @@ def between_lines(
     # in two
     last = lines.size - 3
     i = np.searchsorted(lines, freq, side="right") - 1
-    below = _through(lines, data, np.clip(i - 1, 0, last), freq)
-    above = _through(lines, data, np.clip(i, 0, last), freq)
+    below = _circle_values(lines, data, np.clip(i - 1, 0, last), freq)
+    above = _circle_values(lines, data, np.clip(i, 0, last), freq)
     return 0.5 * (below + above), np.asarray(np.abs(below - above))
 
 
-def followed(lines: FloatArray, data: ComplexArray, freq: FloatArray) -> ComplexArray:
+def on_lines(lines: FloatArray, data: ComplexArray, freq: FloatArray) -> ComplexArray:
     """Return responses (..., k) at frequencies within the lines: as given on them, else between."""
     place = np.minimum(np.searchsorted(lines, freq), lines.size - 1)
     found = np.asarray(data[..., place], dtype=np.complex128)
@@ -181,7 +181,7 @@ def _circle(
     return slope + c * (g2 - g1), c
 
 
-def _through(
+def _circle_values(
     lines: FloatArray, data: ComplexArray, first: IntArray, freq: FloatArray
 ) -> ComplexArray:
     a, c = _circle(lines, data, first)
@@ -261,10 +261,10 @@ def hidden_modes(freq: FloatArray, plant: ComplexArray, controller: ComplexArray
                 np.abs(p - q) * tail / (np.maximum(np.abs(p), 0.5 * wide) * np.abs(beside))
                 for q, _, tail in fits
             ]
-    return _judged(freq, F, np.array(poles), np.array(moves), np.max(others, axis=0))
+    return _hidden_modes(freq, F, np.array(poles), np.array(moves), np.max(others, axis=0))
 
 
-def _judged(
+def _hidden_modes(
     freq: FloatArray, F: ComplexArray, p: ComplexArray, d: ComplexArray, other: FloatArray
 ) -> HiddenModes:
     """Return what fits (k, n - 1) say: poles p from the middle of each interval, moved by d."""
@@ -272,11 +272,11 @@ def _judged(
     step, least = np.angle(F[1:] / F[:-1]), _LEAST * middle
     acts = (np.abs(p.real) <= (0.5 + _ASIDE) * wide) & (np.abs(d) > least)
     there, size = acts.any(axis=0), np.abs(d)
-    error = _SAFETY * _spread(p)
+    error = _SAFETY * _box_size(p)
     width, needed = p.imag, -d.imag
-    alike = (error < _FOUND * wide) & (_spread(d) < _ALIKE * size.max(axis=0))
+    alike = (error < _FOUND * wide) & (_box_size(d) < _ALIKE * size.max(axis=0))
     found = there & alike & (width.min(axis=0) > -error)
-    turn = _turn(p + d, wide) - _turn(p, wide)
+    turn = _phase_change(p + d, wide) - _phase_change(p, wide)
     turns = np.round((turn - step) / (2.0 * np.pi))
     followed = np.abs(turn - step - 2.0 * np.pi * turns).max(axis=0) < _STEP
     followed &= turns.max(axis=0) == turns.min(axis=0)
@@ -304,11 +304,11 @@ def _judged(
     )
 
 
-def _spread(values: ComplexArray) -> FloatArray:
+def _box_size(values: ComplexArray) -> FloatArray:
     """Return the size of the box that holds all fits."""
     return np.asarray(np.hypot(np.ptp(values.real, axis=0), np.ptp(values.imag, axis=0)))
 
 
-def _turn(at: ComplexArray, wide: FloatArray) -> FloatArray:
+def _phase_change(at: ComplexArray, wide: FloatArray) -> FloatArray:
     """Return the change of the argument of ``f - at`` over an interval."""
     return np.asarray(np.angle(0.5 * wide - at) - np.angle(-0.5 * wide - at))

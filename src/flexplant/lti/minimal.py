@@ -12,7 +12,7 @@ from scipy.sparse import csgraph
 from ..checks import ComplexArray, FloatArray, between
 from ..tolerances import TINY
 from .equations import reciprocal, state_scale
-from .joining import is_block_diagonal, joined_blocks, stacked
+from .joining import block_matrix, is_block_diagonal, joined_blocks
 from .lyapunov import controllability_factor, observability_factor
 from .modal import modal_form, part_of, split_stable
 from .norms import DOUBLE, eigenvalues_with_error
@@ -85,7 +85,7 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     tol = between(tol, "tol", 0.0, 1.0, "Try 1e-9.")
     if not g.n_states:
         return g
-    groups = _groups(g)
+    groups = _pole_groups(g)
     kept = [_Group(_less(group.part, tol), group.omega) for group in _visible(groups, g.dt, tol)]
     kept = [group for group in kept if group.part.n_states]
     n = sum(group.part.n_states for group in kept)
@@ -93,7 +93,7 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
         return g
     parts = [group.part for group in kept]
     found = g.replace(
-        A=stacked([part.A for part in parts]),
+        A=block_matrix([part.A for part in parts]),
         B=np.vstack([g.B[:0], *(part.B for part in parts)]),
         C=np.hstack([g.C[:, :0], *(part.C for part in parts)]),
         states=[f"x{i}" for i in range(1, n + 1)],
@@ -110,7 +110,7 @@ class _Group:
     omega: FloatArray  # [rad/s], 0 for a rigid-body mode or an integrator
 
 
-def _groups(g: StateSpace) -> list[_Group]:
+def _pole_groups(g: StateSpace) -> list[_Group]:
     """Return the system, but for its feedthrough, as a sum of groups of modes of equal poles."""
     if not is_block_diagonal(g):
         return _dense_groups(g)
@@ -283,15 +283,15 @@ def _stabilised(g: StateSpace) -> StateSpace:
         if radius < 1 and g.is_stable:
             return g
         # at most to a decay within five samples
-        speed = min(_speed(g, g.A - radius * eye), 0.2)
+        speed = min(_matrix_size(g, g.A - radius * eye), 0.2)
         return g.replace(A=g.A / (radius + (speed or 0.2)))
     growth = float(poles.real.max())
     if growth < 0:
         return g
-    return g.replace(A=g.A - (growth + (_speed(g, g.A) or 1.0)) * eye)
+    return g.replace(A=g.A - (growth + (_matrix_size(g, g.A) or 1.0)) * eye)
 
 
-def _speed(g: StateSpace, A: FloatArray) -> float:
+def _matrix_size(g: StateSpace, A: FloatArray) -> float:
     """Return the size of A of a system in even units of its states, a root mean square."""
     d = state_scale(A, g.B, g.C)
     return float(np.linalg.norm(A * d / d[:, None]) / np.sqrt(g.n_states))

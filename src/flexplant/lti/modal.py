@@ -115,7 +115,7 @@ def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
         return ModalForm(g, np.eye(n), condition, residual, reason)
     B = np.asarray(np.linalg.solve(V, g.B / d[:, None]), dtype=np.float64)
     C = np.asarray((g.C * d) @ V, dtype=np.float64)
-    scale = _even(B, C, blocks)
+    scale = _balance(B, C, blocks)
     size = scale[:, None]
     names = [
         f"mode{i}:{part}" if size > 1 else f"mode{i}"
@@ -147,7 +147,7 @@ def _basis(A: FloatArray, centre: float) -> tuple[FloatArray, FloatArray, list[i
         twin = _parallel(int(k), values, vectors, done)
         if twin is not None:
             done[twin] = True
-            columns.append(_plane(A, values, [int(k), twin]))
+            columns.append(_invariant_plane(A, values, [int(k), twin]))
             parts.append(columns[-1].T @ A @ columns[-1])
             continue
         if not pole.imag:
@@ -177,7 +177,7 @@ def _parallel(
     return twin if sine[twin] < _PARALLEL else None
 
 
-def _plane(A: FloatArray, values: ComplexArray, two: list[int]) -> FloatArray:
+def _invariant_plane(A: FloatArray, values: ComplexArray, two: list[int]) -> FloatArray:
     """Return an orthonormal basis (n, 2) of the invariant plane of two poles (Schur)."""
     rest = np.delete(values, two)
 
@@ -206,7 +206,7 @@ def _chains(N: FloatArray, count: int) -> tuple[FloatArray, FloatArray] | None:
     return pairs, speed[:half]
 
 
-def _even(B: FloatArray, C: FloatArray, blocks: list[int]) -> FloatArray:
+def _balance(B: FloatArray, C: FloatArray, blocks: list[int]) -> FloatArray:
     """Return the size of each block's states that makes B and C equally large, powers of two."""
     owner = np.repeat(np.arange(len(blocks)), blocks)
     drive = np.sqrt(np.bincount(owner, weights=np.sum(B**2, axis=1)))

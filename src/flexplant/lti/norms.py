@@ -13,7 +13,7 @@ from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
 from .discretisation import bilinear_matrices
 from .equations import balanced_matrix, even_scale, state_scale
-from .frequency_sweep import SOUGHT, gains, highest, resonance_grid
+from .frequency_sweep import SOUGHT, highest, largest_gains, resonance_grid
 from .lyapunov import controllability_gramian, observability_gramian
 from .peaks import Residues, proved_peak, residues
 from .responses import points, responder
@@ -106,7 +106,7 @@ def peak_gain(sys: System, *, progress: bool | None = None) -> tuple[float, floa
     (50.003, 0.1591)
     """
     with Progress(LEVELS, "levels of the norm", progress=progress) as bar:
-        return _peak(as_statespace(sys), bar)
+        return _peak_gain(as_statespace(sys), bar)
 
 
 def linf_norm(sys: System) -> float:
@@ -143,11 +143,11 @@ def linf_norm(sys: System) -> float:
 
 def axis_peak(g: StateSpace) -> tuple[float, float]:
     """Return the largest gain on the frequency axis and its frequency [Hz], stable or not."""
-    return _peak(g, Progress(0, "", progress=False), axis_only=True)
+    return _peak_gain(g, Progress(0, "", progress=False), axis_only=True)
 
 
 @one_thread()
-def _peak(g: StateSpace, bar: Progress, axis_only: bool = False) -> tuple[float, float]:
+def _peak_gain(g: StateSpace, bar: Progress, axis_only: bool = False) -> tuple[float, float]:
     """Return gain and frequency [Hz], infinite with a pole on the axis (or beyond it)."""
     if not g.D.size or not g.n_states:
         return float(np.linalg.norm(g.D, 2)) if g.D.size else 0.0, 0.0
@@ -167,11 +167,11 @@ def _proved(g: StateSpace, model: Residues | None) -> tuple[float, float] | None
         return None
     omega = found[1]
     freq = float(np.arctan(omega) / (np.pi * g.dt) if g.dt else omega / (2.0 * np.pi))
-    gain = _gain(g, freq)
+    gain = _gain_at(g, freq)
     return (gain, freq) if abs(found[0] - gain) <= AGREEMENT * gain else None
 
 
-def _gain(g: StateSpace, freq: float) -> float:
+def _gain_at(g: StateSpace, freq: float) -> float:
     """Return the largest singular value at a frequency [Hz]."""
     if g.blocks is not None:
         return float(np.linalg.norm(responder(g)(np.array([freq]))[:, :, 0], 2))
@@ -348,9 +348,9 @@ def level_set_peak(g: StateSpace, tolerance: float, bar: Progress) -> tuple[floa
     respond = responder(g)
 
     def find(freq: FloatArray) -> FloatArray:
-        return gains(respond(freq))
+        return largest_gains(respond(freq))
 
-    gain, freq = _searched(g, find, top)
+    gain, freq = _swept_peak(g, find, top)
     if not gain:
         return 0.0, 0.0
     level = _Level(g)
@@ -373,7 +373,7 @@ def level_set_peak(g: StateSpace, tolerance: float, bar: Progress) -> tuple[floa
     )
 
 
-def _searched(
+def _swept_peak(
     g: StateSpace, find: Callable[[FloatArray], FloatArray], top: float
 ) -> tuple[float, float]:
     """Return the largest gain that a sweep finds, that of the feedthrough too, and where [Hz]."""

@@ -49,7 +49,7 @@ def proved_peak(model: Residues, tolerance: float) -> tuple[float, float] | None
     best = np.argsort(size)[: -PEAKS - 1 : -1]
     start = start[best[size[best] >= PART * size[best[0]]]]
     for _ in range(STEPS):
-        omega, gain, zone = peaks = climbed(model, start, tolerance)
+        omega, gain, zone = peaks = newton_maxima(model, start, tolerance)
         highest = int(np.argmax(gain))
         if not zone[highest] > 0.0:
             return None
@@ -100,7 +100,7 @@ def _expansion(model: Residues, omega: FloatArray) -> _Expansion:
     return _Expansion(sizes**2, A1, A2, T)
 
 
-def climbed(model: Residues, start: FloatArray, tolerance: float) -> Peaks:
+def newton_maxima(model: Residues, start: FloatArray, tolerance: float) -> Peaks:
     """Return where Newton's steps lead from frequencies to maxima of the largest gain."""
     omega = start
     for _ in range(STEPS):
@@ -114,10 +114,10 @@ def climbed(model: Residues, start: FloatArray, tolerance: float) -> Peaks:
             break
         keep = height >= PART * height.max()
         omega = np.abs(omega + move)[keep]
-    return Peaks(omega, np.sqrt(height), _zones(model, omega, near, one, tolerance))
+    return Peaks(omega, np.sqrt(height), _zone_radii(model, omega, near, one, tolerance))
 
 
-def _zones(
+def _zone_radii(
     model: Residues, omega: FloatArray, near: FloatArray, one: _Expansion, tolerance: float
 ) -> FloatArray:
     """Return the radius around each frequency within which no gain is higher than there.
@@ -155,7 +155,7 @@ def exceeding(model: Residues, level: float, peaks: Peaks) -> FloatArray | None:
     through = float(np.linalg.norm(model.through, 2))
     if not level > through * (1.0 + CLEAR):
         return None
-    centre, radius = _outside(model, level - through, peaks)
+    centre, radius = _intervals_left(model, level - through, peaks)
     left = 100 + model.poles.size**2 // 10
     step = max(1, CHUNK // max(model.poles.size, model.through.size))
     while centre.size:
@@ -178,7 +178,7 @@ def exceeding(model: Residues, level: float, peaks: Peaks) -> FloatArray | None:
     return np.zeros(0)
 
 
-def _outside(model: Residues, room: float, peaks: Peaks) -> tuple[FloatArray, FloatArray]:
+def _intervals_left(model: Residues, room: float, peaks: Peaks) -> tuple[FloatArray, FloatArray]:
     """Return centres and radii of intervals outside the peaks' zones, from zero to an end."""
     # beyond the end |G - D| <= sum 2 |R_i| / (omega - |p_i|) is less than what the level leaves
     # room for

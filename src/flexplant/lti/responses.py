@@ -112,7 +112,7 @@ def _solver(g: Part) -> tuple[Solver, int, int]:
     if g.blocks is None or not set(g.blocks) <= {1, 2}:
         return dense_solver(g)
     n, m = g.B.shape
-    pairs, slots, coupling = _paired(g)
+    pairs, slots, coupling = _diagonal_blocks(g)
     tied = np.flatnonzero(np.any(coupling, axis=0))
     head = int(slots[np.isin(slots, tied).any(axis=1), 0].min(initial=n))  # before: decoupled
     modal = max(MODAL_CHUNK, 64 * n), PARTS
@@ -124,7 +124,7 @@ def _solver(g: Part) -> tuple[Solver, int, int]:
     return _substitution(g, pairs, slots, coupling), CHUNK // (m + 2), 1
 
 
-def _paired(g: StateSpace | Part) -> tuple[FloatArray, IntArray, FloatArray]:
+def _diagonal_blocks(g: StateSpace | Part) -> tuple[FloatArray, IntArray, FloatArray]:
     """Return the diagonal blocks as (b, 2, 2), the states of each (b, 2; -1 none), and the rest."""
     sizes = np.asarray(g.blocks)
     starts = np.cumsum(sizes) - sizes
@@ -156,11 +156,11 @@ def modal_pairs(g: StateSpace) -> ModalPairs | None:
     """Return the blocks of a block-diagonal A, None for another."""
     if g.blocks is None or not set(g.blocks) <= {1, 2}:
         return None
-    pairs, slots, coupling = _paired(g)
-    return None if np.any(coupling) else _halved(g, pairs, slots)
+    pairs, slots, coupling = _diagonal_blocks(g)
+    return None if np.any(coupling) else _modal_pairs(g, pairs, slots)
 
 
-def _halved(g: StateSpace | Part, pairs: FloatArray, slots: IntArray) -> ModalPairs:
+def _modal_pairs(g: StateSpace | Part, pairs: FloatArray, slots: IntArray) -> ModalPairs:
     real, pairs = slots >= 0, pairs.copy()
     pairs[~real[:, 1], 1, 1] = pairs[~real[:, 1], 0, 0]
     mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
@@ -179,12 +179,12 @@ def _modal(g: Part, pairs: FloatArray, slots: IntArray) -> Solver:
     which matters for slow modes of a sampled system. Complex numbers are pairs of real columns, so
     that no complex product is formed.
     """
-    mean, N, q, B, C = _halved(g, pairs, slots)
+    mean, N, q, B, C = _modal_pairs(g, pairs, slots)
     split, swing = np.sqrt(np.maximum(q, 0.0)), np.sqrt(np.maximum(-q, 0.0))
     channels = len(g.C) * g.B.shape[1]
     with_s = np.einsum("bip,bim->pmb", C, B).reshape(channels, -1)
     without = np.einsum("bip,bij,bjm->pmb", C, N, B, optimize=True).reshape(channels, -1)
-    moving, fixed = _chosen(with_s), _chosen(without)
+    moving, fixed = _nonzero_columns(with_s), _nonzero_columns(without)
     residues = np.hstack([with_s[:, moving], without[:, fixed]])
     n_moving = with_s[:, moving].shape[1]
     # functions below this, times the residues, cannot overflow
@@ -217,7 +217,7 @@ def _modal(g: Part, pairs: FloatArray, slots: IntArray) -> Solver:
     return add
 
 
-def _chosen(residues: FloatArray) -> npt.NDArray[np.bool_] | slice:
+def _nonzero_columns(residues: FloatArray) -> npt.NDArray[np.bool_] | slice:
     """Return which columns are not zero; all of them as a slice, which copies nothing."""
     some = np.any(residues, axis=0)
     return slice(None) if some.all() else some
@@ -237,7 +237,7 @@ def _fed_by_lines(g: Part, head: int, pairs: FloatArray, slots: IntArray) -> Sol
     driven = _modal(Part(g.A[:head, :head], inputs, g.C[:, :head], g.dt), pairs, slots)
     rest = list(g.blocks or ())[len(slots) :]
     lines = Part(g.A[head:, head:], g.B[head:], np.eye(n - head), g.dt, rest)
-    tail, reached = _substitution(lines, *_paired(lines)), _reached(lines.A, lines.B)
+    tail, reached = _substitution(lines, *_diagonal_blocks(lines)), _reachable(lines.A, lines.B)
     seen = np.flatnonzero(np.any(g.C[:, head:], axis=0))
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
@@ -257,7 +257,7 @@ def _fed_by_lines(g: Part, head: int, pairs: FloatArray, slots: IntArray) -> Sol
     return add
 
 
-def _reached(A: FloatArray, B: FloatArray) -> npt.NDArray[np.bool_]:
+def _reachable(A: FloatArray, B: FloatArray) -> npt.NDArray[np.bool_]:
     """Return which states (n, m) each input can move at all."""
     now = B != 0
     for _ in range(A.shape[0]):
@@ -370,7 +370,7 @@ def dense_solver(g: Part) -> tuple[Solver, int, int]:
         if any(C.size * B.size for C, B in zip(Cs, Bs, strict=True)):
             gains = _by_poles(A, Bs, Cs)
             if gains is None:
-                gains, sizes = _by_schur(A, Bs, Cs), (CHUNK // (g.B.shape[1] + 2), 1)
+                gains, sizes = _schur_gains(A, Bs, Cs), (CHUNK // (g.B.shape[1] + 2), 1)
             solvers.append((gains, list(zip(seen, fed, strict=True))))
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
@@ -438,7 +438,7 @@ def _by_poles(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _Gai
     return gains
 
 
-def _by_schur(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _Gains:
+def _schur_gains(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _Gains:
     """Back substitution with the Schur form in even units."""
     B, C = np.hstack(Bs), np.vstack(Cs)
     d, T, U = scaled_schur(A, B, C)

@@ -127,7 +127,7 @@ def solve_dare(
     >>> print(f"{solve_dare(one, one, Q=one, R=one).P[0, 0]:.12f}")  # the golden ratio
     1.618033988750
     """
-    return _solved(_problem(A, C, Q, R, S, discrete=True))
+    return _solve_riccati(_riccati_problem(A, C, Q, R, S, discrete=True))
 
 
 def solve_care(
@@ -169,7 +169,7 @@ def solve_care(
     >>> found.P.round(9), found.poles.real.round(9)  # p^2 = 4
     (array([[2.]]), array([-2.]))
     """
-    return _solved(_problem(A, C, Q, R, S, discrete=False))
+    return _solve_riccati(_riccati_problem(A, C, Q, R, S, discrete=False))
 
 
 def control_dare(
@@ -268,7 +268,7 @@ def _dual(
     return solution.replace(gain=solution.gain.T)
 
 
-def _problem(
+def _riccati_problem(
     A: FloatArray,
     C: FloatArray,
     Q: FloatArray,
@@ -356,7 +356,7 @@ def _slow(p: RiccatiProblem, poles: ComplexArray) -> bool:
     return bool(np.max(_growth(p, poles)) > -SLOW * size)
 
 
-def _gain(p: RiccatiProblem, P: FloatArray) -> FloatArray:
+def _riccati_gain(p: RiccatiProblem, P: FloatArray) -> FloatArray:
     """Return the gain K (n, p) that belongs to P."""
     if not p.discrete:
         return np.asarray(P @ p.C.T * p.J)
@@ -377,7 +377,7 @@ def _residual(p: RiccatiProblem, P: FloatArray, K: FloatArray) -> tuple[FloatArr
     return residual, relative(residual, float(np.linalg.norm(p.A)) * size, float(la.norm(p.Q)))
 
 
-def _sampled(p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _cayley(p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return A, G, Q of the discrete equation (control form) of the same solution, by Cayley."""
     if p.discrete:
         return p.A.T, p.G, p.Q
@@ -414,18 +414,18 @@ def _sampled(p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 @one_thread()
 @np.errstate(over="ignore", invalid="ignore")
-def _solved(problem: RiccatiProblem) -> RiccatiSolution:
+def _solve_riccati(problem: RiccatiProblem) -> RiccatiSolution:
     """Return the stabilising solution, scaled back."""
     n = problem.A.shape[0]
     if not n:
         empty = np.zeros((0, problem.C.shape[0]))
         return RiccatiSolution(np.zeros((0, 0)), empty, np.zeros(0, dtype=np.complex128), 0.0, 0)
     equation = f"{'discrete' if problem.discrete else 'continuous'} Riccati equation"
-    A, G, Q = _sampled(problem)
+    A, G, Q = _cayley(problem)
     d = _scale(accumulated(A.T, Q), accumulated(A, G))
     first = problem.scaled(d)
     try:
-        P, doublings = doubled_riccati(*_sampled(first))
+        P, doublings = doubled_riccati(*_cayley(first))
         # to unit variances: there residual and correction are relative
         unit = scale_of(np.abs(P.diagonal()))
         d, P = d * unit, P / unit / unit[:, None]
@@ -453,7 +453,7 @@ def _newton(p: RiccatiProblem, P: FloatArray) -> tuple[FloatArray, FloatArray, f
     """Correct P by Newton (Kleinman) steps until the correction is rounding."""
     last, correction = np.inf, doubled if p.discrete else lyapunov
     for taken in range(1, NEWTON_STEPS + 1):  # noqa: B007 - its last value is returned
-        K = _gain(p, P)
+        K = _riccati_gain(p, P)
         change = correction(p.A - K @ p.C, _residual(p, P, K)[0])
         size = float(np.linalg.norm(change) / np.linalg.norm(P)) if np.any(P) else 0.0
         # far from the solution the second step may be the larger one: the first one is arbitrary
@@ -467,7 +467,7 @@ def _newton(p: RiccatiProblem, P: FloatArray) -> tuple[FloatArray, FloatArray, f
             f"the solution is determined to {last:.1e} only (Newton steps stall there): a mode is "
             "hardly excited by Q, or hardly seen in the outputs."
         )
-    K = _gain(p, P)
+    K = _riccati_gain(p, P)
     return P, K, _residual(p, P, K)[1], taken
 
 
@@ -495,14 +495,14 @@ def _defect(p: RiccatiProblem) -> str:
             distinct.append(complex(value))
     for value in distinct:
         shifted = p.A - value * np.eye(p.A.shape[0])
-        missed = _unseen(shifted, p.G)
+        missed = _hidden(shifted, p.G)
         if missed:
             return (
                 f"{missed} mode(s) of A at {value:.6g} (rigid-body or unstable) cannot be seen in "
                 "the outputs (reached by the inputs, in the control form), so their error is "
                 "unbounded. Add or move sensors (actuators)."
             )
-        missed = _unseen(shifted.conj().T, p.Q) if _growth(p, np.array(value)) < SPLIT * size else 0
+        missed = _hidden(shifted.conj().T, p.Q) if _growth(p, np.array(value)) < SPLIT * size else 0
         if missed:
             return (
                 f"{missed} mode(s) of A at {value:.6g} (rigid-body) are not excited by the noise Q "
@@ -512,7 +512,7 @@ def _defect(p: RiccatiProblem) -> str:
     return ""
 
 
-def _unseen(shifted: ComplexArray, weight: FloatArray) -> int:
+def _hidden(shifted: ComplexArray, weight: FloatArray) -> int:
     """Return how many directions of the null space of `shifted` the quadratic form misses."""
     _, sizes, right = la.svd(shifted)
     null = right[sizes < EDGE * max(1.0, float(sizes[0]))].conj().T

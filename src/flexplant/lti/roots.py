@@ -12,7 +12,7 @@ from ..checks import ComplexArray, FloatArray, complex_array, positive, real_arr
 from ..errors import ModelError
 from ..tolerances import ROUNDING, SPLIT, divisor
 from .equations import mean_speed, reciprocal, state_scale
-from .joining import cascaded, stacked
+from .joining import block_matrix, cascaded
 
 
 def zpk_fields(
@@ -23,18 +23,18 @@ def zpk_fields(
     Each pair of poles is a block of two states with the zeros nearest to it, the least damped
     first, so that A keeps its poles to rounding: a companion form of many poles does not.
     """
-    z, p, dt = _roots(zeros, "zeros"), _roots(poles, "poles"), positive(dt, "dt", zero=True)
+    z, p, dt = _as_roots(zeros, "zeros"), _as_roots(poles, "poles"), positive(dt, "dt", zero=True)
     if z.size > p.size:
         raise ModelError(
             f"the transfer function has {z.size} zeros and {p.size} poles: it differentiates its "
             "input, which no state space does. Add poles beyond the band, such as a low-pass."
         )
-    left = paired(z)
+    left = root_pairs(z)
     chain = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1))
     blocks: list[int] = []
     factor = float(real_array(gain, "gain", ()))
-    for pair in sorted(paired(p), key=lambda pole: _damping(pole[0], dt)):
-        nearest = _nearest(pair, left)
+    for pair in sorted(root_pairs(p), key=lambda pole: _decay(pole[0], dt)):
+        nearest = _near_zeros(pair, left)
         left = [part for part in left if part is not nearest]
         a, b, c, d = _section(pair, nearest)
         # sections of moderate gain: what they lack of the poles' size goes to the factor
@@ -68,7 +68,7 @@ def matrix_fields(channels: list[list[dict[str, Any]]]) -> dict[str, Any]:
     inputs = [np.eye(len(row))[j : j + 1] for row in channels for j in range(len(row))]
     outputs = [np.eye(len(channels))[:, i : i + 1] for i, row in enumerate(channels) for _ in row]
     return {
-        "A": stacked([part["A"] for part in every]),
+        "A": block_matrix([part["A"] for part in every]),
         "B": np.vstack([part["B"] @ side for part, side in zip(every, inputs, strict=True)]),
         "C": np.hstack([side @ part["C"] for part, side in zip(every, outputs, strict=True)]),
         "D": np.array([[part["D"][0, 0] for part in row] for row in channels]),
@@ -76,7 +76,7 @@ def matrix_fields(channels: list[list[dict[str, Any]]]) -> dict[str, Any]:
     }
 
 
-def _roots(values: npt.ArrayLike, name: str) -> ComplexArray:
+def _as_roots(values: npt.ArrayLike, name: str) -> ComplexArray:
     roots = complex_array(values, name).ravel()
     lonely = [root for root in roots if not np.isclose(roots, root.conj(), rtol=SPLIT).any()]
     if lonely:
@@ -87,11 +87,11 @@ def _roots(values: npt.ArrayLike, name: str) -> ComplexArray:
     return roots
 
 
-def _damping(pole: complex, dt: float) -> float:
+def _decay(pole: complex, dt: float) -> float:
     return 1.0 - abs(pole) if dt else abs(pole.real) / (abs(pole) or 1.0)
 
 
-def paired(values: ComplexArray) -> list[ComplexArray]:
+def root_pairs(values: ComplexArray) -> list[ComplexArray]:
     """Return conjugate pairs, pairs of neighbouring real values, and one that is left over."""
     upper = values.imag > ROUNDING * np.abs(values)
     pairs = [np.array([v, np.conj(v)]) for v in values[upper]]
@@ -99,7 +99,7 @@ def paired(values: ComplexArray) -> list[ComplexArray]:
     return pairs + [real[i : i + 2] for i in range(0, real.size, 2)]
 
 
-def _nearest(pair: ComplexArray, left: list[ComplexArray]) -> ComplexArray:
+def _near_zeros(pair: ComplexArray, left: list[ComplexArray]) -> ComplexArray:
     """Return the zeros nearest to a pair of poles, none where it cannot hold them."""
     fitting = [z for z in left if z.size == pair.size] or [z for z in left if z.size < pair.size]
     if not fitting:
@@ -149,22 +149,22 @@ def invariant_zeros(g: Any) -> ComplexArray:
     are the zeros; those at infinity have left with the compressed states.
     [EmamiNaeiniVanDooren1982]_.
     """
-    A, B, C, D = _even(*_scaled(g))
-    A, B, C, D = _compressed(A, B, C, D)
-    A, C, B, D = (part.T for part in _compressed(A.T, C.T, B.T, D.T))
+    A, B, C, D = _even(*_scaled_matrices(g))
+    A, B, C, D = _full_rank_part(A, B, C, D)
+    A, C, B, D = (part.T for part in _full_rank_part(A.T, C.T, B.T, D.T))
     n, m = B.shape
     if not n:
         return np.zeros(0, dtype=np.complex128)
     if not m:
-        return np.asarray(la.eigvals(A) * _speed(g), dtype=np.complex128)
+        return np.asarray(la.eigvals(A) * _pole_size(g), dtype=np.complex128)
     # columns that [C D] does not see: the pencil [A - s I, B] on them is square
     unseen = la.qr(np.hstack([C, D]).T)[0][:, -n:]
     alpha, beta = la.eigvals(np.hstack([A, B]) @ unseen, unseen[:n], homogeneous_eigvals=True)
     finite = np.abs(beta) > _ROUNDING * np.abs(alpha)
-    return np.asarray(alpha[finite] / beta[finite] * _speed(g), dtype=np.complex128)
+    return np.asarray(alpha[finite] / beta[finite] * _pole_size(g), dtype=np.complex128)
 
 
-def _compressed(
+def _full_rank_part(
     A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return a system of the same finite zeros whose D has full row rank."""
@@ -209,7 +209,7 @@ def axis_zeros(g: Any) -> ComplexArray:
     their compression.
     """
     n, m = g.n_states, len(g.inputs)
-    A, B, C, D = _scaled(g)
+    A, B, C, D = _scaled_matrices(g)
     mixing = np.linalg.qr(np.random.default_rng(0).standard_normal((C.shape[0], m)))[0].T
     pencil = np.block([[A, B], [mixing @ C, mixing @ D]])
     E = np.zeros((n + m, n + m))
@@ -217,7 +217,7 @@ def axis_zeros(g: Any) -> ComplexArray:
     alpha, beta = la.eig(pencil, E, right=False, homogeneous_eigvals=True)
     # beyond: rounding of a zero at infinity, which comes out at some 1 / (2e-16)
     finite = np.abs(beta) > 1e-14 * np.abs(alpha)
-    speed = _speed(g)
+    speed = _pole_size(g)
     zeros = alpha[finite] / beta[finite]
     size = np.maximum(np.abs(zeros), 0.1)  # double zeros at 0 come out at the root of rounding
     off = np.abs(np.abs(zeros) - 1) if g.dt else np.abs(zeros.real) / size
@@ -236,14 +236,14 @@ def axis_zeros(g: Any) -> ComplexArray:
     return np.array(found, dtype=np.complex128) * speed
 
 
-def _speed(g: Any) -> float:
+def _pole_size(g: Any) -> float:
     """Return a frequency [rad/s] that makes A of order one; 1 when sampled."""
     return 1.0 if g.dt else mean_speed(g.poles())
 
 
-def _scaled(g: Any) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _scaled_matrices(g: Any) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the matrices with time in units of the poles, inputs and outputs of unit size."""
-    A, B = g.A / _speed(g), g.B / _speed(g)
+    A, B = g.A / _pole_size(g), g.B / _pole_size(g)
     into = reciprocal(np.linalg.norm(B, axis=0) + 0.0)
     B, D = B * into, g.D * into
     out = reciprocal(np.linalg.norm(np.hstack([g.C, D]), axis=1))

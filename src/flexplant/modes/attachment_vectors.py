@@ -48,7 +48,7 @@ def _no_place(given: object, name: str) -> ModelError:
     )
 
 
-def named(place: Place) -> str:
+def place_of(place: Place) -> str:
     """Return a short text for a place."""
     if isinstance(place, str):
         return place
@@ -80,7 +80,7 @@ def attachment_vectors(
         if not part > _NEGLIGIBLE * total:
             raise ModelError(
                 f"the {phi.shape[1]} modes already hold all of the static compliance at "
-                f"{named(place)} ({part:.2g} of {total:.3g} m/N is left): an attachment vector "
+                f"{place_of(place)} ({part:.2g} of {total:.3g} m/N is left): an attachment vector "
                 "there adds nothing. Leave it out of compliance_at, or keep fewer modes."
             )
     response = response / np.sqrt(left)
@@ -90,8 +90,8 @@ def attachment_vectors(
     # squares: vectors whose angle is below 1e-5 are one
     if lowest < 1e-10:
         raise ModelError(
-            f"the attachment vectors of {', '.join(named(place) for place in at)} depend on each "
-            f"other (lowest eigenvalue {lowest:.2g} of their Gram matrix): is a place there twice?"
+            f"the attachment vectors of {', '.join(place_of(place) for place in at)} depend on "
+            f"each other (least eigenvalue {lowest:.2g} of their Gram matrix): is a place twice?"
         )
     squares, mix = la.eigh(response.T @ np.asarray(K @ response), gram)
     vectors = response @ mix
@@ -150,4 +150,4 @@ def labels_of(at: Sequence[Place], dofs: DofSet) -> tuple[str, ...]:
     """Return the names of places, after checking that the model has them."""
     for place in at:
         dofs.row(place)
-    return tuple(named(place) for place in at)
+    return tuple(place_of(place) for place in at)

@@ -399,7 +399,7 @@ def checked_response(
     for last in range(_ROUNDS - 1, -1, -1):
         at = np.array(sorted({next(points) for _ in range(checks)}))
         wanted, better = _direct_responses(basis, at, rows, loads)
-        check = _compared(at, find(at), view(at, wanted), found)
+        check = _direct_check(at, find(at), view(at, wanted), found)
         if check.holds(tolerance) or not last:
             return basis, found, check
         basis = better()
@@ -423,7 +423,7 @@ def _direct_responses(
     return np.array([rows @ motion for motion in motions]), lambda: basis.enriched(np.hstack(fresh))
 
 
-def _compared(
+def _direct_check(
     at: FloatArray, found: ComplexArray, wanted: ComplexArray, whole: ComplexArray
 ) -> DirectCheck:
     peak = np.maximum(np.abs(whole).max(axis=0), np.abs(wanted).max(axis=0))

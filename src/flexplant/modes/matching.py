@@ -28,7 +28,7 @@ _RANK = 1e-12
 _FREQUENCY = 0.1
 
 
-def mac(X: Any, Y: Any) -> FloatArray:
+def mac_matrix(X: Any, Y: Any) -> FloatArray:
     """Return the modal assurance criterion of each column of X with each of Y, from 0 to 1."""
     sizes = np.outer(np.sum(np.abs(X) ** 2, axis=0), np.sum(np.abs(Y) ** 2, axis=0))
     return np.asarray(np.abs(X.conj().T @ Y) ** 2 / sizes, dtype=np.float64)
@@ -74,7 +74,7 @@ class ModePairs(NamedTuple):
     group: IntArray
 
 
-def paired(
+def pair_modes(
     freq: FloatArray,
     other_freq: FloatArray,
     gram: Any,
@@ -95,7 +95,7 @@ def paired(
     score = alike.copy()
     for members in spans:
         if members.size > 1:
-            score[members] = _share(gram[np.ix_(members, members)], cross[members], other_size)
+            score[members] = _span_share(gram[np.ix_(members, members)], cross[members], other_size)
     partner = _by_shape(freq, other_freq, score, n_rigid)
     rows = np.arange(freq.size)
     mac = np.where(partner >= 0, alike[rows, partner], 0.0)
@@ -127,13 +127,13 @@ def _by_shape(
     return partner
 
 
-def _share(gram: Any, cross: Any, other_size: FloatArray) -> FloatArray:
+def _span_share(gram: Any, cross: Any, other_size: FloatArray) -> FloatArray:
     """Return how much of each of the other model's shapes lies in the span of a cluster (k,)."""
-    inside = _orthonormal(gram).conj().T @ cross
+    inside = _orthonormal_map(gram).conj().T @ cross
     return np.asarray(np.sum(np.abs(inside) ** 2, axis=0) / other_size)
 
 
-def _orthonormal(gram: Any) -> Any:
+def _orthonormal_map(gram: Any) -> Any:
     """Return T with ``T^H G T = I`` on the span of shapes with inner products G, of its rank."""
     values, vectors = la.eigh(gram)
     kept = values > _RANK * values[-1]
@@ -151,7 +151,7 @@ def _cosines(gram: Any, cross: Any, other_gram: Any) -> FloatArray:
     """Return the squared cosines of the principal angles between two subspaces, largest first."""
     if not cross.shape[1]:
         return np.zeros(0)
-    both = _orthonormal(gram).conj().T @ cross @ _orthonormal(other_gram)
+    both = _orthonormal_map(gram).conj().T @ cross @ _orthonormal_map(other_gram)
     cosines = np.zeros(cross.shape[1])
     found = la.svdvals(both)
     cosines[: found.size] = found**2

@@ -22,8 +22,8 @@ from ..checks import (
 from ..errors import ModelError, ShapeError, SolverError, counted, unknown_label
 from ..labels import DofSet, Place
 from ..structure.definite import signed_square
-from ..structure.placed import Placed, missed
-from .matching import paired
+from ..structure.placed import Placed, relative_miss
+from .matching import pair_modes
 
 #: places at which shapes of two meshes are compared, at most
 _PLACES = 300
@@ -93,7 +93,7 @@ def mesh_error(coarse: Any, finer: Any, order: float) -> MeshError:
         )
     shapes = _at_common_places(coarse, finer)
     X, Y = (one / np.linalg.norm(one, axis=0) for one in shapes)
-    pairs = paired(
+    pairs = pair_modes(
         coarse.freq,
         finer.freq,
         X.T @ X,
@@ -517,7 +517,7 @@ class Modes(Placed, Value):
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return the relative parts (6,) of the rigid-body motions that the shapes cannot make."""
         wanted, basis = self.rigid_motions(about), self.orthonormal_basis
-        return missed(basis @ np.linalg.lstsq(basis, wanted, rcond=None)[0], wanted)
+        return relative_miss(basis @ np.linalg.lstsq(basis, wanted, rcond=None)[0], wanted)
 
     def at(self, place: Place, direction: str = "z") -> FloatArray | ComplexArray:
         """Return the modes' motion (k,) at a place.

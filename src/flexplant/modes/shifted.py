@@ -50,7 +50,7 @@ class StiffnessFactor:
             self.sigma *= _SINGLE_SHIFT / _SHIFT * (np.finfo(np.float32).eps / np.finfo(float).eps)
         elif model.n_unstable:  # below the lowest eigenvalue
             self.sigma += 2.0 * float(unstable_stiffness(self.K, model.body_motions)[0])
-        shifted = _shifted(self.K, self.M, self.sigma)
+        shifted = _shift_matrix(self.K, self.M, self.sigma)
         self.dissection = dissection_of(model)
         try:
             self._cholesky: MultifrontalCholesky | PardisoCholesky | CholmodCholesky = (
@@ -61,7 +61,7 @@ class StiffnessFactor:
         except SolverError as error:
             if single:
                 raise
-            negative = multifrontal_inertia(_shifted(self.K, self.M, near), self.dissection)
+            negative = multifrontal_inertia(_shift_matrix(self.K, self.M, near), self.dissection)
             if not negative:
                 raise
             raise ModelError(
@@ -140,7 +140,7 @@ def counting_factor(model: FEModel, square: float) -> CountingFactor | None:
     order = dissection_of(model)
     if not order.is_costly or model.n_unstable:
         return None
-    signed = signed_factor(_shifted(sp.csc_array(model.K), model.M, square), order)
+    signed = signed_factor(_shift_matrix(sp.csc_array(model.K), model.M, square), order)
     return None if signed is None else CountingFactor(signed, square)
 
 
@@ -185,11 +185,11 @@ def dissection_of(model: FEModel) -> Dissection:
 def modes_below(model: FEModel, square: float, *, single: bool = True) -> int:
     """Return how many modes, rigid-body ones included, have an omega^2 below `square` (Sturm)."""
     # without `single`, single precision is not tried: it was refused before
-    shifted = _shifted(model.K, model.M, square)
+    shifted = _shift_matrix(model.K, model.M, square)
     return multifrontal_inertia(shifted, dissection_of(model), single=single)
 
 
-def _shifted(K: Any, M: Any, square: float) -> Any:
+def _shift_matrix(K: Any, M: Any, square: float) -> Any:
     """Return ``K - square M``, its indices those of K where both have the same."""
     if not same_pattern(K, M):
         return sp.csc_array(K - square * M)

@@ -121,7 +121,7 @@ def solve_modes(
         instance(damping, Damping, "damping", "Pass ModalDamping(0.01) for 1 %.")
     if factor is not None:
         instance(factor, Pardiso | Cholmod, "factor", "Leave it out for the library's own factor.")
-    kept, top = _asked(model, count, below)
+    kept, top = _mode_request(model, count, below)
     at = places(compliance_at)
     if at and model.n_unstable:
         raise ModelError(
@@ -137,7 +137,7 @@ def solve_modes(
         # one factor for the modes and for the attachment vectors, while it is held here
         factored = stiffness_factor(model, factor) if at and _is_large(model) else None
         omega, phi, certificate = _undamped(model, *more, factor)
-    orthonormality, residual, rounding = checked(model, omega, phi)
+    orthonormality, residual, rounding = check_modes(model, omega, phi)
     certificate["orthonormality"] = orthonormality
     if model.rigid_body.shape[1]:
         certificate["rigid_residual"] = rigid_residual(model)
@@ -196,7 +196,7 @@ def modes_reaching(model: FEModel, freq: float, *, least: int = 0) -> Modes:
     return modes
 
 
-def _asked(model: FEModel, count: int | None, below: float | None) -> tuple[int, float]:
+def _mode_request(model: FEModel, count: int | None, below: float | None) -> tuple[int, float]:
     n, r = model.n_dof, model.rigid_body.shape[1]
     top = np.inf if below is None else (2 * np.pi * positive(below, "below")) ** 2
     if count is None:
@@ -336,7 +336,7 @@ _ENTRY = 1e-3
 _EPS = float(np.finfo(np.float64).eps)
 
 
-def checked(
+def check_modes(
     model: FEModel, omega: FloatArray, phi: FloatArray
 ) -> tuple[float, FloatArray, FloatArray]:
     """Raise SolverError unless shapes are M-orthonormal and fulfil the eigenvalue problem.
@@ -368,7 +368,7 @@ def checked(
 
 
 def _mode_residuals(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple[FloatArray, ...]:
-    """Return what `checked` judges, from products of their own."""
+    """Return what `check_modes` judges, from products of their own."""
     M, K = by_rows(model.M), by_rows(model.K)
     size_of_K, stiff = Absolute(K), diagonal(model.K)
     # by stiffness: displacements and rotations compare, and DOFs without inertia weigh no more

@@ -71,10 +71,10 @@ def counted_modes(
     # Lanczos finds them, a Sturm count in a gap above says how many; missing ones are sought
     # beside
     with one_thread():
-        return _counted(model, count, top, method)
+        return _modes_counted(model, count, top, method)
 
 
-def _counted(
+def _modes_counted(
     model: FEModel, count: int, top: float, method: Pardiso | Cholmod | None
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     n, r = model.rigid_body.shape
@@ -125,7 +125,7 @@ def _counted(
         if below == count and _is_gap(squares, count, top, rounding):
             counted, sure, shift = count, count, top
         else:
-            sure, shift = _gap(squares, count, rounding)
+            sure, shift = _widest_gap(squares, count, rounding)
             if not sure and squares.size == n - r:
                 sure, shift = squares.size, 2 * float(squares[-1])
             if not sure:
@@ -270,7 +270,7 @@ def _is_gap(squares: FloatArray, count: int, top: float, rounding: FloatArray) -
     return bool(np.all(np.abs(near - top) > closest) and near[0] < top < near[-1])
 
 
-def _gap(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[int, float]:
+def _widest_gap(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[int, float]:
     """Return how many modes lie below the widest gap after the last wanted one, and its middle."""
     # gaps narrower than some roundings of the modes beside them, or than 1e-8, are none
     above, least = squares[count - 1 :], _GAP_ROUNDINGS * rounding[count - 1 :]

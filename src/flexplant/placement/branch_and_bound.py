@@ -325,7 +325,7 @@ class BranchAndBound(Search):
                     partial(_open, problem, scorer, tree.cutoff),
                     batch,
                     progress=False,
-                    restored=_restored,
+                    restored=_opened_from,
                 )
                 bar.advance(sum(map(tree.take, found)))
         bound = tree.bound
@@ -372,7 +372,7 @@ class _Opened(NamedTuple):
     evaluations: int
 
 
-def _restored(row: Any) -> _Opened:
+def _opened_from(row: Any) -> _Opened:
     """Return what opening a branch showed, from the nested lists of a file."""
     nodes, value, chosen, *rest = row
     return _Opened([_Node.of(*node) for node in nodes], value, tuple(chosen), *rest)

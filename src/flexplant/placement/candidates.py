@@ -11,7 +11,7 @@ import numpy as np
 from ..checks import FloatArray, Value, several, short
 from ..errors import LabelError, ModelError, require_known, unknown_label
 from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
-from ..plant.scheduling import placed, require_positions
+from ..plant.scheduling import port_at, require_positions
 from ..structure import Disc, Rectangle
 
 
@@ -62,7 +62,7 @@ def sides_of(ports: Iterable[Port]) -> Any:
     return "".join(side for side in "yu" if side in found)
 
 
-def checked_plant(given: Any) -> StandardPlant:
+def sampled_plant(given: Any) -> StandardPlant:
     """Return a plant that is sampled and not weighted."""
     plant: StandardPlant = standard_plant(given)
     if plant.is_weighted:
@@ -105,7 +105,7 @@ def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> d
             f"candidates are a list of {_NAME[side]}s or names, got {short(given)}. "
             "Put them in a list."
         )
-    own = _own(plant, side)
+    own = _ports_of(plant, side)
     found: dict[str, Port] = {}
     for item in given:
         port = item
@@ -127,7 +127,7 @@ def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> d
         if plant.is_assembled:  # one that moves is where the machine stands
             ports = plant.assembled.ports
             require_positions([port], ports.positions)
-            port = placed(port, ports.values)
+            port = port_at(port, ports.values)
         other = found.setdefault(port.name, port)
         if other is not port and other._fields() != port._fields():
             raise LabelError(
@@ -137,7 +137,7 @@ def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> d
     return found
 
 
-def _own(plant: StandardPlant, side: str) -> dict[str, Port]:
+def _ports_of(plant: StandardPlant, side: str) -> dict[str, Port]:
     if plant.is_assembled:
         return {port.name: port for port in getattr(plant.assembled.ports, side)}
     return {name: PlantChannel(name, side) for name in (plant.y if side == "y" else plant.u)}
@@ -197,7 +197,7 @@ class Places:
             )
 
 
-def places_of(plant: StandardPlant, candidates: Sequence[Any]) -> Places:
+def candidate_places(plant: StandardPlant, candidates: Sequence[Any]) -> Places:
     """Return where candidates and POIs are; a port with several points is at each of them.
 
     Of a plant made elsewhere no places are known.

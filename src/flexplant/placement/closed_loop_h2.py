@@ -29,11 +29,11 @@ from .poi_variance import (
     factors_of,
     measured_rows,
     plain,
+    poi_arguments,
     poi_rows,
     pushed,
     pushed_columns,
     sensor_rows,
-    shown,
     structure_part,
     unit_of,
 )
@@ -49,7 +49,7 @@ class MotionAndEffort(Criterion):
     effort: float = field(default=1e-9, kw_only=True, metadata=checked(positive))
 
     def __repr__(self) -> str:
-        given = [*shown(self.poi, self.axes), f"effort={self.effort:g}"]
+        given = [*poi_arguments(self.poi, self.axes), f"effort={self.effort:g}"]
         return f"{type(self).__name__}({', '.join(given)})"
 
     def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
@@ -141,7 +141,7 @@ class PoiLqr(MotionAndEffort):
             constant += float(np.sum((rows @ noise) ** 2))
             noise = A @ noise
         constant += float(np.sum((rows @ noise) ** 2))
-        held, late = _late(plant, rows, candidates, fraction)
+        held, late = _delayed_candidates(plant, rows, candidates, fraction)
         S = np.zeros((noise.shape[1], late.n_states))
         S[:, :n] = noise.T
         try:
@@ -173,7 +173,7 @@ def _require_control(plant: StandardPlant, factors: Mapping[str, float], what: s
     plant.with_ports(seen).check().require(("performance",), f"a controller for {what}")
 
 
-def _late(
+def _delayed_candidates(
     plant: StandardPlant, rows: FloatArray, candidates: Sequence[Port], fraction: float
 ) -> tuple[IntArray, StateSpace]:
     """Return the plant of all candidates with a part of a sample of delay, and the states it adds.
@@ -383,7 +383,7 @@ def of_sensors(p: Separation) -> Quadratic:
     """Return the cost as a function of the sensors beside all actuators of the problem."""
     S, V = p.control(tuple(range(len(p.actuators))))
     constant = float(np.sum(S * p.W) + np.sum(V * p.ahead(np.zeros_like(p.A))))
-    looks = _root(V) @ np.linalg.matrix_power(p.A, p.delay)
+    looks = _semidefinite_root(V) @ np.linalg.matrix_power(p.A, p.delay)
     return quadratic(p.A.T, p.W, looks, p.sensors, constant=constant)
 
 
@@ -394,14 +394,14 @@ def of_actuators(p: Separation) -> Quadratic:
     """
     P = p.covariance(tuple(range(len(p.sensors))))
     power = np.linalg.matrix_power(p.A, p.delay)
-    innovations = _root(power @ (p.A @ P @ p.A.T + p.W - P) @ power.T)
+    innovations = _semidefinite_root(power @ (p.A @ P @ p.A.T + p.W - P) @ power.T)
     seen = innovations @ p.rows.T
     constant = float(np.einsum("ij,jk,ik->", p.rows, p.ahead(P), p.rows) + np.sum(seen**2))
     H = p.rows.T @ p.rows
     return quadratic(p.A, H, innovations @ p.A.T, p.actuators, constant=constant)
 
 
-def _root(X: FloatArray) -> FloatArray:
+def _semidefinite_root(X: FloatArray) -> FloatArray:
     """Return r with ``r' r = X``, which is positive semidefinite apart from rounding."""
     size = np.sqrt(np.maximum(X.diagonal(), 0.0))
     unit = divisor(size)

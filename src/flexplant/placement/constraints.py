@@ -222,7 +222,7 @@ class Budget(Constraint):
         return LinearRows(costs[None], np.array([0.0]), np.array([self.total]))
 
 
-def _zones(given: Any, name: str) -> tuple[Zone, ...]:
+def _checked_zones(given: Any, name: str) -> tuple[Zone, ...]:
     listed = (given,) if isinstance(given, Zone) or not isinstance(given, Sequence) else given
     for zone in listed:
         if not isinstance(zone, Zone):
@@ -254,7 +254,7 @@ class Excluded(Constraint):
     ('s3',)
     """
 
-    zones: Zone | Sequence[Zone] = field(metadata=checked(_zones, name="an excluded zone"))
+    zones: Zone | Sequence[Zone] = field(metadata=checked(_checked_zones, name="an excluded zone"))
 
     def rows(self, places: Places) -> LinearRows:
         """Return x_i <= 0 inside."""
@@ -324,7 +324,7 @@ class Within(Constraint):
     ('s3',)
     """
 
-    zones: Zone | Sequence[Zone] = field(metadata=checked(_zones, name="a zone"))
+    zones: Zone | Sequence[Zone] = field(metadata=checked(_checked_zones, name="a zone"))
     at_least: int | None = field(default=None, kw_only=True, metadata=checked(whole, minimum=0))
     at_most: int | None = field(default=None, kw_only=True, metadata=checked(whole, minimum=0))
 
@@ -375,7 +375,7 @@ class MinimumDistance(Constraint):
         return LinearRows(pairs, np.zeros(first.size), np.ones(first.size))
 
 
-def rows_of(constraints: Any, places: Places, side: str) -> LinearRows:
+def constraint_rows(constraints: Any, places: Places, side: str) -> LinearRows:
     """Return the rows of all constraints, OffPoi() among them for sensors unless one is given."""
     return LinearRows.stacked([c.rows(places) for c in all_of(constraints, side)], places.total)
 

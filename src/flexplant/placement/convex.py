@@ -355,7 +355,7 @@ def by_size(sets: Sequence[Sequence[int]], function: Any) -> FloatArray:
     return found
 
 
-def summed(matrices: FloatArray, measure: str) -> Scorer:
+def sum_scorer(matrices: FloatArray, measure: str) -> Scorer:
     """Return the scorer of a measure of ``sum_i W_i``; the trace needs no matrices."""
     if measure == "trace":
         return SummedWorth(np.trace(matrices, axis1=1, axis2=2))

@@ -17,7 +17,7 @@ from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..tolerances import divisor
 from .candidates import Port
-from .convex import MEASURES, SummedWorth, by_size, summed
+from .convex import MEASURES, SummedWorth, by_size, sum_scorer
 from .criterion import Criterion, Scorer
 
 
@@ -213,7 +213,7 @@ class ModalGramian(Criterion):
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return minus the measure: infinite where a mode is missed, for log det."""
-        return float(summed(self.matrix(plant)[None], self.measure).score([(0,)])[0])
+        return float(sum_scorer(self.matrix(plant)[None], self.measure).score([(0,)])[0])
 
     def matrix(self, plant: StandardPlant) -> FloatArray:
         """Return the Gramian (2 m, 2 m) of the m elastic modes."""
@@ -222,7 +222,7 @@ class ModalGramian(Criterion):
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the measure of sums of the candidates' Gramians."""
-        return summed(self._each(plant.assembled.realisation, candidates), self.measure)
+        return sum_scorer(self._each(plant.assembled.realisation, candidates), self.measure)
 
     def _each(self, real: ModalRealisation, ports: Sequence[Any]) -> FloatArray:
         """Return the Gramians (N, 2 m, 2 m) of single ports."""

@@ -14,7 +14,7 @@ from ..errors import AssumptionError, CertificateError, counted
 from ..plant import Actuator, Assumption, SensorPort, StandardPlant, assemble_plant
 from ..tolerances import divisor
 from ..work import Work
-from .candidates import Port, Side, checked_plant, side_of, with_side
+from .candidates import Port, Side, sampled_plant, side_of, with_side
 from .closed_loop_h2 import ClosedLoopH2, PoiLqr
 from .criterion import AGREEMENT, Criterion, OnPlant, Scorer, as_criterion
 from .poi_variance import PoiVariance
@@ -103,7 +103,7 @@ def layouts_of(
     plant: StandardPlant, side: Side, candidates: Sequence[Port], criterion: Any
 ) -> Layouts:
     """Return the layouts of candidates on a plant, with everything checked."""
-    plant = checked_plant(plant)
+    plant = sampled_plant(plant)
     if criterion is None:
         criterion = {"y": PoiVariance(), "u": PoiLqr(), "yu": ClosedLoopH2()}[side]
     criterion = as_criterion(criterion, side)

@@ -16,7 +16,7 @@ from ..lti.discretisation import held_exactly
 from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..plant import Actuator, StandardPlant, larger_plant
-from ..plant.dynamics import followed
+from ..plant.dynamics import direct_effect
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from .candidates import Port, with_side
@@ -48,19 +48,19 @@ def checked_names(given: Any, name: str) -> tuple[str, ...] | Mapping[str, float
     return named if isinstance(given, Mapping) else tuple(named)
 
 
-def shown(poi: Named, axes: Named) -> list[str]:
+def poi_arguments(poi: Named, axes: Named) -> list[str]:
     """Return POIs and their axes as arguments, for a repr."""
-    parts = [] if poi is None else [repr(_plain(poi))]
-    return parts if axes is None else [*parts, f"axes={_plain(axes)!r}"]
+    parts = [] if poi is None else [repr(_unwrap(poi))]
+    return parts if axes is None else [*parts, f"axes={_unwrap(axes)!r}"]
 
 
-def _plain(named: Any) -> Any:
+def _unwrap(named: Any) -> Any:
     if isinstance(named, Mapping):
         return dict(named)
     return named[0] if isinstance(named, tuple) and len(named) == 1 else named
 
 
-def channels_of(plant: StandardPlant) -> dict[str, dict[str, str]]:
+def channels_by_poi(plant: StandardPlant) -> dict[str, dict[str, str]]:
     """Return {POI: {axis: z channel}}; of a plant made elsewhere by the channels' names."""
     if plant.is_assembled:
         pois = plant.assembled.ports.z
@@ -75,7 +75,7 @@ def channels_of(plant: StandardPlant) -> dict[str, dict[str, str]]:
 
 def factors_of(plant: StandardPlant, poi: Named, axes: Named, *, every: bool) -> dict[str, float]:
     """Return {z channel: factor}, the factor of the POI times that of the axis."""
-    known = channels_of(plant)
+    known = channels_by_poi(plant)
     if poi is None and len(known) != 1:
         raise LabelError(
             f"the plant has {counted(len(known), 'POI')} ({', '.join(known)}): say which count, "
@@ -242,7 +242,7 @@ class PoiVariance(Criterion):
             )
 
     def __repr__(self) -> str:
-        given = shown(self.poi, self.axes)
+        given = poi_arguments(self.poi, self.axes)
         given += [f"measure={self.measure!r}"] if self.measure != "sum" else []
         given += [f"lag={self.lag!r}"] if self.lag is not None else []
         given += ["larger=..."] if self.larger is not None else []
@@ -363,7 +363,7 @@ def _check_direct(plant: StandardPlant, candidates: Sequence[Any]) -> None:
     push = np.array([port.push(realisation) for port in loud])
     ground = np.array([port.ground for port in loud])
     for sensor in candidates:
-        if loud and np.any(followed(sensor.see(realisation), sensor.order, push, ground)):
+        if loud and np.any(direct_effect(sensor.see(realisation), sensor.order, push, ground)):
             raise AssumptionError(
                 f"white noise of a disturbance reaches {sensor.name!r} at once "
                 "(an acceleration, say), so a sample of it would have infinite variance. "

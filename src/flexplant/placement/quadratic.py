@@ -49,7 +49,7 @@ class Quadratic(Value, Convex):
     def terms(self, chosen: Sequence[int]) -> FloatArray:
         """Return the parts (k,) of J that the rows of S see, without the constant."""
         g, X, S = self.solution(chosen)
-        return _terms(S, X, g)
+        return _quotients(S, X, g)
 
     def solution(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return g, X and S of some candidates, in the states that are there with them."""
@@ -59,7 +59,7 @@ class Quadratic(Value, Convex):
             keep[self.owned.ravel()] = False
             keep[self.owned[rows].ravel()] = True
         inner = np.ix_(keep, keep)
-        g = _compressed(self.items[rows][:, keep])
+        g = _square_root(self.items[rows][:, keep])
         return g, solved(self.A[inner], self.H[inner], g), self.S[:, keep]
 
     @property
@@ -80,7 +80,7 @@ class Quadratic(Value, Convex):
         """Return J at weights (N,); infinite where it has none."""
         g = self._weighted(weights)
         try:
-            return float(np.sum(_terms(self.S, solved(self.A, self.H, g), g))) + self.constant
+            return float(np.sum(_quotients(self.S, solved(self.A, self.H, g), g))) + self.constant
         except SolverError:
             return np.inf
 
@@ -101,7 +101,7 @@ class Quadratic(Value, Convex):
         face, into = root.T @ self.S.T, (root / sizes[kept]).T
         gradient = np.sum((seen @ adjoint) * seen, axis=1)
         most = float(np.max(gradient))
-        for slopes in _slopes(closed, seen, into):
+        for slopes in _increments(closed, seen, into):
             found = np.einsum("ik,nij,jk->n", face, slopes, face, optimize=True)
             if np.max(np.abs(found - gradient)) <= _CONFIRMED * most:
                 break
@@ -122,13 +122,13 @@ class Quadratic(Value, Convex):
         left, after = measured(X, g)
         closed = left @ self.A.T
         adjoint = doubled(closed.T, self.S.T @ self.S)
-        cost = float(np.sum(_terms(self.S, X, g))) + self.constant
+        cost = float(np.sum(_quotients(self.S, X, g))) + self.constant
         return cost, after, closed, adjoint, self.items @ after
 
     def _weighted(self, weights: FloatArray) -> FloatArray:
         """Return g of the candidates with weights above zero, each times the root of its own."""
         used = weights > 0
-        return _compressed(np.sqrt(weights[used])[:, None] * self.items[used])
+        return _square_root(np.sqrt(weights[used])[:, None] * self.items[used])
 
 
 def quadratic(
@@ -165,12 +165,12 @@ def solved(A: FloatArray, H: FloatArray, g: FloatArray) -> FloatArray:
     return control_dare(A, g.T, Q=H, R=np.eye(g.shape[0])).P
 
 
-def _compressed(g: FloatArray) -> FloatArray:
+def _square_root(g: FloatArray) -> FloatArray:
     """Return as few rows as there are states with the same ``g' g``."""
     return g if g.shape[0] <= g.shape[1] else np.asarray(np.linalg.qr(g, mode="r"))
 
 
-def _slopes(closed: FloatArray, seen: FloatArray, into: FloatArray) -> Iterator[FloatArray]:
+def _increments(closed: FloatArray, seen: FloatArray, into: FloatArray) -> Iterator[FloatArray]:
     """Yield ``into D_i into'`` (N, m, m) for all i with ``D_i = M D_i M' + s_i s_i'``, two ways."""
     poles, modes = np.linalg.eig(closed)
     try:
@@ -201,7 +201,7 @@ def _update_gain(X: FloatArray, g: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(unit, (seen / size).T).T / size)
 
 
-def _terms(S: FloatArray, X: FloatArray, g: FloatArray) -> FloatArray:
+def _quotients(S: FloatArray, X: FloatArray, g: FloatArray) -> FloatArray:
     """Return the diagonal of ``S X+ S'`` as sums of squares: nothing cancels with good sensors."""
     gain = S @ _update_gain(X, g)
     left = S - gain @ g

@@ -17,8 +17,8 @@ from ..plant import Sensor, StandardPlant
 from ..plant.ports import Quantity
 from ..structure import Disc, Rectangle
 from ..work import Work
-from .candidates import Port, Side, checked_plant, known_candidates, places_of, with_side
-from .constraints import Constraint, all_of, constraints_of, rows_of
+from .candidates import Port, Side, candidate_places, known_candidates, sampled_plant, with_side
+from .constraints import Constraint, all_of, constraint_rows, constraints_of
 from .criterion import Criterion, in_words
 from .layouts import layouts_of
 from .problem import Placement
@@ -234,7 +234,7 @@ def _score_layouts(
     executor: Executor | None,
     progress: bool | None,
 ) -> Scores:
-    plant = checked_plant(plant)
+    plant = sampled_plant(plant)
     if isinstance(layouts, str) or not isinstance(layouts, Sequence):
         raise ModelError(f"layouts are a list of lists of names, got {short(layouts)}. Pass such.")
     wrong = [layout for layout in layouts if not isinstance(layout, Iterable)]
@@ -254,7 +254,7 @@ def _score_layouts(
     position = {port.name: i for i, port in enumerate(ports)}
     judged = layouts_of(plant, side, ports, criterion)
     chosen = [tuple(position[name] for name in layout) for layout in names]
-    places, values = places_of(plant, ports), np.full(len(chosen), np.inf)
+    places, values = candidate_places(plant, ports), np.full(len(chosen), np.inf)
     reasons: dict[int, str] = {}
     for constraint in constraints_of(constraints):
         held = constraint.rows(places).hold(chosen)
@@ -364,7 +364,7 @@ def device_worth(
     >>> bool(worth.without[0] > worth.without[1])  # s1, beside the disturbance, is worth more
     True
     """
-    plant = checked_plant(plant)
+    plant = sampled_plant(plant)
     instance(placement, Placement, "placement", "Pass what place_sensors returned.")
     layouts = layouts_of(plant, placement.side, placement.ports, criterion)
     layouts.require_any()
@@ -485,7 +485,7 @@ def sensor_map(
     >>> found.best
     array([0., 0., 0.])
     """
-    plant = checked_plant(plant)
+    plant = sampled_plant(plant)
     places = real_array(points, "points", (None, 3))
     noise = positive(asd, "asd", zero=True)
     own = plant.assembled.ports.y
@@ -495,8 +495,8 @@ def sensor_map(
         Sensor(f"{prefix}{i}", at=place, direction=direction, quantity=quantity, asd=noise)
         for i, place in enumerate(places, 1)
     ]
-    where = places_of(plant, (*own, *tried))
-    free = rows_of(constraints, where, "y").added(range(len(own)))[len(own) :]
+    where = candidate_places(plant, (*own, *tried))
+    free = constraint_rows(constraints, where, "y").added(range(len(own)))[len(own) :]
     if not np.any(free):
         raise ModelError(
             "there is no point to try: give at least one"

@@ -16,9 +16,9 @@ from ..fingerprint import fingerprint
 from ..plant import Actuator, StandardPlant
 from ..work import Work
 from .branch_and_bound import Exchange
-from .candidates import Port, checked_plant, known_candidates, places_of, side_of
+from .candidates import Port, candidate_places, known_candidates, sampled_plant, side_of
 from .closed_loop_h2 import Separation
-from .constraints import Budget, Constraint, rows_of
+from .constraints import Budget, Constraint, constraint_rows
 from .criterion import Criterion, in_words
 from .layouts import layouts_of
 from .problem import Found, Placement, Problem, Search
@@ -105,7 +105,7 @@ def place_sensors(
     (('s1',), True)
     """
     options = (constraints, method, executor, checkpoint, progress, rng)
-    return _placed(plant, {"y": (candidates, count)}, criterion, required, *options)
+    return _placement(plant, {"y": (candidates, count)}, criterion, required, *options)
 
 
 def place_actuators(
@@ -156,7 +156,7 @@ def place_actuators(
     True
     """
     options = (constraints, method, executor, checkpoint, progress, rng)
-    return _placed(plant, {"u": (candidates, count)}, criterion, required, *options)
+    return _placement(plant, {"u": (candidates, count)}, criterion, required, *options)
 
 
 def place_both(
@@ -225,10 +225,10 @@ def place_both(
         )
     options = (constraints, method, executor, checkpoint, progress, rng)
     chosen = {"y": (sensors, counts[0]), "u": (actuators, counts[1])}
-    return _placed(plant, chosen, criterion, required, *options)
+    return _placement(plant, chosen, criterion, required, *options)
 
 
-def _placed(
+def _placement(
     plant: StandardPlant,
     wanted: Mapping[str, tuple[Sequence[Any], int]],
     criterion: Criterion | Callable[[StandardPlant], float] | None,
@@ -240,7 +240,7 @@ def _placed(
     progress: bool | None,
     rng: Rng,
 ) -> Placement:
-    plant = checked_plant(plant)
+    plant = sampled_plant(plant)
     problem = problem_of(plant, wanted, criterion, required, constraints)
     layouts, ports = problem.layouts, problem.layouts.candidates
     if method is None:
@@ -342,9 +342,9 @@ def problem_of(
     side: Any = "".join(wanted)
     layouts = layouts_of(plant, side, ports, criterion)
     layouts.require_any()
-    rows = rows_of(constraints, places_of(plant, ports), side)
+    rows = constraint_rows(constraints, candidate_places(plant, ports), side)
     if len(wanted) > 1:
-        rows = rows.and_(_shares(ports, counts))
+        rows = rows.and_(_count_rows(ports, counts))
         if isinstance(layouts.scorer, Separation):
             numbers = (counts["y"], counts["u"])
             layouts = replace(layouts, scorer=replace(layouts.scorer, counts=numbers))
@@ -369,7 +369,7 @@ def _check_counts(counts: Mapping[str, int], kept: Sequence[Port]) -> None:
             raise ModelError(f"count is {count}, and {needed} candidates are required.")
 
 
-def _shares(ports: Sequence[Port], counts: Mapping[str, int]) -> LinearRows:
+def _count_rows(ports: Sequence[Port], counts: Mapping[str, int]) -> LinearRows:
     """Return the rows by which so many of each side are chosen."""
     A = np.array([[side_of(port) == side for port in ports] for side in counts], dtype=np.float64)
     exact = np.array(list(counts.values()), dtype=np.float64)
@@ -502,7 +502,7 @@ def pareto_curve(
     >>> bool(curve.values[1] < curve.values[0])
     True
     """
-    plant = checked_plant(plant)
+    plant = sampled_plant(plant)
     if not isinstance(amounts, Sequence | np.ndarray | range) or isinstance(amounts, str):
         raise ModelError(f"amounts are counts or budgets, got {short(amounts)}. Type range(3, 8).")
     given = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)

@@ -13,7 +13,7 @@ from ..checks import FloatArray, checked, function, one_of, positive, short
 from ..errors import AssumptionError, FlexplantError, ModelError
 from ..plant import StandardPlant, larger_plant
 from ..tolerances import TINY
-from .candidates import SIDES, Port, checked_plant, side_of, sides_of, with_side
+from .candidates import SIDES, Port, sampled_plant, side_of, sides_of, with_side
 from .criterion import Criterion, Scorer, Wrapping, as_criterion
 from .gramian import Shapes, shapes_of
 from .layouts import RigidPart
@@ -185,7 +185,7 @@ def _checked_machines(machines: Any, name: str) -> tuple[StandardPlant, ...]:
             f"{name} are a list of at least one plant, got {short(machines)}. Pass "
             "plant.uncertain(fit).sample(rng, 20), say."
         )
-    return tuple(checked_plant(machine) for machine in machines)
+    return tuple(sampled_plant(machine) for machine in machines)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -73,7 +73,7 @@ class AssumptionReport(Value):
 
     def __repr__(self) -> str:
         lines = [f"<AssumptionReport: {'all hold' if self.ok else 'NOT all hold'}>"]
-        lines += _lines(self.assumptions)
+        lines += _assumption_lines(self.assumptions)
         if self.plant.form.startswith("dense"):
             lines.append(f"  note the plant is {self.plant.form}")
         if self.plant.unstable_modes:
@@ -114,11 +114,11 @@ class AssumptionReport(Value):
             # what was said is not said again
             short = [item.replace(finding="as said.", remedy="") for item in failed]
             listed = tuple(short[failed.index(i)] if i in failed else i for i in known)
-            table = "\n".join(["The plant's assumptions:", *_lines(listed)])
+            table = "\n".join(["The plant's assumptions:", *_assumption_lines(listed)])
             raise AssumptionError(f"{purpose} is not possible: {said}\n{table}")
 
 
-def _lines(items: tuple[Assumption, ...]) -> list[str]:
+def _assumption_lines(items: tuple[Assumption, ...]) -> list[str]:
     return [
         f"  {'yes' if item.holds else 'NO '} {item.key}: {item.finding}"
         + (f" {item.remedy}" if item.remedy else "")
@@ -218,7 +218,7 @@ def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
     pairs = plant.modal_blocks[n_rigid:count]
     omega = np.sqrt(np.abs(np.linalg.det(pairs)))
     zeta = -0.5 * np.trace(pairs, axis1=1, axis2=2) / omega
-    swinging = _swinging(pairs)
+    swinging = _undamped_pairs(pairs)
     # filters of ports act at the pole; one that does not swing stands for its frequency
     wanted = omega * (-zeta + 1j * np.sqrt(np.maximum(1.0 - zeta**2, 0.0)))
     wanted = np.where(zeta < 1.0, wanted, 1j * omega)
@@ -249,12 +249,12 @@ def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
             motions = np.array(seen).reshape(omega.size, len(names))
         sides[side] = names, np.abs(motions)
     return tuple(
-        _entry(n_rigid + 1 + k, float(omega[k]), float(zeta[k]), k, sides)
+        _visibility(n_rigid + 1 + k, float(omega[k]), float(zeta[k]), k, sides)
         for k in range(omega.size)
     )
 
 
-def _swinging(pairs: FloatArray) -> FloatArray:
+def _undamped_pairs(pairs: FloatArray) -> FloatArray:
     """Return the pairs, those of real modes without their damping: it is no part of the shape."""
     real = pairs[:, 0, 0] == 0.0
     swinging = pairs.copy()
@@ -262,7 +262,7 @@ def _swinging(pairs: FloatArray) -> FloatArray:
     return swinging
 
 
-def _entry(
+def _visibility(
     number: int,
     omega: float,
     zeta: float,

@@ -29,12 +29,12 @@ from .origin import Assembled, Foreign
 from .partition import Partition
 from .ports import Ports
 from .realisation import ModalRealisation, natural
-from .residual_form import modes_of
+from .residual_form import plant_modes
 from .sampling import sampled_physical
 from .sensors import Poi
 
 
-def selected(own: Assembled, ports: Ports) -> Assembled | None:
+def with_ports_of(own: Assembled, ports: Ports) -> Assembled | None:
     """Return a plant's origin with some of its sensors, actuators and POIs in their order."""
     # None for ports that are others or in another order, or whose noise the states hold mixed
     if not _among(ports, own.ports):
@@ -58,20 +58,20 @@ def selected(own: Assembled, ports: Ports) -> Assembled | None:
 
 def _among(ports: Ports, own: Ports) -> bool:
     """Return whether the ports are some of a plant's own, in their order, without lost noise."""
-    some = _in_order(ports.u, own.u) and _in_order(ports.y, own.y)
-    same = len(ports.w) == len(own.w) and _in_order(ports.w, own.w)
+    some = _is_subsequence(ports.u, own.u) and _is_subsequence(ports.y, own.y)
+    same = len(ports.w) == len(own.w) and _is_subsequence(ports.w, own.w)
     noisy = own.input_noises.keys() == ports.input_noises.keys()
     known = {poi.name: poi for poi in own.z}
-    return some and same and noisy and all(_part(poi, known.get(poi.name)) for poi in ports.z)
+    return some and same and noisy and all(_is_part(poi, known.get(poi.name)) for poi in ports.z)
 
 
-def _in_order(ports: Sequence[Value], own: Sequence[Value]) -> bool:
+def _is_subsequence(ports: Sequence[Value], own: Sequence[Value]) -> bool:
     """Return whether all of some ports are among others, in their order."""
     left = iter(own)
     return all(any(port is other for other in left) for port in ports)
 
 
-def _part(poi: Poi, own: Poi | None) -> bool:
+def _is_part(poi: Poi, own: Poi | None) -> bool:
     """Return whether a POI is one of the plant's, or has some of its axes."""
     if own is None or not set(poi.axes) <= set(own.axes):
         return False
@@ -157,7 +157,7 @@ def sampled(plant: P, rate: float, delay: float) -> P:
             f"the plant is {plant.alteration}: sample plant.unweighted, then do so again with "
             "sampled weights and blocks (continuous ones would be distorted by the hold)."
         )
-    check_rate(_elastic(plant), rate, delay)
+    check_rate(_elastic_frequencies(plant), rate, delay)
     for name, late in (plant.assembled.ports.latencies if plant.is_assembled else {}).items():
         check_latency(name, late, rate)
     if not plant.is_assembled:
@@ -235,7 +235,7 @@ def _moves_alike(own: Assembled, realisation: ModalRealisation) -> bool:
     return same and held and not any(sensor.order for sensor in own.ports.y)
 
 
-def _elastic(plant: Partition) -> FloatArray:
+def _elastic_frequencies(plant: Partition) -> FloatArray:
     """Return the frequencies [Hz] of the elastic modes of a plant."""
     if not plant.is_assembled:
         return light_modes(plant.system.poles())
@@ -277,7 +277,7 @@ def rebuilt(
         )
     own = plant.assembled
     if isinstance(ports, Ports) and realisation is None:
-        found = selected(own, ports)
+        found = with_ports_of(own, ports)
         if found is not None:
             before = own.continuous
             whole = None if before is None else rebuilt(before, ports=ports)
@@ -300,7 +300,7 @@ def with_modes_of(plant: P, larger: object) -> P:
     """
     given = instance(larger, FEModel | Modes | ReducedModel, "larger", "Pass one, or a plant.")
     whole = given.completed() if isinstance(given, ReducedModel) else given
-    return rebuilt(plant, realisation=modes_of(whole))
+    return rebuilt(plant, realisation=plant_modes(whole))
 
 
 def with_flexibility(plant: P, flexibility: FloatArray) -> P:

@@ -29,7 +29,7 @@ class PortRows(NamedTuple):
     added: FloatArray  # (p, m) what is added to a sensor
 
 
-def channels(realisation: ModalRealisation, ports: Ports) -> PortRows:
+def port_rows(realisation: ModalRealisation, ports: Ports) -> PortRows:
     """Return the rows and loads of all ports."""
     forces, sensors = ports.forces, ports.y
     if not forces or not (ports.z or sensors):
@@ -52,13 +52,13 @@ def channels(realisation: ModalRealisation, ports: Ports) -> PortRows:
 
 def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
     """Return the structure alone, from all forces to the motions of POIs and sensors."""
-    own = channels(realisation, ports)
+    own = port_rows(realisation, ports)
     both = zip(own.seen, own.orders, strict=True)
     return StateSpace(
         realisation.A,
         np.array([realisation.force(load) for load in own.push]).T,
         np.array([one.row for one in own.seen]),
-        np.array([followed(*one, own.push, own.ground) for one in both]) + own.added,
+        np.array([direct_effect(*one, own.push, own.ground) for one in both]) + own.added,
         inputs=own.inputs,
         outputs=own.outputs,
         states=realisation.names,
@@ -74,9 +74,9 @@ def with_filters(structure: StateSpace, realisation: ModalRealisation, ports: Po
     States are those of the sensors' filters, the structure's, those of the forces' filters: what
     drives stands behind what is driven, so that A is block upper triangular.
     """
-    before = {port.name: _named(port.filter, port.name) for port in ports.forces}
+    before = {port.name: _named_system(port.filter, port.name) for port in ports.forces}
     filters = {sensor.name: sensor.filter for sensor in ports.y}
-    after = {name: _named(filters.get(name), name) for name in structure.outputs}
+    after = {name: _named_system(filters.get(name), name) for name in structure.outputs}
     moving = _carried(realisation, ports)
     if moving:
         structure, before, after = with_ground(Parts(structure, before, after), moving)
@@ -102,7 +102,7 @@ def _carried(realisation: ModalRealisation, ports: Ports) -> dict[str, Carried]:
     grounds = {port.name: port.ground for port in ports.forces if np.any(port.ground)}
     if not grounds:
         return {}
-    own, found = channels(realisation, ports), {}
+    own, found = port_rows(realisation, ports), {}
     for output, order, one in zip(own.outputs, own.orders, own.seen, strict=True):
         gains = {name: float(one.carried @ ground) for name, ground in grounds.items()}
         moved = {name: gain for name, gain in gains.items() if gain}
@@ -111,7 +111,7 @@ def _carried(realisation: ModalRealisation, ports: Ports) -> dict[str, Carried]:
     return found
 
 
-def _named(part: StateSpace | None, name: str) -> StateSpace:
+def _named_system(part: StateSpace | None, name: str) -> StateSpace:
     return (part or as_statespace(1.0)).replace(inputs=[name], outputs=[name])
 
 
@@ -134,7 +134,7 @@ class Parts(NamedTuple):
     after: dict[str, StateSpace]
 
 
-def followed(one: Seen, order: int, push: FloatArray, ground: FloatArray) -> FloatArray:
+def direct_effect(one: Seen, order: int, push: FloatArray, ground: FloatArray) -> FloatArray:
     """Return what a channel shows at once (m,) of loads `push` (m, n) and of `ground` (m, 6)."""
     # an accelerometer on a free body shows none of the ground's: the load -M r takes back what it
     # adds
@@ -170,7 +170,7 @@ def with_ground(parts: Parts, carried: Mapping[str, Carried]) -> Parts:
                 raise ModelError(_unbounded(output, one.order, name, left, found))
             if left:
                 needed.setdefault(name, set()).add(left)
-            entries[own, _channel(name, left)] = gain
+            entries[own, _ground_name(name, left)] = gain
     for name, lefts in needed.items():
         before[name] = _with_integrals(before[name], name, sorted(lefts))
     inputs = [name for part in before.values() for name in part.outputs]
@@ -179,7 +179,7 @@ def with_ground(parts: Parts, carried: Mapping[str, Carried]) -> Parts:
     return Parts(wider, before, after)
 
 
-def _channel(name: str, times: int) -> str:
+def _ground_name(name: str, times: int) -> str:
     """Return the name of the ground's acceleration, integrated some times."""
     return name if not times else f"{name}:{QUANTITIES[2 - times]}"
 
@@ -216,7 +216,7 @@ def _with_integrals(part: StateSpace, name: str, times: list[int]) -> StateSpace
     return part.replace(
         C=np.vstack([part.C, *rows]),
         D=np.vstack([part.D, np.zeros((len(times), 1))]),
-        outputs=[name, *(_channel(name, count) for count in times)],
+        outputs=[name, *(_ground_name(name, count) for count in times)],
         units={},
     )
 

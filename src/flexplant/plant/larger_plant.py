@@ -72,8 +72,8 @@ def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:
         own, other = getattr(plant, side), getattr(larger, side)
         if own != other:
             raise LabelError(
-                f"the larger plant has other channels in {side}: {_listed(other)}, the plant has "
-                f"{_listed(own)}. Assemble both with the same ports."
+                f"the larger plant has other channels in {side}: {_first_names(other)}, the plant "
+                f"has {_first_names(own)}. Assemble both with the same ports."
             )
     if plant.dt and not larger.dt:
         return sampled_like(plant, larger)
@@ -87,5 +87,5 @@ def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:
     return larger
 
 
-def _listed(names: Any) -> str:
+def _first_names(names: Any) -> str:
     return ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")

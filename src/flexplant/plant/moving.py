@@ -53,7 +53,7 @@ class Along(Value):
     B: FloatArray
 
 
-def moved(ports: Ports, places: Any) -> Ports:
+def moved_ports(ports: Ports, places: Any) -> Ports:
     """Return ports with some of them elsewhere; one POI, or {name: place} of any ports."""
     if not isinstance(places, Mapping):
         if len(ports.z) != 1:
@@ -88,7 +88,7 @@ def seen_elsewhere(plant: P, ports: Ports) -> P | None:
     pairs = [pair for old, new in sides for pair in zip(old, new, strict=True)]
     moves = [new for old, new in pairs if getattr(old, "at", None) != getattr(new, "at", None)]
     grounds = any(np.any(port.ground) for port in ports.w)
-    if not moves or grounds or own.realisation.static_outputs.size or not all(map(_plain, moves)):
+    if not moves or grounds or own.realisation.static_outputs.size or not all(map(_is_row, moves)):
         return None
     rows: dict[str, FloatArray] = {}
     for port in moves:
@@ -109,7 +109,7 @@ def seen_elsewhere(plant: P, ports: Ports) -> P | None:
     return wired(type(plant), own.replace(ports=ports, physical=physical, continuous=whole))
 
 
-def _plain(port: Any) -> bool:
+def _is_row(port: Any) -> bool:
     """Return whether a port is a row of C and nothing else."""
     if isinstance(port, Poi):
         return True
@@ -193,4 +193,4 @@ def _force_along(plant: Partition, port: Actuator | Disturbance, points: FloatAr
 
 def _elsewhere(plant: Partition, name: str, point: FloatArray) -> Partition:
     """Return the plant with one port at a point."""
-    return rebuilt(plant, ports=moved(plant.assembled.ports, {name: point.tolist()}))
+    return rebuilt(plant, ports=moved_ports(plant.assembled.ports, {name: point.tolist()}))

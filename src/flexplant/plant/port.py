@@ -45,7 +45,7 @@ class Seen(NamedTuple):
     carried: FloatArray = np.zeros(6)
 
 
-def seen(
+def observed(
     realisation: ModalRealisation,
     row: FloatArray,
     order: int = 0,
@@ -194,7 +194,7 @@ class SensorPort(Value):
     def see(self, realisation: ModalRealisation) -> Seen:
         """Return what it measures of the states, and of forces at once."""
         along = self.carried(realisation) if self.inertial else None
-        return seen(realisation, self.row(realisation), self.order, along)
+        return observed(realisation, self.row(realisation), self.order, along)
 
 
 def static_gain(part: StateSpace | None) -> float:
@@ -235,7 +235,7 @@ def checked_port(port: Any) -> dict[str, Any]:
     """Return the fields that ports have in common, each checked."""
     name = checked_name(port.name)
     checks: dict[str, Any] = {
-        "direction": checked_direction,
+        "direction": port_direction,
         "at": checked_place,
         "asd": lambda name, asd: positive(asd, f"asd of {name!r}", zero=True),
         "shape": lambda name, shape: checked_filter(name, "shape", shape),
@@ -290,7 +290,7 @@ def checked_choice(name: str, absolute: Any) -> bool | None:
     return None if absolute is None else bool(absolute)
 
 
-def checked_direction(name: str, direction: str) -> str:
+def port_direction(name: str, direction: str) -> str:
     """Return one of the six directions, or raise LabelError."""
     if not isinstance(direction, str) or direction not in DIRECTIONS:
         raise unknown_label(f"direction of {name!r}", direction, DIRECTIONS)
@@ -303,7 +303,7 @@ def checked_place(name: str, at: Any) -> Place:
         if not at:
             raise LabelError(f"{name!r} is at an empty mapping: name at least one DOF.")
         return {
-            _term(name, place): float(real_array(weight, f"weight of {place!r} in {name!r}", ()))
+            _key(name, place): float(real_array(weight, f"weight of {place!r} in {name!r}", ()))
             for place, weight in at.items()
         }
     if isinstance(at, str):
@@ -311,7 +311,7 @@ def checked_place(name: str, at: Any) -> Place:
     return tuple(real_array(at, f"place of {name!r}", (3,)).tolist())
 
 
-def _term(name: str, place: Any) -> Any:
+def _key(name: str, place: Any) -> Any:
     if isinstance(place, tuple):
         return tuple(real_array(place, f"a point of {name!r}", (3,)).tolist())
     return str(place)

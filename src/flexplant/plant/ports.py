@@ -16,7 +16,7 @@ from .forces import Disturbance as Disturbance
 from .port import QUANTITIES as QUANTITIES
 from .port import ForcePort, SensorPort
 from .port import Quantity as Quantity
-from .scheduling import Position, placed, require_positions
+from .scheduling import Position, port_at, require_positions
 from .sensors import Poi as Poi
 from .sensors import Sensor as Sensor
 
@@ -170,7 +170,7 @@ class Ports(Value):
         }
         sides = {side: getattr(self, side) for side in "wuzy"}
         require_positions([port for ports in sides.values() for port in ports], positions)
-        there = {side: tuple(placed(p, values) for p in ports) for side, ports in sides.items()}
+        there = {side: tuple(port_at(p, values) for p in ports) for side, ports in sides.items()}
         self._set(positions=positions, values=values, **there)
 
     def __repr__(self) -> str:

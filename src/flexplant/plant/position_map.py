@@ -17,7 +17,7 @@ from .assumptions import WEAK, mode_visibility
 from .partition import Partition
 from .rigid.decoupling import Decoupling, decouple
 from .rigid.rigid_body import rigid_body_of
-from .rigid.rigid_motion import projected
+from .rigid.rigid_motion import rigid_parts
 from .scheduling import values_over
 
 logger = logging.getLogger(__name__)
@@ -132,7 +132,7 @@ def position_map(plant: Any, judge: Any, points: Any) -> PositionMap:
             "the plant has no positions: nothing of it moves. Give ports moves={'x': (-1, 0, 0)} "
             "and Ports(..., positions=[fx.plant.Position('x', range=(-0.1, 0.1))])."
         )
-    judges = _judges(judge)
+    judges = _named_judges(judge)
     grid = values_over(positions, points)
     own = _decoupled(plant)
     rows: list[tuple[Any, ...]] = []
@@ -144,7 +144,7 @@ def position_map(plant: Any, judge: Any, points: Any) -> PositionMap:
         shares = [one for one in mode_visibility(there) if one.freq < most]
         modes = tuple(f"mode {one.mode} ({one.freq:.4g} Hz)" for one in shares)
         sees, pushes = ([one.shares.get(side, 0.0) for one in shares] for side in "yu")
-        rows.append((_errors(own, there), sees, pushes, list(_judged(judges, there, values))))
+        rows.append((_misses(own, there), sees, pushes, list(_figures_at(judges, there, values))))
     shape = tuple(values.size for values in grid.values())
     decoupling, seen, reached, judged = (
         np.array(part, dtype=float) for part in zip(*rows, strict=True)
@@ -160,7 +160,7 @@ def position_map(plant: Any, judge: Any, points: Any) -> PositionMap:
     )
 
 
-def _judges(judge: Any) -> dict[str, Callable[[Any], float]]:
+def _named_judges(judge: Any) -> dict[str, Callable[[Any], float]]:
     """Return named functions of a plant."""
     hint = "Pass a function of a plant, or {'margin': function}."
     if judge is None:
@@ -172,7 +172,7 @@ def _judges(judge: Any) -> dict[str, Callable[[Any], float]]:
     }
 
 
-def _judged(
+def _figures_at(
     judges: Mapping[str, Callable[[Any], float]], plant: Partition, values: tuple[float, ...]
 ) -> Iterator[float]:
     """Return figures of a plant; each is one number."""
@@ -192,7 +192,7 @@ def _decoupled(plant: Any) -> Decoupling | None:
         return None
 
 
-def _errors(own: Decoupling | None, plant: Any) -> tuple[float, float]:
+def _misses(own: Decoupling | None, plant: Any) -> tuple[float, float]:
     """Return by what transformations miss the identity at another place: of sensors, actuators."""
     if own is None:
         return np.nan, np.nan
@@ -202,8 +202,8 @@ def _errors(own: Decoupling | None, plant: Any) -> tuple[float, float]:
     rows = [body.axes.index(axis) for axis in own.axes]
     scale = inertia[rows][:, None] / inertia
     sensors = [sensor for sensor in ports.y if sensor.order == 0]
-    see = projected([sensor.static_row(realisation) for sensor in sensors], body.motions)
-    push = projected([port.static_push(realisation) for port in ports.u], body.motions).T
+    see = rigid_parts([sensor.static_row(realisation) for sensor in sensors], body.motions)
+    push = rigid_parts([port.static_push(realisation) for port in ports.u], body.motions).T
     one = np.eye(len(body.axes))[rows]
     seen, pushed = scale * (own.T_y @ see - one), scale * (own.T_u.T @ push.T - one)
     return float(np.linalg.norm(seen, 2)), float(np.linalg.norm(pushed, 2))

@@ -55,8 +55,8 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
         bare = bare.replace(system=evened(bare.system))
     poles = _persistent(bare.system)
     rate = 1.0 / plant.dt if plant.dt and not bare.dt else 0.0
-    sampled, apart = _alike(poles, rate), [[pole] for pole in poles]
-    words = _counted(bare, poles)
+    sampled, apart = _alias_groups(poles, rate), [[pole] for pole in poles]
+    words = _undamped_kinds(bare, poles)
     found = []
     for case in _cases(bare, poles, plant):
         groups = sampled if case.held else apart
@@ -75,7 +75,7 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
     return found
 
 
-def _counted(plant: Partition, poles: list[_Pole]) -> list[str]:
+def _undamped_kinds(plant: Partition, poles: list[_Pole]) -> list[str]:
     """Return, in words, how many modes of each kind do not decay."""
     rigid, pairs = plant.n_rigid, len(plant.unstable_modes)
     every = f"all {rigid} rigid-body modes" if rigid > 1 else "the rigid-body mode"
@@ -111,7 +111,7 @@ def _cases(bare: Partition, poles: list[_Pole], plant: Partition) -> list[_Case]
 
     def seeing(names: list[str]) -> list[str]:
         rows = g.C[g.output_index(names)]
-        sizes = [np.abs(_part(rows, pole.right)).max(axis=1, initial=0.0) for pole in poles]
+        sizes = [np.abs(_modal_rows(rows, pole.right)).max(axis=1, initial=0.0) for pole in poles]
         return [n for i, n in enumerate(names) if any(size[i] > 0 for size in sizes)]
 
     more = "Add a disturbance (with an asd) that does."
@@ -159,7 +159,7 @@ def _most(g: StateSpace, pole: complex, near: float) -> int:
     return max(most, 1)
 
 
-def _alike(poles: list[_Pole], rate: float) -> list[list[_Pole]]:
+def _alias_groups(poles: list[_Pole], rate: float) -> list[list[_Pole]]:
     """Return the poles, those together whose samples at a rate [Hz] are the same."""
     # exp(lambda / rate) of poles that differ by a multiple of the rate is one pole of the samples
     groups: list[tuple[complex, list[_Pole]]] = []
@@ -183,7 +183,7 @@ def _sample(value: complex, rate: float) -> complex:
     return complex(np.exp(value / rate)) if rate else value
 
 
-def _held(value: complex, rate: float) -> float:
+def _hold_gain(value: complex, rate: float) -> float:
     """Return what is left of an input that is held for a sample, ``|exp(a) - 1| / |a|``."""
     a = value / rate if rate else 0.0
     return abs(np.expm1(a) / a) if a else 1.0
@@ -202,23 +202,23 @@ def _lacks(plant: Partition, group: list[_Pole], case: _Case, rate: float) -> li
     parts = []
     for pole, basis in zip(group, bases, strict=True):
         if case.block is not None:
-            seen = _part(g.C[g.output_index(case.block.inputs)], basis)
-            parts.append(_part(response_at(case.block, _sample(pole.value, rate)), seen))
+            seen = _modal_rows(g.C[g.output_index(case.block.inputs)], basis)
+            parts.append(_modal_rows(response_at(case.block, _sample(pole.value, rate)), seen))
         elif case.pushes:
-            size = _held(pole.value, rate) if case.held else 1.0
-            part = _part(g.B[:, g.input_index(case.names)].T, basis)
+            size = _hold_gain(pole.value, rate) if case.held else 1.0
+            part = _modal_rows(g.B[:, g.input_index(case.names)].T, basis)
             parts.append(part * (size if size > _ALIKE else 0.0))
         else:
-            parts.append(_part(g.C[g.output_index(case.names)], basis))
-    missing = _missing(np.hstack(parts).T)  # one column for each channel
+            parts.append(_modal_rows(g.C[g.output_index(case.names)], basis))
+    missing = _null_combinations(np.hstack(parts).T)  # one column for each channel
     if not missing.shape[1]:
         return []
     if rigid.size:
         shapes = (bases[0] @ missing)[rigid].real
-        return [f"{case.verb} the rigid-body {' and '.join(_described(plant, shapes))}"]
+        return [f"{case.verb} the rigid-body {' and '.join(_axes_in_words(plant, shapes))}"]
     grows = any(pole.value.real > 0 and not pole.value.imag for pole in group)
     fate = "grows" if grows else "does not decay"
-    names = list(dict.fromkeys(_named(plant, pole.value) for pole in group))
+    names = list(dict.fromkeys(_pole_name(plant, pole.value) for pole in group))
     if len(group) == 1:
         return [f"{case.verb} {names[0]}, which {fate}"]
     alike = "they look" if len(names) > 1 else "its two poles look"
@@ -239,14 +239,14 @@ def response_at(block: StateSpace, at: complex) -> ComplexArray:
     return np.full(block.D.shape, np.nan, dtype=np.complex128)
 
 
-def _part(rows: FloatArray | ComplexArray, basis: ComplexArray) -> ComplexArray:
+def _modal_rows(rows: FloatArray | ComplexArray, basis: ComplexArray) -> ComplexArray:
     """Return rows @ basis, rounding set to zero: a channel without part has exactly none."""
     product = np.asarray(rows @ basis, dtype=np.complex128)
     product[np.abs(product) < ROUNDING * np.linalg.norm(rows, axis=1)[:, None]] = 0.0
     return product
 
 
-def _named(plant: Partition, pole: complex) -> str:
+def _pole_name(plant: Partition, pole: complex) -> str:
     """Return a pole as a mode and its frequency, or as a number."""
     if plant.n_rigid and not pole:
         return "the rigid-body motions"
@@ -275,7 +275,7 @@ def _weights_without(plant: Partition, key: str) -> list[str]:
     return texts
 
 
-def _missing(matrix: ComplexArray | FloatArray) -> ComplexArray:
+def _null_combinations(matrix: ComplexArray | FloatArray) -> ComplexArray:
     """Return the combinations (r, missing) that no channel has part in."""
     sizes = np.linalg.norm(matrix, axis=0)
     scaled = matrix[:, sizes > 0] / sizes[sizes > 0]
@@ -285,7 +285,7 @@ def _missing(matrix: ComplexArray | FloatArray) -> ComplexArray:
     return np.asarray(U[:, np.count_nonzero(s > _ABSENT * s[0]) :])
 
 
-def _described(plant: Partition, combinations: FloatArray) -> list[str]:
+def _axes_in_words(plant: Partition, combinations: FloatArray) -> list[str]:
     """Return rigid-body combinations (r, missing) in words, `translation z`, `rotation rx`."""
     realisation = plant.assembled.realisation
     model = realisation.model
@@ -373,7 +373,7 @@ def _transposed(g: StateSpace) -> StateSpace:
 def _frequency(plant: Partition, zero: complex) -> str:
     """Return a zero on the stability limit as a frequency, with the mode it belongs to."""
     omega = abs(np.log(zero)) / plant.dt if plant.dt else abs(zero)
-    if omega < SPLIT * _fastest(plant):
+    if omega < SPLIT * _top_omega(plant):
         return "zero frequency (a rigid-body motion or an integrator)"
     text = f"{omega / (2 * np.pi):.4g} Hz"
     own = np.sqrt(np.abs(np.linalg.det(plant.modal_blocks)))
@@ -384,7 +384,7 @@ def _frequency(plant: Partition, zero: complex) -> str:
     return text
 
 
-def _fastest(plant: Partition) -> float:
+def _top_omega(plant: Partition) -> float:
     if plant.dt:
         return float(np.pi / plant.dt)
     return float(np.max(np.abs(plant.system.poles()), initial=TINY))

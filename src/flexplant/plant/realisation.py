@@ -32,7 +32,7 @@ ILL_CONDITIONED = 30.0
 MODAL = "modal blocks"
 
 
-def _nothing() -> FloatArray:
+def _empty() -> FloatArray:
     return np.zeros(0)
 
 
@@ -61,8 +61,8 @@ class ModalRealisation(Value):
     outputs: FloatArray
     names: tuple[str, ...]
     n_rigid: int
-    static_outputs: FloatArray = field(default_factory=_nothing)
-    static_inputs: FloatArray = field(default_factory=_nothing)
+    static_outputs: FloatArray = field(default_factory=_empty)
+    static_inputs: FloatArray = field(default_factory=_empty)
     coupling: FloatArray | None = None
     form: str = MODAL
 
@@ -129,7 +129,7 @@ class ModalRealisation(Value):
         return np.asarray(self.static_inputs @ (row @ self.static_outputs))
 
 
-def realised(model: Structure | ModalRealisation) -> ModalRealisation:
+def realise(model: Structure | ModalRealisation) -> ModalRealisation:
     """Return the modal realisation of a structure; one that is given passes through."""
     if isinstance(model, ModalRealisation):
         return model
@@ -165,7 +165,7 @@ def realised(model: Structure | ModalRealisation) -> ModalRealisation:
 def _at_once(model: ReducedModel) -> ModalRealisation:
     """Return the realisation of a model whose massless coordinates (MacNeal) answer at once."""
     heavy, follow, flexibility = model.condensed()
-    found = realised(heavy)
+    found = realise(heavy)
     values, vectors = np.linalg.eigh(flexibility)
     # flexibilities beside the softest: what is left out is stiff enough to be rigid
     kept = values > 1e-15 * values[-1]
@@ -197,15 +197,15 @@ def _of_matrices(model: FEModel | ReducedModel, real: RealForm) -> ModalRealisat
     try:
         form: NormalForm = modal(real)
     except ModelError:
-        return _dense(model, real, f"an overdamped pair {_where(real, overdamped=True)}")
+        return _dense(model, real, f"an overdamped pair {_worst_mode(real, overdamped=True)}")
     except SolverError:
-        return _dense(model, real, f"two poles coalesce {_where(real)}")
+        return _dense(model, real, f"two poles coalesce {_worst_mode(real)}")
     if real.condition(form) > ILL_CONDITIONED:
-        return _dense(model, real, f"two poles nearly coalesce {_where(real)}")
+        return _dense(model, real, f"two poles nearly coalesce {_worst_mode(real)}")
     return _complex(model, form.omega, form.zeta, np.asarray(form.phi), r)
 
 
-def _where(real: RealForm, *, overdamped: bool = False) -> str:
+def _worst_mode(real: RealForm, *, overdamped: bool = False) -> str:
     """Return which undamped mode takes most part in the worst conditioned pole."""
     r = real.n_rigid
     omega, C = real.omega[r:], real.C[r:, r:]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks import Value, checked, instance, positive
 from ..errors import ModelError, warn
-from .realisation import MODAL, ModalRealisation, Structure, realised
+from .realisation import MODAL, ModalRealisation, Structure, realise
 
 
 class ResidualForm(Value):
@@ -111,13 +111,13 @@ class Feedthrough(ResidualForm):
         )
 
 
-def modes_of(
+def plant_modes(
     model: Structure | ModalRealisation, residual: ResidualForm | None = None
 ) -> ModalRealisation:
     """Return the modes of a structure as a plant takes them; FastStates where nothing is given."""
     way = FastStates() if residual is None else residual
     instance(way, ResidualForm, "residual", "Pass fx.plant.FastStates() or fx.plant.Feedthrough().")
-    realisation = realised(model)
+    realisation = realise(model)
     if realisation.form != MODAL and realisation is not model:
         warn(
             f"this plant is not in modal blocks but {realisation.form}. It is exact all the same; "

@@ -73,11 +73,11 @@ def sampled_physical(
     A = np.zeros((layout.size, layout.size))
     B = np.zeros((layout.size, len(g.inputs)))
     C = np.zeros((len(g.outputs), layout.size))
-    E, new, old = _moved(held, inputs, h)
+    E, new, old = _flow_at(held, inputs, h)
     A[states, states] = E
     layout.enter(A, B, states, new, old)
     layout.shift_inputs(A, B)
-    D_new, D_old = _direct(g.D, inputs, 0.0)
+    D_new, D_old = _acting_sample(g.D, inputs, 0.0)
     now = np.zeros((len(g.outputs), layout.size)), np.zeros_like(g.D)
     now[0][:, states] = g.C
     layout.enter(now[0], now[1], slice(None), D_new, D_old)
@@ -94,15 +94,15 @@ def sampled_physical(
             A[row], B[row] = now[0][j], now[1][j]
             continue
         t = h - float(outputs.fraction[j])
-        E, new, old = _moved(held, inputs, t)
-        direct_new, direct_old = _direct(g.D[j : j + 1], inputs, t)
+        E, new, old = _flow_at(held, inputs, t)
+        direct_new, direct_old = _acting_sample(g.D[j : j + 1], inputs, t)
         A[row, states] = g.C[j] @ E
         layout.enter(A, B, row, g.C[j] @ new + direct_new, g.C[j] @ old + direct_old)
     blocks = None
     if g.blocks is not None:
         blocks = [*[1] * first, *g.blocks, *[1] * (layout.size - first - n)]
     system = g.replace(A=A, B=B, C=C, D=D, dt=h, states=layout.names, blocks=blocks)
-    return Sampled(system, _noise(g, Flow(g.A, head, pairs), asd, h, layout, outputs))
+    return Sampled(system, _sampled_noise(g, Flow(g.A, head, pairs), asd, h, layout, outputs))
 
 
 class _Layout:
@@ -153,7 +153,7 @@ class _Layout:
                 A[state, self.pushed[age - 1, i]] = 1.0
 
 
-def _moved(held: HeldFlow, inputs: Late, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _flow_at(held: HeldFlow, inputs: Late, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return E(t), and the effects of the new and the old sample of each input."""
     E, whole = held.at(t)
     new, old = whole.copy(), np.zeros_like(whole)
@@ -168,7 +168,7 @@ def _moved(held: HeldFlow, inputs: Late, t: float) -> tuple[FloatArray, FloatArr
     return E, new, old
 
 
-def _direct(D: FloatArray, inputs: Late, t: float) -> tuple[FloatArray, FloatArray]:
+def _acting_sample(D: FloatArray, inputs: Late, t: float) -> tuple[FloatArray, FloatArray]:
     """Return which sample of each input acts at t within the sample: the new or the old one."""
     new = np.where(inputs.fraction <= t, D, 0.0)
     return new, D - new
@@ -187,7 +187,7 @@ def _check_noise(g: StateSpace, asd: FloatArray, outputs: Late) -> None:
         )
 
 
-def _noise(
+def _sampled_noise(
     g: StateSpace, flow: Flow, asd: FloatArray, h: float, layout: _Layout, outputs: Late
 ) -> FloatArray:
     """Return G (N, r), ``G G'`` the covariance that white inputs add in one sample."""

@@ -259,7 +259,7 @@ def checked_moves(name: str, at: Any, moves: Any) -> Moves | None:
     return Moves(at, along)
 
 
-def placed(port: Any, values: Mapping[str, float]) -> Any:
+def port_at(port: Any, values: Mapping[str, float]) -> Any:
     """Return a port where it is at values of the positions."""
     moves = getattr(port, "moves", None)
     if moves is None:

@@ -19,7 +19,7 @@ from .port import (
     checked_name,
     checked_place,
     motion_unit,
-    seen,
+    observed,
 )
 from .realisation import ModalRealisation
 from .scheduling import checked_moves
@@ -188,7 +188,7 @@ class Poi(Value):
         along = None
         if self.absolute:
             along = place_motion(realisation.model.full_dofs, self._at(axis), axis)
-        return seen(realisation, self.row(realisation, axis), 0, along)
+        return observed(realisation, self.row(realisation, axis), 0, along)
 
     def _at(self, axis: str) -> Place:
         """Return the place of an axis: of a label the direction is replaced."""

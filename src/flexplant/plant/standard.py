@@ -15,12 +15,12 @@ from ..labels import Place
 from ..lti.statespace import System
 from .assumptions import AssumptionReport
 from .building import continuous_plant, rebuilt, sampled
-from .moving import Along, along, moved, seen_elsewhere
+from .moving import Along, along, moved_ports, seen_elsewhere
 from .partition import Partition
 from .ports import Ports
 from .position_map import PositionMap, position_map
 from .realisation import ModalRealisation, Structure
-from .residual_form import ResidualForm, modes_of
+from .residual_form import ResidualForm, plant_modes
 from .rigid.rigid_motion import RigidModes, rigid_modes_of
 from .uncertainty.opening import uncertain
 from .uncertainty.uncertain_plant import UncertainPlant
@@ -216,7 +216,7 @@ class StandardPlant(Partition):
         ports = self.assembled.ports
         if positions:
             ports = ports.at(positions)
-        there = ports if poi is None else moved(ports, poi)
+        there = ports if poi is None else moved_ports(ports, poi)
         return seen_elsewhere(self, there) or self.with_ports(there)
 
     def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
@@ -472,4 +472,4 @@ def assemble_plant(
       z (2) die:x  u1:effort
       y (1) y1
     """
-    return continuous_plant(StandardPlant, modes_of(model, residual), ports)
+    return continuous_plant(StandardPlant, plant_modes(model, residual), ports)

@@ -24,10 +24,10 @@ from ..modes.solve import modes_reaching
 from ..parallel import Progress
 from ..reduction import ReducedModel
 from ..structure import Damping, FEModel
-from .dynamics import channels
+from .dynamics import port_rows
 from .ports import Ports
 from .realisation import Structure
-from .residual_form import modes_of
+from .residual_form import plant_modes
 
 
 def _none() -> FloatArray:
@@ -239,7 +239,7 @@ class _PortChannels:
     """The channels of ports over the coordinates of a model: loads, rows, filters, latencies."""
 
     def __init__(self, model: Structure, ports: Ports) -> None:
-        own = channels(_motions(model), ports)
+        own = port_rows(_all_motions(model), ports)
         self.inputs, self.outputs, self.units = own.inputs, own.outputs, ports.units
         seen_as = {sensor.quantity for sensor in ports.y} | {"displacement" for _ in ports.z}
         self._quantity = seen_as.pop() if len(seen_as) == 1 else None
@@ -298,7 +298,7 @@ class _PortChannels:
         return np.asarray(found * after.T[:, :, None] * before.T[:, None])
 
 
-def _motions(model: Structure) -> Any:
+def _all_motions(model: Structure) -> Any:
     """Return what ports read of a realisation, with the states (q, dq/dt, d2q/dt2) of all DOFs."""
     n = model.row(model.full_dofs.labels[0]).size
     nothing: Any = sp.csr_array((n, 3 * n))
@@ -329,7 +329,7 @@ def _realised(
     model: Modes | ReducedModel, freq: FloatArray, rows: FloatArray, loads: FloatArray
 ) -> ComplexArray:
     """Return the responses (f, p, q) of a model by its modes."""
-    own = modes_of(model)
+    own = plant_modes(model)
     system = StateSpace(
         own.A,
         np.array([own.force(load) for load in loads.T]).T,

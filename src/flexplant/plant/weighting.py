@@ -29,10 +29,10 @@ def weighted(plant: P, z: Any, w: Any) -> P:
         raise ModelError("all of z or w was left out: keep at least one channel of each.")
     inner = plant.system.select([*keep_z, *plant.y], [*keep_w, *plant.u])
     before = append(
-        *(_weight(plant, w.get(name, 1.0), name) for name in keep_w), _through(plant, plant.u)
+        *(_weight(plant, w.get(name, 1.0), name) for name in keep_w), _identity(plant, plant.u)
     )
     after = append(
-        *(_weight(plant, z.get(name, 1.0), name) for name in keep_z), _through(plant, plant.y)
+        *(_weight(plant, z.get(name, 1.0), name) for name in keep_z), _identity(plant, plant.y)
     )
     system = series(series(before, inner), after)
     step = tuple(z.items()), tuple(w.items())
@@ -59,9 +59,9 @@ def _mapping(weights: Any, side: str) -> dict[str, Any]:
 def measured_through(plant: P, block: System) -> P:
     """Return the plant with y read through a block."""
     g = as_statespace(block)
-    inner = plant.system.select([*plant.z, *(plant.y[i] for i in _columns(plant, g))])
+    inner = plant.system.select([*plant.z, *(plant.y[i] for i in _positions_of(plant, g))])
     block = g if g.n_states else g.replace(dt=plant.dt)
-    after = append(_through(plant, plant.z), block)
+    after = append(_identity(plant, plant.z), block)
     if plant.origin.reading is not None:
         block = series(plant.origin.reading.select(outputs=block.inputs), block)
     return plant.replace(
@@ -81,7 +81,7 @@ def altered_like(plant: P, plain: P) -> P:
     return plain
 
 
-def _columns(plant: Partition, g: StateSpace) -> list[int]:
+def _positions_of(plant: Partition, g: StateSpace) -> list[int]:
     require_known("channel of y", g.inputs, plant.y)
     return [plant.y.index(name) for name in g.inputs]
 
@@ -112,6 +112,6 @@ def at_rate(weight: StateSpace, name: str, dt: float) -> StateSpace:
     return weight
 
 
-def _through(plant: Partition, names: tuple[str, ...]) -> StateSpace:
+def _identity(plant: Partition, names: tuple[str, ...]) -> StateSpace:
     gain = as_statespace(np.eye(len(names)))
     return gain.replace(dt=plant.dt, inputs=names, outputs=names)

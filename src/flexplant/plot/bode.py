@@ -297,7 +297,7 @@ def frf(
     below = [part for part in _ALSO if part in more and part != "deviation"]
     if ax is not None and below:
         raise ModelError(f"{' and '.join(below)} take panels of their own: leave ax out.")
-    given, panels = ax is not None, _stacked(ax, len(below))
+    given, panels = ax is not None, _magnitude_axes(ax, len(below))
     ax = panels[0]
     plain = role_of(drawn[0].label) is None and "marker" not in drawn[0].line
     wide = {"linewidth": 3.2, "alpha": 0.5} if len(drawn) > 1 and plain else {}
@@ -305,7 +305,7 @@ def frf(
         look = line | wide if i == 0 else line
         ax.semilogx(response.freq, decibel(response[output, input]), label=label, **look)
         if "deviation" in more and response.variance is not None:
-            variance = _entry(response, response.variance, output, input)
+            variance = _channel_values(response, response.variance, output, input)
             text = f"standard deviation of {label}"
             look = {"color": GREY, "linewidth": 1.2, "linestyle": "--", "zorder": 1.7}
             ax.semilogx(response.freq, 0.5 * decibel(variance), label=text, **look)
@@ -328,7 +328,7 @@ def frf(
                 phase = _half_turns(response[output, input], dots="marker" in line)
                 panel.semilogx(response.freq, phase, **line)
             elif response.coherence is not None:
-                shown = _entry(response, response.coherence, output, input)
+                shown = _channel_values(response, response.coherence, output, input)
                 panel.semilogx(response.freq, shown, **line)
         y = "phase [deg]" if part == "phase" else "coherence [-]"
         finish(panel, x="frequency [Hz]" if panel is panels[-1] else "", y=y)
@@ -344,7 +344,7 @@ def frf(
 _ALSO = ("phase", "coherence", "deviation")
 
 
-def _stacked(ax: Axes | None, count: int) -> list[Axes]:
+def _magnitude_axes(ax: Axes | None, count: int) -> list[Axes]:
     """Return axes for a magnitude and so many lower panels below it."""
     if ax is not None or not count:
         return [axes(ax, figsize=(9.0, 4.5))]
@@ -352,7 +352,7 @@ def _stacked(ax: Axes | None, count: int) -> list[Axes]:
     return panel_axes(None, 1 + count, columns=1, figsize=size, height_ratios=ratios)
 
 
-def _entry(response: Frf, values: FloatArray, output: str, input: str) -> FloatArray:
+def _channel_values(response: Frf, values: FloatArray, output: str, input: str) -> FloatArray:
     place = list(response.outputs).index(output), list(response.inputs).index(input)
     return np.asarray(values[place])
 

@@ -94,7 +94,7 @@ def predictions(
     names = list(tables)
     for i, (name, table) in enumerate(tables.items()):
         color = (colors or {}).get(name, str(CYCLE[i % len(CYCLE)]["color"]))
-        _row(ax, len(names) - 1 - i, table / factor, color)
+        _draw_row(ax, len(names) - 1 - i, table / factor, color)
     ax.set_xscale("log")
     _name_cases(ax, cases, next(iter(tables.values()))[:, 1] / factor, len(names) - 1)
     ax.set_yticks(range(len(names)), names[::-1])
@@ -236,7 +236,7 @@ def _name_cases(ax: Axes, cases: Sequence[str], found: FloatArray, place: float)
     ax.margins(x=0.05 + 1.5 * max(beyond, 0.0))
 
 
-def _row(ax: Axes, place: float, table: FloatArray, color: str) -> None:
+def _draw_row(ax: Axes, place: float, table: FloatArray, color: str) -> None:
     """Draw one design: bars first, so that the diamonds around them stay visible."""
     predicted, found, low, high = table.T
     ax.hlines(np.full(found.size, place), np.minimum(predicted, found),
@@ -332,7 +332,7 @@ def consistency(
     )[1]  # fmt: skip
     _nis(panels[0], estimate.time[there], white[there], level)
     dt = float(np.median(np.diff(estimate.time)))
-    _correlation(panels[1], white, dt, level)
+    _draw_correlation(panels[1], white, dt, level)
     _periodogram(panels[2], white, 1.0 / dt, level)
     legend(panels[0], given=True)
     if found is not None and not given:
@@ -363,7 +363,7 @@ def _nis(ax: Axes, time: FloatArray, white: FloatArray, level: float) -> None:
     finish(ax, x=named("time", unit), y="NIS per sensor [-]")
 
 
-def _correlation(ax: Axes, white: FloatArray, dt: float, level: float) -> None:
+def _draw_correlation(ax: Axes, white: FloatArray, dt: float, level: float) -> None:
     from scipy.stats import norm
 
     there = _there(white)

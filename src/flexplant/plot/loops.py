@@ -17,7 +17,7 @@ from ..loop import sensitivity as sensitivity_of
 from ..loop.blocks import references
 from ..loop.comparison import axis_sensitivities, error_sensitivity
 from ..lti.frequency import Frf, frequency_response
-from ..lti.measured_lines import LINES, followed, steps_between
+from ..lti.measured_lines import LINES, on_lines, steps_between
 from ..lti.responses import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
 from ..tolerances import SAME, SPLIT
@@ -97,7 +97,7 @@ def nyquist(
     level = 20.0 * np.log10(positive(modulus, "modulus"))
     limit = positive(reach, "reach")
     measured = [name for name, one in labelled(loop_gains).items() if isinstance(one, Frf)]
-    drawn = curves(_opened(loop_gains, freq), freq)
+    drawn = curves(_loop_gains(loop_gains, freq), freq)
     alone = apart(ax, [curve.label for curve in drawn])
     if alone:
         rows = -(-len(drawn) // 2)
@@ -153,10 +153,10 @@ def _refine_loop_gain(freq: FloatArray, L: ComplexArray) -> tuple[FloatArray, Co
     if not steep.size:
         return freq, L
     every = np.union1d(freq, steps_between(freq, L, steep))
-    return every, followed(freq, L, every)
+    return every, on_lines(freq, L, every)
 
 
-def _opened(found: Any, freq: FloatArray | None) -> dict[str, Any]:
+def _loop_gains(found: Any, freq: FloatArray | None) -> dict[str, Any]:
     """Return what to draw by label; of a closed loop ``L_i = 1 / S_ii - 1`` of each actuator."""
     gains: dict[str, Any] = {}
     for label, one in labelled(found).items():
@@ -217,7 +217,7 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
         pole, zero = _MARKERS[i % len(_MARKERS)]
         _draw_roots(ax, continuous_poles(g), pole, color, f"{label} poles".strip())
         if zeros:
-            _draw_roots(ax, _continuous(g.zeros(), g), zero, color, f"{label} zeros".strip())
+            _draw_roots(ax, _log_poles(g.zeros(), g), zero, color, f"{label} zeros".strip())
     ax.set_xscale("log")
     _wide(ax)
     # a drawn root is on the right of the imaginary axis, or on it
@@ -242,7 +242,7 @@ def _wide(ax: Axes) -> None:
         ax.set_xlim(low / room, high * room, auto=True)
 
 
-def _continuous(roots: ComplexArray, g: StateSpace) -> ComplexArray:
+def _log_poles(roots: ComplexArray, g: StateSpace) -> ComplexArray:
     if not g.dt:
         return roots
     kept = roots[np.abs(roots) > 0]
@@ -337,7 +337,7 @@ def sensitivity(
             text = f"{label}: up to {decibel(line[1][at]):.1f} dB, at {line[0][at]:.4g} Hz"
             name_panel(panel, text)
     for panel in dict.fromkeys(panels):
-        _limit(panel, weight, "S", list(lines.values()))
+        _draw_limit(panel, weight, "S", list(lines.values()))
         if ax is None:
             _from_where_it_rises(panel, list(lines.values()))
         _draw_levels(panel)
@@ -415,13 +415,13 @@ def sensitivities(
     looks = styles(named, colors)
     for what, panel in zip(_LIMITED, panels, strict=True):
         found = responses[what]
-        lines = [(response.freq, largest(response)) for response in found]
+        lines = [(response.freq, largest_value(response)) for response in found]
         for label, line, style in zip(named, lines, looks, strict=True):
             text = label if label and what == "S" else None
             panel.semilogx(line[0], decibel(line[1]), label=text, **style)
-        _limit(panel, limits.get(what), what, lines)
+        _draw_limit(panel, limits.get(what), what, lines)
         if what == "S":
-            _smallest(panel, found, looks)
+            _draw_smallest(panel, found, looks)
         if what == "KS":
             readable(panel)
         else:
@@ -433,7 +433,7 @@ def sensitivities(
     return first
 
 
-def _smallest(ax: Axes, found: Sequence[Frf], looks: Sequence[Style]) -> None:
+def _draw_smallest(ax: Axes, found: Sequence[Frf], looks: Sequence[Style]) -> None:
     """Draw the smallest singular values of S, and all from a hundredth of where they rise on."""
     lines = [(response.freq, singular(response)[:, -1]) for response in found]
     for line, response, style in zip(lines, found, looks, strict=True):
@@ -456,7 +456,7 @@ def singular(response: Frf) -> FloatArray:
     return np.asarray(np.linalg.svd(np.moveaxis(response.data, 2, 0), compute_uv=False))
 
 
-def largest(response: Frf) -> FloatArray:
+def largest_value(response: Frf) -> FloatArray:
     """Return the largest singular value of a response at each frequency."""
     return singular(response)[:, 0]
 
@@ -471,7 +471,7 @@ def _kind_of(what: str, loop: Any, at: Literal["u", "y"], freq: FloatArray | Non
 def _sensitivity_size(one: Any, freq: FloatArray | None) -> _Line:
     """Return frequencies and sizes of one sensitivity."""
     if isinstance(one, Frf):
-        return one.freq, largest(one)
+        return one.freq, largest_value(one)
     if isinstance(one, ClosedLoop):
         try:
             return error_sensitivity(one)
@@ -488,7 +488,7 @@ def _sensitivity_size(one: Any, freq: FloatArray | None) -> _Line:
             "Type {'model': close_loop(plant, controller)}."
         )
     S = sensitivity_of(one, freq=freq)
-    return S.freq, largest(S)
+    return S.freq, largest_value(S)
 
 
 def _is_line(one: Any) -> bool:
@@ -497,7 +497,7 @@ def _is_line(one: Any) -> bool:
     )  # fmt: skip
 
 
-def _limit(ax: Axes, weight: Any, what: str, lines: Sequence[_Line]) -> None:
+def _draw_limit(ax: Axes, weight: Any, what: str, lines: Sequence[_Line]) -> None:
     """Draw the inverse of a weight over the frequencies of the lines."""
     if weight is None:
         return

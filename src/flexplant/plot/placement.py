@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle as Box
 from ..checks import FloatArray, IntArray, in_unit, instance, whole
 from ..errors import ModelError
 from ..placement import ParetoCurve, SensorMap
-from ..placement.candidates import Zone, places_of
+from ..placement.candidates import Zone, candidate_places
 from ..placement.gramian import shapes_of
 from ..plant import Ports, StandardPlant
 from ..structure import Disc
@@ -211,11 +211,11 @@ def placed(
         shape = shapes.full[:, mode - 1]
         shape = shape / float(np.max(np.abs(shape[rows])))
         title = f"mode {mode}, {shapes.omega[mode - 1] / 2 / np.pi:.4g} Hz"
-    where = places_of(plant, (*own.ports.y, *own.ports.u))
+    where = candidate_places(plant, (*own.ports.y, *own.ports.u))
     kinds = {
-        "sensors": _devices(own.ports.y, where.points),
-        "actuators": _devices(own.ports.u, where.points[len(own.ports.y) :]),
-        "POI": _devices(own.ports.z, [points.mean(axis=0)[None] for points in where.pois]),
+        "sensors": _point_devices(own.ports.y, where.points),
+        "actuators": _point_devices(own.ports.u, where.points[len(own.ports.y) :]),
+        "POI": _point_devices(own.ports.z, [points.mean(axis=0)[None] for points in where.pois]),
     }
     height = dofs.xyz[rows, 2]
     middle = 0.5 * float(height.min() + height.max())
@@ -241,7 +241,7 @@ def placed(
 _LAYER = 1e-3
 
 
-def _devices(ports: Sequence[Any], points: Sequence[FloatArray]) -> list[Device]:
+def _point_devices(ports: Sequence[Any], points: Sequence[FloatArray]) -> list[Device]:
     """Return the devices of ports, each of its points one."""
     pairs = zip(ports, points, strict=False)
     return [Device.of(port, point) for port, listed in pairs for point in listed]

@@ -54,11 +54,11 @@ def position_map(found: PositionMap, *, kind: str = "m") -> list[Axes]:
             f"a picture has two axes, the map {len(found.grid)} positions: map fewer, "
             "points={'z': [0.0]} holds one where it is."
         )
-    draw = _lines if len(found.grid) == 1 else _images
+    draw = _curve_panels if len(found.grid) == 1 else _image_panels
     return draw(found, kind)
 
 
-def _lines(found: PositionMap, kind: str) -> list[Axes]:
+def _curve_panels(found: PositionMap, kind: str) -> list[Axes]:
     """Draw panels above each other, over one position."""
     ((name, values),) = found.grid.items()
     factor, unit = in_unit(float(np.abs(values).max()), kind)
@@ -106,7 +106,7 @@ def _lines(found: PositionMap, kind: str) -> list[Axes]:
     return list(drawn[:, 0])
 
 
-def _images(found: PositionMap, kind: str) -> list[Axes]:
+def _image_panels(found: PositionMap, kind: str) -> list[Axes]:
     """Draw panels side by side, over two positions."""
     images: dict[str, FloatArray] = {}
     if np.any(np.isfinite(found.decoupling)):

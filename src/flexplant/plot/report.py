@@ -35,7 +35,7 @@ from .bode import bode, singular_values
 from .errors import budget, error_map
 from .estimation import lag_report
 from .html.page import Chapter, Gallery, page, table
-from .html.result import Design, attempted, loops_section, result
+from .html.result import Design, html_or_why, loops_section, result
 from .identification import stabilisation
 from .placement import pareto_curve, placed, sensor_map
 from .response import response
@@ -70,7 +70,7 @@ _WORDS = {
 Picture = tuple[str, Callable[[], Any]]
 
 
-def sections(design: Design, gallery: Gallery) -> Iterator[Chapter]:
+def room_sections(design: Design, gallery: Gallery) -> Iterator[Chapter]:
     """Yield the sections of all values but loops and verdicts, each value under its room."""
     shown = {
         name: value
@@ -97,18 +97,18 @@ def _value_lines(name: str, value: Any, design: Design, gallery: Gallery) -> str
     loop = next(iter(design.of(ClosedLoop).values()), None)
     if isinstance(value, Response) and value.seed is not None and loop is not None:
         parts.append("<h4>Beside the model of the loop</h4>")
-        parts.append(attempted(lambda: consistency(loop, value)._repr_html_()))
+        parts.append(html_or_why(lambda: consistency(loop, value)._repr_html_()))
     modes = _modes_of(value)
     if modes is not None:
         parts.append(
             f'<div class="pictures">{moving_shapes(modes)}<div>{_modes_table(modes)}</div></div>'
         )
     drawn = [
-        attempted(lambda draw=draw, said=said: gallery.picture(draw, said))  # type: ignore[misc]
+        html_or_why(lambda draw=draw, said=said: gallery.picture(draw, said))  # type: ignore[misc]
         for said, draw in _pictures(name, value, design)
     ]
     if isinstance(value, StandardPlant):
-        drawn.append(f"<div>{attempted(lambda: _ports_table(value))}{_assumptions(value)}</div>")
+        drawn.append(f"<div>{html_or_why(lambda: _ports_table(value))}{_assumptions(value)}</div>")
     if drawn:
         parts.append(f'<div class="pictures">{"".join(drawn)}</div>')
     tick("report")
@@ -215,25 +215,25 @@ def _ports_table(plant: StandardPlant) -> str:
     for side, kind in kinds.items():
         for port in getattr(ports, side):
             at = getattr(port, "at", "")
-            where = ", ".join(f"{x:g}" for x in at) if _point(at) else str(at)
+            where = ", ".join(f"{x:g}" for x in at) if _is_point(at) else str(at)
             asd = getattr(port, "asd", 0.0)
-            density = with_unit(asd, _density(plant, port.name, units.get(side, ""))) if asd else ""
+            density = with_unit(asd, _unit(plant, port.name, units.get(side, ""))) if asd else ""
             along = getattr(port, "direction", None) or " ".join(getattr(port, "axes", ()))
             rows.append([port.name, kind, where, str(along), density])
     return table(["channel", "kind", "place [m]", "along", "noise density"], rows)
 
 
-def _density(plant: StandardPlant, name: str, otherwise: str) -> str:
+def _unit(plant: StandardPlant, name: str, otherwise: str) -> str:
     own = plant.units.get(name)
     return f"{own}/√Hz" if own else otherwise
 
 
-def _point(at: Any) -> bool:
+def _is_point(at: Any) -> bool:
     return isinstance(at, tuple | list | np.ndarray) and len(at) == 3 and not isinstance(at[0], str)
 
 
 def _assumptions(plant: StandardPlant) -> str:
-    shown = attempted(lambda: plant.check()._repr_html_())
+    shown = html_or_why(lambda: plant.check()._repr_html_())
     return f"<details><summary>Standard assumptions</summary>{shown}</details>"
 
 
@@ -433,7 +433,7 @@ def report(
         bar.advance()
         found += [loops_section(design, gallery, channel)]
         bar.advance(1 + len(design.of(ClosedLoop)))
-        found += sections(design, gallery)
+        found += room_sections(design, gallery)
         found += [certificates(design), _origin({**noisy, **(seeds or {})})]
     text = page(str(title), str(subtitle), [one for one in found if one is not None])
     with written(path) as file:

@@ -117,7 +117,7 @@ def response(
     for (own, group), panel in zip(panels, drawn, strict=True):
         if exposures is not None:
             shade(panel, exposures, run)
-        _panel(panel, run, group, own, names, label=label, color=color, given=ax is not None)
+        _draw_panel(panel, run, group, own, names, label=label, color=color, given=ax is not None)
         if len(panels) > len(units) and label is None:
             name_panel(panel, group[0])
             panel.get_lines()[-1].set(color=color or BLUE, linestyle="-")
@@ -138,7 +138,7 @@ def time_axis(ax: Axes, run: Response) -> tuple[float, str]:
     return shown_in(ax.xaxis, float(np.max(np.abs(run.time), initial=0.0)), "s")
 
 
-def _label(label: str | None, name: str, names: Sequence[str]) -> str:
+def _curve_label(label: str | None, name: str, names: Sequence[str]) -> str:
     if label is None:
         return name
     return label if len(names) == 1 else f"{label}: {name}"
@@ -156,7 +156,7 @@ def _within_span(run: Response, span: tuple[float, float]) -> Response:
     return run.replace(time=run.time[within], data=run.data[..., within])
 
 
-def _panel(
+def _draw_panel(
     ax: Axes,
     run: Response,
     group: Sequence[str],
@@ -172,11 +172,11 @@ def _panel(
     size = max(float(np.max(np.abs(signal), initial=0.0)) for signal in signals)
     factor, shown = shown_in(ax.yaxis, size, unit)
     second, time = time_axis(ax, run)
-    labels = [_label(label, name, names) for name in names]
+    labels = [_curve_label(label, name, names) for name in names]
     looks = dict(zip(names, styles(labels, taken=len(ax.get_lines())), strict=True))
     for name, signal in zip(group, signals, strict=True):
         look = looks[name] | {"linewidth": 0.8} | ({"color": color} if color else {})
-        ax.plot(run.time / second, signal / factor, label=_label(label, name, names), **look)
+        ax.plot(run.time / second, signal / factor, label=_curve_label(label, name, names), **look)
     legend(ax, given=given)
     errors = all(name.endswith(":error") for name in group)
     quantity = "error" if errors else quantity_of(unit)
@@ -245,9 +245,9 @@ def step(
     end = (
         max(map(_duration, found.values())) if duration is None else positive(duration, "duration")
     )
-    panels = _panels(ax, len(rows), len(columns))
+    panels = _response_axes(ax, len(rows), len(columns))
     for (label, g), look in zip(found.items(), styles(found), strict=True):
-        time, data = _responses(g.select(rows, columns), end)
+        time, data = _step_responses(g.select(rows, columns), end)
         for i, output in enumerate(rows):
             for j, name in enumerate(columns):
                 _draw_step(panels[i, j], time, data[i, j], g, (output, name), label or None, look)
@@ -269,7 +269,7 @@ def _set_points(found: Any) -> tuple[list[str], list[str]] | None:
     return [name for name in found.plant.z if name.rpartition(":")[0] in owners], refs
 
 
-def _panels(ax: Axes | None, rows: int, columns: int) -> Any:
+def _response_axes(ax: Axes | None, rows: int, columns: int) -> Any:
     if rows * columns > _MOST or (ax is not None and rows * columns > 1):
         raise ModelError(
             f"{rows} outputs and {columns} inputs are {rows * columns} channels: "
@@ -313,7 +313,7 @@ def _duration(g: StateSpace) -> float:
     return float(np.max(np.minimum(decay, 2.0 * np.pi * _PERIODS / np.abs(moving))))
 
 
-def _responses(g: StateSpace, end: float) -> tuple[FloatArray, FloatArray]:
+def _step_responses(g: StateSpace, end: float) -> tuple[FloatArray, FloatArray]:
     """Return times and the responses (p, m, n) to a step at each input."""
     h = g.dt
     if not h:

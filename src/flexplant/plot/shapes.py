@@ -250,7 +250,7 @@ class Surface(NamedTuple):
     @property
     def is_solid(self) -> bool:
         """Whether the nodes fill a volume."""
-        return bool(len(self.triangles)) and _rank(self.xyz) == 3
+        return bool(len(self.triangles)) and _dimension(self.xyz) == 3
 
     @property
     def extent(self) -> float:
@@ -279,18 +279,18 @@ def surface_of(dofs: DofSet) -> Surface:
     moves = dofs.kinds < 3
     rows[node[moves], dofs.kinds[moves]] = np.flatnonzero(moves)
     xyz = np.asarray(dofs.xyz[first])
-    rank = _rank(xyz)
+    rank = _dimension(xyz)
     if rank < 2 or numbers.size < rank + 1:
         # along x, of equal ones along y, then z
         order = np.argsort(xyz @ np.array([1.0, 1e-3, 1e-6]))
         chain = np.column_stack([order[:-1], order[1:]])
         return Surface(xyz, rows, np.zeros((0, 3), dtype=np.int64), chain)
-    flat = _plane(xyz) if rank == 2 else xyz
-    triangles = _triangulated(flat)
-    return Surface(xyz, rows, triangles, _edges(xyz, triangles))
+    flat = _flat_axes(xyz) if rank == 2 else xyz
+    triangles = _surface(flat)
+    return Surface(xyz, rows, triangles, _outline(xyz, triangles))
 
 
-def _rank(xyz: FloatArray) -> int:
+def _dimension(xyz: FloatArray) -> int:
     """Return 0 to 3: whether nodes are in one place, on a line, in a plane, or fill a volume."""
     if len(xyz) < 2:
         return 0
@@ -298,13 +298,13 @@ def _rank(xyz: FloatArray) -> int:
     return int(np.count_nonzero(sizes > _FLAT * sizes[0]))
 
 
-def _plane(xyz: FloatArray) -> FloatArray:
+def _flat_axes(xyz: FloatArray) -> FloatArray:
     """Return two of the coordinates (n, 2) of nodes in a plane, without the one closest across."""
     normal = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)[2][2]
     return np.delete(xyz, int(np.argmax(np.abs(normal))), axis=1)
 
 
-def _triangulated(points: FloatArray) -> IntArray:
+def _surface(points: FloatArray) -> IntArray:
     """Return triangles of points (n, 2), or the outer faces of the tetrahedra between (n, 3)."""
     from scipy.spatial import Delaunay, cKDTree
 
@@ -336,7 +336,7 @@ def _spacings(points: FloatArray) -> FloatArray:
     return np.array(steps) if all(steps) else np.full(extent.size, float(extent.max()))
 
 
-def _edges(xyz: FloatArray, triangles: IntArray) -> IntArray:
+def _outline(xyz: FloatArray, triangles: IntArray) -> IntArray:
     """Return the sides that belong to one triangle only, or to two at an angle."""
     a, b, c = (xyz[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)

@@ -241,8 +241,8 @@ def update(
     )
     axs: dict[str, Axes] = dict(drawn)
     if old.modes:
-        _errors(axs["frequencies"], old, old.freq_error, new.freq_error, "frequency")
-        _errors(axs["damping"], old, old.zeta_error, new.zeta_error, "damping ratio")
+        _draw_errors(axs["frequencies"], old, old.freq_error, new.freq_error, "frequency")
+        _draw_errors(axs["damping"], old, old.zeta_error, new.zeta_error, "damping ratio")
     for name, seen in (("mac before", old), ("mac after", new)):
         if name in axs:
             _mac(axs[name], seen, name)
@@ -255,7 +255,7 @@ def update(
     return axs
 
 
-def _errors(ax: Axes, seen: Correlation, old: FloatArray, new: FloatArray, what: str) -> None:
+def _draw_errors(ax: Axes, seen: Correlation, old: FloatArray, new: FloatArray, what: str) -> None:
     place = np.arange(len(seen.modes))
     unit = 100.0
     ax.bar(place - 0.2, unit * old, 0.38, color=GREY, label="before")

@@ -23,7 +23,7 @@ from .methods import (
     fe_model,
     inner,
     labels_given,
-    projected,
+    projected_model,
 )
 from .reduced import ReducedModel
 
@@ -79,7 +79,7 @@ class CraigBampton(ReductionMethod):
             count = fixed.shape[1]
             T = np.hstack([T, part.whole(np.zeros((len(labels), count)), fixed)])
         names = [*labels, *(f"fixed mode {i}" for i in range(1, count + 1))]
-        return projected(
+        return projected_model(
             model,
             T,
             dofs=model.dofs.select(labels),

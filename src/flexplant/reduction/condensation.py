@@ -23,7 +23,7 @@ from .methods import (
     fe_model,
     inner,
     labels_given,
-    projected,
+    projected_model,
     refused_partition,
 )
 from .reduced import ReducedModel
@@ -133,7 +133,7 @@ class Guyan(ReductionMethod):
         """Return the condensed model; `reduce` is the public way."""
         model, labels = fe_model(structure, self), tuple(self.dofs)
         part = DofPartition(model, labels)
-        return projected(
+        return projected_model(
             model,
             part.static,
             dofs=model.dofs.select(labels),
@@ -204,7 +204,7 @@ class Irs(ReductionMethod):
             if before.size and _is_settled(squares, before, self.tolerance):
                 break
             before = squares
-        return projected(
+        return projected_model(
             model,
             T,
             dofs=model.dofs.select(labels),
@@ -289,7 +289,7 @@ class Serep(ReductionMethod):
         modes = solve_modes(model, damping=ModalDamping(0.0), count=max(numbers))
         phi = np.real(modes.phi)[:, kept_columns(numbers, modes)]
         condition = refused_partition(modes.dofs, phi, labels, f"{len(labels)} modes", 1e6)
-        return projected(
+        return projected_model(
             model,
             la.solve(phi[rows].T, phi.T).T,
             dofs=model.dofs.select(labels),

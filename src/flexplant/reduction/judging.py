@@ -11,10 +11,10 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, real_array, short, whole
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
-from ..lti.frequency_sweep import climbed
+from ..lti.frequency_sweep import climbed_grid
 from ..modes.attachment_vectors import labels_of, places, static_response
 from ..modes.dynamic_basis import DirectCheck, DynamicBasis, antiresonances, checked_response
-from ..modes.matching import paired
+from ..modes.matching import pair_modes
 from ..modes.modes import Modes
 from ..modes.shifted import held_factor
 from ..modes.solve import modes_reaching
@@ -70,7 +70,7 @@ def quality_of(
         size = np.abs(responses.at(grid)).max(axis=0)
         size[size == 0] = 1.0
         # between resonances of both the error may be larger than at either
-        grid, _ = climbed(
+        grid, _ = climbed_grid(
             lambda at: (np.abs(responses.at(at) - less(at)) / size).max(axis=(1, 2)), grid, _ROUNDS
         )
     whole_response, found = responses.at(grid), less(grid)
@@ -88,7 +88,7 @@ def quality_of(
     ):
         bound = None
     return ReductionQuality(
-        **_compared(full, modes, own, count, high),
+        **_mode_comparison(full, modes, own, count, high),
         check_freq=grid,
         frf_error=frf,
         resonance_error=_largest_error(at_peaks, np.isin(grid, peaks)),
@@ -158,7 +158,7 @@ def _full_modes(full: FEModel | Modes, count: int | None, high: float) -> Modes:
     return modes_reaching(full, high, least=number)
 
 
-def _compared(
+def _mode_comparison(
     full: FEModel | Modes, modes: Modes, found: Modes, count: int | None, high: float
 ) -> dict[str, Any]:
     """Return the pairs of full and reduced modes, and how alike they are."""
@@ -177,7 +177,7 @@ def _compared(
         weighted, full_gram = shapes * seen[:, None], phi[seen].conj().T @ phi[seen]
         orthogonality = float("nan")
     gram = shapes.T @ weighted
-    pairs = paired(f, own, full_gram, phi.conj().T @ weighted, gram, n_rigid=modes.n_rigid)
+    pairs = pair_modes(f, own, full_gram, phi.conj().T @ weighted, gram, n_rigid=modes.n_rigid)
     found_freq = np.where(pairs.partner >= 0, own[pairs.partner], np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
         error = np.where(f > 0, found_freq / f - 1.0, 0.0)

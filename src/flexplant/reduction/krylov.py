@@ -20,7 +20,7 @@ from ..modes.shifted import stiffness_factor
 from ..sparse.factor import DENSE_LIMIT, dense, dynamic_lu
 from ..structure import FEModel
 from ..tolerances import RANK, TINY
-from .methods import ReductionMethod, fe_model, projected
+from .methods import ReductionMethod, fe_model, projected_model
 from .reduced import ReducedModel
 
 #: M-norm of what is new in a vector, of the whole vector, below which it adds nothing
@@ -97,7 +97,7 @@ class Krylov(ReductionMethod):
             else:
                 found = _moments(model, D, B, 2j * np.pi * float(f), self.moments)
             basis = extended(model, basis, found)
-        return projected(
+        return projected_model(
             model,
             basis,
             dofs=model.dofs.select(()),

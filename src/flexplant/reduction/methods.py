@@ -94,7 +94,7 @@ def labels_given(dofs: Iterable[str], name: str) -> tuple[str, ...]:
     return labels
 
 
-def shown(labels: Sequence[str]) -> str:
+def label_text(labels: Sequence[str]) -> str:
     """Return a short text for labels."""
     return ", ".join(labels[:3]) + (f", ... {labels[-1]}" if len(labels) > 3 else "")
 
@@ -142,7 +142,7 @@ def modal_damping(
     return np.asarray(0.5 * (D + D.T), dtype=np.float64)
 
 
-def projected(
+def projected_model(
     model: FEModel,
     T: FloatArray,
     *,
@@ -264,7 +264,7 @@ class DesiredDofs(ReductionMethod):
 
     def __repr__(self) -> str:
         labels = tuple(self.dofs)
-        return f"<DesiredDofs: {len(labels)} ({shown(labels)})>"
+        return f"<DesiredDofs: {len(labels)} ({label_text(labels)})>"
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the model in these DOFs; `reduce` is the public way."""

@@ -139,7 +139,7 @@ def rank_modes(
     array([2, 3])
     """
     refuse_unstable(modes, "a ranking of modes")
-    into, out, B, C = channels(modes, inputs, outputs)
+    into, out, B, C = modal_channels(modes, inputs, outputs)
     r = modes.n_rigid
     omega, zeta = modes.omega[r:], modes.zeta[r:]
     b, c = B[r:], C[:, r:]
@@ -163,7 +163,7 @@ def rank_modes(
     )
 
 
-def channels(
+def modal_channels(
     modes: Modes, inputs: Place | Iterable[Place], outputs: Place | Iterable[Place]
 ) -> tuple[tuple[str, ...], tuple[str, ...], FloatArray, FloatArray]:
     """Return names of inputs and outputs, and modal forces (k, q) and motions (p, k) there."""

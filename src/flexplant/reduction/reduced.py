@@ -28,7 +28,7 @@ from ..modes.normal_form import normal_form
 from ..parallel import Progress
 from ..structure import FEModel
 from ..structure.definite import refuse_unstable, unstable_stiffness
-from ..structure.placed import SPANNED, missed
+from ..structure.placed import SPANNED, relative_miss
 from ..structure.rigid import orthonormalised, rigid_motions
 from .judging import ReductionQuality, quality_of
 from .ranking import ErrorBound
@@ -105,7 +105,7 @@ class Spanned:
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return the relative parts (6,) of the rigid-body motions that T cannot make."""
         wanted = rigid_motions(self.full_dofs, real_array(about, "about", (3,)))
-        return missed(self.T @ self.rigid_motions(about), wanted)
+        return relative_miss(self.T @ self.rigid_motions(about), wanted)
 
     def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return the coordinates (k, 6) nearest to the six rigid-body motions of the geometry.

@@ -19,7 +19,7 @@ from ..structure import FEModel, ModalDamping
 from ..tolerances import SAME
 from .condensation import kept_columns, mode_numbers
 from .methods import ReductionMethod, inner
-from .ranking import ErrorBound, channels, peak_gains, rank_modes
+from .ranking import ErrorBound, modal_channels, peak_gains, rank_modes
 from .reduced import STATIC, ReducedModel
 
 _SUM = "sum of the peaks of the neglected modes"
@@ -132,7 +132,7 @@ class ModalTruncation(ReductionMethod):
 
     def _bound(self, model: FEModel, kept: Modes) -> ErrorBound | None:
         law = self.damping
-        into, out, force, seen = channels(kept, self.inputs, self.outputs)
+        into, out, force, seen = modal_channels(kept, self.inputs, self.outputs)
         if not isinstance(law, ModalDamping) or not isinstance(law.ratio, float) or not law.ratio:
             return None
         pushed = places(self.inputs)
@@ -146,7 +146,7 @@ class ModalTruncation(ReductionMethod):
         right = np.sum(C.T * flexible[:, q:]) - np.sum(seen[:, r:].T ** 2 / square)
         both = float(np.sqrt(max(float(left), 0.0) * max(float(right), 0.0)))
         value = both * float(peak_gains(np.ones(1), np.array([law.ratio]))[0])
-        vectors, _ = _channel_terms(_vectors(kept), (self.inputs, self.outputs))
+        vectors, _ = _channel_terms(_vectors_as_modes(kept), (self.inputs, self.outputs))
         value += _peaks(vectors)
         # of the lowest modes: none unseen is below the last, all are at most like one there
         lowest = self._numbers == tuple(range(1, kept.n_modes + 1))
@@ -252,13 +252,13 @@ def truncated(
         omega[columns], zeta[columns], basis[:, columns], modes.dofs, n_rigid=modes.n_rigid
     )
     if static:
-        kept = _corrected(kept, basis[:, others], omega[others], zeta[others], static)
+        kept = _with_static(kept, basis[:, others], omega[others], zeta[others], static)
     bound = None
     if bound_of is not None:
         gone = Modes(omega[others], zeta[others], basis[:, others], modes.dofs)
-        into, out, _, _ = channels(gone, *bound_of)
+        into, out, _, _ = modal_channels(gone, *bound_of)
         terms, missed = _channel_terms(gone, bound_of)
-        vectors, given = _channel_terms(_vectors(kept), bound_of)
+        vectors, given = _channel_terms(_vectors_as_modes(kept), bound_of)
         at_rest = float(np.linalg.norm(missed - given, 2)) if others.size else 0.0
         terms = np.vstack([terms, vectors])
         value = _peaks(terms)
@@ -266,10 +266,10 @@ def truncated(
             covers = modes.n_modes if modes.n_modes < len(modes.dofs) else None
             bound = ErrorBound(value, into, out, _SUM, terms=terms, static=at_rest, covers=covers)
     found = _modal_model(kept, [f"mode {i}" for i in numbers], method, bound)
-    return found.replace(truncated=_left_out(modes, columns))
+    return found.replace(truncated=_residual_modes(modes, columns))
 
 
-def _left_out(modes: Modes, columns: IntArray) -> Modes | None:
+def _residual_modes(modes: Modes, columns: IntArray) -> Modes | None:
     """Return the modes that are not kept, with the attachment vectors of all of them."""
     others = np.setdiff1d(np.arange(modes.n_modes), columns)
     if not others.size and not modes.n_vectors:
@@ -282,7 +282,7 @@ def _left_out(modes: Modes, columns: IntArray) -> Modes | None:
     )
 
 
-def _corrected(
+def _with_static(
     kept: Modes, shapes: FloatArray, omega: FloatArray, zeta: FloatArray, static: Any
 ) -> Modes:
     """Return modes with attachment vectors made of the other modes of a known set."""
@@ -305,14 +305,14 @@ def _corrected(
     )
 
 
-def _vectors(kept: Modes) -> Modes:
+def _vectors_as_modes(kept: Modes) -> Modes:
     """Return attachment vectors as modes of their own."""
     return Modes(kept.vector_omega, kept.vector_zeta, kept.vectors, kept.dofs)
 
 
 def _channel_terms(modes: Modes, bound_of: tuple[Any, Any]) -> tuple[FloatArray, FloatArray]:
     """Return gain, frequency and damping (k, 3) of modes between channels, and their static sum."""
-    _, _, force, seen = channels(modes, *bound_of)
+    _, _, force, seen = modal_channels(modes, *bound_of)
     gain = np.linalg.norm(force, axis=1) * np.linalg.norm(seen, axis=0)
     return np.column_stack([gain, modes.omega, modes.zeta]), (seen / modes.omega**2) @ force
 

@@ -95,7 +95,7 @@ def reading_along(designs: Mapping[str, Estimator]) -> tuple[StateSpace, ...]:
     >>> [output for block in fx.reading_along(designs) for output in block.outputs]
     ['static|die:hat', 'filter|die:hat']
     """
-    _check(designs)
+    _check_estimators(designs)
     return tuple(
         design.system.renamed(outputs={hat: f"{name}|{hat}" for hat in design.system.outputs})
         for name, design in designs.items()
@@ -144,7 +144,7 @@ def compare_estimators(
     >>> bool(found["filter"][1] < found["static"][1])  # measured
     True
     """
-    _check(designs)
+    _check_estimators(designs)
     instance(run, Response, "run", "Pass what simulate returned.")
     rows = []
     for name, design in designs.items():
@@ -162,7 +162,7 @@ def compare_estimators(
     return EstimatorComparison(channel, tuple(designs), np.array(rows), level)
 
 
-def _check(designs: Mapping[str, Estimator]) -> None:
+def _check_estimators(designs: Mapping[str, Estimator]) -> None:
     if not isinstance(designs, Mapping) or not designs:
         raise ModelError(
             f"need a mapping of names to estimators, got {short(designs)}. Type "

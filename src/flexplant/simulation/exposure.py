@@ -12,7 +12,7 @@ from ..checks import FloatArray, Value, instance, name_list, positive, real_arra
 from ..errors import LabelError, ModelError, ShapeError, counted, require_known
 from ..loop import ClosedLoop, close_loop
 from ..plant import Poi, Ports
-from .response import Numbers, Response, moving_moments, unit_of
+from .response import Numbers, Response, moving_moments, signal_unit
 from .simulate import Signal, simulate
 
 #: share of the windows in the third column of the table: three standard deviations of a Gaussian
@@ -125,7 +125,7 @@ def exposure_errors(
     names = error_channels(run) if channels is None else name_list(channels, "channels")
     if not names:
         raise ModelError("the run has no error of a POI: name the channels, channels=['y1'].")
-    parts = _parts(run, start, exposures)
+    parts = _exposure_slices(run, start, exposures)
     shortest = min(part.stop - part.start for part in parts)
     count = shortest if window is None else round(positive(window, "window") / run.dt)
     if not 1 <= count <= shortest:
@@ -191,7 +191,7 @@ def settling_time(
     """
     _check_run(run)
     limit = positive(ma, "ma"), np.inf if msd is None else positive(msd, "msd")
-    part = _parts(run, after, None)[0]
+    part = _exposure_slices(run, after, None)[0]
     count = round(positive(window, "window") / run.dt)
     if not 1 <= count <= part.stop - part.start:
         raise ModelError(
@@ -221,10 +221,10 @@ def error_channels(run: Response) -> tuple[str, ...]:
                 errors.remove(poi)
             elif name not in errors:
                 found.append(name)
-    return tuple(sorted(found, key=_owner))
+    return tuple(sorted(found, key=_poi_of))
 
 
-def _owner(channel: str) -> str:
+def _poi_of(channel: str) -> str:
     """Return the POI of a channel: `die` of die:x, die:error and die:rx:error."""
     place, _, axis = channel.removesuffix(":error").rpartition(":")
     return place if axis in _AXES and place else channel.removesuffix(":error")
@@ -234,7 +234,7 @@ def _check_run(run: object) -> None:
     instance(run, Response, "run", "Pass what simulate returned.")
 
 
-def _parts(run: Response, start: Any, exposures: Any) -> list[slice]:
+def _exposure_slices(run: Response, start: Any, exposures: Any) -> list[slice]:
     """Return the samples of each exposure."""
     if run.time.size < 2:
         raise ModelError("the run has a single sample: there is no window in it. Run it longer.")
@@ -264,7 +264,7 @@ def _parts(run: Response, start: Any, exposures: Any) -> list[slice]:
 
 def _windows(signal: FloatArray, count: int, whole: bool) -> tuple[FloatArray, FloatArray]:
     """Return MA and MSD of all windows of `count` samples that lie within a stretch."""
-    unit = unit_of(signal)
+    unit = signal_unit(signal)
     # an offset would cost digits of the deviation: it is removed first
     offset = np.mean(signal / unit, axis=-1, keepdims=True)
     rest = signal / unit - offset
@@ -387,7 +387,7 @@ def error_map(
     names = [f"map|{i}" for i in range(1, len(places) + 1)]
     pois = [Poi(name, at=tuple(p), axes=(axis,)) for name, p in zip(names, places, strict=True)]
     wide = loop.plant.with_ports(ports.replace(z=[*ports.z, *pois]))
-    followed = "" if reference is None else _followed(ports, axis)
+    followed = "" if reference is None else _map_reference(ports, axis)
     run = simulate(
         close_loop(wide, *loop.blocks, idle=loop.idle),
         duration=duration,
@@ -404,7 +404,7 @@ def error_map(
     return ErrorMap(axis, unit, places, found.values[:, 0], found.values[:, 2], found.window)
 
 
-def _followed(ports: Ports, axis: str) -> str:
+def _map_reference(ports: Ports, axis: str) -> str:
     """Return the reference that a map along an axis follows: the only one, or that of the axis."""
     found = ports.followed
     if len(found) > 1:

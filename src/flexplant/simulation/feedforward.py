@@ -107,7 +107,7 @@ class Feedforward(Value):
     def up_to(self, term: str) -> Feedforward:
         """Return the feedforward without the derivatives above position, velocity, ... or snap."""
         gains = self.gains.copy()
-        gains[:, :, _term(term) + 1 :] = 0.0
+        gains[:, :, _term_index(term) + 1 :] = 0.0
         return self.replace(gains=gains)
 
     def forces(self, move: SetPoint, time: npt.ArrayLike) -> dict[str, FloatArray]:
@@ -192,7 +192,7 @@ def design_feedforward(
     if loop is None:
         find = _of_plant(plant, poi, T, wanted, along)
     else:
-        find = _of_loop(loop, poi, T, wanted, name, along)
+        find = _loop_inverse(loop, poi, T, wanted, name, along)
     gains = coefficients(find, plant.dt, axes)
     gains[:, :, highest + 1 :] = 0.0
     return Feedforward(name, axes, T, tuple(plant.u), gains, plant.dt)
@@ -269,7 +269,7 @@ def _of_plant(
     return found
 
 
-def _of_loop(
+def _loop_inverse(
     loop: ClosedLoop,
     poi: Poi,
     T: FloatArray,
@@ -308,7 +308,7 @@ def _states(g: StateSpace, B: FloatArray, s: complex) -> ComplexArray:
     return np.asarray(np.linalg.solve(z * np.eye(g.n_states) - g.A, B.astype(np.complex128)))
 
 
-def _term(term: Any) -> int:
+def _term_index(term: Any) -> int:
     if not isinstance(term, str) or term not in TERMS:
         raise LabelError(f"a term is one of {', '.join(TERMS)}, got {short(term)}. Choose one.")
     return TERMS.index(term)
@@ -319,7 +319,7 @@ def term_numbers(terms: Any) -> list[int]:
     listed = name_list(terms, "terms")
     if not listed:
         raise ModelError(f"terms names no derivative to feed forward. Choose from {list(TERMS)}.")
-    return [_term(term) for term in listed]
+    return [_term_index(term) for term in listed]
 
 
 def _check_order(move: Any, gains: FloatArray) -> None:

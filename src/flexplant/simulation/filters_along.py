@@ -210,7 +210,7 @@ class _Filters:
         """Return the steady filter at values of the positions."""
         there = {name: float(value[0]) for name, value in values.items()}
         standing = Trajectory(
-            self.machine.path.positions, {n: _held(there[n]) for n in self.moved}, there
+            self.machine.path.positions, {n: _constant(there[n]) for n in self.moved}, there
         )
         sample = next(MovingPlant(self.plant, standing).each(1))
         return solve_dare(sample.A, sample.C[self.y], Q=sample.G @ sample.G.T, R=self.R)
@@ -250,7 +250,7 @@ class _Filters:
         """Return the gain M (n, ny) of the correction x[k|k] = x[k|k-1] + M e."""
         there = {name: float(value[0]) for name, value in values.items()}
         standing = Trajectory(
-            self.machine.path.positions, {n: _held(there[n]) for n in self.moved}, there
+            self.machine.path.positions, {n: _constant(there[n]) for n in self.moved}, there
         )
         C = next(MovingPlant(self.plant, standing).each(1)).C[self.y]
         P = self.steady(values).P
@@ -276,7 +276,7 @@ class _Filters:
         return rms, P
 
 
-def _held(value: float) -> Callable[[FloatArray], FloatArray]:
+def _constant(value: float) -> Callable[[FloatArray], FloatArray]:
     return lambda time: np.full(time.size, value)
 
 
@@ -324,14 +324,14 @@ def estimate_along(
     u = slice(len(plant.w), None)
     y, commands = data[: len(sensors)], data[len(sensors) :]
     for k, sample in enumerate(filters.machine.each(count)):
-        x, P = _corrected(sample, filters, x, P, y[:, k], one)
+        x, P = _measurement_update(sample, filters, x, P, y[:, k], one)
         found[:, k] = sample.C[filters.z] @ x
         x = sample.A @ x + sample.B[:, u] @ commands[:, k]
         P = symmetrised(sample.A @ P @ sample.A.T + sample.G @ sample.G.T)
     return dict(zip(filters.names, found, strict=True))
 
 
-def _corrected(
+def _measurement_update(
     sample: Sample, filters: _Filters, x: FloatArray, P: FloatArray, y: FloatArray, one: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return state and covariance corrected by a measurement."""

@@ -131,7 +131,7 @@ def learn_feedforward(
     >>> bool(found.errors[1] < 0.2 * found.errors[0])
     True
     """
-    _check(start, loop, move)
+    _check_trial(start, loop, move)
     orders = term_numbers(terms)
     part = positive(step, "step")
     if part > 1.0:
@@ -145,7 +145,7 @@ def learn_feedforward(
     function(trial, "trial", "It takes a Feedforward and returns a Response.")
     current, errors, gains = start, [], []
     for _ in range(whole(trials, "trials", maximum=MOST_DRAWS)):
-        error = _error(trial(current), channels)
+        error = _run_errors(trial(current), channels)
         if error.size != effects.shape[1]:
             raise ModelError(
                 f"the trial recorded {error.size // len(channels)} samples, the model's run has "
@@ -183,11 +183,11 @@ def _effects(
             force = np.outer(start.T[:, axis], signals[order] / size)
             given = {force_name(u): force[i] for i, u in enumerate(start.actuators)}
             run = simulate(forced, reference=given, duration=duration, noise=False)
-            rows.append(size * _error(run, channels))
+            rows.append(size * _run_errors(run, channels))
     return np.array(rows)
 
 
-def _error(run: object, channels: list[str]) -> FloatArray:
+def _run_errors(run: object, channels: list[str]) -> FloatArray:
     """Return the errors one after the other; the mean over runs where there are several."""
     if not isinstance(run, Response) or any(name not in run for name in channels):
         raise ModelError(
@@ -198,7 +198,7 @@ def _error(run: object, channels: list[str]) -> FloatArray:
     return np.concatenate([s.mean(axis=0) if s.ndim == 2 else s for s in signals])
 
 
-def _check(start: object, loop: object, move: object) -> None:
+def _check_trial(start: object, loop: object, move: object) -> None:
     if not isinstance(start, Feedforward) or len(start.gains) != 1:
         raise ModelError(
             f"need a Feedforward with one set of gains, got {short(start)}. Use "

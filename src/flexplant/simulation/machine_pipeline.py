@@ -437,7 +437,7 @@ class MachineReport(Value):
             "Loop that was run": [self.loop],
             "The run beside the model": [self._judged()],
             "Specification": [self.verdict],
-            "In numbers": [f"{name}: {_shown(value)}" for name, value in self.row.items()],
+            "In numbers": [f"{name}: {_short_number(value)}" for name, value in self.row.items()],
             "Warnings": self.warned,
         }
         lines = []
@@ -460,5 +460,5 @@ class MachineReport(Value):
             file.write(f"{self!r}\n".encode())
 
 
-def _shown(value: Any) -> str:
+def _short_number(value: Any) -> str:
     return f"{value:.5g}" if isinstance(value, float) else str(value)

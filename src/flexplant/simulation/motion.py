@@ -161,11 +161,11 @@ class SetPoint(Value):
         elapsed = (inside - np.where(back, self.edges[phase + 1], self.edges[phase])) * self.tick
         longest = self.lengths[phase]
         elapsed = np.clip(elapsed, np.where(back, -longest, 0.0), np.where(back, 0.0, longest))
-        return moved(np.moveaxis(self.states[phase], -1, 0), elapsed)
+        return constant_snap(np.moveaxis(self.states[phase], -1, 0), elapsed)
 
     def _before(self) -> FloatArray:
         """Return the states just before the ends of the phases."""
-        return moved(self.states.T, np.where(self.from_end, 0.0, self.lengths))
+        return constant_snap(self.states.T, np.where(self.from_end, 0.0, self.lengths))
 
 
 #: relative: bounds may be exceeded by rounding alone
@@ -259,7 +259,7 @@ def flank(t: tuple[float, ...], change: float) -> list[Phase]:
         x[len(t) + 1] = value
         rows.append(Phase(length, False, x.copy()))
         starts.append(now)
-        x, now = moved(x, length), now + length
+        x, now = constant_snap(x, length), now + length
     middle = np.zeros(5)
     middle[0], middle[1], middle[2] = x[0], 0.5 * change * b[-2] / w[-1], change / w[-1]
     rows.append(Phase(t[-1], False, middle))
@@ -278,7 +278,7 @@ def mirrored(rows: list[Phase], total: float) -> list[Phase]:
     return back
 
 
-def moved(state: FloatArray, t: float | FloatArray) -> FloatArray:
+def constant_snap(state: FloatArray, t: float | FloatArray) -> FloatArray:
     """Return position, velocity, acceleration, jerk and snap (5, ...) after constant snap."""
     p, v, a, j, s = state
     return np.array(

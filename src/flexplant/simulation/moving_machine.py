@@ -119,11 +119,11 @@ class MovingPlant:
         _require_plain(plant, moves)
         moving = {id(port) for port in moves}
         h = float(plant.dt)
-        self.forces = [_late(plant, port, noise) for port in ports.forces if id(port) in moving]
+        self.forces = [_force_at(plant, port, noise) for port in ports.forces if id(port) in moving]
         sensors: tuple[Any, ...] = tuple(ports.y)
         self.seen = [(s, s.direction, [plant.y.index(s.name)]) for s in sensors if id(s) in moving]
         self.shown = [
-            (poi, axis, _rows(plant, poi, axis)) for poi in ports.z if id(poi) in moving
+            (poi, axis, _axis_channels(plant, poi, axis)) for poi in ports.z if id(poi) in moving
             for axis in poi.axes
         ]  # fmt: skip
         self.rule = _Rule(own.pairs, h)
@@ -191,7 +191,7 @@ class MovingPlant:
         values = self.path.at(time)
         found = []
         for force in self.forces:
-            rows = _motions(self.realisation, force.port, force.port.direction, values)
+            rows = _rows_along(self.realisation, force.port, force.port.direction, values)
             columns = rows @ self.realisation.inputs
             found.append(np.stack([columns[:-2:2], columns[1:-1:2], columns[2::2]], axis=1))
         return found
@@ -210,10 +210,10 @@ class MovingPlant:
         values = self.path.at(time)
         nz, found = len(self.plant.z), []
         for port, axis, at in self.shown:
-            rows = _motions(self.realisation, port, axis, values) @ self.realisation.outputs
+            rows = _rows_along(self.realisation, port, axis, values) @ self.realisation.outputs
             found.append((at, rows))
         for sensor, axis, places in self.seen:
-            rows = _motions(self.realisation, sensor, axis, values) @ self.realisation.outputs
+            rows = _rows_along(self.realisation, sensor, axis, values) @ self.realisation.outputs
             found.append(([(nz + places[0], 1.0)], rows))
         return found
 
@@ -373,7 +373,7 @@ class _Rule:
         )
 
 
-def _motions(
+def _rows_along(
     realisation: Any, port: Any, axis: str, values: Mapping[str, FloatArray]
 ) -> FloatArray:
     """Return rows (n, DOFs) of a port's place along an axis at values (n,) of the positions."""
@@ -381,14 +381,14 @@ def _motions(
     return np.asarray(sum(weight * realisation.model.rows(at, axis) for weight, at in terms))
 
 
-def _rows(plant: StandardPlant, poi: Poi, axis: str) -> list[tuple[int, float]]:
+def _axis_channels(plant: StandardPlant, poi: Poi, axis: str) -> list[tuple[int, float]]:
     """Return the channels of z that show an axis of a POI, with their sign."""
     found = [(plant.z.index(poi.channel(axis)), 1.0)]
     error = poi.derived(axis, "error")
     return [*found, (plant.z.index(error), -1.0)] if error in plant.z else found
 
 
-def _late(plant: StandardPlant, port: Any, noise: bool) -> _Force:
+def _force_at(plant: StandardPlant, port: Any, noise: bool) -> _Force:
     """Return a force that moves, with its delay."""
     is_actuator = isinstance(port, Actuator)
     samples = plant.delay + port.latency / plant.dt if is_actuator else 0.0

@@ -24,12 +24,12 @@ from ..plant import StandardPlant
 from ..tolerances import divisor
 
 
-def _limit(value: Any, name: str) -> float:
+def _upper_limit(value: Any, name: str) -> float:
     """Return a limit, which may be infinite."""
     return np.inf if isinstance(value, float) and value == np.inf else positive(value, name)
 
 
-def _least(value: Any, name: str) -> float:
+def _lower_limit(value: Any, name: str) -> float:
     """Return a limit below, which is not positive."""
     found = float(real_array(value, name, ()))
     if found > 0:
@@ -69,9 +69,9 @@ class Saturation(Value):
     0.001
     """
 
-    limit: float = field(default=np.inf, metadata=checked(_limit))
+    limit: float = field(default=np.inf, metadata=checked(_upper_limit))
     rate: float | None = field(default=None, metadata=checked(positive))
-    least: float | None = field(default=None, metadata=checked(_least))
+    least: float | None = field(default=None, metadata=checked(_lower_limit))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -330,7 +330,7 @@ class Acting:
         self.others: list[tuple[int, Element]] = []
         for name, element in elements.items():
             i = names.index(name)
-            for one in _listed(name, element):
+            for one in _checked_elements(name, element):
                 if isinstance(one, Quantiser):
                     step[i] = one.step
                 elif isinstance(one, Jitter):
@@ -443,7 +443,7 @@ class Answering:
         self.dt, self.parts = dt, []
         for name, element in elements.items():
             i = plant.w.index(name)
-            for one in _listed(name, element):
+            for one in _checked_elements(name, element):
                 reads = getattr(one, "reads", None)
                 if not isinstance(one, Element) or reads is None:
                     raise ModelError(
@@ -488,11 +488,11 @@ def split_elements(
     for name, element in elements.items():
         if not any(name in side for side in sides):
             raise unknown_label("channel for an element", name, [*plant.y, *driven, *forces])
-        _listed(name, element)
+        _checked_elements(name, element)
     return [{n: one for n, one in elements.items() if n in side} for side in sides]
 
 
-def _listed(name: str, element: Any) -> list[Acts]:
+def _checked_elements(name: str, element: Any) -> list[Acts]:
     listed = list(element) if isinstance(element, list | tuple) else [element]
     known = (Saturation, Quantiser, Jitter)
     kinds = [type(one) for one in listed if isinstance(one, known)]

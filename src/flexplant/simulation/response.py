@@ -123,8 +123,8 @@ class Response(Value, Mapping[str, FloatArray]):
         start that leaves nothing a ModelError; so in all that follow.
         """
         signal = self._from(channel, start)
-        unit = unit_of(signal)
-        return _numbers(unit * np.sqrt(np.mean((signal / unit) ** 2, axis=-1)))
+        unit = signal_unit(signal)
+        return _as_numbers(unit * np.sqrt(np.mean((signal / unit) ** 2, axis=-1)))
 
     def rms_interval(
         self, channel: str, *, start: float = 0.0, level: float = 0.95
@@ -153,7 +153,7 @@ class Response(Value, Mapping[str, FloatArray]):
 
     def peak(self, channel: str, *, start: float = 0.0) -> Numbers:
         """Return the largest magnitude of a channel from `start` on, one for each run."""
-        return _numbers(np.max(np.abs(self._from(channel, start)), axis=-1))
+        return _as_numbers(np.max(np.abs(self._from(channel, start)), axis=-1))
 
     def psd(self, channel: str, *, start: float = 0.0, segment: float | None = None) -> Spectrum:
         """Return the one-sided power spectral density of a channel, over all runs.
@@ -171,7 +171,7 @@ class Response(Value, Mapping[str, FloatArray]):
                 f"a segment of {count * self.dt:g} s is {count} samples, the record has "
                 f"{signal.shape[-1]} from {start:g} s on: choose one of 2 to that many samples."
             )
-        unit = unit_of(signal)
+        unit = signal_unit(signal)
         freq, density = welch(
             signal / unit, fs=1.0 / self.dt, window="hann", nperseg=count, detrend=False
         )
@@ -238,7 +238,7 @@ class Response(Value, Mapping[str, FloatArray]):
 
     def _moments(self, channel: str, window: float) -> tuple[FloatArray, FloatArray]:
         signal = self[channel]
-        unit = unit_of(signal)
+        unit = signal_unit(signal)
         mean, deviation = moving_moments(signal / unit, self._count(window))
         return unit * mean, unit * deviation
 
@@ -259,7 +259,7 @@ class ChannelError(LabelError, KeyError):
     __str__ = Exception.__str__
 
 
-def _numbers(values: FloatArray) -> Numbers:
+def _as_numbers(values: FloatArray) -> Numbers:
     return float(values) if np.ndim(values) == 0 else values
 
 
@@ -297,7 +297,7 @@ def moving_moments(signal: FloatArray, count: int) -> tuple[FloatArray, FloatArr
     return centre, np.sqrt(np.maximum(means[1] - means[0] ** 2, 0.0))
 
 
-def unit_of(signal: FloatArray) -> float:
+def signal_unit(signal: FloatArray) -> float:
     """Return the size of a signal as a power of two: its squares neither over- nor underflow."""
     return float(2.0 ** (np.frexp(np.max(np.abs(signal), initial=0.0))[1] - 1))
 

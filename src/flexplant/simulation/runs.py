@@ -50,10 +50,10 @@ class Buffers(NamedTuple):
     out: FloatArray
 
 
-def machine(loop: ClosedLoop) -> Machine:
+def machine_of(loop: ClosedLoop) -> Machine:
     """Return the matrices of one sample of a closed loop without feedthrough from u to y."""
     plant, law = loop.plant.system, loop.controller
-    diagonal, coupling, partner, rest = _split(plant)
+    diagonal, coupling, partner, rest = _split_matrix(plant)
     columns = np.flatnonzero(np.any(rest != 0, axis=0))
     B = plant.B[:, plant.input_index(loop.driven)]
     return Machine(
@@ -135,7 +135,7 @@ def step_through(
     return law_in[:, :nc, 0].copy()
 
 
-def _split(g: StateSpace) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
+def _split_matrix(g: StateSpace) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
     """Split A into a diagonal, a coupling to each state's partner, and the rest."""
     n = g.n_states
     blocks = g.blocks if g.blocks is not None else (n,) if n else ()
@@ -249,7 +249,7 @@ def make_runner(
     if met.one_by_one:
         return _under(loop, drawn, met)
     moving = Moving(loop.plant, met.paths) if met.paths else None
-    single = SampleBySample(loop, machine(loop), drawn, hold=met.finer)
+    single = SampleBySample(loop, machine_of(loop), drawn, hold=met.finer)
     if not grows and loop.plant.system.n_states + loop.controller.n_states:
         blocks = InBlocks(loop, drawn, given, moving, met.finer)
         if blocks.cost < single.cost and blocks.agrees(single, given):
@@ -260,7 +260,7 @@ def make_runner(
 
 def _under(loop: ClosedLoop, noise: Drawn, met: Conditions) -> SampleBySample:
     """Return the way through a loop under conditions that are not linear, or change with time."""
-    plant, parts, applied = loop.plant, machine(loop), None
+    plant, parts, applied = loop.plant, machine_of(loop), None
     dt = met.finer * plant.dt
     if met.on_u:
         command, law = split_law(loop, None if met.recovery is None else met.recovery / dt)
@@ -400,7 +400,7 @@ class InBlocks:
     @cached_property
     def blocks(self) -> Blocks:
         """The matrices of a block."""
-        system = lifted(
+        system = lifted_loop(
             self.loop, self.noise.factor, self.columns, self.hold, self.moving is not None
         )
         return system.in_blocks(self.size)
@@ -463,7 +463,7 @@ class InBlocks:
         return bool(np.all(wrong <= allowed))
 
 
-def lifted(
+def lifted_loop(
     loop: ClosedLoop, factor: FloatArray, columns: IntArray, hold: int, states: bool
 ) -> Recursion:
     """Return a sampled loop whose controller acts in the first of every `hold` samples."""

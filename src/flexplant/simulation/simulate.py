@@ -162,7 +162,7 @@ def simulate(
         )
     met = conditions(loop, elements, anti_windup, finer, None if positions else moving, time)
     numbers = _run_numbers(runs)
-    given = _given(plant, reference, disturbance, time, 0 if runs is None else len(numbers))
+    given = _known_inputs(plant, reference, disturbance, time, 0 if runs is None else len(numbers))
     silent = plant if flag(noise, "noise") else plant.replace(asd={})
     white = white_noise(silent)
     state = _start(loop, start)
@@ -254,7 +254,7 @@ def _warn_unstable(loop: ClosedLoop, steps: int) -> bool:
     return True
 
 
-def _given(
+def _known_inputs(
     plant: StandardPlant,
     reference: Signal | Mapping[str, Signal] | None,
     disturbance: Mapping[str, Signal] | None,
@@ -289,7 +289,7 @@ def _given(
     ):
         for name, signal in signals.items():
             require_known(kind, [name], known, "the plant's w")
-            values = _sampled(signal, f"{kind} {name!r}", time, runs)
+            values = _signal_samples(signal, f"{kind} {name!r}", time, runs)
             if values.ndim == 2 and len(given) < len(values):
                 given = np.tile(given, (len(values), 1, 1))
             given[:, :, plant.w.index(name)] = values
@@ -325,7 +325,7 @@ def _of(move: SetPoint, kind: str) -> Callable[[FloatArray], FloatArray]:
     return lambda time: np.asarray(getattr(move.at(time), kind))
 
 
-def _sampled(signal: Any, name: str, time: FloatArray, runs: int) -> FloatArray:
+def _signal_samples(signal: Any, name: str, time: FloatArray, runs: int) -> FloatArray:
     """Return a signal at the sampling instants: a number, (n_time,) or (runs, n_time)."""
     if isinstance(signal, SetPoint):
         _check_setpoint(signal, name, time)

@@ -71,7 +71,7 @@ def spectral_noise(
     draws = generator(rng)
     n = _LONGER * count
     freq: FloatArray = np.asarray(np.arange(1, n // 2) * (rate / n), dtype=np.float64)
-    size = _density(asd, freq) * np.sqrt(rate * n / 4.0)
+    size = _density_at(asd, freq) * np.sqrt(rate * n / 4.0)
     found = np.empty((number, count))
     for one in found:
         lines = np.zeros(n // 2 + 1, dtype=np.complex128)
@@ -81,7 +81,7 @@ def spectral_noise(
     return found[0] if runs is None else found
 
 
-def _density(asd: Any, freq: FloatArray) -> FloatArray:
+def _density_at(asd: Any, freq: FloatArray) -> FloatArray:
     """Return the density at frequencies."""
     if callable(asd):
         values = real_array(asd(freq), "asd")

@@ -398,7 +398,7 @@ def _interval(
         parts = [P0 + (p - start) * S for p in (low, high)]
         near = low - step < ends[0] or high + step > ends[1]
         moves = [step * own for own in ([S, *reach] if near else [S])]
-        if _shown(motion, (low, high), parts, moves, speed):
+        if _inequality_holds(motion, (low, high), parts, moves, speed):
             continue
         middle = 0.5 * (low + high)
         own = 0.5 * (parts[0] + parts[1])
@@ -419,7 +419,7 @@ def _holds_at(
     )
 
 
-def _shown(
+def _inequality_holds(
     motion: _Motion,
     ends: tuple[float, float],
     P: list[FloatArray],

@@ -145,7 +145,7 @@ def _outcome(pipeline: Callable[..., Any], machine: Any, seed: Any) -> Outcome |
             else:
                 found = pipeline(machine, np.random.default_rng(seed))
     except (Exception, SystemExit) as error:  # whatever it is, the other machines go on
-        return _reason(error)
+        return _error_text(error)
     try:
         return checked_row(found)
     except ModelError as error:
@@ -157,11 +157,11 @@ def _kept(outcome: Outcome | ModelError | Lost, number: int) -> Outcome:
     if isinstance(outcome, ModelError):
         if number == 0:
             raise outcome
-        return _reason(outcome)
+        return _error_text(outcome)
     return outcome.reason if isinstance(outcome, Lost) else outcome
 
 
-def _reason(error: BaseException) -> str:
+def _error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
@@ -242,7 +242,7 @@ def tabled(rows: Sequence[Mapping[str, Any] | str]) -> StudyTable:
     for name in dict.fromkeys(name for row in found for name in row):
         counts = Counter(type(row[name]) for row in found if name in row)
         kinds[name] = counts.most_common(1)[0][0]
-    judged = [row if isinstance(row, str) else _misfit(row, kinds) or row for row in rows]
+    judged = [row if isinstance(row, str) else _row_misfit(row, kinds) or row for row in rows]
     lacking = {
         i: [name for name in kinds if name not in row]
         for i, row in enumerate(judged)
@@ -262,7 +262,7 @@ def tabled(rows: Sequence[Mapping[str, Any] | str]) -> StudyTable:
     return StudyTable(columns, tuple(row if isinstance(row, str) else "" for row in judged))
 
 
-def _misfit(row: Mapping[str, Any], kinds: Mapping[str, type]) -> str:
+def _row_misfit(row: Mapping[str, Any], kinds: Mapping[str, type]) -> str:
     """Return why a row does not fit into a table; "" when it does."""
     for name, value in row.items():
         if type(value) is not kinds[name]:

@@ -400,16 +400,16 @@ def iterated(
 
 def _unfinished(theta: FloatArray, error: FloatArray, required: FloatArray) -> int:
     """Return how many Ritz pairs have not reached their tolerance."""
-    return int(np.count_nonzero(_late(theta, error, required)))
+    return int(np.count_nonzero(_unconverged(theta, error, required)))
 
 
 def _converged(theta: FloatArray, error: FloatArray, required: FloatArray) -> int:
     """Return how many Ritz pairs precede the first that has not reached its tolerance."""
-    late = _late(theta, error, required)
+    late = _unconverged(theta, error, required)
     return int(np.argmax(late)) if np.any(late) else theta.size
 
 
-def _late(theta: FloatArray, error: FloatArray, required: FloatArray) -> np.ndarray:
+def _unconverged(theta: FloatArray, error: FloatArray, required: FloatArray) -> np.ndarray:
     limit = np.maximum(required[: theta.size] * theta, REACHED * theta[0])
     return np.asarray(error[: theta.size] > limit)
 

@@ -17,7 +17,7 @@ from ..errors import SolverError, attempted
 from ..parallel import one_thread
 from .factor import DENSE_LIMIT, by_rows, dense, diagonal, negative_pivots, symmetric_lu
 from .lanczos import VALUE, BlockLanczos, beyond, iterated, rayleigh_ritz
-from .multifrontal import MultifrontalCholesky, assembled, in_single
+from .multifrontal import MultifrontalCholesky, assembled_fronts, in_single
 from .ordering import Dissection, Front, dissect
 
 #: rounding let pass in the energies that accompany a count
@@ -140,7 +140,7 @@ def _eliminated(lower: Any, dissection: Dissection) -> Iterator[tuple[Front, _Pi
     of_lapack: Any = lapack.get_lapack_funcs(("potrf",), dtype=lower.dtype)
     of_blas: Any = blas.get_blas_funcs(("syrk",), dtype=lower.dtype)
     (potrf,), (syrk,) = of_lapack, of_blas
-    for front, block, below, rest in assembled(lower, dissection):
+    for front, block, below, rest in assembled_fronts(lower, dissection):
         kept = block.copy(order="F")
         _, info = potrf(block, lower=1, overwrite_a=1, clean=0)
         pivots = _SignedPivots(kept) if info else _Pivots(block, np.ones(len(block), block.dtype))
@@ -362,7 +362,7 @@ def _inverse_iteration(
             mu = 1 / np.where(found == 0, np.finfo(float).tiny, found)
         best = np.argsort(-np.abs(mu))[: count + r]
         return rayleigh_ritz(K, M, beyond(M, known, shapes[:, best]))
-    factor = _factor(K + shift * M, order)
+    factor = _factorise(K + shift * M, order)
     if not isinstance(factor, MultifrontalCholesky):
         return rayleigh_ritz(K, M, beyond(M, known, _both_ways(K, M, shift, count + r, factor)))
     values, shapes = np.zeros(0), np.zeros((n, 0))
@@ -404,11 +404,11 @@ def definite_solver(K: Any, M: Any, shift: float) -> Callable[[FloatArray], Floa
             raise SolverError("K + s M is not positive definite: K has a negative part.") from error
         return lambda b: np.asarray(la.cho_solve(factor, b))
     matrix = sp.csc_array(K + shift * M)
-    held = _factor(matrix, dissect(matrix) if K.shape[0] > DENSE_LIMIT else None)
+    held = _factorise(matrix, dissect(matrix) if K.shape[0] > DENSE_LIMIT else None)
     return lambda b: np.asarray(held.solve(b))
 
 
-def _factor(matrix: Any, order: Dissection | None) -> Any:
+def _factorise(matrix: Any, order: Dissection | None) -> Any:
     """Return a factorisation with a method solve; by fronts where K + s M is definite and large."""
     if order is not None:
         with attempted("a multifrontal Cholesky factor", SolverError):

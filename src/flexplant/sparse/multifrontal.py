@@ -41,7 +41,7 @@ class MultifrontalCholesky:
         self.dissection = dissect(lower) if dissection is None else dissection
         self._blocks: list[tuple[FloatArray | None, FloatArray]] = []
         with one_thread():
-            for front, pivots, below, rest in assembled(lower, self.dissection):
+            for front, pivots, below, rest in assembled_fronts(lower, self.dissection):
                 _, info = potrf(pivots, lower=1, overwrite_a=1, clean=0)
                 if info:
                     raise SolverError(
@@ -128,7 +128,7 @@ def _stored(
     return None, np.vstack([inverse, below @ inverse])
 
 
-def assembled(
+def assembled_fronts(
     lower: Any, dissection: Dissection
 ) -> Iterator[tuple[Front, FloatArray, FloatArray, FloatArray]]:
     """Yield each front with its assembled blocks: pivots, below, rest; its caller eliminates it.
@@ -230,7 +230,7 @@ class ComplexSymmetricFactor:
         #: of each front: LU of its pivot block, the exchanges, and ``D^-1 B^T``
         self._blocks: list[tuple[ComplexArray, Any, ComplexArray]] = []
         with one_thread():
-            for _, pivots, below, rest in assembled(lower, self.dissection):
+            for _, pivots, below, rest in assembled_fronts(lower, self.dissection):
                 block = np.asfortranarray(np.tril(pivots) + np.tril(pivots, -1).T)
                 factor, exchanges, info = lapack.zgetrf(block, overwrite_a=1)
                 if info:

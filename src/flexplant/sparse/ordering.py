@@ -86,7 +86,7 @@ def dissect(
     graph itself (`_graph_cut`), which costs eight times the time.
     """
     if nodes is None:
-        nodes = _alike(matrix)
+        nodes = _supervariables(matrix)
     _, first, member = np.unique(nodes, return_index=True, return_inverse=True)
     width = np.bincount(member)
     graph = _node_graph(matrix, member, width.size)
@@ -105,7 +105,7 @@ def dissect(
     return _fronts(graph, _bisect(graph, width, hubs, leaf, cut), place, member, width)
 
 
-def _alike(matrix: sp.csc_array) -> IntArray:
+def _supervariables(matrix: sp.csc_array) -> IntArray:
     """Return a number for each DOF, the same where DOFs touch each other and the same others.
 
     So are the DOFs of a node; sums of a random integer for each DOF touched tell them apart.
@@ -228,7 +228,7 @@ def _graph_cut(level: _GraphLevel) -> tuple[BoolArray, BoolArray]:
     Its nodes are the minimum cut of the flow through a band of nodes, each of which passes as
     much as it has DOFs (Menger's theorem), for all parts in one network.
     """
-    piece, along = _along(level)
+    piece, along = _long_axis(level)
     order = np.lexsort((along, piece, level.part))
     begin = np.searchsorted(level.part[order], np.arange(int(level.part.max()) + 2))
     rank = np.empty(order.size)
@@ -247,7 +247,7 @@ def _graph_cut(level: _GraphLevel) -> tuple[BoolArray, BoolArray]:
     return upper, np.where(lopsided, _smaller_shore(level, half), between)
 
 
-def _along(level: _GraphLevel) -> tuple[IntArray, FloatArray]:
+def _long_axis(level: _GraphLevel) -> tuple[IntArray, FloatArray]:
     """Return each node's connected piece, and a coordinate along the longest way through it.
 
     The difference of the distances to two far ends, averaged over neighbours: steps towards the
@@ -408,14 +408,14 @@ def _fronts(
             Front(
                 int(offset[starts[k]]),
                 int(offset[starts[k + 1]]),
-                spread(offset[rows], offset[rows + 1]),
+                interval_numbers(offset[rows], offset[rows + 1]),
                 tuple(children[k]),
             )
         )
     return Dissection(order, tuple(fronts))
 
 
-def spread(begin: IntArray, end: IntArray) -> IntArray:
+def interval_numbers(begin: IntArray, end: IntArray) -> IntArray:
     """Return the numbers of all intervals [begin, end), one after the other."""
     length = end - begin
     total = int(length.sum())

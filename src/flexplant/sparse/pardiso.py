@@ -60,7 +60,7 @@ class PardisoCholesky:
     """``A = L L^T`` of a sparse symmetric positive definite matrix, held by MKL."""
 
     def __init__(self, matrix: Any, method: Pardiso) -> None:
-        self._mkl = _loaded(method.library)
+        self._mkl = _load_mkl(method.library)
         given: Any = sp.csc_array(matrix)
         # columns of the lower triangle are rows of the upper one
         lower: Any = sp.csc_array(sp.tril(given, format="csc"))
@@ -136,7 +136,7 @@ def _release(mkl: Any, memory: Any, options: Any, n: int) -> None:
     )
 
 
-def _places() -> Iterator[Path]:
+def _library_paths() -> Iterator[Path]:
     """Yield where mkl_rt may be: in the installed package, below MKLROOT, on the system's path."""
     try:
         for file in metadata.files("mkl") or []:
@@ -155,8 +155,8 @@ def _places() -> Iterator[Path]:
 
 
 @cache
-def _loaded(library: str | None) -> Any:
-    places = list(_places()) if library is None else [Path(library)]
+def _load_mkl(library: str | None) -> Any:
+    places = list(_library_paths()) if library is None else [Path(library)]
     for place in places:
         try:
             mkl = ctypes.CDLL(str(place), mode=getattr(ctypes, "RTLD_GLOBAL", 0))

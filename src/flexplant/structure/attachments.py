@@ -15,9 +15,9 @@ from ..checks import (
     Matrix,
     Value,
     checked,
+    floats_of,
     instance,
     number,
-    numbers,
     positive,
     real_array,
 )
@@ -25,12 +25,12 @@ from ..errors import LabelError, ModelError, counted
 from ..labels import DofSet, Interpolation, Place, checked_direction
 
 
-def checked_place(at: Any, name: str) -> Any:
+def plain_place(at: Any, name: str) -> Any:
     """Return a label, a point as a tuple or a mapping as they are."""
     if isinstance(at, str | Mapping):
         return at
     try:
-        return numbers(at, "at", 3)
+        return floats_of(at, "at", 3)
     except ValueError:
         raise LabelError(
             f"{name} must be at a DOF label like '41:z', a point (x, y, z) in metres or a mapping "
@@ -62,7 +62,7 @@ class PointMass(Value):
            [0., 4.]])
     """
 
-    at: Place = field(metadata=checked(checked_place, name="a point mass"))
+    at: Place = field(metadata=checked(plain_place, name="a point mass"))
     mass: float = field(metadata=checked(positive, name="mass of a point mass", zero=True))
     inertia: float | Sequence[float] = field(default=0.0, kw_only=True)
 
@@ -122,11 +122,11 @@ class Spring(Value):
            [-100.,  100.]])
     """
 
-    at: Place = field(metadata=checked(checked_place, name="a spring"))
+    at: Place = field(metadata=checked(plain_place, name="a spring"))
     stiffness: float = field(metadata=checked(number, name="stiffness of a spring"))
     direction: str = field(default="z", kw_only=True, metadata=checked(checked_direction))
     to: Place | None = field(
-        default=None, kw_only=True, metadata=checked(checked_place, name="a spring")
+        default=None, kw_only=True, metadata=checked(plain_place, name="a spring")
     )
 
     def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
@@ -159,11 +159,11 @@ class Damper(Value):
            [-2.,  2.]])
     """
 
-    at: Place = field(metadata=checked(checked_place, name="a damper"))
+    at: Place = field(metadata=checked(plain_place, name="a damper"))
     rate: float = field(metadata=checked(positive, name="rate of a damper", zero=True))
     direction: str = field(default="z", kw_only=True, metadata=checked(checked_direction))
     to: Place | None = field(
-        default=None, kw_only=True, metadata=checked(checked_place, name="a damper")
+        default=None, kw_only=True, metadata=checked(plain_place, name="a damper")
     )
 
     def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
@@ -244,7 +244,7 @@ def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.c
     return found
 
 
-def summed(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:
+def matrix_sum(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:
     """Return the sum of two matrices, sparse where the first one is, of which any may be None."""
     if matrix is None or change is None:
         return change if matrix is None else matrix

@@ -18,8 +18,8 @@ from .matrices import FEMatrices
 from .model import FEModel
 from .precision import loss, shown_digits
 from .rigid import RigidMass, farness, orthonormalised, pieces, rigid_mass, rigid_motions, unheld
-from .singular_mass import empty_rows, left_out, null_motions
-from .zero_energy import ZeroEnergy, beyond, own_motions, zero_energy
+from .singular_mass import empty_rows, massless_dofs, null_motions
+from .zero_energy import ZeroEnergy, nonrigid, own_motions, zero_energy
 
 #: requested from the solver: six rigid-body motions and some elastic modes, a few beside more
 _MODES, _FEW = 10, 4
@@ -92,7 +92,7 @@ def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
         if matrix is not None
     }
     K, M, D = (
-        sp.csc_array(matrix) if proven and matrix is not None else _halved(matrix)
+        sp.csc_array(matrix) if proven and matrix is not None else _symmetric_part(matrix)
         for matrix in (given.K, given.M, given.D)
     )
     n = given.n_dof
@@ -127,7 +127,7 @@ def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
         if scaled:
             lowest, unstable = _of_springs(K, M, lowest, motions)
         zero = lowest.shapes[:, : lowest.n_zero]
-        mechanisms = beyond(zero, motions.rigid)
+        mechanisms = nonrigid(zero, motions.rigid)
     nothing = RigidMass(np.full(3, np.nan), np.full(3, np.nan), np.full((3, 3), np.nan))
     body = nothing if M is None or given.dofs is None else rigid_mass(M, given.dofs)
     if not given.located:
@@ -166,7 +166,7 @@ def _skew(matrix: Any) -> tuple[float, int, int]:
     return float(difference[i, j]), min(i, j), max(i, j)
 
 
-def _halved(matrix: Any) -> Any:
+def _symmetric_part(matrix: Any) -> Any:
     return None if matrix is None else sp.csc_array(0.5 * (matrix + matrix.T))
 
 
@@ -184,7 +184,7 @@ def _mass_state(given: FEMatrices, M: Any, no_mass: Any) -> tuple[bool | None, I
         motions = null_motions(part, given.digits)
     except ModelError:
         return False, negative, none
-    return True, negative, kept[left_out(motions, part)] if motions.size else none
+    return True, negative, kept[massless_dofs(motions, part)] if motions.size else none
 
 
 def _rounding(K: Any, M: Any, given: FEMatrices, digits: int | None) -> float:

@@ -26,13 +26,13 @@ _SYMMETRY = 1e-9
 _PENALTY = 1e6
 
 
-def listed(names: Sequence[str], most: int = 6) -> str:
+def some_names(names: Sequence[str], most: int = 6) -> str:
     """Return some names in a row, and how many more there are."""
     more = f", ... ({len(names)} in all)" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
 
-def spread(found: Facts, motion: FloatArray) -> tuple[str, ...]:
+def widest_dofs(found: Facts, motion: FloatArray) -> tuple[str, ...]:
     """Return the DOFs that move most in a motion (n,), the first first."""
     return found.names(most_moved(motion))
 
@@ -74,7 +74,7 @@ def _mass_line(found: Facts) -> Line:
         singular = found.massless.size or found.empty.size or found.without_inertia.size
         kind = "positive semi-definite" if singular else "positive definite"
         return ("ok", "definiteness of M", kind, "")
-    at = f": zero or negative at {listed(found.names(found.negative_mass))}"
+    at = f": zero or negative at {some_names(found.names(found.negative_mass))}"
     return (
         "fail",
         "definiteness of M",
@@ -97,8 +97,8 @@ def _stiffness_line(found: Facts) -> Line:
         if negative is not None:
             lowest = f", the lowest {negative[0][0]:.3g} 1/s^2" if found.scaled_by_mass else ""
             # displacements and rotations compare by the forces that they take
-            size = np.sqrt(np.abs(diagonal(found.given.K)))
-            text += f"{lowest}, moving {listed(spread(found, size * negative[1][:, 0]), most=3)}"
+            size = np.sqrt(np.abs(diagonal(found.given.K))) * negative[1][:, 0]
+            text += f"{lowest}, moving {some_names(widest_dofs(found, size), most=3)}"
         if found.n_unstable == found.n_negative:
             return (
                 "note",
@@ -146,14 +146,14 @@ def zero_rows(found: Facts) -> Iterator[Line]:
         yield (
             "fail",
             "empty rows",
-            f"neither mass nor stiffness: {listed(found.names(found.empty))}",
+            f"neither mass nor stiffness: {some_names(found.names(found.empty))}",
             "held DOFs that the export kept? Drop them: FEMatrices.without([...])",
         )
     if found.massless.size:
         yield (
             "fail",
             "without mass",
-            listed(found.names(found.massless)),
+            some_names(found.names(found.massless)),
             "condense them, exactly: FEMatrices.model(massless='condense')",
         )
     if found.without_inertia.size:
@@ -162,7 +162,7 @@ def zero_rows(found: Facts) -> Iterator[Line]:
             "without inertia",
             (
                 f"{counted(found.without_inertia.size, 'motion')} that no mass resists, at "
-                f"{listed(found.names(found.without_inertia))}"
+                f"{some_names(found.names(found.without_inertia))}"
             ),
             "offset masses without rotary inertia? FEMatrices.model(massless='condense')",
         )
@@ -172,7 +172,7 @@ def zero_rows(found: Facts) -> Iterator[Line]:
         yield (
             "note" if whole and not found.massless.size else "fail",
             "without stiffness",
-            f"{listed(found.names(found.stiffless))}: free to drift away",
+            f"{some_names(found.names(found.stiffless))}: free to drift away",
             "join them to the structure, or drop them",
         )
     rows = (found.empty, found.massless, found.without_inertia, found.stiffless)
@@ -193,7 +193,7 @@ def rigid(found: Facts) -> Iterator[Line]:
         )
         return
     motions = found.motions
-    text = _freedom(found, motions)
+    text = _free_and_held(found, motions)
     extra = found.mechanisms.shape[1]
     expected = f"{motions.n_rigid} by the geometry, {found.n_zero} found in K"
     odd = motions.length_factor
@@ -224,7 +224,7 @@ def rigid(found: Facts) -> Iterator[Line]:
     if not extra:
         yield ("ok", "mechanisms", "none", "")
     elif odd is None:
-        moved = listed(spread(found, found.mechanisms[:, 0]), most=4)
+        moved = some_names(widest_dofs(found, found.mechanisms[:, 0]), most=4)
         yield (
             "fail",
             "mechanisms",
@@ -233,7 +233,7 @@ def rigid(found: Facts) -> Iterator[Line]:
         )
 
 
-def _freedom(found: Facts, motions: ZeroEnergy) -> str:
+def _free_and_held(found: Facts, motions: ZeroEnergy) -> str:
     """Return what moves freely and what is held, in words."""
     free, held = ", ".join(motions.free), ", ".join(motions.grounded)
     combined = motions.n_rigid - len(motions.free)
@@ -297,7 +297,7 @@ def scales(found: Facts) -> Iterator[Line]:
         yield (
             "note",
             "uncoupled rows",
-            f"joined to nothing but ground: {listed(found.names(alone))}",
+            f"joined to nothing but ground: {some_names(found.names(alone))}",
             "rows that a solver put there for held DOFs? FEMatrices.without([...])",
         )
     coupled = coupling > 0
@@ -307,7 +307,7 @@ def scales(found: Facts) -> Iterator[Line]:
         yield (
             "note",
             "penalties",
-            f"held by a huge stiffness: {listed(found.names(penalty))}",
+            f"held by a huge stiffness: {some_names(found.names(penalty))}",
             "their rounding exceeds soft modes; hold them: FEMatrices.without([...])",
         )
     odd = unusual(found)

@@ -36,14 +36,14 @@ _SLOW = 1e-2
 
 def check_semidefinite(matrix: Matrix, name: str) -> None:
     """Raise ModelError unless a symmetric matrix is positive semi-definite to rounding."""
-    if said := indefinite(matrix, name):
+    if said := why_indefinite(matrix, name):
         raise ModelError(
             f"{said} Look for a sign or for swapped arguments (the order is M, K, D)."
             + (" Magnets may only make rigid-body motions unstable." if name == "K" else "")
         )
 
 
-def indefinite(matrix: Matrix, name: str) -> str:
+def why_indefinite(matrix: Matrix, name: str) -> str:
     """Return in words that K or D is not positive semi-definite; empty when it is."""
     if _is_semidefinite(matrix):
         return ""
@@ -53,7 +53,7 @@ def indefinite(matrix: Matrix, name: str) -> str:
     )
 
 
-def symmetric(given: Any, name: str, n: int) -> Matrix:
+def symmetric_matrix(given: Any, name: str, n: int) -> Matrix:
     """Return a finite symmetric (n, n) matrix, dense or sparse."""
     value, matrix = given, cast(Any, None)
     if sp.issparse(given):
@@ -114,7 +114,7 @@ def without_inertia(M: Matrix, K: Matrix) -> str:
 
 def slow(M: Matrix, K: Matrix, directions: Sequence[str]) -> str:
     """Return in words that no motion of a structure is as fast as one has; empty when one is."""
-    fastest = _fastest(M, K)
+    fastest = _omega_bound(M, K)
     if not 0.0 < fastest < _SLOW:
         return ""
     found = f"no sqrt(K_ii / M_ii) is above {fastest:.3g} rad/s, slower than any machine"
@@ -139,7 +139,7 @@ def are_swapped(K: Matrix, M: Matrix | None, dofs: DofSet | None) -> bool:
     energies = [(_energy(M, motion), _energy(K, motion)) for motion in moves]
     if energies and all(of_M <= _NONE and of_K >= _SOME for of_M, of_K in energies):
         return True
-    return bool(0.0 < _fastest(M, K) < _SLOW) and _unmoved(M, dofs.directions) > _unmoved(
+    return bool(0.0 < _omega_bound(M, K) < _SLOW) and _unmoved(M, dofs.directions) > _unmoved(
         K, dofs.directions
     )
 
@@ -150,7 +150,7 @@ def _energy(matrix: Any, motion: FloatArray) -> float:
     return abs(float(motion @ (matrix @ motion))) / size if size else 0.0
 
 
-def _fastest(M: Matrix, K: Matrix) -> float:
+def _omega_bound(M: Matrix, K: Matrix) -> float:
     """Return the largest sqrt(K_ii / M_ii) [rad/s] of a DOF with mass."""
     heavy, stiff = diagonal(M), np.abs(diagonal(K))
     return float(np.sqrt(np.max(stiff[heavy > 0] / heavy[heavy > 0], initial=0.0)))

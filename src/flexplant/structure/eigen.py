@@ -15,7 +15,7 @@ from ..sparse.factor import DENSE_LIMIT, dense, unit_diagonal
 from ..sparse.lanczos import rayleigh_ritz, rounding_of, soft_group
 from ..tolerances import TYPED
 from .definite import are_rigid, signed_root
-from .zero_energy import beyond, most_moved
+from .zero_energy import most_moved, nonrigid
 
 #: eigenvalues above this part of the largest one are right to 1e-9 when M is made the identity
 _DIRECT = 1e-6
@@ -166,7 +166,7 @@ def check_stiffness(
     moved = ""
     if dofs is not None:
         basis = np.asarray(la.qr(rigid, mode="economic")[0] if r else rigid, dtype=np.float64)
-        motion = beyond(np.hstack([basis, phi[:, lost]]), basis)[:, 0]
+        motion = nonrigid(np.hstack([basis, phi[:, lost]]), basis)[:, 0]
         moved = f" The first moves {', '.join(dofs.labels[i] for i in most_moved(motion)[:4])}."
     several = "an elastic mode has" if lost.size == 1 else f"{lost.size} elastic modes have"
     raise ModelError(

@@ -206,7 +206,7 @@ class Hysteretic(Damping):
         ModelError
             When a frequency is negative, or regions need the ratios.
         """
-        at, own = _frequencies(freq, "freq")[:, None], _frequencies(natural, "natural")
+        at, own = _checked_hertz(freq, "freq")[:, None], _checked_hertz(natural, "natural")
         r = at / divisor(own)
         eta = 2.0 * (self.zeta(own) if zeta is None else real_array(zeta, "zeta", own.shape))
         size = np.sqrt((1 - r**2) ** 2 + (eta * r) ** 2)
@@ -242,7 +242,7 @@ class Hysteretic(Damping):
         ModelError, ShapeError
             When a frequency is negative or the sizes differ.
         """
-        own = _frequencies(natural, "natural")
+        own = _checked_hertz(natural, "natural")
         weights = np.abs(real_array(gains, "gains", own.shape))
         relative = self.error(freq, own, zeta=zeta)
         eta = 2.0 * (self.zeta(own) if zeta is None else real_array(zeta, "zeta", own.shape))
@@ -252,7 +252,7 @@ class Hysteretic(Damping):
         return np.asarray(part @ weights, dtype=np.float64)
 
 
-def _frequencies(value: Any, name: str) -> FloatArray:
+def _checked_hertz(value: Any, name: str) -> FloatArray:
     found = real_array(value, name, (None,))
     if np.any(found < 0):
         raise ModelError(f"{name} must not be negative, got {found.min():g} Hz. Take its size.")

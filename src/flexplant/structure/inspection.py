@@ -11,7 +11,7 @@ from ..checks import FloatArray, Value, one_of
 from ..errors import ModelError, counted
 from ..parallel import Progress
 from .check_facts import Facts, facts
-from .check_lines import Line, listed, masses, matrices, rigid, scales, spread, zero_rows
+from .check_lines import Line, masses, matrices, rigid, scales, some_names, widest_dofs, zero_rows
 from .matrices import FEMatrices
 from .model import FEModel
 from .precision import held_motions, verdict
@@ -142,12 +142,12 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
         )
     with Progress(0, "check"):
         found = facts(matrices_, model if isinstance(model, FEModel) else None)
-    parts = (matrices, zero_rows, rigid, _pieces, masses, scales, _digits)
+    parts = (matrices, zero_rows, rigid, _connectivity, masses, scales, _digits)
     # of swapped matrices all else would be nonsense
     lines = [line for part in parts[: 1 if found.swapped else None] for line in part(found)]
     lines += [("note", "reader", note, "") for note in matrices_.notes]
     if matrices_.constrained:
-        lines.append(("note", "constrained", f"{listed(matrices_.constrained)} dropped", ""))
+        lines.append(("note", "constrained", f"{some_names(matrices_.constrained)} dropped", ""))
     return ModelCheck(
         lines=tuple(lines),
         mass=found.body.mass,
@@ -157,7 +157,7 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
         grounded=found.motions.grounded if found.motions else (),
         n_rigid=found.motions.n_rigid if found.motions else 0,
         n_zero=found.n_zero,
-        mechanisms=tuple(spread(found, column) for column in found.mechanisms.T),
+        mechanisms=tuple(widest_dofs(found, column) for column in found.mechanisms.T),
         massless=found.names(found.massless),
         stiffless=found.names(found.stiffless),
         n_pieces=int(found.piece.max(initial=-1)) + 1,
@@ -166,7 +166,7 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
     )
 
 
-def _pieces(found: Facts) -> list[Line]:
+def _connectivity(found: Facts) -> list[Line]:
     count = int(found.piece.max(initial=-1)) + 1
     if count <= 1:
         return [("ok", "connectivity", "one piece", "")]
@@ -175,7 +175,7 @@ def _pieces(found: Facts) -> list[Line]:
     shown = []
     for piece in range(1, min(count, 4)):
         rows = np.flatnonzero(found.piece == piece)
-        shown.append(f"{counted(rows.size, 'DOF')} with {listed(found.names(rows), most=2)}")
+        shown.append(f"{counted(rows.size, 'DOF')} with {some_names(found.names(rows), most=2)}")
     more = f" and {count - 4} more" if count > 4 else ""
     return [
         (
@@ -205,14 +205,14 @@ def _digits(found: Facts) -> list[Line]:
             )
         ]
     notes: list[Line] = []
-    for one in (said, _held(found, digits)):
+    for one in (said, _rounding_warning(found, digits)):
         if one:
             text, _, following = one.partition(" Export")
             notes.append(("note", "digits", text, f"export{following}"))
     return notes or [("ok", "digits", f"{digits} digits are enough", "")]
 
 
-def _held(found: Facts, digits: int) -> str | None:
+def _rounding_warning(found: Facts, digits: int) -> str | None:
     """Return what `FEMatrices.model` warns of, where rounding alone holds rigid-body motions."""
     given = found.given
     if given.dofs is None or not given.located or found.motions is None:

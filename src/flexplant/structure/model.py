@@ -15,13 +15,13 @@ from ..checks import FloatArray, Matrix, Value, frozen, instance, real_array
 from ..errors import ModelError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite, with_pattern_of
-from .attachments import HeldShape, Part, added_matrices, summed
+from .attachments import HeldShape, Part, added_matrices, matrix_sum
 from .damping import Damping, Rayleigh, damping_matrix
 from .definite import (
     MatrixLike,
     check_semidefinite,
     slow,
-    symmetric,
+    symmetric_matrix,
     unstable_stiffness,
     without_inertia,
 )
@@ -115,8 +115,8 @@ class FEModel(Placed, Value):
             raise ModelError("the DofSet holds no DOF: there is no structure. Check the table.")
         instance(self.name, str | None, "name", "Pass text for reports.")
         digits = digits_of(self.K)
-        M, K = symmetric(self.M, "M", n), symmetric(self.K, "K", n)
-        D = None if self.D is None else symmetric(self.D, "D", n)
+        M, K = symmetric_matrix(self.M, "M", n), symmetric_matrix(self.K, "K", n)
+        D = None if self.D is None else symmetric_matrix(self.D, "D", n)
         if not is_positive_definite(M):
             raise ModelError(f"M is not positive definite: {without_inertia(M, K)}")
         self._set(M=M, K=K, D=D)
@@ -255,7 +255,7 @@ class FEModel(Placed, Value):
                     f"damping must be a ModalDamping or Rayleigh (or Hysteretic, or a matrix D), "
                     f"got {type(damping).__name__}. Give ModalDamping(0.01) for 1 % in all modes."
                 )
-            D = symmetric(damping, "D", self.n_dof)
+            D = symmetric_matrix(damping, "D", self.n_dof)
             check_semidefinite(D, "D")
             return self._with(D=frozen(D))
         free = self.rigid_body.shape[1] > 0
@@ -299,7 +299,7 @@ class FEModel(Placed, Value):
         added = added_matrices(self.dofs, parts)
         # sums of definite matrices are definite: nothing to check again
         return self._with(
-            **{name: frozen(summed(getattr(self, name), more)) for name, more in added.items()}
+            **{name: frozen(matrix_sum(getattr(self, name), more)) for name, more in added.items()}
         )
 
     def fixed(self, labels: Iterable[str]) -> FEModel:

@@ -65,7 +65,7 @@ class Placed:
         return rigid_motions(self.dofs, centre)
 
 
-def missed(made: FloatArray, wanted: FloatArray) -> FloatArray:
+def relative_miss(made: FloatArray, wanted: FloatArray) -> FloatArray:
     """Return how far motions (n, r) that a model makes are from those wanted, relative to these."""
     size = np.linalg.norm(wanted, axis=0)
     return np.asarray(np.linalg.norm(made - wanted, axis=0) / divisor(size))

@@ -380,11 +380,11 @@ def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -
     loaded = np.zeros((basis.shape[0], 0))  # M done, for as few products with M as possible
     for i in range(basis.shape[1]):
         vector = basis[:, i]
-        length = _length(M, vector) if vector.any() else 0.0
+        length = _mass_norm(M, vector) if vector.any() else 0.0
         if length:
             for _ in range(2):
                 vector = vector - done @ (loaded.T @ vector)
-        left = _length(M, vector) if length else 0.0
+        left = _mass_norm(M, vector) if length else 0.0
         if left <= SAME * length:
             if dependent == "drop":
                 continue
@@ -402,7 +402,7 @@ def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -
     return done
 
 
-def _length(M: Matrix, vector: FloatArray) -> float:
+def _mass_norm(M: Matrix, vector: FloatArray) -> float:
     square = float(vector @ np.asarray(M @ vector))
     if square < 0:
         raise ModelError(

@@ -60,14 +60,14 @@ def null_motions(M: Any, digits: int | None) -> FloatArray:
     return np.column_stack(columns) if columns else np.zeros((n, 0))
 
 
-def left_out(motions: FloatArray, M: Any) -> IntArray:
+def massless_dofs(motions: FloatArray, M: Any) -> IntArray:
     """Return the DOFs (q,), ascending, that the motions (n, q) without inertia move most."""
     size = np.sqrt(diagonal(M))[:, None] * motions
     pivots = la.qr(size.T, mode="r", pivoting=True)[1]
     return np.sort(np.asarray(pivots[: motions.shape[1]], dtype=np.int64))
 
 
-def projected(
+def condense_massless(
     K: Any, M: Any, D: Any, motions: FloatArray, names: Callable[[IntArray], tuple[str, ...]]
 ) -> tuple[FloatArray, FloatArray, FloatArray | None, IntArray]:
     """Return K, M, D on the motions that M can accelerate, in n - q of the DOFs, and which.
@@ -87,7 +87,7 @@ def projected(
             "damping acts on motions without inertia: they do not follow statically. Give them "
             "inertia, or leave D out and give damping by mode."
         )
-    s = left_out(motions, M)
+    s = massless_dofs(motions, M)
     m = np.setdiff1d(np.arange(n), s)
     forces = np.asarray(K @ motions).T
     weight = np.sqrt(np.abs(diagonal(K)))[s]
@@ -148,14 +148,14 @@ def inertial(
     count = motions.shape[1]
     if count:
         if massless == "refuse":
-            at = ", ".join(names(rows[left_out(motions, M)[:6]]))
+            at = ", ".join(names(rows[massless_dofs(motions, M)[:6]]))
             raise ModelError(
                 f"{counted(count, 'motion')} without inertia, turning {at} among others: offset "
                 "masses without rotary inertia, or rods that do not resist turning? Condense them, "
                 "which is exact: model(massless='condense'); or give them their inertia."
             )
         left = rows
-        K, M, D, kept = projected(K, M, D, motions, lambda some: names(left[some]))
+        K, M, D, kept = condense_massless(K, M, D, motions, lambda some: names(left[some]))
         rows = rows[kept]
         notes = (*notes, f"{counted(count, 'motion')} without inertia condensed")
     return Inertial(K, M, D, rows, notes)

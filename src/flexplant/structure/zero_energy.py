@@ -100,7 +100,7 @@ def _of_bodies(
         whole = rows.size == motions.shape[0]
         stiffness, mass = (A if whole or A is None else A[rows][:, rows] for A in (K, M))
         own = own_motions(mass, motions[rows])
-        found = _free_motions(stiffness, abs(stiffness), own, _MARGIN * rounding)
+        found = _energy_free(stiffness, abs(stiffness), own, _MARGIN * rounding)
         written, far = rounding * PRECISION / ROUNDING, farness(xyz[rows])
         mix = unheld(by_rows(stiffness), found, written, far)
         for part, kept in ((every, _independent(own)), (free, _independent(found @ mix))):
@@ -122,7 +122,7 @@ def own_motions(M: Any, motions: FloatArray) -> FloatArray:
     return independent
 
 
-def _free_motions(K: Any, size: Any, motions: FloatArray, allowed: float) -> FloatArray:
+def _energy_free(K: Any, size: Any, motions: FloatArray, allowed: float) -> FloatArray:
     """Return those of some independent motions, or combinations, without energy (n, r)."""
     most = np.einsum("ij,ij->j", np.abs(motions), np.asarray(size @ np.abs(motions)))
     energy = np.abs(np.einsum("ij,ij->j", motions, np.asarray(K @ motions)))
@@ -188,7 +188,7 @@ def most_moved(motion: FloatArray) -> IntArray:
     return np.asarray(order[size[order] >= _MOVES * size[order[0]]], dtype=np.int64)
 
 
-def beyond(zero_modes: FloatArray, rigid: FloatArray, extra: int | None = None) -> FloatArray:
+def nonrigid(zero_modes: FloatArray, rigid: FloatArray, extra: int | None = None) -> FloatArray:
     """Return the part of a space that is not rigid-body motion, as `extra` orthonormal columns."""
     extra = zero_modes.shape[1] - rigid.shape[1] if extra is None else extra
     if extra <= 0:

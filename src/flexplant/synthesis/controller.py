@@ -10,11 +10,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ..certificates import in_words, stability, stability_name
+from ..certificates import one_line, stability, stability_name
 from ..checks import FloatArray, Value
 from ..errors import CertificateError, FlexplantWarning, counted, warn
 from ..loop import ClosedLoop, ModeTolerances, SpillOver, close_loop
-from ..lti.frequency_sweep import gains, highest, resonance_grid
+from ..lti.frequency_sweep import highest, largest_gains, resonance_grid
 from ..lti.norms import peak_gain
 from ..lti.preparation import Prepared
 from ..lti.responses import Responder, responder
@@ -97,7 +97,7 @@ class Controller(Value):
             lines.append(f"  reached, of 1 that the weights require: {shown}")
         if self.certificate:
             own = {k: v for k, v in self.certificate.items() if "left out" not in k}
-            lines.append(f"  verified: {in_words(own)}")
+            lines.append(f"  verified: {one_line(own)}")
         if self.left_out is not None:
             lines.append(f"  with the modes left out: {self.left_out.summary}")
         if self.tolerances is not None:
@@ -164,11 +164,11 @@ def reached_norms(P: StandardPlant, loop: StateSpace, respond: Responder) -> dic
     # groups by the names that `assemble_plant` gives; empty for other plants
     if not P.is_assembled:
         return {}
-    gain = respond(_grid(loop))
+    gain = respond(_loop_grid(loop))
     w = {"references": ":ref", "noises": ":noise"}
     sides = [_grouped(P.z, {"efforts": ":effort"}, "motions"), _grouped(P.w, w, "disturbances")]
     return {
-        f"{to} from {source}": float(gains(gain[rows][:, columns]).max())
+        f"{to} from {source}": float(largest_gains(gain[rows][:, columns]).max())
         for to, rows in sides[0].items()
         for source, columns in sides[1].items()
     }
@@ -190,11 +190,11 @@ def swept_norm(loop: StateSpace, respond: Responder | None = None) -> float:
     if not loop.n_states:
         return float(np.linalg.norm(loop.D, 2))
     respond = respond or responder(loop)
-    swept, _ = highest(lambda freq: gains(respond(freq)), _grid(loop), 3)
+    swept, _ = highest(lambda freq: largest_gains(respond(freq)), _loop_grid(loop), 3)
     return swept if loop.dt else max(swept, float(np.linalg.norm(loop.D, 2)))
 
 
-def _grid(loop: StateSpace) -> FloatArray:
+def _loop_grid(loop: StateSpace) -> FloatArray:
     """Return frequencies [Hz] from 0 up, dense around the resonances of a loop with states."""
     return np.append(0.0, resonance_grid(loop.poles(), loop.dt, around=_AROUND))
 

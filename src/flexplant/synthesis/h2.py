@@ -105,7 +105,7 @@ def design_h2(
     _require_finite(plant)
     problem = prepared(plant.system, plant.u, plant.y, direct=True)
     try:
-        found = _least(problem)
+        found = _optimal_controller(problem)
     except FlexplantError:  # a mode that u or y misses is named, with channel and frequency
         require_reach(prepared(plant.system, plant.u, plant.y))
         raise
@@ -136,18 +136,18 @@ def _require_finite(plant: StandardPlant) -> None:
     )
 
 
-def _least(p: Prepared) -> SolvedController:
+def _optimal_controller(p: Prepared) -> SolvedController:
     """Return the optimal controller; noise and effort are added where the problem is singular."""
     lacking = missing_ranks(p)
     if not lacking:
         try:
-            return _solved(p)
+            return _solve_regular(p)
         except AssumptionError as error:  # a mode on the stability boundary is missed by w or z
             lacking = (str(error).rstrip("."),)
-    return made_regular(p, _solved, lacking, h2_norm)
+    return made_regular(p, _solve_regular, lacking, h2_norm)
 
 
-def _solved(p: Prepared) -> SolvedController:
+def _solve_regular(p: Prepared) -> SolvedController:
     """Return the optimal controller of a regular prepared problem."""
     solve_control, solve_filter = (
         (control_dare, solve_dare) if p.direct else (control_care, solve_care)

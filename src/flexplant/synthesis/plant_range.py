@@ -20,18 +20,18 @@ _HINT = "Pass {0.0: plant, 0.1: other}, the same model with its ports at each po
 def sorted_places(given: Any, name: str, least: int = 2) -> tuple[FloatArray, list[Any]]:
     """Return positions in rising order, and what is at each."""
     entries = mapping(given, name, _HINT, least=least)
-    pairs = sorted(((number(x, "a position"), one) for x, one in entries.items()), key=_first)
+    pairs = sorted(((number(x, "a position"), one) for x, one in entries.items()), key=_position)
     places = np.array([x for x, _ in pairs])
     if np.any(np.diff(places) <= 0.0):
         raise ModelError(f"positions of {name} must differ, got {places.tolist()}. {_HINT}")
     return places, [one for _, one in pairs]
 
 
-def _first(pair: tuple[float, Any]) -> float:
+def _position(pair: tuple[float, Any]) -> float:
     return pair[0]
 
 
-def between(systems: Sequence[StateSpace], places: FloatArray, x: float) -> StateSpace:
+def system_at(systems: Sequence[StateSpace], places: FloatArray, x: float) -> StateSpace:
     """Return the system at a position, its matrices linear between the nearest two."""
     i = int(np.clip(np.searchsorted(places, x, side="right") - 1, 0, max(len(places) - 2, 0)))
     if x == places[i] or len(places) == 1:
@@ -78,7 +78,7 @@ class PlantRange:
         if known.size:
             return self.plants[int(known[0])]
         first = self.plants[0]
-        found = between([one.system for one in self.plants], self.places, x)
+        found = system_at([one.system for one in self.plants], self.places, x)
         sides = {side: getattr(first, side) for side in "wuzy"}
         return StandardPlant.from_statespace(found, **sides)
 

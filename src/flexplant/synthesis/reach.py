@@ -83,9 +83,9 @@ def require_reach(problem: Prepared) -> None:
             pencil = np.hstack([matrix - pole * np.eye(A.shape[0]), reach])
             if np.linalg.svd(pencil, compute_uv=False)[-1] < _MISSED * size:
                 raise AssumptionError(
-                    _delayed(problem, float(pole.real))
+                    _delay_effect(problem, float(pole.real))
                     or f"{text} a mode of the plant or of a weight that is not stable "
-                    f"({_described(problem, complex(pole))}): no controller can stabilise it. "
+                    f"({_pole_in_words(problem, complex(pole))}): no controller can stabilise it. "
                     "Add or move an actuator or a sensor, or give the weight finite gain."
                 )
 
@@ -101,7 +101,7 @@ def beyond_rounding(problem: Prepared) -> str:
             "reaches or y hardly sees."
         )
     growth = float(np.max(unstable.real))
-    return _delayed(problem, growth) or (
+    return _delay_effect(problem, growth) or (
         f"the plant has {unstable.size} unstable pole(s), growing e-fold in "
         f"{1.0 / (problem.speed * growth):.3g} s, which u ({', '.join(problem.u)}) and y "
         f"({', '.join(problem.y)}) can hold only with gains that 16 digits do not resolve. Add "
@@ -110,7 +110,7 @@ def beyond_rounding(problem: Prepared) -> str:
     )
 
 
-def _delayed(problem: Prepared, growth: float) -> str:
+def _delay_effect(problem: Prepared, growth: float) -> str:
     """Return what a delay does to a mode of that growth, in words; empty where it does little."""
     if not problem.dt or problem.direct or growth <= _ZERO:
         return ""
@@ -129,7 +129,7 @@ def _delayed(problem: Prepared, growth: float) -> str:
     )
 
 
-def _described(problem: Prepared, pole: complex) -> str:
+def _pole_in_words(problem: Prepared, pole: complex) -> str:
     if abs(pole.imag) > _ZERO and abs(pole.imag) > pole.real:
         return f"at {problem.frequency(abs(pole.imag)):.3g} Hz"
     if pole.real > _ZERO:

@@ -13,7 +13,7 @@ from ..dof_columns import Interpolation
 from ..errors import LabelError
 from ..labels import DofSet
 from ..structure import FEModel
-from .ritz_plate import EDGE, lagrange, nodes_of
+from .ritz_plate import EDGE, lagrange, lobatto
 
 #: orders along x, y and z of a block that is thin in z: a wave of bending has few half waves in a
 #: thickness, and twelve elastic frequencies change by less than 1e-4 with one order more of each
@@ -54,7 +54,7 @@ class SolidShape(Interpolation):
     def seen(self, points: Sequence[FloatArray], slope: int | None = None) -> FloatArray:
         """Return all polynomials (p, n), or their slopes along an axis, at the points of a grid."""
         each = [
-            lagrange(nodes_of(order), at, int(slope == i)) * (2.0 / length) ** int(slope == i)
+            lagrange(lobatto(order), at, int(slope == i)) * (2.0 / length) ** int(slope == i)
             for i, (order, at, length) in enumerate(
                 zip(self.orders, points, self.size, strict=True)
             )
@@ -100,7 +100,7 @@ def ritz_block(
         K[:, i, :, i] += shear * sum(each[k][k] for k in range(3))
         for j in range(3):
             K[:, i, :, j] += first * each[i][j] + shear * each[j][i]
-    places = [0.5 * a * (1.0 + nodes_of(order)) for order, a in zip(orders, lengths, strict=True)]
+    places = [0.5 * a * (1.0 + lobatto(order)) for order, a in zip(orders, lengths, strict=True)]
     z, y, x = (one.reshape(-1) for one in np.meshgrid(*reversed(places), indexing="ij"))
     xyz = np.repeat(np.column_stack([x, y, z]), 3, axis=0)
     dofs = DofSet(np.repeat(np.arange(1, n + 1), 3), _AXES * n, xyz, shape)

@@ -59,7 +59,7 @@ class PolynomialShape(Interpolation):
         return np.asarray(sign * np.einsum("pi,pj->pij", y, x).reshape(len(places), -1))
 
 
-def nodes_of(order: int) -> FloatArray:
+def lobatto(order: int) -> FloatArray:
     """Return Lobatto's points in [-1, 1], through which Lagrange's polynomials stay small."""
     inner = legendre.legroots(legendre.legder(np.eye(order + 1)[order]))
     return np.concatenate([[-1.0], np.sort(inner.real), [1.0]])
@@ -90,7 +90,7 @@ def ritz_plate(
     polynomials that meet each boundary condition in the limit; integrals exact. `stiffer` is a
     function of (x, y): a factor of E there.
     """
-    nodes = nodes_of(order)
+    nodes = lobatto(order)
     points, weights = legendre.leggauss(order + 3)
     a, b = (0.5 * float(length) for length in size)
     N = [lagrange(nodes, points, k) for k in range(3)]
@@ -119,7 +119,7 @@ def ritz_plate(
     return FEModel(0.5 * (M + M.T), 0.5 * (K + K.T), dofs=dofs, name="plate by Ritz")
 
 
-def elastic_modes(plate: FEModel) -> tuple[FloatArray, FloatArray]:
+def plate_modes(plate: FEModel) -> tuple[FloatArray, FloatArray]:
     """Return omega (k,) [rad/s] and mass-normalised shapes (n, k) of all modes but three."""
     values, phi = la.eigh(dense(plate.K), dense(plate.M))
     return np.sqrt(values[3:]), phi[:, 3:]

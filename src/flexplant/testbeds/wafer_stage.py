@@ -27,12 +27,12 @@ from ..identification.periodic import frf_of_periods, line_spectra, offsets
 from ..loop import ClosedLoop, ScheduledLoop, close_loop
 from ..lti.frequency import Frf
 from ..plant import Disturbance, GroundSpring, Poi, Ports, StandardPlant, assemble_plant, suspend
-from ..plant.realisation import ModalRealisation, realised
+from ..plant.realisation import ModalRealisation, realise
 from ..reduction import ReducedModel
 from ..simulation import Quantiser, Response, simulate
 from ..structure import FEModel, ModalDamping, kirchhoff_plate, solid_block
 from ..synthesis import design_servo
-from .ritz_plate import elastic_modes, ritz_plate
+from .ritz_plate import plate_modes, ritz_plate
 
 #: the plate of the paper's Table 1, as its drawing says
 DRAWING: Mapping[str, Any] = {
@@ -115,7 +115,7 @@ def wafer_stage(
     """
     mass = positive(added_mass, "added_mass", zero=True)
     fast = positive(rate, "rate")
-    drawing = _drawn(size, thickness)
+    drawing = _plate_drawing(size, thickness)
     mass_at: dict[tuple[float, ...], float] = {_spot(drawing): mass}
     if elements is None:
         late = positive(LATENCY if delay is None else delay, "delay", zero=True)
@@ -129,11 +129,11 @@ def wafer_stage(
     elements = (whole(given[0], "elements along x"), whole(given[1], "elements along y"))
     late = positive(1.0 if delay is None else delay, "delay", zero=True)
     bare = kirchhoff_plate(elements=elements, name="wafer stage", **drawing)
-    truth = _loaded(bare.with_damping(ModalDamping(damping)), mass_at)
+    truth = _with_masses(bare.with_damping(ModalDamping(damping)), mass_at)
     return WaferStage(truth, fast, late, drawing=drawing)
 
 
-def _drawn(size: Any, thickness: Any) -> Mapping[str, Any]:
+def _plate_drawing(size: Any, thickness: Any) -> Mapping[str, Any]:
     """Return the drawing of a plate of this size."""
     sides = tuple(size) if isinstance(size, Sequence) and not isinstance(size, str) else ()
     if len(sides) != 2:
@@ -170,17 +170,17 @@ def _individual(
     random = np.random.default_rng([seed, 8])
     sides = drawing["size"]
     bare = ritz_plate(stiffer=waves(random, sides), **drawing)
-    omega, phi = elastic_modes(bare)
+    omega, phi = plate_modes(bare)
     own = random.normal(size=DAMPINGS)[: omega.size]
     zeta = positive(damping, "damping", zero=True) * np.exp(SPREAD * own)
     shapes = bare.M @ phi
     D = shapes * (2.0 * zeta * omega) @ shapes.T
     spot = (sides[0] * random.random(), sides[1] * random.random(), 0.0)
     masses = {**known, spot: SECOND * random.random()}
-    return _loaded(bare.replace(D=0.5 * (D + D.T), name="wafer stage"), masses)
+    return _with_masses(bare.replace(D=0.5 * (D + D.T), name="wafer stage"), masses)
 
 
-def _loaded(bare: FEModel, masses: Mapping[tuple[float, ...], float]) -> FEModel:
+def _with_masses(bare: FEModel, masses: Mapping[tuple[float, ...], float]) -> FEModel:
     """Return a damped plate with point masses [kg] added after its damping."""
     M = bare.M
     for at, mass in masses.items():
@@ -229,7 +229,7 @@ class WaferStage(Value):
 
     @cached_property
     def _realisation(self) -> ModalRealisation:
-        return realised(self.truth)
+        return realise(self.truth)
 
     @cached_property
     def _own_poles(self) -> ComplexArray:

@@ -11,8 +11,8 @@ from ..checks import FloatArray, Matrix
 from ..errors import ModelError, attempted, warn
 from ..modes import solve_modes
 from ..modes.normal_form import RIGID_DRAG
-from ..structure.attachments import summed
-from ..structure.definite import indefinite
+from ..structure.attachments import matrix_sum
+from ..structure.definite import why_indefinite
 from ..structure.model import FEModel
 from ..structure.rigid import orthonormalised
 from .family import Family
@@ -35,7 +35,7 @@ def changed_model(
         return _changed_structure(model, parameters, p, std)
     family = Family(model, parameters) if family is None else family
     changes: dict[str, Any] = {
-        name: summed(getattr(model, name), change if np.any(change) else None)
+        name: matrix_sum(getattr(model, name), change if np.any(change) else None)
         for name, change in zip("MDK", family.changes(p), strict=True)
     }
     if hasattr(model, "T"):
@@ -65,8 +65,8 @@ def _changed_structure(
     total: dict[str, Matrix | None] = dict.fromkeys("MDK")
     for parameter, value in zip(parameters, p.tolist(), strict=True):
         for name, part in zip("MDK", parameter.change(model, value), strict=True):
-            total[name] = summed(total[name], part)
-    changes = {name: summed(getattr(model, name), change) for name, change in total.items()}
+            total[name] = matrix_sum(total[name], part)
+    changes = {name: matrix_sum(getattr(model, name), change) for name, change in total.items()}
     try:
         changed: FEModel = _replaced(model, changes, parameters, p, std)
     except ModelError:
@@ -97,7 +97,7 @@ def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
     if drag > RIGID_DRAG * float(first):
         return None
     # the rigid-body part of D + d M comes out at 0 in theory, so twice d: above rounding
-    shifted = summed(D, 2.0 * drag * held.M)
+    shifted = matrix_sum(D, 2.0 * drag * held.M)
     try:
         model.replace(D=shifted)
     except ModelError:
@@ -131,7 +131,7 @@ def _impossible(
 ) -> str:
     """Return in words that D or K is indefinite, by which parameters; empty when neither is."""
     for name in "DK":
-        said = "" if changes[name] is None else indefinite(changes[name], name)
+        said = "" if changes[name] is None else why_indefinite(changes[name], name)
         if not said:
             continue
         at = "MDK".index(name)

@@ -133,7 +133,7 @@ class _Weighed(Bound):
         return self.own.assigned(point)
 
 
-def weighed(
+def weigh_discrepancy(
     objective: Objective,
     method: UpdateMethod,
     end: SearchEnd,

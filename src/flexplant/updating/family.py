@@ -96,7 +96,7 @@ class Family:
             self.massive, self.rigid = np.arange(k), np.eye(k)[:, : self.n_rigid]
             omega, self.V = _modal_basis(M, K, rigid)
             self.M, self.D, self.K = np.eye(k), self.V.T @ D @ self.V, np.diag(omega**2)
-            self.terms = [turned(stack, self.V) for stack in self.physical]
+            self.terms = [congruence(stack, self.V) for stack in self.physical]
         self.condensed = self.massive.size < k
         self._derive(np.zeros(len(self.parameters)))
         self._weight: FloatArray | None = None
@@ -121,7 +121,7 @@ class Family:
         part.V, part.rigid = self.V @ B, B.T @ self.rigid
         part.massive = np.arange(B.shape[1])
         part.M, part.D, part.K = (B.T @ whole @ B for whole in (self.M, self.D, self.K))
-        part.terms = [turned(stack, B) for stack in self.terms]
+        part.terms = [congruence(stack, B) for stack in self.terms]
         part._unchanged, part._weight = [], None
         part._derive(np.zeros(len(part.parameters)))
         return part
@@ -142,7 +142,7 @@ class Family:
             slopes = np.zeros((len(self.parameters), len(self.owner)))
             slopes[self.owner, range(len(self.owner))] = self._curves(p)[1]
             self.dM, self.dD, self.dK = (np.tensordot(slopes, part, axes=1) for part in self.terms)
-        self._stacks = [_stacked(stack) for stack in (self.dM, self.dD, self.dK)]
+        self._stacks = [_vertical_stack(stack) for stack in (self.dM, self.dD, self.dK)]
 
     def _curves(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return g_j and their derivatives at `p`, of all terms."""
@@ -297,7 +297,7 @@ def repeated_groups(poles: ComplexArray) -> list[list[int]]:
     return [group.tolist() for group in found if group.size > 1]
 
 
-def _stacked(stack: FloatArray) -> Any:
+def _vertical_stack(stack: FloatArray) -> Any:
     """Return (q, k, k) matrices below each other, sparse where that saves work, None if zero."""
     q, k, _ = stack.shape
     filled = np.count_nonzero(stack)
@@ -383,7 +383,7 @@ def factors(
     return None
 
 
-def turned(stack: FloatArray, V: FloatArray) -> FloatArray:
+def congruence(stack: FloatArray, V: FloatArray) -> FloatArray:
     """Return ``V^T A V`` of all A (q, k, k): of one factor by its own, ``s (V^T b)(V^T b)^T``."""
     found = np.zeros((stack.shape[0], V.shape[1], V.shape[1]))
     for A, own in zip(stack, found, strict=True):

@@ -16,13 +16,13 @@ from ..modes.dynamic_basis import static_shapes
 from ..modes.sparse_modes import counted_modes
 from ..reduction import ReducedModel
 from ..sparse.lanczos import beyond
-from ..structure.attachments import summed
+from ..structure.attachments import matrix_sum
 from ..structure.model import FEModel
 from .parameters.added import Parameter, PointParameter
 from .point_model import Point, pair
 from .residuals.residual import Residual
 from .search import Objective
-from .search.objective import numbers
+from .search.objective import compared_modes
 
 #: modes of the basis for each coordinate of the reduced model
 WIDER = 4
@@ -143,23 +143,23 @@ class FullBasis:
         """Return the shapes of a changed model that take part."""
         n = model.n_dof
         if self.reduced is not None:
-            return _lowest(model, min(WIDER * self.reduced.n_dof, n))[1]
-        highest = max((number for r in self.residuals for number in numbers(r)), default=6)
+            return _lowest_modes(model, min(WIDER * self.reduced.n_dof, n))[1]
+        highest = max((number for r in self.residuals for number in compared_modes(r)), default=6)
         top = WIDER * max(residual.top for residual in self.residuals)
-        omega, phi = _lowest(model, min(WIDER * highest, n))
+        omega, phi = _lowest_modes(model, min(WIDER * highest, n))
         if omega.size < n and omega[-1] < top:
-            _, phi = _lowest(model, n, top)
+            _, phi = _lowest_modes(model, n, top)
         return phi
 
     def _changed(self, p: FloatArray) -> FEModel:
         changes: dict[str, Any] = {"M": self.full.M, "K": self.full.K}
         for q, value in zip(self.parameters, p.tolist(), strict=True):
             dM, _, dK = q.change(self.full, value)
-            changes = {"M": summed(changes["M"], dM), "K": summed(changes["K"], dK)}
+            changes = {"M": matrix_sum(changes["M"], dM), "K": matrix_sum(changes["K"], dK)}
         return self.full.replace(**changes, D=None)
 
 
-def _lowest(model: FEModel, count: int, top: float = np.inf) -> tuple[FloatArray, FloatArray]:
+def _lowest_modes(model: FEModel, count: int, top: float = np.inf) -> tuple[FloatArray, FloatArray]:
     """Return omega and shapes of the lowest modes, up to `top` [rad/s]."""
     r = model.rigid_body.shape[1]
     sparse = sp.issparse(model.K) and sp.issparse(model.M) and not model.n_unstable

@@ -110,7 +110,7 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
     places = places + 1 - found.modes[0]
     own = found.poles[places]
     both = np.r_[places, m + places]
-    S = _relative(found.poles, found.S)
+    S = _relative_changes(found.poles, found.S)
     ratio = _damping(poles) / divisor(_damping(own))
     said = np.r_[np.full(ratio.size, True), ratio > ZETA]
     gap = np.r_[np.log(np.abs(poles / own)), np.log(np.where(ratio > ZETA, ratio, 1.0))]
@@ -182,11 +182,11 @@ def _noise(measured: Any, poles: ComplexArray) -> FloatArray:
     exact = np.eye(2 * m) * _EXACT**2
     if measured.covariance is None:
         return exact
-    G = _relative(poles, np.hstack([np.eye(m), 1j * np.eye(m)]))
+    G = _relative_changes(poles, np.hstack([np.eye(m), 1j * np.eye(m)]))
     return np.asarray(G @ measured.covariance @ G.T + exact)
 
 
-def _relative(poles: ComplexArray, changes: ComplexArray) -> FloatArray:
+def _relative_changes(poles: ComplexArray, changes: ComplexArray) -> FloatArray:
     """Return relative changes (2m, q) of frequencies and of damping ratios by those of poles."""
     part = np.real(changes / poles[:, None])
     # an undamped pole has no relative damping: nothing is said of it

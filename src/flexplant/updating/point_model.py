@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
-from ..modes.matching import assigned, clusters, in_span, mac
+from ..modes.matching import assigned, clusters, in_span, mac_matrix
 from .family import Eigen, Family
 
 #: entries of bordered systems that are solved together
@@ -145,14 +145,14 @@ def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntAr
     nothing of each other keep to themselves and may cross, all others keep their order of
     frequency, since two modes that couple veer instead of crossing.
     """
-    shapes = mac(old_X, X)
+    shapes = mac_matrix(old_X, X)
     score, close = shapes.copy(), clusters(old_poles, CLUSTER)
     for cluster in close:
         score[cluster] = in_span(old_X[:, cluster], X)
     found = assigned(-score)
     for cluster in close:
         members = cluster[found[cluster] >= 0]
-        found[members] = _inside(shapes, members, found[members])
+        found[members] = _match_cluster(shapes, members, found[members])
     return found
 
 
@@ -164,10 +164,10 @@ def measured_pairs(
     Minimises the sum of ``1 - MAC + |ln(f_j / f_i)|`` over the pairs.
     """
     far = np.abs(np.log(np.abs(poles) / np.abs(psi_poles)[:, None]))
-    return assigned(NEARNESS * far - mac(psi, X))
+    return assigned(NEARNESS * far - mac_matrix(psi, X))
 
 
-def _inside(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:
+def _match_cluster(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:
     """Return the new modes of a cluster in the order of its old ones."""
     s = old.size
     new = np.sort(new)

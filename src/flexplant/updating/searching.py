@@ -100,7 +100,7 @@ def _magnitude(residual: FrfResidual) -> FrfResidual:
 
 
 #: part of the measured power that a minimum leaves which has little to do with the measurement
-ABSURD = 0.1
+POOR_FIT = 0.1
 #: relative distance of a pole from the measured one, beyond noise, that a wrong pairing may leave
 FAR = 1e-3
 #: starts that are always tried beside the first, for models of up to so many DOFs and larger ones;
@@ -151,22 +151,22 @@ class _Tried:
 
     def add(self, begin: FloatArray, *, led: bool, named: bool = False) -> None:
         """Search from a start; `led`: through easier problems first."""
-        best, search = self.best, _led if led else _direct
+        best, search = self.best, _led if led else _direct_search
         sound = best is not None and not best.improvable
         limit = GLANCE if sound and self.most is None else self.most
         enough = max(self.tolerance, NEARLY) if self.ends else self.tolerance
-        end = _attempt(search, self.objective, begin, self.method, limit, enough)
+        end = _try_search(search, self.objective, begin, self.method, limit, enough)
         if isinstance(end, SearchEnd) and best is not None and limit != self.most:
             near = end.cost < WORTH * best.end.cost
             if near and not end.converged:
-                end = _attempt(_settled, self.objective, end, self.method, None, enough)
+                end = _try_search(_continue_search, self.objective, end, self.method, None, enough)
         self.begins.append(begin)
         self.ends.append(end)
         if isinstance(end, SearchEnd):
             if not self.found:
                 size = self.objective.size(self.objective.at(end.p))
                 self.rounding = (EXACT * float(np.linalg.norm(size))) ** 2
-            self.found.append(_judged(self.objective, end, named=named))
+            self.found.append(_graded_end(self.objective, end, named=named))
 
     @property
     def best(self) -> _GradedEnd | None:
@@ -183,7 +183,7 @@ class _Tried:
     @property
     def alike(self) -> bool:
         """Whether all starts met the same: more of them would as well."""
-        return not self.found and len({_head(end) for end in self.ends}) == 1
+        return not self.found and len({_message(end) for end in self.ends}) == 1
 
 
 def from_one_start(
@@ -218,7 +218,7 @@ def from_one_start(
         middles.insert(1 if well else 0, (default, True))
     small = len(objective.family.V) <= SMALL
     always, retries = (ALWAYS, RETRIES) if small else (ALWAYS_LARGE, RETRIES_LARGE)
-    others, led = _others(objective, middles, retries + 1 - len(tried.ends), rng)
+    others, led = _other_starts(objective, middles, retries + 1 - len(tried.ends), rng)
     for other in others:
         best = tried.best
         enough = tried.alike if best is None else not best.improvable
@@ -230,14 +230,14 @@ def from_one_start(
         raise none_found(objective, tried.begins, tried.ends)
     end = best.end
     if end is not tried.ends[0]:
-        settled = _attempt(_settled, objective, end, method, most, tolerance)
+        settled = _try_search(_continue_search, objective, end, method, most, tolerance)
         end = settled if isinstance(settled, SearchEnd) else end
     objective.path = []
     objective.follow(end.trail.p)
     return end, tried.begins, tried.ends
 
 
-def _others(
+def _other_starts(
     objective: Objective, middles: list[tuple[FloatArray, bool]], count: int, rng: Rng
 ) -> tuple[list[FloatArray], bool]:
     """Return starts around the first of some where the modes can be numbered, and its `led`."""
@@ -252,7 +252,7 @@ def none_found(
 ) -> FlexplantError:
     """Return the error that no start leads to an end: what all of them met."""
     failed = [end for end in ends if isinstance(end, FlexplantError)]
-    met = Counter(map(_head, failed))
+    met = Counter(map(_message, failed))
     if len(met) == 1:
         # what is met at the default start is no matter of the values there
         default = (np.array_equal(begin, objective.default_start) for begin in begins)
@@ -269,12 +269,12 @@ def none_found(
     return error
 
 
-def _head(end: Reached) -> str:
+def _message(end: Reached) -> str:
     """Return what a search met without where."""
     return str(end).split(": ")[0]
 
 
-def _judged(objective: Objective, end: SearchEnd, *, named: bool) -> _GradedEnd:
+def _graded_end(objective: Objective, end: SearchEnd, *, named: bool) -> _GradedEnd:
     """Return an end, where the objective is, with how good it is."""
     point = objective.at(end.p)
     chi2, dof = chi_square(objective, point, np.ones(end.p.size, dtype=bool))
@@ -292,7 +292,7 @@ def _is_possible(objective: Objective, p: FloatArray) -> bool:
     return True
 
 
-def _settled(
+def _continue_search(
     objective: Objective, end: SearchEnd, method: UpdateMethod, most: int | None, tolerance: float
 ) -> SearchEnd:
     """Return the end of a search that goes on from another's."""
@@ -302,7 +302,7 @@ def _settled(
     return found
 
 
-def _attempt(search: Callable[..., SearchEnd], *given: Any) -> Reached:
+def _try_search(search: Callable[..., SearchEnd], *given: Any) -> Reached:
     """Return the end of a search, or why there is none."""
     try:
         return search(*given)
@@ -310,7 +310,7 @@ def _attempt(search: Callable[..., SearchEnd], *given: Any) -> Reached:
         return error
 
 
-def _direct(
+def _direct_search(
     objective: Objective,
     begin: FloatArray,
     method: UpdateMethod,
@@ -343,7 +343,7 @@ def _improvable(objective: Objective, end: SearchEnd, point: Point) -> bool:
     """Return whether another start may lead to a better end than one that noise leaves open."""
     if not objective.numbers:
         r, size = objective.values(point, prior=False), objective.size(point)
-        return bool(np.sum(r**2) > ABSURD * np.sum(size[: r.size] ** 2))
+        return bool(np.sum(r**2) > POOR_FIT * np.sum(size[: r.size] ** 2))
     poles = objective.poles_measured
     alone = all(isinstance(residual, Eigenvalues) for residual in objective.residuals)
     if poles is None or not alone or point.p.size < 2:
@@ -361,7 +361,7 @@ def from_starts(
     tolerance: float,
 ) -> tuple[SearchEnd, list[Reached]]:
     """Return the best end, the objective being there, and what every start led to."""
-    ends = [_attempt(_direct, objective, one, method, most, tolerance) for one in begins]
+    ends = [_try_search(_direct_search, objective, one, method, most, tolerance) for one in begins]
     reached = [found for found in ends if isinstance(found, SearchEnd)]
     if not reached:
         raise none_found(objective, begins, ends)
@@ -387,7 +387,7 @@ def all_starts(objective: Objective, start: Any, starts: Any, rng: Rng) -> list[
         return [first]
     if np.ndim(starts) == 0:
         others = whole(starts, "starts") - 1
-        return [first, *_drawn(objective, others, rng)] if others else [first]
+        return [first, *_random_starts(objective, others, rng)] if others else [first]
     values = real_array(starts, "starts")
     if values.ndim != 2 or values.shape[1] != first.size or not values.shape[0]:
         raise ShapeError(f"starts must have shape (any, {first.size}), got {values.shape}.")
@@ -411,13 +411,13 @@ def summary(
         np.array(begins),
         np.array([end.p if isinstance(end, SearchEnd) else nan for end in ends]),
         np.array([end.cost if isinstance(end, SearchEnd) else np.inf for end in ends]),
-        tuple(_said(end) for end in ends),
+        tuple(_ending(end) for end in ends),
         np.array([end.p for end in minima]).reshape(-1, best.p.size),
         above,
     )
 
 
-def _said(end: Reached) -> str:
+def _ending(end: Reached) -> str:
     """Return how a search ended, in words."""
     if not isinstance(end, SearchEnd):
         return str(end)
@@ -478,7 +478,7 @@ def scattered(objective: Objective, middle: FloatArray, count: int, rng: Rng) ->
     return found
 
 
-def _drawn(objective: Objective, count: int, rng: Rng) -> FloatArray:
+def _random_starts(objective: Objective, count: int, rng: Rng) -> FloatArray:
     from scipy.stats import qmc
 
     low = np.where(objective.has_prior, objective.prior_mean - 2 * objective.prior_std, -np.inf)

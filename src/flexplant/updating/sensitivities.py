@@ -35,7 +35,7 @@ def group_derivatives(family: Family, eigen: Eigen) -> GroupDerivatives:
     ]
 
 
-def split(groups: GroupDerivatives, eigen: Eigen, direction: FloatArray) -> Rotation:
+def split_rotation(groups: GroupDerivatives, eigen: Eigen, direction: FloatArray) -> Rotation:
     """Return exactly repeated modes turned to the eigenvectors of their derivative.
 
     Along `direction`; the modes of a group come in the order of the frequencies they move to.
@@ -132,14 +132,14 @@ def eigenvalue_sensitivities(
     eigen = family.at(checked_values(values, listed, "values"))
     numbers = range(eigen.n_rigid + 1, eigen.n_rigid + eigen.poles.size + 1)
     columns = mode_columns(numbers if modes is None else modes, eigen)
-    growing = 1 / _nonzero(family.strength(float(np.abs(eigen.poles[0]))))
-    rotation = split(group_derivatives(family, eigen), eigen, growing)
+    growing = 1 / _divisor(family.strength(float(np.abs(eigen.poles[0]))))
+    rotation = split_rotation(group_derivatives(family, eigen), eigen, growing)
     S = family.sensitivity(rotation.eigen, columns)
     for group in repeated_groups(eigen.poles):
         if set(group) & set(columns):
             G = family.group_derivative(rotation.eigen, group)
             size = np.abs(G).max(axis=(1, 2), keepdims=True)
-            off = np.abs(G) * (1 - np.eye(len(group))) / _nonzero(size)
+            off = np.abs(G) * (1 - np.eye(len(group))) / _divisor(size)
             # within a group of equal eigenvalues, as accurate as these are equal
             if off.max() > 1e-6:
                 raise ModelError(
@@ -207,5 +207,5 @@ def checked_values(values: Any, parameters: Sequence[Parameter], name: str) -> F
     return array
 
 
-def _nonzero(sizes: Any) -> Any:
+def _divisor(sizes: Any) -> Any:
     return np.where(sizes == 0, 1.0, sizes)

@@ -13,7 +13,7 @@ from ..parallel import Progress
 from ..structure.model import FEModel
 from ..tolerances import TINY
 from .changed_model import changed_model
-from .discrepancy import weighed
+from .discrepancy import weigh_discrepancy
 from .full_basis import MOST_ROUNDS, FullBasis, is_large
 from .judgement.goodness import chi_square, covariance, is_bad, worst
 from .parameters.added import Parameter
@@ -21,7 +21,7 @@ from .residuals.eigenvalues import Eigenvalues
 from .residuals.residual import Residual
 from .search import Objective, SearchEnd, Secured, TrustRegion, UpdateMethod, checked_residuals
 from .search.objective import Defect
-from .search.update_method import ITERATIONS, units
+from .search.update_method import ITERATIONS, unit_changes
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
 from .sensitivities import checked_parameters, checked_values
 from .update_result import History, UpdateResult
@@ -204,7 +204,7 @@ def update(
     if not method.least_squares or not is_bad(fit.p_value):
         return fit
     named = worst(objective, objective.at(best.p))
-    end, found = weighed(objective, method, best, most=max_iterations, tolerance=enough)
+    end, found = weigh_discrepancy(objective, method, best, most=max_iterations, tolerance=enough)
     if found:
         again = _result(model, objective, method, end, begins[0])
         kept = {"starts": fit.starts, "rounds": fit.rounds, "residuals": given}
@@ -226,7 +226,10 @@ def _ends_warned(
 
     `estimates`: the first and that of each round; `lost`: why the start given has no end.
     """
-    if len(estimates) > 1 and (still := moved(objective, best.p, estimates[-2])) > UNSETTLED:
+    if (
+        len(estimates) > 1
+        and (still := normalised_step(objective, best.p, estimates[-2])) > UNSETTLED
+    ):
         warn(
             f"defect correction has not settled: round {len(estimates) - 1} still moved the "
             f"estimate by {still:.2g} standard deviations. Give more rounds=, or a reduced model "
@@ -251,7 +254,9 @@ def _result(
 ) -> UpdateResult:
     """Return what the best search found and how well it is known."""
     point = objective.at(best.p)
-    at_bound = _at_bound(objective, best.p, units(objective, objective.slopes(point, prior=False)))
+    at_bound = _at_bound(
+        objective, best.p, unit_changes(objective, objective.slopes(point, prior=False))
+    )
     fitted = np.array([q.name not in at_bound for q in objective.parameters])
     if method.penalised:
         fitted &= best.p != begin
@@ -353,12 +358,12 @@ def corrected(
         end = method.search(objective, begin, most=most, tolerance=tolerance)
         end.trail = end.trail if method.penalised else before.joined(end.trail)
         estimates.append(end.p)
-        if moved(objective, end.p, estimates[-2]) < STILL:
+        if normalised_step(objective, end.p, estimates[-2]) < STILL:
             break
     return end, estimates
 
 
-def moved(objective: Objective, p: FloatArray, before: FloatArray) -> float:
+def normalised_step(objective: Objective, p: FloatArray, before: FloatArray) -> float:
     """Return how far an estimate moved, in standard deviations: ``|J dp| / sqrt(q)``.
 
     Of residuals of unit variance where the noise is known; else relative to what is left of them.

@@ -55,7 +55,7 @@ class Bench:
     @classmethod
     def of(cls, plant: Any, design: LoopDesign | None, options: Mapping[str, Any]) -> Self:
         """Return the bench of a plant, a list of plants or a mapping of them by name."""
-        machines = _named(plant)
+        machines = _machines_by_name(plant)
         names = ("before", "after", "rate", "delay", "hold", "rigid", "unstable", "references")
         given = {n: options[n] for n in names if options.get(n) is not None}
         model = options.get("model")
@@ -98,7 +98,7 @@ class Bench:
         return f"<{type(self).__name__} of {plant}>\n{self.design!r}"
 
 
-def _named(plant: Any) -> dict[str, Any]:
+def _machines_by_name(plant: Any) -> dict[str, Any]:
     """Return machines by name, the nominal one first."""
     if isinstance(plant, Mapping) and not isinstance(plant, Frf):
         found = {str(name): one for name, one in plant.items()}

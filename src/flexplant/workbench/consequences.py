@@ -149,13 +149,13 @@ def step_of_model(
     a = axes.names.index(name)
     T = T.select(T.outputs[a], T.inputs[a])
     if not T.dt:
-        T = discretized(T, max(200.0 / duration, 4.0 * _fastest(T)))
+        T = discretized(T, max(200.0 / duration, 4.0 * _highest_frequency(T)))
     steps = int(np.clip(duration / T.dt, 50, _SAMPLES))
     out, _ = Recursion(T.A, T.B, T.C, T.D).run(np.ones((steps, 1)), np.zeros(T.n_states))
     return np.asarray(np.arange(steps) * T.dt), np.asarray(1.0 - out[:, 0])
 
 
-def _fastest(T: Any) -> float:
+def _highest_frequency(T: Any) -> float:
     """Return the highest frequency [Hz] of poles that a step shows."""
     size = np.abs(T.poles()) / (2.0 * np.pi)
     return float(np.median(size)) if size.size else 1.0

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import FlexplantError
 from ..synthesis import ShapedAxis
 from ..tolerances import SAME
-from .fields import Field, fields_of, moved, name_of, parsed, removed, shown, switched, with_element
+from .fields import Field, digits, fields_of, name_of, parsed, removed, swap, switched, with_element
 from .style import COMPACT, ELEMENT, OFF
 
 #: takes a changed axis, a key by which changes of one number are one step, and whether cards change
@@ -60,7 +60,7 @@ class Number:
                 self.slider.start = min(self.slider.start, place)
                 self.slider.end = max(self.slider.end, place)
                 self.slider.value = place
-            self.text.value = shown(value, self.unit)
+            self.text.value = digits(value, self.unit)
         finally:
             self._own = False
 
@@ -69,7 +69,7 @@ class Number:
             return
         value = self._sign * float(f"{10.0**event.new:.4g}")
         self._own = True
-        self.text.value = shown(value, self.unit)
+        self.text.value = digits(value, self.unit)
         self._own = False
         self._offer(value)
 
@@ -137,7 +137,7 @@ class ElementCards:
         switch.param.watch(lambda event: self._switch(i, event.new), "value")
         buttons = []
         for sign, act in (
-            ("▲", lambda: moved(self.axis, i, -1)), ("▼", lambda: moved(self.axis, i, 1)),
+            ("▲", lambda: swap(self.axis, i, -1)), ("▼", lambda: swap(self.axis, i, 1)),
             ("✕", lambda: removed(self.axis, i)),
         ):  # fmt: skip
             button = pn.widgets.Button(

@@ -17,7 +17,7 @@ from ..loop.broken import BrokenLoop
 from ..loop.report import NyquistCount, broken_count, broken_margins
 from ..loop.sensitivity import broken_bandwidth
 from ..lti.interconnection import loop_poles, side_by_side
-from ..lti.measured_lines import followed, low_slope
+from ..lti.measured_lines import low_slope, on_lines
 from ..synthesis import LoopDesign, ShapedAxis
 from ..synthesis.laws.law import Law
 from .machine import BenchMachine
@@ -148,7 +148,7 @@ class Evaluator:
 
         def plant(freq: FloatArray) -> ComplexArray:
             if machine.is_measured:
-                return followed(machine.freq, others.G, freq)[None, None]
+                return on_lines(machine.freq, others.G, freq)[None, None]
             return others.respond(freq)[None, None]
 
         def poles() -> ComplexArray:
@@ -170,14 +170,14 @@ class Evaluator:
         others = tuple(axis for n, axis in design.axes.items() if n != name)
         key = id(machine), name
         known = self._kept.get(key)
-        if known and known[0] is machine and all(map(_same, known[1], others)):
+        if known and known[0] is machine and all(map(_same_axis, known[1], others)):
             return known[2]
         found = _closed_around(machine, design, name)
         self._kept[key] = machine, others, found
         return found
 
 
-def _same(one: ShapedAxis, other: ShapedAxis) -> bool:
+def _same_axis(one: ShapedAxis, other: ShapedAxis) -> bool:
     return one is other or (not one.closed and not other.closed)
 
 
@@ -196,12 +196,12 @@ def _closed_around(machine: BenchMachine, design: LoopDesign, name: str) -> Othe
         fed = np.linalg.solve(np.moveaxis(back, 2, 0), np.moveaxis(G[np.ix_(o, [a])], 2, 0))
         return np.asarray(G[a, a] - np.einsum("of,fo->f", G[a, o] * C, fed[:, :, 0]))
 
-    count = _others(machine, design, o, laws) if machine.is_measured else _NONE
+    count = _count_others(machine, design, o, laws) if machine.is_measured else _NONE
     G = reduced(machine.freq, machine.G)
     return OthersClosed(G, lambda f: reduced(f, machine.respond(f)), count, closed)
 
 
-def _others(
+def _count_others(
     machine: BenchMachine, design: LoopDesign, o: list[int], laws: list[Law]
 ) -> NyquistCount:
     """Return the count of the other axes of a measured plant, this one open."""

@@ -40,7 +40,7 @@ def c_code(design: LoopDesign) -> bytes:
         return _zipped({file.name: file.read_bytes() for file in files})
 
 
-def matlab(design: LoopDesign) -> bytes:
+def matlab_file(design: LoopDesign) -> bytes:
     """Return the controller, and the laws of the axes, for MATLAB."""
     values: dict[str, Any] = {"controller": design.controller()}
     for i, law in enumerate(design.laws.values(), 1):
@@ -64,7 +64,7 @@ def script(design: LoopDesign, plant: str = "") -> bytes:
     return design.script(plant).encode()
 
 
-def report(design: LoopDesign, plant: Any, larger: Any = None) -> bytes:
+def report_page(design: LoopDesign, plant: Any, larger: Any = None) -> bytes:
     """Return the report page of the design and its loops."""
     from ..plot import report as write_report
 

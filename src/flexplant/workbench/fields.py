@@ -47,14 +47,14 @@ def parsed(text: str, unit: str | None = None) -> float:
     return float(10.0 ** (value / 20.0)) if typed == "db" else value * _UNITS[typed]
 
 
-def shown(value: float, unit: str) -> str:
+def digits(value: float, unit: str) -> str:
     """Return a number as the page writes it."""
     if unit == "Hz" and abs(value) >= 1e4:
         return f"{value / 1e3:.5g} kHz"
     return f"{value:.5g} {unit}".strip()
 
 
-def _plain(name: str, label: str, unit: str, low: float, high: float) -> Field:
+def _numeric(name: str, label: str, unit: str, low: float, high: float) -> Field:
     return Field(
         label,
         unit,
@@ -98,12 +98,12 @@ def _poles_damping(element: Notch, value: float) -> Notch:
 def fields_of(element: SingleElement, top: float) -> tuple[Field, ...]:
     """Return the numbers of an element; `top` is the highest frequency of a slider [Hz]."""
     low = 1e-4 * top
-    freq = _plain("freq", "frequency", "Hz", low, top)
+    freq = _numeric("freq", "frequency", "Hz", low, top)
     if isinstance(element, Pid):
         corners = element.as_corners()
         if corners is None:  # complex zeros: as gains
-            free = (_plain(n, n, u, 1e-6, 1e9) for n, u in (("p", ""), ("i", "/s"), ("d", "s")))
-            return (*free, *([_plain("pole", "pole", "Hz", low, top)] if element.pole else []))
+            free = (_numeric(n, n, u, 1e-6, 1e9) for n, u in (("p", ""), ("i", "/s"), ("d", "s")))
+            return (*free, *([_numeric("pole", "pole", "Hz", low, top)] if element.pole else []))
         some = [_corner("integrator", "integrator", "Hz", low, top)]
         if corners["zero"] is not None:
             some += [
@@ -113,18 +113,18 @@ def fields_of(element: SingleElement, top: float) -> tuple[Field, ...]:
             (*some, _corner("gain", "gain", "", 1e-3, 1e3)) if corners["gain"] != 1.0 else (*some,)
         )
     if isinstance(element, Lead):
-        return freq, _plain("ratio", "pole / zero", "", 1.0, 100.0)
+        return freq, _numeric("ratio", "pole / zero", "", 1.0, 100.0)
     if isinstance(element, Lag):
-        return freq, _plain("ratio", "zero / pole", "", 1.0, 100.0)
+        return freq, _numeric("ratio", "zero / pole", "", 1.0, 100.0)
     if isinstance(element, Notch):
         return (
             freq,
             Field("damping zeros", "", 1e-4, 1.0, lambda e: e.depth * e.width, _zeros_damping),
             Field("damping poles", "", 1e-3, 2.0, lambda e: e.width, _poles_damping),
-            _plain("skew", "skew", "", 0.5, 2.0),
+            _numeric("skew", "skew", "", 0.5, 2.0),
         )
     if isinstance(element, LowPass) and element.order == 2:
-        return freq, _plain("damping", "damping", "", 0.05, 2.0)
+        return freq, _numeric("damping", "damping", "", 0.05, 2.0)
     return (freq,) if isinstance(element, LowPass | Integrator) else ()
 
 
@@ -163,7 +163,7 @@ def with_element(axis: ShapedAxis, at: int, element: SingleElement) -> ShapedAxi
     return axis.replace(elements=(*axis.elements[:at], element, *axis.elements[at + 1 :]))
 
 
-def added(axis: ShapedAxis, element: SingleElement) -> ShapedAxis:
+def with_new(axis: ShapedAxis, element: SingleElement) -> ShapedAxis:
     """Return an axis with one more element, at the end."""
     return axis.replace(elements=(*axis.elements, element), on=(*axis.on, True))
 
@@ -176,7 +176,7 @@ def removed(axis: ShapedAxis, at: int) -> ShapedAxis:
     )
 
 
-def moved(axis: ShapedAxis, at: int, by: int) -> ShapedAxis:
+def swap(axis: ShapedAxis, at: int, by: int) -> ShapedAxis:
     """Return an axis with one element exchanged with its neighbour."""
     to = at + by
     if not 0 <= to < len(axis.elements):

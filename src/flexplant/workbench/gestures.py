@@ -9,7 +9,7 @@ import numpy as np
 
 from ..synthesis import Notch
 from .fields import with_element
-from .views import decibel
+from .views import magnitude_db
 
 #: how near a handle or a curve is that the mouse means, beside the picture
 _NEAR = 0.06
@@ -81,7 +81,7 @@ class Gestures:
         tall = fig.y_range.end - fig.y_range.start
         distances = []
         for loop in self.page.fleet:
-            curve = decibel(loop.L if name == "magnitude" else loop.S)
+            curve = magnitude_db(loop.L if name == "magnitude" else loop.S)
             distances.append(abs(float(np.interp(event.x, loop.freq, curve)) - event.y) / tall)
         nearest = int(np.argmin(distances))
         if distances[nearest] < _NEAR:

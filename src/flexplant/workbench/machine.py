@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ..checks import ComplexArray, FloatArray
 from ..lti.frequency import Frf
 from ..lti.frequency_sweep import resonance_grid
-from ..lti.measured_lines import followed
+from ..lti.measured_lines import on_lines
 from ..lti.responses import Responder, responder
 from ..synthesis import LoopDesign
 from ..synthesis.laws.axis_law import MeasuredAxis
@@ -51,7 +51,7 @@ class BenchMachine:
         if not self.is_measured:
             return responder(self.axes.plant)
         lines, data = self.axes.plant.freq, self.axes.plant.data
-        return lambda freq: followed(lines, data, freq)
+        return lambda freq: on_lines(lines, data, freq)
 
     @cached_property
     def freq(self) -> FloatArray:

@@ -19,7 +19,7 @@ from .bench import Bench, crossing_axis, first_axis
 from .consequences import Consequences
 from .controls import ElementCards, Number
 from .evaluation import AxisLoop, Evaluator, coupling
-from .fields import added, new_elements, parsed
+from .fields import new_elements, parsed, with_new
 from .gestures import Gestures
 from .history import DesignHistory
 from .machine import BenchMachine
@@ -258,8 +258,8 @@ class Page:
             freq = self.loop.margins.crossovers[0]
         element = new_elements(freq, self.bench.top)[self.kind.value]()
         if isinstance(element, Notch) and self.loop is not None:
-            element = element.replace(freq=float(f"{_peak(self.loop, 1.5 * freq):.4g}"))
-        self.change_axis(added(self.design.axes[self.axis], element), None, True)
+            element = element.replace(freq=float(f"{_loop_peak(self.loop, 1.5 * freq):.4g}"))
+        self.change_axis(with_new(self.design.axes[self.axis], element), None, True)
 
     def _go(self, design: LoopDesign) -> None:
         self.show_controls()
@@ -408,7 +408,7 @@ class Page:
         answer = self.answer
         fresh = self._answered == self._serial
         rms = answer.rms if answer is not None and fresh else None
-        self.judged.object = style.judged(list(self.limits.judged(self.loop, rms)))
+        self.judged.object = style.limit_verdicts(list(self.limits.judged(self.loop, rms)))
         rows: list[tuple[str, str, bool | None]] = []
         if len(self.fleet) > 1:
             least = 1.0 / self.limits.peak
@@ -538,7 +538,7 @@ class Page:
                 axis = (
                     axis.replace(gain=axis.gain * one)
                     if isinstance(one, float)
-                    else added(axis, one)
+                    else with_new(axis, one)
                 )
             self.change_axis(axis, None, True)
         except FlexplantError as problem:
@@ -570,7 +570,7 @@ class Page:
             self.tuning = None
 
 
-def _peak(loop: AxisLoop, above: float) -> float:
+def _loop_peak(loop: AxisLoop, above: float) -> float:
     """Return the resonance beyond a frequency where the loop gain is highest: notches are there."""
     variance = None if loop.deviation is None else loop.deviation**2
     axis = MeasuredAxis("", loop.freq, loop.others.G, loop.law.rate, True, variance)

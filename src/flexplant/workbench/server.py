@@ -15,7 +15,7 @@ HOST = "127.0.0.1"
 #: of a session whose tab was closed, and how often that is checked [ms]
 _LIFETIME, _CHECKED = 4000, 1000
 #: how long a start or an end may take [s]
-_PATIENCE = 30.0
+_TIMEOUT = 30.0
 
 
 def free_port() -> int:
@@ -37,7 +37,7 @@ class Served:
         self._ready, self._over = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="workbench", daemon=True)
         self._thread.start()
-        self._ready.wait(_PATIENCE)
+        self._ready.wait(_TIMEOUT)
         if self.error is not None or self._server is None:
             raise FlexplantError(
                 f"the page cannot be served on port {self.port} ({self.error}). Pass port=0 for a "
@@ -93,4 +93,4 @@ class Served:
             self._loop.stop()
 
         self._loop.add_callback(end)
-        self._over.wait(_PATIENCE)
+        self._over.wait(_TIMEOUT)

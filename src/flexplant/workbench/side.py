@@ -13,7 +13,7 @@ from ..errors import FlexplantError
 from ..synthesis import ShapedAxis
 from ..synthesis.laws.hand_design import TERMS
 from . import exports, style
-from .fields import parsed, shown
+from .fields import digits, parsed
 
 #: limits of the page: field of LoopLimits, label, unit; those in dB are typed so
 _LIMITS = (
@@ -98,7 +98,7 @@ class SideCards:
         value = getattr(self.page.limits, name)
         if value is None:
             return ""
-        return f"{20.0 * np.log10(value):.3g} dB" if unit == "dB" else shown(value, unit)
+        return f"{20.0 * np.log10(value):.3g} dB" if unit == "dB" else digits(value, unit)
 
     def _put_limit(self, name: str, text: str) -> None:
         value = parsed(text) if text.strip() else None
@@ -118,17 +118,17 @@ class SideCards:
         )
         self.notches = pn.widgets.Select(options=[0, 1, 2, 3, 4, 5], value=3, width=56, **small)
         self.tuned = pn.pane.HTML(
-            style.note("all axes, highest bandwidth below the peak of |S|"), margin=0
+            style.remark("all axes, highest bandwidth below the peak of |S|"), margin=0
         )
         self.start.on_click(lambda _: self.page.tune(int(self.notches.value)))
         self.stop.on_click(lambda _: self.page.stop_tuning())
-        label = pn.pane.HTML(style.note("notches"), margin=(8, 4, 0, 0))
+        label = pn.pane.HTML(style.remark("notches"), margin=(8, 4, 0, 0))
         row = pn.Row(self.start, self.stop, label, self.notches, margin=0)
         return self._card("automatic", row, self.tuned, collapsed=False)
 
     def show_tuning(self, said: str, running: bool) -> None:
         """Show how far a search is."""
-        self.tuned.object = style.note(said)
+        self.tuned.object = style.remark(said)
         self.start.disabled, self.stop.disabled = running, not running
 
     def _files_card(self) -> Any:
@@ -138,7 +138,7 @@ class SideCards:
         kinds: tuple[tuple[str, str, Callable[[], bytes]], ...] = (
             ("design", "design.npz", lambda: exports.design_file(page.design)),
             ("C99", "loops.zip", lambda: exports.c_code(page.design)),
-            ("MATLAB", "loops.mat", lambda: exports.matlab(page.design)),
+            ("MATLAB", "loops.mat", lambda: exports.matlab_file(page.design)),
             ("sections", "sections.csv", lambda: exports.sections(page.design)),
             ("Python", "loops.py", lambda: exports.script(page.design, page.bench.source)),
             ("report", "loops.html", self._report),
@@ -172,14 +172,14 @@ class SideCards:
         note = "load a design, or a law or controller as elements"
         if not sampled:
             note = f"C99 and sections need the controller's rate: open the page with it. {note}"
-        load = pn.pane.HTML(style.note(note), margin=0)
+        load = pn.pane.HTML(style.remark(note), margin=0)
         box = pn.FlexBox(*buttons, copy, gap="0px", sizing_mode="stretch_width")
         return self._card("files", box, load, given, self.script, collapsed=False)
 
     def _report(self) -> bytes:
         page = self.page
         plant = page.bench.question_of(page.index).plant
-        return exports.report(page.design, plant or page.machine.given, page.bench.larger)
+        return exports.report_page(page.design, plant or page.machine.given, page.bench.larger)
 
     def _made(self, make: Callable[[], bytes]) -> Any:
         """Return a file for the browser; what is wrong with it appears on the page."""

@@ -7,7 +7,7 @@ from html import escape
 
 from .evaluation import AxisLoop
 from .limits import Judged
-from .verdict import figures, stability
+from .verdict import figures, stability_verdict
 
 #: of all widgets: small, so that a law is seen as a whole
 COMPACT = """
@@ -45,7 +45,7 @@ def error(text: str) -> str:
     return ERROR.format(escape(text))
 
 
-def note(text: str) -> str:
+def remark(text: str) -> str:
     """Return a short remark."""
     return f'<div style="font-size:11px;color:#5B6670">{escape(text)}</div>'
 
@@ -63,7 +63,7 @@ def headline(loop: AxisLoop) -> str:
         f'color:#5B6670">{escape(where)}</div></td>'
         for name, value, where in figures(loop)
     )
-    word, how = stability(loop)
+    word, how = stability_verdict(loop)
     return (
         f'<div data-verdict="{escape(loop.name)}" style="display:flex;flex-wrap:wrap;gap:4px 18px;'
         'align-items:center"><div style="min-width:120px;max-width:290px"><div style="font-size:'
@@ -73,7 +73,7 @@ def headline(loop: AxisLoop) -> str:
     )
 
 
-def judged(limits: Sequence[Judged]) -> str:
+def limit_verdicts(limits: Sequence[Judged]) -> str:
     """Return each limit with whether it is met."""
     parts = []
     for one in limits:

@@ -14,7 +14,7 @@ def decibels(gain: float) -> str:
     return f"{20.0 * np.log10(gain):.1f} dB" if np.isfinite(gain) and gain else "infinite"
 
 
-def stability(loop: AxisLoop) -> tuple[str, str]:
+def stability_verdict(loop: AxisLoop) -> tuple[str, str]:
     """Return whether a loop is stable, and how that was counted, with what lines leave open."""
     count, measured = loop.count, loop.machine.is_measured
     if count.unstable is None:

@@ -28,7 +28,7 @@ _NYQUIST = (-2.6, 1.2), (-1.9, 1.9)
 _EDGE = 60.0
 
 
-def decibel(value: Any) -> FloatArray:
+def magnitude_db(value: Any) -> FloatArray:
     """Return magnitudes in dB."""
     return np.asarray(20.0 * np.log10(np.maximum(np.abs(value), 1e-300)))
 
@@ -45,7 +45,7 @@ def thinned(freq: FloatArray, values: FloatArray, points: int = _PALE) -> tuple[
     return freq[keep], values[keep]
 
 
-def joined(curves: Sequence[tuple[Any, Any]]) -> dict[str, Any]:
+def gapped_line(curves: Sequence[tuple[Any, Any]]) -> dict[str, Any]:
     """Return curves as one line with gaps: one array to send for all machines."""
     gap = np.array([np.nan])
     x = [part for f, _ in curves for part in (f, gap)]
@@ -263,14 +263,14 @@ class Views:
         """Show a loop; nothing else changes, no range either."""
         f, L = loop.freq, loop.L
         self._curves("main", loop)
-        self._put("S T", x=f, y=decibel(loop.T))
+        self._put("S T", x=f, y=magnitude_db(loop.T))
         if loop.deviation is not None:
             wide = DEVIATIONS * np.abs(loop.C) * loop.deviation
             high, low = np.abs(L) + wide, np.maximum(np.abs(L) - wide, 1e-3 * np.abs(L))
-            self._put("band", x=f, low=decibel(low), high=decibel(high))
+            self._put("band", x=f, low=magnitude_db(low), high=magnitude_db(high))
         i = loop.machine.axes.names.index(loop.name)
         marked = loop.machine.unresolved(i)
-        self._put("unresolved", x=f[marked], y=decibel(L[marked]))
+        self._put("unresolved", x=f[marked], y=magnitude_db(L[marked]))
         closest = -1.0 + 0.0j
         if np.isfinite(loop.margins.freq):
             closest = complex(
@@ -296,18 +296,18 @@ class Views:
                 x.append(float(freq))
                 at.append(k)
                 names.append(name_of(element))
-        y = np.interp(x, loop.freq, decibel(loop.L)) if x else np.zeros(0)
+        y = np.interp(x, loop.freq, magnitude_db(loop.L)) if x else np.zeros(0)
         self._put("handles", x=x, y=list(y), at=at, name=names)
 
     def _curves(self, name: str, loop: AxisLoop) -> None:
         """Show all curves of a loop under a name."""
         f, L = loop.freq, loop.L
-        self._put(f"magnitude {name}", x=f, y=decibel(L))
+        self._put(f"magnitude {name}", x=f, y=magnitude_db(L))
         self._put(f"phase {name}", x=f, y=_wrapped(L))
-        self._put(f"S {name}", x=f, y=decibel(loop.S))
-        self._put(f"KS {name}", x=f, y=decibel(loop.KS))
-        self._put(f"PS {name}", x=f, y=decibel(loop.PS))
-        near = _bounded(L)
+        self._put(f"S {name}", x=f, y=magnitude_db(loop.S))
+        self._put(f"KS {name}", x=f, y=magnitude_db(loop.KS))
+        self._put(f"PS {name}", x=f, y=magnitude_db(loop.PS))
+        near = _clipped_curve(L)
         if name == "main":  # on the wrong side of -1
             color = RED if loop.is_stable is False else BLUE
             self._drawn["nyquist main"].glyph.line_color = color
@@ -324,22 +324,22 @@ class Views:
     def show_fleet(self, loops: Sequence[AxisLoop]) -> None:
         """Show all machines in pale."""
         pick: Mapping[str, Callable[[AxisLoop], Any]] = {
-            "magnitude": lambda one: thinned(one.freq, decibel(one.L)),
-            "S": lambda one: thinned(one.freq, decibel(one.S)),
-            "nyquist": lambda one: _near(one),
+            "magnitude": lambda one: thinned(one.freq, magnitude_db(one.L)),
+            "S": lambda one: thinned(one.freq, magnitude_db(one.S)),
+            "nyquist": lambda one: _visible_part(one),
         }
         for figure, curve in pick.items():
-            self._put(f"{figure} fleet", **joined([curve(one) for one in loops]))
+            self._put(f"{figure} fleet", **gapped_line([curve(one) for one in loops]))
 
     def show_coupling(
         self, freq: FloatArray, others: Mapping[str, FloatArray], loop: AxisLoop
     ) -> None:
         """Show how the axis moves the others, and how their loops change it."""
         for k, values in enumerate(list(others.values())[:5]):
-            self._put(f"coupling {k}", x=freq, y=decibel(values))
+            self._put(f"coupling {k}", x=freq, y=magnitude_db(values))
         i = loop.machine.axes.names.index(loop.name)
         own = loop.machine.G[i, i]
-        self._put("coupling closed", x=freq, y=decibel(loop.others.G / own - 1.0))
+        self._put("coupling closed", x=freq, y=magnitude_db(loop.others.G / own - 1.0))
         names = ", ".join(list(others)[:3])
         self.figures["coupling"].title.text = f"to {names}; dashed: by their loops [dB]"
 
@@ -371,11 +371,11 @@ class Views:
     def fit(self, loop: AxisLoop) -> None:
         """Choose all ranges for a loop: at the start, and anew by a button."""
         f = loop.freq
-        low = f[0] if loop.machine.is_measured else max(f[0], 0.02 * _lowest(loop))
+        low = f[0] if loop.machine.is_measured else max(f[0], 0.02 * _first_crossover(loop))
         self.freq_range.start, self.freq_range.end = float(low), float(f[-1])
         inside = f >= low
         for name, values in (("magnitude", loop.L), ("KS", loop.KS), ("PS", loop.PS)):
-            size = decibel(values[inside])
+            size = magnitude_db(values[inside])
             top, bottom = (
                 float(size.max()) + 6.0,
                 max(float(size.min()), float(size.max()) - _DEPTH),
@@ -388,7 +388,7 @@ class Views:
         (fig.x_range.start, fig.x_range.end), (fig.y_range.start, fig.y_range.end) = _NYQUIST
 
 
-def _lowest(loop: AxisLoop) -> float:
+def _first_crossover(loop: AxisLoop) -> float:
     return float(loop.margins.crossovers[0]) if loop.margins.crossovers else float(loop.freq[0])
 
 
@@ -399,13 +399,13 @@ def _wrapped(L: Any) -> FloatArray:
     return np.asarray(np.where(jump, np.nan, phase))
 
 
-def _bounded(L: Any) -> Any:
+def _clipped_curve(L: Any) -> Any:
     """Return a curve that ends on a circle far outside the picture."""
     size = np.abs(L)
     return L * np.minimum(1.0, _EDGE / np.maximum(size, 1e-300))
 
 
-def _near(loop: AxisLoop) -> tuple[Any, Any]:
+def _visible_part(loop: AxisLoop) -> tuple[Any, Any]:
     """Return the part of a Nyquist curve that the picture shows, of fewer points."""
     L = loop.L[np.abs(loop.L) < 4.0]
     step = max(1, L.size // _PALE)

@@ -12,7 +12,7 @@ from ...errors import AssumptionError, counted, require_known
 from ...lti.statespace import StateSpace
 from ..partition import Partition
 from .rigid_body import RigidBody, refuse_lost, rigid_body_of
-from .rigid_motion import projected
+from .rigid_motion import rigid_parts
 
 #: relative: what the sensors show or the actuators push of other axes
 _CLEAN = 1e-6
@@ -121,37 +121,37 @@ def decouple(plant: Partition, *, axes: Sequence[str] | None = None) -> Decoupli
     require_known("rigid-body axis", wanted, body.axes)
     pick = np.eye(len(body.axes))[[body.axes.index(axis) for axis in wanted]]
     sensors = [s for s in ports.y if s.order == 0]
-    see = projected([s.static_row(realisation) for s in sensors], body.motions)
-    push = projected([port.static_push(realisation) for port in ports.u], body.motions).T
-    length = _length(body)
-    T_y = _left(see, length, pick)
-    T_u = _left(push.T, 1.0 / length, pick).T
-    _check(T_y @ see, pick, wanted, body, length, "sensors", [s.name for s in sensors])
-    _check((push @ T_u).T, pick, wanted, body, 1.0 / length, "actuators", list(plant.u))
+    see = rigid_parts([s.static_row(realisation) for s in sensors], body.motions)
+    push = rigid_parts([port.static_push(realisation) for port in ports.u], body.motions).T
+    length = _axis_units(body)
+    T_y = _left_inverse(see, length, pick)
+    T_u = _left_inverse(push.T, 1.0 / length, pick).T
+    _check_identity(T_y @ see, pick, wanted, body, length, "sensors", [s.name for s in sensors])
+    _check_identity((push @ T_u).T, pick, wanted, body, 1.0 / length, "actuators", list(plant.u))
     mass = pick @ body.mass @ pick.T
     forces = [f"cog:{axis}:force" for axis in wanted]
     pushes = [f"cog:{axis}:acceleration" for axis in wanted]
     return Decoupling(
-        _static(T_u, forces, plant.u, plant),
-        _static(T_y, [s.name for s in sensors], [f"cog:{axis}" for axis in wanted], plant),
-        _static(T_u @ mass, pushes, plant.u, plant),
+        _gain_system(T_u, forces, plant.u, plant),
+        _gain_system(T_y, [s.name for s in sensors], [f"cog:{axis}" for axis in wanted], plant),
+        _gain_system(T_u @ mass, pushes, plant.u, plant),
         mass,
         body.centre,
         wanted,
     )
 
 
-def _length(body: RigidBody) -> FloatArray:
+def _axis_units(body: RigidBody) -> FloatArray:
     """Return units (r,) in which rotations and translations move the structure alike."""
     return np.asarray(1.0 / np.linalg.norm(body.motions, axis=0))
 
 
-def _left(matrix: FloatArray, unit: FloatArray, pick: FloatArray) -> FloatArray:
+def _left_inverse(matrix: FloatArray, unit: FloatArray, pick: FloatArray) -> FloatArray:
     """Return the rows `pick` of the least-squares left inverse, its columns in these units."""
     return np.asarray(pick @ (unit[:, None] * np.linalg.pinv(matrix * unit, rcond=_CLEAN)))
 
 
-def _check(
+def _check_identity(
     product: FloatArray,
     pick: FloatArray,
     wanted: tuple[str, ...],
@@ -177,7 +177,7 @@ def _check(
         )
 
 
-def _static(
+def _gain_system(
     gain: FloatArray, inputs: Sequence[str], outputs: Sequence[str], plant: Partition
 ) -> StateSpace:
     units = plant.units

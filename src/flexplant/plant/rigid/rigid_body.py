@@ -78,13 +78,13 @@ def _rigid_body(model: Structure) -> tuple[RigidBody | None, str]:
         for i, axis in enumerate(DIRECTIONS)
         if np.any(everywhere[:, i]) and (axis in model.full_dofs.directions or axis.startswith("r"))
     ]
-    exists = _independent(everywhere, [i for i in moving if missed[i] < SPANNED])
+    exists = _drop_dependent(everywhere, [i for i in moving if missed[i] < SPANNED])
     lost = {DIRECTIONS[i]: float(missed[i]) for i in moving if missed[i] >= SPANNED}
     if not exists:
         why = (
             f"DOFs are held against {', '.join(lost)}"
             if isinstance(model, FEModel)
-            else f"its shapes miss {_listed(lost)} of these motions"
+            else f"its shapes miss {_lost_shares(lost)} of these motions"
         )
         return None, why
     axes = tuple(DIRECTIONS[i] for i in exists)
@@ -119,17 +119,17 @@ def refuse_lost(
             )
         raise AssumptionError(
             f"the channels have part in rigid-body axes that this model has no shapes for: they "
-            f"miss {_listed(named)}, and {others}. Stiff springs that were there before the modes "
-            "were solved bend them: keep more modes, or solve the free structure and "
+            f"miss {_lost_shares(named)}, and {others}. Stiff springs that were there before the "
+            "modes were solved bend them: keep more modes, or solve the free structure and "
             f"fx.plant.suspend(modes, springs){do}."
         )
 
 
-def _listed(lost: Mapping[str, float]) -> str:
+def _lost_shares(lost: Mapping[str, float]) -> str:
     return ", ".join(f"{100 * part:.2g} % of {axis}" for axis, part in lost.items())
 
 
-def _independent(motions: FloatArray, exists: list[int]) -> list[int]:
+def _drop_dependent(motions: FloatArray, exists: list[int]) -> list[int]:
     """Drop axes that are combinations of earlier ones (few DOFs)."""
     kept: list[int] = []
     for i in exists:

@@ -118,7 +118,7 @@ def require_weak(motions: RigidModes, bandwidth: float, what: str) -> None:
         )
 
 
-def seen(plant: Partition, motions: RigidModes, channels: Sequence[str]) -> FloatArray:
+def rigid_rows(plant: Partition, motions: RigidModes, channels: Sequence[str]) -> FloatArray:
     """Return the displacements (n, r) at channels of POIs and sensors; 0 of other quantities."""
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     places = {
@@ -129,10 +129,10 @@ def seen(plant: Partition, motions: RigidModes, channels: Sequence[str]) -> Floa
     }
     places |= {s.name: s.static_row(realisation) for s in ports.y if s.name in channels}
     require_known("motion of a POI or a sensor", channels, places)
-    return projected([places[name] for name in channels], motions.shapes)
+    return rigid_parts([places[name] for name in channels], motions.shapes)
 
 
-def projected(rows: Sequence[FloatArray], motions: FloatArray) -> FloatArray:
+def rigid_parts(rows: Sequence[FloatArray], motions: FloatArray) -> FloatArray:
     """Return the parts (p, r) of rows over the DOFs, which may be none, in motions (n, r)."""
     return np.array(rows).reshape(len(rows), motions.shape[0]) @ motions
 
@@ -148,5 +148,5 @@ def rigid_gain(
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     forces = {port.name: port for port in ports.forces}
     require_known("force", inputs, forces)
-    push = projected([forces[name].static_push(realisation) for name in inputs], motions.shapes)
-    return np.asarray(seen(plant, motions, outputs) @ push.T)
+    push = rigid_parts([forces[name].static_push(realisation) for name in inputs], motions.shapes)
+    return np.asarray(rigid_rows(plant, motions, outputs) @ push.T)

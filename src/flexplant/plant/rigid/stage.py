@@ -17,7 +17,7 @@ from ...lti.statespace import StateSpace
 from ..forces import BaseAcceleration
 from ..ports import Ports
 from ..standard import StandardPlant, standard_plant
-from .rigid_motion import RigidModes, require_weak, rigid_gain, seen
+from .rigid_motion import RigidModes, require_weak, rigid_gain, rigid_rows
 
 #: |S| of the finished loop crosses 1 below the weight's crossing by about this factor (measured:
 #: the table in the room's docstring)
@@ -67,7 +67,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     ports = plant.assembled.ports
     if not ports.references:
         raise AssumptionError("the plant has no reference: add Reference(...) to the ports.")
-    followed = ports.poi(_chosen([r.poi for r in ports.references], poi, "POI with a reference"))
+    followed = ports.poi(_only_poi([r.poi for r in ports.references], poi, "POI with a reference"))
     sensors = [s.name for s in ports.y if s.order == 0]
     if not sensors:
         kinds = ", ".join(sorted({s.quantity for s in ports.y})) or "none"
@@ -75,7 +75,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
             f"there is no displacement sensor in y (its sensors: {kinds}): they do not "
             "determine where the rigid body is. Add Sensor(name, at=...)."
         )
-    axes = seen(plant, motions, [followed.channel(axis) for axis in followed.axes])
+    axes = rigid_rows(plant, motions, [followed.channel(axis) for axis in followed.axes])
     count = motions.modes.size
     if len(followed.axes) < count or np.linalg.matrix_rank(axes) < count:
         raise AssumptionError(
@@ -84,7 +84,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
         )
     own = [axis for one, axis in ports.followed if one is followed]
     turned = np.linalg.pinv(axes)[:, [followed.axes.index(axis) for axis in own]]
-    moved = seen(plant, motions, sensors) @ turned
+    moved = rigid_rows(plant, motions, sensors) @ turned
     return StateSpace(
         [],
         [],
@@ -98,7 +98,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     )
 
 
-def _chosen(names: list[str], poi: str | None, kind: str) -> str:
+def _only_poi(names: list[str], poi: str | None, kind: str) -> str:
     """Return the POI that is meant: the one named, or the only one."""
     if poi is None:
         if len(names) > 1:
@@ -206,7 +206,7 @@ def stage_weights(
     ports = plant.assembled.ports
     if not ports.z or not ports.u or not ports.y:
         raise AssumptionError("stage weights need a POI, actuators and sensors in the ports.")
-    scale = ports.poi(_chosen([port.name for port in ports.z], poi, "POI"))
+    scale = ports.poi(_only_poi([port.name for port in ports.z], poi, "POI"))
     first = scale.channel(scale.axes[0])
     push = np.linalg.norm(rigid_gain(plant, motions, [first], [port.name for port in ports.u]))
     crossing = _HEADROOM * positive(bandwidth, "bandwidth")
@@ -233,12 +233,12 @@ def stage_weights(
                 z |= {name: None for name in (goal.channel(axis), error) if name in plant.z}
                 continue
             size = arm if axis.startswith("r") else 1.0
-            weight = _sampled(series(sense, np.array([[unit * size]])), plant)
+            weight = _at_plant_rate(series(sense, np.array([[unit * size]])), plant)
             if error in plant.z:
                 z[goal.channel(axis)], z[error] = None, weight
             else:
                 z[goal.channel(axis)] = weight
-    z |= {f"{port.name}:effort": _sampled(rolloff, plant) for port in ports.u}
+    z |= {f"{port.name}:effort": _at_plant_rate(rolloff, plant) for port in ports.u}
     w: dict[str, Any] = {}
     for port in ports.w:
         if port.added_to is not None:
@@ -278,8 +278,8 @@ def _arm(plant: StandardPlant, ports: Ports, motions: RigidModes) -> float:
     turning = [p.channel(a) for p in ports.z for a in p.axes if a.startswith("r")]
     if not turning:
         return 1.0
-    R = seen(plant, motions, turning)
-    S = seen(plant, motions, [s.name for s in ports.y]) / np.sqrt(len(ports.y))
+    R = rigid_rows(plant, motions, turning)
+    S = rigid_rows(plant, motions, [s.name for s in ports.y]) / np.sqrt(len(ports.y))
     # directions in which no axis turns come out as rounding of the others
     turn = np.linalg.pinv(R, rcond=1e-6)
     straight = S @ (np.eye(R.shape[1]) - turn @ R)
@@ -289,5 +289,5 @@ def _arm(plant: StandardPlant, ports: Ports, motions: RigidModes) -> float:
     )
 
 
-def _sampled(weight: StateSpace, plant: StandardPlant) -> StateSpace:
+def _at_plant_rate(weight: StateSpace, plant: StandardPlant) -> StateSpace:
     return tustin(weight, 1.0 / plant.dt) if plant.dt else weight

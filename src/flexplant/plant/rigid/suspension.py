@@ -19,8 +19,8 @@ from ...structure import Damper, FEModel, Spring
 from ...structure.placed import SPANNED
 from ...structure.rigid import orthonormalised
 from ...tolerances import TINY, divisor
-from ..port import checked_direction, checked_place
-from ..realisation import realised
+from ..port import checked_place, port_direction
+from ..realisation import realise
 
 Suspended = TypeVar("Suspended", FEModel, ReducedModel, Modes)
 #: relative: a rigid-body motion that stretches a spring by less than this does not
@@ -62,13 +62,13 @@ class GroundSpring(Value):
     def __post_init__(self) -> None:
         self._set(
             at=checked_place("a ground spring", self.at),
-            direction=checked_direction("a ground spring", self.direction),
-            stiffness=_nonzero(self.stiffness),
+            direction=port_direction("a ground spring", self.direction),
+            stiffness=_stiffness(self.stiffness),
             damping=positive(self.damping, "damping of a ground spring", zero=True),
         )
 
 
-def _nonzero(stiffness: float) -> float:
+def _stiffness(stiffness: float) -> float:
     value = float(real_array(stiffness, "stiffness of a ground spring", ()))
     if not value:
         raise ModelError(
@@ -122,10 +122,10 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
     listed = list(members(several, GroundSpring, "springs", hint))
     given: Any = model
     if isinstance(given, FEModel):
-        return _full(given, listed)  # type: ignore[return-value]
+        return _suspend_model(given, listed)  # type: ignore[return-value]
     if isinstance(given, ReducedModel):
         rows = np.array([given.row(s.at, s.direction) for s in listed])
-        stiffness, damping = _matrices(rows, listed)
+        stiffness, damping = _spring_terms(rows, listed)
         return given.replace(  # type: ignore[return-value]
             K=given.K + stiffness,
             D=given.D + damping,
@@ -134,7 +134,7 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
             method=f"{given.method}, {counted(len(listed), 'ground spring')}",
         )
     if isinstance(given, Modes):
-        return _modes(given, listed)  # type: ignore[return-value]
+        return _suspend_modes(given, listed)  # type: ignore[return-value]
     raise ModelError(
         f"suspend needs an FEModel, ReducedModel or Modes, got {type(model).__name__}."
     )
@@ -153,7 +153,7 @@ def _each(modes: Modes, springs: list[GroundSpring]) -> Modes:
     )
 
 
-def _matrices(rows: FloatArray, springs: list[GroundSpring]) -> tuple[FloatArray, FloatArray]:
+def _spring_terms(rows: FloatArray, springs: list[GroundSpring]) -> tuple[FloatArray, FloatArray]:
     k = np.array([spring.stiffness for spring in springs])
     d = np.array([spring.damping for spring in springs])
     return rows.T @ (k[:, None] * rows), rows.T @ (d[:, None] * rows)
@@ -173,7 +173,7 @@ def _untouched(rows: FloatArray, rigid: FloatArray) -> FloatArray:
     return np.asarray(right[rank:].T)
 
 
-def _full(model: FEModel, springs: list[GroundSpring]) -> FEModel:
+def _suspend_model(model: FEModel, springs: list[GroundSpring]) -> FEModel:
     dampers = [Damper(s.at, s.damping, direction=s.direction) for s in springs if s.damping]
     stiff = [Spring(s.at, s.stiffness, direction=s.direction) for s in springs]
     suspended = model.with_parts([*stiff, *dampers])
@@ -189,14 +189,14 @@ def _full(model: FEModel, springs: list[GroundSpring]) -> FEModel:
     return suspended
 
 
-def _modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
+def _suspend_modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
     if np.iscomplexobj(modes.phi):
-        return _complex(modes, springs)
+        return _suspend_complex(modes, springs)
     basis = np.real(modes.basis)
     b = basis.shape[1]
     places = np.array([modes.row(s.at, s.direction) for s in springs])
     rows = places @ basis
-    stiffness, damping = _matrices(rows, springs)
+    stiffness, damping = _spring_terms(rows, springs)
     free = np.zeros((b, 0))
     if modes.n_rigid:
         kept = _untouched(places, basis[:, : modes.n_rigid])
@@ -235,7 +235,7 @@ def _modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
     )
 
 
-def _complex(modes: Modes, springs: list[GroundSpring]) -> Modes:
+def _suspend_complex(modes: Modes, springs: list[GroundSpring]) -> Modes:
     if modes.n_unstable:
         raise ModelError(
             "complex modes with an unstable pair cannot be suspended once more: suspend the "
@@ -265,7 +265,7 @@ def suspended(
     ``q = S x`` and ``f = -rows' (k rows q + d rows q')`` give A', the residues of which,
     ``S v w' N' = phi phi' / (2i Im lambda)``, are the new shapes. Exact within the span.
     """
-    given, r = realised(modes), modes.n_rigid
+    given, r = realise(modes), modes.n_rigid
     left = kept.shape[1]
     turned = np.hstack([kept, la.null_space(kept.T)]) if left else np.eye(r)
     turn = la.block_diag(np.kron(turned, np.eye(2)), np.eye(given.A.shape[0] - 2 * r))
@@ -284,7 +284,7 @@ def suspended(
     inverse: ComplexArray = np.asarray(np.linalg.inv(right), dtype=np.complex128)
     upper = upper[np.argsort(np.abs(values[upper]), kind="stable")]
     poles = np.asarray(values[upper], dtype=np.complex128)
-    shapes = _shapes(poles, S @ right[:, upper], N @ inverse[upper].T)
+    shapes = _residue_shapes(poles, S @ right[:, upper], N @ inverse[upper].T)
     rigid = np.real(modes.phi[:, :r]) @ kept
     size = np.abs(poles)
     return Modes(
@@ -296,7 +296,7 @@ def suspended(
     )
 
 
-def _shapes(poles: ComplexArray, see: ComplexArray, push: ComplexArray) -> ComplexArray:
+def _residue_shapes(poles: ComplexArray, see: ComplexArray, push: ComplexArray) -> ComplexArray:
     """Return phi (n, k) with ``phi phi' = 2i Im(lambda) see push'`` for each pole."""
     phi = np.zeros_like(see)
     for own in runs(poles, _CLUSTER):

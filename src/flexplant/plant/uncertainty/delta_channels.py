@@ -16,7 +16,7 @@ from ...lti.interconnection import lft
 from ...lti.statespace import StateSpace
 from ...tolerances import ROUNDING, TINY, divisor
 from ..partition import Partition
-from .neglected import NeglectedModes, opened
+from .neglected import NeglectedModes, with_neglected
 from .uncertain_plant import Delta, UncertainPlant, with_changes
 
 #: directions of a Delta's change below this, relative to the largest, are left out
@@ -58,14 +58,14 @@ def delta_channels(uncertain: UncertainPlant[Any]) -> DeltaChannels:
     """
     plant = uncertain.plant
     if not plant.dt:
-        system, sizes = _grouped(uncertain)
+        system, sizes = _paired_channels(uncertain)
         return _with_neglected(system, sizes, uncertain.neglected, 0.0)
     system, sizes = _sampled_channels(uncertain)
     distance = _distance(uncertain, system, sizes)
     if distance > _LARGEST:
         raise CertificateError(
             f"sampled machines at the corners of the uncertainty lie {100 * distance:.3g} % off "
-            f"the affine channels of their Deltas: {_cause(uncertain)}"
+            f"the affine channels of their Deltas: {_not_affine(uncertain)}"
         )
     if uncertain.neglected is not None and uncertain.neglected.sampled is None:
         raise ModelError(
@@ -76,7 +76,7 @@ def delta_channels(uncertain: UncertainPlant[Any]) -> DeltaChannels:
     return _with_neglected(system, sizes, sampled, distance)
 
 
-def _cause(uncertain: UncertainPlant[Any]) -> str:
+def _not_affine(uncertain: UncertainPlant[Any]) -> str:
     """Return why sampled machines are not affine in the Deltas, and what to do."""
     moving = [sensor.name for sensor in uncertain.plant.assembled.ports.y if sensor.order]
     if moving and any(delta.kind == "shape" for delta in uncertain.deltas):
@@ -91,7 +91,7 @@ def _cause(uncertain: UncertainPlant[Any]) -> str:
     )
 
 
-def _grouped(uncertain: UncertainPlant[Any]) -> tuple[StateSpace, list[tuple[str, int]]]:
+def _paired_channels(uncertain: UncertainPlant[Any]) -> tuple[StateSpace, list[tuple[str, int]]]:
     """Return the continuous system without weights, each Delta's channels side by side."""
     g, channels, plant = uncertain.system, uncertain.channels, uncertain.plant
     order, sizes = [], []
@@ -125,7 +125,7 @@ def _with_neglected(
     names = neglected.outputs
     plain = StateSpace([], [], [], np.eye(len(names)), inputs=names, outputs=names)
     total = sum(size for _, size in sizes)
-    whole = opened(system, neglected.replace(weights=plain), total)
+    whole = with_neglected(system, neglected.replace(weights=plain), total)
     return DeltaChannels(whole, tuple(sizes), neglected, distance)
 
 
@@ -140,17 +140,17 @@ def sampled_machine(uncertain: UncertainPlant[Any], values: Mapping[str, float])
             "Deltas on the parameters of a fit are sampled with one delay for all actuators, and "
             "the ports of this plant have delays of their own. Model these by filters."
         )
-    g, sizes = _grouped(uncertain)
+    g, sizes = _paired_channels(uncertain)
     amounts = np.concatenate([[values.get(name, 0.0)] * size for name, size in sizes])
     late = plant.delay + sum(
         delta.scale * values.get(delta.name, 0.0)
         for delta in uncertain.deltas
         if delta.kind == "delay"
     )
-    return discretized(_closed(g, amounts), 1.0 / plant.dt, delay=late, delayed=plant.u)
+    return discretized(_at_values(g, amounts), 1.0 / plant.dt, delay=late, delayed=plant.u)
 
 
-def _closed(g: StateSpace, amounts: FloatArray) -> StateSpace:
+def _at_values(g: StateSpace, amounts: FloatArray) -> StateSpace:
     """Return the system at some values (k,) of the Deltas, its first k channels."""
     k = amounts.size
     block = StateSpace([], [], [], np.diag(amounts), inputs=g.outputs[:k], outputs=g.inputs[:k])
@@ -300,7 +300,7 @@ def _distance(
         values = dict(zip([name for name, _ in sizes], corner.tolist(), strict=True))
         exact = units.scaled(sampled_machine(uncertain, values))
         amounts = np.repeat(corner, [size for _, size in sizes])
-        closed = units.scaled(tustin(_closed(system, amounts), 1.0 / base.dt))
+        closed = units.scaled(tustin(_at_values(system, amounts), 1.0 / base.dt))
         found = max(found, float(la.norm(exact - closed) / la.norm(exact - units.scaled(base))))
     return found
 

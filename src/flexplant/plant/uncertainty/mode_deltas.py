@@ -22,7 +22,7 @@ _DAMPING = 0.99
 SAME_MODEL = 1e-6
 
 
-def judged(
+def correlated_deltas(
     realisation: ModalRealisation,
     source: ModalUncertainty,
     modes: Sequence[int] | None,

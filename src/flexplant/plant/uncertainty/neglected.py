@@ -138,20 +138,20 @@ def neglected_modes(
     small = given.continuous
     big = Partition.of(larger).continuous if is_plant(larger) else with_modes_of(small, larger)
     follow = whole(resonances, "resonances")
-    found = _bounded(_elastic(small, big), follow)
+    found = _bounding(_elastic_pair(small, big), follow)
     if not given.dt:
         return found
-    return found.replace(sampled=_bounded(_elastic(given, sampled_like(given, big)), follow))
+    return found.replace(sampled=_bounding(_elastic_pair(given, sampled_like(given, big)), follow))
 
 
-def _bounded(pair: Pair, follow: int) -> NeglectedModes:
+def _bounding(pair: Pair, follow: int) -> NeglectedModes:
     """Return the weights that bound the difference of two systems."""
     pair, mirrored = _distinct(*pair)
     if not pair[0].outputs or not pair[0].inputs:
         raise ModelError("the larger model does not differ from the plant: nothing is neglected.")
-    poles = _swinging(*pair)
-    grid = _grid(poles)
-    gap = _gap(pair, grid)
+    poles = _upper_poles(*pair)
+    grid = _resonance_grid(poles)
+    gap = _deviation(pair, grid)
     scales, gap = _evened(gap)
     tall = np.sqrt(gap.shape[0])  # all rows may be at their bound at once, at one resonance
     rows = [covering(grid, tall * np.linalg.norm(row, axis=0), poles, follow) for row in gap]
@@ -160,7 +160,7 @@ def _bounded(pair: Pair, follow: int) -> NeglectedModes:
     factor = _MARGIN * float(height.max())
     weights = weights.replace(C=factor * weights.C, D=factor * weights.D)
     fine = _verifying(grid, poles)
-    found = _height(weights, _gap(pair, fine) * scales[:, None], fine)
+    found = _height(weights, _deviation(pair, fine) * scales[:, None], fine)
     tightest = float(found.max())
     if not tightest <= 1.0:
         worst = fine[int(np.argmax(found))]
@@ -183,7 +183,7 @@ def _bounded(pair: Pair, follow: int) -> NeglectedModes:
     )
 
 
-def opened(system: StateSpace, neglected: NeglectedModes, deltas: int) -> StateSpace:
+def with_neglected(system: StateSpace, neglected: NeglectedModes, deltas: int) -> StateSpace:
     """Return a system with the channels of neglected modes after its first, those of Deltas.
 
     Inputs `y1:neglected:w` pass the weights and add to the outputs; outputs `u1:neglected:z` are
@@ -211,7 +211,7 @@ def opened(system: StateSpace, neglected: NeglectedModes, deltas: int) -> StateS
     return whole.replace(name=system.name, units={}, blocks=blocks)
 
 
-def _elastic(small: Partition, big: Partition) -> Pair:
+def _elastic_pair(small: Partition, big: Partition) -> Pair:
     """Return both systems with the channels of the small one, without their rigid-body motions."""
     names = (*small.z, *small.y), (*small.w, *small.u)
     if not set(names[0]) <= set(big.system.outputs) or not set(names[1]) <= set(big.system.inputs):
@@ -246,9 +246,9 @@ def _same_body(one: FloatArray, other: FloatArray) -> None:
 
 def _distinct(small: StateSpace, big: StateSpace) -> tuple[Pair, dict[str, str]]:
     """Return the pair with the channels that differ, each output once, and which are mirrored."""
-    probe = _grid(_swinging(small, big))[1::7]
-    gap = _gap((small, big), probe)
-    size = np.abs(_response(big, probe))
+    probe = _resonance_grid(_upper_poles(small, big))[1::7]
+    gap = _deviation((small, big), probe)
+    size = np.abs(_bilinear_response(big, probe))
     moved = np.abs(gap).max(axis=2) > _ROUNDING * size.max(axis=2).max(initial=0.0)
     rows, columns = np.flatnonzero(moved.any(axis=1)), np.flatnonzero(moved.any(axis=0))
     kept: list[int] = []
@@ -264,7 +264,7 @@ def _distinct(small: StateSpace, big: StateSpace) -> tuple[Pair, dict[str, str]]
     return (small.select(*names), big.select(*names)), mirrored
 
 
-def _swinging(small: StateSpace, big: StateSpace) -> ComplexArray:
+def _upper_poles(small: StateSpace, big: StateSpace) -> ComplexArray:
     """Return the poles of both in the upper half plane, slowest first, each once."""
     poles = np.concatenate([_poles(big), _poles(small)])
     # the rounding of delays at z = 0 has no frequency
@@ -278,7 +278,7 @@ def _swinging(small: StateSpace, big: StateSpace) -> ComplexArray:
     return np.array(found)
 
 
-def _grid(poles: ComplexArray) -> FloatArray:
+def _resonance_grid(poles: ComplexArray) -> FloatArray:
     """Return 0 and frequencies [Hz] from a hundredth of the first resonance, through all."""
     own = np.abs(poles) / (2 * np.pi)
     flat = np.geomspace(0.01 * own[0], 10 * own[-1], 500)
@@ -301,14 +301,14 @@ def _poles(g: StateSpace) -> ComplexArray:
     return np.asarray(2.0 / g.dt * (poles - 1.0) / (poles + 1.0)) if g.dt else poles
 
 
-def _response(g: StateSpace, grid: FloatArray) -> ComplexArray:
+def _bilinear_response(g: StateSpace, grid: FloatArray) -> ComplexArray:
     """Return the responses, of a sampled system at bilinear frequencies."""
     return frequency_response(g, image_freq(2.0 * np.pi * grid, g.dt)).data
 
 
-def _gap(pair: Pair, grid: FloatArray) -> ComplexArray:
+def _deviation(pair: Pair, grid: FloatArray) -> ComplexArray:
     """Return the difference of the responses (n_out, n_in, n_freq)."""
-    return _response(pair[1], grid) - _response(pair[0], grid)
+    return _bilinear_response(pair[1], grid) - _bilinear_response(pair[0], grid)
 
 
 def _evened(gap: ComplexArray) -> tuple[FloatArray, ComplexArray]:
@@ -354,7 +354,7 @@ def covering(
     is a rational function of x, positive for x >= 0; w has its zeros and poles ``s = -sqrt(-x)``.
     """
     unit = 2 * np.pi * freq[-1]
-    own = _standing_out(freq, height, poles)[:resonances] / unit
+    own = _peak_poles(freq, height, poles)[:resonances] / unit
     corners = np.geomspace(20 * np.pi * freq[1] / unit, 1.0, _SMOOTH)
     terms = [_Term(0, (pole,)) for pole in own]
     terms += [_Term(0, (corner * np.exp(0.75j * np.pi),)) for corner in corners[::2]]
@@ -362,12 +362,12 @@ def covering(
     terms += [_Term(2, (c * _HUMP, c * _APART * _HUMP)) for c in corners]
     x = (2 * np.pi * freq / unit) ** 2
     square = height**2
-    tall = _followed(freq, square, own[-1:] * unit)
+    tall = _envelope(freq, square, own[-1:] * unit)
     values = np.column_stack([np.ones(x.size), *(term.at(x) for term in terms)])
     size = values.max(axis=0)
     values = values / size
     spacing = np.gradient(np.log(np.maximum(freq, freq[1])))
-    p = _raised(values, _least(values, tall, spacing), square)
+    p = _raised(values, _log_fit(values, tall, spacing), square)
     part = np.max(values * p / (values @ p)[:, None], axis=0)
     kept = np.flatnonzero(part[1:] > _NEGLIGIBLE)
     gains = p / size
@@ -378,7 +378,7 @@ def covering(
     constant = max(float(gains[0]), _LEAST * max(map(abs, ends.values()), default=0.0))
     total = constant + sum(gains[i + 1] * terms[i].at(x) for i in kept)
     rise = float(np.max(square / total))
-    return _factor(rise * constant, {at: rise * end for at, end in ends.items()}, unit)
+    return _spectral_factor(rise * constant, {at: rise * end for at, end in ends.items()}, unit)
 
 
 @dataclass(frozen=True)
@@ -407,7 +407,7 @@ class _Term:
         return found
 
 
-def _standing_out(freq: FloatArray, height: FloatArray, poles: ComplexArray) -> ComplexArray:
+def _peak_poles(freq: FloatArray, height: FloatArray, poles: ComplexArray) -> ComplexArray:
     """Return the poles at which the curve is far above what it is half an eighth away."""
     at = np.log(np.maximum(freq, freq[1]))
     line = np.log(height + TINY)
@@ -416,7 +416,7 @@ def _standing_out(freq: FloatArray, height: FloatArray, poles: ComplexArray) -> 
     return np.asarray(poles[top - np.minimum(low, high) > np.log(_PROMINENT)])
 
 
-def _followed(freq: FloatArray, square: FloatArray, last: ComplexArray) -> FloatArray:
+def _envelope(freq: FloatArray, square: FloatArray, last: ComplexArray) -> FloatArray:
     """Return the curve, its deepest valleys filled, above the last resonance its envelope."""
     at = np.log(np.maximum(freq, freq[1]))
     start = np.searchsorted(at, at[:, None] - _WIDE)[:, 0]
@@ -426,7 +426,7 @@ def _followed(freq: FloatArray, square: FloatArray, last: ComplexArray) -> Float
     return np.asarray(np.maximum(np.where(above, around, square), _VALLEY**2 * around))
 
 
-def _least(terms: FloatArray, square: FloatArray, spacing: FloatArray) -> FloatArray:
+def _log_fit(terms: FloatArray, square: FloatArray, spacing: FloatArray) -> FloatArray:
     """Return p > 0 with ``terms p`` near a curve in logarithms: below it counts four times.
 
     Least squares over q = log p, weighted half by the logarithm of frequency, half by the points
@@ -469,7 +469,7 @@ def _raised(terms: FloatArray, p: FloatArray, square: FloatArray) -> FloatArray:
     return p
 
 
-def _factor(constant: float, ends: dict[complex, complex], unit: float) -> StateSpace:
+def _spectral_factor(constant: float, ends: dict[complex, complex], unit: float) -> StateSpace:
     """Return the spectral factor of ``constant + sum_k 2 Re(r_k / (x + l_k^2))``, in modal form.
 
     Its zeros, as x, are the finite eigenvalues of an arrow matrix.

@@ -24,8 +24,8 @@ from ..partition import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
 from ..realisation import ModalRealisation
 from .delta_channels import require_exact, system_matrix, with_channels, with_gain_channels
-from .mode_deltas import KNOWN, SAME_MODEL, check_poles, judged, stated
-from .neglected import NeglectedModes, neglected_modes, opened
+from .mode_deltas import KNOWN, SAME_MODEL, check_poles, correlated_deltas, stated
+from .neglected import NeglectedModes, neglected_modes, with_neglected
 from .shape_channels import shape_deltas, with_shape_channels
 from .uncertain_plant import (
     Delta,
@@ -98,7 +98,7 @@ def uncertain(
     if isinstance(source, UpdateResult) and source.discrepancy and source.fitted_poles is not None:
         source = source.uncertainty()
     if isinstance(source, ModalUncertainty):
-        deltas, own = judged(realisation, source, modes, many)
+        deltas, own = correlated_deltas(realisation, source, modes, many)
         own = la.block_diag(own, np.eye(len(beside)) / many**2)
         return _with_deltas(plant, (*deltas, *beside), own, many, neglected)
     if isinstance(source, UpdateResult):
@@ -116,7 +116,7 @@ def uncertain(
     # measured: poles that were typed
     limit, name = (SAME_MODEL, "fit") if fitted else (0.1, "measurement")
     check_poles(realisation, numbers, poles, limit, name)
-    G = _relative(poles)
+    G = _log_derivatives(poles)
     covariance = G @ covariance @ G.T
     scale = many * np.sqrt(np.diag(covariance))
     kinds: tuple[Literal["freq", "damping"], ...] = ("freq", "damping")
@@ -207,7 +207,7 @@ def _with_deltas(
     if neglected is not None:
         known = isinstance(neglected, NeglectedModes)
         weight = neglected if known else neglected_modes(plant, neglected)
-        system = opened(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
+        system = with_neglected(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
     return UncertainPlant(
         plant, system, (*deltas, *shapes), covariance, deviations, weight, fit, parameters
     )
@@ -237,7 +237,7 @@ def _by_parameters(
     weight = None
     if neglected is not None:
         weight = neglected_modes(plant, neglected)
-        system = opened(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
+        system = with_neglected(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
     own = la.block_diag(covariance / np.outer(std, std), np.eye(len(beside))) / deviations**2
     deltas = (*deltas[: len(parameters)], *modes, *(one for one in beside if not one.mode))
     return UncertainPlant(plant, system, deltas, own, deviations, weight, fit, every)
@@ -258,7 +258,7 @@ def _check_model(plant: Partition, other: Any) -> None:
     for name in "MDK":
         own, others = getattr(plant.model, name, None), getattr(other, name)
         if own is None or own.shape != others.shape or not np.allclose(
-            _dense(own), _dense(others), rtol=SAME, atol=0.0
+            _to_dense(own), _to_dense(others), rtol=SAME, atol=0.0
         ):  # fmt: skip
             raise ModelError(
                 f"the plant has another {name} than the fit's model. Assemble it from fit.model."
@@ -325,7 +325,7 @@ def _opened(plant: Partition, deltas: Sequence[Delta]) -> StateSpace:
     ``R_j x'`` makes it exact. The columns are read off the plant assembled with one mode changed,
     so that they hold for any port.
     """
-    own = _channels(plant, deltas)
+    own = _delta_channels(plant, deltas)
     twice = np.flatnonzero(own.repeated)
     left = np.hstack([own.left, own.again[:, twice]])
     right = np.vstack([own.right, own.rates[twice]])
@@ -338,7 +338,7 @@ def _opened(plant: Partition, deltas: Sequence[Delta]) -> StateSpace:
     return system
 
 
-def _channels(plant: Partition, deltas: Sequence[Delta]) -> _Channels:
+def _delta_channels(plant: Partition, deltas: Sequence[Delta]) -> _Channels:
     """Return how the plant depends on its Deltas, read off with one mode changed at a time."""
     base, n = system_matrix(plant.system), plant.system.n_states
     left, right = np.zeros((base.shape[0], len(deltas))), np.zeros((len(deltas), base.shape[1]))
@@ -401,7 +401,7 @@ def _measured_poles(
     return tuple(chosen), measured.poles[at], measured.covariance[np.ix_(both, both)]
 
 
-def _relative(poles: ComplexArray) -> FloatArray:
+def _log_derivatives(poles: ComplexArray) -> FloatArray:
     """Return the derivatives of [log omega^2; log 2 zeta omega] to [Re lambda; Im lambda]."""
     size = np.abs(poles) ** 2
     damped = np.where(poles.real != 0, poles.real, np.inf)
@@ -481,7 +481,7 @@ def by_parameters(
         for order, part in zip((2, 1, 0), parameter.matrices(model), strict=True):
             if part is None:
                 continue
-            whole = _dense(part)
+            whole = _to_dense(part)
             if order == 1:
                 whole = elastic_part(model, realisation, whole)
             values, vectors = np.linalg.eigh(0.5 * (whole + whole.T))
@@ -501,5 +501,5 @@ def by_parameters(
     )
 
 
-def _dense(matrix: object) -> FloatArray:
+def _to_dense(matrix: object) -> FloatArray:
     return np.asarray(matrix.toarray() if sp.issparse(matrix) else matrix)  # type: ignore[attr-defined]

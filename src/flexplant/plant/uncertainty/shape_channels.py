@@ -74,7 +74,7 @@ def with_shape_channels(
     further: list[_Channel] = []
     for delta in deltas:
         states = [int(plant.modal_states[2 * delta.mode - i]) for i in (2, 1)]
-        own = _factors(plant, delta, base, *states)
+        own = _channels(plant, delta, base, *states)
         if not own:
             raise ModelError(f"{delta.name} moves no port of the plant: leave that mode out.")
         for i, one in enumerate(own):
@@ -99,7 +99,7 @@ def with_shape_channels(
     return found
 
 
-def _factors(plant: Partition, delta: Delta, base: FloatArray, q: int, v: int) -> list[_Channel]:
+def _channels(plant: Partition, delta: Delta, base: FloatArray, q: int, v: int) -> list[_Channel]:
     """Return columns and rows of what a unit change of a shape does, of states q and v."""
     realisation = modal_realisation(plant)
     driven, seen = (

@@ -20,7 +20,7 @@ from ...updating.parameters.added import Parameter
 from ..building import P, rebuilt, sampled
 from ..partition import Partition
 from ..realisation import MODAL, ModalRealisation
-from ..residual_form import modes_of
+from ..residual_form import plant_modes
 from .neglected import NeglectedModes
 
 
@@ -375,10 +375,10 @@ class UncertainPlant(Value, Generic[P]):
         """Return the plant of the model with its parameters, gains and delay changed."""
         realisation = self.plant.assembled.realisation
         own = self.plant.model if self.fit is None else self.fit.model
-        model = _moved(realisation, own, self.parameters, change)
+        model = _changed_model(realisation, own, self.parameters, change)
         with warnings.catch_warnings():  # the nominal plant has said in which form it is
             warnings.simplefilter("ignore", FlexplantWarning)
-            return _with_ports(self.plant, modes_of(model), changes)
+            return _with_ports(self.plant, plant_modes(model), changes)
 
 
 def _normal(rng: np.random.Generator, covariance: FloatArray) -> FloatArray:
@@ -404,7 +404,7 @@ def elastic_part(model: Any, realisation: ModalRealisation, D: FloatArray) -> Fl
     return np.asarray(elastic.T @ D @ elastic)
 
 
-def _moved(
+def _changed_model(
     realisation: ModalRealisation, model: Any, parameters: Sequence[Parameter], change: FloatArray
 ) -> Any:
     """Return the fit's model with parameters changed by some amounts."""

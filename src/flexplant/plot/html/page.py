@@ -189,7 +189,7 @@ def _picture_html(figure: Figure, prefix: str, caption: str) -> str:
             f'<image width="{width:g}" height="{height:g}" href="data:image/png;base64,{data}"/>'
             "</svg>"
         )
-    panels = [panel for ax in figure.axes if (panel := _panel(ax, width, height))]
+    panels = [panel for ax in figure.axes if (panel := _axes_frame(ax, width, height))]
     buttons = "".join(
         f'<button type="button" data-do="{what}" title="{said}" aria-label="{said}">{sign}</button>'
         for what, said, sign in _BUTTONS
@@ -225,15 +225,15 @@ def _inline(svg: str, prefix: str, caption: str) -> str:
 
     svg = re.sub(r'\sid="([^"]*)"', named, svg)
     svg = re.sub(r'(url\(|href=")#', rf"\1#{prefix}", svg)
-    return re.sub(r'\sd="([^"]*)"', _rounded, svg)
+    return re.sub(r'\sd="([^"]*)"', _short_path, svg)
 
 
-def _rounded(match: re.Match[str]) -> str:
+def _short_path(match: re.Match[str]) -> str:
     short = re.sub(r"-?\d+\.\d{3,}", lambda n: f"{float(n[0]):.2f}", match[1])
     return f' d="{" ".join(short.split())}"'
 
 
-def _panel(ax: Axes, width: float, height: float) -> dict[str, Any] | None:
+def _axes_frame(ax: Axes, width: float, height: float) -> dict[str, Any] | None:
     """Return where axes lie in the picture, and what their two scales show there."""
     if ax.name != "rectilinear" or ax.get_label() == "<colorbar>" or not ax.axison:
         return None

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ...certificates import in_words, stability_name
+from ...certificates import one_line, stability_name
 from ...checks import Value, short, with_unit
 from ...errors import FlexplantError, ModelError, counted
 from ...loop import (
@@ -38,7 +38,7 @@ def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | N
         return None
     name, loop = next(iter(loops.items()))
     main = _main(loop, channel)
-    compared = _compared(loops, main)
+    compared = _loop_figures(loops, main)
     found, why = _budget(loop, main)
     parts = [tiles([_error_tile(main, found), *_stability(loop), *_margins(compared.rows[name])])]
     for verdict in design.of(Verdict).values():
@@ -66,7 +66,7 @@ def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | N
         f'<div class="pictures">{picture}<div>{found._repr_html_()}{motions}</div></div>'
     )
     others = [n for n in loop.plant.z if n != main and n.endswith(":error")]
-    drawn = "".join(attempted(lambda n=n: _other_budget(loop, n, gallery)) for n in others)  # type: ignore[misc]
+    drawn = "".join(html_or_why(lambda n=n: _other_budget(loop, n, gallery)) for n in others)  # type: ignore[misc]
     if drawn:
         parts.append(f'<h3>Error budgets of the other axes</h3><div class="pictures">{drawn}</div>')
     return Chapter("Result", "".join(parts))
@@ -88,7 +88,7 @@ def loops_section(design: Design, gallery: Gallery, channel: str | None) -> Chap
     if not loops:
         return None
     parts = []
-    compared = _compared(loops, _main(next(iter(loops.values())), channel))
+    compared = _loop_figures(loops, _main(next(iter(loops.values())), channel))
     stable = {name: loop for name, loop in loops.items() if compared.rows[name].stable}
     if compared.channel and stable:
         name, first = next(iter(stable.items()))
@@ -106,18 +106,18 @@ def loops_section(design: Design, gallery: Gallery, channel: str | None) -> Chap
         parts.append(f'<div class="pictures">{drawn}</div>')
     for name, loop in loops.items():
         parts += [f"<h3>{escape(name)}</h3>", loop._repr_html_()]
-        parts.append(attempted(lambda loop=loop: _margin_table(loop)))  # type: ignore[misc]
+        parts.append(html_or_why(lambda loop=loop: _margin_table(loop)))  # type: ignore[misc]
     return Chapter("Loop", "".join(parts))
 
 
-def _compared(loops: Mapping[str, ClosedLoop], channel: str) -> LoopComparison:
+def _loop_figures(loops: Mapping[str, ClosedLoop], channel: str) -> LoopComparison:
     """Return the figures of loops, of S from the reference of an error, else from the first."""
     known = references(next(iter(loops.values())).plant)
     own = f"{channel.removesuffix(':error')}:ref"
     return compare_loops(loops, reference=own if own in known else next(iter(known), None))
 
 
-def attempted(make: Callable[[], str]) -> str:
+def html_or_why(make: Callable[[], str]) -> str:
     """Return HTML, or in its place why it cannot be computed."""
     try:
         return make()
@@ -148,13 +148,13 @@ def _stability(loop: ClosedLoop) -> list[Tile]:
     stable = loop.obstacle is None
     sampled = bool(loop.plant.dt)
     size = loop.spectral_radius if sampled else loop.spectral_abscissa
-    own = in_words({stability_name(sampled): size})
+    own = one_line({stability_name(sampled): size})
     found = [("stability", "stable" if stable else "UNSTABLE", own, "good" if stable else "bad")]
     left = loop.left_out
     if left is None:
         return [*found, ("with the modes left out", "not checked", "close_loop(larger=...)", "")]
     figure = "stable" if left.is_stable else "UNSTABLE"
-    beside = in_words({stability_name(sampled): left.stability})
+    beside = one_line({stability_name(sampled): left.stability})
     if left.modes:
         beside = left.named_modes
     kind = "good" if left.is_fine else "bad"

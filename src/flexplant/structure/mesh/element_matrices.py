@@ -72,10 +72,10 @@ def hermite(s: float, length: float, order: int = 0) -> FloatArray:
 
 def plate_terms(s: Any, t: Any, dp: int, dq: int) -> FloatArray:
     """Return the d^dp/ds^dp d^dq/dt^dq derivatives (..., 12) of the terms s^p t^q."""
-    return _derived(_P, s, dp) * _derived(_Q, t, dq)
+    return _monomials(_P, s, dp) * _monomials(_Q, t, dq)
 
 
-def _derived(power: IntArray, x: Any, order: int) -> FloatArray:
+def _monomials(power: IntArray, x: Any, order: int) -> FloatArray:
     factor = np.ones(power.size)
     for k in range(order):
         factor *= power - k

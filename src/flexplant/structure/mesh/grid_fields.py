@@ -116,7 +116,7 @@ def lengths_of(size: Any, count: int) -> tuple[float, ...]:
     )
 
 
-def _asked(function: Any, name: str, centres: FloatArray) -> list[Any]:
+def _field_values(function: Any, name: str, centres: FloatArray) -> list[Any]:
     """Return what a user's function answers at the centres (elements, d)."""
     if isinstance(function, type):
         raise ModelError(f"{name} is a class, {function.__name__}. Pass a number or a function.")
@@ -163,7 +163,7 @@ def field_of(
         chosen = np.full(int(np.prod(counts)), True) if present is None else present.ravel()
         found = np.ones(chosen.size)
         centres = centres_of(lengths, counts)[chosen]
-        answers = _asked(value, name, centres)
+        answers = _field_values(value, name, centres)
         found[chosen] = real_array(answers, f"{name} of the elements", (len(answers),))
         values = found.reshape(tuple(counts[::-1]))
     else:
@@ -246,7 +246,7 @@ def _hole_mask(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> A
             return given.T.ravel()
     centres = centres_of(lengths, counts)
     if callable(holes):
-        return np.array([bool(answer) for answer in _asked(holes, "holes", centres)])
+        return np.array([bool(answer) for answer in _field_values(holes, "holes", centres)])
     listed = list(holes) if several(holes) else [holes]
     if len(counts) != 2 or not all(isinstance(hole, Hole) for hole in listed):
         raise ModelError(

@@ -179,7 +179,7 @@ def beam(
     <FEModel 'beam': 20 DOFs, sparse, no rigid-body motions, D not given>
     """
     lengths, counts = (positive(length, "length"),), counts_of(elements, 1)
-    held = _ends(ends)
+    held = _end_supports(ends)
     rho, E, A, inertia_of = (
         field_of(value, text, lengths, counts)
         for value, text in (
@@ -204,7 +204,7 @@ def beam(
     return free.fixed(labels) if labels else free
 
 
-def _ends(ends: Any) -> list[tuple[str, ...]]:
+def _end_supports(ends: Any) -> list[tuple[str, ...]]:
     if not several(ends) or len(list(ends)) != 2:
         raise ModelError(
             f"ends must be two words, for the ends at 0 and at the length, got {short(ends)}. "

@@ -218,7 +218,7 @@ def _following(loop: ScheduledLoop, name: str, single: bool) -> CProgram:
         B, D = (np.hstack([part, np.zeros((len(part), 1))]) for part in (K.B, K.D))
         laws.append(K.replace(B=B, D=D, inputs=[*K.inputs, loop.position], units={}))
     K, driven = laws[0], len(loop.loops[0].driven)
-    _check_sampled(K.dt, K.n_states)
+    _check_rate(K.dt, K.n_states)
     form = scheduled_form(laws, driven=driven, single=single)
     text = CText(name, K, form, driven, None, loop.places, len(K.inputs) - 1, single)
     return CProgram(K, form, text.header, text.source)
@@ -276,11 +276,11 @@ def _law(given: Any, recovery: float | None, limited: bool, driven: bool) -> _La
     """Return a controller with what is applied fed back, and how the rest moves it."""
     if isinstance(given, ClosedLoop):
         dt = given.plant.dt
-        _check_sampled(dt, given.controller.n_states)
+        _check_rate(dt, given.controller.n_states)
         law, L = applied_law(given, None if recovery is None else recovery / dt)
-        return _closed(law, len(given.driven), [*given.plant.y], L)
+        return _applied_law(law, len(given.driven), [*given.plant.y], L)
     K = as_statespace(given)
-    _check_sampled(K.dt, K.n_states)
+    _check_rate(K.dt, K.n_states)
     if not driven:
         return _Law(K, 0, None)
     fed = [name for name in K.inputs if name in K.outputs]
@@ -288,7 +288,7 @@ def _law(given: Any, recovery: float | None, limited: bool, driven: bool) -> _La
         rows = [*fed, *(name for name in K.outputs if name not in fed)]
         outer = [name for name in K.inputs if name not in fed]
         law = K.select(rows, [*outer, *fed])
-        found = _closed(law, len(fed), outer, np.zeros((K.n_states, len(fed))))
+        found = _applied_law(law, len(fed), outer, np.zeros((K.n_states, len(fed))))
         if len(fed) < len(K.outputs) and limited:
             raise ModelError(
                 f"limits need all commands back, and the controller reads {fed} of {K.outputs} "
@@ -305,7 +305,7 @@ def controller_law(loop: ClosedLoop) -> StateSpace:
     return _law(loop, None, False, True).system
 
 
-def _check_sampled(dt: float, states: int) -> None:
+def _check_rate(dt: float, states: int) -> None:
     if not dt and states:
         raise ModelError(
             "a computer runs a sampled controller: synthesis.discretise_controller(plant, "
@@ -313,7 +313,7 @@ def _check_sampled(dt: float, states: int) -> None:
         )
 
 
-def _closed(law: StateSpace, nu: int, outer: Sequence[str], L: FloatArray) -> _Law:
+def _applied_law(law: StateSpace, nu: int, outer: Sequence[str], L: FloatArray) -> _Law:
     """Return ``[outer; applied] -> [u; watched]`` with what is commanded applied."""
     ny = len(outer)
     if np.any(law.D[:, ny:]):

@@ -77,7 +77,7 @@ def _sections(g: StateSpace) -> FloatArray:
     if not size:
         return np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
     back = np.expm1(-2j * np.pi * grid * (g.dt or 1.0))  # 1/z - 1
-    shape = _product(poles, zeros, back)
+    shape = _root_product(poles, zeros, back)
     at = int(np.argmax(np.abs(wanted)))
     gain = float((wanted[at] / shape[at]).real)
     # with a zero at z = 0 for each that is missing: so many samples too early
@@ -86,7 +86,7 @@ def _sections(g: StateSpace) -> FloatArray:
     for row in sections:
         while late and not row[2]:
             row[:3], late = [0.0, *row[:2]], late - 1
-    off = float(np.abs(_response(sections, back) - wanted).max()) / size
+    off = float(np.abs(_sections_response(sections, back) - wanted).max()) / size
     if not off <= _AGREEMENT:
         exact = float(np.abs(gain * shape - wanted).max()) / size
         raise CertificateError(
@@ -96,7 +96,7 @@ def _sections(g: StateSpace) -> FloatArray:
     return sections
 
 
-def _product(poles: ComplexArray, zeros: ComplexArray, back: ComplexArray) -> ComplexArray:
+def _root_product(poles: ComplexArray, zeros: ComplexArray, back: ComplexArray) -> ComplexArray:
     """Return ``prod (z - zeros) / prod (z - poles)`` at 1/z - 1 = back."""
     z = 1.0 / (1.0 + back)
     rise = -back * z  # z - 1
@@ -108,7 +108,7 @@ def _product(poles: ComplexArray, zeros: ComplexArray, back: ComplexArray) -> Co
     return found
 
 
-def _response(sections: FloatArray, back: ComplexArray) -> ComplexArray:
+def _sections_response(sections: FloatArray, back: ComplexArray) -> ComplexArray:
     """Return the response of sections: in powers of 1/z - 1, small where coefficients cancel."""
     found = np.ones(back.size, dtype=np.complex128)
     for row in sections:

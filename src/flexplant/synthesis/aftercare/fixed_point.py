@@ -16,7 +16,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...tolerances import TINY
 from .c_code import controller_law
-from .order import LoopFacts, kept, loop_facts, reduce_controller, stable_before
+from .order import LoopFacts, loop_facts, loss_text, reduce_controller, stable_before
 from .two_state import TwoStateForm, two_state_form
 
 Integers: TypeAlias = npt.NDArray[np.int64]
@@ -185,19 +185,19 @@ def fixed_point(
             f"fewer; together at most {_PRODUCT}."
         )
     before = stable_before(closed.plant, K)
-    inputs = np.array([_record(run, name) for name in K.inputs])
+    inputs = np.array([_run_channel(run, name) for name in K.inputs])
     room, allowed = positive(headroom, "headroom"), positive(loss, "loss", zero=True)
     counts = [None] if sections is None else np.atleast_1d(np.asarray(sections)).tolist()
     tried: dict[str, str] = {}
     best: tuple[int, int, _WordForm, StateSpace, LoopFacts] | None = None
     for count in counts:
         try:
-            own = _reduced(closed, K, count, allowed)
+            own = _fewer_sections(closed, K, count, allowed)
         except FlexplantError as error:
             tried[f"{count} sections"] = str(error)
             continue
         form = two_state_form(own)
-        parts = _sizes(form, inputs, room)
+        parts = _replayed_sizes(form, inputs, room)
         number = -(-own.n_states // 2)
         for length in range(_FEWEST, longest + 1) if given is None else (given,):
             if best is not None and number * length >= best[0]:
@@ -205,7 +205,7 @@ def fixed_point(
             words = _words(form, parts, length, wide)
             system = words.system(own)
             facts = loop_facts(closed.plant, system)
-            lost = kept(before, facts, allowed)
+            lost = loss_text(before, facts, allowed)
             if not lost:
                 best = number * length, length, words, system, facts
                 break
@@ -248,7 +248,7 @@ def _require_rest(
         )
 
 
-def _record(run: Any, name: str) -> FloatArray:
+def _run_channel(run: Any, name: str) -> FloatArray:
     try:
         values = np.asarray(run[name], dtype=np.float64)
     except (TypeError, KeyError, FlexplantError) as error:
@@ -258,7 +258,7 @@ def _record(run: Any, name: str) -> FloatArray:
     return np.asarray(values.reshape(-1, values.shape[-1])[0])
 
 
-def _reduced(loop: ClosedLoop, K: StateSpace, count: Any, loss: float) -> StateSpace:
+def _fewer_sections(loop: ClosedLoop, K: StateSpace, count: Any, loss: float) -> StateSpace:
     """Return the controller of so many sections."""
     if count is None or 2 * whole(count, "sections") >= K.n_states:
         return K
@@ -273,7 +273,7 @@ class _Sizes(NamedTuple):
     out: Integers
 
 
-def _sizes(form: TwoStateForm, inputs: FloatArray, headroom: float) -> _Sizes:
+def _replayed_sizes(form: TwoStateForm, inputs: FloatArray, headroom: float) -> _Sizes:
     """Return the powers of two above what a run has, replayed through the form."""
     A = form.change
     x, most = np.zeros(len(A)), np.zeros(len(A))
@@ -323,13 +323,13 @@ class _WordForm(NamedTuple):
     def outputs(self, x: Integers, into: Integers) -> Integers:
         """Return the outputs (p, runs) of a sample."""
         return self._held(
-            _shifted(self.C @ x, self.shifts[2]) + _shifted(self.D @ into, self.shifts[3])
+            _downshift(self.C @ x, self.shifts[2]) + _downshift(self.D @ into, self.shifts[3])
         )
 
     def following(self, x: Integers, into: Integers) -> Integers:
         """Return the states (n, runs) of the next sample."""
         return self._held(
-            x + _shifted(self.A @ x, self.shifts[0]) + _shifted(self.B @ into, self.shifts[1])
+            x + _downshift(self.A @ x, self.shifts[0]) + _downshift(self.B @ into, self.shifts[1])
         )
 
     def read(self, values: FloatArray) -> Integers:
@@ -346,7 +346,7 @@ class _WordForm(NamedTuple):
         return np.clip(values, -most, most)
 
 
-def _shifted(sums: Integers, shift: Integers) -> Integers:
+def _downshift(sums: Integers, shift: Integers) -> Integers:
     """Return sums divided by powers of two, rounded to nearest."""
     right = np.maximum(shift, 0)[:, None]
     half = np.where(right > 0, np.left_shift(1, np.maximum(right - 1, 0)), 0)

@@ -38,15 +38,15 @@ class _FactoredController(NamedTuple):
 
     @classmethod
     def of(cls, plant: StandardPlant, K: StateSpace) -> _FactoredController:
-        size = _size(plant, K)
+        size = _controller_gain(plant, K)
         split = split_stable(K)
         scaled = split.stable.replace(C=split.stable.C / size, D=split.stable.D / size, blocks=None)
-        factors, F = _factors(scaled)
+        factors, F = _coprime_factors(scaled)
         rows = [name for name in K.outputs if name in plant.u]
         P = plant.system.select(K.inputs, rows)
         if split.rest.n_states:  # the plant with what is kept around it
             P = feedback(P, split.rest.select(rows), sign=1)
-        return cls(K, split.rest, factors, _weight(P, scaled, rows, F, size), size)
+        return cls(K, split.rest, factors, _factor_weight(P, scaled, rows, F, size), size)
 
     def truncated(self, order: int) -> tuple[StateSpace, float]:
         """Return the controller of truncated factors, and the weighted error."""
@@ -157,7 +157,7 @@ def reduce_controller(
         after = loop_facts(given, found)
         required(before, after, allowed, "Choose a higher order, leave order out, or raise loss.")
     else:
-        found, error, after = _smallest(given, problem, before, allowed)
+        found, error, after = _fewest_states(given, problem, before, allowed)
     was = {f"{name} before": value for name, value in before.certificate.items()}
     answer = Controller(
         found,
@@ -168,7 +168,7 @@ def reduce_controller(
     return with_left_out(answer, given, larger)
 
 
-def _smallest(
+def _fewest_states(
     plant: StandardPlant, problem: _FactoredController, before: LoopFacts, loss: float
 ) -> tuple[StateSpace, float, LoopFacts]:
     """Return the reduced controller of the fewest states that keeps the loop, from halvings."""
@@ -183,7 +183,7 @@ def _smallest(
             lost = str(failure)
             return False
         after = loop_facts(plant, found)
-        lost = kept(before, after, loss)
+        lost = loss_text(before, after, loss)
         if not lost and (best is None or found.n_states < best[0].n_states):
             best = found, error, after
         return not lost
@@ -208,7 +208,7 @@ def _smallest(
     return best
 
 
-def _size(plant: StandardPlant, K: StateSpace) -> float:
+def _controller_gain(plant: StandardPlant, K: StateSpace) -> float:
     """Return the gain of the controller where the loop works, the unit of u in those of y."""
     loop = plant.system.select(plant.y, plant.u)
     grid = resonance_grid(np.concatenate([loop.poles(), K.poles()]), K.dt, points=60)
@@ -222,7 +222,7 @@ def _size(plant: StandardPlant, K: StateSpace) -> float:
     return float(np.median(gain[acts])) if acts.any() else float(gain.max())
 
 
-def _factors(K: StateSpace) -> tuple[StateSpace, FloatArray]:
+def _coprime_factors(K: StateSpace) -> tuple[StateSpace, FloatArray]:
     """Return [N; M] of the normalised right coprime factorisation, and its feedback F."""
     m = len(K.inputs)
     R = np.eye(m) + K.D.T @ K.D
@@ -233,7 +233,7 @@ def _factors(K: StateSpace) -> tuple[StateSpace, FloatArray]:
     return StateSpace(K.A + K.B @ F, K.B, C, D, K.dt), F
 
 
-def _weight(
+def _factor_weight(
     P: StateSpace, K: StateSpace, rows: list[str], F: FloatArray, size: float
 ) -> StateSpace:
     """Return W: from errors of u = N v and of y = M v to v, the loop of P and K closed."""
@@ -295,7 +295,7 @@ def loop_facts(plant: StandardPlant, controller: StateSpace) -> LoopFacts:
     return LoopFacts(bool(dt), stability(poles, dt), float(freq), stable, margin, gamma)
 
 
-def kept(before: LoopFacts, after: LoopFacts, loss: float) -> str:
+def loss_text(before: LoopFacts, after: LoopFacts, loss: float) -> str:
     """Return what was lost in words; empty when nothing was."""
     if not after.is_stable:
         return f"the loop becomes unstable ({after.why})"
@@ -314,7 +314,7 @@ def kept(before: LoopFacts, after: LoopFacts, loss: float) -> str:
 
 def required(before: LoopFacts, after: LoopFacts, loss: float, cure: str) -> None:
     """Raise CertificateError when a loop lost more than is allowed."""
-    lost = kept(before, after, loss)
+    lost = loss_text(before, after, loss)
     if lost:
         raise CertificateError(f"{lost}: the controller is refused. {cure}")
 

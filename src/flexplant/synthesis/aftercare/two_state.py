@@ -90,9 +90,9 @@ def two_state_form(
     the values of the first `inputs`.
     """
     most, error = (_SINGLE if single else _DOUBLE), np.inf
-    for form, sizes in _blocks(K):
+    for form, sizes in _block_forms(K):
         found = _arranged(form, sizes, driven, inputs)
-        found = _rounded(found) if single else found
+        found = _single_precision(found) if single else found
         error = min(error, away := _difference(K, found))
         if away <= most:
             return found._replace(error=away)
@@ -121,7 +121,7 @@ def scheduled_form(
     for K in laws:
         K = K.replace(A=K.A * d / d[:, None], B=K.B / d[:, None], C=K.C * d, blocks=None)
         own = _arranged(K, [K.n_states], [slice(driven)], None)
-        own = _rounded(own) if single else own
+        own = _single_precision(own) if single else own
         error = max(error, _difference(K, own))
         found.append(own)
     if error > (most := _SINGLE if single else _DOUBLE):
@@ -136,7 +136,7 @@ def scheduled_form(
     return TwoStateForm(found[0].pairs, rest, B, C, D, start[:, 0], error)
 
 
-def _blocks(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
+def _block_forms(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
     """Yield the system with A block diagonal and the sizes of its blocks, the smallest first."""
     try:
         modal = modal_form(K)
@@ -152,7 +152,7 @@ def _blocks(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
     real, imag = la.lapack.dtrsen(np.zeros(len(T)), T, Z, job="N")[2:4]
     values = real + 1j * imag  # in the order of T
     for near in _NEAR:
-        owner = _groups(values, near)
+        owner = _cluster_numbers(values, near)
         sizes = np.bincount(owner).tolist()
         bases = [
             la.lapack.dtrsen(owner == k, T, Z, job="N")[1][:, :size] for k, size in enumerate(sizes)
@@ -166,7 +166,7 @@ def _blocks(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
         yield K.replace(A=new, B=B, C=C, blocks=None), sizes
 
 
-def _groups(values: ComplexArray, near: float) -> IntArray:
+def _cluster_numbers(values: ComplexArray, near: float) -> IntArray:
     """Return the group of each pole: those within a distance of each other, and conjugates."""
     folded = values.real + 1j * np.abs(values.imag)
     owner = np.full(values.size, -1)
@@ -207,18 +207,18 @@ def _arranged(
     N = len(pairs)
     entries = [[np.diag(full[i : i + N, j : j + N]) for j in (0, N)] for i in (0, N)]
     held = K.replace(B=K.B[:, :inputs], D=K.D[:, :inputs], inputs=K.inputs[:inputs], units={})
-    start = [np.where(exists[:, None], _steady(held, rows)[place], 0.0) for rows in driven if n]
+    start = [np.where(exists[:, None], _at_rest(held, rows)[place], 0.0) for rows in driven if n]
     return TwoStateForm(np.array(entries), full[2 * N :, 2 * N :], B, C, K.D, np.array(start), 0.0)
 
 
-def _rounded(form: TwoStateForm) -> TwoStateForm:
+def _single_precision(form: TwoStateForm) -> TwoStateForm:
     """Return a form with its numbers in single precision."""
     parts = form._asdict().items()
     single = {name: np.asarray(part, np.float32).astype(np.float64) for name, part in parts}
     return form._replace(**single)  # type: ignore[arg-type]
 
 
-def _steady(K: StateSpace, driven: slice) -> FloatArray:
+def _at_rest(K: StateSpace, driven: slice) -> FloatArray:
     """Return the states (n, m + driven) that give the wanted commands and move least.
 
     Of all x with ``C x = out - D in`` (in least squares, where states cannot give them) that with

@@ -93,7 +93,7 @@ def require_shown(p: Prepared) -> None:
         raise _missed_by_w(p, found) from found
 
 
-def quadratic(p: Prepared) -> StateSpace:
+def h2_controller(p: Prepared) -> StateSpace:
     """Return the controller of least H2 norm, feedthrough apart (gamma without bound)."""
     rows, columns = p.B2.shape[1], p.C2.shape[0]
     require_shown(p)
@@ -118,7 +118,7 @@ def quadratic(p: Prepared) -> StateSpace:
 
 def _missed_by_z(p: Prepared, found: OnAxisError) -> AssumptionError:
     return AssumptionError(
-        f"z does not feel all that u moves at {_listed(p, found)}: an undamped (rigid-body or "
+        f"z does not feel all that u moves at {_axis_freq(p, found)}: an undamped (rigid-body or "
         "integrating) mode there is left out of z, or u -> z (a weight) has a zero there. Keep "
         "that motion in z with a weight of finite gain, or give it damping."
     )
@@ -126,7 +126,7 @@ def _missed_by_z(p: Prepared, found: OnAxisError) -> AssumptionError:
 
 def _missed_by_w(p: Prepared, found: OnAxisError) -> AssumptionError:
     return AssumptionError(
-        f"w does not excite all that y sees at {_listed(p, found)}: an undamped (rigid-body or "
+        f"w does not excite all that y sees at {_axis_freq(p, found)}: an undamped (rigid-body or "
         "integrating) mode there has no disturbance, or w -> y (a weight) has a zero there. "
         "Add a disturbance that reaches it, or give it damping."
     )
@@ -144,13 +144,13 @@ def _require_full_columns(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatA
             raise OnAxisError(np.array([omega]))
 
 
-def _listed(p: Prepared, found: OnAxisError) -> str:
+def _axis_freq(p: Prepared, found: OnAxisError) -> str:
     omega = float(np.min(found.omega))
     # a double pole at zero comes out of rounding beside it
     return f"{p.frequency(omega if omega > 1e-6 else 0.0):.3g} Hz"
 
 
-def indefinite(X: FloatArray, size: float) -> bool:
+def is_indefinite(X: FloatArray, size: float) -> bool:
     """Return whether X has a negative eigenvalue beyond rounding; size is what X comes from."""
     values = la.eigvalsh(X) if X.size else np.zeros(1)
     # an accurate X to 1e-6 of its size (the residual), and beyond what its equation rounds

@@ -45,7 +45,7 @@ from .mode_channels import (
     mode_channels,
     rebalanced,
     tolerated,
-    with_channels,
+    with_mode_channels,
 )
 from .moved_design import over_positions
 from .singular import ADDED
@@ -176,7 +176,7 @@ def design_hinf(
             middle = list(posed_at.values())[len(posed_at) // 2]
             weights = stage_weights(middle, bandwidth)
             posed_at = {x: one.weighted(weights) for x, one in posed_at.items()}
-        return over_positions(posed_at, lambda one: _designed(one, method, progress), progress)
+        return over_positions(posed_at, lambda one: _design_one(one, method, progress), progress)
     plant = posed(plant, u, y, "H-infinity synthesis")
     if bandwidth is not None:
         plant = plant.weighted(stage_weights(plant, bandwidth, uncertainty=uncertain))
@@ -186,7 +186,7 @@ def design_hinf(
     if known is not None:
         found = tolerant(plant, known, method, progress, damped_below)
         return with_left_out(found, plant, larger)
-    return with_left_out(_designed(plant, method, progress), plant, larger)
+    return with_left_out(_design_one(plant, method, progress), plant, larger)
 
 
 def tolerant(
@@ -201,13 +201,13 @@ def tolerant(
     instance(uncertain, UncertainPlant, "uncertain", "Make it by plant.uncertain(frequency=0.005).")
     if solved is None:
         channels, first = _even_channels(plant, uncertain, method, progress, damped_below)
-        answer = _designed(with_channels(plant, channels), method, progress)
+        answer = _design_one(with_mode_channels(plant, channels), method, progress)
     else:
         channels, first = solved.channels, solved.first
-        answer = _designed(with_channels(plant, channels), None, progress, solved.found)
+        answer = _design_one(with_mode_channels(plant, channels), None, progress, solved.found)
     scales = {one.mode: one.D for one in channels}
     stated = [one.replace(D=scales[one.mode]) for one in mode_channels(plant, uncertain)]
-    share = tolerated(stated, with_channels(plant, stated), answer.system)
+    share = tolerated(stated, with_mode_channels(plant, stated), answer.system)
     return answer.replace(
         certificate=dict(answer.certificate or {}) | {TOLERATED: share},
         reached={},  # of the weights beside the channels of modes
@@ -232,7 +232,7 @@ def tolerant_system(
 ) -> tuple[StateSpace, Solved]:
     """Return the controller that `tolerant` verifies, by itself, and what led to it."""
     channels, first = _even_channels(plant, uncertain, None, False, damped_below)
-    open_plant = with_channels(plant, channels)
+    open_plant = with_mode_channels(plant, channels)
     problem = prepared(open_plant.system, open_plant.u, open_plant.y)
     found = Riccati(progress=False).solve(problem)
     system = problem.restored(found.A, found.B, found.C, found.D)
@@ -248,7 +248,7 @@ def _even_channels(
 ) -> tuple[tuple[ModeChannel, ...], float]:
     """Return channels for the modes, scaled in closed loop, and gamma before they were."""
     channels = mode_channels(plant, uncertain, damped_below)
-    open_plant = with_channels(plant, channels)
+    open_plant = with_mode_channels(plant, channels)
     problem = prepared(open_plant.system, open_plant.u, open_plant.y)
     first = np.inf
     # only the scales hang on it: where it fails, the design itself says all
@@ -259,7 +259,7 @@ def _even_channels(
     return channels, first
 
 
-def _designed(
+def _design_one(
     plant: StandardPlant,
     method: SynthesisMethod | None,
     progress: bool | None,
@@ -276,7 +276,7 @@ def _designed(
         else:
             if progress is not None and isinstance(method, (Riccati, Lmi)):
                 method = method.replace(progress=progress)
-            answer = answered(plant, problem, method)
+            answer = answer_of(plant, problem, method)
         _require_known(plant, problem, answer)
     except (AssumptionError, InfeasibleError, SolverError, CertificateError) as error:
         blamed = _blamed(problem, error)
@@ -375,9 +375,9 @@ class Answer(NamedTuple):
         return self.gamma <= _CLOSE * self.lower
 
 
-def answered(plant: StandardPlant, problem: Prepared, method: SynthesisMethod) -> Answer:
+def answer_of(plant: StandardPlant, problem: Prepared, method: SynthesisMethod) -> Answer:
     """Return the answer of one method, verified on the plant."""
-    one = _verified(plant, problem, method, method.solve(problem))
+    one = _verified_answer(plant, problem, method, method.solve(problem))
     known = max(one.lower, pointwise_bound(problem))
     return one._replace(lower=raised_bound(problem, one.gamma, known))
 
@@ -410,7 +410,7 @@ def best_answer(
             failures[name] = error
             continue
         try:
-            one = _verified(plant, problem, method, found)
+            one = _verified_answer(plant, problem, method, found)
         except FlexplantError as error:
             failures[name] = error
             broken.append((method, found))
@@ -444,7 +444,7 @@ def _beyond_claim(
     plant: StandardPlant, problem: Prepared, method: SynthesisMethod, found: SolvedController
 ) -> Answer:
     """Return an answer whose norm is only what was verified, with a note."""
-    one = _verified(plant, problem, method, found._replace(gamma=np.inf))
+    one = _verified_answer(plant, problem, method, found._replace(gamma=np.inf))
     note = (
         f"rounding costs {100 * (one.gamma / found.gamma - 1.0):.2g} % of gamma: "
         f"{found.gamma:.6g} was found for the scaled plant, {one.gamma:.6g} verified for this "
@@ -463,20 +463,20 @@ def idle_answer(plant: StandardPlant, problem: Prepared, failure: FlexplantError
     parts = np.zeros((0, 0)), np.zeros((0, n_y)), np.zeros((n_u, 0)), np.zeros((n_u, n_y))
     K = StateSpace(*parts, plant.system.dt, inputs=plant.y, outputs=plant.u)
     found = SolvedController(*parts, np.inf, 0.0, {}, (note,))
-    one = _of_loop(plant, None, found, K.replace(name="hinf", units=plant.units))
+    one = _certified_answer(plant, None, found, K.replace(name="hinf", units=plant.units))
     if not np.isfinite(one.gamma):  # the poles are stable by no more than their rounding
         raise CertificateError("the norm of the plant without feedback cannot be verified.")
     return one._replace(lower=min(pointwise_bound(problem), one.gamma))
 
 
-def _verified(
+def _verified_answer(
     plant: StandardPlant, problem: Prepared, method: SynthesisMethod, found: SolvedController
 ) -> Answer:
     K = problem.restored(found.A, found.B, found.C, found.D)
-    return _of_loop(plant, method, found, K.replace(name="hinf", units=plant.units))
+    return _certified_answer(plant, method, found, K.replace(name="hinf", units=plant.units))
 
 
-def _of_loop(
+def _certified_answer(
     plant: StandardPlant,
     method: SynthesisMethod | None,
     found: SolvedController,

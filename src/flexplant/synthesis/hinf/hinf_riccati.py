@@ -27,7 +27,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ..controller import SolvedController
 from ..reach import beyond_rounding
-from .central import central, indefinite, quadratic, riccati_solutions
+from .central import central, h2_controller, is_indefinite, riccati_solutions
 from .lower_bound import parrott
 from .singular import LEVELS, Regularised, made_regular, missing_ranks, require_ranks
 
@@ -124,8 +124,8 @@ class Riccati(Value):
     def _regular(self, problem: Prepared, back_off: float) -> SolvedController:
         # the least quadratic cost stabilises: its norm is where the search for less begins
         try:
-            least = quadratic(problem)
-            unit = _seen(problem, least)
+            least = h2_controller(problem)
+            unit = _resonance_gain(problem, least)
         except (la.LinAlgError, SolverError):
             unit = np.inf
         if not np.isfinite(unit):
@@ -146,7 +146,7 @@ class Riccati(Value):
                 controller, norm, _ = self._accepted(scaled, high, back_off)
         if controller is None:  # nothing below it holds
             controller = least.replace(C=least.C / unit)
-            norm = _norm(scaled, controller)
+            norm = _loop_norm(scaled, controller)
         _require_finite_gain(scaled, controller, unit * norm)
         return SolvedController(
             controller.A,
@@ -196,7 +196,7 @@ class Riccati(Value):
             gamma = high * (1.0 + step)
             controller = _attempt(problem, gamma).controller
             if controller is not None:
-                norm = _norm(problem, controller)
+                norm = _loop_norm(problem, controller)
                 if norm <= gamma * (1.0 + _SLACK):
                     return controller, norm, number == 0
             step = max(2.0 * step, self.tolerance)
@@ -211,8 +211,8 @@ def quick_answer(problem: Prepared) -> SolvedController:
     """
     regular = Regularised(problem, LEVELS[0]) if missing_ranks(problem) else None
     given = problem if regular is None else regular.problem
-    least = quadratic(given)
-    unit = _seen(given, least)
+    least = h2_controller(given)
+    unit = _resonance_gain(given, least)
     if not np.isfinite(unit):
         raise SolverError("no controller of least quadratic cost stabilises in rounding.")
     scaled, K = given.measured_in(unit), None
@@ -222,7 +222,7 @@ def quick_answer(problem: Prepared) -> SolvedController:
     for _ in range(_GROWTH):
         gamma = high * (1.0 + step)
         K = _attempt(scaled, gamma).controller
-        if K is not None and _seen(scaled, K) <= gamma * (1.0 + _SLACK):
+        if K is not None and _resonance_gain(scaled, K) <= gamma * (1.0 + _SLACK):
             break
         K, step = None, 2.0 * step
     K, gain = (least, 1.0) if K is None else (K, unit)
@@ -270,11 +270,11 @@ def _bound_at(problem: Prepared, omega: float) -> float:
     return float(parrott(P[None], problem.B1.shape[1], problem.C1.shape[0])[0])
 
 
-def _norm(problem: Prepared, controller: StateSpace) -> float:
+def _loop_norm(problem: Prepared, controller: StateSpace) -> float:
     return peak_gain(lft(problem.system, controller))[0]
 
 
-def _seen(problem: Prepared, controller: StateSpace) -> float:
+def _resonance_gain(problem: Prepared, controller: StateSpace) -> float:
     """Return the largest gain of the loop at its resonances: quick, at most its norm."""
     try:
         loop = lft(problem.system, controller)
@@ -292,7 +292,7 @@ def _seen(problem: Prepared, controller: StateSpace) -> float:
 
 def _below(problem: Prepared, controller: StateSpace, gamma: float) -> bool:
     """Return whether the gains of the loop at its resonances are below gamma."""
-    return _seen(problem, controller) <= gamma * (1.0 + _SLACK)
+    return _resonance_gain(problem, controller) <= gamma * (1.0 + _SLACK)
 
 
 def _stable(problem: Prepared, controller: StateSpace, _gamma: float) -> bool:
@@ -326,7 +326,7 @@ def _attempt(problem: Prepared, gamma: float) -> _Attempt:
     speed = float(np.linalg.norm(problem.A)) or 1.0
     sizes = (float(np.linalg.norm(part)) ** 2 / speed for part in (problem.C1, problem.B1))
     # as accurate as X and Y are
-    if any(map(indefinite, (X, Y), sizes)) or coupling > gamma**2 * (1.0 + 1e-5):
+    if any(map(is_indefinite, (X, Y), sizes)) or coupling > gamma**2 * (1.0 + 1e-5):
         return _Attempt(None, True)
     try:
         return _Attempt(central(problem, gamma, X, F, Y, H))

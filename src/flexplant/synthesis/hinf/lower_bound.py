@@ -16,7 +16,7 @@ from ...lti.responses import responses
 from ...lti.roots import axis_zeros
 from ...lti.statespace import StateSpace
 from ...tolerances import divisor
-from .central import indefinite
+from .central import is_indefinite
 
 #: points of the sweep, and times that it is refined
 _POINTS, _REFINEMENTS = 200, 2
@@ -103,11 +103,11 @@ def _bound_at_zeros(
 def parrott(P: ComplexArray | FloatArray, m1: int, p1: int) -> FloatArray:
     """Return the bound of each of a stack of responses (n_freq, p, m)."""
     Pzw = P[:, :p1, :m1]
-    parts = (_beyond(P[:, :p1, m1:], Pzw), _beyond(_adjoint(P[:, p1:, :m1]), _adjoint(Pzw)))
+    parts = (_perp_norms(P[:, :p1, m1:], Pzw), _perp_norms(_adjoint(P[:, p1:, :m1]), _adjoint(Pzw)))
     return np.maximum(*parts)
 
 
-def _beyond(M: ComplexArray | FloatArray, Pzw: ComplexArray | FloatArray) -> FloatArray:
+def _perp_norms(M: ComplexArray | FloatArray, Pzw: ComplexArray | FloatArray) -> FloatArray:
     """Return the norms of Pzw on what is perpendicular to the columns of M.
 
     Its dimension is that of M of full rank: more would hang on rounding.
@@ -167,7 +167,7 @@ class FullInformation(NamedTuple):
             self.A, np.hstack([self.B1, self.B2]), self.C.T @ self.C, R, self.C.T @ D
         )
         speed = float(np.linalg.norm(self.A)) or 1.0
-        if indefinite(X, float(np.linalg.norm(self.C)) ** 2 / speed):
+        if is_indefinite(X, float(np.linalg.norm(self.C)) ** 2 / speed):
             return None
         return np.asarray(self.T @ X @ self.T.T)
 

@@ -18,7 +18,7 @@ from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import RANK, TINY
-from ..robustness.uncertainty_blocks import FullBlock, Place, osborne, places
+from ..robustness.uncertainty_blocks import FullBlock, Place, block_places, osborne
 
 #: G over D of real mu, as a part of the response of a channel at its resonance
 _SHIFT = 0.7
@@ -165,7 +165,7 @@ def _pole(pair: FloatArray) -> tuple[float, float]:
     return omega, zeta
 
 
-def with_channels(weighted: StandardPlant, channels: Sequence[ModeChannel]) -> StandardPlant:
+def with_mode_channels(weighted: StandardPlant, channels: Sequence[ModeChannel]) -> StandardPlant:
     """Return a weighted plant with the channels before its own w and z."""
     g, n, m = weighted.system, weighted.system.n_states, len(channels)
     A, D = la.block_diag(g.A, np.zeros((m, m))), la.block_diag(np.zeros((m, m)), g.D)
@@ -258,7 +258,7 @@ class ModeLoop:
         blocks = [FullBlock(1, 1) for _ in channels]
         if weighted:
             blocks.append(FullBlock(p - m, q - m))
-        return cls(M, np.asarray(shift.imag), places(blocks))
+        return cls(M, np.asarray(shift.imag), block_places(blocks))
 
     def level(self, near: float) -> float:
         """Return beta, the largest over the grid: the Deltas and gains over it are all shown.

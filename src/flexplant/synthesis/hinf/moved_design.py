@@ -45,7 +45,7 @@ def over_positions(
     """
     moving = PlantRange.of(given)
     search = _Search(moving, design)
-    mean = _mean(moving)
+    mean = _mean_plant(moving)
     motion = _MotionChannels(moving, mean)
     with Progress(_MOST, _DESIGNS, progress=progress):
         first = search.tried_with("the mean plant", mean)
@@ -117,8 +117,8 @@ class _Search:
                 "a shorter range, or schedule the design (loop.schedule_loops)."
             )
         K = self.best.system
-        norms = [_norm(one, K) for one in moving.plants]
-        certificate = moving.certified(lambda one: _norm(one, K), norms)
+        norms = [_position_norm(one, K) for one in moving.plants]
+        certificate = moving.certified(lambda one: _position_norm(one, K), norms)
         bounds = [pointwise_bound(prepared(one.system, one.u, one.y)) for one in moving.plants]
         worst = certificate["worst position"]
         return self.best.replace(
@@ -131,7 +131,7 @@ class _Search:
         )
 
 
-def _mean(moving: PlantRange) -> StandardPlant:
+def _mean_plant(moving: PlantRange) -> StandardPlant:
     """Return the plant with the mean matrices."""
     systems = [one.system for one in moving.plants]
     mixed = {m: np.mean([getattr(g, m) for g in systems], axis=0) for m in "ABCD"}
@@ -154,7 +154,7 @@ class _MotionChannels:
                     for t, one in zip(x, moving.plants, strict=True)], axis=0) / power
             for m in "CB"
         )  # fmt: skip
-        self.rows, self.columns = _moved(dC, g.C), _moved(dB.T, g.B.T)
+        self.rows, self.columns = _changed_rows(dC, g.C), _changed_rows(dB.T, g.B.T)
         self.dC, self.dB = dC[self.rows], dB[:, self.columns]
         self.scales = np.ones(self.rows.size + self.columns.size)
 
@@ -199,7 +199,7 @@ class _MotionChannels:
         self.scales = np.where(both, np.sqrt(into / np.where(both, out, 1.0)), 1.0)
 
 
-def _moved(change: FloatArray, rows: FloatArray) -> Any:
+def _changed_rows(change: FloatArray, rows: FloatArray) -> Any:
     """Return which rows change at all, each beside its own size."""
     size = np.abs(change).max(axis=1, initial=0.0)
     return np.flatnonzero(size > _STILL * np.abs(rows).max(axis=1, initial=0.0))
@@ -212,7 +212,7 @@ def _norms(moving: PlantRange, K: StateSpace, least: float) -> list[float]:
     found: list[float] = []
     for one in plants:
         try:
-            found.append(_norm(one, K))
+            found.append(_position_norm(one, K))
         except FlexplantError:
             found.append(np.inf)
         if found[-1] > least:
@@ -220,7 +220,7 @@ def _norms(moving: PlantRange, K: StateSpace, least: float) -> list[float]:
     return found
 
 
-def _norm(plant: StandardPlant, K: StateSpace) -> float:
+def _position_norm(plant: StandardPlant, K: StateSpace) -> float:
     """Return the norm of the loop of one position."""
     loop = lft(plant.system, K)
     if not loop.is_stable:

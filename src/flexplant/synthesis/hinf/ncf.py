@@ -29,7 +29,7 @@ _INTEGRAL = 0.1
 #: claim and margin, and the smallest gamma by two computations, agree to this
 AGREEMENT = 1e-4
 #: smallest gamma of a shaped plant above which its bandwidth is out of reach
-_HOPELESS = 1e3
+_LARGEST_GAMMA = 1e3
 
 
 @one_thread()
@@ -214,7 +214,7 @@ def verified_controller(
         cause = (
             "the shaped plant is too badly conditioned to trust. Bring its gains at u and y to "
             "size 1, and leave out states that are hardly reached or seen"
-            if least < _HOPELESS
+            if least < _LARGEST_GAMMA
             else "no controller has more than a tiny margin. The delay or the resonances allow no "
             "loop of that bandwidth: lower it"
         )
@@ -264,7 +264,7 @@ def continuous(shaped: StateSpace) -> StateSpace:
     return bilinear(shaped, 1.0 / shaped.dt) if shaped.dt else shaped
 
 
-def riccati_solutions(g: StateSpace) -> tuple[FloatArray, FloatArray]:
+def ncf_solutions(g: StateSpace) -> tuple[FloatArray, FloatArray]:
     """Return X and Z of the Riccati equations of control and filtering (the bilinear map's too)."""
     control, estimate = (control_dare, solve_dare) if g.dt else (control_care, solve_care)
     R, S = np.eye(len(g.outputs)) + g.D @ g.D.T, np.eye(len(g.inputs)) + g.D.T @ g.D
@@ -280,7 +280,7 @@ def riccati_solutions(g: StateSpace) -> tuple[FloatArray, FloatArray]:
 
 def _robust(shaped: StateSpace, back_off: float) -> tuple[StateSpace, float, float]:
     """Return the controller of the shaped plant, its gamma, and the smallest gamma."""
-    X, Z = riccati_solutions(shaped)
+    X, Z = ncf_solutions(shaped)
     g = continuous(shaped)
     least = float(np.sqrt(1.0 + np.max(np.linalg.eigvals(X @ Z).real, initial=0.0)))
     gamma = (1.0 + back_off) * least
@@ -335,7 +335,7 @@ def integral_action(shaped: StateSpace, bandwidth: float) -> StateSpace:
 
 def _least_by_factors(shaped: StateSpace) -> float:
     """Return ``(1 - |[N, M]|_H^2)^(-1/2)``, the smallest gamma by a Hankel norm."""
-    _, Z = riccati_solutions(shaped)
+    _, Z = ncf_solutions(shaped)
     g = continuous(shaped)
     R = np.eye(len(g.outputs)) + g.D @ g.D.T
     H = -np.linalg.solve(R, (g.B @ g.D.T + Z @ g.C.T).T).T

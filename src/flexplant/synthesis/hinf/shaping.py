@@ -29,8 +29,8 @@ from .ncf import (
     continuous,
     integral_action,
     loop_margin,
+    ncf_solutions,
     require_model,
-    riccati_solutions,
     verified_controller,
 )
 
@@ -166,7 +166,7 @@ def shape_loop(
     for _ in range(_STEPS):
         shaping = _shaping(axes, freq, rolloff)
         shaped = series(shaping, axes.plant)
-        found = _designed(shaped, T_ref, rho, back_off)
+        found = _shaped_controller(shaped, T_ref, rho, back_off)
         K = series(found.K, shaping)
         inner = K.select(inputs=K.inputs[-len(axes.names) :])
         inner = inner.replace(inputs=axes.names, outputs=axes.before.inputs)
@@ -228,7 +228,7 @@ class _Designed:
     certificate: dict[str, float]
 
 
-def _designed(
+def _shaped_controller(
     shaped: StateSpace, model: StateSpace | None, rho: float, back_off: float
 ) -> _Designed:
     """Return the controller with one degree of freedom, or with two where there is a model."""
@@ -299,18 +299,18 @@ def following(shaped: StateSpace, model: StateSpace, weight: float) -> tuple[Sta
             f"{model!r}. Pass low-passes of the loop's bandwidth, one for each axis."
         )
     part = minimal(shaped)
-    _, Z = riccati_solutions(part)
+    _, Z = ncf_solutions(part)
     g = continuous(part)
     values, vectors = np.linalg.eigh(np.eye(p) + g.D @ g.D.T)
     root, inverse = ((vectors * values**e) @ vectors.T for e in (0.5, -0.5))
-    P = _problem(g, model, Z, root, inverse, weight)
+    P = _two_degrees(g, model, Z, root, inverse, weight)
     found = design_hinf(P, u=P.inputs[-m:], y=P.outputs[-2 * p :])
     K = tustin(found.system, 1.0 / shaped.dt) if shaped.dt else found.system
     W = la.block_diag(_scaling(shaped, model, K), np.eye(p))
     return K.replace(B=K.B @ W, D=K.D @ W), float(found.gamma or np.nan)
 
 
-def _problem(
+def _two_degrees(
     g: StateSpace,
     model: StateSpace,
     Z: FloatArray,

@@ -58,11 +58,11 @@ def require_ranks(lacking: Sequence[str]) -> None:
     if lacking:
         raise AssumptionError(
             f"{'; '.join(lacking)}, and nothing may be added (regularised=False). "
-            f"{_cure(lacking)} Or use Lmi(), which needs no rank."
+            f"{_remedy(lacking)} Or use Lmi(), which needs no rank."
         )
 
 
-def _cure(lacking: Sequence[str]) -> str:
+def _remedy(lacking: Sequence[str]) -> str:
     """Return what to do about what is lacking, that of D21 where only it lacks rank."""
     effort, noise = (any(one.startswith(name) for one in lacking) for name in ("D12", "D21"))
     cures = ["weight the efforts in z"] * (effort or not noise)
@@ -183,7 +183,7 @@ def _require_positive_infimum(
         f"{found[0].level:.0e} to {found[least].level:.0e} added, {gammas[0]:.3g} to "
         f"{gammas[-1]:.3g} are reached by ever larger gains, with which u "
         f"({', '.join(problem.u)}) cancels w in z at no cost. {'; '.join(lacking)}. "
-        f"{_cure(lacking)}"
+        f"{_remedy(lacking)}"
     )
 
 
@@ -211,7 +211,7 @@ def _with_notes(
         notes.append(
             "the smallest gamma is approached by infinite gain only: the controller's fastest pole "
             f"lies at {problem.speed * one.speed:.3g} rad/s and moves on as the added noise falls. "
-            f"{_cure(lacking)[:-1]} to get a slower one."
+            f"{_remedy(lacking)[:-1]} to get a slower one."
         )
     certificate = {ADDED: one.level}
     if finer is not one:

@@ -308,7 +308,7 @@ class _StageTask:
         best, drawn = self.best, self.best.drawn
         options: dict[str, Any] = {"damped_below": best.damped_below}
         found = tolerant(best.weighted, self.uncertain, **options, solved=best.solved)
-        if not _same(found.system, best.system):
+        if not _same_controller(found.system, best.system):
             # a better answer than that of one Riccati method: it must hold as well
             margin, drawn = self._judged(found.system)
             if margin < self.margin or drawn < _KEPT * self.margin:
@@ -351,7 +351,7 @@ class _Drawn:
             yield one
 
 
-def _same(one: StateSpace, other: StateSpace | None) -> bool:
+def _same_controller(one: StateSpace, other: StateSpace | None) -> bool:
     """Return whether two controllers are the same numbers."""
     return other is not None and all(
         np.array_equal(getattr(one, m), getattr(other, m)) for m in "ABCD"

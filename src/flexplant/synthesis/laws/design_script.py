@@ -59,7 +59,7 @@ def _call(value: Value, depth: int) -> str:
     """Return the constructor's call of a value, with what is not its default."""
     kind = type(value).__name__
     name = f"fx.{kind}" if isinstance(value, StateSpace) else kind
-    parts = [f"{key}={literal(one)}" for key, one in _given(value)]
+    parts = [f"{key}={literal(one)}" for key, one in _fields_given(value)]
     if not depth:
         return f"{name}({', '.join(parts)})"
     elements = getattr(value, "elements", ())
@@ -69,7 +69,7 @@ def _call(value: Value, depth: int) -> str:
     return f"{name}(\n        {', '.join([listed, *rest])},\n    )"
 
 
-def _given(value: Value) -> Iterable[tuple[str, Any]]:
+def _fields_given(value: Value) -> Iterable[tuple[str, Any]]:
     for one in fields(value):  # type: ignore[arg-type]
         item = getattr(value, one.name)
         if one.name == "on" and all(item):

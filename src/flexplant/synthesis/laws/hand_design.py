@@ -175,8 +175,8 @@ class LoopDesign(Value):
                 given = ShapedAxis(axis)  # type: ignore[arg-type]
             found[str(name)] = instance(given, ShapedAxis, f"axis {name!r}", "Pass a ShapedAxis.")
         names = tuple(found)
-        before = static_map(self.before, _channels(self.before, "outputs", names, "u"), "before")
-        after = static_map(self.after, _channels(self.after, "inputs", names, "y"), "after")
+        before = static_map(self.before, _at_plant(self.before, "outputs", names, "u"), "before")
+        after = static_map(self.after, _at_plant(self.after, "inputs", names, "y"), "after")
         if self.after is None or isinstance(self.after, np.ndarray | list | tuple):
             after = after.replace(outputs=names)
         if tuple(after.outputs) != names or len(before.inputs) != len(names):
@@ -411,7 +411,7 @@ class LoopDesign(Value):
         return design_script(self, str(plant))
 
 
-def _channels(given: Any, side: str, names: tuple[str, ...], prefix: str) -> tuple[str, ...]:
+def _at_plant(given: Any, side: str, names: tuple[str, ...], prefix: str) -> tuple[str, ...]:
     """Return the channels at the plant of a transformation that may be a matrix or none."""
     if isinstance(given, StateSpace):
         return tuple(getattr(given, side))

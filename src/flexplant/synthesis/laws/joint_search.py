@@ -15,7 +15,7 @@ from ...loop.report import nyquist_count
 from ...lti.frequency import Frf
 from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ...lti.interconnection import loop_poles
-from ...lti.joining import stacked
+from ...lti.joining import block_matrix
 from ...lti.measured_lines import hidden_modes
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace
@@ -104,7 +104,7 @@ class JointPlant:
         """Return the largest |S| of a stable loop, the grid refined at its peaks."""
 
         def sizes(freq: FloatArray) -> FloatArray:
-            return 1.0 / self.coupling(freq).distances(_gains(laws, freq))
+            return 1.0 / self.coupling(freq).distances(_law_gains(laws, freq))
 
         rounds = 0 if isinstance(self.plant, Frf) else _REFINEMENTS
         size, freq = highest(lambda f: sizes(f).max(axis=0), self._closed_grid(laws), rounds)
@@ -117,7 +117,7 @@ class JointPlant:
         A mode is as narrow as its damping, and the loop moves it off the grid of the plant.
         """
         grid = self._closed_grid(laws)
-        least = self.coupling(grid).distances(_gains(laws, grid)).min(axis=0)
+        least = self.coupling(grid).distances(_law_gains(laws, grid)).min(axis=0)
         return np.asarray(grid[least * size < 1.0])
 
     def _closed_grid(self, laws: Sequence[Law]) -> FloatArray:
@@ -131,14 +131,14 @@ class JointPlant:
     def _poles(self, laws: Sequence[Law]) -> ComplexArray:
         assert isinstance(self.plant, StateSpace)  # noqa: S101 - an Frf has no poles
         parts = [law.system for law in laws]
-        A, B, C, D = (stacked([getattr(one, part) for one in parts]) for part in "ABCD")
+        A, B, C, D = (block_matrix([getattr(one, part) for one in parts]) for part in "ABCD")
         K = StateSpace(
             A, -B @ self.after, self.before @ C, -self.before @ D @ self.after, self.plant.dt
         )
         return loop_poles(self.plant, K)
 
 
-def _gains(laws: Sequence[Law], freq: FloatArray) -> ComplexArray:
+def _law_gains(laws: Sequence[Law], freq: FloatArray) -> ComplexArray:
     return np.stack([law.at(freq) for law in laws], axis=-1)
 
 
@@ -323,7 +323,7 @@ class JointSearch:
                 # second-order correction: the bounds are curved, and steps along them short
                 bent = program.at(found) - program.slopes @ step
                 step = program.step(bent, radius)[0]
-            if gained > 0.1 * expected and all(map(_alike, couplings, gains, there)):
+            if gained > 0.1 * expected and all(map(_same_winding, couplings, gains, there)):
                 x, gains, rooms, lowest = x + step, there, found, low
                 radius *= 2.0 if gained > 0.7 * expected and radius < _RADIUS else 1.0
             else:
@@ -444,7 +444,7 @@ def _critical(room: FloatArray) -> IntArray:
     return np.unique(near[(near >= 0) & (near < room.size)])
 
 
-def _alike(one: Coupling, before: ComplexArray, after: ComplexArray) -> bool:
+def _same_winding(one: Coupling, before: ComplexArray, after: ComplexArray) -> bool:
     """Return whether ``det(I + P C)`` of two laws with the same unstable poles turns as often."""
     ratio = one.turns(after) / one.turns(before)
     return bool(abs(np.sum(np.angle(ratio[1:] / ratio[:-1]))) < 0.5 * np.pi)

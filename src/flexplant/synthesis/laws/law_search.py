@@ -102,7 +102,7 @@ class LawSearch:
         """Return the step of the linear program, and the gain that it predicts."""
         from scipy.optimize import linprog
 
-        rows = _critical(room)
+        rows = _critical_points(room)
         low, high, limits, most = self.of.limits(x)
         none = np.zeros((most.size, 1))
         answer = linprog(
@@ -188,7 +188,7 @@ def lowest_of(room: FloatArray) -> IntArray:
     return np.asarray(places[np.argsort(room[places], kind="stable")])
 
 
-def _critical(room: FloatArray) -> IntArray:
+def _critical_points(room: FloatArray) -> IntArray:
     """Return the points that count in a step: local minima, and the valleys about the lowest."""
     least = lowest_of(room)[:_POINTS]
     least = least[room[least] < room[least[0]] + _REACH]
@@ -217,11 +217,11 @@ def starts(of: AxisLaw, notches: int) -> list[FloatArray]:
     """Return numbers near the highest bandwidths, with and without notches at the modes."""
     if not of.lowest < of.highest:
         return []
-    rows = _rows(of)
+    rows = _axis_points(of)
     sets = _sets(of, notches)
     found: list[list[_Start]] = [[] for _ in sets]
     for w in np.geomspace(of.highest, of.lowest, _TRIALS).tolist():
-        for own, start in zip(found, _at(of, w, sets, rows), strict=True):
+        for own, start in zip(found, _best_starts(of, w, sets, rows), strict=True):
             # far enough from the last of the same notches to end elsewhere
             apart = not own or start.score < own[-1].score - _APART
             if np.isfinite(start.score) and len(own) < _EACH and apart:
@@ -246,7 +246,7 @@ def _sets(of: AxisLaw, notches: int) -> list[FloatArray]:
     return [np.log([one for one in chosen if one]).reshape(-1) for chosen in every(*each)]
 
 
-def _at(of: AxisLaw, w: float, sets: list[FloatArray], rows: IntArray) -> list[_Start]:
+def _best_starts(of: AxisLaw, w: float, sets: list[FloatArray], rows: IntArray) -> list[_Start]:
     """Return for each set of notches the best start at one bandwidth [Hz]."""
     top, s = of.axis.ceiling, np.append(of.s[rows], tustin_s(np.array([w]), of.axis.rate))
     shapes = sorted({(a, min(b, top / w), min(c, top / w)) for a, b in _LEADS for c in _TAILS})
@@ -275,7 +275,7 @@ def _turns_stably(L: ComplexArray, at_zero: int) -> npt.NDArray[np.bool_]:
     return np.asarray(np.abs(low + turned - last - 0.5 * np.pi * at_zero) < 0.5 * np.pi)
 
 
-def _rows(of: AxisLaw) -> IntArray:
+def _axis_points(of: AxisLaw) -> IntArray:
     """Return points that show the axis: even ones, and those around its modes."""
     freq = of.axis.points[0]
     even = np.searchsorted(freq, np.geomspace(freq[0], freq[-1], _GRID_POINTS))

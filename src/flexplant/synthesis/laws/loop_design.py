@@ -204,14 +204,14 @@ def design_loops(
     found = made(axes, checked_laws(axes, laws), rigid, unstable, references, larger)
     if found.report.is_stable is False:
         warn(
-            f"the loops are unstable ({found.report.poles}){_where(axes, found)}. Check sign "
+            f"the loops are unstable ({found.report.poles}){_unstable_at(axes, found)}. Check sign "
             "and unit of the laws against the crossovers, notch what resonates there, add "
             "lead, or change the gain."
         )
     return found
 
 
-def _where(axes: Axes, found: DesignedLoops) -> str:
+def _unstable_at(axes: Axes, found: DesignedLoops) -> str:
     """Return where a loop is unstable: the frequencies of a model's poles, lines of an Frf."""
     if isinstance(axes.plant, Frf):
         closest = min(found.report.loops, key=lambda loop: loop.modulus_margin)

@@ -104,8 +104,8 @@ def tune_loops(
         rigid = len(axes.names) if measured else _free_modes(axes.plant)
     rigid = whole(rigid, "rigid", minimum=0)
     most = whole(notches, "notches", minimum=0)
-    plants = _plants(plant, axes, rigid, larger, {"rate": rate, "delay": delay, "hold": hold})
-    tuner = _Tuner(axes, _response(plants[-1], axes), float(peak), rigid, most)
+    plants = _joint_plants(plant, axes, rigid, larger, {"rate": rate, "delay": delay, "hold": hold})
+    tuner = _Tuner(axes, _axes_response(plants[-1], axes), float(peak), rigid, most)
     with Progress(len(axes.names), "axes", progress=progress) as bar:
         alone = tuner.each_alone(bar)
     reached = _together(alone, plants, float(peak))
@@ -170,7 +170,7 @@ class _Tuner:
         return MeasuredAxis(self.axes.names[i], self.frf.freq, G, self.axes.rate, free, variance)
 
 
-def _plants(
+def _joint_plants(
     plant: Any, axes: Axes, rigid: int, larger: Any, measured: Mapping[str, Any]
 ) -> list[JointPlant]:
     """Return the plant in its own channels, and the one with the modes left out where known."""
@@ -197,7 +197,7 @@ def _free_modes(plant: StateSpace) -> int:
     return int(np.count_nonzero(distance <= _ZERO * np.max(distance, initial=0.0))) // 2
 
 
-def _response(plant: JointPlant, axes: Axes) -> Frf:
+def _axes_response(plant: JointPlant, axes: Axes) -> Frf:
     """Return the response in the axes: that measured, or of a model through its resonances."""
     if isinstance(axes.plant, Frf):
         return axes.plant

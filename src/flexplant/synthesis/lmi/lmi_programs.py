@@ -330,7 +330,7 @@ class Lmi(Value):
                     count()
             except (SolverError, InfeasibleError) as error:
                 failures.append(error)
-            if found and _settled(_tightest(found)):
+            if found and _is_close(_tightest(found)):
                 break
         if not found:
             # a proof of infeasibility says more than a solver that stopped
@@ -345,7 +345,7 @@ class Lmi(Value):
         for number in range(_ROUNDS):
             one = smallest_gamma(states.scaled(scale), scale, settings)
             yield one
-            if _settled(one) or (number and one.value > 0.99 * scale):
+            if _is_close(one) or (number and one.value > 0.99 * scale):
                 return
             states, scale = one.plant.scaled(1.0 / one.value), one.value
 
@@ -354,6 +354,6 @@ def _tightest(found: list[Optimum]) -> Optimum:
     return min(found, key=lambda one: one.value - one.lower)
 
 
-def _settled(one: Optimum) -> bool:
+def _is_close(one: Optimum) -> bool:
     """Whether the bound is close, in a scale that resolves it."""
     return one.value - one.lower <= _GAP * one.value and one.value > 0.03 * one.scale

@@ -118,10 +118,10 @@ def design_lmi(
     True
     """
     given = standard_plant(plant)
-    _checked(given, minimize, subject_to, whole(max_states, "max_states"))
+    _check_specifications(given, minimize, subject_to, whole(max_states, "max_states"))
     require_stabilisable(given, prepared(given.system, given.u, given.y), "synthesis by LMIs")
     require_reachable(given, subject_to)
-    scaled = _prepared(given)
+    scaled = _balanced_plant(given)
     problem = ObjectivePrograms(given, scaled, minimize, tuple(subject_to))
     claim, rate = _best_rate(problem)
     failures: list[Exception] = []
@@ -130,7 +130,7 @@ def design_lmi(
         bound = factor * claim
         try:
             K = problem.controller(bound, rate)
-            reached = _verified(given, K, minimize, subject_to)
+            reached = _verified_values(given, K, minimize, subject_to)
         except (SolverError, CertificateError, InfeasibleError, np.linalg.LinAlgError) as error:
             failures.append(error)
             continue
@@ -148,7 +148,7 @@ def design_lmi(
     )
 
 
-def _checked(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) -> None:
+def _check_specifications(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) -> None:
     """Refuse specifications that do not fit."""
     if not isinstance(minimize, _KINDS) or minimize.below is not None:
         raise ModelError(
@@ -182,7 +182,7 @@ def _checked(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) ->
         )
 
 
-def _prepared(plant: StandardPlant) -> Plant:
+def _balanced_plant(plant: StandardPlant) -> Plant:
     """Return the plant in balanced states and units of its own, its w and z as they are."""
     g = plant.system
     d = state_scale(g.A, g.B, g.C)
@@ -243,7 +243,7 @@ def _best_rate(problem: ObjectivePrograms) -> tuple[float, float]:
     return values[best], best
 
 
-def _verified(
+def _verified_values(
     plant: StandardPlant, K: StateSpace, minimize: Any, subject_to: Sequence[Any]
 ) -> dict[str, float]:
     """Return what every objective reaches, computed from the closed loop."""

@@ -13,7 +13,7 @@ from ...lti.responses import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
 from ...tolerances import TINY
-from ..structured.judges import GainJudge, H2Judge, Judge, PeakJudge, require_finite_h2, selected
+from ..structured.judges import GainJudge, H2Judge, Judge, PeakJudge, problem_on, require_finite_h2
 
 #: samples of an impulse response that are computed together, and at most
 _TOGETHER, _LONGEST = 256, 4e6
@@ -66,7 +66,7 @@ class H2(_ChannelNorm):
         """Return what finds the norm for controllers of an order."""
         w, z = self.chosen(plant)
         require_finite_h2(plant, w, z)
-        return [H2Judge(selected(plant, w, z), order)]
+        return [H2Judge(problem_on(plant, w, z), order)]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -91,7 +91,7 @@ class Hinf(_ChannelNorm):
 
     def judges(self, plant: StandardPlant, order: int) -> list[Judge]:
         """Return what finds the norm for controllers of an order."""
-        return [GainJudge(selected(plant, *self.chosen(plant)), order)]
+        return [GainJudge(problem_on(plant, *self.chosen(plant)), order)]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -124,7 +124,7 @@ class PeakGain(_ChannelNorm):
     def judges(self, plant: StandardPlant, order: int) -> list[Judge]:
         """Return what finds the sum of each channel for controllers of an order."""
         w, z = self.chosen(plant)
-        return [PeakJudge(selected(plant, [i], [o]), order) for i in w for o in z]
+        return [PeakJudge(problem_on(plant, [i], [o]), order) for i in w for o in z]
 
 
 @dataclass(frozen=True, eq=False)

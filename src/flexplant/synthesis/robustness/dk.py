@@ -21,7 +21,7 @@ from ..hinf.hinf_design import design_hinf
 from .mode_dk import by_mode_channels
 from .sweep import covered
 from .uncertain_loop import OpenPlant, UncertainLoop, open_plant, require_uncertain, uncertain_loop
-from .uncertainty_blocks import FullBlock, Scalings, osborne, places
+from .uncertainty_blocks import FullBlock, Scalings, block_places, osborne
 from .upper import upper_level
 
 #: frequencies at which D is found
@@ -121,8 +121,8 @@ def design_mu(
         for number in range(most + 1):
             bar.advance(int(number > 0))
             try:
-                K = _designed(plant, scales, method, nominal=not number)
-                step = _judged(uncertain, K, w, z)
+                K = _scaled_controller(plant, scales, method, nominal=not number)
+                step = _robust_step(uncertain, K, w, z)
             except FlexplantError as error:
                 failure = error
                 if number or not isinstance(error, AssumptionError | SolverError):
@@ -159,7 +159,7 @@ class _DFilters(NamedTuple):
         """Return ones, and the weights of neglected modes by few states."""
         n = sum(block.z for block in plant.blocks)
         m = sum(block.w for block in plant.blocks)
-        omega = _grid(plant.system)
+        omega = _fit_grid(plant.system)
         tall = np.array([plant.heights(one, one) for one in omega])[:, :m]
         return cls(
             tuple(StateSpace([], [], [], [[1.0]]) for _ in range(n)),
@@ -167,13 +167,13 @@ class _DFilters(NamedTuple):
         )
 
 
-def _grid(g: StateSpace) -> FloatArray:
+def _fit_grid(g: StateSpace) -> FloatArray:
     """Return frequencies [rad/s] over which D is fitted."""
     grid = resonance_grid(g.poles(), 0.0, points=200)
     return 2 * np.pi * np.geomspace(grid[0], grid[-1], _POINTS)
 
 
-def _designed(
+def _scaled_controller(
     plant: OpenPlant, scales: _DFilters, method: SynthesisMethod | None, *, nominal: bool
 ) -> StateSpace:
     """Return the H-infinity controller of the scaled plant, sampled like the plant."""
@@ -190,7 +190,7 @@ def _designed(
     return tustin(K, 1.0 / plant.dt) if plant.dt else K
 
 
-def _judged(uncertain: UncertainPlant[Any], K: StateSpace, w: Any, z: Any) -> _DkStep:
+def _robust_step(uncertain: UncertainPlant[Any], K: StateSpace, w: Any, z: Any) -> _DkStep:
     """Return mu of robust performance of a controller, real Deltas real."""
     loop = uncertain_loop(uncertain, [K], w=w, z=z)
     blocks = [*loop.blocks, loop.performance]
@@ -201,8 +201,8 @@ def _judged(uncertain: UncertainPlant[Any], K: StateSpace, w: Any, z: Any) -> _D
 def _scales_of(plant: OpenPlant, loop: UncertainLoop, order: int) -> _DFilters:
     """Return D of a loop as filters: one for each block, its Delta taken as complex."""
     blocks = [FullBlock(block.w, block.z) for block in (*loop.blocks, loop.performance)]
-    scalings, where = Scalings(blocks), places(blocks)
-    omega = _grid(loop.system)
+    scalings, where = Scalings(blocks), block_places(blocks)
+    omega = _fit_grid(loop.system)
     rows = []
     for one in omega:
         M = loop.system.evaluated(1j * one) * loop.heights(one, one)
@@ -258,7 +258,7 @@ def fitted_magnitude(omega: FloatArray, size: FloatArray, order: int) -> StateSp
         start = np.concatenate([[goal.mean()], corners[::2], corners[1::2]])
         best = least_squares(error, start, max_nfev=200)
         a, b = np.exp(best.x[1 : count + 1]), np.exp(best.x[count + 1 :])
-        found = _product(float(np.exp(best.x[0])), a, b)
+        found = _scaled_series(float(np.exp(best.x[0])), a, b)
         if np.std(best.fun) < _CLOSE:
             break
     return found
@@ -270,7 +270,7 @@ def inverse(g: StateSpace) -> StateSpace:
     return g.replace(A=g.A - d * g.B @ g.C, B=d * g.B, C=-d * g.C, D=[[d]])
 
 
-def _product(k: float, a: FloatArray, b: FloatArray) -> StateSpace:
+def _scaled_series(k: float, a: FloatArray, b: FloatArray) -> StateSpace:
     """Return the factors in series, the gain in the last."""
     g = StateSpace([], [], [], [[k]])
     for zero, pole in zip(a, b, strict=True):

@@ -18,8 +18,8 @@ from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from .lower import power_iteration
 from .sweep import INTERVALS, Covered, covered
-from .uncertain_loop import UncertainLoop, machine, neglected_delta, uncertain_loop, values_of
-from .uncertainty_blocks import Perturbation, matrix_of, places
+from .uncertain_loop import UncertainLoop, machine_at, neglected_delta, uncertain_loop, values_of
+from .uncertainty_blocks import Perturbation, block_places, matrix_of
 
 #: frequencies that start a search, starts at each, rounds over all real Deltas
 _SOUGHT, _STARTS, _ROUNDS = 5, 3, 3
@@ -158,7 +158,7 @@ def worst_case_gain(
         )
     upper = size * float(np.sqrt(found.level))
     candidates = _candidates(loop, M, listed, found, chance)
-    reached = [_reached(loop, one) for one in candidates]
+    reached = [_machine_gain(loop, one) for one in candidates]
     lower, freq, values, made = max(reached, key=lambda one: one[0])
     if not lower <= upper * (1.0 + 1e-2):
         raise CertificateError(
@@ -187,12 +187,12 @@ def _in_units(M: StateSpace, size: float, p: int) -> StateSpace:
     return M.replace(C=unit * M.C, D=unit * M.D)
 
 
-def _reached(
+def _machine_gain(
     loop: UncertainLoop, one: Perturbation
 ) -> tuple[float, float, dict[str, float], StandardPlant]:
     """Return the gain of the machine of a perturbation, where it is, its Deltas, and itself."""
     values = values_of(loop, one, 1.0)
-    made = machine(loop, values, neglected_delta(loop, one, 1.0))
+    made = machine_at(loop, values, neglected_delta(loop, one, 1.0))
     closed = _performance(loop, made)
     if not loop.neglected_w:
         gain, freq = peak_gain(closed)
@@ -220,7 +220,7 @@ def _candidates(
     rng: np.random.Generator,
 ) -> list[Perturbation]:
     """Return perturbations of size one that are bad at some frequency, the worst first."""
-    where = places(listed)
+    where = block_places(listed)
     chosen = [float(found.omega)]
     for omega in found.frequencies[np.argsort(-found.bounds)]:
         if len(chosen) < _SOUGHT and all(abs(omega - one) > 1e-2 * one for one in chosen):
@@ -234,17 +234,17 @@ def _candidates(
         skewed[where[-1].z] /= np.sqrt(found.level)
         for _ in range(_STARTS):
             one = power_iteration(skewed, where, rng, omega)
-            results.append(_ascended(gains, where, one))
+            results.append(_corner_gain(gains, where, one))
     results.sort(key=lambda pair: -pair[0])
     return [one for _, one in results[:2]]
 
 
-def _ascended(
+def _corner_gain(
     gains: ComplexArray, where: list[Any], one: Perturbation
 ) -> tuple[float, Perturbation]:
     """Return the largest gain in a band, real Deltas moved one after the other to an end or 0."""
     one = one._replace(vectors=one.vectors[:-1])
-    best = _gain(gains, where, one)
+    best = _perturbed_gain(gains, where, one)
     for _ in range(_ROUNDS):
         before = best
         for i, number in enumerate(one.scalars):
@@ -253,7 +253,7 @@ def _ascended(
                     continue
                 scalars = (*one.scalars[:i], complex(value), *one.scalars[i + 1 :])
                 moved = one._replace(scalars=scalars)
-                gain = _gain(gains, where, moved)
+                gain = _perturbed_gain(gains, where, moved)
                 if gain > best:
                     best, one = gain, moved
         if best <= before * (1.0 + 1e-4):
@@ -261,7 +261,7 @@ def _ascended(
     return best, one
 
 
-def _gain(gains: ComplexArray, where: list[Any], one: Perturbation) -> float:
+def _perturbed_gain(gains: ComplexArray, where: list[Any], one: Perturbation) -> float:
     """Return the largest gain over a band of the loop with a perturbation."""
     performance = where[-1]
     delta = matrix_of(one, where[:-1])

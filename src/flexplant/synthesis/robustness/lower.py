@@ -18,9 +18,9 @@ from .uncertainty_blocks import (
     Perturbation,
     Place,
     RepeatedScalar,
+    block_places,
     matrix_of,
-    places,
-    realised,
+    realised_delta,
 )
 
 #: steps of a power iteration; change at which it has settled
@@ -48,41 +48,41 @@ def power_iteration(
     [Young1990]_; [PackardDoyle1993]_.
     """
     n = M.shape[1]
-    b, w = (_unit(_drawn(rng, n)) for _ in range(2))
+    b, w = (_unit_vector(_random_complex(rng, n)) for _ in range(2))
     q = {i: 1.0 + 0j for i, p in enumerate(where) if isinstance(p.block, RepeatedScalar)}
     old, a = b, M @ b
     for _ in range(_STEPS):
         a = M @ b
         if not np.any(a):
             break
-        a = _unit(a)
+        a = _unit_vector(a)
         left = np.zeros(M.shape[0], dtype=np.complex128)
         for i, p in enumerate(where):
-            left[p.z] = _left(p, q, i, a, b, w)
+            left[p.z] = _next_left(p, q, i, a, b, w)
         w = M.conj().T @ left
         if not np.any(w):
             break
-        w = _unit(w)
+        w = _unit_vector(w)
         b = np.zeros(n, dtype=np.complex128)
         for i, p in enumerate(where):
             b[p.w] = _right(p, q, i, a, old, w)
-        b = _unit(b)
+        b = _unit_vector(b)
         if la.norm(b - old) < _SETTLED:
             break
         old = b
     full = [p for p in where if isinstance(p.block, FullBlock)]
-    vectors = [(_unit(a[p.z]), _unit(w[p.w])) for p in full]
+    vectors = [(_unit_vector(a[p.z]), _unit_vector(w[p.w])) for p in full]
     return Perturbation(tuple(q.values()), tuple(vectors), omega)
 
 
-def _left(
+def _next_left(
     p: Place, q: dict[int, complex], i: int, a: ComplexArray, b: ComplexArray, w: ComplexArray
 ) -> ComplexArray:
     """Return the block of the next left vector."""
     if isinstance(p.block, FullBlock):
         return np.asarray(a[p.z] * (la.norm(w[p.w]) / max(la.norm(a[p.z]), TINY)))
     if p.block.real:
-        q[i] = _real(q[i].real, a[p.z], b[p.w], w[p.w])
+        q[i] = _real_scalar(q[i].real, a[p.z], b[p.w], w[p.w])
         return np.asarray(q[i] * w[p.w])
     inner = np.vdot(w[p.w], a[p.z])
     return np.asarray(inner / (abs(inner) or 1.0) * w[p.w])
@@ -95,25 +95,25 @@ def _right(
     if isinstance(p.block, FullBlock):
         return np.asarray(w[p.w] * (la.norm(a[p.z]) / max(la.norm(w[p.w]), TINY)))
     if p.block.real:
-        q[i] = _real(q[i].real, a[p.z], b[p.w], w[p.w])
+        q[i] = _real_scalar(q[i].real, a[p.z], b[p.w], w[p.w])
         return np.asarray(q[i] * a[p.z])
     inner = np.vdot(a[p.z], w[p.w])
     q[i] = complex(inner / (abs(inner) or 1.0))
     return np.asarray(q[i] * a[p.z])
 
 
-def _real(q: float, a: ComplexArray, b: ComplexArray, w: ComplexArray) -> float:
+def _real_scalar(q: float, a: ComplexArray, b: ComplexArray, w: ComplexArray) -> float:
     """Return the next number of a real scalar, on its interval."""
     sign = 1.0 if q >= 0 else -1.0
     moved = sign * la.norm(b) / max(la.norm(a), TINY) + float(np.vdot(a, w).real)
     return float(np.clip(moved, -1.0, 1.0))
 
 
-def _drawn(rng: np.random.Generator, n: int) -> ComplexArray:
+def _random_complex(rng: np.random.Generator, n: int) -> ComplexArray:
     return np.asarray(rng.standard_normal(n) + 1j * rng.standard_normal(n))
 
 
-def _unit(v: ComplexArray) -> ComplexArray:
+def _unit_vector(v: ComplexArray) -> ComplexArray:
     size = la.norm(v)
     if not size > 0:
         v = np.zeros_like(v)
@@ -141,13 +141,13 @@ def smallest_multiple(
 
     The loop's eigenvalues decide: on the size before it is stable, on this one it is not.
     """
-    delta = realised(found, blocks)
+    delta = realised_delta(found, blocks)
     ladder = least * _LADDER
     if most < ladder[-1]:  # one loop decides whether this perturbation is worse than the best
         ladder = np.array([most])
     stable, unstable = 0.0, np.inf
     for t in ladder:
-        if _growth(M, delta, t)[0] >= 0:
+        if _abscissa(M, delta, t)[0] >= 0:
             unstable = float(t)
             break
         stable = float(t)
@@ -156,11 +156,11 @@ def smallest_multiple(
     stable = max(stable, 0.99 * least)
     while unstable - stable > _FINE * unstable:
         middle = 0.5 * (stable + unstable)
-        if _growth(M, delta, middle)[0] >= 0:
+        if _abscissa(M, delta, middle)[0] >= 0:
             unstable = middle
         else:
             stable = middle
-    return Destabilising(unstable, found, _growth(M, delta, unstable)[1])
+    return Destabilising(unstable, found, _abscissa(M, delta, unstable)[1])
 
 
 def crossing_multiple(
@@ -274,7 +274,7 @@ def loop_matrix(M: StateSpace, delta: StateSpace, t: float) -> FloatArray:
     ])  # fmt: skip
 
 
-def _growth(M: StateSpace, delta: StateSpace, t: float) -> tuple[float, float]:
+def _abscissa(M: StateSpace, delta: StateSpace, t: float) -> tuple[float, float]:
     """Return the largest real part of the loop, and the frequency [rad/s] of that pole."""
     poles = la.eigvals(loop_matrix(M, delta, t))
     worst = int(np.argmax(poles.real))
@@ -288,7 +288,7 @@ def worse_signs(
 
     The pole with the largest real part, or the one near some value. None where nothing changes.
     """
-    delta = realised(one.found, blocks)
+    delta = realised_delta(one.found, blocks)
     A = loop_matrix(M, delta, one.size)
     eigen: Any = la.eig(A, left=True, right=True)
     values, left, right = eigen
@@ -303,7 +303,7 @@ def worse_signs(
     into = into + own_l[n:].conj() @ delta.B @ back @ M.D
     scalars = []
     numbers = iter(one.found.scalars)
-    for p in places(blocks):
+    for p in block_places(blocks):
         if isinstance(p.block, FullBlock):
             continue
         number = next(numbers)
@@ -323,7 +323,7 @@ def destabilising(
     rng: np.random.Generator,
 ) -> Destabilising | None:
     """Return the smallest perturbation found that makes a loop unstable."""
-    where = places(blocks)
+    where = block_places(blocks)
     least = 1.0 / max(level, TINY)
     best: Destabilising | None = None
     for omega in omegas:
@@ -332,7 +332,7 @@ def destabilising(
         first = Destabilising(0.0, starts[0], omega)
         signs = worse_signs(M, blocks, first, near=1j * omega)
         for start in [*starts, *([] if signs is None else [signs])]:
-            best = _ascended(M, blocks, start, least, best)
+            best = _worse_signs(M, blocks, start, least, best)
             if best is not None and best.size < 1.001 * least:
                 return best
     return _at_corners(M, blocks, least, best)
@@ -354,9 +354,9 @@ def _at_corners(
     ]
     for corner in corners:
         most = 100.0 * least if best is None else best.size * (1 - 1e-6)
-        delta = realised(corner, blocks)
+        delta = realised_delta(corner, blocks)
         for t in np.geomspace(least, most, _LOOPS // len(corners) + 1)[1:].tolist():
-            if _growth(M, delta, t)[0] >= 0:
+            if _abscissa(M, delta, t)[0] >= 0:
                 found = smallest_multiple(M, blocks, corner, least, t)
                 if found is not None and (best is None or found.size < best.size):
                     best = found
@@ -364,7 +364,7 @@ def _at_corners(
     return best
 
 
-def _ascended(
+def _worse_signs(
     M: StateSpace,
     blocks: Sequence[Block],
     start: Perturbation,

@@ -30,7 +30,7 @@ from ..hinf.mode_channels import (
     ModeLoop,
     mode_channels,
     rebalanced,
-    with_channels,
+    with_mode_channels,
 )
 from .uncertain_loop import weighted_names
 
@@ -65,7 +65,7 @@ def by_mode_channels(
     at a fixed point the norm is 1 and mu what it was divided by.
     """
     plant = uncertain.plant
-    weighted = _weighted(plant, w, z)
+    weighted = _performance_plant(plant, w, z)
     stated = None
     with attempted("mode by mode", AssumptionError):  # no disturbance moves them: no D to begin
         stated = mode_channels(weighted, uncertain)
@@ -80,7 +80,7 @@ def by_mode_channels(
             bar.advance(int(number > 0))
             step = None
             with attempted(f"step {number + 1} of the D-K iteration"):
-                step = _step(weighted, channels, level, method)
+                step = _dk_iteration(weighted, channels, level, method)
             if step is None:
                 break
             found.append(step.mu)
@@ -94,7 +94,7 @@ def by_mode_channels(
     if best is None or not np.isfinite(best.mu):
         return None
     certificate = {"mu": best.mu} | {f"mu of step {i}": mu for i, mu in enumerate(found, 1)}
-    certificate["largest gain of machines over mu"] = _tried(uncertain, best, w, z)
+    certificate["largest gain of machines over mu"] = _corner_ratio(uncertain, best, w, z)
     return Controller(
         best.controller,
         f"D-K iteration with one channel a mode, {counted(len(found), 'step')}",
@@ -103,7 +103,7 @@ def by_mode_channels(
     )
 
 
-def _step(
+def _dk_iteration(
     weighted: StandardPlant,
     channels: Sequence[ModeChannel],
     level: float,
@@ -111,7 +111,7 @@ def _step(
 ) -> _Step:
     """Return the controller for Deltas and weights over a level, its mu, and channels for it."""
     sized = [one.of_size(1.0 / level) for one in channels]
-    plant = with_channels(weighted, sized)
+    plant = with_mode_channels(weighted, sized)
     own = plant.system.output_index(weighted.z)
     scale = np.ones(len(plant.system.outputs))
     scale[own] = 1.0 / level
@@ -122,15 +122,15 @@ def _step(
     K = problem.restored(found.A, found.B, found.C, found.D).replace(name="mu", units=plant.units)
     if not lft(system, K).is_stable:
         raise SolverError("the controller does not stabilise in rounding.")
-    again = rebalanced(channels, with_channels(weighted, channels), K)
-    loop = ModeLoop.of(again, with_channels(weighted, again), K, 2.0, weighted=True)
+    again = rebalanced(channels, with_mode_channels(weighted, channels), K)
+    loop = ModeLoop.of(again, with_mode_channels(weighted, again), K, 2.0, weighted=True)
     mu = loop.level(level)
     if abs(mu / level - 1.0) > _NEAR:  # D is found for a level
         mu = min(mu, loop.level(mu))
     return _Step(mu, K, again)
 
 
-def _weighted(plant: StandardPlant, w: Any, z: Any) -> StandardPlant:
+def _performance_plant(plant: StandardPlant, w: Any, z: Any) -> StandardPlant:
     """Return a plant with the channels of performance alone, weighted."""
     sides = {}
     for side, given in (("z", z), ("w", w)):
@@ -140,7 +140,7 @@ def _weighted(plant: StandardPlant, w: Any, z: Any) -> StandardPlant:
     return plant.weighted(**sides)
 
 
-def _tried(uncertain: UncertainPlant[Any], best: _Step, w: Any, z: Any) -> float:
+def _corner_ratio(uncertain: UncertainPlant[Any], best: _Step, w: Any, z: Any) -> float:
     """Return the largest weighted gain of machines at corners, each closed exactly, over mu."""
     chance, size = np.random.default_rng(0), min(1.0, 1.0 / best.mu)
     names = [delta.name for delta in uncertain.deltas]
@@ -148,8 +148,8 @@ def _tried(uncertain: UncertainPlant[Any], best: _Step, w: Any, z: Any) -> float
     for _ in range(_MACHINES):
         ends = size * chance.choice([-1.0, 1.0], len(names))
         machine = uncertain.lft(dict(zip(names, ends.tolist(), strict=True)))
-        loop = lft(_weighted(machine, w, z).system, best.controller)
-        most = max(most, _gain(loop) / best.mu if loop.is_stable else np.inf)
+        loop = lft(_performance_plant(machine, w, z).system, best.controller)
+        most = max(most, _grid_peak(loop) / best.mu if loop.is_stable else np.inf)
     if most > 1.0 + _BEYOND:
         raise CertificateError(
             f"of machines within {size:.3g} of the uncertainty one has {most:.4g} times the gain "
@@ -159,7 +159,7 @@ def _tried(uncertain: UncertainPlant[Any], best: _Step, w: Any, z: Any) -> float
     return most
 
 
-def _gain(loop: StateSpace) -> float:
+def _grid_peak(loop: StateSpace) -> float:
     """Return the largest singular value over a grid through the resonances."""
     freq: FloatArray = resonance_grid(loop.poles(), loop.dt)
     return float(np.linalg.norm(np.moveaxis(responder(loop)(freq), 2, 0), 2, axis=(1, 2)).max())

@@ -22,9 +22,9 @@ from .uncertainty_blocks import (
     Perturbation,
     RepeatedScalar,
     Scalings,
-    checked_blocks,
+    block_places,
+    filled_blocks,
     matrix_of,
-    places,
 )
 from .upper import upper_level
 
@@ -128,7 +128,7 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
     g = as_statespace(M)
     if not g.n_states:
         return _of_matrix(g.D.astype(np.complex128), blocks, chance)
-    listed = checked_blocks(blocks, len(g.inputs), len(g.outputs))
+    listed = filled_blocks(blocks, len(g.inputs), len(g.outputs))
     problem = obstacle(g)
     if problem is not None:
         raise AssumptionError(
@@ -142,7 +142,7 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
     best = destabilising(image, listed, sought(image, found), upper, chance)
     delta: ComplexArray = np.zeros((len(g.inputs), len(g.outputs)), dtype=np.complex128)
     if best is not None:
-        delta = best.size * matrix_of(best.found, places(listed))
+        delta = best.size * matrix_of(best.found, block_places(listed))
     return MuBounds(
         upper,
         0.0 if best is None else min(1.0 / best.size, upper),
@@ -165,8 +165,8 @@ def sought(M: StateSpace, found: Any) -> list[float]:
 
 def _of_matrix(M: ComplexArray, blocks: Sequence[Block], rng: np.random.Generator) -> MuBounds:
     """Return the bounds of one matrix."""
-    listed = checked_blocks(blocks, M.shape[1], M.shape[0])
-    where = places(listed)
+    listed = filled_blocks(blocks, M.shape[1], M.shape[0])
+    where = block_places(listed)
     upper = float(np.sqrt(upper_level(M, Scalings(listed)).level))
     lower = 0.0
     delta: ComplexArray = np.zeros(M.shape[::-1], dtype=np.complex128)

@@ -15,7 +15,7 @@ from ...loop import ClosedLoop, SpillOver, close_loop
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant, larger_plant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ..hinf.mode_channels import mode_channels, tolerated, with_channels
+from ..hinf.mode_channels import mode_channels, tolerated, with_mode_channels
 from .lower import (
     Destabilising,
     destabilising,
@@ -24,8 +24,8 @@ from .lower import (
 )
 from .mu import sought
 from .sweep import INTERVALS, covered
-from .uncertain_loop import UncertainLoop, machine, neglected_delta, uncertain_loop, values_of
-from .uncertainty_blocks import FullBlock, places
+from .uncertain_loop import UncertainLoop, machine_at, neglected_delta, uncertain_loop, values_of
+from .uncertainty_blocks import FullBlock, block_places
 
 #: mu below this is not resolved
 _RESOLVED = 0.05
@@ -189,13 +189,13 @@ def robust_stability(
     upper = float(np.sqrt(found.level))
     worst = _worst(loop, found, upper, chance)
     names = [block.name for block in loop.blocks if not isinstance(block, FullBlock)]
-    certificate = _tried(uncertain, loop.loop, names, upper, count, chance)
+    certificate = _corner_machines(uncertain, loop.loop, names, upper, count, chance)
     # systems of many states are covered by sampling between the frequencies instead
     certificate["intervals by Hamiltonians"] = float(found.intervals * found.by_hamiltonian)
     if loop.dt:
         certificate["distance of channels"] = loop.channels.distance
-    values, shown, lower = _shown(loop, worst)
-    left_out = _left_out(loop.loop, larger)
+    values, shown, lower = _worst_machine(loop, worst)
+    left_out = _spill_over(loop.loop, larger)
     if left_out is not None:
         certificate |= left_out.certificate
     return RobustStability(
@@ -211,7 +211,7 @@ def robust_stability(
     )
 
 
-def _left_out(loop: ClosedLoop, larger: Any) -> SpillOver | None:
+def _spill_over(loop: ClosedLoop, larger: Any) -> SpillOver | None:
     """Return the check of the nominal loop with the modes left out."""
     if larger is None:
         return loop.left_out
@@ -225,7 +225,7 @@ def _worst(
     omegas = sought(loop.system, found)
     if not loop.neglected_w:
         return destabilising(loop.system, loop.blocks, omegas, upper, rng)
-    where, best = places(loop.blocks), None
+    where, best = block_places(loop.blocks), None
     for omega in omegas:
         gain = loop.system.evaluated(1j * omega) * loop.heights(omega, omega)
         for _ in range(_STARTS):
@@ -236,7 +236,7 @@ def _worst(
     return best
 
 
-def _shown(
+def _worst_machine(
     loop: UncertainLoop, worst: Destabilising | None
 ) -> tuple[dict[str, float], StandardPlant | None, float]:
     """Return the Deltas of the worst machine, that machine and one over its size.
@@ -250,7 +250,7 @@ def _shown(
         size = worst.size * (1.0 + beyond)
         values = values_of(loop, worst.found, size)
         try:
-            made = machine(loop, values, neglected_delta(loop, worst.found, size))
+            made = machine_at(loop, values, neglected_delta(loop, worst.found, size))
         except FlexplantError:  # no stiffness left, say: it can only be computed
             return values, None, 1.0 / worst.size
         if not loop.around(made).is_stable:
@@ -273,7 +273,7 @@ def _quick(
     if loop.obstacle is not None:
         return None  # the whole search says what is wrong
     channels = mode_channels(uncertain.plant, uncertain)
-    opened = with_channels(uncertain.plant, channels)
+    opened = with_mode_channels(uncertain.plant, channels)
     controller = loop.controller.select(outputs=loop.driven)
     upper = tolerated(channels, opened, controller)
     if not upper < 1.0:
@@ -281,9 +281,9 @@ def _quick(
     # the grid goes through the places of the modes at Deltas of a size, not beyond
     size = 1.0 / max(upper, 1.0 / _REACH)
     upper = max(1.0 / size, tolerated(channels, opened, controller, size) / size)
-    certificate = _tried(uncertain, loop, names, upper, count, rng)
+    certificate = _corner_machines(uncertain, loop, names, upper, count, rng)
     certificate["modes, each by one channel"] = float(len(channels))
-    left_out = _left_out(loop, larger)
+    left_out = _spill_over(loop, larger)
     if left_out is not None:
         certificate |= left_out.certificate
     none = np.zeros(0)
@@ -292,7 +292,7 @@ def _quick(
     )  # fmt: skip
 
 
-def _tried(
+def _corner_machines(
     uncertain: UncertainPlant[Any],
     nominal: ClosedLoop,
     names: list[str],

@@ -22,7 +22,7 @@ from ...lti.responses import responder
 from ...lti.statespace import StateSpace
 from ...parallel import tick
 from ...tolerances import ROUNDING, TINY
-from .uncertainty_blocks import Block, Scalings, places
+from .uncertainty_blocks import Block, Scalings, block_places
 from .upper import WIDE, centred, reached_level, simple_bound, upper_level
 
 #: relative distance of the level to the largest upper bound found at a frequency
@@ -82,7 +82,7 @@ class _Cover:
         d = state_scale(g.A, g.B, g.C)
         self.A, self.B, self.C, self.D = g.A * d / d[:, None], g.B / d[:, None], g.C * d, g.D
         self.scalings = Scalings(self.blocks, self.leveled)
-        self.where = places(self.blocks)
+        self.where = block_places(self.blocks)
         self.respond = responder(g)
         poles = g.poles()
         self.poles = poles[poles.imag >= 0]

@@ -18,10 +18,10 @@ from ...lti.responses import Responder, responder
 from ...lti.statespace import StateSpace, as_statespace
 from ...plant import StandardPlant
 from ...plant.uncertainty.delta_channels import DeltaChannels, delta_channels
-from ...plant.uncertainty.neglected import opened
+from ...plant.uncertainty.neglected import with_neglected
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...plant.weighting import at_rate
-from .uncertainty_blocks import Block, FullBlock, Perturbation, RepeatedScalar, realised
+from .uncertainty_blocks import Block, FullBlock, Perturbation, RepeatedScalar, realised_delta
 
 #: heights are taken this much above the weights at the frequencies that sample an interval
 _SAFE = 1.002
@@ -162,7 +162,7 @@ def open_plant(
     before, behind = _checked_weights(weights_in, plant.dt), _checked_weights(weights_out, plant.dt)
     system = _with_weights(
         g.select(outputs, inputs), inputs, outputs,
-        *(_images(part, plant.dt) for part in (before, behind)),
+        *(_bilinear_images(part, plant.dt) for part in (before, behind)),
     )  # fmt: skip
     return OpenPlant(
         uncertain, channels, system, tuple(listed), tuple(w_names), tuple(z_names), before, behind
@@ -228,7 +228,7 @@ def _checked_weights(given: Mapping[str, Any], dt: float) -> dict[str, StateSpac
     return found
 
 
-def _images(weights: Mapping[str, StateSpace], dt: float) -> dict[str, StateSpace]:
+def _bilinear_images(weights: Mapping[str, StateSpace], dt: float) -> dict[str, StateSpace]:
     """Return the bilinear images of sampled weights."""
     return {
         name: bilinear(one, 1.0 / dt) if dt and one.n_states else one
@@ -279,13 +279,13 @@ def neglected_delta(loop: UncertainLoop, found: Perturbation, size: float) -> St
     turned = found._replace(
         scalars=(), vectors=((a, b * np.exp(1j * (ahead - np.angle(W)))),)
     )  # fmt: skip
-    one = realised(turned, [full])
+    one = realised_delta(turned, [full])
     return one.replace(
         C=size * one.C, D=size * one.D, inputs=loop.neglected_z, outputs=loop.neglected_w
     )
 
 
-def machine(
+def machine_at(
     loop: UncertainLoop, values: Mapping[str, float], delta: StateSpace | None
 ) -> StandardPlant:
     """Return the plant of given Deltas: its modes exact, sampled like the nominal one.
@@ -303,7 +303,7 @@ def machine(
         rate = 1.0 / plant.dt
         part = part.replace(weights=tustin(part.weights, rate))
         delta = series(_delayed(delta, plant.dt), tustin(delta, rate)).replace(inputs=delta.inputs)
-    system = opened(plant.system.replace(blocks=None), part, 0)
+    system = with_neglected(plant.system.replace(blocks=None), part, 0)
     starts = [f"{name}:neglected:z" for name in part.inputs]
     system = system.select(
         [*(name for name in starts if name in delta.inputs), *plant.z, *plant.y], None

@@ -76,7 +76,7 @@ class FullBlock(Value):
 Block: TypeAlias = RepeatedScalar | FullBlock
 
 
-def checked_blocks(blocks: Any, w: int, z: int) -> tuple[Block, ...]:
+def filled_blocks(blocks: Any, w: int, z: int) -> tuple[Block, ...]:
     """Return blocks that fill w outputs and z inputs of an uncertainty."""
     if not isinstance(blocks, Sequence) or not blocks or any(
         not isinstance(block, RepeatedScalar | FullBlock) for block in blocks
@@ -103,7 +103,7 @@ class Place(NamedTuple):
     z: slice
 
 
-def places(blocks: Sequence[Block]) -> list[Place]:
+def block_places(blocks: Sequence[Block]) -> list[Place]:
     """Return each block with its channels."""
     found, w, z = [], 0, 0
     for block in blocks:
@@ -127,7 +127,7 @@ class Scalings:
     """
 
     def __init__(self, blocks: Sequence[Block], leveled: Sequence[bool] | None = None) -> None:
-        self.places = places(blocks)
+        self.places = block_places(blocks)
         self.w, self.z = sum(b.w for b in blocks), sum(b.z for b in blocks)
         chosen = [True] * len(blocks) if leveled is None else list(leveled)
         self.skewed = not all(chosen)
@@ -279,13 +279,13 @@ def matrix_of(found: Perturbation, where: Sequence[Place]) -> ComplexArray:
     return total
 
 
-def realised(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
+def realised_delta(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
     """Return a real, stable system Delta(s) of norm one with the perturbation at its frequency.
 
     Each entry of a and b is a number times an all-pass ``+-(s - p) / (s + p)`` of its phase, so
     that the gain is one at all frequencies.
     """
-    where = places(blocks)
+    where = block_places(blocks)
     scalars, vectors = iter(found.scalars), iter(found.vectors)
     parts: list[StateSpace] = []
     for p in where:
@@ -298,8 +298,8 @@ def realised(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
             parts.append(as_statespace(number.real * np.eye(p.block.size)))
         else:
             one = [_all_pass(number, found.omega) for _ in range(p.block.size)]
-            parts.append(_stacked(one))
-    return _stacked(parts)
+            parts.append(_block_diagonal(one))
+    return _block_diagonal(parts)
 
 
 def _all_pass(number: complex, omega: float) -> StateSpace:
@@ -316,7 +316,7 @@ def _all_pass(number: complex, omega: float) -> StateSpace:
     return StateSpace([[-p]], [[root]], [[-sign * root]], [[sign * size]])
 
 
-def _stacked(parts: Sequence[StateSpace]) -> StateSpace:
+def _block_diagonal(parts: Sequence[StateSpace]) -> StateSpace:
     D = la.block_diag(*[g.D for g in parts])
     n = sum(g.n_states for g in parts)
     A, B, C = np.zeros((n, n)), np.zeros((n, D.shape[1])), np.zeros((D.shape[0], n))
@@ -332,7 +332,7 @@ def _rank_one(a: ComplexArray, b: ComplexArray, omega: float) -> StateSpace:
     """Return ``b(s) a(s)'`` with the values b and conj(a) at omega."""
     into = [_all_pass(complex(v), omega) for v in a.conj()]
     out = [_all_pass(complex(v), omega) for v in b]
-    first, second = _stacked(into), _stacked(out)
+    first, second = _block_diagonal(into), _block_diagonal(out)
     ones_in, ones_out = np.ones((1, len(into))), np.ones((len(out), 1))
     row = StateSpace(first.A, first.B, ones_in @ first.C, ones_in @ first.D)
     column = StateSpace(second.A, second.B @ ones_out, second.C, second.D @ ones_out)

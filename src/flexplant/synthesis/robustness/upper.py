@@ -87,7 +87,7 @@ def upper_level(
 
 def _admissible(M: ComplexArray, scalings: Scalings, x: FloatArray) -> FloatArray | None:
     """Return scalings of a skewed problem for which some level is finite, None without any."""
-    inner = [p for p, lev in zip(scalings.places, _levels(scalings), strict=True) if not lev]
+    inner = [p for p, lev in zip(scalings.places, _are_leveled(scalings), strict=True) if not lev]
     plain = Scalings([p.block for p in inner])
     rows = np.concatenate([np.arange(p.z.start, p.z.stop) for p in inner])
     columns = np.concatenate([np.arange(p.w.start, p.w.stop) for p in inner])
@@ -100,7 +100,7 @@ def _admissible(M: ComplexArray, scalings: Scalings, x: FloatArray) -> FloatArra
     x = np.array(x)
     i = 0
     for (own_range, _), end, lev in zip(
-        scalings.d_ranges, scalings.ends, _levels(scalings), strict=True
+        scalings.d_ranges, scalings.ends, _are_leveled(scalings), strict=True
     ):
         if not lev:
             x[own_range.start : end] = own[plain.d_ranges[i][0].start : plain.ends[i]]
@@ -114,10 +114,10 @@ def _admissible(M: ComplexArray, scalings: Scalings, x: FloatArray) -> FloatArra
 
 def _leveled_by(scalings: Scalings, x: FloatArray, factor: float) -> FloatArray:
     """Return scalings whose leveled blocks' D is so many times larger."""
-    return scalings.scaled(x, np.where(_levels(scalings), factor, 1.0))
+    return scalings.scaled(x, np.where(_are_leveled(scalings), factor, 1.0))
 
 
-def _levels(scalings: Scalings) -> list[bool]:
+def _are_leveled(scalings: Scalings) -> list[bool]:
     """Return which blocks are leveled."""
     return [bool(np.any(scalings.leveled[scalings.owner == own.start]))
             for own, _ in scalings.d_ranges]  # fmt: skip
@@ -170,7 +170,7 @@ def centred(
         _add_of_D(scalings, x, gradient, hessian)
         gradient += 2.0 * wide * x
         hessian.reshape(-1)[:: len(x) + 1] += 2.0 * wide
-        step, decrement = _newton(hessian, gradient, trace)
+        step, decrement = _newton_step(hessian, gradient, trace)
         # the value is off by the square of it
         if not decrement > 1e-6:
             break
@@ -255,7 +255,7 @@ def _skewed(
             level_gradient, level_curve = gradient[fixed], hessian[fixed, fixed]
             _add_of_D(scalings, x, gradient, hessian)
             gradient[fixed], hessian[fixed, fixed] = level_gradient + t, level_curve
-            step, decrement = _newton(hessian, gradient)
+            step, decrement = _newton_step(hessian, gradient)
             size = 1.0 if decrement < _CENTRED else 1.0 / (1.0 + decrement)
             # shorter steps are rounding of x
             while size > 1e-10:
@@ -278,7 +278,7 @@ def _skewed(
     return Certified(max(best.level, 0.0), best.x)
 
 
-def _newton(
+def _newton_step(
     hessian: FloatArray, gradient: FloatArray, trace: FloatArray | None = None
 ) -> tuple[FloatArray, float]:
     """Return the Newton step, one that keeps a trace where there is one, and its decrement."""

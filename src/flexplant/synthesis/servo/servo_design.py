@@ -12,10 +12,10 @@ import numpy as np
 from ...checks import FloatArray, between, positive, real_array
 from ...errors import AssumptionError, LabelError, ModelError, SolverError, counted, warn
 from ...loop import ClosedLoop
-from ...loop.blocks import drives, joined
-from ...loop.spill_over import growing_modes, named
+from ...loop.blocks import drives, driving_blocks
+from ...loop.spill_over import growing_modes, modes_in_words
 from ...lti.interconnection import loop_poles
-from ...lti.joining import stacked
+from ...lti.joining import block_matrix
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import Poi, StandardPlant, larger_plant, standard_plant
@@ -227,7 +227,7 @@ def servo_bandwidth(
 
 def _refuse(closed: ClosedLoop, bandwidth: float, observed: bool, advice: str) -> None:
     """Raise SolverError for the loop that will run, warn of a loop on the POI itself."""
-    modes = named(*growing_modes(closed.monitored, closed.plant.system.states))
+    modes = modes_in_words(*growing_modes(closed.monitored, closed.plant.system.states))
     what = "with its observer" if observed else "on the POI itself"
     text = (
         f"the servo's loop at {bandwidth:g} Hz {what} is unstable (spectral radius "
@@ -295,7 +295,7 @@ class ServoTask:
     def controller(self) -> Callable[[Axis], StateSpace]:
         """The function of an axis that gives [ref, hats] -> u: errors, axes and decoupling."""
         T_u = decoupling(self.plant, self.poi)
-        return cache(lambda axis: _joined(self.plant, self.poi, axis.system, T_u))
+        return cache(lambda axis: _servo_law(self.plant, self.poi, axis.system, T_u))
 
     def is_stable(self, axis: Axis) -> bool:
         """Return whether the loop is stable with the modes that the plant has."""
@@ -312,7 +312,7 @@ class ServoTask:
 
         def found(axis: Axis) -> ClosedLoop:
             blocks = (*before, self.controller(axis))
-            controller = joined(plant, blocks, *drives(plant, blocks, ()))
+            controller = driving_blocks(plant, blocks, *drives(plant, blocks, ()))
             return ClosedLoop(plant, blocks, controller, larger=larger)
 
         return cache(found)
@@ -455,7 +455,7 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
     return ports.poi(name if name is not None else ports.z[0].name)
 
 
-def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, T_u: FloatArray) -> StateSpace:
+def _servo_law(plant: StandardPlant, poi: Poi, axis: StateSpace, T_u: FloatArray) -> StateSpace:
     """Return [refs, hats] -> u: ``T_u (I x c) E``, E the errors, c the controller of an axis."""
     refs = [poi.derived(name, "ref") for name in poi.axes]
     inputs = [name for name in refs if name in plant.y]
@@ -463,7 +463,7 @@ def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, T_u: FloatArray) -
     errors = -np.eye(len(hats), len(hats) + len(inputs), len(inputs))
     for column, name in enumerate(inputs):
         errors[refs.index(name), column] = 1.0
-    A, B, C, D = (stacked([one] * len(hats)) for one in (axis.A, axis.B, axis.C, axis.D))
+    A, B, C, D = (block_matrix([one] * len(hats)) for one in (axis.A, axis.B, axis.C, axis.D))
     return StateSpace(
         A,
         B @ errors,

@@ -136,18 +136,18 @@ def servo_loop(
     T_u = decoupling(known, poi)
     if observer is None:
         seen = [poi.channel(axis) for axis in poi.axes]
-        P = _stacked(plant.system.select(seen, plant.u), grid)
+        P = _response_stack(plant.system.select(seen, plant.u), grid)
         return ServoLoop(grid, T_u @ P, None, elastic(known), plant)
     read = [name for name in observer.inputs if name in plant.y]
     given = [name for name in observer.inputs if name in plant.u]
-    estimate = T_u @ _stacked(observer.select(hats, [*read, *given]), grid)
-    moved = estimate[:, :, : len(read)] @ _stacked(plant.system.select(read, plant.u), grid)
+    estimate = T_u @ _response_stack(observer.select(hats, [*read, *given]), grid)
+    moved = estimate[:, :, : len(read)] @ _response_stack(plant.system.select(read, plant.u), grid)
     own = np.zeros_like(moved)
     own[:, :, [plant.u.index(name) for name in given]] = estimate[:, :, len(read) :]
     return ServoLoop(grid, moved, own if given else None, elastic(known), plant)
 
 
-def _stacked(system: StateSpace, grid: FloatArray) -> ComplexArray:
+def _response_stack(system: StateSpace, grid: FloatArray) -> ComplexArray:
     return np.ascontiguousarray(np.moveaxis(responses(system, grid), -1, 0))
 
 

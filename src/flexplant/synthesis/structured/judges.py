@@ -230,7 +230,7 @@ def _crossings(t: FloatArray, poles: ComplexArray, residues: ComplexArray) -> Fl
     return np.asarray(low + (high - low) * before / (before - after))
 
 
-def selected(plant: StandardPlant, w: Sequence[str], z: Sequence[str]) -> Prepared:
+def problem_on(plant: StandardPlant, w: Sequence[str], z: Sequence[str]) -> Prepared:
     """Return the problem of some channels, ready for synthesis."""
     system = plant.system.select([*z, *plant.y], [*w, *plant.u])
     return prepared(system, plant.u, plant.y)

@@ -18,7 +18,7 @@ Function: TypeAlias = Callable[[FloatArray], tuple[float, FloatArray]]
 _ARMIJO, _WOLFE, _BISECTIONS = 1e-4, 0.9, 30
 #: so many steps that gain less than this together end a search (parameters that run to infinity
 #: gain little for ever)
-_PATIENCE, _GAIN = 8, 1e-4
+_STALLED, _GAIN = 8, 1e-4
 #: the first step, beside the size of the parameters
 _FIRST = 0.3
 #: part of the decrease of the model that a step has to reach; below and above which the model
@@ -109,7 +109,7 @@ def bfgs(
             left = np.eye(x.size) - rho * np.outer(s, change)
             H = left @ H @ left.T + rho * np.outer(s, s)
         values.append(value)
-        if len(values) > _PATIENCE and values[-_PATIENCE - 1] - value <= 0.1 * _GAIN * abs(value):
+        if len(values) > _STALLED and values[-_STALLED - 1] - value <= 0.1 * _GAIN * abs(value):
             break
     return x, value
 
@@ -166,7 +166,7 @@ def minimax(
             pieces = function.pieces(x)
             values.append(value)
             mu *= _LESS if part > _GOOD else _MORE if part < _POOR else 1.0
-            if len(values) > _PATIENCE and values[-_PATIENCE - 1] - value <= _GAIN:
+            if len(values) > _STALLED and values[-_STALLED - 1] - value <= _GAIN:
                 break
         else:
             refused += 1
@@ -239,7 +239,7 @@ def decrease_left(pieces: Pieces, radius: float) -> tuple[float, float]:
     return slope, gained
 
 
-def joined(parts: Sequence[Pieces]) -> Pieces:
+def joined_pieces(parts: Sequence[Pieces]) -> Pieces:
     """Return the pieces of several functions, such as the gains of several plants."""
     every = parts[0]
     for one in parts[1:]:

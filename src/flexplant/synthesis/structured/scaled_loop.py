@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray
-from ...lti.frequency_sweep import climbed, resonance_grid
+from ...lti.frequency_sweep import climbed_grid, resonance_grid
 from ...lti.norms import peak_gain
 from ...lti.preparation import Prepared
 from ...lti.responses import responses
@@ -180,7 +180,7 @@ class Closed(NamedTuple):
             all_ = np.moveaxis(responses(system, freq), 2, 0)
             return np.asarray(np.linalg.norm(all_, 2, axis=(1, 2)))
 
-        freq, gain = climbed(gains, first, _REFINEMENTS)
+        freq, gain = climbed_grid(gains, first, _REFINEMENTS)
         beside = np.concatenate([[-np.inf], gain, [-np.inf]])
         peak = (gain >= beside[:-2]) & (gain >= beside[2:])
         chosen = (peak | np.isin(freq, first)) & (gain >= _PART * gain.max())

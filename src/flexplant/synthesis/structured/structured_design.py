@@ -23,7 +23,7 @@ from ..objectives.specifications import H2, Hinf
 from ..plant_range import PlantRange
 from ..reach import require_stabilisable
 from .judges import GainJudge, Judge, LoopObjective
-from .nonsmooth import Pieces, bfgs, decrease_left, joined, minimax
+from .nonsmooth import Pieces, bfgs, decrease_left, joined_pieces, minimax
 from .scaled_loop import DECAY, ScaledLoop
 from .structures import ControllerFamily, ControllerStructure, as_system
 
@@ -172,8 +172,8 @@ def design_structured(
     K = as_system(family.matrices(found.x), (plants[0].y, plants[0].u), plants[0].dt)
     K = K.replace(name="structured", units=plants[0].units)
     closed = [lft(one.system, K) for one in plants]
-    claim = _norm(found)
-    each = [_verified(*pair, objectives, claim) for pair in zip(plants, closed, strict=True)]
+    claim = _end_norm(found)
+    each = [_verified_loop(*pair, objectives, claim) for pair in zip(plants, closed, strict=True)]
     worst = int(np.argmax([one["norm"] for one in each]))
     if not abs(each[worst]["norm"] - claim) <= _AGREEMENT * claim:
         raise CertificateError(
@@ -181,7 +181,7 @@ def design_structured(
             f"{claim:.6g} in the scaled problem: it is too badly conditioned to trust. Bring "
             "the weights closer together."
         )
-    kind = _kind(objectives)
+    kind = _measure_word(objectives)
     reached = {}
     if kind == "H-infinity":
         reached = reached_norms(plants[worst], closed[worst], responder(closed[worst]))
@@ -195,7 +195,7 @@ def design_structured(
     norms = [one["norm"] for one in each]
     if moving is not None:
         certificate |= moving.certified(
-            lambda one: _verified(one, lft(one.system, K), objectives, np.inf)["norm"], norms
+            lambda one: _verified_loop(one, lft(one.system, K), objectives, np.inf)["norm"], norms
         )
     elif len(plants) > 1:
         certificate |= {f"norm of plant {i}": norm for i, norm in enumerate(norms, 1)}
@@ -266,7 +266,7 @@ def _objectives(given: Any) -> list[LoopObjective]:
     return every
 
 
-def _kind(objectives: Sequence[LoopObjective]) -> str:
+def _measure_word(objectives: Sequence[LoopObjective]) -> str:
     """Return what is minimised, in a word."""
     if len(objectives) > 1:
         return "several objectives"
@@ -283,7 +283,7 @@ def _judges(
     order: int,
 ) -> _Judged:
     """Return the judges of all plants."""
-    if _kind(objectives) == "H-infinity":  # the problems are ready
+    if _measure_word(objectives) == "H-infinity":  # the problems are ready
         return [(GainJudge(problem, order), 1.0) for problem in problems]
     return [
         (judge, one.below or 1.0)
@@ -311,11 +311,11 @@ def _require_no_feedthrough(
             )
 
 
-def _verified(
+def _verified_loop(
     plant: StandardPlant, loop: StateSpace, objectives: Sequence[LoopObjective], claim: float
 ) -> dict[str, float]:
     """Return what was verified of a closed loop: `norm` is the largest, over its bound."""
-    if _kind(objectives) == "H-infinity":
+    if _measure_word(objectives) == "H-infinity":
         return certified_norm(loop, claim)
     least = stability(loop.poles(), loop.dt)
     if not least < (1.0 if loop.dt else 0.0):
@@ -388,7 +388,7 @@ class _StructureSearch:
         self._latest = theta, each
         worst = int(np.argmax([number for number, _ in each]))
         number, place = each[worst]
-        return float(np.log(max(number, _NOTHING))) + _SMALL * _size(theta), (worst, place)
+        return float(np.log(max(number, _NOTHING))) + _SMALL * _theta_size(theta), (worst, place)
 
     def pieces(self, theta: FloatArray) -> Pieces:
         """Return the numbers that are near the largest, as `value` counts them."""
@@ -396,7 +396,7 @@ class _StructureSearch:
             self.value(theta)
         _, each = self._latest
         most = max(gain for gain, _ in each)
-        return joined(
+        return joined_pieces(
             [
                 self._of_judge(theta, i, place, sweep=True)
                 for i, (gain, place) in enumerate(each)
@@ -411,7 +411,7 @@ class _StructureSearch:
     def _of_judge(self, theta: FloatArray, which: int, place: Any, *, sweep: bool) -> Pieces:
         K, by = self.family.matrices(theta), self.family.jacobian(theta)
         judge, below = self.judged[which]
-        found, size = judge.pieces(K, by, place, sweep=sweep), _size(theta)
+        found, size = judge.pieces(K, by, place, sweep=sweep), _theta_size(theta)
         return found._replace(
             value=found.value - np.log(below) + _SMALL * size,
             gradient=found.gradient + _SMALL / size * theta,
@@ -437,7 +437,7 @@ class _StructureSearch:
             bar.advance()
         lowest = min(range(len(stable)), key=lambda i: stable[i].value)
         stable[lowest] = self._continued(stable[lowest])
-        self.tried = {end.name: _norm(end) for end in (*ends, *stable)}
+        self.tried = {end.name: _end_norm(end) for end in (*ends, *stable)}
         best = min(stable, key=lambda end: end.value)
         same = sum(end.value <= best.value + _SAME for end in stable)
         self.notes = (f"{same} of {len(ends)} starts end within 1 % of the best",)
@@ -509,9 +509,9 @@ class _StructureSearch:
         )
 
 
-def _size(theta: FloatArray) -> float:
+def _theta_size(theta: FloatArray) -> float:
     return float(np.sqrt(1.0 + theta @ theta))
 
 
-def _norm(end: _End) -> float:
-    return float(np.exp(end.value - _SMALL * _size(end.x)))
+def _end_norm(end: _End) -> float:
+    return float(np.exp(end.value - _SMALL * _theta_size(end.x)))

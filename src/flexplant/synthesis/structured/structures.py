@@ -116,7 +116,7 @@ class FixedOrder(Value):
                 f"pattern must have shape ({nu}, {ny}) of (u, y), got {pattern.shape}."
             )
         entries = _Entries(self.order, pattern, prepared, nests=self.start is None)
-        known = self.start if self.start is not None else _reduced(plant, self.order)
+        known = self.start if self.start is not None else _reduced_controller(plant, self.order)
         if known is None:
             return entries
         if known.n_states != self.order or known.D.shape != (nu, ny):
@@ -127,7 +127,7 @@ class FixedOrder(Value):
         return entries.starting(Matrices(g.A, g.B, g.C, g.D))
 
 
-def _reduced(plant: StandardPlant, order: int) -> StateSpace | None:
+def _reduced_controller(plant: StandardPlant, order: int) -> StateSpace | None:
     """Return the controller of full order, reduced; None where that is not possible."""
     if not order:
         return None

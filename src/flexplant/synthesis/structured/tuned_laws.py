@@ -152,7 +152,7 @@ class _Laws(ControllerFamily):
     def _element(self, axis: int, factor: int, theta: FloatArray) -> SingleElement:
         element = self._each[axis].factors[factor]
         scaled = {
-            name: getattr(element, name) * _factor(value)
+            name: getattr(element, name) * _clipped_exp(value)
             for value, (i, place, name) in zip(theta, self.numbers, strict=True)
             if (i, place) == (axis, factor)
         }
@@ -160,7 +160,7 @@ class _Laws(ControllerFamily):
 
     def _gain(self, axis: int, theta: FloatArray) -> float:
         own = [v for v, n in zip(theta, self.numbers, strict=True) if n[:2] == (axis, -1)]
-        return self._each[axis].gain * _factor(sum(own))
+        return self._each[axis].gain * _clipped_exp(sum(own))
 
     def _law(self, axis: int, theta: FloatArray) -> Law:
         law = self._each[axis]
@@ -179,7 +179,7 @@ class _Laws(ControllerFamily):
         return chained(self._gain(axis, theta), sections)
 
 
-def _factor(theta: float) -> float:
+def _clipped_exp(theta: float) -> float:
     return float(np.exp(np.clip(theta, -_FARTHEST, _FARTHEST)))
 
 

@@ -46,10 +46,10 @@ def mac(X: Any, Y: Any) -> FloatArray:
     >>> fx.updating.mac([[1.0], [0.0]], [[1.0, 1.0], [0.0, 1.0]]).round(6)
     array([[1. , 0.5]])
     """
-    left, right = _shapes(X, "X"), _shapes(Y, "Y")
+    left, right = _nonzero_shapes(X, "X"), _nonzero_shapes(Y, "Y")
     if left.shape[0] != right.shape[0]:
         raise ShapeError(f"X has {left.shape[0]} rows and Y {right.shape[0]}.")
-    return matching.mac(left, right)
+    return matching.mac_matrix(left, right)
 
 
 def frac(H: Any, G: Any) -> FloatArray:
@@ -77,7 +77,7 @@ def frac(H: Any, G: Any) -> FloatArray:
     >>> fx.updating.frac([[[1.0, 2.0j]]], [[[2.0, 4.0j]]]).round(6)  # scale does not count
     array([[1.]])
     """
-    a, b = _responses(H, G)
+    a, b = _checked_responses(H, G)
     product = np.abs(np.sum(a.conj() * b, axis=-1)) ** 2
     size = np.sum(np.abs(a) ** 2, axis=-1) * np.sum(np.abs(b) ** 2, axis=-1)
     if np.any(size == 0):
@@ -247,14 +247,14 @@ def _alike(seen: ComplexArray, point: Point, columns: list[int]) -> tuple[tuple[
     return tuple(tuple(members) for members in found if len(members) > 1)
 
 
-def _shapes(value: Any, name: str) -> ComplexArray:
+def _nonzero_shapes(value: Any, name: str) -> ComplexArray:
     array = complex_array(value, name, (None, None))
     if np.any(np.all(array == 0, axis=0)):
         raise ModelError(f"{name} holds a zero shape: its MAC is not defined.")
     return array
 
 
-def _responses(H: Any, G: Any) -> tuple[ComplexArray, ComplexArray]:
+def _checked_responses(H: Any, G: Any) -> tuple[ComplexArray, ComplexArray]:
     a, b = complex_array(H, "H"), complex_array(G, "G")
     if a.shape != b.shape or a.ndim < 1:
         raise ShapeError(

@@ -187,11 +187,11 @@ def identifiability(
         correlation=correlation,
         unseen=unseen,
         mixed=tuple(mixed),
-        missing=_missing(objective, point, names, poor, lost),
+        missing=_missing_modes(objective, point, names, poor, lost),
     )
 
 
-def _missing(
+def _missing_modes(
     objective: Objective, point: Any, names: tuple[str, ...], poor: list[str], lost: FloatArray
 ) -> dict[str, tuple[int, ...]]:
     """Return the unmeasured modes that determine a lost combination, for poorly known parameters.

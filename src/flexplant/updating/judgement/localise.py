@@ -331,10 +331,10 @@ class Localisation(Value):
             f"{self.nothing_bic:.4g})\n  explained alone: {best}"
         )
         if len(self.alike) > 1 and self.chosen:
-            text += f"\n  AMBIGUOUS, {len(self.alike)} alike: {_shown(self.alike)}"
+            text += f"\n  AMBIGUOUS, {len(self.alike)} alike: {_first_few(self.alike)}"
         rivals = [name for name in self.rivals if len(self.alike) < 2 or name not in self.alike]
         if rivals and self.chosen:
-            text += f"\n  differs by less than {NEAR:.0%} of the data from: {_shown(rivals)}"
+            text += f"\n  differs by less than {NEAR:.0%} of the data from: {_first_few(rivals)}"
         if self.chosen and np.isfinite(self.next_bic):
             said = "NOT CERTAIN, next" if self.margin < CERTAIN else "next"
             other = ", ".join(self.next_best) or "no change"
@@ -345,6 +345,6 @@ class Localisation(Value):
         return text + ">"
 
 
-def _shown(names: Sequence[str]) -> str:
+def _first_few(names: Sequence[str]) -> str:
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return ", ".join(names[:SHOWN]) + more

@@ -11,7 +11,7 @@ import scipy.linalg as la
 
 from ...checks import FloatArray
 from ...errors import ModelError, SolverError
-from ...modes.matching import mac
+from ...modes.matching import mac_matrix
 from ...tolerances import TINY, divisor
 from ..family import ROUNDING, Eigen, Family, factors
 from ..point_model import Point
@@ -82,7 +82,7 @@ class Subsets:
             self.start = self.start.copy()
             self.start[self.beside] = self.ways[()][-1]
         else:
-            self.done[()], self.ends[()] = _left(whole, self.start[:0], point), point
+            self.done[()], self.ends[()] = _subset_fit(whole, self.start[:0], point), point
 
     def fit(self, subset: Subset) -> SubsetFit | None:
         """Return the fit of a subset, None when it cannot be fitted."""
@@ -105,7 +105,7 @@ class Subsets:
         found = TrustRegion().search(objective, end, most=50, tolerance=CHOSEN)
         self.ways[subset] = [*self.ways[subset], *found.trail.p[1:]]
         point = objective.at(found.p)
-        self.done[subset], self.ends[subset] = _left(objective, found.p, point), point
+        self.done[subset], self.ends[subset] = _subset_fit(objective, found.p, point), point
 
     def worst(self, subset: Subset) -> str:
         """Return the residuals that the fit of a subset explains least, in words."""
@@ -183,7 +183,7 @@ class Subsets:
                 J = self.whole.slopes(point)
                 if not subset:
                     self.linear = _alone(J[:, : self.count], J[:, fixed], r)
-                return _share(J[:, : self.count], J[:, fixed], r)
+                return _explained(J[:, : self.count], J[:, fixed], r)
             # slopes of repeated modes depend on the candidate: each by itself
             return np.array([self._alone(b, subset, r) for b in range(self.count)])
         except ModelError:
@@ -195,7 +195,7 @@ class Subsets:
         fixed = [*subset, *self.beside]
         alone = self._objective([candidate, *fixed])
         J = alone.slopes(self._end_of(alone, range(1, len(fixed) + 1), subset))
-        return float(_share(J[:, :1], J[:, 1:], r)[0])
+        return float(_explained(J[:, :1], J[:, 1:], r)[0])
 
     def _end_of(self, objective: Objective, rows: Sequence[int], subset: Subset) -> Point:
         """Return the end of the fit of a subset as a point of `objective`.
@@ -285,11 +285,11 @@ class Subsets:
             few = self._objective(picked, B)
             found, way = self._searched(few, subset)
             made = few.at(found.p)
-            point = lifted(exact.family, B, made, exact.numbers)
+            point = lifted_point(exact.family, B, made, exact.numbers)
             r = exact.values(point)
             off = float(np.sum((r - few.values(made)) ** 2))
             close = off <= max(FAITHFUL**2 * float(r @ r), NEGLIGIBLE**2 * self.error_without)
-            left = _left(exact, found.p, point)
+            left = _subset_fit(exact, found.p, point)
             # what is not physical leaves less than what is: of interest if it is the best
             worse = self._criterion(left, len(subset)) > self.least
             if close and (worse or is_physical(exact.family, found.p)):
@@ -298,7 +298,7 @@ class Subsets:
         found, way = self._searched(exact, subset)
         point = exact.at(found.p)
         self.ways[subset], self.ends[subset] = way, point
-        return _left(exact, found.p, point)
+        return _subset_fit(exact, found.p, point)
 
     def _searched(self, objective: Objective, subset: Subset) -> tuple[SearchEnd, list[FloatArray]]:
         """Return the end of the search for a subset's values, and the points on the way there."""
@@ -330,7 +330,7 @@ class Subsets:
             objective.family.weighted(point.eigen.X)[:, own]
             for point, own in zip((begin, end), columns, strict=True)
         )
-        if np.all(np.diag(mac(X, Y)) >= SAME):
+        if np.all(np.diag(mac_matrix(X, Y)) >= SAME):
             return [first]
         return [first + part * (guess - first) for part in WAY]
 
@@ -356,7 +356,7 @@ class Subsets:
         return np.inf if found is None else found.error
 
 
-def _left(objective: Objective, values: FloatArray, point: Point) -> SubsetFit:
+def _subset_fit(objective: Objective, values: FloatArray, point: Point) -> SubsetFit:
     """Return what the model at a point leaves; `values` are those parameters that were fitted."""
     r = objective.values(point)
     chi2, _ = chi_square(objective, point, np.full(point.p.size, bool(values.size)))
@@ -376,7 +376,7 @@ def _alone(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
     return np.asarray(-(J.T @ r) / np.where(length > 0, length, np.inf))
 
 
-def _share(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
+def _explained(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
     whole = np.sum(J**2, axis=0)
     J, r = _beside(J, beside, r)
     length = np.sum(J**2, axis=0)
@@ -456,7 +456,7 @@ def is_physical(family: Family, p: FloatArray) -> bool:
     return softest > -NEARLY * float(elastic)
 
 
-def lifted(family: Family, B: FloatArray, point: Point, numbers: Sequence[int]) -> Point:
+def lifted_point(family: Family, B: FloatArray, point: Point, numbers: Sequence[int]) -> Point:
     r"""Return a point of few coordinates in all those of `family`, corrected to second order.
 
     What the coordinates miss, :math:`\rho = P(\lambda) B x`, moves the shape by

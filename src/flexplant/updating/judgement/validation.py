@@ -15,7 +15,7 @@ from ...sparse.factor import dense
 from ..parameters.added import Parameter
 from ..residuals.residual import Residual
 from ..search import Objective, checked_residuals
-from ..search.objective import numbers
+from ..search.objective import compared_modes
 from ..search.update_method import UpdateMethod
 from ..sensitivities import checked_parameters
 from ..update import update
@@ -234,7 +234,7 @@ def _check_apart(given: Sequence[Residual], kept: Sequence[Residual]) -> None:
         for other in kept:
             if type(one) is not type(other):
                 continue
-            parts, twice = _parts(one), _parts(other)
+            parts, twice = _parts_of(one), _parts_of(other)
             common = [part for part in twice if part in parts]
             if _same_data(one, other) and (common or not parts):
                 which = f"parts {', '.join(map(str, common[:6]))}" if common else "all"
@@ -245,10 +245,10 @@ def _check_apart(given: Sequence[Residual], kept: Sequence[Residual]) -> None:
                 )
 
 
-def _parts(residual: Residual) -> list[int]:
+def _parts_of(residual: Residual) -> list[int]:
     """Return the modes or lines of a residual."""
     lines = getattr(residual, "lines", None)
-    return [int(i) for i in (numbers(residual) if lines is None else lines)]
+    return [int(i) for i in (compared_modes(residual) if lines is None else lines)]
 
 
 def _same_data(one: Any, other: Any) -> bool:

@@ -98,14 +98,14 @@ class PointParameter(Parameter):
 
     def __post_init__(self) -> None:
         require_known("direction", [self.direction], (*DIRECTIONS, *self.together))
-        place, text = checked_place(self.at, self.direction)
+        place, text = named_place(self.at, self.direction)
         if self.direction in self.together and not isinstance(place, tuple):
             raise LabelError(
                 f"{text} names one motion: give a point (x, y, z) for direction={self.direction!r}."
             )
         other = self.to
         if other is not None:
-            other, end = checked_place(other, self.direction, "to")
+            other, end = named_place(other, self.direction, "to")
             text += f" to {end}"
         name = checked_text(self.name, "name") or f"{self.quantity} at {text}"
         self._set(at=place, name=name, to=other)
@@ -222,7 +222,7 @@ class AddedStiffness(PointParameter):
     acts_on = 2
 
 
-def checked_place(at: Any, direction: str, what: str = "at") -> tuple[Place, str]:
+def named_place(at: Any, direction: str, what: str = "at") -> tuple[Place, str]:
     """Return a place and its name."""
     if isinstance(at, str):
         if not at:

@@ -227,9 +227,9 @@ class MatrixParameter(Parameter):
             When the matrices belong neither to the model nor to its full structure.
         """
         return (
-            projected(self.dM, model, self.name),
-            projected(self.dD, model, self.name),
-            projected(self.dK, model, self.name),
+            projected_matrix(self.dM, model, self.name),
+            projected_matrix(self.dD, model, self.name),
+            projected_matrix(self.dK, model, self.name),
         )
 
 
@@ -302,7 +302,7 @@ class ModeDamping(Parameter):
         return None, 2 * float(omega[-1]) * np.outer(force, force), None
 
 
-def projected(part: Matrix | None, model: Any, name: str) -> Matrix | None:
+def projected_matrix(part: Matrix | None, model: Any, name: str) -> Matrix | None:
     """Return a matrix of a model's own DOFs, ``T^T A T`` of one of its full structure."""
     if part is None:
         return None

@@ -13,7 +13,7 @@ import numpy as np
 from ...checks import FloatArray, Matrix, function, positive, real_array, whole
 from ...errors import LabelError, ModelError, ShapeError
 from .added import MAKES, Derivatives, Parameter, checked_bounds, checked_text
-from .matrix_parameters import checked_matrix, projected
+from .matrix_parameters import checked_matrix, projected_matrix
 
 #: relative to the change of a matrix: what its polynomial may miss between the points of it, and
 #: what rounding makes it miss where the matrix is one
@@ -165,8 +165,8 @@ class PolynomialParameter(Parameter):
         """Return the matrices of all powers in the model's DOFs."""
         powers = zip_longest(self.dM, self.dD, self.dK)
         return [
-            (projected(M, model, self.name), projected(D, model, self.name),
-             projected(K, model, self.name))
+            (projected_matrix(M, model, self.name), projected_matrix(D, model, self.name),
+             projected_matrix(K, model, self.name))
             for M, D, K in powers
         ]  # fmt: skip
 
@@ -186,7 +186,7 @@ class PolynomialParameter(Parameter):
         for label in ("dM", "dD", "dK"):
             parts = getattr(self, label)
             moved[label] = [
-                _sum([comb(k, j) * value ** (k - j) for k in range(j, len(parts) + 1)],
+                _weighted_sum([comb(k, j) * value ** (k - j) for k in range(j, len(parts) + 1)],
                      list(parts[j - 1 :]))
                 for j in range(1, len(parts) + 1)
             ]  # fmt: skip
@@ -227,11 +227,11 @@ def _interpolated(
         if base is None:
             continue
         changes = [getattr(points[x], label) - base for x in nodes]
-        terms = [_sum(row, changes) for row in weights]
+        terms = [_weighted_sum(row, changes) for row in weights]
         size = max(float(abs(part).max()) for part in changes)
         missed[label] = (0.0, 0.0)
         for x in CHECKS:
-            made = _sum([x ** (k + 1) for k in range(powers)], terms)
+            made = _weighted_sum([x ** (k + 1) for k in range(powers)], terms)
             off = float(abs(made - (getattr(points[x], label) - base)).max())
             missed[label] = max(missed[label], (off / size if size else 0.0, x))
         kept = [part / half ** (k + 1) for k, part in enumerate(terms)]
@@ -242,7 +242,7 @@ def _interpolated(
     return found, missed
 
 
-def _sum(weights: Any, parts: Sequence[Any]) -> Any:
+def _weighted_sum(weights: Any, parts: Sequence[Any]) -> Any:
     """Return the weighted sum of matrices of which any may be None."""
     total: Any = None
     for weight, part in zip(weights, parts, strict=True):

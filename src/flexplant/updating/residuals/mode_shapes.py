@@ -25,7 +25,7 @@ from ...labels import DIRECTIONS, Place
 from ...modes.matching import clusters
 from ...tolerances import SAME, TYPED
 from ..family import Family
-from ..parameters.added import checked_place
+from ..parameters.added import named_place
 from ..point_model import CLUSTER, Point, measured_pairs
 from .residual import Bound, Residual, channel_places, place_rows, split_parts
 
@@ -90,7 +90,7 @@ class ModeShapes(Residual):
         if self.measured.modes is None:
             raise LabelError(f"{name} needs mode numbers: MeasuredModes(poles, modes=[...]).")
         require_known("direction", [self.direction], DIRECTIONS)
-        at, given = _rows(self, name)
+        at, given = _measured_shapes(self, name)
         shape = (len(at), len(self.measured))
         real = real_array(np.real(given), "shapes", shape)
         imag = real_array(np.imag(given), "the imaginary part of shapes", shape)
@@ -110,7 +110,7 @@ class ModeShapes(Residual):
         if covariance is not None:
             if std is not None:
                 raise ModelError("std and covariance say the same thing: give one of them.")
-            covariance = _checked_covariance(covariance, (shape[1], shape[0]))
+            covariance = _hermitian_stack(covariance, (shape[1], shape[0]))
         self._set(shapes=shapes, at=tuple(at), std=std, covariance=covariance)
         self._set(assign=flag(self.assign, "assign"))
 
@@ -208,7 +208,7 @@ class BoundShapes(Bound):
         if not np.any(Phi.imag):
             Phi = Phi.real
         Q = np.linalg.qr(Phi)[0]
-        return Phi, Q, batch.psi - Q @ (_adjoint(Q) @ batch.psi)
+        return Phi, Q, batch.psi - Q @ (_conjugated(Q) @ batch.psi)
 
     def _moved(self, point: Point, batch: _Batch, Phi: Any) -> tuple[Any, Any, Any]:
         """Return dPhi (b, m, q, s), ``dPhi Phi^+ psi`` (b, m, q) and Phi^+ (b, s, m)."""
@@ -230,8 +230,8 @@ class BoundShapes(Bound):
         for batch in self.batches:
             Phi, Q, left = self._parts(point, batch)
             dPhi, inner, plus = self._moved(point, batch, Phi)
-            inner = inner - Q @ (_adjoint(Q) @ inner)
-            outer = _adjoint(plus) @ np.einsum("bmqs,bm->bsq", dPhi.conj(), left[:, :, 0])
+            inner = inner - Q @ (_conjugated(Q) @ inner)
+            outer = _conjugated(plus) @ np.einsum("bmqs,bm->bsq", dPhi.conj(), left[:, :, 0])
             found += [self._stacked(one) for one in -(inner + outer)]
         return np.concatenate(found)
 
@@ -240,7 +240,7 @@ class BoundShapes(Bound):
         return split_parts(np.asarray(part, dtype=complex)) if complex_data else np.real(part)
 
 
-def _adjoint(X: Any) -> Any:
+def _conjugated(X: Any) -> Any:
     """Return X^H of stacks of matrices."""
     return X.conj().transpose(0, 2, 1)
 
@@ -258,13 +258,13 @@ def chosen_modes(measured: MeasuredModes, modes: Sequence[int]) -> tuple[Measure
     return measured.select(columns), columns
 
 
-def _rows(residual: ModeShapes, name: str) -> tuple[list[Place], Any]:
+def _measured_shapes(residual: ModeShapes, name: str) -> tuple[list[Place], Any]:
     """Return the places and the shapes there, from the measured modes where none are given."""
     measured, at = residual.measured, residual.at
     if residual.shapes is not None:
         if at is None or isinstance(at, Mapping):
             raise ShapeError(f"{name} needs at= with shapes=. Pass the place of each row.")
-        return _listed(at, residual.direction), residual.shapes
+        return _checked_places(at, residual.direction), residual.shapes
     if measured.shapes is None:
         raise ShapeError(
             f"{measured!r} holds no shapes: give them, {name}(measured, shapes, at), or identify "
@@ -273,17 +273,17 @@ def _rows(residual: ModeShapes, name: str) -> tuple[list[Place], Any]:
     labels = measured.dofs or ()
     if at is None or isinstance(at, Mapping):
         return list(channel_places(labels, at)), measured.shapes
-    return _listed(at, residual.direction), measured.shapes
+    return _checked_places(at, residual.direction), measured.shapes
 
 
-def _listed(at: Any, direction: str) -> list[Place]:
+def _checked_places(at: Any, direction: str) -> list[Place]:
     if isinstance(at, str):
         return [at]
     instance(at, Sequence | np.ndarray, "at", "Give a place for each row.", ShapeError)
-    return [checked_place(place, direction)[0] for place in at]
+    return [named_place(place, direction)[0] for place in at]
 
 
-def _checked_covariance(value: Any, size: tuple[int, int]) -> Any:
+def _hermitian_stack(value: Any, size: tuple[int, int]) -> Any:
     shape = (size[0], size[1], size[1])
     real = real_array(np.real(value), "covariance", shape)
     imag = real_array(np.imag(value), "the imaginary part of covariance", shape)
@@ -365,7 +365,7 @@ class _BoundMac(BoundShapes):
 
     def _inside(self, batch: _Batch, Q: Any) -> tuple[FloatArray, FloatArray]:
         """Return |psi| and |Q^H psi| (b,)."""
-        both = (batch.psi, _adjoint(Q) @ batch.psi)
+        both = (batch.psi, _conjugated(Q) @ batch.psi)
         whole, inside = (np.linalg.norm(part, axis=(1, 2)) for part in both)
         return whole, inside
 
@@ -382,6 +382,6 @@ class _BoundMac(BoundShapes):
             Phi, Q, left = self._parts(point, batch)
             whole, inside = self._inside(batch, Q)
             # d |P psi|^2 = 2 Re (left^H dPhi Phi^+ psi)
-            change = np.real(_adjoint(left) @ self._moved(point, batch, Phi)[1])[:, 0]
+            change = np.real(_conjugated(left) @ self._moved(point, batch, Phi)[1])[:, 0]
             found.append(-change * (whole / inside**3)[:, None])
         return np.concatenate(found)

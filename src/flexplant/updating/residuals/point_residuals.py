@@ -15,7 +15,7 @@ from ...labels import DIRECTIONS, Place
 from ...modes.matching import assigned
 from ...tolerances import SPLIT, TINY
 from ..family import Family
-from ..parameters.added import checked_place
+from ..parameters.added import named_place
 from ..point_model import Point
 from .residual import Bound, Residual, place_rows, split_parts
 
@@ -292,7 +292,7 @@ class _BoundStatic(Bound):
 def _check_places(residual: Antiresonances | StaticCompliance) -> None:
     require_known("direction", [residual.direction], DIRECTIONS)
     for what in ("output", "input"):
-        checked_place(getattr(residual, what), residual.direction, what)
+        named_place(getattr(residual, what), residual.direction, what)
 
 
 def _checked_std(value: Any, count: int) -> FloatArray | None:
@@ -358,11 +358,11 @@ class Held:
         Y = np.linalg.solve(turned, np.broadcast_to(self.C.T + 0j, (z.size, *self.C.T.shape)))
         found = np.zeros((self.point.p.size, z.size, self.C.shape[0], self.i), complex)
         for b, direction in enumerate(self._directions()):
-            moved = _moved(self.S, direction)
+            moved = _expm_derivative(self.S, direction)
             part = moved[:n, n:]
             if self.part:
                 share = 1 - self.part
-                part = _moved(share * self.S, share * direction)[:n, n:]
+                part = _expm_derivative(share * self.S, share * direction)[:n, n:]
             gains = part, moved[:n, n:] - part
             pushed = np.matmul(moved[:n, :n], X) + late[:, None, None] * self._inputs(z, gains)
             found[b] = np.matmul(Y.transpose(0, 2, 1), pushed)
@@ -394,7 +394,7 @@ class Held:
         scale = np.sum(y * x, axis=0) * z * self.T
         slopes = np.zeros((z.size, self.point.p.size), dtype=np.complex128)
         for b, direction in enumerate(self._directions()):
-            moved = _moved(self.S, direction)
+            moved = _expm_derivative(self.S, direction)
             slopes[:, b] = np.sum(y * (moved[:n, :n] @ x + moved[:n, n:] @ u), axis=0) / scale
         return np.asarray(s, dtype=np.complex128), slopes
 
@@ -433,7 +433,7 @@ class Held:
         return found
 
 
-def _moved(S: FloatArray, dS: FloatArray) -> FloatArray:
+def _expm_derivative(S: FloatArray, dS: FloatArray) -> FloatArray:
     """Return the derivative of e^S in the direction dS."""
     moved: Any = la.expm_frechet(S, dS, compute_expm=False, check_finite=False)
     return np.asarray(moved, dtype=np.float64)

@@ -86,7 +86,7 @@ class GaussNewton(UpdateMethod):
         p, point = start, objective.begin(start)
         r, size = objective.values(point), objective.size(point)
         trail.add(objective, p, 0.0)
-        step, change = _step(objective, point, r, self.truncate)
+        step, change = _gauss_newton_step(objective, point, r, self.truncate)
         converged = _is_small(r, size, tolerance)
         reason = EXACT if converged else "max_iterations reached"
         for _ in range(most or self.steps):
@@ -101,7 +101,7 @@ class GaussNewton(UpdateMethod):
             p = p + fraction * step
             point = objective.at(p, refer=True)
             trail.add(objective, p, fraction)
-            step, change = _step(objective, point, r, self.truncate)
+            step, change = _gauss_newton_step(objective, point, r, self.truncate)
             exact = _is_small(r, size, tolerance)
             if exact or small:
                 converged, reason = True, EXACT if exact else STEP
@@ -112,7 +112,7 @@ def _is_small(rows: FloatArray, size: FloatArray, tolerance: float) -> bool:
     return bool(np.max(np.abs(rows) / size) < tolerance)
 
 
-def _step(
+def _gauss_newton_step(
     objective: Objective, point: Point, r: FloatArray, truncate: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the step of (13) and the change of the residuals to first order.

@@ -12,7 +12,7 @@ from ...errors import ModelError, SolverError
 from ...tolerances import ROUNDING, TINY
 from .objective import Objective
 from .trust_region import TrustRegion
-from .update_method import PenalisedMethod, SearchEnd, Trail, units
+from .update_method import PenalisedMethod, SearchEnd, Trail, unit_changes
 
 #: weights on the path
 PATH = 13
@@ -75,7 +75,7 @@ def _lasso(
     """Minimise with an l1 penalty on the change; None: the weight of least BIC, refitted."""
     J = objective.slopes(objective.begin(start), prior=False)
     r = objective.values(objective.at(start), prior=False)
-    unit = units(objective, J)
+    unit = unit_changes(objective, J)
     if weight is not None:
         return _sparse(objective, start, unit, weight, most, tolerance)
     largest = float(np.abs((J * unit).T @ r).max())

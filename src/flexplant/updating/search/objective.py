@@ -14,7 +14,7 @@ from ..parameters.added import Parameter
 from ..point_model import Point, first_point
 from ..residuals.eigenvalues import BoundEigenvalues
 from ..residuals.residual import Bound, Residual
-from ..sensitivities import GroupDerivatives, group_derivatives, mode_columns, split
+from ..sensitivities import GroupDerivatives, group_derivatives, mode_columns, split_rotation
 
 
 class Defect(NamedTuple):
@@ -45,7 +45,7 @@ class Objective:
     ) -> None:
         self.parameters = tuple(parameters)
         self.residuals = checked_residuals(residuals)
-        own = [n for r in self.residuals for n in numbers(r)]
+        own = [n for r in self.residuals for n in compared_modes(r)]
         if family is None:
             family = Family(model, parameters, highest=max(own, default=6))
         self.family = family
@@ -130,7 +130,7 @@ class Objective:
 
     def _turned(self, point: Point) -> Point:
         """Return the point with exactly repeated modes turned to the split of the next step."""
-        return point if self.poles_measured is None else turned(point, self.poles_measured)
+        return point if self.poles_measured is None else split_point(point, self.poles_measured)
 
     def values(self, point: Point, *, prior: bool = True) -> FloatArray:
         """Return the residuals, then those of the priors."""
@@ -211,7 +211,7 @@ def _from_bounds(parameter: Parameter) -> tuple[float, float] | None:
     return mean, max(high - mean, mean - low) / 3
 
 
-def numbers(residual: Residual) -> tuple[int, ...]:
+def compared_modes(residual: Residual) -> tuple[int, ...]:
     """Return the numbers of the modes a residual compares."""
     measured = getattr(residual, "measured", None)
     return tuple(getattr(measured, "modes", None) or ())
@@ -241,7 +241,7 @@ class PoleRows:
         return np.concatenate(found)
 
 
-def turned(point: Point, data: PoleRows) -> Point:
+def split_point(point: Point, data: PoleRows) -> Point:
     """Return the point with exactly repeated modes turned to the split of the next step.
 
     How repeated modes split depends on the step, and the step on how they split: try both
@@ -281,7 +281,7 @@ def _best_split(
     best = (np.inf, S, point.eigen)
     groups = group_derivatives(family, point.eigen)
     for way in np.vstack([np.eye(scale.size), -np.eye(scale.size)]) / scale:
-        S, eigen = _along(groups, point.eigen, columns, S, way)
+        S, eigen = _split_along(groups, point.eigen, columns, S, way)
         # rounding in the row of a vector that stays would give a step without bounds
         felt = np.where(np.abs(S) > UNSEEN * scale, S, 0.0)
         scaled, *_ = np.linalg.lstsq(
@@ -289,14 +289,14 @@ def _best_split(
         )
         step = scaled / scale
         if np.any(step):
-            S, eigen = _along(groups, point.eigen, columns, S, step)
+            S, eigen = _split_along(groups, point.eigen, columns, S, step)
         left = float(np.sum(data.whitened(gap - S @ step) ** 2))
         if left < best[0]:
             best = (left, S, eigen)
     return best[1], best[2]
 
 
-def _along(
+def _split_along(
     groups: GroupDerivatives,
     eigen: Eigen,
     columns: list[int],
@@ -304,6 +304,6 @@ def _along(
     direction: FloatArray,
 ) -> tuple[ComplexArray, Eigen]:
     """Return S with the rows of repeated modes as they split along a direction, and the modes."""
-    rotation = split(groups, eigen, direction)
+    rotation = split_rotation(groups, eigen, direction)
     rows = [rotation.sensitivity.get(c, row) for c, row in zip(columns, S, strict=True)]
     return np.array(rows), rotation.eigen

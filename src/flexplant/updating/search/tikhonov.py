@@ -10,7 +10,7 @@ from ...checks import FloatArray
 from ...tolerances import TINY
 from .objective import Objective
 from .trust_region import TrustRegion, minimised
-from .update_method import PenalisedMethod, SearchEnd, units
+from .update_method import PenalisedMethod, SearchEnd, unit_changes
 
 #: weights tried for an L-curve
 PATH = 13
@@ -59,7 +59,7 @@ class Tikhonov(PenalisedMethod):
     ) -> SearchEnd:
         """Return where the search from `start` ends; see `UpdateMethod.search`."""
         J = objective.slopes(objective.begin(start), prior=False)
-        unit = units(objective, J)
+        unit = unit_changes(objective, J)
 
         def solved(size: float, begin: FloatArray) -> SearchEnd:
             def extra(p: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,7 @@ from ...checks import FloatArray, checked, one_of, positive
 from ...errors import ModelError
 from ...tolerances import divisor
 from .objective import Objective
-from .update_method import SearchEnd, Trail, UpdateMethod, units
+from .update_method import SearchEnd, Trail, UpdateMethod, unit_changes
 
 Loss: TypeAlias = Literal["linear", "huber", "soft_l1", "cauchy"]
 LOSSES = ("linear", "huber", "soft_l1", "cauchy")
@@ -104,7 +104,7 @@ def minimised(
     free = np.full(start.size, np.inf)
     if np.any(np.isfinite(objective.lower)) or np.any(np.isfinite(objective.upper)):
         try:
-            found = _within(objective, start, method, (-free, free), most, tolerance, extra)
+            found = _bounded_fit(objective, start, method, (-free, free), most, tolerance, extra)
         except (ModelError, np.linalg.LinAlgError):
             found = None
         if (
@@ -115,10 +115,10 @@ def minimised(
         ):
             return found
     limits = (objective.lower, objective.upper)
-    return _within(objective, start, method, limits, most, tolerance, extra)
+    return _bounded_fit(objective, start, method, limits, most, tolerance, extra)
 
 
-def _within(
+def _bounded_fit(
     objective: Objective,
     start: FloatArray,
     method: TrustRegion,
@@ -162,7 +162,7 @@ def _within(
     loss: Any = method.loss
     if method.loss != "linear":
         loss = _data_loss(method.loss, rows)
-    unit = units(objective, objective.slopes(point, prior=False))
+    unit = unit_changes(objective, objective.slopes(point, prior=False))
 
     def searched(start: FloatArray, most: int) -> Any:
         return least_squares(

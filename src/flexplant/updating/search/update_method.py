@@ -112,7 +112,7 @@ class UpdateMethod(Value):
         """
 
 
-def units(objective: Objective, J: FloatArray) -> FloatArray:
+def unit_changes(objective: Objective, J: FloatArray) -> FloatArray:
     """Return what counts as one change of each parameter."""
     width = (objective.upper - objective.lower) / 2
     length = np.linalg.norm(J, axis=0)
