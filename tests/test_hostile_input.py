@@ -22,6 +22,12 @@ NO_NUMBERS = {
 }  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    """A text is a path to whoever writes files."""
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.mark.parametrize("kind", NO_NUMBERS)
 @pytest.mark.parametrize(
     "check",

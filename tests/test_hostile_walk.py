@@ -25,6 +25,12 @@ from flexplant.errors import FlexplantError
 HUGE = 10**400
 
 
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    """A text is a path to whoever writes files."""
+    monkeypatch.chdir(tmp_path)
+
+
 class Odd:
     """No kind of anything."""
 

@@ -20,7 +20,7 @@ so at the level INFO (``logging.basicConfig(level="INFO")`` shows it).
 import logging
 import sys
 import warnings
-from collections.abc import Hashable, Iterable, Iterator
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Any
@@ -94,6 +94,12 @@ class FlexplantWarning(UserWarning):
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun: `1 mode`, `2 modes`."""
     return f"{number} {noun}{'s' * (number != 1)}"
+
+
+def some_names(names: Sequence[str], most: int = 6) -> str:
+    """Return some names in a row, and how many more there are."""
+    more = f", ... ({len(names)} in all)" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def short(value: Any) -> str:

@@ -15,6 +15,7 @@ from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
 from ..lti.discretisation import uncoupled_pairs
 from ..lti.equations import accumulated, scale_of, shifted_columns, stein, sylvester
+from ..lti.joining import equal_matrices
 from ..lti.lyapunov import solve_stein
 from ..lti.modal import ModalMap
 from ..lti.statespace import StateSpace, System
@@ -337,7 +338,7 @@ def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop
     own = [block for block in loop.blocks if set(hats) & set(block.outputs)]
     if not own:
         loop = close_loop(loop.plant, *loop.blocks, estimator)
-    elif not all(_equal_systems(block, estimator) for block in own):
+    elif not all(equal_matrices(block, estimator) for block in own):
         raise ModelError(
             f"the loop has {', '.join(hats)} from another estimator. Close it with this one: "
             "close_loop(machine, observer, servo)."
@@ -351,11 +352,6 @@ def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop
     )  # fmt: skip
     noises = sources(loop.plant, error)
     return np.array([source_variances(error, row, noises)[0].sum() for row in range(len(hats))])
-
-
-def _equal_systems(one: StateSpace, other: StateSpace) -> bool:
-    pairs = ((one.A, other.A), (one.B, other.B), (one.C, other.C), (one.D, other.D))
-    return all(np.array_equal(a, b) for a, b in pairs)
 
 
 class PoiFilter(Value):

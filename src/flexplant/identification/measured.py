@@ -24,7 +24,7 @@ from ..checks import (
     short,
     whole,
 )
-from ..errors import LabelError, ModelError, ShapeError, counted
+from ..errors import LabelError, ModelError, ShapeError, counted, some_names
 from ..modes import Modes
 from ..modes.matching import assigned, in_span
 from ..tolerances import SAME
@@ -160,11 +160,11 @@ class MeasuredModes(Value):
         return int(self.poles.size)
 
     def __repr__(self) -> str:
-        known = "" if self.modes is None else ", modes " + _number_list(self.modes, "d")
+        known = "" if self.modes is None else ", modes " + some_names([*map(str, self.modes)])
         spread = "" if self.covariance is None else ", with covariance"
         return (
             f"<MeasuredModes: {counted(len(self), 'pole')}{known} at "
-            f"{_number_list(self.freq, '.1f')} Hz{spread}>"
+            f"{some_names([f'{f:.1f}' for f in self.freq])} Hz{spread}>"
         )
 
     @property
@@ -218,12 +218,6 @@ class MeasuredModes(Value):
             "covariance": None if self.covariance is None else self.covariance[np.ix_(both, both)],
             "shapes": None if self.shapes is None else self.shapes[:, places],
         }
-
-
-def _number_list(numbers: Iterable[float], form: str) -> str:
-    items = list(numbers)
-    shown = ", ".join(format(item, form) for item in items[:6])
-    return shown + (", ..." if len(items) > 6 else "")
 
 
 def _checked_poles(value: Any) -> ComplexArray:

@@ -145,6 +145,11 @@ def block_eigenvalues(A: FloatArray, blocks: Sequence[int]) -> ComplexArray:
     return poles
 
 
+def equal_matrices(one: Any, other: Any) -> bool:
+    """Return whether two systems have the same A, B, C and D."""
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in "ABCD")
+
+
 def is_block_diagonal(g: Any) -> bool:
     """Return whether A is known to be made of 1 x 1 and 2 x 2 diagonal blocks alone."""
     if g.blocks is None or not set(g.blocks) <= {1, 2}:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from ..errors import LabelError, ModelError
+from ..errors import LabelError, ModelError, some_names
 from ..lti.statespace import StateSpace
 from ..reduction import ReducedModel
 from ..tolerances import SAME
@@ -72,8 +70,8 @@ def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:
         own, other = getattr(plant, side), getattr(larger, side)
         if own != other:
             raise LabelError(
-                f"the larger plant has other channels in {side}: {_first_names(other)}, the plant "
-                f"has {_first_names(own)}. Assemble both with the same ports."
+                f"the larger plant has other channels in {side}: {some_names(other)}, the plant "
+                f"has {some_names(own)}. Assemble both with the same ports."
             )
     if plant.dt and not larger.dt:
         return sampled_like(plant, larger)
@@ -85,7 +83,3 @@ def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:
             "continuous, or sampled like the plant."
         )
     return larger
-
-
-def _first_names(names: Any) -> str:
-    return ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")

@@ -19,6 +19,7 @@ from ..errors import (
     SolverError,
     attempted,
     counted,
+    some_names,
 )
 from ..labels import DofSet, Place
 from ..modes.attachment_vectors import places
@@ -92,11 +93,6 @@ def labels_given(dofs: Iterable[str], name: str) -> tuple[str, ...]:
         doubled = sorted(label for label in seen if labels.count(label) > 1)
         raise LabelError(f"{name} {doubled} appear twice: what must be inverted would be singular.")
     return labels
-
-
-def label_text(labels: Sequence[str]) -> str:
-    """Return a short text for labels."""
-    return ", ".join(labels[:3]) + (f", ... {labels[-1]}" if len(labels) > 3 else "")
 
 
 def fe_model(structure: FEModel | Modes, method: object) -> FEModel:
@@ -264,7 +260,7 @@ class DesiredDofs(ReductionMethod):
 
     def __repr__(self) -> str:
         labels = tuple(self.dofs)
-        return f"<DesiredDofs: {len(labels)} ({label_text(labels)})>"
+        return f"<DesiredDofs: {len(labels)} ({some_names(labels, 3)})>"
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the model in these DOFs; `reduce` is the public way."""

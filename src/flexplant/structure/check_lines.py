@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
 
 from ..checks import FloatArray
-from ..errors import counted
+from ..errors import counted, some_names
 from ..labels import DIRECTIONS, DofSet
 from ..sparse.factor import diagonal
 from ..tolerances import TYPED
@@ -24,12 +24,6 @@ Line: TypeAlias = tuple[str, str, str, str]
 _SYMMETRY = 1e-9
 #: a diagonal that exceeds all it couples to by this much is a penalty
 _PENALTY = 1e6
-
-
-def some_names(names: Sequence[str], most: int = 6) -> str:
-    """Return some names in a row, and how many more there are."""
-    more = f", ... ({len(names)} in all)" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
 
 
 def widest_dofs(found: Facts, motion: FloatArray) -> tuple[str, ...]:

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray, Value, one_of
-from ..errors import ModelError, counted
+from ..errors import ModelError, counted, some_names
 from ..parallel import Progress
 from .check_facts import Facts, facts
-from .check_lines import Line, masses, matrices, rigid, scales, some_names, widest_dofs, zero_rows
+from .check_lines import Line, masses, matrices, rigid, scales, widest_dofs, zero_rows
 from .matrices import FEMatrices
 from .model import FEModel
 from .precision import held_motions, verdict

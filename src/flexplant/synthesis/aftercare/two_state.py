@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as la
+from scipy.sparse import csgraph
 
 from ...checks import ComplexArray, FloatArray, IntArray
 from ...errors import CertificateError
@@ -169,17 +170,8 @@ def _block_forms(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
 def _cluster_numbers(values: ComplexArray, near: float) -> IntArray:
     """Return the group of each pole: those within a distance of each other, and conjugates."""
     folded = values.real + 1j * np.abs(values.imag)
-    owner = np.full(values.size, -1)
-    for first in range(values.size):
-        if owner[first] < 0:
-            group = owner.max() + 1
-            owner[first] = group
-            grown = True
-            while grown:
-                apart = np.abs(folded[:, None] - folded[owner == group]).min(axis=1)
-                joins = (owner < 0) & (apart <= near)
-                owner[joins], grown = group, bool(joins.any())
-    return owner
+    near_others = np.abs(folded[:, None] - folded) <= near
+    return np.asarray(csgraph.connected_components(near_others, directed=False)[1], dtype=np.int64)
 
 
 def _arranged(

@@ -20,6 +20,7 @@ from ...errors import (
 from ...loop import ClosedLoop, close_loop
 from ...loop.mode_tolerance import BEYOND, mode_tolerances
 from ...lti.interconnection import series
+from ...lti.joining import equal_matrices
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ...plant import (
@@ -308,7 +309,7 @@ class _StageTask:
         best, drawn = self.best, self.best.drawn
         options: dict[str, Any] = {"damped_below": best.damped_below}
         found = tolerant(best.weighted, self.uncertain, **options, solved=best.solved)
-        if not _same_controller(found.system, best.system):
+        if best.system is None or not equal_matrices(found.system, best.system):
             # a better answer than that of one Riccati method: it must hold as well
             margin, drawn = self._judged(found.system)
             if margin < self.margin or drawn < _KEPT * self.margin:
@@ -349,10 +350,3 @@ class _Drawn:
         for one in self.source:
             self.known.append(one)
             yield one
-
-
-def _same_controller(one: StateSpace, other: StateSpace | None) -> bool:
-    """Return whether two controllers are the same numbers."""
-    return other is not None and all(
-        np.array_equal(getattr(one, m), getattr(other, m)) for m in "ABCD"
-    )

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray, IntArray, Value, checked, flag, short, whole
 from ...errors import ModelError, ShapeError
+from ...lti.joining import block_matrix
 from ...lti.statespace import StateSpace, as_statespace
 from ...tolerances import ROUNDING, TINY
 
@@ -317,14 +317,7 @@ def _all_pass(number: complex, omega: float) -> StateSpace:
 
 
 def _block_diagonal(parts: Sequence[StateSpace]) -> StateSpace:
-    D = la.block_diag(*[g.D for g in parts])
-    n = sum(g.n_states for g in parts)
-    A, B, C = np.zeros((n, n)), np.zeros((n, D.shape[1])), np.zeros((D.shape[0], n))
-    i = row = column = 0
-    for g in parts:
-        j, k, m = i + g.n_states, row + g.D.shape[0], column + g.D.shape[1]
-        A[i:j, i:j], B[i:j, column:m], C[row:k, i:j] = g.A, g.B, g.C
-        i, row, column = j, k, m
+    A, B, C, D = (block_matrix([getattr(g, name) for g in parts]) for name in "ABCD")
     return StateSpace(A, B, C, D)
 
 

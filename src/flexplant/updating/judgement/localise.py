@@ -10,7 +10,7 @@ import numpy as np
 
 from ...checks import FloatArray, Value
 from ...checks import whole as counted
-from ...errors import ModelError, require_known, warn
+from ...errors import ModelError, require_known, some_names, warn
 from ...parallel import Progress
 from ...structure.model import FEModel
 from ..full_basis import FullBasis
@@ -331,10 +331,12 @@ class Localisation(Value):
             f"{self.nothing_bic:.4g})\n  explained alone: {best}"
         )
         if len(self.alike) > 1 and self.chosen:
-            text += f"\n  AMBIGUOUS, {len(self.alike)} alike: {_first_few(self.alike)}"
+            text += f"\n  AMBIGUOUS, {len(self.alike)} alike: {some_names(self.alike, SHOWN)}"
         rivals = [name for name in self.rivals if len(self.alike) < 2 or name not in self.alike]
         if rivals and self.chosen:
-            text += f"\n  differs by less than {NEAR:.0%} of the data from: {_first_few(rivals)}"
+            text += (
+                f"\n  differs by less than {NEAR:.0%} of the data from: {some_names(rivals, SHOWN)}"
+            )
         if self.chosen and np.isfinite(self.next_bic):
             said = "NOT CERTAIN, next" if self.margin < CERTAIN else "next"
             other = ", ".join(self.next_best) or "no change"
@@ -343,8 +345,3 @@ class Localisation(Value):
         if is_bad(self.p_value):
             text += f"\n  MORE THAN NOISE IS LEFT: chi2 {self.chi2:.4g} for {self.dof} dof"
         return text + ">"
-
-
-def _first_few(names: Sequence[str]) -> str:
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(names[:SHOWN]) + more
