@@ -9,6 +9,10 @@ two states of mode i, which are fed by ``F_i u`` (through other states too) and 
 
 has a pole at z, and ``S(delta) = S + q_i (I - g Y_i q_i)^-1 g Y_i S`` with ``g = e_i (z I -
 A_i(delta))^-1 T_i(delta)``. Everything is a row of numbers at each z: all modes at once.
+
+Filters and latencies of sensors are states R that modes drive: ``c_i(z) = C_i + C_R (z I -
+A_RR)^-1 A_Ri``. What the change alters in A_Ri within a sample, of order omega dt delta relative to
+it, is left out.
 """
 
 from __future__ import annotations
@@ -73,7 +77,8 @@ class ModeLoops:
     """A loop and the modes of its plant, at any frequencies.
 
     `changes` of each kind, `own` states (modes, 2) of each mode, `fed` states that feed any,
-    `sums` (modes, r, states fed and u), `seen` c_i (modes, p, k) and e_i (modes, k, 2).
+    `sums` (modes, r, states fed and u), `seen` c_i (modes, p, k) and e_i (modes, k, 2), `behind`
+    what y shows of the modes' states through other states, (p, 2 modes).
     """
 
     plant: StandardPlant
@@ -84,6 +89,7 @@ class ModeLoops:
     fed: IntArray
     sums: FloatArray
     seen: tuple[FloatArray, FloatArray]
+    behind: Responder | None = None
 
     @classmethod
     def of(cls, plant: StandardPlant, broken: BrokenLoop, modes: IntArray) -> ModeLoops:
@@ -115,12 +121,21 @@ class ModeLoops:
             T = np.concatenate([A, fed[..., used] @ sums.swapaxes(1, 2)], axis=-1)
             T[0] = 0.0
             changes[kind] = ModeChanges(A, T)
-        rows_y = g.C[g.output_index(broken.y)]
+        rows_y, states = g.C[g.output_index(broken.y)], responder(to_states)
         seen = np.stack([rows_y[:, pair] for pair in own])
+        late = driven_states(g.A, plant.modal_states)
+        if np.any(rows_y[:, late]):
+            A, driven = g.A[np.ix_(late, late)], g.A[np.ix_(late, own.ravel())]
+            nothing = np.zeros((len(rows_y), own.size))
+            behind = responder(StateSpace(A, driven, rows_y[:, late], nothing, g.dt))
+            parts = seen, np.tile(np.eye(2), (len(own), 1, 1))
+            return cls(
+                *(plant, broken, states, changes, own),
+                *(np.flatnonzero(used[:n]), sums, parts, behind),
+            )
         left, size, right = np.linalg.svd(seen, full_matrices=False)
         k = 1 + int(np.any(size[:, 1:] > SAME * size[:, :1]))
         parts = left[..., :k] * size[:, None, :k], right[:, :k]
-        states = responder(to_states)
         return cls(plant, broken, states, changes, own, np.flatnonzero(used[:n]), sums, parts)
 
     def swept(self, freq: FloatArray) -> SweptLoop:
@@ -128,17 +143,25 @@ class ModeLoops:
         K, P = self.broken.respond(freq)
         S = inverted(K @ P)
         x = np.moveaxis(self.states(freq), 2, 0)
-        return SweptLoop(self, points(self.plant.system, freq), S, S @ K, x)
+        shown = None
+        if self.behind is not None:
+            late = self.behind(freq).transpose(2, 1, 0).reshape(freq.size, len(self.own), 2, -1)
+            shown = self.seen[0] + late.swapaxes(2, 3)
+        return SweptLoop(self, points(self.plant.system, freq), S, S @ K, x, shown)
 
 
 class SweptLoop(NamedTuple):
-    """S, S K and the states' responses x (n, states, m) at points z of the stability boundary."""
+    """S, S K and the states' responses x (n, states, m) at points z of the stability boundary.
+
+    `shown`: c_i (n, modes, p, 2) where it changes along it.
+    """
 
     loops: ModeLoops
     z: ComplexArray
     S: ComplexArray
     SK: ComplexArray
     x: ComplexArray
+    shown: ComplexArray | None = None
 
     def swept_modes(self, at: IntArray, mode: IntArray) -> SweptModes:
         """Return what a mode's equation is made of, for pairs of a point and a mode."""
@@ -152,8 +175,25 @@ class SweptLoop(NamedTuple):
             axis=1,
         )
         c, e = loops.seen
-        q = _times_real(self.SK[at], c[mode])
+        q = (
+            _times_real(self.SK[at], c[mode])
+            if self.shown is None
+            else self.SK[at] @ self.shown[at, mode]
+        )
         return SweptModes(loops, at, mode, self.z[at], Y, q, Y @ q, e[mode])
+
+
+def driven_states(A: FloatArray, modal: IntArray) -> IntArray:
+    """Return the other states that modes drive, directly or through others."""
+    others = np.setdiff1d(np.arange(len(A)), modal)
+    inside = A[np.ix_(others, others)] != 0.0
+    driven = np.any(A[np.ix_(others, modal)], axis=1)
+    for _ in others:
+        more = driven | (inside @ driven)
+        if np.array_equal(more, driven):
+            break
+        driven = more
+    return np.asarray(others[driven])
 
 
 def _real_times(real: FloatArray, other: ComplexArray) -> ComplexArray:
