@@ -363,7 +363,8 @@ def _check_direct(plant: StandardPlant, candidates: Sequence[Any]) -> None:
     push = np.array([port.push(realisation) for port in loud])
     ground = np.array([port.ground for port in loud])
     for sensor in candidates:
-        if loud and np.any(direct_effect(sensor.see(realisation), sensor.order, push, ground)):
+        seen = sensor.see(realisation)
+        if loud and np.any(direct_effect(realisation.model, seen, sensor.order, push, ground)):
             raise AssumptionError(
                 f"white noise of a disturbance reaches {sensor.name!r} at once "
                 "(an acceleration, say), so a sample of it would have infinite variance. "

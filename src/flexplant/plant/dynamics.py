@@ -11,7 +11,9 @@ from ..checks import FloatArray
 from ..errors import ModelError, counted
 from ..lti.interconnection import among, append, series
 from ..lti.statespace import StateSpace, as_statespace
-from ..structure.placed import SPANNED
+from ..structure import FEModel
+from ..structure.placed import SPANNED, Structure
+from ..tolerances import ROUNDING, SAME
 from .port import QUANTITIES, Seen
 from .ports import Ports
 from .realisation import ModalRealisation
@@ -58,7 +60,8 @@ def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
         realisation.A,
         np.array([realisation.force(load) for load in own.push]).T,
         np.array([one.row for one in own.seen]),
-        np.array([direct_effect(*one, own.push, own.ground) for one in both]) + own.added,
+        np.array([direct_effect(realisation.model, *one, own.push, own.ground) for one in both])
+        + own.added,
         inputs=own.inputs,
         outputs=own.outputs,
         states=realisation.names,
@@ -134,16 +137,21 @@ class Parts(NamedTuple):
     after: dict[str, StateSpace]
 
 
-def direct_effect(one: Seen, order: int, push: FloatArray, ground: FloatArray) -> FloatArray:
+def direct_effect(
+    model: Structure, one: Seen, order: int, push: FloatArray, ground: FloatArray
+) -> FloatArray:
     """Return what a channel shows at once (m,) of loads `push` (m, n) and of `ground` (m, 6)."""
-    # an accelerometer on a free body shows none of the ground's: the load -M r takes back what it
-    # adds
     direct = push @ one.direct
+    sizes = np.linalg.norm(push, axis=1) * np.linalg.norm(one.direct)
+    direct[np.abs(direct) <= ROUNDING * sizes] = 0.0  # lumped masses do not feel each other
     if order < 2:
         return direct
+    # an accelerometer on a free body shows none of the ground's: the load -M r takes back what it
+    # adds, up to modes left out; on a held structure a part stays, that of the held DOFs' inertia
     along = ground @ one.carried
     total: FloatArray = direct + along
-    total[np.abs(total) <= SPANNED * np.abs(along)] = 0.0
+    held = isinstance(model, FEModel) and model.held_inertia is not None
+    total[np.abs(total) <= (SAME if held else SPANNED) * np.abs(along)] = 0.0
     return total
 
 
