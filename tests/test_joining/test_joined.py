@@ -504,3 +504,28 @@ def test_the_certificate_can_fail(monkeypatch):
     monkeypatch.setattr(joining_certificate, "_force", lambda K, motions: 1.0)
     with pytest.raises(CertificateError, match="fails its check"):
         fx.joined({"left": half, "right": half}, seam(half), placed=RIGHT)
+
+
+@pytest.mark.parametrize("stiffness", [None, (1e8, 1e8, 2e8, 1e5, 1e5, 1e5)])
+def test_one_joint_of_patches_listed_twice(stiffness):
+    """It was numpy's "Singular matrix": its axes were counted twice."""
+    below = fx.solid_block(
+        size=(0.2, 0.1, 0.05), elements=(4, 2, 1), density=2700, youngs_modulus=70e9,
+        poisson_ratio=0.33,
+    )  # fmt: skip
+    above = fx.solid_block(
+        size=(0.1, 0.1, 0.1), elements=(2, 2, 2), density=7800, youngs_modulus=210e9,
+        poisson_ratio=0.3,
+    )  # fmt: skip
+    ends = (
+        fx.Patch("a", box=[(0.05, 0, 0.05), (0.15, 0.1, 0.05)], at=(0.1, 0.05, 0.05)),
+        fx.Patch("b", box=[(0.06, 0, 0.05), (0.16, 0.1, 0.05)], at=(0.1, 0.05, 0.05)),
+    )
+    joint = fx.Joint(*ends, stiffness=stiffness)
+    placed = {"b": fx.Pose(shift=(0.06, 0, 0.05))}
+    once, twice = (fx.joined({"a": below, "b": above}, [joint] * n, placed=placed) for n in (1, 2))
+    assert set(twice.joining.patches) == set(once.joining.patches)
+    if stiffness is None:
+        np.testing.assert_allclose(elastic(twice, 6), elastic(once, 6), rtol=1e-9)
+    else:  # springs beside each other add
+        assert np.all(elastic(twice, 6) >= elastic(once, 6) * (1 - 1e-9))

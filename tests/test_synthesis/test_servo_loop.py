@@ -104,7 +104,7 @@ def test_notches_are_placed_where_they_serve():
     by_hand = design_servo(plant, bandwidth=50.0, observer=kalman, notches=[bowl])
     assert f"notches at {bowl:.4g} Hz" in repr(servo)
     np.testing.assert_allclose(servo.system.A, by_hand.system.A, rtol=1e-9)
-    with pytest.raises(SolverError, match=r"with its observer is unstable .*mode 6 \(45\d"):
+    with pytest.raises(SolverError, match=r"with its observer is unstable .*mode 6 \(at 45\d"):
         design_servo(plant, bandwidth=50.0, observer=kalman, notches=())
     # the static relation does not see that mode, but another one: on the machine too
     found, without = (

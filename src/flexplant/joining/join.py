@@ -425,7 +425,8 @@ def patch_errors(links: Sequence[Link], parts: Sequence[Component]) -> dict[str,
     found: dict[str, float] = {}
     joints = list({id(link.joint): link.joint for link in links}.values())
     for number, joint in enumerate(joints, 1):
-        axes = [DIRECTIONS.index(link.axis) for link in links if link.joint is joint]
+        # a joint that is listed twice is one
+        axes = sorted({DIRECTIONS.index(link.axis) for link in links if link.joint is joint})
         for end in (joint.first, joint.second):
             if isinstance(end, Patch):
                 name = split_end(f"{end.component}/", [part.name for part in parts])[0]

@@ -139,7 +139,7 @@ def _db(margin: float) -> str:
 
 def modes_in_words(modes: Sequence[int], freq: Sequence[float]) -> str:
     """Return modes in words, the first few of many."""
-    listed = [f"mode {n} ({f:.4g} Hz)" for n, f in zip(modes, freq, strict=True)]
+    listed = [f"mode {n} (at {f:.4g} Hz)" for n, f in zip(modes, freq, strict=True)]
     more = len(listed) - _NAMED
     first = ", ".join(listed[:_NAMED]) or "no mode named"
     return first + (f" and {more} more" if more > 0 else "")

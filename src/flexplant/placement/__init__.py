@@ -16,7 +16,7 @@ Criteria are values (`PoiVariance`, `ClosedLoopH2`, `ModeInformation`, ...), as 
 >>> best = fx.place_sensors(
 ...     plant, places, count=1, constraints=[fx.placement.OffPoi(-1)], progress=False
 ... )
->>> best.chosen, round(best.value * 1e9, 1), round(best.bound * 1e9, 1)  # nm rms
+>>> best.chosen, round(1e9 * best.value**0.5, 1), round(1e9 * best.bound**0.5, 1)  # nm rms
 (('at 2',), 0.0, 0.0)
 
 Names elsewhere: effective independence and modal kinetic energy (FEMtools, `AutoMac`,

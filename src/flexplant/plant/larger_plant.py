@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, some_names
+from ..checks import FloatArray
+from ..errors import LabelError, ModelError, some_names, warn
 from ..lti.statespace import StateSpace
 from ..reduction import ReducedModel
 from ..tolerances import SAME
 from .building import sampled_like, with_modes_of
+from .dynamics import structure_system
+from .origin import Assembled
 from .partition import is_plant
 from .realisation import Structure
 from .standard import StandardPlant, standard_plant
+
+#: relative difference of rigid-body accelerations that is none of an updated mass
+_ANOTHER_BODY = 0.1
 
 
 def larger_plant(
@@ -58,9 +64,38 @@ def larger_plant(
         if not isinstance(model, ReducedModel) or model.truncated is None:
             return None
         larger = model
-    if is_plant(larger):
-        return _matched(plain, standard_plant(larger))
-    return with_modes_of(plain, larger)
+    found = (
+        _matched(plain, standard_plant(larger))
+        if is_plant(larger)
+        else with_modes_of(plain, larger)
+    )
+    if plain.is_assembled and found.is_assembled:
+        _warn_of_another_body(plain.assembled, found.assembled)
+    return found
+
+
+def _warn_of_another_body(own: Assembled, larger: Assembled) -> None:
+    """Warn where forces accelerate the rigid body of a larger model otherwise than the plant's."""
+    one, two = _rigid_gains(own), _rigid_gains(larger)
+    size = float(np.linalg.norm(one))
+    if not size or one.shape != two.shape or not np.any(two):
+        return  # held, or on springs: no mode shows the mass alone
+    off = float(np.linalg.norm(two - one)) / size
+    if off > _ANOTHER_BODY:
+        warn(
+            f"the larger model moves as another rigid body: its acceleration per force differs by "
+            f"{off:.0%} from the plant's. What is said of modes left out is then that of another "
+            "machine. Pass the model that the plant was made of, with more modes."
+        )
+
+
+def _rigid_gains(own: Assembled) -> FloatArray:
+    """Return the acceleration (p, m) of what is seen, per force, by rigid-body motion."""
+    g, r = structure_system(own.realisation, own.ports), 2 * own.realisation.n_rigid
+    A, B, C = g.A[:r, :r], g.B[:r], g.C[:, :r]
+    orders = [0] * (len(C) - len(own.ports.y)) + [sensor.order for sensor in own.ports.y]
+    powers = [C @ A @ B, C @ B, 0.0 * (C @ B)]
+    return np.array([powers[order][i] for i, order in enumerate(orders)]).reshape(len(C), -1)
 
 
 def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:
