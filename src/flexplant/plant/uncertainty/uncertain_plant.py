@@ -19,6 +19,7 @@ from ...updating import UpdateResult
 from ...updating.parameters.added import Parameter
 from ..building import P, rebuilt, sampled
 from ..partition import Partition
+from ..port import ForcePort
 from ..realisation import MODAL, ModalRealisation
 from ..residual_form import plant_modes
 from .neglected import NeglectedModes
@@ -146,8 +147,10 @@ def _times(port: Any, gain: float) -> Any:
     """Return an actuator or sensor with another gain."""
     if gain == 1.0:
         return port
-    static = as_statespace([[gain]])
-    return port.replace(dynamics=static if port.dynamics is None else gain * port.dynamics)
+    part = as_statespace([[1.0]]) if port.dynamics is None else port.dynamics
+    # states as before: a command is scaled before the filter, a reading behind it
+    driven = {"B": gain * part.B} if isinstance(port, ForcePort) else {"C": gain * part.C}
+    return port.replace(dynamics=part.replace(D=gain * part.D, **driven))
 
 
 def reshaped(
