@@ -199,7 +199,8 @@ class Response(Value, Mapping[str, FloatArray]):
     ) -> tuple[float, float]:
         """Return the largest |MA| and the largest MSD of a channel after a time, over all runs.
 
-        Windows [s] centred before `start` [s] are left out: the move and its settling.
+        Windows [s] centred before `start` [s] are left out: the move and its settling; those at
+        the record's end are cut off by it (`moving_average`).
         """
         late = self._late(start)
         average, deviation = self._moments(channel, window)
