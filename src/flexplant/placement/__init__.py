@@ -17,7 +17,7 @@ Criteria are values (`PoiVariance`, `ClosedLoopH2`, `ModeInformation`, ...), as 
 ...     plant, places, count=1, constraints=[fx.placement.OffPoi(-1)], progress=False
 ... )
 >>> best.chosen, round(1e9 * best.value**0.5, 1), round(1e9 * best.bound**0.5, 1)  # nm rms
-(('at 2',), 0.0, 0.0)
+(('at 2',), 20.6, 20.6)
 
 Names elsewhere: effective independence and modal kinetic energy (FEMtools, `AutoMac`,
 `KineticEnergy` here). ``examples/placement.py`` chooses four of 48 places with a proof.

@@ -125,7 +125,8 @@ class Partition(Value):
         w, z : sequences of str, optional
             Disturbances and performance; the remaining channels when not given.
         asd : mapping, optional
-            One-sided amplitude spectral densities of white w channels.
+            One-sided amplitude spectral densities of white w channels; the noise of a sensor y1
+            is the w channel `y1:noise`.
         noise_factor : (n, r) array, optional
             G with G G' the covariance of x that disturbances add in one sample.
 
@@ -150,11 +151,13 @@ class Partition(Value):
         u, y = name_list(u, "u"), name_list(y, "y")
         w = [n for n in g.inputs if n not in u] if w is None else list(name_list(w, "w"))
         z = [n for n in g.outputs if n not in y] if z is None else list(name_list(z, "z"))
+        if noise_factor is not None:
+            noise_factor = real_array(noise_factor, "noise_factor", (g.n_states, None))
         return cls(
             g.select([*z, *y], [*w, *u]),
             tuple(w), tuple(u), tuple(z), tuple(y),
             {} if asd is None else mapping(asd, "asd", "Pass {channel: density}."),
-            Foreign(None if noise_factor is None else real_array(noise_factor, "noise_factor")),
+            Foreign(noise_factor),
         )  # fmt: skip
 
     @property
