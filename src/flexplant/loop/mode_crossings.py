@@ -25,6 +25,7 @@ import numpy as np
 
 from ..checks import BoolArray, ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
+from ..lti.discretisation import acting
 from ..lti.responses import Responder, points, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
@@ -123,20 +124,19 @@ class ModeLoops:
             changes[kind] = ModeChanges(A, T)
         rows_y, states = g.C[g.output_index(broken.y)], responder(to_states)
         seen = np.stack([rows_y[:, pair] for pair in own])
-        late = driven_states(g.A, plant.modal_states)
+        modal = plant.modal_states
+        late = np.setdiff1d(np.flatnonzero(acting(g.A != 0)[:, modal].any(axis=1)), modal)
+        feeding = np.flatnonzero(used[:n])
         if np.any(rows_y[:, late]):
             A, driven = g.A[np.ix_(late, late)], g.A[np.ix_(late, own.ravel())]
             nothing = np.zeros((len(rows_y), own.size))
             behind = responder(StateSpace(A, driven, rows_y[:, late], nothing, g.dt))
-            parts = seen, np.tile(np.eye(2), (len(own), 1, 1))
-            return cls(
-                *(plant, broken, states, changes, own),
-                *(np.flatnonzero(used[:n]), sums, parts, behind),
-            )
+            both = seen, np.tile(np.eye(2), (len(own), 1, 1))
+            return cls(plant, broken, states, changes, own, feeding, sums, both, behind)
         left, size, right = np.linalg.svd(seen, full_matrices=False)
         k = 1 + int(np.any(size[:, 1:] > SAME * size[:, :1]))
         parts = left[..., :k] * size[:, None, :k], right[:, :k]
-        return cls(plant, broken, states, changes, own, np.flatnonzero(used[:n]), sums, parts)
+        return cls(plant, broken, states, changes, own, feeding, sums, parts)
 
     def swept(self, freq: FloatArray) -> SweptLoop:
         """Return the loop's responses at frequencies [Hz]."""
@@ -181,19 +181,6 @@ class SweptLoop(NamedTuple):
             else self.SK[at] @ self.shown[at, mode]
         )
         return SweptModes(loops, at, mode, self.z[at], Y, q, Y @ q, e[mode])
-
-
-def driven_states(A: FloatArray, modal: IntArray) -> IntArray:
-    """Return the other states that modes drive, directly or through others."""
-    others = np.setdiff1d(np.arange(len(A)), modal)
-    inside = A[np.ix_(others, others)] != 0.0
-    driven = np.any(A[np.ix_(others, modal)], axis=1)
-    for _ in others:
-        more = driven | (inside @ driven)
-        if np.array_equal(more, driven):
-            break
-        driven = more
-    return np.asarray(others[driven])
 
 
 def _real_times(real: FloatArray, other: ComplexArray) -> ComplexArray:

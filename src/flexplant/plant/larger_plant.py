@@ -10,10 +10,9 @@ from ..lti.statespace import StateSpace
 from ..reduction import ReducedModel
 from ..tolerances import SAME
 from .building import sampled_like, with_modes_of
-from .dynamics import structure_system
-from .origin import Assembled
 from .partition import is_plant
 from .realisation import Structure
+from .rigid.rigid_motion import rigid_gain, rigid_modes
 from .standard import StandardPlant, standard_plant
 
 #: relative difference of rigid-body accelerations that is none of an updated mass
@@ -70,15 +69,15 @@ def larger_plant(
         else with_modes_of(plain, larger)
     )
     if plain.is_assembled and found.is_assembled:
-        _warn_of_another_body(plain.assembled, found.assembled)
+        _warn_of_another_body(plain, found)
     return found
 
 
-def _warn_of_another_body(own: Assembled, larger: Assembled) -> None:
+def _warn_of_another_body(own: StandardPlant, larger: StandardPlant) -> None:
     """Warn where forces accelerate the rigid body of a larger model otherwise than the plant's."""
     one, two = _rigid_gains(own), _rigid_gains(larger)
     size = float(np.linalg.norm(one))
-    if not size or one.shape != two.shape or not np.any(two):
+    if not size or not np.any(two):
         return  # held, or on springs: no mode shows the mass alone
     off = float(np.linalg.norm(two - one)) / size
     if off > _ANOTHER_BODY:
@@ -89,13 +88,11 @@ def _warn_of_another_body(own: Assembled, larger: Assembled) -> None:
         )
 
 
-def _rigid_gains(own: Assembled) -> FloatArray:
-    """Return the acceleration (p, m) of what is seen, per force, by rigid-body motion."""
-    g, r = structure_system(own.realisation, own.ports), 2 * own.realisation.n_rigid
-    A, B, C = g.A[:r, :r], g.B[:r], g.C[:, :r]
-    orders = [0] * (len(C) - len(own.ports.y)) + [sensor.order for sensor in own.ports.y]
-    powers = [C @ A @ B, C @ B, 0.0 * (C @ B)]
-    return np.array([powers[order][i] for i, order in enumerate(orders)]).reshape(len(C), -1)
+def _rigid_gains(plant: StandardPlant) -> FloatArray:
+    """Return the acceleration (p, m) of what is seen, per force, by the modes at 0 Hz."""
+    ports = plant.assembled.ports
+    seen = [poi.channel(axis) for poi in ports.z for axis in poi.axes] + [s.name for s in ports.y]
+    return rigid_gain(plant, rigid_modes(plant.assembled.realisation, None), seen, plant.u)
 
 
 def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:
