@@ -2,6 +2,7 @@
 
 import ast
 import json
+import os
 import subprocess
 import sys
 from functools import cache
@@ -241,6 +242,7 @@ def only_exports(node, *, root):
     return (
         docstring
         or lazy
+        or (root and names == ["(_imported, __dir__, __all__)"])
         or checking
         or isinstance(node, ast.Import | ast.ImportFrom)
         or names in (["__version__"], ["__all__"], ["__dir__"])
@@ -270,6 +272,10 @@ import json, sys, warnings
 import numpy, scipy.linalg, scipy.sparse.linalg
 before = list(warnings.filters), numpy.get_printoptions(), numpy.geterr()
 import flexplant
+rooms = [name for name in dir(flexplant) if name not in ("plot", "workbench")]
+first = [name for name in sys.modules if name.startswith("flexplant.")]
+for name in rooms:
+    getattr(flexplant, name)
 after = list(warnings.filters), numpy.get_printoptions(), numpy.geterr()
 heavy = "matplotlib control cvxpy clarabel filterpy tqdm slycot pandas".split()
 parts = "io stats ndimage integrate interpolate signal optimize spatial special".split()
@@ -277,7 +283,8 @@ heavy += [f"scipy.{name}" for name in parts]
 print(json.dumps({
     "heavy": [name for name in heavy if name in sys.modules],
     "same": [a == b for a, b in zip(before, after)],
-    "numpy": "numpy" in sys.modules and "scipy" in sys.modules,
+    "first": first,
+    "rooms": len(rooms),
 }))
 """
 
@@ -287,8 +294,31 @@ def test_importing_it_is_light_and_changes_nothing():
         [sys.executable, "-c", PROBE], capture_output=True, text=True, check=True, timeout=60
     )
     found = json.loads(answer.stdout)
-    assert found == {"heavy": [], "same": [True, True, True], "numpy": True}
+    assert found.pop("rooms") > 140
+    assert found == {"heavy": [], "same": [True, True, True], "first": []}
     assert not answer.stderr
+
+
+ALONE = """
+import importlib, os, sys
+import numpy, scipy.linalg, scipy.sparse.linalg
+for name in sys.argv[1:]:
+    child = os.fork()
+    if not child:
+        importlib.import_module(f"flexplant.{name}")
+        os._exit(0)
+    if os.waitpid(child, 0)[1]:
+        sys.exit(f"{name} cannot be the first room that is imported")
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_any_room_may_be_imported_first():
+    rooms = [path.name for path in ROOT.iterdir() if (path / "__init__.py").is_file()]
+    assert len(rooms) > 15
+    command = [sys.executable, "-c", ALONE, *rooms, "store", "labels"]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert not answer.returncode, answer.stderr
 
 
 def test_class_names_are_unique():

@@ -23,6 +23,7 @@ LICENCES = {
     "cvxpy": "Apache",
     "clarabel": "Apache",
     "filterpy": "MIT",
+    "lazy-loader": "BSD",
     "matplotlib": "Python Software Foundation",
     "tqdm": "MPL",
     "h5py": "BSD",
