@@ -239,6 +239,7 @@ def test_repr_is_short(loop):
             LabelError,
             "'y1', which the plant has in y",
         ),
+        (lambda: [observer(), servo(), servo()], ModelError, "blocks 2 and 3 are the same system"),
         (lambda: [observer(dt=1e-3), servo()], ModelError, "block 1 .* dt 0.001 s"),
         (lambda: [observer().replace(dt=0.0), servo()], ModelError, "0 is continuous"),
     ],

@@ -179,6 +179,8 @@ def test_names_of_derived_channels_are_reserved(kind, ending):
         (lambda: Ports(u=[Sensor("y", at=P)]), r"got Sensor. It belongs in y"),
         (lambda: Sensor("y", at=P, asd=True), "asd of 'y' must be one number"),
         (lambda: Actuator("u", at=P, latency="1 ms"), "latency of 'u'"),
+        (lambda: Sensor("y", at="1:z", direction="rx"), r"its own direction, 'z'.*at='1:rx'"),
+        (lambda: Sensor("y", at=["1:z", "2:z"]), r"a port for each.*a mapping, \{"),
     ],
 )
 def test_other_kinds_are_refused_at_the_door(make, words):

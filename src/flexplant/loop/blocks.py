@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, inner_names
 from ..errors import LabelError, ModelError, unknown_label
 from ..lti.interconnection import among, connect
+from ..lti.joining import equal_matrices
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
@@ -136,6 +138,15 @@ def drives(
             raise LabelError(
                 f"{name!r} is an output of {produced.count(name)} blocks: only outputs to "
                 "actuators add. Rename one: system.renamed(outputs={...})."
+            )
+    for i, j in combinations(range(len(systems)), 2):
+        one, other = systems[i], systems[j]
+        if (one.inputs, one.outputs) == (other.inputs, other.outputs) and equal_matrices(
+            one, other
+        ):
+            raise ModelError(
+                f"blocks {i + 1} and {j + 1} are the same system: what they drive adds, so that it "
+                "acts twice. Pass it once; for twice the gain, scale its matrices C and D."
             )
     for name in plant.u:
         if name not in produced and name not in idle:

@@ -525,8 +525,8 @@ def close_loop(
         connected to nothing, an actuator is driven by nothing (and not idle), or
         a name other than an actuator's is driven twice.
     ModelError
-        When there is no block, a block is no system, sampling times differ, or the algebraic loop
-        is ill-posed, or `larger` does not go with the plant.
+        When there is no block, a block is no system or stands twice, sampling times differ, the
+        algebraic loop is ill-posed, or `larger` does not go with the plant.
 
     Examples
     --------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -248,6 +248,14 @@ def checked_port(port: Any) -> dict[str, Any]:
     found = {"name": name} | {
         key: check(name, given[key]) for key, check in checks.items() if key in given
     }
+    label = found.get("at")
+    own = label.rpartition(":")[2] if isinstance(label, str) else "z"
+    if isinstance(label, str) and found.get("direction", "z") not in ("z", own):
+        raise LabelError(
+            f"{name!r} is at {label!r} with direction {found['direction']!r}: a label has its own "
+            f"direction, {own!r}. Name the other DOF, "
+            f"at='{label.rpartition(':')[0]}:{found['direction']}', or give a point (x, y, z)."
+        )
     if "moves" in given:
         found["moves"] = checked_moves(name, found["at"], given["moves"])
     return found
@@ -308,6 +316,11 @@ def checked_place(name: str, at: Any) -> Place:
         }
     if isinstance(at, str):
         return at
+    if isinstance(at, Sequence) and all(isinstance(place, str) for place in at):
+        raise LabelError(
+            f"{name!r} is at one place, got {short(at)}. A channel for each is a port for each; "
+            "their weighted sum is a mapping, {'1:z': 0.5, '2:z': 0.5}."
+        )
     return tuple(real_array(at, f"place of {name!r}", (3,)).tolist())
 
 
