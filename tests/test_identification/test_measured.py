@@ -72,6 +72,7 @@ def test_repr_is_one_line_without_arrays():
         ([-5.0], ModelError, "overdamped"),
         ([0.0], ModelError, "rigid-body"),
         ([0.1 + 10j], ModelError, "unstable"),
+        ([-1 + 10j, -2 + 9j, -1 - 10j], ModelError, "poles 0 and 2 are a conjugate pair"),
     ],
 )
 def test_bad_poles_are_refused(poles, error, text):

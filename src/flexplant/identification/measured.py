@@ -243,6 +243,15 @@ def _checked_poles(value: Any) -> ComplexArray:
                 f"pole {i} is {pole:g}, unstable: a passive structure's poles have a real part "
                 "of at most zero. Check the sign convention (exp(lambda t)) or the fit."
             )
+    apart = np.abs(poles[:, None] - poles.conj())
+    np.fill_diagonal(apart, np.inf)
+    i, j = np.unravel_index(np.argmin(apart), apart.shape)
+    if apart[i, j] <= SAME * abs(poles[i]):
+        raise ModelError(
+            f"poles {min(i, j)} and {max(i, j)} are a conjugate pair, {poles[i]:g} and "
+            f"{poles[j]:g}: one mode, which would count twice. Pass one of each pair: "
+            "poles[poles.imag > 0]."
+        )
     return poles
 
 
