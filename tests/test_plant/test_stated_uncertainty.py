@@ -252,25 +252,28 @@ def closed(P, *blocks):
     return loop.blocks, loop.controller, loop.idle
 
 
-@pytest.mark.parametrize("rate", [0.0, 5e3])
-def test_the_gain_of_an_actuator_behind_its_own_filter(rate):
-    """It was refused: the filter's state was scaled in the one and not in the other."""
+@pytest.mark.parametrize(("rate", "amplifier"), [(0.0, 0.0), (5e3, 0.0), (0.0, 2e-3), (5e3, 2e-3)])
+def test_the_gain_of_an_actuator_behind_its_own_filter(rate, amplifier):
+    """It was refused: the filter's state was scaled in the one and not in the other.
+
+    Noise at the amplifier's input passes the same gain.
+    """
     model = fx.chain(masses=[2.0, 1.0], stiffnesses=[1e6], ground=[1e5, 0.0])
     modes = fx.solve_modes(model, count=2, damping=fx.ModalDamping(0.01))
 
     def made(gain):
         own = fx.Ports(
-            u=[fx.Actuator("u1", at="1:x", dynamics=gain * fx.lowpass(500.0), latency=0.0)],
+            u=[fx.Actuator("u1", at="1:x", dynamics=gain * fx.lowpass(500.0), asd=amplifier)],
             y=[fx.Sensor("y1", at="2:x", asd=1e-10, dynamics=fx.lowpass(900.0))],
         )
         plant = fx.assemble_plant(modes, own)
         return plant.discretized(rate, delay=1.0) if rate else plant
 
     known = made(1.0).uncertain(gain={"u1": 0.05})
-    changed = known.lft({"u1:gain": 1.0})
-    freq = np.array([3.0, 50.0, 300.0])
+    changed, wanted = known.lft({"u1:gain": 1.0}), made(1.05)
+    assert ("u1:disturbance" in wanted.w) == bool(amplifier)
     np.testing.assert_allclose(
-        fx.frequency_response(changed.Gyu, freq).data,
-        fx.frequency_response(made(1.05).Gyu, freq).data,
+        fx.frequency_response(changed.system, freq := [3.0, 50.0, 300.0]).data,
+        fx.frequency_response(wanted.system, freq).data,
         rtol=1e-12,
     )

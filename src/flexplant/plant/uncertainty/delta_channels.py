@@ -353,8 +353,8 @@ def with_gain_channels(
 ) -> tuple[StateSpace, list[tuple[str, int]]]:
     """Return a system with a first channel for each Delta on a gain, and their names, in order.
 
-    ``(1 + d) u`` acts by d times the command's column more, all but its own effort; ``(1 + d) y``
-    adds d times what the sensor shows of the motion, with what the actuators' Deltas do.
+    ``(1 + d) u`` acts by d times the command's column more, all but its own effort, and so does
+    noise at the amplifier's input; ``(1 + d) y`` adds d times what the sensor shows of the motion, with what the actuators' Deltas do.
     """
     order = sorted(deltas, key=lambda one: one.name.removesuffix(":gain") in plant.y)
     for delta in order:
@@ -366,6 +366,11 @@ def with_gain_channels(
             left[:, 0] = np.concatenate([system.B[:, column], system.D[:, column]])
             left[n + system.outputs.index(f"{name}:effort")] = 0.0
             right[0, n + column] = delta.scale
+            if f"{name}:disturbance" in system.inputs:  # at the amplifier's input: scaled as well
+                noise = system.inputs.index(f"{name}:disturbance")
+                its = np.concatenate([system.B[:, noise], system.D[:, noise]])
+                share = float(left[:, 0] @ its) / float(left[:, 0] @ left[:, 0])
+                right[0, n + noise] = delta.scale * share
         else:
             row = system.outputs.index(name)
             left[n + row] = 1.0
