@@ -118,6 +118,8 @@
 .. [Hanus1987] Hanus, Kinnaert, Henrotte, Conditioning technique, a general anti-windup and bumpless
    transfer method, Automatica 23, 1987.
 .. [Hassibi1999] Hassibi, Sayed, Kailath, Indefinite-Quadratic Estimation and Control, SIAM, 1999.
+.. [Hewer1971] Hewer, An iterative technique for the computation of the steady state gains for the
+   discrete optimal regulator, IEEE Trans. Autom. Control 16, 1971, 382-384.
 .. [HeylenLammens1996] Heylen, Lammens, FRAC: a consistent way of comparing frequency response
    functions, Identification in Engineering Systems, 1996.
 .. [Higham2008] Higham, Functions of Matrices: Theory and Computation, SIAM, 2008.

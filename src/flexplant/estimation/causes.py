@@ -11,6 +11,7 @@ from ..errors import counted
 from ..plant import StandardPlant
 from ..tolerances import SAME, TINY, divisor
 from .estimator import KalmanEstimator
+from .filter_model import innovation_root
 from .innovations import ExcessPeak, InnovationLines, InnovationParts, impulse, steady_gain
 from .moved_modes import ModeChange, explained_by_change, peak_band
 
@@ -76,7 +77,7 @@ def outliers(
     response = impulse(observer, length)
     model = observer.model
     S = model.innovation(observer.predicted_covariance)
-    root, size = np.linalg.cholesky(0.5 * (S + S.T)), np.sqrt(S.diagonal())
+    root, size = innovation_root(S), np.sqrt(S.diagonal())
     places: list[tuple[int, int]] = []
     sizes: list[float] = []
     while np.any(late := np.abs(plain) > bound):

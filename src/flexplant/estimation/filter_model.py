@@ -11,14 +11,12 @@ from ..certificates import Certificate
 from ..checks import FloatArray, IntArray, Value, real_array
 from ..errors import AssumptionError, CertificateError, ShapeError, SolverError
 from ..lti.lyapunov import solve_stein
+from ..lti.square_roots import square_root, stein_root
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..tolerances import divisor
 from .estimator_channels import estimates, poi_channels, sensors
 from .left_out import LeftOut
-
-#: noise of a sensor beside its motion in one sample that rounding may hide: its square is 1e-12
-_LOST = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -49,6 +47,8 @@ class FilterModel(Value):
         Sampling time.
     channels, sensors, commands : tuples of str
         Names of z, y and u.
+    root : (n + ny, r) array, optional
+        A factor of ``[Q S; S' R]``, where one is known.
 
     Examples
     --------
@@ -73,6 +73,7 @@ class FilterModel(Value):
     channels: tuple[str, ...]
     sensors: tuple[str, ...]
     commands: tuple[str, ...]
+    root: FloatArray | None = None
 
     def scaled(self, d: FloatArray, s: FloatArray) -> FilterModel:
         """Return the model with states x / d and measurements y / s."""
@@ -86,6 +87,7 @@ class FilterModel(Value):
             R=self.R / s / s[:, None],
             N=self.N / s,
             S=self.S / d[:, None] / s,
+            root=None if self.root is None else self.root / np.concatenate([d, s])[:, None],
         )
 
     def innovation(self, P: FloatArray) -> FloatArray:
@@ -125,11 +127,16 @@ def filter_model(plant: StandardPlant, found: LeftOut | None = None) -> FilterMo
     R = own.sensor_noise[np.ix_(rows, rows)] + direct @ direct.T
     ny, nz = len(y), len(z)
     V, N = np.zeros((nz, nz)), np.zeros((nz, ny))
+    noises = [own.sensor_noise_factor[rows]]
     if found is not None:
         R, V, N = R + found.sensors, found.pois, found.cross
+        noises.append(square_root(found.sensors))
+    noise = np.hstack(noises)
+    silent = np.zeros((n, noise.shape[1]))
+    root = np.block([[own.noise_factor, silent], [direct, noise]])
     return FilterModel(
         g.A, toward.B, at.C, at.D, toward.C, toward.D, own.process_noise, R, V, N,
-        own.noise_factor @ direct.T, own.dt, z, y, tuple(own.u),
+        own.noise_factor @ direct.T, own.dt, z, y, tuple(own.u), root,
     )  # fmt: skip
 
 
@@ -159,24 +166,6 @@ def check_noises(plant: StandardPlant) -> None:
             "displacement or velocity, shape the disturbance, or let it be held over each sample: "
             "Disturbance(..., held=True)."
         )
-
-
-def check_precision(model: FilterModel, error: Exception) -> None:
-    """Raise SolverError when the noise of a sensor is why a filter could not be computed."""
-    moved = model.C2 @ model.Q @ model.C2.T
-    motion, noise = np.sqrt(moved.diagonal()), np.sqrt(model.R.diagonal())
-    part = np.where(motion > 0, noise / divisor(motion), np.inf)
-    if np.min(part) > _LOST:
-        return
-    i = int(np.argmin(part))
-    raise SolverError(
-        f"the noise of sensor {model.sensors[i]!r} is {noise[i]:.2g} in a sample, {part[i]:.1e} "
-        f"of the {motion[i]:.2g} that the disturbances move it within a sample. Its square is lost "
-        f"in double precision, so that no filter can be computed ({error}). So little noise "
-        f"changes no estimate: give Sensor({model.sensors[i]!r}, asd="
-        f"{_LOST * motion[i] * np.sqrt(2.0 * model.dt):.1g}) or more, what the data sheet says, "
-        "and check the unit of asd."
-    ) from error
 
 
 class Sight(NamedTuple):
@@ -230,15 +219,10 @@ def filter_system(
 
 
 def noise_root(model: FilterModel) -> tuple[FloatArray, FloatArray]:
-    """Return G (n, r) and H (ny, r): process and sensor noise are G xi and H xi, xi of unit size.
-
-    A factor of ``[Q S; S' R]`` by its eigenvectors, each row scaled to unit size before.
-    """
-    n, joint = model.A.shape[0], np.block([[model.Q, model.S], [model.S.T, model.R]])
-    size = np.sqrt(np.maximum(joint.diagonal(), 0.0))
-    size = divisor(size)
-    values, vectors = np.linalg.eigh(joint / size / size[:, None])
-    root = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    """Return G (n, r) and H (ny, r): the noises of process and sensors, of xi of unit variance."""
+    n, root = model.A.shape[0], model.root
+    if root is None:
+        root = square_root(np.block([[model.Q, model.S], [model.S.T, model.R]]))
     return root[:n], root[n:]
 
 
@@ -255,12 +239,41 @@ def own_variances(model: FilterModel, K: FloatArray, L_z: FloatArray) -> FloatAr
     return np.asarray(np.sum((left @ X) * left, axis=1) + np.sum((L_z @ m.R) * L_z, axis=1))
 
 
+def dual_variances(
+    model: FilterModel, K: FloatArray, L_z: FloatArray, size: FloatArray
+) -> FloatArray:
+    """Return what `own_variances` does, by sums ``c F^k (G - K H)`` in square roots.
+
+    `size` (n,) are standard deviations of the states: their units.
+    """
+    m, (G, H) = model, noise_root(model)
+    F, entering = (m.A - K @ m.C2) * size / size[:, None], (G - K @ H) / size[:, None]
+    seen = [
+        float(np.sum((stein_root(F.T, row[:, None]).T @ entering) ** 2))
+        for row in (m.C1 - L_z @ m.C2) * size
+    ]
+    return np.asarray(seen + np.sum((L_z @ H) ** 2, axis=1))
+
+
 class FilterGains(NamedTuple):
     """L, K and the whitening W of the innovations, zeros at sensors that are missing."""
 
     L: FloatArray
     K: FloatArray
     W: FloatArray
+
+
+def innovation_root(S: FloatArray) -> FloatArray:
+    """Return the Cholesky factors of covariances (..., ny, ny) of innovations."""
+    try:
+        return np.asarray(np.linalg.cholesky(0.5 * (S + np.swapaxes(S, -1, -2))))
+    except np.linalg.LinAlgError:
+        raise SolverError(
+            "the covariance of the innovations, C P C' + R, is indefinite by rounding: the noise "
+            "of the sensors is too little beside the motion for covariances in double precision. "
+            "Run the filter itself (observer.system, close_loop), or give the sensors the asd of "
+            "their data sheet and check its unit."
+        ) from None
 
 
 def filter_gains(model: FilterModel, P: FloatArray, seen: FloatArray) -> FilterGains:
@@ -271,7 +284,7 @@ def filter_gains(model: FilterModel, P: FloatArray, seen: FloatArray) -> FilterG
     there = np.flatnonzero(seen)
     if there.size:
         at = np.ix_(there, there)
-        W[at] = np.linalg.inv(np.linalg.cholesky(0.5 * (S + S.T)[at]))
+        W[at] = np.linalg.inv(innovation_root(S[at]))
     weight = W.T @ W
     L = M @ weight
     return FilterGains(L, model.A @ L + model.S @ weight, W)
@@ -320,8 +333,9 @@ class Steady:
         return solve_stein(self.F.T, H.T @ H)
 
 
-#: the covariance of the Riccati equation and that of the gain's own Stein equation agree to this
-AGREEMENT = 1e-6
+#: the covariance of the Riccati equation and that of the gain's own Stein equation agree to this;
+#: where the gain's own rounding counts (`riccati_root`): half of it of a standard deviation
+AGREEMENT, ROUNDED = 1e-6, 1e-4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -336,7 +350,8 @@ class KalmanCertificate(Certificate):
         Of the Riccati equation, relative, in states of unit variance.
     difference : float
         Largest relative difference between two ways to the POI variances: on the filter's own
-        model the Riccati equation and a Stein equation of the gain, at most 1e-6; on the plant with
+        model the Riccati equation and a Stein equation of the gain, at most 1e-6 (1e-4 where noise
+        is so little that square roots were needed); on the plant with
         the modes left out the joint Stein equation and its dual, at most 1 %, with what rounding of
         hardly damped poles may change.
     left_out : int, optional
@@ -408,6 +423,17 @@ def error_of(
     model: FilterModel, gain: FloatArray, predictor: FloatArray, covariance: FloatArray
 ) -> tuple[float, float]:
     """Return spectral radius and difference of a gain L and its predictor gain K, if both hold."""
+    radius = stable_radius(model, predictor)
+    try:
+        truth = own_variances(model, predictor, model.C1 @ gain)
+    except SolverError as error:
+        raise CertificateError(f"the estimation error could not be checked: {error}") from error
+    claim = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
+    return radius, agreement(claim, truth)
+
+
+def stable_radius(model: FilterModel, predictor: FloatArray) -> float:
+    """Return the spectral radius of the error of a predictor gain, which is below 1."""
     closed = model.A - predictor @ model.C2
     radius = float(np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0))
     if radius >= 1:
@@ -415,16 +441,15 @@ def error_of(
             f"the estimation error is not stable: spectral radius {radius:.9f}. The gain is not "
             "that of a Kalman filter of this plant."
         )
-    try:
-        truth = own_variances(model, predictor, model.C1 @ gain)
-    except SolverError as error:
-        raise CertificateError(f"the estimation error could not be checked: {error}") from error
-    claim = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
-    size = divisor(truth)
-    difference = float(np.max(np.abs(claim - truth) / size))
-    if not difference <= AGREEMENT:
+    return radius
+
+
+def agreement(claim: FloatArray, truth: FloatArray, allowed: float = AGREEMENT) -> float:
+    """Return the largest relative difference of POI variances from those of the gain."""
+    difference = float(np.max(np.abs(claim - truth) / divisor(truth)))
+    if not difference <= allowed:
         raise CertificateError(
             f"the gain gives POI variances that differ from the predicted ones by {difference:.1e} "
-            f"(allowed {AGREEMENT:.0e}). The prediction cannot be trusted."
+            f"(allowed {allowed:.0e}). The prediction cannot be trusted."
         )
-    return radius, difference
+    return difference

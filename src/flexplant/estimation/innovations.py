@@ -12,6 +12,7 @@ from ..lti.frequency import frequency_response
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from .estimator import KalmanEstimator
+from .filter_model import innovation_root
 
 #: bands of lines over which the spectrum is averaged to find an excess, beside the narrowest one
 _WIDTHS = (1, 8, 64)
@@ -279,7 +280,7 @@ def expected(observer: KalmanEstimator, plant: StandardPlant, samples: int) -> I
 
 def _cholesky(observer: KalmanEstimator) -> FloatArray:
     S = observer.model.innovation(observer.predicted_covariance)
-    return np.asarray(np.linalg.cholesky(0.5 * (S + S.T)))
+    return innovation_root(S)
 
 
 def _squared(part: ComplexArray) -> ComplexArray:

@@ -10,21 +10,27 @@ import numpy as np
 from ..checks import FloatArray
 from ..errors import AssumptionError, CertificateError, SolverError
 from ..lti.riccati import solve_dare
+from ..lti.square_roots import riccati_root
 from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
+from ..tolerances import divisor
 from .error import error_variances, unresolved_share
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike
 from .filter_model import (
+    ROUNDED,
     FilterModel,
     KalmanCertificate,
+    agreement,
     check_noises,
-    check_precision,
+    dual_variances,
     error_of,
     filter_model,
     filter_system,
+    noise_root,
+    stable_radius,
     weigh,
 )
 from .left_out import left_out
@@ -70,8 +76,7 @@ def design_kalman(
     LabelError
         When the labels of a system do not name w, u, z and y, or the larger plant has others.
     SolverError
-        When no strictly stable filter exists for another reason, or the noise of a sensor is so far
-        below the motion within a sample that rounding hides it.
+        When no strictly stable filter exists for another reason.
     CertificateError
         When the check by the other route fails.
 
@@ -103,11 +108,7 @@ def design_kalman(
     whole = None if larger is plant else larger_plant(plant, larger)
     found = None if whole is None else left_out(plant, whole)
     model = filter_model(plant, found)
-    try:
-        design = _filter_design(model)
-    except (SolverError, CertificateError) as error:
-        check_precision(model, error)
-        raise
+    design = _filter_design(model)
     own = plant if found is None else found.plant
     system = filter_system(own, model, design.predictor, design.poi_gain, "kalman")
     if whole is None or found is None:
@@ -158,6 +159,14 @@ class _Design(NamedTuple):
 
 def _filter_design(model: FilterModel) -> _Design:
     """Return the gains of a model whose sensors may have the noise of modes left out as well."""
+    try:
+        return _design_by_covariance(model)
+    except (SolverError, CertificateError) as error:
+        return _design_in_roots(model, error)
+
+
+def _design_by_covariance(model: FilterModel) -> _Design:
+    """Return the gains by the Riccati equation of P."""
     solution = solve_dare(model.A, model.C2, Q=model.Q, R=model.R, S=model.S)
     P = solution.P
     innovation = model.innovation(P)
@@ -169,3 +178,23 @@ def _filter_design(model: FilterModel) -> _Design:
     radius, difference = error_of(model, gain, predictor, covariance)
     certificate = KalmanCertificate(radius, solution.residual, difference)
     return _Design(gain, predictor, poi_gain, covariance, variances, certificate)
+
+
+def _design_in_roots(model: FilterModel, why: SolverError | CertificateError) -> _Design:
+    """Return the gains where P itself has too few digits; raise `why` where there are none."""
+    G, H = noise_root(model)
+    try:
+        found = riccati_root(model.A, model.C2, G, H)
+    except SolverError as error:
+        raise why from error
+    gain = found.weighed(found.L @ (model.C2 @ found.L).T)
+    rest = np.hstack([found.L - gain @ (model.C2 @ found.L), gain @ H])
+    covariance = rest @ rest.T
+    variances = np.sum((model.C1 @ rest) ** 2, axis=1)
+    radius = stable_radius(model, found.K)
+    size = divisor(np.linalg.norm(found.L, axis=1))
+    truth = dual_variances(model, found.K, model.C1 @ gain, size)
+    difference = agreement(variances, truth, ROUNDED)
+    certificate = KalmanCertificate(radius, found.change, difference)
+    poi_gain = model.C1 @ gain + found.weighed(model.N)
+    return _Design(gain, found.K, poi_gain, covariance, variances, certificate)

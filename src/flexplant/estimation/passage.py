@@ -13,7 +13,7 @@ from ..lti.equations import sylvester
 from ..lti.lyapunov import solve_stein
 from ..lti.recursion import Recursion
 from .estimator_channels import Recorded
-from .filter_model import FilterGains, FilterModel, Sight, Steady, filter_gains
+from .filter_model import FilterGains, FilterModel, Sight, Steady, filter_gains, innovation_root
 
 #: the gain counts as stationary when all that its last changes would still do to the estimates and
 #: innovations, summed over time, is this part of their variances
@@ -248,7 +248,7 @@ class _Walk:
         self.deviation[k, known] = (self.s * size)[known]
         if np.any(known) and np.all(known == there):
             at = np.flatnonzero(known)
-            root = np.linalg.cholesky(S[np.ix_(at, at)])
+            root = innovation_root(S[np.ix_(at, at)])
             self.whitened[k, at] = np.linalg.solve(root, e[at])
 
     def _settled(
@@ -306,7 +306,7 @@ class _Walk:
             S = m.innovation(self.steady.P) + C @ found.covariance[:-1] @ C.transpose(0, 2, 1)
             self.innovations[at] = e * self.s
             self.deviation[at] = self.s * np.sqrt(np.diagonal(S, axis1=1, axis2=2))
-            self.whitened[at] = np.linalg.solve(np.linalg.cholesky(S), e[:, :, None])[:, :, 0]
+            self.whitened[at] = np.linalg.solve(innovation_root(S), e[:, :, None])[:, :, 0]
             cut = self._dropped(k, at.stop)
             if cut < at.stop:  # the block up to there again; none when it is its first sample
                 x, until = first, cut

@@ -271,8 +271,9 @@ def _augmented(
     C2 = np.hstack([m.C2, d.H])
     C = np.block([[m.C1, d.at_pois], [np.zeros((k, n)), np.eye(k)]])
     larger = m.replace(
-        A=A, C2=C2, Q=la.block_diag(m.Q, variance * np.eye(k)), S=np.vstack([m.S, 0 * d.H.T])
-    )
+        A=A, C2=C2, Q=la.block_diag(m.Q, variance * np.eye(k)), S=np.vstack([m.S, 0 * d.H.T]),
+        root=None,
+    )  # fmt: skip
     try:
         P = solve_dare(A, C2, Q=larger.Q, R=m.R, S=larger.S).P
     except SolverError as error:

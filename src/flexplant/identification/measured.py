@@ -245,7 +245,7 @@ def _checked_poles(value: Any) -> ComplexArray:
             )
     apart = np.abs(poles[:, None] - poles.conj())
     np.fill_diagonal(apart, np.inf)
-    i, j = np.unravel_index(np.argmin(apart), apart.shape)
+    i, j = divmod(int(np.argmin(apart)), len(poles))
     if apart[i, j] <= SAME * abs(poles[i]):
         raise ModelError(
             f"poles {min(i, j)} and {max(i, j)} are a conjugate pair, {poles[i]:g} and "

@@ -16,10 +16,10 @@ from ..estimation import design_kalman
 from ..lti.discretisation import held_exactly
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import control_dare
+from ..lti.square_roots import square_root
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
 from ..synthesis import design_hinf
-from ..tolerances import divisor
 from .candidates import PlantChannel, Port, side_of
 from .criterion import AGREEMENT, Criterion, Scorer
 from .poi_variance import (
@@ -383,7 +383,7 @@ def of_sensors(p: Separation) -> Quadratic:
     """Return the cost as a function of the sensors beside all actuators of the problem."""
     S, V = p.control(tuple(range(len(p.actuators))))
     constant = float(np.sum(S * p.W) + np.sum(V * p.ahead(np.zeros_like(p.A))))
-    looks = _semidefinite_root(V) @ np.linalg.matrix_power(p.A, p.delay)
+    looks = square_root(V).T @ np.linalg.matrix_power(p.A, p.delay)
     return quadratic(p.A.T, p.W, looks, p.sensors, constant=constant)
 
 
@@ -394,19 +394,11 @@ def of_actuators(p: Separation) -> Quadratic:
     """
     P = p.covariance(tuple(range(len(p.sensors))))
     power = np.linalg.matrix_power(p.A, p.delay)
-    innovations = _semidefinite_root(power @ (p.A @ P @ p.A.T + p.W - P) @ power.T)
+    innovations = square_root(power @ (p.A @ P @ p.A.T + p.W - P) @ power.T).T
     seen = innovations @ p.rows.T
     constant = float(np.einsum("ij,jk,ik->", p.rows, p.ahead(P), p.rows) + np.sum(seen**2))
     H = p.rows.T @ p.rows
     return quadratic(p.A, H, innovations @ p.A.T, p.actuators, constant=constant)
-
-
-def _semidefinite_root(X: FloatArray) -> FloatArray:
-    """Return r with ``r' r = X``, which is positive semidefinite apart from rounding."""
-    size = np.sqrt(np.maximum(X.diagonal(), 0.0))
-    unit = divisor(size)
-    values, vectors = np.linalg.eigh(0.5 * (X + X.T) / unit / unit[:, None])
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T * unit)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -7,11 +7,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg as la
 
 from ..checks import FloatArray, IntArray, Value
 from ..errors import SolverError
 from ..lti.equations import doubled, doubled_riccati, relative
 from ..lti.riccati import control_dare
+from ..lti.square_roots import riccati_root, square_root
 from ..tolerances import divisor
 from .convex import Convex, Tangent
 from .criterion import Scorer
@@ -141,7 +143,7 @@ def quadratic(
     owned: IntArray | None = None,
 ) -> Quadratic:
     """Return the problem in states in which X, with all candidates, has a unit diagonal."""
-    X = control_dare(A, items.T, Q=H, R=np.eye(items.shape[0])).P
+    X = _certain(A, H, items)
     variance = np.maximum(X.diagonal(), 0.0)
     s = np.sqrt(divisor(variance))
     return Quadratic(
@@ -162,7 +164,21 @@ def solved(A: FloatArray, H: FloatArray, g: FloatArray) -> FloatArray:
         # closed loops that are barely stable look converged: `control_dare` distinguishes them
         if relative(residual, float(np.linalg.norm(X))) <= RESIDUAL:
             return X
-    return control_dare(A, g.T, Q=H, R=np.eye(g.shape[0])).P
+    return _certain(A, H, g)
+
+
+def _certain(A: FloatArray, H: FloatArray, g: FloatArray) -> FloatArray:
+    """Return X by Newton's steps; in square roots where it has too few digits for these."""
+    one = np.eye(g.shape[0])
+    try:
+        return control_dare(A, g.T, Q=H, R=one).P
+    except SolverError as error:
+        noise = la.block_diag(square_root(H), one)
+        try:
+            L = riccati_root(A.T, g, noise[: len(A)], noise[len(A) :]).L
+        except SolverError:
+            raise error from None
+        return np.asarray(L @ L.T)
 
 
 def _square_root(g: FloatArray) -> FloatArray:

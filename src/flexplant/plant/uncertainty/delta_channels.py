@@ -354,7 +354,8 @@ def with_gain_channels(
     """Return a system with a first channel for each Delta on a gain, and their names, in order.
 
     ``(1 + d) u`` acts by d times the command's column more, all but its own effort, and so does
-    noise at the amplifier's input; ``(1 + d) y`` adds d times what the sensor shows of the motion, with what the actuators' Deltas do.
+    noise at the amplifier's input; ``(1 + d) y`` adds d times what the sensor shows of the motion,
+    with what the actuators' Deltas do.
     """
     order = sorted(deltas, key=lambda one: one.name.removesuffix(":gain") in plant.y)
     for delta in order:
