@@ -144,6 +144,46 @@ def test_hostile_arguments_meet_errors_of_ours(room):
     assert not raw, "\n".join(raw)
 
 
+def hooks():
+    """Yield methods of values that functions call, with what each needs."""
+    values = [
+        *(
+            fx.AddedMass("1:x"),
+            fx.AddedStiffness("1:x"),
+            fx.updating.MatrixParameter("k", dK=[[1]]),
+        ),
+        *(fx.PoiVariance(), fx.placement.PoiLqr(), fx.placement.ClosedLoopH2()),
+        *(fx.synthesis.H2(), fx.synthesis.Hinf(), fx.synthesis.FixedOrder(2), fx.Riccati()),
+        *(fx.simulation.Quantiser(1.0), fx.Eigenvalues(fx.MeasuredModes([-1 + 9j], modes=[1]))),
+        *(fx.Spring("1:x", 1.0), fx.Rayleigh(1.0, 1e-6), fx.Sensor("y", at="1:x"), fx.Notch(9.0)),
+        *(fx.Actuator("u", at="1:x"), fx.BaseAcceleration("b"), fx.ModalTruncation(3)),
+    ]
+    for value in values:
+        for name in dir(type(value)):
+            if not name.startswith("_") and inspect.isroutine(getattr(type(value), name)):
+                taken = inspect.signature(getattr(value, name)).parameters.values()
+                several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+                needed = [p.name for p in taken if p.default is p.empty and p.kind not in several]
+                if needed:
+                    yield getattr(value, name), needed
+
+
+def test_hooks_of_protocols_meet_errors_of_ours():
+    wrong = [None, 3, Odd(), "text", [], np.ones((2, 2)), fx.testbeds.three_masses()]
+    raw, count = [], 0
+    for hook, needed in hooks():
+        for one in wrong:
+            count += 1
+            try:
+                call(hook, dict.fromkeys(needed, one))
+            except (FlexplantError, OSError):
+                pass
+            except Exception as error:
+                raw.append(f"{hook.__qualname__}({one!r:.20}): {error!r}")
+    assert not raw, "\n".join(raw)
+    assert count > 200
+
+
 @pytest.mark.parametrize(
     ("value", "hint", "wanted"),
     [

@@ -52,7 +52,7 @@ class _Kind(ABCMeta):
         ) -> Any:
             """Return a kind with its public methods as `answering` ones."""
             for key, item in own.items():
-                if key.startswith("_") or name.startswith("_"):
+                if key.startswith("_"):
                     continue
                 if isinstance(item, FunctionType):
                     own[key] = answering(item)

@@ -472,7 +472,7 @@ def by_parameters(
     matrices have rank. Exact for any port and any damping.
     """
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
-    model = realisation.model
+    model: Any = realisation.model  # one with M, D and K: `uncertain` has checked it
     deltas: list[Delta] = []
     loads: list[_Load] = []
     felt: list[_Felt] = []

@@ -13,6 +13,8 @@ import scipy.sparse as sp
 from ...checks import FloatArray, Matrix, Value, real_array, short, with_deviation
 from ...errors import LabelError, ModelError, require_known
 from ...labels import DIRECTIONS, Place
+from ...reduction import ReducedModel
+from ...structure import FEModel
 
 #: how the function that builds a model is written
 MAKES = "It returns an FEModel: lambda t: kirchhoff_plate(thickness=t, ...), say."
@@ -39,7 +41,7 @@ class Parameter(Value):
     prior: tuple[float, float] | None
 
     @abstractmethod
-    def matrices(self, model: Any) -> Derivatives:
+    def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
         """Return the derivatives (dM, dD, dK) of the model's matrices, None where zero.
 
         Raises
@@ -48,7 +50,7 @@ class Parameter(Value):
             When the model has no such place.
         """
 
-    def terms(self, model: Any) -> list[Derivatives]:
+    def terms(self, model: FEModel | ReducedModel) -> list[Derivatives]:
         """Return the matrices M_j of ``M(p) = M + sum_j g_j(p) M_j``, and of D and K."""
         return [self.matrices(model)]
 
@@ -56,7 +58,7 @@ class Parameter(Value):
         """Return the sizes g_j of the terms at a value, and their derivatives."""
         return np.array([value]), np.ones(1)
 
-    def change(self, model: Any, value: float) -> Derivatives:
+    def change(self, model: FEModel | ReducedModel, value: float) -> Derivatives:
         """Return what the parameter at a value adds to M, D and K of the model."""
         total: list[Any] = [None, None, None]
         for size, parts in zip(self.curve(value)[0].tolist(), self.terms(model), strict=True):
@@ -114,7 +116,7 @@ class PointParameter(Parameter):
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.name} [{self.unit}]>"
 
-    def matrices(self, model: Any) -> Derivatives:
+    def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
         """Return (dM, dD, dK) of the model: r r^T in one of them, sparse where M is."""
         found = np.array(self.rows(model)).T
         if not np.any(found):
@@ -126,7 +128,7 @@ class PointParameter(Parameter):
         parts[self.acts_on] = columns @ columns.T
         return parts[0], parts[1], parts[2]
 
-    def rows(self, model: Any) -> list[FloatArray]:
+    def rows(self, model: FEModel | ReducedModel) -> list[FloatArray]:
         """Return r of each motion it acts along, of those together the ones the model has."""
         of = model if hasattr(model, "row") else model.dofs
         along: tuple[str, ...] = (self.direction,)

@@ -22,8 +22,9 @@ from ...checks import (
 )
 from ...errors import LabelError, ModelError, ShapeError
 from ...modes import solve_modes
+from ...reduction import ReducedModel
 from ...sparse.factor import DENSE_LIMIT, dense
-from ...structure import ModalDamping
+from ...structure import FEModel, ModalDamping
 from ...structure.eigen import elastic_modes
 from .added import MAKES, Derivatives, Parameter, checked_text
 
@@ -218,7 +219,7 @@ class MatrixParameter(Parameter):
             found.append(one)
         return found
 
-    def matrices(self, model: Any) -> Derivatives:
+    def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
         """Return (dM, dD, dK) in the model's DOFs.
 
         Raises
@@ -273,7 +274,7 @@ class ModeDamping(Parameter):
     def __repr__(self) -> str:
         return f"<ModeDamping: {self.name}>"
 
-    def matrices(self, model: Any) -> Derivatives:
+    def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
         """Return (None, dD, None).
 
         Raises

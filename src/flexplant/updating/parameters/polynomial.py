@@ -12,6 +12,8 @@ import numpy as np
 
 from ...checks import FloatArray, Matrix, function, positive, real_array, whole
 from ...errors import LabelError, ModelError, ShapeError
+from ...reduction import ReducedModel
+from ...structure import FEModel
 from .added import MAKES, Derivatives, Parameter, checked_bounds, checked_text
 from .matrix_parameters import checked_matrix, projected_matrix
 
@@ -161,7 +163,7 @@ class PolynomialParameter(Parameter):
             bounds = max(low, -half), min(high, half)
         return cls(name, **found, unit=unit, bounds=bounds, prior=prior, missed=missed[worst][0])
 
-    def terms(self, model: Any) -> list[Derivatives]:
+    def terms(self, model: FEModel | ReducedModel) -> list[Derivatives]:
         """Return the matrices of all powers in the model's DOFs."""
         powers = zip_longest(self.dM, self.dD, self.dK)
         return [
@@ -170,7 +172,7 @@ class PolynomialParameter(Parameter):
             for M, D, K in powers
         ]  # fmt: skip
 
-    def matrices(self, model: Any) -> Derivatives:
+    def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
         """Return the derivatives (dM, dD, dK) at p = 0."""
         return self.terms(model)[0]
 
