@@ -39,6 +39,8 @@ from .uncertain_plant import (
 _AFFINE = 1e-8
 #: relative change at which the plant's dependence on a Delta is read off
 _PROBE = 0.25
+#: relative distance of measured poles from the plant's: they were typed, of that machine
+_TYPED_POLES = 0.1
 
 
 def uncertain(
@@ -97,47 +99,54 @@ def uncertain(
     realisation = modal_realisation(plant)
     if isinstance(source, UpdateResult) and source.discrepancy and source.fitted_poles is not None:
         source = source.uncertainty()
+    more: Sequence[Delta] = ()
     if isinstance(source, ModalUncertainty):
         deltas, own = correlated_deltas(realisation, source, modes, many)
-        own = la.block_diag(own, np.eye(len(beside)) / many**2)
-        return _with_deltas(plant, (*deltas, *beside), own, many, neglected)
+    else:
+        deltas, own, numbers = _of_poles(realisation, source, parameters, modes, many)
+        if shapes is not None and isinstance(source, MeasuredModes):
+            more = shape_deltas(plant, shapes, source.modes or (), numbers, many)
+    own = la.block_diag(own, np.eye(len(beside)) / many**2)
+    fit = source if isinstance(source, UpdateResult) else None
+    about = about_fit(fit, fit.unknowns if parameters is None else parameters) if fit else ()
+    return _with_deltas(plant, (*deltas, *beside), own, many, neglected, more, fit, about)
+
+
+def _of_poles(
+    realisation: ModalRealisation,
+    source: Any,
+    parameters: Sequence[Parameter] | None,
+    modes: Sequence[int] | None,
+    deviations: float,
+) -> tuple[tuple[Delta, ...], FloatArray, Sequence[int]]:
+    """Return Deltas of the poles of a fit or a measurement, their covariance, and the modes."""
     if isinstance(source, UpdateResult):
         parameters = source.unknowns if parameters is None else parameters
         numbers, poles, covariance = _fitted_poles(realisation, source, parameters, modes)
+        check_poles(realisation, numbers, poles, SAME_MODEL, "fit")
     elif isinstance(source, MeasuredModes):
         numbers, poles, covariance = _measured_poles(source, modes)
+        check_poles(realisation, numbers, poles, _TYPED_POLES, "measurement")
     else:
         raise ModelError(
             "uncertainty comes from an UpdateResult or MeasuredModes, got "
             f"{type(source).__name__}: pass one, fit.uncertainty(measured), or state it: "
             "frequency=0.005, damping=0.3."
         )
-    fitted = isinstance(source, UpdateResult)
-    # measured: poles that were typed
-    limit, name = (SAME_MODEL, "fit") if fitted else (0.1, "measurement")
-    check_poles(realisation, numbers, poles, limit, name)
     G = _log_derivatives(poles)
     covariance = G @ covariance @ G.T
-    scale = many * np.sqrt(np.diag(covariance))
+    scale = deviations * np.sqrt(np.diag(covariance))
     kinds: tuple[Literal["freq", "damping"], ...] = ("freq", "damping")
+    named = [(kind, number) for kind in kinds for number in numbers]
     every = [
         Delta(f"mode{number}:{kind}", number, kind, float(size))
-        for (kind, number), size in zip(
-            ((kind, number) for kind in kinds for number in numbers), scale, strict=True
-        )
+        for (kind, number), size in zip(named, scale, strict=True)
     ]
     keep = sorted(np.flatnonzero(scale > KNOWN), key=lambda i: (every[i].mode, i))
     if not keep:
         raise ModelError(f"modes {list(numbers)} have no variance: there is nothing uncertain.")
-    deltas = (*(every[i] for i in keep), *beside)
     own = covariance[np.ix_(keep, keep)] / np.outer(scale[keep], scale[keep])
-    own = la.block_diag(own, np.eye(len(beside)) / many**2)
-    fit = source if isinstance(source, UpdateResult) else None
-    more: Sequence[Delta] = ()
-    if shapes is not None and isinstance(source, MeasuredModes):
-        more = shape_deltas(plant, shapes, source.modes or (), numbers, many)
-    about = about_fit(fit, parameters or ()) if fit else ()
-    return _with_deltas(plant, deltas, own, many, neglected, more, fit, about)
+    return tuple(every[i] for i in keep), own, numbers
 
 
 def _of_ports(plant: Partition, gain: Any, delay: float | None) -> tuple[Delta, ...]:
