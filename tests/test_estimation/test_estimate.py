@@ -101,11 +101,11 @@ def test_noises_of_process_and_sensors_may_be_correlated(lag):
     S = np.zeros_like(model.C2.T)
     S[:, 0] = 0.7 * observer().plant.noise_factor[:, 0] * np.sqrt(model.R[0, 0])
     model = model.replace(S=S)
-    P = solve_dare(model.A, model.C2, Q=model.Q, R=model.R, S=S).P
+    solved = solve_dare(model.A, model.C2, Q=model.Q, R=model.R, S=S)
     y, u, _ = run(model, 40, seed=10)
     y[12:15, 0] = np.nan
     method, later = LAGS[lag]
-    result = estimated(model, P, records(model, y, u), method, None, None, {})
+    result = estimated(model, solved.P, solved.gain, records(model, y, u), method, None, None, {})
     agree(result, *batch(dense(model), y, u, *prior(model), np.arange(40) + later))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..checks import ComplexArray, FloatArray, IntArray, Value
-from ..errors import AssumptionError, CertificateError, ModelError, warn
+from ..errors import AssumptionError, CertificateError, ModelError, SolverError, warn
 from ..labels import DofSet
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
@@ -18,6 +19,7 @@ from ..lti.equations import accumulated, scale_of, shifted_columns, stein, sylve
 from ..lti.joining import equal_matrices
 from ..lti.lyapunov import solve_stein
 from ..lti.modal import ModalMap
+from ..lti.square_roots import difference_of, dual_variances, stein_root
 from ..lti.statespace import StateSpace, System
 from ..modes import Modes
 from ..plant import StandardPlant
@@ -75,10 +77,15 @@ def error_variances(
         dual = np.array([_dual_dense(joint, row) for row in joint.E])
     else:
         primal, dual = _primal(joint), _gain_trace(joint)
+    if not difference_of(dual, primal) <= _AGREEMENT:  # squares that cancel: by their roots
+        with suppress(SolverError):  # poles on the circle: refused below
+            L = stein_root(joint.A, joint.noise)
+            dual = dual_variances(joint.A, joint.noise, joint.E, np.linalg.norm(L, axis=1))
+            primal = np.sum((joint.E @ L) ** 2, axis=1)
     size = divisor(primal)
     # both have the same poles: how far rounding moves their damping shows in neither
     rounded = np.sum(missed.variances * (np.finfo(np.float64).eps / missed.gap), axis=1)
-    difference = float(np.max((np.abs(dual - primal) + rounded) / size, initial=0.0))
+    difference = difference_of(dual, primal) + float(np.max(rounded / size, initial=0.0))
     if not difference <= _AGREEMENT:
         raise CertificateError(
             "the variance of the estimation error on a plant and its dual differ by "

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from ..checks import BoolArray, FloatArray, Value, instance, known_units, real_array, sizes_of
-from ..errors import LabelError, counted, unknown_label, warn
+from ..errors import LabelError, SolverError, counted, unknown_label, warn
 from ..lti.equations import scale_of
 from ..parallel import one_thread
 from .estimator_channels import estimates, recorded
-from .filter_model import FilterModel, Sight, Steady
+from .filter_model import FEW_DIGITS, FilterModel, Sight, Steady, innovation_root
 from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother
 from .passage import Passage, Start, passed, stationary_start
 from .smoothing import lagged, smoothed
@@ -175,10 +175,16 @@ class EstimateChannelError(LabelError, KeyError):
     __str__ = Exception.__str__
 
 
+#: difference of a gain from the one of P, times a deviation of the innovations, in deviations of
+#: the states: its square is what a sample adds to a variance, and slow states keep 1e6 samples
+_OTHER = 1e-6
+
+
 @one_thread()
 def estimated(
     model: FilterModel,
     P: FloatArray,
+    K: FloatArray,
     records: Any,
     lag: Any,
     start: Any,
@@ -186,7 +192,7 @@ def estimated(
     units: Mapping[str, str],
     gate: float = np.inf,
 ) -> Estimate:
-    """Return the estimate of a record by the filter of a model with stationary covariance P.
+    """Return the estimate of a record by the filter of a model, stationary covariance P, gain K.
 
     `place` gives the rows of POIs that move, for a number of samples.
     """
@@ -194,7 +200,7 @@ def estimated(
         lag, Predictor | Filter | FixedLag | Smoother, "lag", "Say when: Filter() or Smoother()."
     )
     record = recorded(records, model)
-    steady, sight, d, s = in_unit_states(model, P)
+    steady, sight, d, s = in_unit_states(model, P, K)
     if place is not None:
         moving = place(record.time.size)
         sight = moving._replace(c=moving.c * np.concatenate([d, 1.0 / s]))
@@ -235,15 +241,22 @@ def estimated(
 
 
 def in_unit_states(
-    model: FilterModel, P: FloatArray
+    model: FilterModel, P: FloatArray, K: FloatArray
 ) -> tuple[Steady, Sight, FloatArray, FloatArray]:
-    """Return the stationary filter and the POIs in states x / d and measurements y / s."""
+    """Return the stationary filter and the POIs in states x / d and measurements y / s.
+
+    Covariances are followed from P: SolverError where it has too few digits for the gain K.
+    """
     d, s = scale_of(P.diagonal()), scale_of(model.innovation(P).diagonal())
     unit = model.scaled(d, s)
     sight = Sight(
         np.hstack([unit.C1, unit.N])[None], unit.D1[None], np.diagonal(unit.V)[None].copy()
     )
-    return Steady(unit, P / d / d[:, None]), sight, d, s
+    steady = Steady(unit, P / d / d[:, None])
+    other = (steady.gains.K - K * s / d[:, None]) @ innovation_root(unit.innovation(steady.P))
+    if not np.max(np.abs(other), initial=0.0) <= _OTHER:
+        raise SolverError(FEW_DIGITS)
+    return steady, sight, d, s
 
 
 def _across(columns: FloatArray) -> FloatArray:

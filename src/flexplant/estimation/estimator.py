@@ -189,6 +189,7 @@ class KalmanEstimator(PoiFilter):
         found = estimated(
             self.model,
             self.predicted_covariance,
+            self.predictor_gain,
             records,
             Filter() if lag is None else lag,
             start,
@@ -274,7 +275,9 @@ class KalmanEstimator(PoiFilter):
         ModelError
             When lags are not positive numbers.
         """
-        steady, sight, _, _ = in_unit_states(self.model, self.predicted_covariance)
+        steady, sight, _, _ = in_unit_states(
+            self.model, self.predicted_covariance, self.predictor_gain
+        )
         filtered = steady.variances(sight, steady.P, steady.gains, predict=False)[0]
         whole = self.variances if self.left_out is not None else filtered
         return lag_errors(self.plant, steady, sight, np.sqrt(whole), lags, poi_channels(self.plant))

@@ -11,12 +11,19 @@ from ..certificates import Certificate
 from ..checks import FloatArray, IntArray, Value, real_array
 from ..errors import AssumptionError, CertificateError, ShapeError, SolverError
 from ..lti.lyapunov import solve_stein
-from ..lti.square_roots import square_root, stein_root
+from ..lti.square_roots import difference_of, square_root
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..tolerances import divisor
 from .estimator_channels import estimates, poi_channels, sensors
 from .left_out import LeftOut
+
+#: said where a covariance is followed sample by sample and cannot be
+FEW_DIGITS = (
+    "the noise of the sensors is so little beside the motion that the covariance of the error, in "
+    "double precision, does not give the filter's gain: deviations of single samples, delayed and "
+    "smoothed estimates cannot be computed. The filter itself is right: run it by observer.system, "
+    "observer.step or close_loop; or give the sensors the asd of their data sheet, checking units."
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -239,22 +246,6 @@ def own_variances(model: FilterModel, K: FloatArray, L_z: FloatArray) -> FloatAr
     return np.asarray(np.sum((left @ X) * left, axis=1) + np.sum((L_z @ m.R) * L_z, axis=1))
 
 
-def dual_variances(
-    model: FilterModel, K: FloatArray, L_z: FloatArray, size: FloatArray
-) -> FloatArray:
-    """Return what `own_variances` does, by sums ``c F^k (G - K H)`` in square roots.
-
-    `size` (n,) are standard deviations of the states: their units.
-    """
-    m, (G, H) = model, noise_root(model)
-    F, entering = (m.A - K @ m.C2) * size / size[:, None], (G - K @ H) / size[:, None]
-    seen = [
-        float(np.sum((stein_root(F.T, row[:, None]).T @ entering) ** 2))
-        for row in (m.C1 - L_z @ m.C2) * size
-    ]
-    return np.asarray(seen + np.sum((L_z @ H) ** 2, axis=1))
-
-
 class FilterGains(NamedTuple):
     """L, K and the whitening W of the innovations, zeros at sensors that are missing."""
 
@@ -268,12 +259,7 @@ def innovation_root(S: FloatArray) -> FloatArray:
     try:
         return np.asarray(np.linalg.cholesky(0.5 * (S + np.swapaxes(S, -1, -2))))
     except np.linalg.LinAlgError:
-        raise SolverError(
-            "the covariance of the innovations, C P C' + R, is indefinite by rounding: the noise "
-            "of the sensors is too little beside the motion for covariances in double precision. "
-            "Run the filter itself (observer.system, close_loop), or give the sensors the asd of "
-            "their data sheet and check its unit."
-        ) from None
+        raise SolverError(FEW_DIGITS) from None
 
 
 def filter_gains(model: FilterModel, P: FloatArray, seen: FloatArray) -> FilterGains:
@@ -446,7 +432,7 @@ def stable_radius(model: FilterModel, predictor: FloatArray) -> float:
 
 def agreement(claim: FloatArray, truth: FloatArray, allowed: float = AGREEMENT) -> float:
     """Return the largest relative difference of POI variances from those of the gain."""
-    difference = float(np.max(np.abs(claim - truth) / divisor(truth)))
+    difference = difference_of(claim, truth)
     if not difference <= allowed:
         raise CertificateError(
             f"the gain gives POI variances that differ from the predicted ones by {difference:.1e} "

@@ -8,14 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..checks import FloatArray
-from ..errors import AssumptionError, CertificateError, SolverError
+from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..lti.riccati import solve_dare
-from ..lti.square_roots import riccati_root
+from ..lti.square_roots import dual_variances, riccati_root
 from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
-from ..tolerances import divisor
 from .error import error_variances, unresolved_share
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike
@@ -25,7 +24,6 @@ from .filter_model import (
     KalmanCertificate,
     agreement,
     check_noises,
-    dual_variances,
     error_of,
     filter_model,
     filter_system,
@@ -34,6 +32,9 @@ from .filter_model import (
     weigh,
 )
 from .left_out import left_out
+
+#: least part of R that is the sensors' own: of less, six digits and more are lost in covariances
+_OWN = 1e-10
 
 
 @one_thread()
@@ -159,10 +160,19 @@ class _Design(NamedTuple):
 
 def _filter_design(model: FilterModel) -> _Design:
     """Return the gains of a model whose sensors may have the noise of modes left out as well."""
+    if _hidden_noise(model):
+        return _design_in_roots(model, None)
     try:
         return _design_by_covariance(model)
-    except (SolverError, CertificateError) as error:
+    except (SolverError, CertificateError, ModelError) as error:  # R singular by rounding, say
         return _design_in_roots(model, error)
+
+
+def _hidden_noise(model: FilterModel) -> bool:
+    """Return whether R is nearly all noise that moves the states too, its own part lost in it."""
+    G, H = noise_root(model)
+    own = np.sum(H[:, ~np.any(G, axis=0)] ** 2, axis=1)
+    return bool(np.any(own < _OWN * np.sum(H**2, axis=1)))
 
 
 def _design_by_covariance(model: FilterModel) -> _Design:
@@ -180,20 +190,25 @@ def _design_by_covariance(model: FilterModel) -> _Design:
     return _Design(gain, predictor, poi_gain, covariance, variances, certificate)
 
 
-def _design_in_roots(model: FilterModel, why: SolverError | CertificateError) -> _Design:
+def _design_in_roots(model: FilterModel, why: Exception | None) -> _Design:
     """Return the gains where P itself has too few digits; raise `why` where there are none."""
     G, H = noise_root(model)
     try:
         found = riccati_root(model.A, model.C2, G, H)
     except SolverError as error:
-        raise why from error
+        raise why or error from error
     gain = found.weighed(found.L @ (model.C2 @ found.L).T)
     rest = np.hstack([found.L - gain @ (model.C2 @ found.L), gain @ H])
     covariance = rest @ rest.T
     variances = np.sum((model.C1 @ rest) ** 2, axis=1)
     radius = stable_radius(model, found.K)
-    size = divisor(np.linalg.norm(found.L, axis=1))
-    truth = dual_variances(model, found.K, model.C1 @ gain, size)
+    poi_rows, entering = model.C1 @ gain, G - found.K @ H
+    truth = dual_variances(
+        model.A - found.K @ model.C2,
+        entering,
+        model.C1 - poi_rows @ model.C2,
+        np.linalg.norm(found.L, axis=1),
+    ) + np.sum((poi_rows @ H) ** 2, axis=1)
     difference = agreement(variances, truth, ROUNDED)
     certificate = KalmanCertificate(radius, found.change, difference)
     poi_gain = model.C1 @ gain + found.weighed(model.N)

@@ -64,7 +64,9 @@ def commands(
     outputs = [name for names in used for name in names]
 
     def same(rows: Sequence[str], columns: Sequence[str]) -> FloatArray:
-        return np.array([[float(a == b) for b in columns] for a in rows]).reshape(len(rows), -1)
+        return np.array([[float(a == b) for b in columns] for a in rows]).reshape(
+            len(rows), len(columns)
+        )
 
     each = [
         (responder(sys), sys.output_index(names), same(sys.inputs, [*outputs, *read]))
