@@ -130,11 +130,6 @@ def inverted(L: ComplexArray) -> ComplexArray:
         return np.asarray(np.linalg.inv(eye - (1.0 - _BESIDE) * L))
 
 
-def largest_singular(S: ComplexArray) -> FloatArray:
-    """Return the largest singular value at each frequency: the root of an eigenvalue of S* S."""
-    return np.asarray(np.sqrt(np.linalg.eigvalsh(S.conj().swapaxes(1, 2) @ S)[:, -1]))
-
-
 def sensitivity_size(L: ComplexArray) -> FloatArray:
     """Return sigma_max of ``S = (I - L)^-1`` at each frequency, a lower bound where it is not high.
 
