@@ -175,7 +175,7 @@ def solve_program(
     how = f"Clarabel: {reached.status} after {counted(reached.iterations, 'iteration')}"
     for constraint in problem.constraints:
         M = constraint.args[0].value
-        if not _is_lmi(constraint):
+        if constraint.__class__.__name__ != "PSD":
             continue
         values = la.eigvalsh(half(M))
         # solvers return them symmetric: else the constraint is not the one meant
@@ -188,10 +188,6 @@ def solve_program(
                 f"an LMI is violated: smallest eigenvalue {values[0]:.1e}, largest "
                 f"{values[-1]:.1e} ({how}). Loosen weights or reduce the order of the plant."
             )
-
-
-def _is_lmi(constraint: Any) -> bool:
-    return bool(constraint.__class__.__name__ == "PSD")
 
 
 def _unpack(problem: Any, raw: Any, chain: Any, inverse: Any) -> None:
