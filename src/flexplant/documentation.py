@@ -317,25 +317,7 @@ def _page(name: str, text: str) -> Any:
 
 
 def write_site(folder: str | Path) -> Links:
-    """Write the documentation as static pages; `folder` / index.html is the first.
-
-    Parameters
-    ----------
-    folder : path
-        Where to; files there are overwritten.
-
-    Returns
-    -------
-    Links
-        Numbers of pages, links and pictures.
-
-    Raises
-    ------
-    SolverError
-        When pdoc is not installed.
-    CertificateError
-        When a link leads nowhere.
-    """
+    """Write the documentation as static pages, `folder` / index.html the first; count them."""
     try:
         import jinja2
         from pdoc import doc, docstrings, render

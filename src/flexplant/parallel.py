@@ -25,7 +25,6 @@ from functools import cache
 from math import inf
 from os import cpu_count
 from time import monotonic, perf_counter, sleep
-from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
 import numpy as np
@@ -455,12 +454,7 @@ class Progress:
             raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         try:
             self._close()
         except BaseException:  # Ctrl-C in there

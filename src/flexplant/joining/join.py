@@ -377,7 +377,8 @@ def left_motions(
         stretch = np.asarray(rows @ motions)
         most = np.asarray(abs(rows) @ np.abs(motions)).max(axis=1, initial=0.0)
         stretch[np.abs(stretch) <= _NONE * most[:, None]] = 0.0  # rounding of what cancels
-        allowed = rigid_null_space(stretch)
+        size = np.linalg.norm(stretch, axis=1)
+        allowed = la.null_space(stretch / divisor(size)[:, None], rcond=_NONE)
         beside = np.linalg.norm(whole - allowed @ (allowed.T @ whole), axis=0)
         size = np.linalg.norm(whole, axis=0)
         clean = (missed < SPANNED) & (size > 0) & (beside <= _NONE * size)
@@ -394,17 +395,6 @@ def _own_motions(part: Component, *, free: bool) -> FloatArray:
     every: FloatArray = part.model.body_motions
     # those of a reduced model are known better than from its shapes
     return rigid if rigid.shape[1] == every.shape[1] else every
-
-
-def rigid_null_space(stretch: FloatArray) -> FloatArray:
-    """Return an orthonormal basis (r, q) of the motions (r,) that stretch (m, r) nothing."""
-    if not stretch.size:
-        return np.eye(stretch.shape[1])
-    size = np.linalg.norm(stretch, axis=1)
-    _, values, right = la.svd(stretch / divisor(size)[:, None])
-    full = np.zeros(stretch.shape[1])
-    full[: values.size] = values
-    return np.asarray(right[full <= _NONE * max(float(full.max(initial=0.0)), TINY)].T)
 
 
 #: patches of more displacements are not examined: each is a load of the component

@@ -130,11 +130,6 @@ def inverted(L: ComplexArray) -> ComplexArray:
         return np.asarray(np.linalg.inv(eye - (1.0 - _BESIDE) * L))
 
 
-def largest_singular(S: ComplexArray) -> FloatArray:
-    """Return the largest singular value at each frequency: the root of an eigenvalue of S* S."""
-    return np.asarray(np.sqrt(np.linalg.eigvalsh(S.conj().swapaxes(1, 2) @ S)[:, -1]))
-
-
 def sensitivity_size(L: ComplexArray) -> FloatArray:
     """Return sigma_max of ``S = (I - L)^-1`` at each frequency, a lower bound where it is not high.
 
@@ -206,7 +201,7 @@ def scaled_size(S: ComplexArray) -> FloatArray:
     largest it is a bound from above.
     """
     log = _log_scaling(S)
-    size = _scaled_norms(S, log)
+    size = np.asarray(np.linalg.norm(_d_scaled(S, log), 2, axis=(1, 2)))
     if S.shape[-1] < 3:  # the product of both singular values is fixed: balanced is optimal
         return size
     best, order = 0.0, np.argsort(-size, kind="stable")
@@ -217,10 +212,6 @@ def scaled_size(S: ComplexArray) -> FloatArray:
         size[some] = _optimised(S[some], log[some], size[some])
         best = max(best, float(size[some].max()))
     return size
-
-
-def _scaled_norms(S: ComplexArray, log: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.norm(_d_scaled(S, log), 2, axis=(1, 2)))
 
 
 def _d_scaled(S: ComplexArray, log: FloatArray) -> ComplexArray:

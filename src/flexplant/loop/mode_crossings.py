@@ -32,7 +32,7 @@ from ..plant import StandardPlant
 from ..plant.building import sampled_motions
 from ..plant.uncertainty.uncertain_plant import Delta, changed_pairs
 from ..tolerances import SAME, SETTLED, TINY
-from .broken import BrokenLoop, inverted, largest_singular
+from .broken import BrokenLoop, inverted
 
 #: largest relative change of a frequency whose polynomials are exact
 LIMIT = 0.05
@@ -414,7 +414,7 @@ def size_reached(
     that come near the size at an end. `freq` [Hz] of each pair, rising within a mode.
     """
     count = len(limits)
-    high = largest_singular(swept.S) >= size
+    high = np.linalg.norm(swept.S, 2, axis=(1, 2)) >= size
     every = _Sized(modes, SizeBound.of(np.where(high[:, None, None], 0.0, swept.S), modes, size))
     ends = np.minimum(np.abs(stable), limits[:, None])
     near = passed.copy()

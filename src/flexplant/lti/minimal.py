@@ -86,7 +86,7 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     if not g.n_states:
         return g
     groups = _pole_groups(g)
-    kept = [_Group(_less(group.part, tol), group.omega) for group in _visible(groups, g.dt, tol)]
+    kept = [_Group(_less(group.part, tol), group.omega) for group in _visible(groups, tol)]
     kept = [group for group in kept if group.part.n_states]
     n = sum(group.part.n_states for group in kept)
     if n == g.n_states:
@@ -207,7 +207,7 @@ def _frequencies(groups: list[_Group]) -> FloatArray:
     return moving if moving.size else np.ones(1)
 
 
-def _visible(groups: list[_Group], dt: float, tol: float) -> list[_Group]:
+def _visible(groups: list[_Group], tol: float) -> list[_Group]:
     """Return the groups whose share of the response around their own frequency is no rounding."""
     slowest = _frequencies(groups)[0]
     omega = [np.maximum(np.unique(group.omega), slowest) for group in groups]

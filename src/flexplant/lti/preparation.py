@@ -135,7 +135,8 @@ def prepared(
     departure = departure_from_normal(A)
     if departure > _MIXED:
         form = modal_form(P, largest_condition=_CONDITION * departure)
-        A, B, C = (A, B, C) if form.reason else _balanced(*_matrices(form.system), s)
+        if not form.reason:
+            A, B, C = _balanced(form.system.A, form.system.B, form.system.C, s)
     g = P.replace(A=A, B=B, C=C, blocks=None)
     direct = direct and bool(P.dt)
     g = bilinear(g, 1.0 / P.dt) if P.dt and not direct else g
@@ -208,10 +209,6 @@ def _answers(A: FloatArray, B: FloatArray, C: FloatArray, s: complex) -> FloatAr
 
 def _none_zero(sizes: FloatArray) -> FloatArray:
     return np.asarray(np.where(sizes > 0.0, sizes, np.max(sizes, initial=0.0) or 1.0))
-
-
-def _matrices(g: StateSpace) -> tuple[FloatArray, FloatArray, FloatArray]:
-    return g.A, g.B, g.C
 
 
 def departure_from_normal(A: FloatArray) -> float:

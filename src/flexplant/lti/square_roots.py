@@ -107,13 +107,7 @@ def _measured(
 
 
 def riccati_root(A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray) -> RiccatiRoot:
-    """Return the stationary filter, by Newton's steps from that of noisier sensors.
-
-    Raises
-    ------
-    SolverError
-        When no noise of the sensors gives one, or the steps do not settle.
-    """
+    """Return the stationary filter, by Newton's steps from that of noisier sensors."""
     start = _noisier(A, C, G, H)
     d = scale_of(np.abs(start.P.diagonal()))
     found = _newton(A * d / d[:, None], C * d, G / d[:, None], H, start.gain / d[:, None])

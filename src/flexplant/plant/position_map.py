@@ -144,7 +144,7 @@ def position_map(plant: Any, judge: Any, points: Any) -> PositionMap:
         shares = [one for one in mode_visibility(there) if one.freq < most]
         modes = tuple(f"mode {one.mode} ({one.freq:.4g} Hz)" for one in shares)
         sees, pushes = ([one.shares.get(side, 0.0) for one in shares] for side in "yu")
-        rows.append((_misses(own, there), sees, pushes, list(_figures_at(judges, there, values))))
+        rows.append((_misses(own, there), sees, pushes, list(_figures_at(judges, there))))
     shape = tuple(values.size for values in grid.values())
     decoupling, seen, reached, judged = (
         np.array(part, dtype=float) for part in zip(*rows, strict=True)
@@ -172,9 +172,7 @@ def _named_judges(judge: Any) -> dict[str, Callable[[Any], float]]:
     }
 
 
-def _figures_at(
-    judges: Mapping[str, Callable[[Any], float]], plant: Partition, values: tuple[float, ...]
-) -> Iterator[float]:
+def _figures_at(judges: Mapping[str, Callable[[Any], float]], plant: Partition) -> Iterator[float]:
     """Return figures of a plant; each is one number."""
     for name, one in judges.items():
         try:

@@ -349,7 +349,9 @@ def no_zeros(plant: Partition) -> list[Assumption]:
             continue
         if not plant.is_assembled:
             g = evened(g)
-        zeros = axis_zeros(g if key == "P12" else _transposed(g))
+        if key != "P12":
+            g = StateSpace(g.A.T, g.C.T, g.B.T, g.D.T, g.dt)
+        zeros = axis_zeros(g)
         if zeros.size:
             listed = ", ".join(dict.fromkeys(_frequency(plant, zero) for zero in zeros[:3]))
             text = f"{fro} -> {to} has an invariant zero on the stability limit at {listed}."
@@ -364,10 +366,6 @@ def evened(g: StateSpace) -> StateSpace:
     """Return the system with its states in even units: judgements then do not depend on them."""
     d = state_scale(g.A, g.B, g.C) if g.n_states else np.ones(0)
     return g.replace(A=g.A * d / d[:, None], B=g.B / d[:, None], C=g.C * d)
-
-
-def _transposed(g: StateSpace) -> StateSpace:
-    return StateSpace(g.A.T, g.C.T, g.B.T, g.D.T, g.dt)
 
 
 def _frequency(plant: Partition, zero: complex) -> str:

@@ -150,10 +150,6 @@ class _FreeInterface(ReductionMethod):
         return model, modes, T, back
 
 
-def _free_names(labels: Iterable[str], count: int) -> tuple[str, ...]:
-    return (*labels, *(f"mode {i}" for i in range(1, count + 1)))
-
-
 def _built(
     model: FEModel,
     modes: Modes,
@@ -201,7 +197,7 @@ def _built(
         method=method,
         condition=float(values[-1] / values[0]),
         condition_of="M*",
-        coordinates=_free_names(labels, k),
+        coordinates=(*labels, *(f"mode {i}" for i in range(1, k + 1))),
         static_at=labels,
     )
 

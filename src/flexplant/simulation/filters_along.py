@@ -206,13 +206,17 @@ class _Filters:
         self.moved = list(self.machine.path.paths)
         self.count = whole(positions, "positions", minimum=2)
 
-    def steady(self, values: Mapping[str, FloatArray]) -> Any:
-        """Return the steady filter at values of the positions."""
+    def _sample(self, values: Mapping[str, FloatArray]) -> Any:
+        """Return the matrices of a plant that stands at values of the positions."""
         there = {name: float(value[0]) for name, value in values.items()}
         standing = Trajectory(
             self.machine.path.positions, {n: _constant(there[n]) for n in self.moved}, there
         )
-        sample = next(MovingPlant(self.plant, standing).each(1))
+        return next(MovingPlant(self.plant, standing).each(1))
+
+    def steady(self, values: Mapping[str, FloatArray]) -> Any:
+        """Return the steady filter at values of the positions."""
+        sample = self._sample(values)
         return solve_dare(sample.A, sample.C[self.y], Q=sample.G @ sample.G.T, R=self.R)
 
     def frozen(self) -> Callable[[int], FloatArray]:
@@ -248,11 +252,7 @@ class _Filters:
 
     def _correcting(self, values: Mapping[str, FloatArray]) -> FloatArray:
         """Return the gain M (n, ny) of the correction x[k|k] = x[k|k-1] + M e."""
-        there = {name: float(value[0]) for name, value in values.items()}
-        standing = Trajectory(
-            self.machine.path.positions, {n: _constant(there[n]) for n in self.moved}, there
-        )
-        C = next(MovingPlant(self.plant, standing).each(1)).C[self.y]
+        C = self._sample(values).C[self.y]
         P = self.steady(values).P
         return np.asarray(np.linalg.solve(C @ P @ C.T + self.R, C @ P).T)
 

@@ -57,13 +57,7 @@ class Tuning:
         self._folder.cleanup()
 
     def result(self) -> LoopDesign:
-        """Return the design that was found.
-
-        Raises
-        ------
-        SolverError
-            With the message of the search, where it found none.
-        """
+        """Return the design that was found; raise the message of the search where it found none."""
         _, said = self._process.communicate()
         found = Path(self._folder.name) / "found.npz"
         try:

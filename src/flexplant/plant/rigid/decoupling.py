@@ -123,7 +123,8 @@ def decouple(plant: Partition, *, axes: Sequence[str] | None = None) -> Decoupli
     sensors = [s for s in ports.y if s.order == 0]
     see = rigid_parts([s.static_row(realisation) for s in sensors], body.motions)
     push = rigid_parts([port.static_push(realisation) for port in ports.u], body.motions).T
-    length = _axis_units(body)
+    # in these units rotations and translations move the structure alike
+    length = np.asarray(1.0 / np.linalg.norm(body.motions, axis=0))
     T_y = _left_inverse(see, length, pick)
     T_u = _left_inverse(push.T, 1.0 / length, pick).T
     _check_identity(T_y @ see, pick, wanted, body, length, "sensors", [s.name for s in sensors])
@@ -139,11 +140,6 @@ def decouple(plant: Partition, *, axes: Sequence[str] | None = None) -> Decoupli
         body.centre,
         wanted,
     )
-
-
-def _axis_units(body: RigidBody) -> FloatArray:
-    """Return units (r,) in which rotations and translations move the structure alike."""
-    return np.asarray(1.0 / np.linalg.norm(body.motions, axis=0))
 
 
 def _left_inverse(matrix: FloatArray, unit: FloatArray, pick: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ from ...reduction import ReducedModel
 from ...structure import Damper, FEModel, Spring
 from ...structure.placed import SPANNED
 from ...structure.rigid import orthonormalised
-from ...tolerances import TINY, divisor
+from ...tolerances import divisor
 from ..port import checked_place, port_direction
 from ..realisation import realise
 
@@ -168,9 +168,7 @@ def _untouched(rows: FloatArray, rigid: FloatArray) -> FloatArray:
     most = np.abs(rows).sum(axis=1, keepdims=True) * np.abs(rigid).max()
     stretch[np.abs(stretch) <= _SLACK * most] = 0.0  # a spring on the axis of a hinge
     size = np.linalg.norm(stretch, axis=1, keepdims=True)
-    _, values, right = np.linalg.svd(stretch / divisor(size), full_matrices=True)
-    rank = int(np.count_nonzero(values > _SLACK * max(values.max(initial=0.0), TINY)))
-    return np.asarray(right[rank:].T)
+    return np.asarray(la.null_space(stretch / divisor(size), rcond=_SLACK))
 
 
 def _suspend_model(model: FEModel, springs: list[GroundSpring]) -> FEModel:

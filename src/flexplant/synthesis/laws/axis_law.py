@@ -99,10 +99,6 @@ class AxisLaw:
         ]
         return [lead, *centred]
 
-    def slower(self, numbers: FloatArray, factor: float) -> Law:
-        """Return the law with its bandwidth times a factor below 1, its notches where they are."""
-        return self.law(np.append(numbers[0] + np.log(factor), numbers[1:]))
-
     def notes(self, numbers: FloatArray) -> list[str]:
         """Return what a user has to know of the law: its sign, and lines that ended the search."""
         name, top = self.axis.name, self.axis.ceiling

@@ -21,7 +21,7 @@ from ...lti.responses import responder
 from ...lti.statespace import StateSpace
 from .axis_law import AxisLaw
 from .law import Law, tustin_s
-from .law_search import lowest_of
+from .law_search import near_lowest
 
 #: logarithmic part of a grid through the resonances, and times that it is refined
 _POINTS, _REFINEMENTS = 250, 6
@@ -357,7 +357,7 @@ class JointSearch:
         slopes, places = [np.empty((0, x.size))], []
         for number, (one, C, room) in enumerate(zip(couplings, gains, rooms, strict=True)):
             for place, own in enumerate(room):
-                rows = _critical(own)
+                rows = np.unique(near_lowest(own, _POINTS, _REACH))
                 if rows.size:
                     some = one.rows(rows)
                     slopes.append(self._by_numbers(x, some, some.slopes(C[rows], place)))
@@ -434,14 +434,6 @@ class _Program(NamedTuple):
             return np.zeros(self.low.size), 0.0
         now = float(min(self.room.min(initial=np.inf), 0.0))
         return answer.x[:-1], float(-answer.fun) - _PENALTY * now
-
-
-def _critical(room: FloatArray) -> IntArray:
-    """Return the points of one place that count in a step: its lowest minima, and about them."""
-    least = lowest_of(room)[:_POINTS]
-    least = least[room[least] < _REACH]
-    near = (least[:, None] + np.array([-1, 0, 1])).ravel()
-    return np.unique(near[(near >= 0) & (near < room.size)])
 
 
 def _same_winding(one: Coupling, before: ComplexArray, after: ComplexArray) -> bool:

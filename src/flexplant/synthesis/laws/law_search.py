@@ -188,15 +188,19 @@ def lowest_of(room: FloatArray) -> IntArray:
     return np.asarray(places[np.argsort(room[places], kind="stable")])
 
 
+def near_lowest(room: FloatArray, most: int, level: float) -> IntArray:
+    """Return so many of the lowest local minima, those below a level, and the points about them."""
+    least = lowest_of(room)[:most]
+    near = (least[room[least] < level, None] + np.array([-1, 0, 1])).ravel()
+    return np.asarray(near[(near >= 0) & (near < room.size)])
+
+
 def _critical_points(room: FloatArray) -> IntArray:
     """Return the points that count in a step: local minima, and the valleys about the lowest."""
-    least = lowest_of(room)[:_POINTS]
-    least = least[room[least] < room[least[0]] + _REACH]
-    near = (least[:, None] + np.array([-1, 0, 1])).ravel()
-    valley = np.flatnonzero(room < room[least[0]] + 0.5 * _REACH)
+    near = near_lowest(room, _POINTS, room.min() + _REACH)
+    valley = np.flatnonzero(room < room.min() + 0.5 * _REACH)
     even = valley[:: max(1, valley.size // (2 * _POINTS))]
-    every = np.concatenate([near[(near >= 0) & (near < room.size)], even, [room.size - 1]])
-    return np.unique(every)
+    return np.unique(np.concatenate([near, even, [room.size - 1]]))
 
 
 #: shapes: zero below and pole above the bandwidth, low-pass above it

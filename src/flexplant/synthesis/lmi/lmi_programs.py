@@ -28,11 +28,12 @@ from .lmi_solution import (
     first_verified,
     half,
     lqg_states,
-    null_space,
     reconstructed,
     same_states,
 )
 
+#: singular values below this part of the largest are none: channels are prepared to some 1e-12
+NULL = 1e-10
 #: part of the back-off that goes into X Y >= (1 + ...)^2, away from the singular I - X Y
 APART = 0.6
 #: weight of the size of the controller's matrices beside the traces of X and Y
@@ -86,8 +87,8 @@ def smallest_gamma(p: Plant, scale: float, settings: dict[str, float]) -> Optimu
     n, nw, nz = p.A.shape[0], p.B1.shape[1], p.C1.shape[0]
     X, Y = (cp.Variable((n, n), symmetric=True) for _ in range(2))
     gamma = cp.Variable()
-    onto_u = la.block_diag(null_space(np.hstack([p.B2.T, p.D12.T])), np.eye(nw))
-    onto_y = la.block_diag(null_space(np.hstack([p.C2, p.D21])), np.eye(nz))
+    onto_u = la.block_diag(la.null_space(np.hstack([p.B2.T, p.D12.T]), NULL), np.eye(nw))
+    onto_y = la.block_diag(la.null_space(np.hstack([p.C2, p.D21]), NULL), np.eye(nz))
     AY, XA, w, z = p.A @ Y, X @ p.A, -gamma * np.eye(nw), -gamma * np.eye(nz)
     control = symmetric_blocks([[AY + AY.T, Y @ p.C1.T, p.B1], [z, p.D11], [w]])
     observe = symmetric_blocks([[XA + XA.T, X @ p.B1, p.C1.T], [w, p.D11.T], [z]])
@@ -174,7 +175,7 @@ def solve_program(
     how = f"Clarabel: {reached.status} after {counted(reached.iterations, 'iteration')}"
     for constraint in problem.constraints:
         M = constraint.args[0].value
-        if not _is_lmi(constraint):
+        if constraint.__class__.__name__ != "PSD":
             continue
         values = la.eigvalsh(half(M))
         # solvers return them symmetric: else the constraint is not the one meant
@@ -187,10 +188,6 @@ def solve_program(
                 f"an LMI is violated: smallest eigenvalue {values[0]:.1e}, largest "
                 f"{values[-1]:.1e} ({how}). Loosen weights or reduce the order of the plant."
             )
-
-
-def _is_lmi(constraint: Any) -> bool:
-    return bool(constraint.__class__.__name__ == "PSD")
 
 
 def _unpack(problem: Any, raw: Any, chain: Any, inverse: Any) -> None:

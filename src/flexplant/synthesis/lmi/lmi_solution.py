@@ -284,11 +284,3 @@ def factor(P: FloatArray) -> FloatArray:
 def half(M: Any) -> Any:
     """Return the symmetric part."""
     return 0.5 * (M + M.T)
-
-
-def null_space(M: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of the null space."""
-    _, values, right = la.svd(M)
-    # channels are of unit size here, and prepared to some 1e-12
-    rank = int(np.count_nonzero(values > 1e-10 * max(float(values[0]), TINY)))
-    return np.asarray(right[rank:].T)

@@ -47,8 +47,8 @@ def power_iteration(
     inside their interval. It need not converge: what it gives is judged by what it does.
     [Young1990]_; [PackardDoyle1993]_.
     """
-    n = M.shape[1]
-    b, w = (_unit_vector(_random_complex(rng, n)) for _ in range(2))
+    drawn = rng.standard_normal((2, 2, M.shape[1]))
+    b, w = (_unit_vector(real + 1j * imag) for real, imag in drawn)
     q = {i: 1.0 + 0j for i, p in enumerate(where) if isinstance(p.block, RepeatedScalar)}
     old, a = b, M @ b
     for _ in range(_STEPS):
@@ -63,7 +63,7 @@ def power_iteration(
         if not np.any(w):
             break
         w = _unit_vector(w)
-        b = np.zeros(n, dtype=np.complex128)
+        b = np.zeros(M.shape[1], dtype=np.complex128)
         for i, p in enumerate(where):
             b[p.w] = _right(p, q, i, a, old, w)
         b = _unit_vector(b)
@@ -107,10 +107,6 @@ def _real_scalar(q: float, a: ComplexArray, b: ComplexArray, w: ComplexArray) ->
     sign = 1.0 if q >= 0 else -1.0
     moved = sign * la.norm(b) / max(la.norm(a), TINY) + float(np.vdot(a, w).real)
     return float(np.clip(moved, -1.0, 1.0))
-
-
-def _random_complex(rng: np.random.Generator, n: int) -> ComplexArray:
-    return np.asarray(rng.standard_normal(n) + 1j * rng.standard_normal(n))
 
 
 def _unit_vector(v: ComplexArray) -> ComplexArray:
