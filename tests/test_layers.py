@@ -242,7 +242,7 @@ def only_exports(node, *, root):
     return (
         docstring
         or lazy
-        or (root and names == ["(_imported, _names, __all__)"])
+        or (root and names == ["(_imported, __dir__, __all__)"])
         or checking
         or isinstance(node, ast.Import | ast.ImportFrom)
         or names in (["__version__"], ["__all__"], ["__dir__"])

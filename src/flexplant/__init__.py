@@ -134,12 +134,7 @@ from lazy_loader import attach_stub as _attach_stub
 __version__ = "0.1.0"
 
 # a room is imported when a name of it is first used: the names are in __init__.pyi
-_imported, _names, __all__ = _attach_stub(__name__, __file__)
-
-
-def __dir__() -> list[str]:
-    """Return the public names and rooms, and what each module has."""
-    return [*_names(), "__doc__", "__file__", "__version__"]
+_imported, __dir__, __all__ = _attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> _Any:

@@ -402,7 +402,7 @@ def test_a_quiet_accelerometer_beside_a_held_disturbance():
 def test_covariances_that_lack_digits_give_no_deviations():
     observer = design_kalman(on_soft_springs("4:z", 1e-3, 1e-12))
     silent = dict.fromkeys(("y1", "y7", "y43", "u1"), np.zeros(50))
-    with pytest.raises(SolverError, match="run it by observer.system"):
+    with pytest.raises(SolverError, match=r"run it by observer\.system"):
         observer.estimate(silent)
     assert difference_of(np.array([-1e-24]), np.array([-2e-24])) == np.inf
 

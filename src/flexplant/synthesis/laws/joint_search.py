@@ -208,7 +208,7 @@ _STEPS, _ROUNDS = 50, 6
 #: radii [e-folds], penalty on what is violated, step of differences
 _RADIUS, _SMALLEST, _PENALTY, _DIFFERENCE = 0.25, 1e-3, 4.0, 1e-6
 #: points of one place that count in a step, at most and as far above the bound
-_POINTS, _REACH = 12, 0.3
+_LOWEST, _REACH = 12, 0.3
 #: distance kept beyond what is needed, to end with no less
 _SPARE = 2e-3
 #: steps down, and their factor, where the grid missed the very top of a peak; |S| beside the bound
@@ -357,7 +357,7 @@ class JointSearch:
         slopes, places = [np.empty((0, x.size))], []
         for number, (one, C, room) in enumerate(zip(couplings, gains, rooms, strict=True)):
             for place, own in enumerate(room):
-                rows = np.unique(near_lowest(own, _POINTS, _REACH))
+                rows = np.unique(near_lowest(own, _LOWEST, _REACH))
                 if rows.size:
                     some = one.rows(rows)
                     slopes.append(self._by_numbers(x, some, some.slopes(C[rows], place)))
