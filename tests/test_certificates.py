@@ -165,7 +165,7 @@ class Unstable:
 #: what is made wrong, how, what is called then, and what is said
 WRONG = {
     "error of an observer, its dual": (
-        "estimation.error._gain_trace", larger(1.02),
+        "estimation.error._two_ways", larger(1.02, 1),
         lambda: estimate().rms("die", on=masses()), "its dual differ",
     ),
     "minimax filter": (

@@ -71,17 +71,7 @@ def error_variances(
             f"{observer.dt:g} s, got {plant.dt:g} s."
         )
     joint, missed = _apart(_joint(plant, observer, suspension))
-    if joint.modal is None:
-        X = solve_stein(joint.A, joint.noise @ joint.noise.T)
-        primal = np.sum((joint.E @ X) * joint.E, axis=1)
-        dual = np.array([_dual_dense(joint, row) for row in joint.E])
-    else:
-        primal, dual = _primal(joint), _gain_trace(joint)
-    if not difference_of(dual, primal) <= _AGREEMENT:  # squares that cancel: by their roots
-        with suppress(SolverError):  # poles on the circle: refused below
-            L = stein_root(joint.A, joint.noise)
-            dual = dual_variances(joint.A, joint.noise, joint.E, np.linalg.norm(L, axis=1))
-            primal = np.sum((joint.E @ L) ** 2, axis=1)
+    primal, dual = _two_ways(joint)
     size = divisor(primal)
     # both have the same poles: how far rounding moves their damping shows in neither
     rounded = np.sum(missed.variances * (np.finfo(np.float64).eps / missed.gap), axis=1)
@@ -94,6 +84,22 @@ def error_variances(
         )
     _note_hardly_damped(plant, missed, size)
     return Variances(primal + joint.direct, difference)
+
+
+def _two_ways(joint: _Joint) -> tuple[FloatArray, FloatArray]:
+    """Return the variances by the equation of the states and by its dual."""
+    if joint.modal is None:
+        X = solve_stein(joint.A, joint.noise @ joint.noise.T)
+        primal = np.sum((joint.E @ X) * joint.E, axis=1)
+        dual = np.array([_dual_dense(joint, row) for row in joint.E])
+    else:
+        primal, dual = _primal(joint), _gain_trace(joint)
+    if not difference_of(dual, primal) <= _AGREEMENT:  # squares that cancel: by their roots
+        with suppress(SolverError):  # poles on the circle: refused by the difference
+            L = stein_root(joint.A, joint.noise)
+            dual = dual_variances(joint.A, joint.noise, joint.E, np.linalg.norm(L, axis=1))
+            primal = np.sum((joint.E @ L) ** 2, axis=1)
+    return primal, dual
 
 
 class _Missed(NamedTuple):
