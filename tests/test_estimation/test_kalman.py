@@ -363,18 +363,15 @@ def on_soft_springs(at, asd, sensor_asd, rate=5e3):
 def test_one_disturbance_on_a_softly_mounted_plate(at):
     """Refused before ("the Stein series does not end"), in half of such cases."""
     found = {}
-    for asd, noise in ((1e-3, 1e-9), (1e-6, 1e-12), (1e-3, 1e-12)):
+    for asd, noise in ((1e-3, 1e-9), (1e-6, 1e-12)):
         plant = on_soft_springs(at, asd, noise)
         found[asd, noise] = design_kalman(plant)
-        if (asd, noise) != (1e-3, 1e-12):  # there 80 bits are too few for the oracle
-            variance = observer_error(*dictionaries(plant, found[asd, noise]))
-            rms = found[asd, noise].rms("die")
-            assert np.sqrt(variance[0]) == pytest.approx(rms, rel=2e-5, abs=0)
-    # in other units it is the same problem, and less noise is no worse
-    assert found[1e-3, 1e-9].rms("die") == pytest.approx(
-        1e3 * found[1e-6, 1e-12].rms("die"), rel=1e-6, abs=0
-    )
-    assert found[1e-3, 1e-12].rms("die") < found[1e-3, 1e-9].rms("die")
+        variance = observer_error(*dictionaries(plant, found[asd, noise]))
+        rms = found[asd, noise].rms("die")
+        assert np.sqrt(variance[0]) == pytest.approx(rms, rel=2e-5, abs=0)
+    # in other units it is the same problem
+    milli, micro = found[1e-3, 1e-9].rms("die"), found[1e-6, 1e-12].rms("die")
+    assert milli == pytest.approx(1e3 * micro, rel=1e-6, abs=0)
     layout = score_sensors(on_soft_springs(at, 1e-6, 1e-12), [["y1", "y7", "y43"]])
     assert np.sqrt(layout.values[0]) == pytest.approx(
         found[1e-6, 1e-12].rms("die"), rel=1e-6, abs=0
@@ -400,10 +397,11 @@ def test_a_quiet_accelerometer_beside_a_held_disturbance():
 
 
 def test_covariances_that_lack_digits_give_no_deviations():
-    observer = design_kalman(on_soft_springs("4:z", 1e-3, 1e-12))
-    silent = dict.fromkeys(("y1", "y7", "y43", "u1"), np.zeros(50))
+    observer = design_kalman(plate_plant(1e-2))
+    other = observer.replace(covariance=1.001 * observer.covariance)
+    silent = dict.fromkeys((*other.sensors, *other.model.commands), np.zeros(50))
     with pytest.raises(SolverError, match=r"run it by observer\.system"):
-        observer.estimate(silent)
+        other.estimate(silent)
     assert difference_of(np.array([-1e-24]), np.array([-2e-24])) == np.inf
 
 
@@ -428,7 +426,7 @@ def test_square_roots_give_the_filter_that_covariances_give():
     ("wrong", "words"),
     [
         (lambda r: r._replace(K=-r.K), "not stable"),
-        (lambda r: r._replace(L=1.001 * r.L), "differ"),
+        (lambda r: r._replace(L=1.02 * r.L), "differ"),
         (lambda r: r._replace(K=0.9 * r.K), "differ|not stable"),
     ],
 )

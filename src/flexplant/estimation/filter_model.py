@@ -320,8 +320,8 @@ class Steady:
 
 
 #: the covariance of the Riccati equation and that of the gain's own Stein equation agree to this;
-#: where the gain's own rounding counts (`riccati_root`): half of it of a standard deviation
-AGREEMENT, ROUNDED = 1e-6, 1e-4
+#: where the gain's own rounding counts (`riccati_root`), to half of it of a standard deviation
+AGREEMENT, ROUNDED = 1e-6, 1e-2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -336,7 +336,7 @@ class KalmanCertificate(Certificate):
         Of the Riccati equation, relative, in states of unit variance.
     difference : float
         Largest relative difference between two ways to the POI variances: on the filter's own
-        model the Riccati equation and a Stein equation of the gain, at most 1e-6 (1e-4 where noise
+        model the Riccati equation and a Stein equation of the gain, at most 1e-6 (1 % where noise
         is so little that square roots were needed); on the plant with
         the modes left out the joint Stein equation and its dual, at most 1 %, with what rounding of
         hardly damped poles may change.

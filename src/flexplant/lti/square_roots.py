@@ -25,9 +25,9 @@ _LAST, _SETTLED, _STALLED = 1e-9, 1e-9, 3e-4
 #: Newton's steps: from a start with 1e8 times the noise it took 20, the last four of them
 #: quadratic
 STEPS = 60
-#: powers of ten by which sensors have more noise: from where R is not singular by rounding to
-#: where it is as large as any motion
-DECADES = (-4, 16)
+#: powers of ten by which sensors have more noise, beside their motion in a sample and own noise:
+#: from rounding to a million times as much
+DECADES = (-16, 7)
 
 
 class RiccatiRoot(NamedTuple):
@@ -117,13 +117,14 @@ def riccati_root(A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray) -> 
 def _noisier(A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray) -> RiccatiSolution:
     """Return the filter for the least noise that sensors have besides, in decades, with one."""
     why: Exception | None = None
-    R = H @ H.T
+    R, moved = H @ H.T, C @ G
+    reach = np.diag(R) + np.sum(moved**2, axis=1)
     for factor in 10.0 ** (2 * np.arange(*DECADES)):
         try:
-            return solve_dare(A, C, Q=G @ G.T, R=R + factor * np.diag(np.diag(R)), S=G @ H.T)
+            return solve_dare(A, C, Q=G @ G.T, R=R + factor * np.diag(reach), S=G @ H.T)
         except (SolverError, ModelError, np.linalg.LinAlgError) as error:  # R may be singular
             why = error
-    raise SolverError(f"with sensors 1e{DECADES[1] - 1} times as noisy no filter was found: {why}")
+    raise SolverError(f"with much noisier sensors no filter was found either: {why}")
 
 
 def _newton(
