@@ -249,6 +249,10 @@ def test_wrong_connections_are_refused(blocks, error, message):
         close_loop(stage(), *blocks())
 
 
+def test_a_loop_whose_actuators_all_rest():
+    assert "driven: \n" in f"{close_loop(stage(), observer(), idle=['u1', 'u2'])}\n"
+
+
 def test_idle_must_be_true():
     with pytest.raises(LabelError, match="cannot be idle"):
         close_loop(stage(), observer(), servo(), idle="u1")
