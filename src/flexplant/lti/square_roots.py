@@ -22,6 +22,8 @@ from .riccati import RiccatiSolution, solve_dare
 #: the most that is accepted: of
 #: 12 such filters at 3e-4, of states that the POIs hardly show, 8 were within 1e-6 of the optimum
 _LAST, _SETTLED, _STALLED = 1e-9, 1e-9, 3e-4
+#: steps in a row that do not halve the least change: some come before the quadratic ones
+_STALLS = 6
 #: Newton's steps: from a start with 1e8 times the noise it took 20, the last four of them
 #: quadratic
 STEPS = 60
@@ -131,7 +133,7 @@ def _newton(
     A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray, K: FloatArray
 ) -> RiccatiRoot:
     """Improve a stable gain: the error that it has, then the gain best for it [Hewer1971]_."""
-    last, before = np.zeros(A.shape[0]), np.inf
+    last, least, stalls = np.zeros(A.shape[0]), np.inf, 0
     for taken in range(1, STEPS + 1):
         closed = A - K @ C
         if np.max(np.abs(la.eigvals(closed)), initial=0.0) >= 1.0:
@@ -140,9 +142,10 @@ def _newton(
         size = np.linalg.norm(L, axis=1)
         change = float(np.max(np.abs(size - last) / np.where(size > 0, size, 1.0), initial=0.0))
         K, X = _measured(A, C, G, H, L)
-        if change <= (_STALLED if change >= 0.5 * before else _SETTLED):
+        stalls = stalls + 1 if change >= 0.5 * least else 0
+        if change <= (_STALLED if stalls >= _STALLS else _SETTLED):
             return RiccatiRoot(L, K, X, change, taken)
-        last, before = size, change
+        last, least = size, min(least, change)
     raise SolverError(
         f"the filter is not settled in {STEPS} steps of Newton in square roots: a standard "
         f"deviation still changes by {change:.1e} of it."
