@@ -100,7 +100,9 @@ def test_noises_of_process_and_sensors_may_be_correlated(lag):
     model = observer().model
     S = np.zeros_like(model.C2.T)
     S[:, 0] = 0.7 * observer().plant.noise_factor[:, 0] * np.sqrt(model.R[0, 0])
-    model = model.replace(S=S)
+    with pytest.raises(ModelError, match="root is no factor"):
+        model.replace(S=S)
+    model = model.replace(S=S, root=None)
     solved = solve_dare(model.A, model.C2, Q=model.Q, R=model.R, S=S)
     y, u, _ = run(model, 40, seed=10)
     y[12:15, 0] = np.nan

@@ -173,6 +173,9 @@ class KalmanEstimator(PoiFilter):
         ModelError
             When `records` hold no channels, infinite values, or times of another rate, `lag` is
             none, or `gate` is not positive.
+        SolverError
+            When sensors are so quiet that covariances have too few digits; the filter runs
+            all the same, by `system` or `step`.
 
         Warns
         -----
@@ -274,6 +277,8 @@ class KalmanEstimator(PoiFilter):
         ------
         ModelError
             When lags are not positive numbers.
+        SolverError
+            When covariances have too few digits, as in `estimate`.
         """
         steady, sight, _, _ = in_unit_states(
             self.model, self.predicted_covariance, self.predictor_gain

@@ -9,11 +9,12 @@ import numpy as np
 
 from ..certificates import Certificate
 from ..checks import FloatArray, IntArray, Value, real_array
-from ..errors import AssumptionError, CertificateError, ShapeError, SolverError
+from ..errors import AssumptionError, CertificateError, ModelError, ShapeError, SolverError
 from ..lti.lyapunov import solve_stein
 from ..lti.square_roots import difference_of, square_root
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..tolerances import SAME
 from .estimator_channels import estimates, poi_channels, sensors
 from .left_out import LeftOut
 
@@ -57,6 +58,11 @@ class FilterModel(Value):
     root : (n + ny, r) array, optional
         A factor of ``[Q S; S' R]``, where one is known.
 
+    Raises
+    ------
+    ModelError
+        When `root` is no such factor.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -81,6 +87,18 @@ class FilterModel(Value):
     sensors: tuple[str, ...]
     commands: tuple[str, ...]
     root: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        if self.root is None:
+            return
+        joint = np.block([[self.Q, self.S], [self.S.T, self.R]])
+        size = np.sqrt(np.abs(joint.diagonal()))
+        # a product that was replaced beside its factor would be two problems in one model
+        if np.any(np.abs(self.root @ self.root.T - joint) > SAME * np.outer(size, size)):
+            raise ModelError(
+                "root is no factor of [Q S; S' R]: the noises of the model were changed, and it "
+                "was not. Replace it with them, or pass root=None."
+            )
 
     def scaled(self, d: FloatArray, s: FloatArray) -> FilterModel:
         """Return the model with states x / d and measurements y / s."""
