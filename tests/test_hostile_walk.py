@@ -118,13 +118,14 @@ def call(called, given):
 LEFT_OUT = ("self", "cls", "progress", "executor", "build", "design", "trial")
 
 
-#: in CI, and those whose examples take a quarter of a minute each: ``-m benchmark``
+#: rooms by how long their walk takes; whose examples take a quarter of a minute: ``-m benchmark``
 QUICK = ["lti", "modes", "structure", "reduction", "joining", "plant", "loop", "identification"]
+LONG = [pytest.param(one, marks=pytest.mark.long) for one in ("updating", "placement", "io")]
 DESIGNS = [pytest.param(one, marks=pytest.mark.benchmark) for one in ("estimation", "simulation")]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("room", [*QUICK, *DESIGNS])
+@pytest.mark.parametrize("room", [*QUICK, *LONG, *DESIGNS])
 def test_hostile_arguments_meet_errors_of_ours(room):
     calls = recorded(f"flexplant.{room}")
     assert len(calls) >= 7

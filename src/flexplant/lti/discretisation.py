@@ -154,7 +154,7 @@ def propagated(g: StateSpace, h: float) -> Propagated:
         exponential = np.where(acting(augmented != 0), la.expm(augmented), 0.0)
         return Propagated(exponential[:n, :n], exponential[:n, n:])
     E, integral = pair_exponential(pairs, h)
-    driven = np.einsum("bij,bjm->bim", integral, g.B.reshape(-1, 2, g.B.shape[1]))
+    driven = np.einsum("bij,bjm->bim", integral, g.B.reshape(len(integral), 2, g.B.shape[1]))
     return Propagated(block_diagonal(E), driven.reshape(g.B.shape))
 
 

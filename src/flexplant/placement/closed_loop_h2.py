@@ -187,7 +187,8 @@ def _delayed_candidates(
         late = StateSpace(A, B, rows, np.zeros((len(rows), len(candidates))), dt=plant.dt)
     else:
         late = held_exactly(pushed(plant, candidates, rows), 1.0 / plant.dt, delay=fraction)
-    return n + np.arange(late.n_states - n).reshape(len(candidates), -1), late
+    own = (late.n_states - n) // max(len(candidates), 1)
+    return n + np.arange(late.n_states - n).reshape(len(candidates), own), late
 
 
 _WEIGHTS = "Type HinfLevel(z={'die:z': 1e9}, w={'amp1': 1e-3})."

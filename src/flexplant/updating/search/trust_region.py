@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import FloatArray, checked, one_of, positive
+from ...checks import FloatArray, checked, one_of, positive, whole
 from ...errors import ModelError
 from ...tolerances import divisor
 from .objective import Objective
@@ -101,6 +101,7 @@ def minimised(
     Steps that keep away from bounds cost half as much again where none of them is active. Only
     points that the search moves to become references for the pairing of modes.
     """
+    most = whole(most, "most")  # the steps are counted up to it: no other number ends them
     free = np.full(start.size, np.inf)
     if np.any(np.isfinite(objective.lower)) or np.any(np.isfinite(objective.upper)):
         try:
