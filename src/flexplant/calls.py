@@ -177,7 +177,7 @@ def unfit(value: Any, hint: Any, *, strict: bool = False) -> str:
         return "" if isinstance(value, bool | np.bool_) else _WORDS[bool]
     if kind in _MANY:
         return _unfit_elements(value, "a sequence", value, inner)
-    if issubclass(kind, Mapping) and isinstance(value, Mapping):
+    if kind in (dict, Mapping) and isinstance(value, Mapping):
         return _unfit_elements(value, "a mapping", value.values(), inner[1:])
     return "" if isinstance(value, kind) else _WORDS.get(kind, f"a {kind.__name__}")
 

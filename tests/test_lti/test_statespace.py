@@ -145,3 +145,8 @@ GOOD = {"A": -np.eye(2), "B": np.ones((2, 1)), "C": np.ones((1, 2)), "D": np.zer
 def test_bad_input(change, error, message):
     with pytest.raises(error, match=message):
         StateSpace(**(GOOD | change))
+
+
+def test_a_static_gain_of_nothing_is_refused():
+    with pytest.raises(ShapeError, match="rows and columns"):
+        as_statespace([])

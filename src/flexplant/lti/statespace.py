@@ -423,6 +423,8 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
     ------
     ModelError
         When it is neither a system nor a (p, m) array; for a StandardPlant, which holds four.
+    ShapeError
+        When an array holds nothing.
 
     Examples
     --------
@@ -435,6 +437,11 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
         return sys
     if isinstance(sys, np.ndarray | list | tuple | float | int):
         gain = np.atleast_2d(real_array(sys, "a static gain"))
+        if not gain.size and np.ndim(sys) < 2:
+            raise ShapeError(
+                f"a static gain has rows and columns (p, m), got {short(sys)}: nothing. Pass a "
+                "matrix, [[1.0]], or a system."
+            )
         return StateSpace(
             np.zeros((0, 0)), np.zeros((0, gain.shape[1])), np.zeros((gain.shape[0], 0)), gain
         )

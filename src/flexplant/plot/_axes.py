@@ -489,6 +489,15 @@ def _response_to_draw(one: Any, freq: FloatArray | None) -> Frf:
         ) from error
 
 
+def require_channels(rows: int, columns: int) -> None:
+    """Raise ModelError where no channel is chosen."""
+    if not rows * columns:
+        raise ModelError(
+            f"{rows} outputs and {columns} inputs are no channel to draw. Choose some: outputs=, "
+            "inputs=; all without."
+        )
+
+
 def decibel(values: ComplexArray | FloatArray) -> FloatArray:
     """Return 20 log10 of sizes; zero is far below all."""
     return np.asarray(20.0 * np.log10(np.maximum(np.abs(values), TINY)))

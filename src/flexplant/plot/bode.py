@@ -25,6 +25,7 @@ from ._axes import (
     legend,
     panel_axes,
     readable,
+    require_channels,
     role_of,
     shared_reference,
 )
@@ -102,6 +103,7 @@ def bode(
 
 
 def _panels(ax: Sequence[Axes] | None, rows: int, columns: int) -> Any:
+    require_channels(rows, columns)
     if rows * columns > _MOST:
         raise ModelError(
             f"{rows} outputs and {columns} inputs are {rows * columns} channels, more than can be "

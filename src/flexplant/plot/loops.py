@@ -200,7 +200,7 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
     Raises
     ------
     ModelError
-        When one is no system.
+        When one is no system, or none has states.
 
     Examples
     --------
@@ -210,10 +210,12 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
     True
     """
     given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
-    named = labelled(systems)
+    named = {label: as_statespace(one) for label, one in labelled(systems).items()}
+    if not any(g.n_states for g in named.values()):
+        raise ModelError("static gains have no poles to draw. Pass a system with states.")
     looks = styles(named)
-    for i, (label, one) in enumerate(named.items()):
-        g, color = as_statespace(one), str(looks[i]["color"])
+    for i, (label, g) in enumerate(named.items()):
+        color = str(looks[i]["color"])
         pole, zero = _MARKERS[i % len(_MARKERS)]
         _draw_roots(ax, continuous_poles(g), pole, color, f"{label} poles".strip())
         if zeros:

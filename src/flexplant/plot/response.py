@@ -32,6 +32,7 @@ from ._axes import (
     named,
     panel_axes,
     quantity_of,
+    require_channels,
     shown_in,
     styles,
 )
@@ -270,6 +271,7 @@ def _set_points(found: Any) -> tuple[list[str], list[str]] | None:
 
 
 def _response_axes(ax: Axes | None, rows: int, columns: int) -> Any:
+    require_channels(rows, columns)
     if rows * columns > _MOST or (ax is not None and rows * columns > 1):
         raise ModelError(
             f"{rows} outputs and {columns} inputs are {rows * columns} channels: "

@@ -159,7 +159,7 @@ def shape_loop(
     if rolloff is not None:
         below_half_rate(rolloff, "rolloff", dt)
     if isinstance(model, int | float | np.number):
-        below_half_rate(float(model), "model", dt)
+        below_half_rate(positive(model, "model"), "model", dt)
     _unusual(target, rolloff, None if model is None else rho)
     T_ref = None if model is None else _model(model, axes)
     freq = target
