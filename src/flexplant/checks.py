@@ -248,6 +248,10 @@ def positive(value: Any, name: str, *, zero: bool = False) -> float:
     return number
 
 
+#: of machines or starts that are each a search: days on any computer, so that more is a mistake
+MOST = 1_000_000
+
+
 def whole(value: Any, name: str, *, minimum: int = 1, maximum: int | None = None) -> int:
     """Return `value` as an int between bounds; 3.0 is none, nor is True."""
     least = f"at least {minimum}" if maximum is None else f"from {minimum} to {maximum}"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...certificates import stability
-from ...checks import FloatArray, Value, generator, whole
+from ...checks import MOST, FloatArray, Value, generator, whole
 from ...errors import CertificateError, FlexplantError, counted
 from ...loop import ClosedLoop, SpillOver, close_loop
 from ...parallel import Progress, one_thread
@@ -177,7 +177,7 @@ def robust_stability(
     >>> fx.synthesis.robust_stability(plant.uncertain(fit), lead, machines=3).is_robust
     True
     """
-    count = whole(machines, "machines", minimum=0)
+    count = whole(machines, "machines", minimum=0, maximum=MOST)
     chance = generator(rng)
     if quick:
         first = _quick(uncertain, blocks, larger, count, chance)

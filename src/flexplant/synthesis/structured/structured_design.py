@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...certificates import stability, stability_name
-from ...checks import FloatArray, Rng, generator, short, whole
+from ...checks import MOST, FloatArray, Rng, generator, short, whole
 from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError
 from ...lti.interconnection import lft
 from ...lti.preparation import Prepared, prepared
@@ -154,7 +154,7 @@ def design_structured(
             f"{short(structure)}. Pass one of them, such as synthesis.TunedLaws(law) or "
             "synthesis.FixedOrder(2)."
         )
-    starts, random = whole(starts, "starts"), generator(rng)
+    starts, random = whole(starts, "starts", maximum=MOST), generator(rng)
     evaluations = whole(evaluations, "evaluations")
     problems = [prepared(one.system, one.u, one.y) for one in plants]
     for one, problem in zip(plants, problems, strict=True):
