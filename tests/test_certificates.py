@@ -229,8 +229,8 @@ WRONG = {
         lambda: reducer(loss=0.1), "no controller of fewer states",
     ),
     "blocks for C, of several places": (
-        "synthesis.aftercare.two_state._difference", lambda _: lambda *_: 1e-3,
-        lambda: import_module("flexplant.synthesis.aftercare.two_state").scheduled_form(
+        "synthesis.aftercare.forms._difference", lambda _: lambda *_: 1e-3,
+        lambda: import_module("flexplant.synthesis.aftercare.forms").scheduled_form(
             [lead(2e3).replace(blocks=None)], driven=1
         ), "moves the response",
     ),

@@ -29,7 +29,7 @@ from flexplant.lti import riccati as doubling
 from flexplant.lti.riccati import control_care
 from flexplant.parallel import CHUNK, PROBE, mapped
 from flexplant.synthesis.hinf import hinf_design as attempts
-from flexplant.synthesis.servo import servo_design as servo
+from flexplant.synthesis.laws import servo_design as servo
 
 
 def square(item):

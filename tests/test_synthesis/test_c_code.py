@@ -398,7 +398,7 @@ def test_refusals_of_the_c_export(tmp_path):
 
 def test_a_wrong_block_is_found(monkeypatch, tmp_path):
     """The certificate compares responses: what drives the states off by 1e-6 is refused."""
-    from flexplant.synthesis.aftercare import two_state
+    from flexplant.synthesis.aftercare import forms as two_state
 
     right = two_state._arranged
 

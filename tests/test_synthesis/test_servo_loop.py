@@ -11,7 +11,7 @@ from flexplant.loop import close_loop
 from flexplant.lti import StateSpace
 from flexplant.plant import Poi, Sensor, assemble_plant
 from flexplant.synthesis import design_servo, servo_bandwidth
-from flexplant.synthesis.servo.servo_design import servo_task
+from flexplant.synthesis.laws.servo_design import servo_task
 from flexplant.testbeds import three_masses, wafer_stage
 from oracles_plant import closed_loop
 from stages import RATE, L, block, calibrated, ports, reduced, sampled

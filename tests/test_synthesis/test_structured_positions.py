@@ -7,7 +7,7 @@ from test_structured import judged, law, machine
 from flexplant.errors import ModelError
 from flexplant.lti import StateSpace
 from flexplant.synthesis import TunedLaws, design_structured
-from flexplant.synthesis.plant_range import system_at
+from flexplant.synthesis.synthesis_plants import system_at
 
 
 def moving(places=(0.0, 0.5, 1.0)):

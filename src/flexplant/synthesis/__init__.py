@@ -38,13 +38,13 @@ Dense methods suit plants of up to some 500 states; `Lmi` takes 30 states, `desi
 
 from ..rooms import public_names as _public_names
 from .aftercare.c_code import write_c as write_c
-from .aftercare.filter_sections import second_order_sections as second_order_sections
 from .aftercare.fixed_point import FixedPointController as FixedPointController
 from .aftercare.fixed_point import LimitCycle as LimitCycle
 from .aftercare.fixed_point import fixed_point as fixed_point
+from .aftercare.forms import anti_windup_form as anti_windup_form
+from .aftercare.forms import second_order_sections as second_order_sections
 from .aftercare.order import discretise_controller as discretise_controller
 from .aftercare.order import reduce_controller as reduce_controller
-from .aftercare.windup import anti_windup_form as anti_windup_form
 from .controller import Controller as Controller
 from .h2 import design_h2 as design_h2
 from .hinf.hinf_design import design_hinf as design_hinf
@@ -54,18 +54,20 @@ from .hinf.ncf import ncf_margin as ncf_margin
 from .hinf.shaping import ShapedLoop as ShapedLoop
 from .hinf.shaping import shape_loop as shape_loop
 from .hinf.stage_design import design_stage as design_stage
+from .laws.controller_elements import FixedBlock as FixedBlock
 from .laws.controller_elements import Integrator as Integrator
 from .laws.controller_elements import Lag as Lag
 from .laws.controller_elements import Lead as Lead
 from .laws.controller_elements import LowPass as LowPass
 from .laws.controller_elements import Notch as Notch
 from .laws.controller_elements import Pid as Pid
-from .laws.fixed_block import FixedBlock as FixedBlock
 from .laws.hand_design import LoopDesign as LoopDesign
 from .laws.hand_design import ShapedAxis as ShapedAxis
 from .laws.law import Law as Law
 from .laws.loop_design import DesignedLoops as DesignedLoops
 from .laws.loop_design import design_loops as design_loops
+from .laws.servo_design import design_servo as design_servo
+from .laws.servo_design import servo_bandwidth as servo_bandwidth
 from .laws.tune import tune_loops as tune_loops
 from .lmi.lmi_programs import Lmi as Lmi
 from .objectives.design import design_lmi as design_lmi
@@ -82,12 +84,10 @@ from .robustness.robust_stability import RobustStability as RobustStability
 from .robustness.robust_stability import robust_stability as robust_stability
 from .robustness.uncertainty_blocks import FullBlock as FullBlock
 from .robustness.uncertainty_blocks import RepeatedScalar as RepeatedScalar
-from .servo.servo_design import design_servo as design_servo
-from .servo.servo_design import servo_bandwidth as servo_bandwidth
 from .structured.structured_design import design_structured as design_structured
 from .structured.structures import FixedOrder as FixedOrder
 from .structured.structures import ObserverGains as ObserverGains
 from .structured.structures import Parametrised as Parametrised
-from .structured.tuned_laws import TunedLaws as TunedLaws
+from .structured.structures import TunedLaws as TunedLaws
 
 __dir__ = _public_names(__name__)

@@ -18,7 +18,7 @@ from ..parallel import one_thread
 from ..plant import StandardPlant
 from .controller import Controller, SolvedController, with_left_out
 from .hinf.singular import made_regular, missing_ranks
-from .reach import posed, require_reach
+from .synthesis_plants import posed, require_reach
 
 #: the H2 norm by the closed loop's Gramians and by the formula of the least cost agree to this
 AGREEMENT = 1e-5

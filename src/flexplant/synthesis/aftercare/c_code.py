@@ -18,8 +18,7 @@ from ...lti.statespace import StateSpace, as_statespace
 from ...store import written
 from ...tolerances import SAME
 from .c_text import CText
-from .two_state import TwoStateForm, scheduled_form, two_state_form
-from .windup import back_gain
+from .forms import TwoStateForm, back_gain, scheduled_form, two_state_form
 
 #: words of C, and what its library has with the ending _t
 _RESERVED = frozenset(

@@ -9,7 +9,7 @@ import numpy as np
 from ...checks import FloatArray
 from ...errors import counted
 from ...lti.statespace import StateSpace
-from .two_state import LANES, TwoStateForm
+from .forms import LANES, TwoStateForm
 
 _HEADER = """\
 /* {title}

@@ -16,8 +16,8 @@ from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...tolerances import TINY
 from .c_code import controller_law
+from .forms import TwoStateForm, two_state_form
 from .order import LoopFacts, loop_facts, loss_text, reduce_controller, stable_before
-from .two_state import TwoStateForm, two_state_form
 
 Integers: TypeAlias = npt.NDArray[np.int64]
 

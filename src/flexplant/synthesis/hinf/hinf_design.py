@@ -36,7 +36,7 @@ from ..controller import (
     with_left_out,
 )
 from ..lmi.lmi_programs import Lmi
-from ..reach import posed, require_reach
+from ..synthesis_plants import posed, require_reach
 from .central import require_shown
 from .hinf_riccati import Riccati
 from .lower_bound import pointwise_bound, raised_bound

@@ -26,7 +26,7 @@ from ...lti.responses import responses
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ..controller import SolvedController
-from ..reach import beyond_rounding
+from ..synthesis_plants import beyond_rounding
 from .central import central, h2_controller, is_indefinite, riccati_solutions
 from .lower_bound import parrott
 from .singular import LEVELS, Regularised, made_regular, missing_ranks, require_ranks

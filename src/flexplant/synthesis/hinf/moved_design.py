@@ -18,7 +18,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress, tick
 from ...plant import StandardPlant
 from ..controller import Controller
-from ..plant_range import PlantRange
+from ..synthesis_plants import PlantRange
 from .lower_bound import pointwise_bound
 
 #: size of the channels beside the whole motion, where the search begins: they are for complex

@@ -19,9 +19,8 @@ from ...lti.joining import block_matrix
 from ...lti.measured_lines import hidden_modes
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace
-from .axis_law import AxisLaw
+from .axis_law import AxisLaw, near_lowest
 from .law import Law, tustin_s
-from .law_search import near_lowest
 
 #: logarithmic part of a grid through the resonances, and times that it is refined
 _POINTS, _REFINEMENTS = 250, 6

@@ -18,11 +18,10 @@ from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant, larger_plant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ..servo.servo_loop import TARGET
-from .axis_law import AxisLaw, MeasuredAxis
+from .axis_law import AxisLaw, FoundLaw, LawSearch, MeasuredAxis
 from .joint_search import JointLaws, JointPlant, JointSearch, Worst
-from .law_search import FoundLaw, LawSearch
 from .loop_design import Axes, DesignedLoops, axes_of, made
+from .servo_loop import TARGET
 
 #: distance of a pole from zero frequency, beside the farthest, that counts as none
 _ZERO = 1e-6

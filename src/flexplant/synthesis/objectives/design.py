@@ -29,8 +29,8 @@ from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati
 from ..lmi.lmi_solution import Plant
-from ..reach import require_stabilisable
 from ..structured.judges import require_finite_h2
+from ..synthesis_plants import require_stabilisable
 from .lmis import ObjectivePrograms
 from .specifications import H2, Hinf, PeakGain, PoleRegion
 

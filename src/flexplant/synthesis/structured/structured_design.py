@@ -20,11 +20,9 @@ from ...plant import StandardPlant, standard_plant
 from ...tolerances import SAME
 from ..controller import Controller, certified_norm, reached_norms, with_left_out
 from ..objectives.specifications import H2, Hinf
-from ..plant_range import PlantRange
-from ..reach import require_stabilisable
-from .judges import GainJudge, Judge, LoopObjective
+from ..synthesis_plants import PlantRange, require_stabilisable
+from .judges import DECAY, GainJudge, Judge, LoopObjective, ScaledLoop
 from .nonsmooth import Pieces, bfgs, decrease_left, joined_pieces, minimax
-from .scaled_loop import DECAY, ScaledLoop
 from .structures import ControllerFamily, ControllerStructure, as_system
 
 #: steps for stability, from each start towards the least norm, and on from the best of them

@@ -20,8 +20,8 @@ from ...plant import Foreign, Poi, StandardPlant
 from ...plant.realisation import natural
 from ...plant.rigid.rigid_motion import rigid_gain
 from ...tolerances import SAME, divisor
-from ..laws.controller_elements import LowPass, Notch, Pid
-from ..laws.law import Law
+from .controller_elements import LowPass, Notch, Pid
+from .law import Law
 
 #: |S| at u that a notch is to bring the loop below: 6 dB
 TARGET = 2.0

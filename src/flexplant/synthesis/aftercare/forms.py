@@ -1,22 +1,24 @@
-"""A sampled system as blocks of two states that act side by side, as a computer runs it."""
+"""Forms of a controller: blocks of two states, second-order sections, conditioned on u."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
-from ...checks import ComplexArray, FloatArray, IntArray
-from ...errors import CertificateError
+from ...checks import ComplexArray, FloatArray, IntArray, positive
+from ...errors import AssumptionError, CertificateError, ModelError
 from ...lti.equations import state_scale
 from ...lti.frequency import frequency_response
 from ...lti.frequency_sweep import resonance_grid
+from ...lti.minimal import minimal
 from ...lti.modal import modal_form
 from ...lti.norms import eigenvalues_with_error
-from ...lti.statespace import StateSpace
+from ...lti.riccati import solve_care, solve_dare
+from ...lti.statespace import StateSpace, as_statespace
 from ...tolerances import RANK, ROUNDING, divisor
 
 #: blocks that are computed at a time: four doubles are one AVX register, four floats one of SSE
@@ -242,3 +244,243 @@ def _difference(K: StateSpace, form: TwoStateForm) -> float:
     least = _SMALL * np.sqrt(np.outer(size.max(axis=1), size.max(axis=0)))
     away = np.abs(got - wanted).max(axis=2, initial=0.0)
     return float(np.max(away / divisor(np.maximum(size, least)), initial=0.0))
+
+
+#: largest difference of the responses, relative to the largest gain of a channel
+_AGREEMENT = 1e-6
+
+
+def second_order_sections(controller: Any) -> Mapping[tuple[str, str], FloatArray]:
+    """Return each channel of a sampled controller as second-order sections.
+
+    ::
+
+        K_ij(z) = prod_k (b0 + b1 z^-1 + b2 z^-2) / (1 + a1 z^-1 + a2 z^-2)
+
+    Poles and zeros are those of the channel's minimal states; the product is compared with the
+    channel over all frequencies.
+
+    Parameters
+    ----------
+    controller : StateSpace or Controller
+        Sampled.
+
+    Returns
+    -------
+    mapping {(output, input): (k, 6) array}
+        Rows [b0, b1, b2, 1, a1, a2], the form of `scipy.signal.sosfilt`; the gain is in the first.
+
+    Raises
+    ------
+    CertificateError
+        When the sections differ from the channel by more than 1e-6 of its largest gain, as where
+        the rate is so high above a pole that rounded coefficients move it.
+    ModelError
+        When the controller is continuous.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> list(fx.synthesis.second_order_sections(servo))
+    [('u1', 'die:ref'), ('u1', 'die:hat')]
+    """
+    K = as_statespace(controller)
+    if not K.dt and K.n_states:
+        raise ModelError(
+            "sections are of a sampled controller: synthesis.discretise_controller(plant, "
+            "controller) first."
+        )
+    return {(output, name): _sections(K[output, name]) for output in K.outputs for name in K.inputs}
+
+
+def _sections(g: StateSpace) -> FloatArray:
+    """Return the sections of one channel."""
+    from scipy.signal import zpk2sos
+
+    small = minimal(g) if g.n_states else g
+    poles: Any = small.poles()
+    zeros: Any = small.zeros()
+    grid = resonance_grid(poles, g.dt or 1.0, points=100)
+    wanted = frequency_response(g.replace(dt=g.dt or 1.0), grid).data[0, 0]
+    size = float(np.abs(wanted).max(initial=0.0))
+    if not size:
+        return np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+    back = np.expm1(-2j * np.pi * grid * (g.dt or 1.0))  # 1/z - 1
+    shape = _root_product(poles, zeros, back)
+    at = int(np.argmax(np.abs(wanted)))
+    gain = float((wanted[at] / shape[at]).real)
+    # with a zero at z = 0 for each that is missing: so many samples too early
+    sections = np.asarray(zpk2sos(zeros, poles, gain, pairing="nearest"), dtype=np.float64)
+    late = len(poles) - len(zeros)
+    for row in sections:
+        while late and not row[2]:
+            row[:3], late = [0.0, *row[:2]], late - 1
+    off = float(np.abs(_sections_response(sections, back) - wanted).max()) / size
+    if not off <= _AGREEMENT:
+        exact = float(np.abs(gain * shape - wanted).max()) / size
+        raise CertificateError(
+            f"the sections of {g.outputs[0]!r} from {g.inputs[0]!r} differ from it by {off:.1e} of "
+            f"its largest gain: {_cause(exact, poles, g.dt)}, or export its states (write_c)."
+        )
+    return sections
+
+
+def _root_product(poles: ComplexArray, zeros: ComplexArray, back: ComplexArray) -> ComplexArray:
+    """Return ``prod (z - zeros) / prod (z - poles)`` at 1/z - 1 = back."""
+    z = 1.0 / (1.0 + back)
+    rise = -back * z  # z - 1
+    found = np.ones(z.size, dtype=np.complex128)
+    for root in zeros:
+        found *= rise + (1.0 - root)
+    for root in poles:
+        found /= rise + (1.0 - root)
+    return found
+
+
+def _sections_response(sections: FloatArray, back: ComplexArray) -> ComplexArray:
+    """Return the response of sections: in powers of 1/z - 1, small where coefficients cancel."""
+    found = np.ones(back.size, dtype=np.complex128)
+    for row in sections:
+        above, below = (
+            (c0 + c1 + c2) + (c1 + 2.0 * c2) * back + c2 * back**2
+            for c0, c1, c2 in (row[:3], row[3:])
+        )
+        found *= above / below
+    return found
+
+
+def _cause(exact: float, poles: ComplexArray, dt: float) -> str:
+    """Return why sections differ, and what helps: the product of their factors differs less."""
+    if exact > _AGREEMENT:
+        return (
+            "poles and zeros of so many states are lost to rounding. Reduce the controller first "
+            "(reduce_controller)"
+        )
+    slow = float(np.abs(poles - 1.0).min()) / (2.0 * np.pi * dt)
+    return (
+        f"a pole at {slow:.3g} Hz is so near z = 1 at a rate of {1.0 / dt:g} Hz that coefficients "
+        "in double precision cannot hold it: 1 + a1 + a2 is (w dt)^2. Lower the rate"
+    )
+
+
+#: D of a conditioned controller is inverted up to this condition
+_LARGEST = 1e8
+
+
+def anti_windup_form(controller: Any, *, recovery: float | None = None) -> StateSpace:
+    """Return the controller with the applied u as inputs, unchanged until an actuator saturates.
+
+    ::
+
+        x' = (A - L C) x + (B - L D) y + L u_applied,    u = C x + D y
+
+    Where u_applied = u it is the controller. Where actuators saturate, its states follow those of
+    a controller that commanded what was applied, with the poles of A - L C:
+
+    Hanus (`recovery` not given): ``L = B D^-1``, which makes ``A - L C`` the zeros of the
+    controller. Observer: L of a steady filter that settles within the recovery time.
+
+    Parameters
+    ----------
+    controller : StateSpace or Controller
+        From y to u, continuous or sampled.
+    recovery : float [s], optional
+        Time constant of the slowest pole of A - L C.
+
+    Returns
+    -------
+    StateSpace
+        Inputs [y; u], outputs u: a block of `close_loop`, which feeds it what the actuators
+        apply; `simulate` needs no other anti_windup then.
+
+    Raises
+    ------
+    AssumptionError
+        When Hanus' form needs the inverse of a D that is singular, or its poles (the zeros of the
+        controller) are not stable: give a recovery time.
+    ModelError
+        When slow states are not seen in the commands.
+
+    References
+    ----------
+    [Hanus1987]_; [AstromWittenmark1997]_, section 9.4.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> fx.synthesis.anti_windup_form(servo, recovery=0.05).inputs
+    ('die:ref', 'die:hat', 'u1')
+    """
+    K = as_statespace(controller)
+    L = back_gain(K, recovery)
+    n_u = len(K.outputs)
+    return K.replace(
+        A=K.A - L @ K.C,
+        B=np.hstack([K.B - L @ K.D, L]),
+        D=np.hstack([K.D, np.zeros((n_u, n_u))]),
+        inputs=[*K.inputs, *K.outputs],
+        blocks=None,
+    )
+
+
+def back_gain(K: StateSpace, recovery: float | None) -> FloatArray:
+    """Return L (n, nu): the states move by ``L (applied - commanded)``, with stable A - L C."""
+    L = _hanus(K) if recovery is None else _observer(K, positive(recovery, "recovery"))
+    A = K.A - L @ K.C
+    poles = np.linalg.eigvals(A) if K.n_states else np.zeros(0)
+    size = np.abs(poles)
+    growth = np.max(size - 1.0 if K.dt else poles.real, initial=-np.inf)
+    # Tustin's rule puts zeros at exactly -1, several at once, which rounding moves by its root
+    if not growth < -(1e-7 if K.dt else 1e-9 * np.max(size, initial=0.0)):
+        raise AssumptionError(
+            "the zeros of the controller, which Hanus' form has as poles, are not all stable, or "
+            "not clearly: its states would run off while an actuator saturates. Give a recovery "
+            "time."
+        )
+    return L
+
+
+def _hanus(K: StateSpace) -> FloatArray:
+    """Return ``B D^-1``, of a wide D its least solution."""
+    size = np.linalg.svd(K.D, compute_uv=False)
+    rank = int(np.count_nonzero(size > size.max(initial=0.0) / _LARGEST))
+    if rank < len(K.outputs) or not size.max(initial=0.0) > 0:
+        raise AssumptionError(
+            f"Hanus' form divides by D, which has rank {rank} for {len(K.outputs)} actuators: a "
+            "controller that rolls off has none. Give a recovery time: the observer form."
+        )
+    return np.asarray(K.B @ np.linalg.pinv(K.D))
+
+
+def _observer(K: StateSpace, recovery: float) -> FloatArray:
+    """Return the gain of a filter that reads the command, its poles shifted by the recovery time.
+
+    With ``A + I / T`` in place of A (sampled: A e^(dt / T)) its stable loop decays with T.
+    """
+    n = K.n_states
+    if not n:
+        return np.zeros((0, len(K.outputs)))
+    size = np.linalg.norm(K.C, axis=1)
+    C = K.C / divisor(size)[:, None]
+    scale = np.linalg.norm(K.B, axis=1)
+    scale = np.where(scale > 0, scale, np.max(scale, initial=1.0))
+    grow = float(np.exp(K.dt / recovery)) if K.dt else 1.0 / recovery
+    A = K.A * grow if K.dt else K.A + grow * np.eye(n)
+    # all states a little, so that each has a stabilising gain
+    Q = np.diag(scale**2) * 1e-6
+    seen = float(np.sum((C * scale) ** 2)) or 1.0
+    try:
+        found = (solve_dare if K.dt else solve_care)(A, C, Q=Q, R=1e-2 * seen * np.eye(len(C)))
+    except Exception as error:
+        raise ModelError(
+            f"slow states of the controller cannot be found from its commands: {error} Let fewer "
+            "integrators drive each actuator, or reduce the controller first."
+        ) from error
+    gain = found.gain / (grow if K.dt else 1.0)
+    return np.asarray(gain / divisor(size))

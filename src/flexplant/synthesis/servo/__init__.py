@@ -1,1 +1,0 @@
-"""Rigid-body decoupled servos: their loop, and the search for a bandwidth."""
