@@ -18,7 +18,7 @@ from flexplant.placement import (
     ModalObservability,
     SensorIndices,
 )
-from flexplant.placement.layouts import layouts_of
+from flexplant.placement.problem import layouts_of
 from stages import RATE, L, ports
 
 SIDE = 21

@@ -12,7 +12,6 @@ import flexplant as fx
 import oracles_joining as oracles
 from flexplant.errors import CertificateError, FlexplantWarning, LabelError, ModelError
 from flexplant.joining import join as join_module
-from flexplant.joining import joining_certificate
 from flexplant.joining.component import components_of
 
 PLATE = {"density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}
@@ -490,18 +489,18 @@ def test_what_is_refused(monkeypatch):
 def test_the_certificate_can_fail(monkeypatch):
     """A gap, and a count that is wrong, are found."""
     half = plate(2, 0.3)
-    good = join_module.stretch_rows
+    good = join_module.eliminated
 
-    def wrong(some, parts):
-        found = good(some, parts)
-        found.data[:1] *= 1.001
-        return found
+    def wrong(rows, size, order):
+        rows = rows.copy()
+        rows.data[:1] *= 1.001
+        return good(rows, size, order)
 
-    monkeypatch.setattr(join_module, "stretch_rows", wrong)
+    monkeypatch.setattr(join_module, "eliminated", wrong)
     with pytest.raises(CertificateError, match="fails its check"):
         fx.joined({"left": half, "right": half}, seam(half), placed=RIGHT)
     monkeypatch.undo()
-    monkeypatch.setattr(joining_certificate, "_force", lambda K, motions: 1.0)
+    monkeypatch.setattr(join_module, "_force", lambda K, motions: 1.0)
     with pytest.raises(CertificateError, match="fails its check"):
         fx.joined({"left": half, "right": half}, seam(half), placed=RIGHT)
 

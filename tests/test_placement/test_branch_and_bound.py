@@ -20,8 +20,8 @@ from flexplant.placement import (
     place_actuators,
     place_sensors,
 )
-from flexplant.placement.layouts import layouts_of
-from flexplant.placement.rows import Branch
+from flexplant.placement.convex import Branch
+from flexplant.placement.problem import layouts_of
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
 from flexplant.structure import FEModel, ModalDamping
 from oracles_placement import best_subset, stationary_riccati

@@ -13,10 +13,9 @@ from flexplant.placement import (
     ModeInformation,
     place_sensors,
 )
-from flexplant.placement.by_rows import ModeRows
-from flexplant.placement.layouts import Layouts, RigidPart
-from flexplant.placement.problem import Problem
-from flexplant.placement.rows import LinearRows
+from flexplant.placement.constraints import LinearRows
+from flexplant.placement.mode_shapes import ModeRows
+from flexplant.placement.problem import Layouts, Problem, RigidPart
 from flexplant.reduction import EffectiveIndependence, PivotedQr
 from flexplant.work import Work
 

@@ -24,7 +24,7 @@ from flexplant.placement import (
     place_sensors,
     sensor_map,
 )
-from flexplant.placement.layouts import layouts_of
+from flexplant.placement.problem import layouts_of
 from flexplant.plant import Poi, Sensor
 from flexplant.store import load
 from flexplant.structure import Disc, Rectangle

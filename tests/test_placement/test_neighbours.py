@@ -31,7 +31,7 @@ from flexplant.placement import (
     place_sensors,
     score_sensors,
 )
-from flexplant.placement.layouts import layouts_of
+from flexplant.placement.problem import layouts_of
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Reference, Sensor, assemble_plant
 from flexplant.structure import FEModel, ModalDamping
 from placement_plate import plate_modes

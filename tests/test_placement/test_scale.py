@@ -37,7 +37,7 @@ from flexplant.placement import (
 )
 from flexplant.placement.candidates import with_side
 from flexplant.placement.criterion import OnPlant
-from flexplant.placement.layouts import layouts_of
+from flexplant.placement.problem import layouts_of
 from flexplant.plant import BaseAcceleration, Reference, building
 from placement_plate import machine, plate_modes
 

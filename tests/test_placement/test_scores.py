@@ -17,7 +17,7 @@ from flexplant.errors import (
 )
 from flexplant.lti import lowpass
 from flexplant.placement import PoiLqr, PoiVariance, quadratic, score_actuators, score_sensors
-from flexplant.placement.layouts import layouts_of
+from flexplant.placement.problem import layouts_of
 from flexplant.placement.quadratic import Quadratic
 from flexplant.plant import Sensor, StandardPlant
 from flexplant.store import load

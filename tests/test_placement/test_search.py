@@ -16,7 +16,7 @@ from flexplant.placement import (
     place_actuators,
     place_sensors,
 )
-from flexplant.placement.layouts import layouts_of
+from flexplant.placement.problem import layouts_of
 from flexplant.plant import Sensor
 from flexplant.store import load
 from oracles_placement import best_subset

@@ -25,8 +25,8 @@ from .component import JoinedShape as JoinedShape
 from .component import PlacedShape as PlacedShape
 from .component import Pose as Pose
 from .frf_coupling import uncoupled as uncoupled
+from .join import JoiningCertificate as JoiningCertificate
 from .join import joined as joined
-from .joining_certificate import JoiningCertificate as JoiningCertificate
 from .joint import Joint as Joint
 from .joint import Patch as Patch
 from .links import coincident_joints as coincident_joints

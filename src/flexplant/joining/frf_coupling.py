@@ -247,10 +247,7 @@ def uncoupled(
 
 
 def _taken_out(
-    machine: Frf,
-    known: Mapping[str, Frf],
-    joints: Sequence[Any],
-    dofs: Mapping[str, DofSet] | None,
+    machine: Frf, known: Mapping[str, Frf], joints: Sequence[Any], dofs: Mapping[str, DofSet] | None
 ) -> list[FrfLink]:
     """Return rigid joints between the machine and the negatives of known components."""
     labels = [*machine.outputs, *machine.inputs]

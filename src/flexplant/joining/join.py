@@ -1,8 +1,9 @@
-"""Components joined to one machine: `joined`."""
+"""Components joined to one machine: `joined`, and the checks of it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, overload
 
 import numpy as np
@@ -10,8 +11,8 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..checks import FloatArray, IntArray, frozen
-from ..errors import ModelError, warn
+from ..checks import FloatArray, IntArray, Value, frozen
+from ..errors import CertificateError, ModelError, counted, warn
 from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
 from ..modes.attachment_vectors import static_response
@@ -24,7 +25,6 @@ from ..structure.rigid import orthonormalised, rigid_body_basis
 from ..tolerances import TINY, divisor
 from .component import Component, JoinedShape, Model, Pose, components_of
 from .frf_coupling import joined_frfs
-from .joining_certificate import certified
 from .joint import Joint, Patch, split_end
 from .links import (
     Elimination,
@@ -197,12 +197,8 @@ def _coordinate_reach(parts: Sequence[Component]) -> FloatArray:
     length, found = machine_size(parts), []
     for part in parts:
         weight = np.where(part.dofs.kinds < 3, 1.0, length)
-        if part.is_reduced:
-            found.append(np.abs(weight[:, None] * part.T).max(axis=0))
-        else:
-            found.append(weight)
-    size = np.concatenate(found)
-    return divisor(size)
+        found.append(np.abs(weight[:, None] * part.T).max(axis=0) if part.is_reduced else weight)
+    return divisor(np.concatenate(found))
 
 
 def _machine_matrices(
@@ -217,7 +213,6 @@ def _machine_matrices(
             "CraigBampton(boundary=[...]) at their joints, or join models and reduce the machine."
         )
     damped = [part.is_damped for part in parts]
-    rates = any(link.rate for link in soft)
     if any(damped) and not all(damped):
         bare = [part.name for part, there in zip(parts, damped, strict=True) if not there]
         warn(
@@ -225,12 +220,10 @@ def _machine_matrices(
             "them one first, model.with_damping(ModalDamping(...)), or damp the machine's modes."
         )
     weights = {"K": [link.stiffness for link in soft], "D": [link.rate for link in soft]}
-    found: dict[str, Any] = {}
-    for name in ("M", "D", "K"):
-        if name == "D" and not any(damped) and not rates and not reduced:
-            found[name] = None
-            continue
-        blocks = [_component_matrix(part, name) for part in parts]
+    found: dict[str, Any] = {"D": None}
+    for name in "MDK" if any(damped) or reduced or any(weights["D"]) else "MK":
+        own = [(part, getattr(part.model, name)) for part in parts]
+        blocks = [sp.csc_array((part.n, part.n) if A is None else A) for part, A in own]
         whole: Any = sp.block_diag(blocks, format="csc")
         if name in weights and soft:
             whole = whole + S.T @ sp.diags_array(np.array(weights[name])) @ S
@@ -238,11 +231,6 @@ def _machine_matrices(
         whole = sp.csc_array(0.5 * (whole + whole.T))
         found[name] = dense(whole) if reduced else whole
     return found
-
-
-def _component_matrix(part: Component, name: str) -> Any:
-    matrix = getattr(part.model, name)
-    return sp.csc_array((part.n, part.n)) if matrix is None else sp.csc_array(matrix)
 
 
 def _all_dofs(parts: Sequence[Component]) -> DofSet:
@@ -265,24 +253,23 @@ def _all_dofs(parts: Sequence[Component]) -> DofSet:
     )
 
 
+def _shape(parts: Sequence[Component], expansion: Any = None, motions: Any = None) -> JoinedShape:
+    names, dofs = zip(*((part.name, part.dofs) for part in parts), strict=True)
+    return JoinedShape(names, dofs, expansion, motions)
+
+
 def _joined_model(
     parts: Sequence[Component], done: Elimination, fields: dict[str, Any], name: str | None
 ) -> FEModel:
-    shape = JoinedShape(
-        tuple(part.name for part in parts), tuple(part.dofs for part in parts), done.T
-    )
-    loads = [part.model.held_inertia for part in parts]
     held = None
-    if any(load is not None for load in loads):
-        some = [
-            np.zeros((part.n, 6)) if load is None else load
-            for part, load in zip(parts, loads, strict=True)
-        ]
-        held = np.asarray(done.T.T @ np.vstack(some))
+    if any(part.model.held_inertia is not None for part in parts):
+        own = [(part.n, part.model.held_inertia) for part in parts]
+        loads = [np.zeros((n, 6)) if load is None else load for n, load in own]
+        held = np.asarray(done.T.T @ np.vstack(loads))
     # sums of definite matrices are definite, and T has full rank: nothing to check again
     return FEModel._proven(
         **{key: frozen(value) for key, value in fields.items()},
-        dofs=_all_dofs(parts)._taken(done.kept).replace(interpolation=shape),
+        dofs=_all_dofs(parts)._taken(done.kept).replace(interpolation=_shape(parts, done.T)),
         name=name,
         held_inertia=frozen(held),
     )
@@ -294,22 +281,15 @@ def _joined_reduced_model(
     full = _all_dofs(parts)
     names = np.array([label for part in parts for label in part.coordinates], dtype=object)
     left = names[done.kept].tolist()
-    physical = np.concatenate(
-        [np.arange(part.n) < len(part.model.dofs) for part in parts],
-    )[done.kept]
+    of_dofs = [np.arange(part.n) < len(part.model.dofs) for part in parts]
+    physical = np.concatenate(of_dofs)[done.kept]
     # DOFs first, generalised coordinates after them
     order = np.argsort(~physical, kind="stable")
     T = frozen(la.block_diag(*(dense(part.T) for part in parts)) @ done.T[:, order].toarray())
-    shape = JoinedShape(
-        tuple(part.name for part in parts), tuple(part.dofs for part in parts), motions=T
-    )
-    full = full.replace(interpolation=shape)
+    full = full.replace(interpolation=_shape(parts, motions=T))
     listed = [left[i] for i in order.tolist()]
-    square = np.ix_(order, order)
     return ReducedModel(
-        M=fields["M"][square],
-        D=fields["D"][square],
-        K=fields["K"][square],
+        **{name: fields[name][np.ix_(order, order)] for name in "MDK"},
         T=T,
         dofs=full.select(listed[: int(physical.sum())]),
         full_dofs=full,
@@ -364,13 +344,14 @@ def left_motions(
     for group in groups:
         several = [parts[i] for i in group]
         own = [_own_motions(part, free=free) for part in several]
+        mixes = [
+            body.T @ part.model.inertia(part.model.rigid_motions())
+            for part, body in zip(several, own, strict=True)
+        ]
+        missed = np.max([part.model.missed_motions() for part in several], axis=0)
+        rows_of = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in group])
         motions = np.zeros((int(starts[-1]), sum(part.shape[1] for part in own)))
-        mixes, column, missed = [], 0, np.zeros(6)
-        for i, part, body in zip(group, several, own, strict=True):
-            motions[starts[i] : starts[i + 1], column : column + body.shape[1]] = body
-            column += body.shape[1]
-            mixes.append(body.T @ part.model.inertia(part.model.rigid_motions()))
-            missed = np.maximum(missed, part.model.missed_motions())
+        motions[rows_of] = la.block_diag(*own)
         scale = np.abs(motions).max(axis=0, initial=0.0)
         motions = motions / divisor(scale)
         whole = np.vstack(mixes) * scale[:, None]
@@ -447,11 +428,172 @@ def compliances(
 def _compliance(part: Component, rows: Any) -> FloatArray:
     """Return the elastic compliance (m, m) of some DOFs of a component, free or held."""
     model: Any = part.model
-    loads = np.asarray(part.T[rows].T.todense() if not part.is_reduced else part.T[rows].T)
-    large = sp.issparse(model.K) and model.n_dof > DENSE_LIMIT
-    if large:
+    loads = dense(part.T[rows].T)
+    if sp.issparse(model.K) and model.n_dof > DENSE_LIMIT:
         moved = stiffness_factor(model).static(loads)
     else:
         moved = static_response(model.M, model.K, model.rigid_body, loads)
     found = loads.T @ moved
     return np.asarray(0.5 * (found + found.T))
+
+
+#: largest gap, imbalance and error of the inertia, relative
+_LIMIT = 1e-7
+#: a rigid-body motion that a reduced component misses by less is one of its own
+_MADE = 1e-8
+#: the part of the largest entry of a motion that counts for the rounding of each
+_ENTRY = 1e-3
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class JoiningCertificate(Value):
+    """What `joined` checked.
+
+    Parameters
+    ----------
+    gap : float
+        Largest opening of a rigid joint over all motions of what is left, relative to what cancels
+        there.
+    balance : float
+        Largest resultant of the forces of a joint between two components, relative: what a motion
+        of the whole machine stretches it. Springs may have one (they are warned of), rigid joints
+        have none.
+    mass : float [kg]
+        Of the machine; NaN without displacements.
+    inertia_error : float
+        Largest difference between the machine's inertia against the six rigid-body motions and the
+        sum of its components', relative.
+    constraints, rank : int
+        Axes of rigid joints, and how many of them are independent.
+    rigid : mapping {str: int}
+        Rigid-body motions of each component before it was joined.
+    pieces : mapping {str: int}
+        Rigid-body motions of each part of the machine that joints hold together, by the names of
+        its components, "stage, frame".
+    n_rigid : int
+        Rigid-body motions of the machine.
+    rigid_force : float
+        Largest elastic force of these motions, relative to what cancels.
+    patches : mapping {str: float}
+        For each joint of a patch, by how much of the compliance of its mean motion a patch that
+        stays rigid would be stiffer, at most over its axes: the error of either is below.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> parts = {n: fx.chain(masses=[1.0, 2.0], stiffnesses=[5e5]) for n in ("stage", "frame")}
+    >>> found = fx.joined(parts, fx.Joint("stage/1:x", "frame/1:x")).joining
+    >>> found.n_rigid, found.mass, found.gap < 1e-12
+    (1, 6.0, True)
+    """
+
+    gap: float
+    balance: float
+    mass: float
+    inertia_error: float
+    constraints: int
+    rank: int
+    rigid: Mapping[str, int]
+    pieces: Mapping[str, int]
+    n_rigid: int
+    rigid_force: float
+    patches: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        before = ", ".join(f"{name} {count}" for name, count in self.rigid.items())
+        pieces = "one piece"
+        if len(self.pieces) > 1:
+            listed = [f"{names}: {count}" for names, count in self.pieces.items()]
+            pieces = f"{len(listed)} pieces ({'; '.join(listed)})"
+        independent = f"{self.rank} of {counted(self.constraints, 'rigid constraint')} independent"
+        errors = f"gap {self.gap:.1g}, balance {self.balance:.1g}, inertia {self.inertia_error:.1g}"
+        errors += f", rigid force {self.rigid_force:.1g}"
+        head = f"{counted(self.n_rigid, 'rigid-body motion')} (alone: {before}), {pieces}"
+        text = [f"<JoiningCertificate: {head}, {self.mass:.6g} kg", f" {independent}, {errors}"]
+        text += [f" {name}: compliance to {error:.2g}" for name, error in self.patches.items()]
+        return "\n".join(text) + ">"
+
+
+def certified(
+    parts: Sequence[Component],
+    links: Sequence[Link],
+    done: Elimination,
+    matrices: Mapping[str, Any],
+    groups: Sequence[IntArray],
+    rigid: FloatArray,
+    expected: int,
+    patches: Mapping[str, float],
+) -> JoiningCertificate:
+    """Return the checks of a joined machine."""
+    B = stretch_rows([link for link in links if link.joint.is_rigid], parts)
+    opening: Any = abs(B @ done.T).max(axis=1)
+    most: Any = (abs(B) @ abs(done.T)).max(axis=1)
+    opening, most = (np.asarray(part.todense()).ravel() for part in (opening, most))
+    gap = float(np.max(opening / divisor(most), initial=0.0))
+    size = np.array([1.0] * 3 + [machine_size(parts)] * 3)
+    felt = [(link.joint.is_rigid, float(np.abs(link.carried / size).max())) for link in links]
+    balance = max((part for is_rigid, part in felt if is_rigid), default=0.0)
+    apart, error = _inertia(parts, matrices["M"], done.kept)
+    found = JoiningCertificate(
+        gap=gap,
+        balance=max((part for _, part in felt), default=0.0),
+        mass=float(max(np.diag(apart)[:3])) or float("nan"),
+        inertia_error=error,
+        constraints=B.shape[0],
+        rank=done.rank,
+        rigid={part.name: int(part.model.rigid_body.shape[1]) for part in parts},
+        pieces=_by_piece(parts, groups, rigid, done.kept),
+        n_rigid=rigid.shape[1],
+        rigid_force=_force(matrices["K"], rigid),
+        patches=patches,
+    )
+    if not max(gap, balance, error, found.rigid_force) < _LIMIT:
+        raise CertificateError(
+            f"the joined machine fails its check (limit {_LIMIT:g}): {found!r}. Join fewer axes, "
+            "or look for joints that nearly repeat each other."
+        )
+    if found.n_rigid != expected:
+        raise CertificateError(
+            f"the machine has {counted(found.n_rigid, 'rigid-body motion')}, but {expected} of its "
+            "components' stretch no joint: a joint is too soft or too stiff for the digits of the "
+            "matrices. Look for a wrong unit of a stiffness, or leave the joint out."
+        )
+    return found
+
+
+def _by_piece(
+    parts: Sequence[Component], groups: Sequence[IntArray], rigid: FloatArray, kept: IntArray
+) -> dict[str, int]:
+    """Return how many rigid-body motions move each piece."""
+    owner = np.repeat(np.arange(len(parts)), [part.n for part in parts])[kept]
+    moved = [np.any(rigid[np.isin(owner, group)] != 0, axis=0) for group in groups]
+    names = [", ".join(parts[i].name for i in group) for group in groups]
+    return {name: int(np.count_nonzero(some)) for name, some in zip(names, moved, strict=True)}
+
+
+def _force(K: Any, motions: FloatArray) -> float:
+    """Return the largest elastic force of motions (k, r), relative to what cancels in it."""
+    force = np.linalg.norm(np.asarray(K @ motions), axis=0)
+    # a motion that no spring feels has nothing but rounding of its largest entries there
+    moved = np.abs(motions) + _ENTRY * np.abs(motions).max(axis=0, initial=0.0)
+    most = np.linalg.norm(np.asarray(abs(K) @ moved), axis=0)
+    return float(np.max(force / divisor(most), initial=0.0))
+
+
+def _inertia(parts: Sequence[Component], M: Any, kept: IntArray) -> tuple[FloatArray, float]:
+    """Return the inertia (6, 6) of all components, and how far that of the machine is off.
+
+    Motions that a reduced component cannot make (it is held, say) have no inertia of the whole.
+    """
+    own = [part.model.rigid_motions() for part in parts]
+    apart = np.zeros((6, 6))
+    missed = np.zeros(6)
+    for part, motions in zip(parts, own, strict=True):
+        apart += motions.T @ part.model.inertia(motions)
+        if part.is_reduced:
+            missed = np.maximum(missed, part.model.missed_motions())
+    whole = np.vstack(own)[kept]
+    size = np.sqrt(np.maximum(np.diag(apart), TINY))
+    error = np.abs(whole.T @ np.asarray(M @ whole) - apart) / np.outer(size, size)
+    made = missed < _MADE
+    return apart, float(error[np.ix_(made, made)].max(initial=0.0))

@@ -27,8 +27,6 @@ from ..rooms import public_names as _public_names
 from .branch_and_bound import BranchAndBound as BranchAndBound
 from .branch_and_bound import Exchange as Exchange
 from .branch_and_bound import Screened as Screened
-from .by_rows import ByRows as ByRows
-from .by_rows import ModeInformation as ModeInformation
 from .candidates import PlantChannel as PlantChannel
 from .closed_loop_h2 import ClosedLoopH2 as ClosedLoopH2
 from .closed_loop_h2 import HinfLevel as HinfLevel
@@ -44,13 +42,14 @@ from .constraints import Together as Together
 from .constraints import Within as Within
 from .criterion import Criterion as Criterion
 from .criterion import Scorer as Scorer
-from .gramian import ActuatorIndices as ActuatorIndices
-from .gramian import AutoMac as AutoMac
-from .gramian import KineticEnergy as KineticEnergy
 from .gramian import ModalControllability as ModalControllability
 from .gramian import ModalObservability as ModalObservability
-from .gramian import SensorIndices as SensorIndices
-from .over_positions import OverPositions as OverPositions
+from .mode_shapes import ActuatorIndices as ActuatorIndices
+from .mode_shapes import AutoMac as AutoMac
+from .mode_shapes import ByRows as ByRows
+from .mode_shapes import KineticEnergy as KineticEnergy
+from .mode_shapes import ModeInformation as ModeInformation
+from .mode_shapes import SensorIndices as SensorIndices
 from .poi_variance import PoiVariance as PoiVariance
 from .problem import Found as Found
 from .problem import Placement as Placement
@@ -72,6 +71,7 @@ from .search import place_sensors as place_sensors
 from .wrapping import AfterLoss as AfterLoss
 from .wrapping import LeftOutModes as LeftOutModes
 from .wrapping import OverMachines as OverMachines
+from .wrapping import OverPositions as OverPositions
 from .wrapping import Penalised as Penalised
 
 __dir__ = _public_names(__name__)

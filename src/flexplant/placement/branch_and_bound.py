@@ -15,11 +15,9 @@ from ..checks import FloatArray, between, checked, function, whole
 from ..errors import ModelError, warn
 from ..parallel import Progress, expect
 from ..work import Work
-from .convex import Below, Convex
-from .layouts import ADVICE, layouts_of
-from .problem import Found, Problem, Search
+from .convex import Below, Branch, Convex, Groups
+from .problem import ADVICE, Found, Problem, Search, layouts_of
 from .quadratic import Quadratic
-from .rows import Branch, Groups
 
 #: from so many trials on a lower bound shows first which of them could be better
 _MANY = 24
@@ -338,12 +336,7 @@ class BranchAndBound(Search):
                 "branches, or accept a larger gap."
             )
         return Found(
-            tree.chosen,
-            tree.value,
-            bound,
-            evaluations + tree.evaluations,
-            history,
-            stopped,
+            tree.chosen, tree.value, bound, evaluations + tree.evaluations, history, stopped
         )
 
 

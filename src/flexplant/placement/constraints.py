@@ -1,4 +1,4 @@
-"""Constraints by name (all or none, so many, a budget) and on where devices may be."""
+"""Constraints by name (all or none, so many, a budget) and on where devices may be, as rows."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_array
 
 from ..checks import (
     FloatArray,
@@ -23,8 +25,139 @@ from ..checks import (
 )
 from ..errors import LabelError, ModelError
 from ..structure import Disc
+from ..tolerances import TINY
 from .candidates import Places, Zone
-from .rows import LinearRows
+from .convex import Branch
+
+#: what rounding may have added to a sum
+_SLACK = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class LinearRows:
+    """``lower <= A x <= upper``, x 1 for chosen candidates and 0 for others."""
+
+    A: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+
+    @classmethod
+    def closed(cls, which: npt.NDArray[np.bool_]) -> LinearRows:
+        """Return rows that exclude some candidates (N,)."""
+        rows = np.eye(which.size)[which]
+        return cls(rows, np.zeros(len(rows)), np.zeros(len(rows)))
+
+    @classmethod
+    def counted(cls, row: FloatArray, at_least: int | None, at_most: int | None) -> LinearRows:
+        """Return one row (N,) between two limits, of which either may be absent."""
+        high = np.inf if at_most is None else float(at_most)
+        return cls(row[None], np.array([float(at_least or 0)]), np.array([high]))
+
+    @classmethod
+    def equal(cls, pairs: Sequence[tuple[int, int]], total: int) -> LinearRows:
+        """Return rows by which both or none of each pair are chosen."""
+        rows = np.zeros((len(pairs), total))
+        for row, (i, j) in zip(rows, pairs, strict=True):
+            row[i] += 1.0
+            row[j] -= 1.0
+        return cls(rows, np.zeros(len(rows)), np.zeros(len(rows)))
+
+    @classmethod
+    def stacked(cls, parts: Sequence[LinearRows], total: int) -> LinearRows:
+        """Return the rows of all parts."""
+        found = cls(np.zeros((0, total)), np.zeros(0), np.zeros(0))
+        for part in parts:
+            found = found.and_(part)
+        return found
+
+    def and_(self, other: LinearRows) -> LinearRows:
+        """Return the rows of both."""
+        return LinearRows(
+            np.vstack([self.A, other.A]),
+            np.concatenate([self.lower, other.lower]),
+            np.concatenate([self.upper, other.upper]),
+        )
+
+    def hold(self, sets: Sequence[Sequence[int]]) -> npt.NDArray[np.bool_]:
+        """Return which of some choices (m,) satisfy every row."""
+        x = np.zeros((len(sets), self.A.shape[1]))
+        for row, chosen in zip(x, sets, strict=True):
+            row[list(chosen)] = 1.0
+        sums = x @ self.A.T
+        within = (sums >= self.lower - self._slack) & (sums <= self.upper + self._slack)
+        return np.asarray(np.all(within, axis=1))
+
+    def added(self, base: Sequence[int]) -> npt.NDArray[np.bool_]:
+        """Return which candidates (N,) exceed no upper limit beside `base` that it does not."""
+        used = self.A[:, list(base)].sum(axis=1)
+        over = (used[:, None] + self.A > (self.upper + self._slack)[:, None]) & (self.A > 0)
+        return np.asarray(~np.any(over & (used <= self.upper + self._slack)[:, None], axis=0))
+
+    def shut(self, required: Sequence[int]) -> npt.NDArray[np.bool_]:
+        """Return which candidates (N,) no choice with `required` can hold, by one row alone."""
+        used = np.zeros(self.A.shape[1])
+        used[list(required)] = 1.0
+        least = np.minimum(self.A, 0.0) @ (1.0 - used) + self.A @ used
+        with_it = least[:, None] + np.maximum(self.A, 0.0)
+        found = np.any(with_it > (self.upper + self._slack)[:, None], axis=0)
+        found[list(required)] = False
+        return np.asarray(found)
+
+    def possible(self, branch: Branch) -> bool:
+        """Return whether each row alone leaves a choice of a branch."""
+        low, high = np.zeros(len(self.A)), np.zeros(len(self.A))
+        for group, count in branch.groups:
+            part = np.sort(self.A[:, group], axis=1)
+            low += part[:, :count].sum(axis=1)
+            high += part[:, part.shape[1] - count :].sum(axis=1)
+        return bool(
+            np.all(low <= self.upper + self._slack) and np.all(high >= self.lower - self._slack)
+        )
+
+    def units(self) -> list[tuple[int, ...]]:
+        """Return the sets of candidates that are chosen together, single ones included."""
+        from scipy.sparse.csgraph import connected_components
+
+        zero = (self.lower == 0) & (self.upper == 0)
+        pair = zero & (np.count_nonzero(self.A, axis=1) == 2) & (self.A.sum(axis=1) == 0)
+        total = self.A.shape[1]
+        ends = np.nonzero(self.A[pair])[1].reshape(-1, 2)
+        graph = csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(total, total))
+        count, label = connected_components(graph, directed=False)
+        return [tuple(np.flatnonzero(label == i).tolist()) for i in range(count)]
+
+    def with_partners(self, chosen: Sequence[int]) -> tuple[int, ...]:
+        """Return a choice with all that its members are chosen together with."""
+        return tuple(sorted(i for unit in self.units() if set(unit) & set(chosen) for i in unit))
+
+    def best(
+        self, worth: FloatArray, count: int, required: Sequence[int]
+    ) -> tuple[int, ...] | None:
+        """Return the choice of `count` with the largest sum of worth (N,); None if there is none.
+
+        A mixed-integer linear program (HiGHS).
+        """
+        from scipy.optimize import Bounds, LinearConstraint, milp
+
+        total, slack = self.A.shape[1], self._slack
+        low = np.zeros(total)
+        low[list(required)] = 1.0
+        found = milp(
+            -np.asarray(worth) / max(float(np.max(np.abs(worth))), TINY),
+            constraints=[
+                LinearConstraint(csr_array(self.A), self.lower - slack, self.upper + slack),
+                LinearConstraint(np.ones((1, total)), count, count),
+            ],
+            integrality=np.ones(total, dtype=np.int64),
+            bounds=Bounds(low, 1.0),
+        )
+        if found.x is None:
+            return None
+        return tuple(np.flatnonzero(found.x > 0.5).tolist())
+
+    @property
+    def _slack(self) -> FloatArray:
+        return np.asarray(_SLACK * np.abs(self.A).max(axis=1, initial=0.0))
 
 
 class Constraint(Value):

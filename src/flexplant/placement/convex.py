@@ -1,19 +1,20 @@
-"""Lower bounds of convex costs of weighted candidates, among them sums over the chosen."""
+"""Lower bounds of costs that are convex in weights of the candidates, over branches of choices."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import combinations, product
+from math import comb, prod
+from typing import TypeAlias
 
 import numpy as np
 
-from ..checks import FloatArray
+from ..checks import FloatArray, IntArray
 from ..errors import SolverError, attempted
-from ..tolerances import TINY
+from ..tolerances import SETTLED, TINY
 from .criterion import Scorer
-from .rows import Branch, ascended
 
 #: steps in the weights on one tangent, and the relative gap at which they stop
 _CUTS, _GAP = 40, 1e-3
@@ -21,6 +22,126 @@ _CUTS, _GAP = 40, 1e-3
 _TANGENTS, _HALVES = 20, (1.0, 0.5, 0.25, 0.125, 0.0625)
 #: what rounding may have added to a bound, relative
 _RELATIVE = 1e-9
+
+#: disjoint groups of candidates, and how many of each are chosen
+Groups: TypeAlias = tuple[tuple[IntArray, int], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """All choices with given counts in disjoint groups of candidates, and none elsewhere."""
+
+    groups: Groups
+
+    @property
+    def members(self) -> IntArray:
+        """Every candidate that appears in a choice."""
+        return np.sort(np.concatenate([group for group, _ in self.groups]))
+
+    @property
+    def size(self) -> int:
+        """How many choices there are."""
+        return prod(comb(group.size, count) for group, count in self.groups)
+
+    def choices(self) -> list[tuple[int, ...]]:
+        """Return all choices, indices ascending."""
+        parts = [combinations(group.tolist(), count) for group, count in self.groups]
+        return [tuple(sorted(sum(parts, ()))) for parts in product(*parts)]
+
+    def nearest(self, weights: FloatArray) -> FloatArray:
+        """Return the nearest weights (N,) in [0, 1] whose sums over the groups are the counts."""
+        found = np.zeros_like(weights)
+        for group, count in self.groups:
+            found[group] = _capped(weights[group], count)
+        return found
+
+    def centre(self, total: int) -> FloatArray:
+        """Return equal weights (total,) within each group."""
+        found = np.zeros(total)
+        for group, count in self.groups:
+            found[group] = count / group.size
+        return found
+
+    def least(self, slope: FloatArray) -> float:
+        """Return the smallest sum of `slope` (N,) over any choice."""
+        return float(sum(np.sort(slope[group])[:count].sum() for group, count in self.groups))
+
+    def halves(self, rows: FloatArray, weights: FloatArray) -> Iterator[Branch]:
+        """Return the parts that arise when the most diverse group is cut in two."""
+        open_groups = [i for i, (group, count) in enumerate(self.groups) if count < group.size]
+        spread = [
+            _main_variance(rows[g], weights[g]) for g, _ in (self.groups[i] for i in open_groups)
+        ]
+        most = open_groups[int(np.argmax([size for size, _ in spread]))]
+        group, count = self.groups[most]
+        along = spread[open_groups.index(most)][1]
+        order = np.argsort(along, kind="stable")
+        heaped = np.cumsum(weights[group][order])
+        middle = int(np.searchsorted(heaped, 0.5 * heaped[-1])) + 1
+        middle = min(max(middle, 1), group.size - 1)
+        low, high = np.sort(group[order[:middle]]), np.sort(group[order[middle:]])
+        rest = self.groups[:most] + self.groups[most + 1 :]
+        for part in range(max(0, count - high.size), min(count, low.size) + 1):
+            counts = ((low, part), (high, count - part))
+            yield Branch(rest + tuple((g, c) for g, c in counts if c))
+
+
+def _main_variance(rows: FloatArray, weights: FloatArray) -> tuple[float, FloatArray]:
+    """Return the weighted variance of rows, and each row's place along its main direction."""
+    # those of weight zero are to be cut as well
+    weights = weights + 1e-3 * np.max(weights) + TINY
+    away = rows - weights @ rows / np.sum(weights)
+    _, sizes, directions = np.linalg.svd(np.sqrt(weights)[:, None] * away, full_matrices=False)
+    return float(np.sum(sizes**2)), np.asarray(away @ directions[0])
+
+
+def _capped(values: FloatArray, count: int) -> FloatArray:
+    """Return the nearest entries in [0, 1] that sum to count: all shifted alike, then cut off."""
+    if count >= values.size:
+        return np.ones_like(values)
+    kinks = np.sort(np.concatenate([values, values - 1.0]))
+    sums = np.clip(values - kinks[:, None], 0.0, 1.0).sum(axis=1)  # falls from the size to 0
+    return np.asarray(np.clip(values - np.interp(-count, -sums, kinks), 0.0, 1.0))
+
+
+def ascended(
+    function: Callable[[FloatArray], tuple[float, FloatArray] | None],
+    branch: Branch,
+    start: FloatArray,
+    *,
+    steps: int,
+    close: Callable[[float, float], bool],
+) -> tuple[float, FloatArray]:
+    """Return a number above the function at every choice of a branch, and weights near the largest.
+
+    Projected gradient steps of Barzilai and Borwein [BarzilaiBorwein1988]_. Whatever w is,
+    ``h(w) + h'(w) (x - w)`` is above h at every choice x: that is the bound.
+    """
+    weights, step = branch.nearest(start), 0.0
+    most, kept, highest = np.inf, weights, -np.inf
+    before: tuple[FloatArray, FloatArray] | None = None
+    for _ in range(steps):
+        found = function(weights)
+        if found is None:
+            break
+        value, rise = found
+        most = min(most, value - branch.least(-rise) - float(rise @ weights))
+        if value > highest:
+            kept, highest = weights, value
+        if close(value, most):
+            break
+        if before is None:
+            # weights move by 0.3 of their range at first
+            step = 0.3 / max(float(np.max(np.abs(rise))), TINY)
+        else:
+            moved, turned = weights - before[0], before[1] - rise
+            bend = float(moved @ turned)
+            step = float(moved @ moved) / bend if bend > 0 else 2.0 * step
+        before = weights, rise
+        weights = branch.nearest(weights + step * rise)
+        if np.max(np.abs(weights - before[0])) < SETTLED:
+            break
+    return most, kept
 
 
 class Below(ABC):
@@ -61,7 +182,7 @@ class Tangent(Below):
             solved = np.linalg.solve(self._information(weights), self.face)
         except np.linalg.LinAlgError:
             return np.full(len(sets), -np.inf)
-        return _safe(np.einsum("ij,mij->m", self.face, solved) + self.constant)
+        return safe(np.einsum("ij,mij->m", self.face, solved) + self.constant)
 
     def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
         """Return a number below the cost of all choices of a branch, and weights near the least."""
@@ -113,7 +234,7 @@ def least_sum(
     )
     if not np.isfinite(most):
         return -np.inf, weights
-    return float(_safe(np.array(1.0 / most + constant))), weights
+    return float(safe(np.array(1.0 / most + constant))), weights
 
 
 class Convex(Scorer, ABC):
@@ -172,7 +293,7 @@ class Convex(Scorer, ABC):
 
     def everything(self) -> float:
         """Return a number below the cost of all candidates together."""
-        return float(_safe(np.array(self.value(range(self.total)))))
+        return float(safe(np.array(self.value(range(self.total)))))
 
     @property
     @abstractmethod
@@ -180,183 +301,6 @@ class Convex(Scorer, ABC):
         """How many candidates there are."""
 
 
-def _safe(bound: FloatArray) -> FloatArray:
+def safe(bound: FloatArray) -> FloatArray:
+    """Return bounds less what rounding may have added."""
     return np.asarray(bound - _RELATIVE * np.abs(bound))
-
-
-MEASURES = ("trace", "log det", "least")
-#: what rounding leaves of an eigenvalue of zero, beside the largest
-_NOTHING = 1e-13
-#: steps to the largest log det, and the gap at which they stop [nats]
-_STEPS, _CLOSE = 300, 1e-3
-#: what rounding may have added to a log det [nats]
-_ROUNDING = 1e-8
-#: sums of so many numbers are made at once: they stay in the cache
-_AT_ONCE = 200_000
-
-
-@dataclass(frozen=True, eq=False)
-class SummedWorth(Scorer):
-    """Minus the sum of a worth (N,) of each candidate; its bound is exact."""
-
-    worth: FloatArray
-
-    def value(self, chosen: Sequence[int]) -> float:
-        """Return minus the sum."""
-        return -float(self.worth[list(chosen)].sum())
-
-    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
-        """Return the scores (n,) of choices, those of one size at once."""
-        return by_size(sets, lambda rows: -self.worth[rows].sum(axis=1))
-
-    def bound(self, count: int, required: Sequence[int]) -> float:
-        """Return the score of the best choice, and what rounding may have added to it."""
-        kept = list(required)
-        free = np.sort(np.delete(self.worth, kept))[::-1]
-        used = np.concatenate([self.worth[kept], free[: count - len(kept)]])
-        return -float(used.sum() + 1e-14 * np.abs(used).sum())
-
-
-@dataclass(frozen=True, eq=False)
-class SummedMatrices(Scorer):
-    """Minus a measure of ``sum_i W_i`` over the chosen: W_i (N, n, n), positive semidefinite.
-
-    It grows with each candidate: the bound is that of all of them.
-    """
-
-    matrices: FloatArray
-
-    @property
-    def total(self) -> int:
-        """How many candidates there are."""
-        return int(self.matrices.shape[0])
-
-    def value(self, chosen: Sequence[int]) -> float:
-        """Return minus the measure."""
-        return float(self.score([tuple(chosen)])[0])
-
-    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
-        """Return the scores (n,) of choices, those of one size at once."""
-        n = self.matrices.shape[1]
-        few = max(1, _AT_ONCE // (n * n))
-
-        def of(rows: FloatArray) -> FloatArray:
-            parts = [self._measured(rows[i : i + few]) for i in range(0, len(rows), few)]
-            return np.concatenate(parts)
-
-        return by_size(sets, of)
-
-    def bound(self, count: int, required: Sequence[int]) -> float:
-        """Return a number below the score of every choice."""
-        return float(_safe(np.array(self.value(range(self.total)))))
-
-    def _measured(self, rows: FloatArray) -> FloatArray:
-        """Return minus the measure of sums over rows (m, k) of indices."""
-        return np.asarray(-np.linalg.eigvalsh(self._sums(rows))[:, 0])
-
-    def _sums(self, rows: FloatArray) -> FloatArray:
-        total = self.matrices[rows[:, 0]]
-        for j in range(1, rows.shape[1]):
-            total += self.matrices[rows[:, j]]
-        return np.asarray(total)
-
-
-@dataclass(frozen=True, eq=False)
-class LogDetOfSum(SummedMatrices, Convex):
-    """Minus log det: convex in weights of the candidates, so that it has a relaxation.
-
-    [JoshiBoyd2009]_.
-    """
-
-    bound = Convex.bound
-    total = SummedMatrices.total
-
-    def cost(self, weights: FloatArray) -> float:
-        """Return it at weights (N,): infinite where log det has none."""
-        found = self.climbed(weights)
-        return np.inf if found is None else -found[0]
-
-    def tangent(self, weights: FloatArray) -> Below:
-        """Return the relaxed cost itself, which is cheap to compute."""
-        return _LogDet(self)
-
-    def relaxation(self, branch: Branch) -> tuple[float, FloatArray]:
-        """Return a lower bound over a branch, and weights near the least relaxed cost."""
-        weights = branch.centre(self.total)
-        found, weights = self.tangent(weights).least(branch, weights)
-        return max(found, self.everything()), weights
-
-    def climbed(self, weights: FloatArray) -> tuple[float, FloatArray] | None:
-        """Return log det at weights and its gradient ``tr(F^-1 W_i)``."""
-        n = self.matrices.shape[1]
-        F = (weights @ self.matrices.reshape(self.total, -1)).reshape(n, n)
-        size = np.sqrt(np.maximum(F.diagonal(), TINY))
-        sign, logs = np.linalg.slogdet(F / size / size[:, None])
-        if sign <= 0:
-            return None
-        inverse = np.linalg.inv(F / size / size[:, None]) / size / size[:, None]
-        rise = self.matrices.reshape(self.total, -1) @ inverse.ravel()
-        return float(logs + 2.0 * np.sum(np.log(size))), rise
-
-    def _measured(self, rows: FloatArray) -> FloatArray:
-        """Return minus log det of sums over rows (m, k) of indices, infinite where it has none."""
-        total = self._sums(rows)
-        size = np.sqrt(np.maximum(np.einsum("mii->mi", total), TINY))
-        try:
-            root = np.linalg.cholesky(total / size[:, :, None] / size[:, None, :])
-            part = np.einsum("mii->mi", root)
-            if np.all(part.min(axis=1) > 1e-4):  # far from singular: nothing to decide
-                return np.asarray(-2.0 * np.sum(np.log(part) + np.log(size), axis=1))
-        except np.linalg.LinAlgError:
-            pass
-        values = np.linalg.eigvalsh(total)
-        singular = values[:, 0] <= _NOTHING * values[:, -1]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            found = -np.sum(np.log(np.maximum(values, 0.0)), axis=1)
-        return np.asarray(np.where(singular, np.inf, found))
-
-
-class _LogDet(Below):
-    """Minus log det as a function of weights: convex, and equal to the cost at choices."""
-
-    def __init__(self, costs: LogDetOfSum) -> None:
-        self.costs = costs
-        self.rows = costs.matrices.reshape(costs.total, -1)
-
-    def values(self, sets: Sequence[Sequence[int]]) -> FloatArray:
-        """Return the costs (m,) of each choice."""
-        return self.costs.score(sets)
-
-    def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
-        """Return a number below the cost of all choices of a branch, and weights near the least.
-
-        A weight of zero may make the sum singular, so that the start is moved inwards.
-        """
-        inner = 0.9 * branch.nearest(start) + 0.1 * branch.centre(start.size)
-        most, weights = ascended(
-            self.costs.climbed,
-            branch,
-            inner,
-            steps=_STEPS,
-            close=lambda value, most: most - value <= _CLOSE,
-        )
-        return -most - _ROUNDING, weights
-
-
-def by_size(sets: Sequence[Sequence[int]], function: Any) -> FloatArray:
-    """Return numbers of choices: the function gets rows (m, k) of those with k candidates."""
-    if isinstance(sets, np.ndarray):
-        return np.asarray(function(sets))
-    found = np.empty(len(sets))
-    sizes = np.fromiter(map(len, sets), dtype=np.int64, count=len(sets))
-    for size in np.unique(sizes).tolist():
-        which = np.flatnonzero(sizes == size)
-        found[which] = function(np.array([sets[i] for i in which.tolist()], dtype=np.int64))
-    return found
-
-
-def sum_scorer(matrices: FloatArray, measure: str) -> Scorer:
-    """Return the scorer of a measure of ``sum_i W_i``; the trace needs no matrices."""
-    if measure == "trace":
-        return SummedWorth(np.trace(matrices, axis1=1, axis2=2))
-    return LogDetOfSum(matrices) if measure == "log det" else SummedMatrices(matrices)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..checks import FloatArray, Value, checked, function, short, with_unit
+from ..checks import FloatArray, IntArray, Value, checked, function, short, with_unit
 from ..errors import FlexplantError, ModelError
 from ..estimation.estimator_channels import sensors
 from ..plant import StandardPlant
@@ -75,6 +75,16 @@ class Scorer:
     def bound(self, count: int, required: Sequence[int]) -> float:
         """Return a number below the score of every choice of `count`; -inf when none is known."""
         return -np.inf
+
+
+def by_size(sets: Sequence[Sequence[int]], function: Callable[[IntArray], Any]) -> FloatArray:
+    """Return numbers of choices: the function gets rows (m, k) of those with k candidates."""
+    found = np.empty(len(sets))
+    sizes = np.fromiter(map(len, sets), dtype=np.int64, count=len(sets))
+    for size in np.unique(sizes).tolist():
+        which = np.flatnonzero(sizes == size)
+        found[which] = function(np.array([sets[i] for i in which.tolist()], dtype=np.int64))
+    return found
 
 
 @dataclass(frozen=True, eq=False)

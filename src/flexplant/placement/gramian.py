@@ -1,55 +1,178 @@
-"""Criteria of mode shapes where candidates are: Gramians of the elastic modes, indices."""
+"""Gramians of the elastic modes, and scores that are sums over the chosen."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ..checks import FloatArray, checked, instance, one_of
+from ..checks import FloatArray, IntArray, checked, one_of
 from ..errors import AssumptionError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..plant.realisation import ModalRealisation
-from ..reduction import ReducedModel
-from ..structure import FEModel
-from ..tolerances import divisor
+from ..tolerances import TINY, divisor
 from .candidates import Port
-from .convex import MEASURES, SummedWorth, by_size, sum_scorer
-from .criterion import Criterion, Scorer
+from .convex import Below, Branch, Convex, ascended, safe
+from .criterion import Criterion, Scorer, by_size
+
+MEASURES = ("trace", "log det", "least")
+#: what rounding leaves of an eigenvalue of zero, beside the largest
+_NOTHING = 1e-13
+#: steps to the largest log det, and the gap at which they stop [nats]
+_STEPS, _CLOSE = 300, 1e-3
+#: what rounding may have added to a log det [nats]
+_ROUNDING = 1e-8
+#: sums of so many numbers are made at once: they stay in the cache
+_AT_ONCE = 200_000
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
-    """Mass-normalised shapes of a plant's modes, rigid-body modes first."""
+class SummedWorth(Scorer):
+    """Minus the sum of a worth (N,) of each candidate; its bound is exact."""
 
-    phi: FloatArray
-    omega: FloatArray
-    zeta: FloatArray
-    rows: FloatArray
-    full: FloatArray
-    asd: FloatArray
+    worth: FloatArray
+
+    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
+        """Return the scores (n,) of choices, those of one size at once."""
+        return by_size(sets, lambda rows: -self.worth[rows].sum(axis=1))
+
+    def bound(self, count: int, required: Sequence[int]) -> float:
+        """Return the score of the best choice, and what rounding may have added to it."""
+        kept = list(required)
+        free = np.sort(np.delete(self.worth, kept))[::-1]
+        used = np.concatenate([self.worth[kept], free[: count - len(kept)]])
+        return -float(used.sum() + 1e-14 * np.abs(used).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class SummedMatrices(Scorer):
+    """Minus a measure of ``sum_i W_i`` over the chosen: W_i (N, n, n), positive semidefinite.
+
+    It grows with each candidate: the bound is that of all of them.
+    """
+
+    matrices: FloatArray
 
     @property
-    def elastic(self) -> slice:
-        """The modes that are no rigid-body modes."""
-        return slice(int(np.count_nonzero(self.omega == 0)), None)
+    def total(self) -> int:
+        """How many candidates there are."""
+        return int(self.matrices.shape[0])
+
+    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
+        """Return the scores (n,) of choices, those of one size at once."""
+        n = self.matrices.shape[1]
+        few = max(1, _AT_ONCE // (n * n))
+
+        def of(rows: IntArray) -> FloatArray:
+            parts = [self._measured(rows[i : i + few]) for i in range(0, len(rows), few)]
+            return np.concatenate(parts)
+
+        return by_size(sets, of)
+
+    def bound(self, count: int, required: Sequence[int]) -> float:
+        """Return a number below the score of every choice."""
+        return float(safe(np.array(self.value(range(self.total)))))
+
+    def _measured(self, rows: IntArray) -> FloatArray:
+        """Return minus the measure of sums over rows (m, k) of indices."""
+        return np.asarray(-np.linalg.eigvalsh(self._sums(rows))[:, 0])
+
+    def _sums(self, rows: IntArray) -> FloatArray:
+        total = self.matrices[rows[:, 0]]
+        for j in range(1, rows.shape[1]):
+            total += self.matrices[rows[:, j]]
+        return np.asarray(total)
 
 
-def shapes_of(plant: StandardPlant, ports: Sequence[Any]) -> Shapes:
-    """Return the shapes at ports of a plant that was assembled from a structure."""
-    real = plant.assembled.realisation
-    m = real.n_modes
-    pairs = real.pairs[:m]
-    omega = np.sqrt(np.abs(np.linalg.det(pairs)))
-    omega[: real.n_rigid] = 0.0
-    zeta = -np.trace(pairs, axis1=1, axis2=2) / 2.0 / divisor(omega)
-    full = real.inputs[:, 1 : 2 * m : 2]
-    rows = [p.row(real) if isinstance(p, SensorPort) else p.push(real) for p in ports]
-    stacked = np.array(rows).reshape(len(ports), full.shape[0])
-    return Shapes(stacked @ full, omega, zeta, stacked, full, noise_sizes(ports))
+@dataclass(frozen=True, eq=False)
+class LogDetOfSum(SummedMatrices, Convex):
+    """Minus log det: convex in weights of the candidates, so that it has a relaxation.
+
+    [JoshiBoyd2009]_.
+    """
+
+    bound = Convex.bound
+    total = SummedMatrices.total
+
+    def cost(self, weights: FloatArray) -> float:
+        """Return it at weights (N,): infinite where log det has none."""
+        found = self.climbed(weights)
+        return np.inf if found is None else -found[0]
+
+    def tangent(self, weights: FloatArray) -> Below:
+        """Return the relaxed cost itself, which is cheap to compute."""
+        return _LogDet(self)
+
+    def relaxation(self, branch: Branch) -> tuple[float, FloatArray]:
+        """Return a lower bound over a branch, and weights near the least relaxed cost."""
+        weights = branch.centre(self.total)
+        found, weights = self.tangent(weights).least(branch, weights)
+        return max(found, self.everything()), weights
+
+    def climbed(self, weights: FloatArray) -> tuple[float, FloatArray] | None:
+        """Return log det at weights and its gradient ``tr(F^-1 W_i)``."""
+        n = self.matrices.shape[1]
+        F = (weights @ self.matrices.reshape(self.total, -1)).reshape(n, n)
+        size = np.sqrt(np.maximum(F.diagonal(), TINY))
+        sign, logs = np.linalg.slogdet(F / size / size[:, None])
+        if sign <= 0:
+            return None
+        inverse = np.linalg.inv(F / size / size[:, None]) / size / size[:, None]
+        rise = self.matrices.reshape(self.total, -1) @ inverse.ravel()
+        return float(logs + 2.0 * np.sum(np.log(size))), rise
+
+    def _measured(self, rows: IntArray) -> FloatArray:
+        """Return minus log det of sums over rows (m, k) of indices, infinite where it has none."""
+        total = self._sums(rows)
+        size = np.sqrt(np.maximum(np.einsum("mii->mi", total), TINY))
+        try:
+            root = np.linalg.cholesky(total / size[:, :, None] / size[:, None, :])
+            part = np.einsum("mii->mi", root)
+            if np.all(part.min(axis=1) > 1e-4):  # far from singular: nothing to decide
+                return np.asarray(-2.0 * np.sum(np.log(part) + np.log(size), axis=1))
+        except np.linalg.LinAlgError:
+            pass
+        values = np.linalg.eigvalsh(total)
+        singular = values[:, 0] <= _NOTHING * values[:, -1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = -np.sum(np.log(np.maximum(values, 0.0)), axis=1)
+        return np.asarray(np.where(singular, np.inf, found))
+
+
+class _LogDet(Below):
+    """Minus log det as a function of weights: convex, and equal to the cost at choices."""
+
+    def __init__(self, costs: LogDetOfSum) -> None:
+        self.costs = costs
+        self.rows = costs.matrices.reshape(costs.total, -1)
+
+    def values(self, sets: Sequence[Sequence[int]]) -> FloatArray:
+        """Return the costs (m,) of each choice."""
+        return self.costs.score(sets)
+
+    def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
+        """Return a number below the cost of all choices of a branch, and weights near the least.
+
+        A weight of zero may make the sum singular, so that the start is moved inwards.
+        """
+        inner = 0.9 * branch.nearest(start) + 0.1 * branch.centre(start.size)
+        most, weights = ascended(
+            self.costs.climbed,
+            branch,
+            inner,
+            steps=_STEPS,
+            close=lambda value, most: most - value <= _CLOSE,
+        )
+        return -most - _ROUNDING, weights
+
+
+def sum_scorer(matrices: FloatArray, measure: str) -> Scorer:
+    """Return the scorer of a measure of ``sum_i W_i``; the trace needs no matrices."""
+    if measure == "trace":
+        return SummedWorth(np.trace(matrices, axis1=1, axis2=2))
+    return LogDetOfSum(matrices) if measure == "log det" else SummedMatrices(matrices)
 
 
 def noise_sizes(ports: Sequence[Any]) -> FloatArray:
@@ -62,134 +185,6 @@ def noise_sizes(ports: Sequence[Any]) -> FloatArray:
             "they would count without limit. Give all of them Sensor(..., asd=), or none."
         )
     return divisor(sizes)
-
-
-class ByShapes(Criterion):
-    """A criterion of mode shapes at the sensors: a new one defines `of`."""
-
-    sides: ClassVar[str] = "y"
-    scale: ClassVar[float] = 1.0
-
-    @abstractmethod
-    def of(self, plant: StandardPlant, shapes: Shapes) -> Scorer:
-        """Return the scores of choices among the ports that the shapes belong to."""
-
-    def __call__(self, plant: StandardPlant) -> float:
-        """Return the criterion of the plant's own ports."""
-        ports = getattr(plant.assembled.ports, self.sides)
-        scorer = self.of(plant, shapes_of(plant, ports))
-        return float(scorer.score([tuple(range(len(ports)))])[0])
-
-    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
-        """Return the criterion of choices among candidates."""
-        return self.of(plant, shapes_of(plant, candidates))
-
-
-@dataclass(frozen=True, eq=False)
-class LargestMac(Scorer):
-    """The largest off-diagonal MAC of shapes (N, m) at the chosen rows."""
-
-    phi: FloatArray
-
-    def value(self, chosen: Sequence[int]) -> float:
-        """Return it for one choice."""
-        return float(self.score([tuple(chosen)])[0])
-
-    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
-        """Return it for choices of one size at once."""
-        return by_size(sets, self._largest)
-
-    def bound(self, count: int, required: Sequence[int]) -> float:
-        """Return 0: no shapes are less alike than orthogonal ones."""
-        return 0.0
-
-    def _largest(self, rows: FloatArray) -> FloatArray:
-        part = self.phi[rows]
-        cross = np.einsum("mki,mkj->mij", part, part)
-        sizes = np.einsum("mii->mi", cross)
-        scale = sizes[:, :, None] * sizes[:, None, :]
-        # a mode that none of the sensors sees is like every other
-        mac = np.where(scale > 0, cross**2 / divisor(scale), 1.0)
-        i = np.arange(mac.shape[1])
-        mac[:, i, i] = 0.0
-        return np.asarray(mac.max(axis=(1, 2)))
-
-
-@dataclass(frozen=True, eq=False)
-class AutoMac(ByShapes):
-    """Largest off-diagonal entry of the MAC between the elastic mode shapes at the sensors.
-
-    ``(phi_i' phi_j)^2 / (phi_i' phi_i phi_j' phi_j)``, 0 where all shapes differ, 1 where two look
-    alike. It does not count how large the motions are that the sensors see, and of a POI it says
-    next to nothing, as `ModeInformation`.
-
-    References
-    ----------
-    [Allemang2003]_.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> fx.place_sensors(plant, candidates, 2, fx.placement.AutoMac()).chosen
-    ('s1', 's3')
-    """
-
-    def of(self, plant: StandardPlant, shapes: Shapes) -> LargestMac:
-        """Return the largest entry of choices."""
-        return LargestMac(shapes.phi[:, shapes.elastic])
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class KineticEnergy(ByShapes):
-    """Minus the part of the elastic modes' kinetic energy at the sensors.
-
-    ``sum_i sum_k (r_i phi_k) (r_i M phi_k)``, 1 for each mode over all DOFs: places that move much,
-    and are heavy. Each place counts by itself, so that neighbours that see the same are both
-    chosen. Of a POI it says next to nothing, as `ModeInformation`.
-
-    Parameters
-    ----------
-    model : FEModel, optional
-        Of the mass matrix; not needed where the plant was assembled from matrices or a reduced
-        model.
-
-    References
-    ----------
-    [Kammer1991]_.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> masses = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
-    >>> fx.place_sensors(plant, candidates, 2, fx.placement.KineticEnergy(masses)).chosen
-    ('s1', 's3')
-    """
-
-    model: Any = field(
-        default=None, metadata=checked(instance, kind=FEModel | ReducedModel, hint="Pass one.")
-    )
-
-    def of(self, plant: StandardPlant, shapes: Shapes) -> SummedWorth:
-        """Return the energy of choices."""
-        model = plant.assembled.realisation.model if self.model is None else self.model
-        if not isinstance(model, FEModel | ReducedModel):
-            raise ModelError(
-                "the plant was assembled from modes, which have no mass matrix. Pass "
-                "placement.KineticEnergy(model), the FEModel that they are of."
-            )
-        if model.M.shape[0] != shapes.full.shape[0]:
-            raise ModelError(
-                f"the model has {model.M.shape[0]} DOFs, the plant's {shapes.full.shape[0]}: pass "
-                "the one that the plant's modes are of."
-            )
-        moving = shapes.phi[:, shapes.elastic] * (
-            shapes.rows @ (model.M @ shapes.full[:, shapes.elastic])
-        )
-        return SummedWorth(np.sum(moving, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,20 +223,18 @@ class ModalGramian(Criterion):
         """Return the Gramians (N, 2 m, 2 m) of single ports."""
         start = 2 * real.n_rigid
         A = real.A[start:, start:]
-        rows = np.array([self._row(real, port) for port in ports])[:, start:]
-        rows = rows / noise_sizes(ports)[:, None]
+        seeing = self.sides == "y"
+        rows = [port.see(real).row if seeing else real.force(port.push(real)) for port in ports]
+        part = np.array(rows)[:, start:] / noise_sizes(ports)[:, None]
         if not A.size:
             raise ModelError("the plant has no elastic mode, so no Gramian. Keep some modes.")
-        poles, modes = np.linalg.eig(A.T if self.sides == "u" else A)
-        part = rows @ modes
+        poles, modes = np.linalg.eig(A if seeing else A.T)
+        part = part @ modes
         sums = poles.conj()[:, None] + poles
         W = -(part.conj()[:, :, None] * part[:, None, :]) / sums
         back = np.linalg.inv(modes)
         found = (back.conj().T @ W @ back).real
         return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
-
-    @abstractmethod
-    def _row(self, real: ModalRealisation, port: Any) -> FloatArray: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,9 +263,6 @@ class ModalObservability(ModalGramian):
 
     sides: ClassVar[str] = "y"
 
-    def _row(self, real: ModalRealisation, port: Any) -> FloatArray:
-        return np.asarray(port.see(real).row)
-
 
 @dataclass(frozen=True, eq=False)
 class ModalControllability(ModalGramian):
@@ -295,86 +285,6 @@ class ModalControllability(ModalGramian):
     >>> plant = fx.testbeds.three_masses()
     >>> candidates = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2, 3)]
     >>> fx.place_actuators(plant, candidates, 1, fx.placement.ModalControllability()).side
-    'u'
-    """
-
-    sides: ClassVar[str] = "u"
-
-    def _row(self, real: ModalRealisation, port: Any) -> FloatArray:
-        return real.force(port.push(real))
-
-
-@dataclass(frozen=True, eq=False)
-class SensorIndices(ByShapes):
-    """Minus the sum of squared placement indices of the sensors, by modal norms.
-
-    ``sum_i sum_k (alpha_k phi_ik / asd_i)^2`` over the elastic modes, which are mass-normalised;
-    alpha_k is the norm of mode k from the disturbances to the POIs, ``g = |phi_wk| |phi_zk|``::
-
-        H2:  g / (2 sqrt(zeta) omega^(3/2)),   Hinf:  g / (2 zeta omega^2),   Hankel: half of it
-
-    over that of the largest. Each device counts by itself: two at one place count twice. Of a POI
-    it says next to nothing, as `ModeInformation`.
-
-    Parameters
-    ----------
-    norm : {"h2", "hinf", "hankel"}
-        By which modes are weighted.
-
-    References
-    ----------
-    [Gawronski2004]_, ch. 5 and 7.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> fx.place_sensors(plant, candidates, 2, fx.placement.SensorIndices()).chosen
-    ('s1', 's3')
-    """
-
-    norm: str = field(default="h2", metadata=checked(one_of, choices=("h2", "hinf", "hankel")))
-
-    def of(self, plant: StandardPlant, shapes: Shapes) -> SummedWorth:
-        """Return the indices of choices."""
-        kept = shapes.elastic
-        # in sqrt(Hz) / pm, so that the indices are numbers of usual size
-        unit = 1e-12 / shapes.asd if self.sides == "y" else shapes.asd
-        seen = shapes.phi[:, kept] * unit[:, None]
-        return SummedWorth(np.sum((seen * self.weights(plant)) ** 2, axis=1))
-
-    def weights(self, plant: StandardPlant) -> FloatArray:
-        """Return alpha (m,) of the elastic modes."""
-        ports, real = plant.assembled.ports, plant.assembled.realisation
-        pushes = [port for port in ports.forces if port.asd > 0]
-        pushed = shapes_of(plant, pushes)
-        kept = pushed.elastic
-        omega, zeta = pushed.omega[kept], pushed.zeta[kept]
-        asd = np.array([port.asd for port in pushes])
-        force = np.sqrt(np.sum((pushed.phi[:, kept] * asd[:, None]) ** 2, axis=0))
-        rows = [real.row(poi.at, axis) for poi in ports.z for axis in poi.axes]
-        motion = np.sqrt(np.sum((np.array(rows) @ pushed.full[:, kept]) ** 2, axis=0))
-        damped = {"h2": 2.0 * np.sqrt(zeta) * omega**1.5, "hinf": 2.0 * zeta * omega**2}
-        size = force * motion / damped.get(self.norm, damped["hinf"])
-        return np.asarray(size / np.max(size))
-
-
-@dataclass(frozen=True, eq=False)
-class ActuatorIndices(SensorIndices):
-    """Minus the sum of squared placement indices of the actuators, as `SensorIndices` has them.
-
-    Parameters
-    ----------
-    norm : {"h2", "hinf", "hankel"}
-        By which modes are weighted.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2, 3)]
-    >>> fx.place_actuators(plant, candidates, 1, fx.placement.ActuatorIndices()).side
     'u'
     """
 

@@ -20,8 +20,7 @@ from ..work import Work
 from .candidates import Port, Side, candidate_places, known_candidates, sampled_plant, with_side
 from .constraints import Constraint, all_of, constraint_rows, constraints_of
 from .criterion import Criterion, in_words
-from .layouts import layouts_of
-from .problem import Placement
+from .problem import Placement, layouts_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)

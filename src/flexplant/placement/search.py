@@ -18,11 +18,9 @@ from ..work import Work
 from .branch_and_bound import Exchange
 from .candidates import Port, candidate_places, known_candidates, sampled_plant, side_of
 from .closed_loop_h2 import Separation
-from .constraints import Budget, Constraint, constraint_rows
+from .constraints import Budget, Constraint, LinearRows, constraint_rows
 from .criterion import Criterion, in_words
-from .layouts import layouts_of
-from .problem import Found, Placement, Problem, Search
-from .rows import LinearRows
+from .problem import Found, Placement, Problem, Search, layouts_of
 
 #: up to here every subset is scored when no method is given: it takes seconds, and proves it
 _FEW = 1500

@@ -1,23 +1,36 @@
-"""Criteria made of others: with a penalty, over several machines, after the loss of a device."""
+"""Criteria made of others: with a penalty, over machines and positions, after losing a device."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..checks import FloatArray, checked, function, one_of, positive, short
-from ..errors import AssumptionError, FlexplantError, ModelError
+from ..errors import AssumptionError, FlexplantError, LabelError, ModelError, counted
 from ..plant import StandardPlant, larger_plant
+from ..plant.scheduling import values_over
 from ..tolerances import TINY
 from .candidates import SIDES, Port, sampled_plant, side_of, sides_of, with_side
+from .convex import Below, Branch, Convex, Tangent, least_sum
 from .criterion import Criterion, Scorer, Wrapping, as_criterion
-from .gramian import Shapes, shapes_of
-from .layouts import RigidPart
-from .many import MEASURES, many_scores, over
+from .mode_shapes import Shapes, shapes_of
+from .problem import RigidPart
+
+MEASURES = ("worst", "mean")
+#: rounds in which the shares of parts move to the worst one, how fast, and the gap that ends them
+_ROUNDS, _PULL, _GAP = 8, 4.0, 1e-3
+
+
+def over(measure: str, values: Any) -> Any:
+    """Return the largest or the mean along the first axis."""
+    return np.max(values, axis=0) if measure == "worst" else np.mean(values, axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +91,7 @@ class LeftOutModes(Criterion):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the share of choices among candidates of this kind; others do not count."""
         own = [side_of(port) == SIDES[self.of] for port in candidates]
-        counted = np.array(own, dtype=np.float64)
+        counts = np.array(own, dtype=np.float64)
         whole = larger_plant(plant, self.larger)
         kept = shapes_of(plant, candidates)
         more = None if whole is None else shapes_of(whole, candidates)
@@ -90,7 +103,7 @@ class LeftOutModes(Criterion):
             )
         # modes are in order of their frequency: the plant has the first of them
         beyond = more.omega > 1.0001 * np.max(kept.omega)
-        return Share(counted * _worth(more, beyond), counted * _worth(kept, kept.omega > 0))
+        return Share(counts * _worth(more, beyond), counts * _worth(kept, kept.omega > 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +191,147 @@ def _worth(shapes: Shapes, which: npt.NDArray[np.bool_]) -> FloatArray:
     return np.asarray(np.sum(shapes.phi[:, which] ** 2 / (4.0 * zeta * omega**3), axis=1))
 
 
+@dataclass(frozen=True, eq=False)
+class ManyScores(Scorer):
+    """The worst or the mean of several scores of the same choice.
+
+    With what each part sees of the rigid-body modes, a choice that misses one has no score.
+    """
+
+    parts: tuple[Any, ...]
+    measure: str
+    rigid: tuple[RigidPart, ...]
+
+    def value(self, chosen: Sequence[int]) -> float:
+        """Return it for one choice."""
+        missed = [i for i, part in enumerate(self.rigid) if part.missing(chosen)]
+        if missed:
+            raise AssumptionError(
+                f"It misses a rigid-body mode at {len(missed)} of {len(self.rigid)} positions."
+            )
+        return float(over(self.measure, [part.value(chosen) for part in self.parts]))
+
+    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
+        """Return it for several choices."""
+        values = np.full(len(sets), np.inf)
+        missed = [part.all_missing(sets) for part in self.rigid]
+        kept = np.flatnonzero(~np.any(missed, axis=0)).tolist()
+        found = [part.score([sets[i] for i in kept]) for part in self.parts]
+        values[kept] = over(self.measure, found)
+        return values
+
+    def bound(self, count: int, required: Sequence[int]) -> float:
+        """Return the worst or the mean of the bounds."""
+        bounds = [part.bound(count, required) for part in self.parts]
+        return float(over(self.measure, bounds))
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexScores(ManyScores, Convex):
+    """The worst or the mean of convex costs: it is one itself."""
+
+    def cost(self, weights: FloatArray) -> float:
+        """Return it at weights (N,)."""
+        return float(over(self.measure, [part.cost(weights) for part in self.parts]))
+
+    def tangent(self, weights: FloatArray) -> Below:
+        """Return the worst or the mean of the tangents."""
+        return BelowAll(tuple(part.tangent(weights) for part in self.parts), self.measure)
+
+    def everything(self) -> float:
+        """Return a number below the cost of all candidates together."""
+        return float(over(self.measure, [part.everything() for part in self.parts]))
+
+    def bound(self, count: int, required: Sequence[int]) -> float:
+        """Return the bound of the relaxation."""
+        return Convex.bound(self, count, required)
+
+    @property
+    def total(self) -> int:
+        """How many candidates there are."""
+        return int(self.parts[0].total)
+
+
+@dataclass(frozen=True, eq=False)
+class BelowAll(Below):
+    """The worst or the mean of functions below costs: it lies below the worst or the mean."""
+
+    parts: tuple[Below, ...]
+    measure: str
+
+    @cached_property
+    def rows(self) -> FloatArray:  # type: ignore[override]
+        """Effects of each candidate on all parts."""
+        return np.hstack([part.rows for part in self.parts])
+
+    def values(self, sets: Sequence[Sequence[int]]) -> FloatArray:
+        """Return numbers (m,) below the cost of each choice."""
+        return np.asarray(over(self.measure, [part.values(sets) for part in self.parts]))
+
+    def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
+        """Return a number below the cost of all choices of a branch, and weights near the least.
+
+        For any shares that add up to one ``min_w sum_p share_p f_p(w) <= min_w max_p f_p(w)``;
+        they are moved to the worst parts as far as that lifts the bound.
+        """
+        tangents = [part for part in self.parts if isinstance(part, Tangent)]
+        if len(tangents) < len(self.parts):
+            found = [part.least(branch, start) for part in self.parts]
+            bound = float(over(self.measure, [one for one, _ in found]))
+            return bound, np.mean([weights for _, weights in found], axis=0)
+        shares = np.full(len(tangents), 1.0 / len(tangents))
+        best, kept = least_sum(tangents, shares, branch, start)
+        if self.measure == "mean":
+            return best, kept
+        weights = kept
+        for _ in range(_ROUNDS):
+            falls = [one.fall(weights) for one in tangents]
+            if any(fall is None for fall in falls):
+                break
+            costs = np.array(
+                [f[0] + t.constant for f, t in zip(falls, tangents, strict=True) if f is not None]
+            )
+            size = float(np.abs(costs).max())
+            if float(costs.max()) - best <= _GAP * size:
+                break
+            shares = shares * np.exp(_PULL * (costs - costs.max()) / size)
+            shares = shares / shares.sum()
+            bound, weights = least_sum(tangents, shares, branch, weights)
+            if bound > best:
+                best, kept = bound, weights
+        return best, kept
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Several(Wrapping):
+    """The worst or the mean of a criterion over several plants; a new one defines `plants`."""
+
+    measure: str = field(default="worst", kw_only=True, metadata=checked(one_of, choices=MEASURES))
+
+    @abstractmethod
+    def plants(
+        self, plant: StandardPlant, candidates: Sequence[Port]
+    ) -> Iterator[tuple[StandardPlant, Sequence[Port]]]:
+        """Yield the plants that take the place of one, and where its candidates are there."""
+
+    def __call__(self, plant: StandardPlant) -> float:
+        """Return it with the devices of a plant."""
+        return float(over(self.measure, [self.criterion(one) for one, _ in self.plants(plant, ())]))
+
+    def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
+        """Check the criterion on every plant."""
+        for one, ports in self.plants(plant, candidates):
+            super().check(one, ports)
+
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
+        """Return the scores by those on each plant, with bounds of their relaxation if all have."""
+        every, side = list(self.plants(plant, candidates)), sides_of(candidates)
+        parts = tuple(self.inner.scorer(one, ports) for one, ports in every)
+        rigid = tuple(RigidPart.of(one, side, ports) for one, ports in every)
+        kind = ConvexScores if all(isinstance(part, Convex) for part in parts) else ManyScores
+        return kind(parts, self.measure, rigid)
+
+
 def _checked_machines(machines: Any, name: str) -> tuple[StandardPlant, ...]:
     """Return the machines of a criterion, one at least."""
     if isinstance(machines, str) or not isinstance(machines, Sequence) or not machines:
@@ -189,7 +343,7 @@ def _checked_machines(machines: Any, name: str) -> tuple[StandardPlant, ...]:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OverMachines(Wrapping):
+class OverMachines(Several):
     """The worst or the mean of a criterion over several machines with the same devices.
 
     Parameters
@@ -213,30 +367,90 @@ class OverMachines(Wrapping):
     """
 
     machines: Sequence[StandardPlant] = field(metadata=checked(_checked_machines))
-    measure: str = field(default="worst", kw_only=True, metadata=checked(one_of, choices=MEASURES))
 
     def __repr__(self) -> str:
         return f"OverMachines({self.criterion!r}, {len(self.machines)} machines, {self.measure!r})"
 
-    def __call__(self, plant: StandardPlant) -> float:
-        """Return it with the devices of a plant."""
-        ports = plant.assembled.ports
-        values = [self.criterion(machine.with_ports(ports)) for machine in self.machines]
-        return float(over(self.measure, values))
+    def plants(
+        self, plant: StandardPlant, candidates: Sequence[Port]
+    ) -> Iterator[tuple[StandardPlant, Sequence[Port]]]:
+        """Yield every machine with the devices of the plant."""
+        for machine in self.machines:
+            yield machine.with_ports(plant.assembled.ports), candidates
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OverPositions(Several):
+    """The worst or the mean of a criterion over the positions of a machine whose ports move.
+
+    Candidates may move as other ports do (`moves`): a head on the frame sees another point of the
+    stage at each position. Scores share the modes of the plant and cost one equation for each
+    position; a bound is the worst (or the mean) of those at the positions. A choice that misses a
+    rigid-body mode at any of them has no score. Constraints on places hold where the plant stands.
+
+    Parameters
+    ----------
+    criterion : Criterion or callable
+        From plant to float.
+    points : int or mapping {name: int or array}
+        How many values of each position are taken over its range, or which [m or rad]. Between
+        them nothing is known: compare with more of them.
+    measure : {"worst", "mean"}
+        Over the positions.
+
+    Raises
+    ------
+    AssumptionError
+        In a search, when at a position even all candidates miss a rigid-body mode.
+    LabelError
+        When it is called on a plant without positions, or a name is none of them.
+    ModelError
+        When the measure is neither; when called, where a value is out of its range.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.placement.OverPositions(fx.PoiVariance("die"), {"x": [-0.1, 0.0, 0.1]})
+    OverPositions(PoiVariance('die'), {'x': [-0.1, 0.0, 0.1]}, 'worst')
+    """
+
+    points: Any = 5
+
+    def __repr__(self) -> str:
+        given = dict(self.points) if isinstance(self.points, Mapping) else self.points
+        return f"OverPositions({self.criterion!r}, {given!r:.60}, {self.measure!r})"
 
     def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
-        """Check the criterion on every machine."""
-        for machine in self._with(plant):
-            super().check(machine, candidates)
+        """Check the criterion at every position, and that the candidates suffice there."""
+        for there, ports in self.plants(plant, candidates):
+            missed = RigidPart.of(there, sides_of(ports), ports).missing(range(len(ports)))
+            if missed:
+                raise AssumptionError(
+                    f"no choice of these candidates will do: at {there.assembled.ports.standing} "
+                    f"even all of them miss {counted(missed, 'rigid-body mode')}. Add others, or "
+                    "narrow the positions."
+                )
+        super().check(plant, candidates)
 
-    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
-        """Return the scores by those on each machine."""
-        inner = self.inner
-        parts = tuple(inner.scorer(machine, candidates) for machine in self._with(plant))
-        return many_scores(parts, self.measure)
-
-    def _with(self, plant: StandardPlant) -> list[StandardPlant]:
-        return [machine.with_ports(plant.assembled.ports) for machine in self.machines]
+    def plants(
+        self, plant: StandardPlant, candidates: Sequence[Port]
+    ) -> Iterator[tuple[StandardPlant, Sequence[Port]]]:
+        """Yield the plant with all candidates at each position, and where these are there."""
+        keys = [(side_of(port), port.name) for port in candidates]
+        whole = with_side(plant, sides_of(candidates), candidates) if keys else plant
+        positions = whole.assembled.ports.positions
+        if not positions:
+            raise LabelError(
+                "the plant has no positions, over which OverPositions could go: nothing of it "
+                "moves. Give ports moves={'x': (-1, 0, 0)} and "
+                "Ports(..., positions=[fx.plant.Position('x', range=(-0.1, 0.1))])."
+            )
+        grid = values_over(positions, self.points)
+        for values in product(*grid.values()):
+            there = whole.at(**dict(zip(grid, values, strict=True)))
+            ports = there.assembled.ports
+            own = {(s, port.name): port for s in "yu" for port in getattr(ports, s)}
+            yield there, [own[key] for key in keys]
 
 
 @dataclass(frozen=True, eq=False)

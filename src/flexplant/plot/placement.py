@@ -14,7 +14,7 @@ from ..checks import FloatArray, IntArray, in_unit, instance, whole
 from ..errors import ModelError
 from ..placement import ParetoCurve, SensorMap
 from ..placement.candidates import Zone, candidate_places
-from ..placement.gramian import shapes_of
+from ..placement.mode_shapes import shapes_of
 from ..plant import Ports, StandardPlant
 from ..structure import Disc
 from ._axes import (

@@ -28,11 +28,11 @@ twelve ways.
 """
 
 from ..rooms import public_names as _public_names
-from .component_modes import CraigBampton as CraigBampton
-from .component_modes import MacNeal as MacNeal
-from .component_modes import Rubin as Rubin
+from .condensation import CraigBampton as CraigBampton
 from .condensation import Guyan as Guyan
 from .condensation import Irs as Irs
+from .condensation import MacNeal as MacNeal
+from .condensation import Rubin as Rubin
 from .condensation import Serep as Serep
 from .criteria import DofSelection as DofSelection
 from .criteria import EffectiveIndependence as EffectiveIndependence

@@ -240,12 +240,7 @@ class FullResponses:
     """The responses of a full structure, wherever they are wanted."""
 
     def __init__(
-        self,
-        full: FEModel | Modes,
-        modes: Modes,
-        B: FloatArray,
-        C: FloatArray,
-        loss: float | None,
+        self, full: FEModel | Modes, modes: Modes, B: FloatArray, C: FloatArray, loss: float | None
     ) -> None:
         self.full, self.B, self.C, self.loss = full, B, C, loss
         self.basis: DynamicBasis | None = None

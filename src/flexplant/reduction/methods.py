@@ -12,15 +12,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..checks import FloatArray, Matrix, Value, checked, instance, name_list
-from ..errors import (
-    LabelError,
-    ModelError,
-    ShapeError,
-    SolverError,
-    attempted,
-    counted,
-    some_names,
-)
+from ..errors import LabelError, ModelError, ShapeError, SolverError, attempted, counted, some_names
 from ..labels import DofSet, Place
 from ..modes.attachment_vectors import places
 from ..modes.modes import Modes
@@ -121,12 +113,7 @@ def inner(matrix: Matrix, T: FloatArray) -> FloatArray:
 
 
 def modal_damping(
-    M: FloatArray,
-    K: FloatArray,
-    rigid: FloatArray,
-    damping: Damping,
-    model: FEModel,
-    T: FloatArray,
+    M: FloatArray, K: FloatArray, rigid: FloatArray, damping: Damping, model: FEModel, T: FloatArray
 ) -> FloatArray:
     """Return the D that gives the modes of a reduced model the ratios of a damping law."""
     omega, phi = elastic_modes(M, K, rigid)

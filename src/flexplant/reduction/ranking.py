@@ -101,10 +101,7 @@ class ModeRanking(Value):
 
 
 def rank_modes(
-    modes: Modes,
-    *,
-    inputs: Place | Iterable[Place],
-    outputs: Place | Iterable[Place] = (),
+    modes: Modes, *, inputs: Place | Iterable[Place], outputs: Place | Iterable[Place] = ()
 ) -> ModeRanking:
     """Return which elastic modes matter to which channels, by Hankel values.
 
