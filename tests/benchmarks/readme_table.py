@@ -32,7 +32,7 @@ from test_estimation_benchmarks import observer
 from test_lti_benchmarks import slycot_hinf
 
 import flexplant as fx
-from flexplant.loop.applied import applied_law
+from flexplant.loop.blocks import applied_law
 from flexplant.lti import solve_dare
 from plates import make_plate
 from systems_lti import machine

@@ -9,7 +9,7 @@ import scipy.linalg as la
 
 import flexplant as fx
 from flexplant.errors import AssumptionError, FlexplantWarning, ModelError
-from flexplant.loop.mode_tolerance import mode_tolerances
+from flexplant.loop.other_machines import mode_tolerances
 from flexplant.plant.uncertainty.uncertain_plant import Delta, with_changes
 from stages import RATE, ports, sampled, some_modes
 

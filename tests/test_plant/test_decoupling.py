@@ -6,7 +6,7 @@ import pytest
 from flexplant.errors import AssumptionError, LabelError, ModelError
 from flexplant.lti import StateSpace, lowpass
 from flexplant.plant import Actuator, Sensor, StandardPlant, assemble_plant, decouple, suspend
-from flexplant.plant.rigid.suspension import GroundSpring
+from flexplant.plant.suspension import GroundSpring
 from stages import CORNERS, INSET, NOISE, RATE, Z8, L, full, ports, reduced, some_modes
 
 MASS = 0.6 * 0.6 * 0.0272 * 2702

@@ -10,7 +10,7 @@ from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.estimation import design_static
 from flexplant.labels import DofSet
 from flexplant.loop import SpillOver, close_loop
-from flexplant.loop.spill_over import growing_modes
+from flexplant.loop.other_machines import growing_modes
 from flexplant.modes import solve_modes
 from flexplant.plant import (
     Actuator,

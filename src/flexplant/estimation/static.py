@@ -12,7 +12,7 @@ from ..errors import AssumptionError, ModelError
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
-from ..plant.rigid.rigid_motion import rigid_rows
+from ..plant.rigid_motion import rigid_rows
 from .error import error_variances
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 

@@ -33,14 +33,16 @@ from .budget import (
     sources,
     stationary_row,
 )
-from .mode_tolerance import (
+from .other_machines import (
     MARGIN,
     ModeTolerances,
+    SpillOver,
+    growing_modes,
+    high,
     machine_draws,
     mode_tolerances,
     reported_tolerances,
 )
-from .spill_over import SpillOver, growing_modes, high
 
 
 @dataclass(frozen=True, eq=False, repr=False)

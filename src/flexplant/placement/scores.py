@@ -14,7 +14,7 @@ from ..checks import FloatArray, IntArray, Value, instance, positive, real_array
 from ..errors import LabelError, ModelError, counted
 from ..parallel import mapped
 from ..plant import Sensor, StandardPlant
-from ..plant.ports import Quantity
+from ..plant.port import Quantity
 from ..structure import Disc, Rectangle
 from ..work import Work
 from .candidates import Port, Side, candidate_places, known_candidates, sampled_plant, with_side

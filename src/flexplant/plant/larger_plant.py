@@ -1,6 +1,10 @@
-"""The plant with the modes that a reduction left out: the check of designs on the reduced one."""
+"""The plant with the modes that a reduction left out, and machines drawn of it."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -9,11 +13,12 @@ from ..errors import LabelError, ModelError, some_names, warn
 from ..lti.statespace import StateSpace
 from ..reduction import ReducedModel
 from ..tolerances import SAME
-from .building import sampled_like, with_modes_of
+from .building import rebuilt, sampled_like, with_modes_of
 from .partition import is_plant
-from .realisation import Structure
-from .rigid.rigid_motion import rigid_gain, rigid_modes
+from .realisation import ModalRealisation, Structure, natural
+from .rigid_motion import rigid_gain, rigid_modes
 from .standard import StandardPlant, standard_plant
+from .uncertainty.uncertain_plant import Delta, UncertainPlant, changed_modes, modal_realisation
 
 #: relative difference of rigid-body accelerations that is none of an updated mass
 _ANOTHER_BODY = 0.1
@@ -115,3 +120,141 @@ def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:
             "continuous, or sampled like the plant."
         )
     return larger
+
+
+#: kinds of Deltas that say the same of the modes of a larger plant
+_OF_MODES = ("freq", "damping")
+#: std of the logarithm of the damping of a mode that was not measured (one structure's modes
+#: scatter by 20 to 40 %)
+_DAMPING = 0.3
+#: a frequency that is not known to so many half-widths of its resonance was not measured
+_MEASURED = 2.0
+#: modes of the plant further off in the larger model, relative, are others: the last ones of a
+#: reduced model stand for compliance
+_SAME = 0.05
+
+
+def draws_with_left_out(
+    uncertain: UncertainPlant[StandardPlant],
+    whole: StandardPlant,
+    rng: np.random.Generator,
+    count: int,
+    *,
+    shapes: float = 0.0,
+) -> Iterator[StandardPlant] | None:
+    """Return machines of a larger plant, drawn one by one; None where no Delta is of its modes.
+
+    The plant's own modes are off as its Deltas say, normally with 1 at some deviations. Nothing is
+    measured of the modes left out: each frequency is off like that of the plant's least known. The
+    logarithm of the damping of a mode that was not measured is off by 0.3: a loop may live on it.
+    """
+    unknown = _Unmeasured.of(uncertain, whole)
+    if unknown is None:
+        return None
+    deltas, covariance = list(uncertain.deltas), uncertain.covariance
+    deviation = np.sqrt(np.diag(covariance))
+    root = np.linalg.cholesky(
+        covariance / np.outer(deviation, deviation) + 1e-9 * np.eye(deviation.size)
+    )
+
+    def one(own_rng: np.random.Generator) -> StandardPlant:
+        amounts = np.concatenate([
+            deviation * (root @ own_rng.standard_normal(deviation.size)),
+            own_rng.standard_normal(len(unknown.frequencies)) / uncertain.deviations,
+        ])  # fmt: skip
+        (apart,) = own_rng.spawn(1)
+        scattered = np.exp(_DAMPING * apart.standard_normal(len(unknown.modes)))
+        every = [*deltas, *unknown.frequencies]
+        changes = [(d, float(max(d.scale * x, -0.9))) for d, x in zip(every, amounts, strict=True)]
+        modes = changed_modes(whole, [*changes, *unknown.damped(scattered)])
+        return rebuilt(whole, realisation=_mixed(modes, own_rng, shapes) if shapes else modes)
+
+    return (one(each) for each in rng.spawn(count))
+
+
+def damped_less(
+    uncertain: UncertainPlant[StandardPlant], whole: StandardPlant
+) -> tuple[StandardPlant, dict[int, float]] | None:
+    """Return a larger plant whose unmeasured modes have less damping, 0.55 times (two deviations).
+
+    And by what share the frequency of each may be off with it: of the plant's own half of what is
+    known, one deviation. None as for `draws_with_left_out`.
+    """
+    unknown = _Unmeasured.of(uncertain, whole)
+    if unknown is None:
+        return None
+    lower = unknown.damped(np.full(len(unknown.modes), np.exp(-2.0 * _DAMPING)))
+    ranges = {delta.mode: 0.5 * delta.scale for delta in unknown.frequencies}
+    given = uncertain.frequencies.items()
+    own = {mode: 0.5 * share for mode, share in given if mode in unknown.modes}
+    return rebuilt(whole, realisation=changed_modes(whole, lower)), ranges | own
+
+
+@dataclass(frozen=True)
+class _Unmeasured:
+    """Modes of a larger plant that were not measured, and the frequencies of those left out."""
+
+    modes: tuple[int, ...]
+    frequencies: tuple[Delta, ...]
+
+    @classmethod
+    def of(cls, uncertain: UncertainPlant[StandardPlant], whole: StandardPlant) -> Self | None:
+        """Return them; None where a Delta is of something else than modes."""
+        kinds = {delta.kind for delta in uncertain.deltas}
+        if uncertain.fit is not None or not kinds <= set(_OF_MODES) or not whole.has_own_modes:
+            return None
+        realisation, ranges = modal_realisation(whole), uncertain.frequencies
+        omega, zeta = natural(realisation.pairs)
+        own, _ = natural(modal_realisation(uncertain.plant).pairs)
+        least = max(ranges.values(), default=0.0)
+        rigid, n = realisation.n_rigid, min(own.size, omega.size)
+        same = np.abs(own[:n] - omega[:n]) <= _SAME * omega[:n]
+        left = [
+            i + 1
+            for i in range(rigid, realisation.n_modes)
+            if least and i + 1 not in ranges and not (i < n and same[i])
+        ]
+        wide = [mode for mode, r in ranges.items() if r > _MEASURED * (1.0 + SAME) * zeta[mode - 1]]
+        known = {delta.mode for delta in uncertain.deltas if delta.kind == "damping"}
+        modes = tuple(mode for mode in sorted({*left, *wide} - known) if zeta[mode - 1] < 1.0)
+        return cls(modes, tuple(Delta(f"mode{m}:freq", m, "freq", 2.0 * least) for m in left))
+
+    def damped(self, factors: FloatArray) -> list[tuple[Delta, float]]:
+        """Return the changes by which the damping of each is a multiple of what it was."""
+        return [
+            (Delta(f"mode{mode}:damping", mode, "damping", 1.0), float(factor - 1.0))
+            for mode, factor in zip(self.modes, factors, strict=True)
+        ]
+
+
+def _mixed(
+    realisation: ModalRealisation, rng: np.random.Generator, size: float
+) -> ModalRealisation:
+    r"""Return a realisation whose elastic shapes hold a little of all others.
+
+    What a model lacks of mass and stiffness moves shapes, to first order, by
+
+    .. math:: \delta\phi_i = \sum_j \frac{\omega_i \max(\omega_i, \omega_j)}
+        {\omega_i^2 - \omega_j^2} E_{ij} \phi_j
+
+    with E_ij as large as the relative errors of omega^2 that it causes.
+    """
+    n, r = realisation.pairs.shape[0], realisation.n_rigid
+    real = ~np.any(realisation.inputs[:, ::2], axis=0)
+    omega, _ = natural(realisation.pairs)
+    omega[:r] = 0.0
+    E = np.triu(size * rng.standard_normal((n, n)), 1)
+    E = E + E.T
+    gap = omega[:, None] ** 2 - omega**2
+    gap[gap == 0] = np.inf  # of rigid-body motions, and each mode of itself
+    part = E * omega[:, None] * np.maximum(omega[:, None], omega) / gap
+    part /= np.sqrt(1.0 + part**2)  # near each other modes turn, and mix no further
+    part[:r] = 0.0
+    part[:, ~real], part[~real] = 0.0, 0.0
+    inputs, outputs = np.array(realisation.inputs), np.array(realisation.outputs)
+    s: FloatArray = realisation.pairs[:, 0, 1]
+    phi = inputs[:, 1::2].copy()
+    changed = phi + phi @ part.T
+    inputs[:, 1::2] = changed
+    outputs[:, ::2] += (changed - phi) / s
+    return realisation.replace(inputs=inputs, outputs=outputs)

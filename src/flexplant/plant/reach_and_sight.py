@@ -16,7 +16,7 @@ from ..lti.roots import axis_zeros
 from ..lti.statespace import StateSpace
 from ..tolerances import ROUNDING, SAME, SPLIT, TINY, TYPED, divisor
 from .partition import Partition
-from .rigid.rigid_motion import body_of, rigid_modes
+from .rigid_motion import body_of, rigid_modes
 
 #: a motion weaker than this beside the strongest one counts as absent
 _ABSENT = 1e-8

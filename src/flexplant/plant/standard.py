@@ -14,17 +14,14 @@ from ..errors import LabelError, ModelError
 from ..labels import Place
 from ..lti.statespace import System
 from .assumptions import AssumptionReport
-from .building import continuous_plant, rebuilt, sampled
-from .moving import Along, along, moved_ports, seen_elsewhere
+from .building import altered_like, continuous_plant, measured_through, rebuilt, sampled, weighted
+from .moving import Along, PositionMap, along, moved_ports, position_map, seen_elsewhere
 from .partition import Partition
 from .ports import Ports
-from .position_map import PositionMap, position_map
-from .realisation import ModalRealisation, Structure
-from .residual_form import ResidualForm, plant_modes
-from .rigid.rigid_motion import RigidModes, rigid_modes_of
+from .realisation import ModalRealisation, ResidualForm, Structure, plant_modes
+from .rigid_motion import RigidModes, rigid_modes_of
 from .uncertainty.opening import uncertain
 from .uncertainty.uncertain_plant import UncertainPlant
-from .weighting import altered_like, measured_through, weighted
 
 _WEIGHTS = "Pass stage_weights(plant, bandwidth), or z={...} and w={...}."
 

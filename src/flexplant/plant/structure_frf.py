@@ -26,8 +26,7 @@ from ..reduction import ReducedModel
 from ..structure import Damping, FEModel
 from .dynamics import port_rows
 from .ports import Ports
-from .realisation import Structure
-from .residual_form import plant_modes
+from .realisation import Structure, plant_modes
 
 
 def _none() -> FloatArray:

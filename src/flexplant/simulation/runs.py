@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks import FloatArray, IntArray
 from ..loop import ClosedLoop
-from ..loop.applied import applied_law
+from ..loop.blocks import applied_law
 from ..loop.budget import WhiteNoise
 from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, Recursion, cheapest
 from ..lti.statespace import StateSpace

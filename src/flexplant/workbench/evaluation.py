@@ -14,7 +14,8 @@ from ..checks import ComplexArray, FloatArray
 from ..errors import AssumptionError
 from ..loop import LoopMargins
 from ..loop.broken import BrokenLoop
-from ..loop.report import NyquistCount, broken_count, broken_margins
+from ..loop.measured_loop import NyquistCount
+from ..loop.report import broken_count, broken_margins
 from ..loop.sensitivity import broken_bandwidth
 from ..lti.interconnection import loop_poles, side_by_side
 from ..lti.measured_lines import low_slope, on_lines

@@ -20,8 +20,7 @@ from ...updating.parameters.added import Parameter
 from ..building import P, rebuilt, sampled
 from ..partition import Partition
 from ..port import ForcePort
-from ..realisation import MODAL, ModalRealisation
-from ..residual_form import plant_modes
+from ..realisation import MODAL, ModalRealisation, plant_modes
 from .neglected import NeglectedModes
 
 

@@ -21,7 +21,7 @@ from ...loop import (
     report_loops,
 )
 from ...loop.blocks import references
-from ...loop.comparison import axis_sensitivities, error_sensitivity
+from ...loop.report import axis_sensitivities, error_sensitivity
 from ...plant import StandardPlant
 from ...simulation import ExposureErrors, Verdict
 from ..errors import budget

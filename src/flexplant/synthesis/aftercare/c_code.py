@@ -13,7 +13,7 @@ import numpy as np
 from ...checks import FloatArray, flag, number, positive, short
 from ...errors import AssumptionError, LabelError, ModelError, require_known
 from ...loop import ClosedLoop, ScheduledLoop
-from ...loop.applied import applied_law
+from ...loop.blocks import applied_law
 from ...lti.statespace import StateSpace, as_statespace
 from ...store import written
 from ...tolerances import SAME

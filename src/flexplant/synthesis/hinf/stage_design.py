@@ -18,7 +18,7 @@ from ...errors import (
     attempted,
 )
 from ...loop import ClosedLoop, close_loop
-from ...loop.mode_tolerance import BEYOND, mode_tolerances
+from ...loop.other_machines import BEYOND, mode_tolerances
 from ...lti.interconnection import series
 from ...lti.joining import equal_matrices
 from ...lti.statespace import StateSpace
@@ -30,9 +30,9 @@ from ...plant import (
     stage_weights,
     standard_plant,
 )
+from ...plant.larger_plant import damped_less, draws_with_left_out
 from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ...plant.uncertainty.whole_machines import damped_less, draws_with_left_out
 from ..controller import Controller, with_left_out
 from .hinf_design import Solved, tolerant, tolerant_system
 from .hinf_riccati import Riccati

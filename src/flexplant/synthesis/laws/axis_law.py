@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ...checks import ComplexArray, FloatArray, IntArray
 from ...errors import SolverError
-from ...loop.report import nyquist_count
+from ...loop.measured_loop import nyquist_count
 from ...lti.measured_lines import FEWEST, between_lines, hidden_modes, steps_between
 from ...tolerances import TINY
 from .controller_elements import LowPass, Notch, Pid

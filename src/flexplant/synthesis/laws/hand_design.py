@@ -12,8 +12,8 @@ import numpy as np
 from ...checks import FloatArray, Value, flag, instance, number, positive, real_array, short, whole
 from ...errors import AssumptionError, LabelError, ModelError, ShapeError, require_known
 from ...fingerprint import fingerprint
-from ...loop.axes import static_map
 from ...loop.blocks import DERIVATIVES
+from ...loop.measured_loop import static_map
 from ...lti.frequency import Frf
 from ...lti.interconnection import side_by_side
 from ...lti.statespace import StateSpace

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray, IntArray
-from ...loop.report import nyquist_count
+from ...loop.measured_loop import nyquist_count
 from ...lti.frequency import Frf
 from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ...lti.interconnection import loop_poles

@@ -11,7 +11,7 @@ import numpy as np
 from ...checks import FloatArray, Value, name_list, short
 from ...errors import LabelError, ModelError, counted, require_known, warn
 from ...loop import LoopReport, ModeTolerances, SpillOver, in_axes, report_loops
-from ...loop.axes import static_map
+from ...loop.measured_loop import static_map
 from ...loop.sensitivity import taken_apart
 from ...lti.frequency import Frf
 from ...lti.interconnection import series, side_by_side

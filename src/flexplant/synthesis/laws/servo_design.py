@@ -13,13 +13,13 @@ from ...checks import FloatArray, between, positive, real_array
 from ...errors import AssumptionError, LabelError, ModelError, SolverError, counted, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
-from ...loop.spill_over import growing_modes, modes_in_words
+from ...loop.other_machines import growing_modes, modes_in_words
 from ...lti.interconnection import loop_poles
 from ...lti.joining import block_matrix
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import Poi, StandardPlant, larger_plant, standard_plant
-from ...plant.rigid.rigid_motion import RigidModes, require_weak
+from ...plant.rigid_motion import RigidModes, require_weak
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import SAME
 from ..controller import CLOSE, Controller, unchecked

@@ -18,7 +18,7 @@ from ...lti.responses import responder, responses
 from ...lti.statespace import StateSpace
 from ...plant import Foreign, Poi, StandardPlant
 from ...plant.realisation import natural
-from ...plant.rigid.rigid_motion import rigid_gain
+from ...plant.rigid_motion import rigid_gain
 from ...tolerances import SAME, divisor
 from .controller_elements import LowPass, Notch, Pid
 from .law import Law

@@ -17,10 +17,10 @@ from ...lti.interconnection import lft, series, side_by_side
 from ...lti.responses import Responder, responder
 from ...lti.statespace import StateSpace, as_statespace
 from ...plant import StandardPlant
+from ...plant.building import at_rate
 from ...plant.uncertainty.delta_channels import DeltaChannels, delta_channels
 from ...plant.uncertainty.neglected import with_neglected
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ...plant.weighting import at_rate
 from .uncertainty_blocks import Block, FullBlock, Perturbation, RepeatedScalar, realised_delta
 
 #: heights are taken this much above the weights at the frequencies that sample an interval

@@ -9,18 +9,18 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray, Value, members, positive, real_array
-from ...errors import ModelError, counted
-from ...labels import Place
-from ...modes import Modes, normal_form
-from ...modes.matching import runs
-from ...reduction import ReducedModel
-from ...structure import Damper, FEModel, Spring
-from ...structure.placed import SPANNED
-from ...structure.rigid import orthonormalised
-from ...tolerances import divisor
-from ..port import checked_place, port_direction
-from ..realisation import realise
+from ..checks import ComplexArray, FloatArray, Value, members, positive, real_array
+from ..errors import ModelError, counted
+from ..labels import Place
+from ..modes import Modes, normal_form
+from ..modes.matching import runs
+from ..reduction import ReducedModel
+from ..structure import Damper, FEModel, Spring
+from ..structure.placed import SPANNED
+from ..structure.rigid import orthonormalised
+from ..tolerances import divisor
+from .port import checked_place, port_direction
+from .realisation import realise
 
 Suspended = TypeVar("Suspended", FEModel, ReducedModel, Modes)
 #: relative: a rigid-body motion that stretches a spring by less than this does not

@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...checks import FloatArray, Value
-from ...errors import AssumptionError, ModelError
-from ...labels import DIRECTIONS
-from ...structure import FEModel
-from ...structure.placed import SPANNED
-from ...structure.rigid import turned_about
-from ...tolerances import SAME
-from ..realisation import ModalRealisation, Structure
+from ..checks import FloatArray, Value
+from ..errors import AssumptionError, ModelError
+from ..labels import DIRECTIONS
+from ..structure import FEModel
+from ..structure.placed import SPANNED
+from ..structure.rigid import turned_about
+from ..tolerances import SAME
+from .realisation import ModalRealisation, Structure
 
 #: part of a channel's largest motion that counts as seen
 _SEEN = 1e-9
