@@ -87,7 +87,7 @@ LINES = [
      "1.0 * getattr(a"),
     ("synthesis/structured/judges.py", "own = 2.0 *",
      "own = 1.0 *"),
-    ("synthesis/robustness/robust_stability.py", "upper = float(np.sqrt(found.level))",
+    ("synthesis/robustness/guarantees.py", "upper = float(np.sqrt(found.level))",
      "upper = float(found.level)"),
     ("lti/balancing.py", "2.0 * float(np.sum(values[r:]))",
      "1.0 * float(np.sum(values[r:]))"),

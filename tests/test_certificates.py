@@ -272,18 +272,18 @@ WRONG = {
         ), "was claimed",
     ),
     "largest gain": (
-        "synthesis.robustness.gain._machine_gain", larger(100.0, 0),
+        "synthesis.robustness.guarantees._machine_gain", larger(100.0, 0),
         lambda: fx.synthesis.worst_case_gain(off_by(0.01), lead(), w=["d"], z=["tip:x"]),
         "was proven as largest",
     ),
     "mu of one channel a mode": (
-        "synthesis.robustness.mode_dk._grid_peak", larger(100.0),
+        "synthesis.robustness.dk._grid_peak", larger(100.0),
         lambda: fx.synthesis.design_mu(
             off_by(0.01), w=["d", "y1:noise"], z=["tip:x", "u1:effort"], iterations=1
         ), "times the gain",
     ),
     "robust stability by machines": (
-        "synthesis.robustness.robust_stability.stability", lambda _: lambda *_: 1.5,
+        "synthesis.robustness.guarantees.stability", lambda _: lambda *_: 1.5,
         lambda: fx.synthesis.robust_stability(off_by(0.01), lead(), machines=8), "is unstable",
     ),
     "structured claim": (

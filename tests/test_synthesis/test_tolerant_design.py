@@ -9,7 +9,7 @@ import flexplant as fx
 from flexplant.errors import InfeasibleError, ModelError
 from flexplant.modes import solve_modes
 from flexplant.structure import FEModel, ModalDamping
-from flexplant.synthesis.robustness.robust_stability import _quick
+from flexplant.synthesis.robustness.guarantees import _quick
 from plates import make_plate
 from stages import RATE, ports, sampled, some_modes
 

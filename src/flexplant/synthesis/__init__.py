@@ -76,12 +76,12 @@ from .objectives.specifications import Hinf as Hinf
 from .objectives.specifications import PeakGain as PeakGain
 from .objectives.specifications import PoleRegion as PoleRegion
 from .robustness.dk import design_mu as design_mu
-from .robustness.gain import WorstCaseGain as WorstCaseGain
-from .robustness.gain import worst_case_gain as worst_case_gain
+from .robustness.guarantees import RobustStability as RobustStability
+from .robustness.guarantees import WorstCaseGain as WorstCaseGain
+from .robustness.guarantees import robust_stability as robust_stability
+from .robustness.guarantees import worst_case_gain as worst_case_gain
 from .robustness.mu import MuBounds as MuBounds
 from .robustness.mu import mu as mu
-from .robustness.robust_stability import RobustStability as RobustStability
-from .robustness.robust_stability import robust_stability as robust_stability
 from .robustness.uncertainty_blocks import FullBlock as FullBlock
 from .robustness.uncertainty_blocks import RepeatedScalar as RepeatedScalar
 from .structured.structured_design import design_structured as design_structured

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...checks import FloatArray, whole
-from ...errors import AssumptionError, FlexplantError, ModelError, SolverError, counted
+from ...errors import (
+    AssumptionError,
+    CertificateError,
+    FlexplantError,
+    ModelError,
+    SolverError,
+    attempted,
+    counted,
+)
 from ...lti.discretisation import tustin
-from ...lti.frequency_sweep import resonance_grid
-from ...lti.interconnection import series, side_by_side
+from ...lti.frequency_sweep import largest_gains, resonance_grid
+from ...lti.interconnection import lft, series, side_by_side
+from ...lti.preparation import prepared
+from ...lti.responses import responder
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant
@@ -18,25 +29,44 @@ from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import ROUNDING
 from ..controller import Controller, SynthesisMethod, with_left_out
 from ..hinf.hinf_design import design_hinf
-from .mode_dk import by_mode_channels
-from .sweep import covered
-from .uncertain_loop import OpenPlant, UncertainLoop, open_plant, require_uncertain, uncertain_loop
+from ..hinf.hinf_riccati import quick_answer
+from ..hinf.mode_channels import (
+    ModeChannel,
+    ModeLoop,
+    mode_channels,
+    rebalanced,
+    with_mode_channels,
+)
+from .mu import Cover
+from .uncertain_loop import (
+    UncertainLoop,
+    open_plant,
+    require_uncertain,
+    uncertain_loop,
+    weighted_names,
+)
 from .uncertainty_blocks import FullBlock, Scalings, block_places, osborne
 from .upper import upper_level
 
 #: frequencies at which D is found
 _POINTS = 40
-#: relative decrease of mu below which the iteration ends
-_SETTLED = 0.01
+#: relative decrease of mu below which the iteration ends: D(s), one channel a mode
+_SETTLED, _SETTLED_BY_MODES = 0.01, 0.02
+#: relative distance of mu from the level that D was found for, from which on D is found again
+_NEAR = 0.02
+#: machines at corners of the uncertainty that are closed exactly, and by how much their gain may
+#: exceed the bound: the first order of the channels
+_MACHINES, _BEYOND = 8, 0.05
 
 
 class _DkStep(NamedTuple):
-    """A controller with its mixed mu, and the loop it was found from."""
+    """A controller with its mixed mu, and the loop or the channels that the next step needs."""
 
+    number: int
     mu: float
     controller: StateSpace
-    loop: UncertainLoop
-    freq: float
+    after: Any
+    freq: float = np.nan
 
 
 @one_thread()
@@ -109,43 +139,60 @@ def design_mu(
     most = whole(iterations, "iterations")
     states = whole(order, "order", minimum=0)
     if uncertain.neglected is None and all(one.kind == "freq" for one in uncertain.deltas):
-        answer = by_mode_channels(uncertain, w, z, most, method, progress)
+        answer = _by_mode_channels(uncertain, w, z, most, method, progress)
         if answer is not None:
             return with_left_out(answer, uncertain.plant, larger)
-    plant = open_plant(uncertain, w=w, z=z)
-    scales = _DFilters.none(plant)
-    best: _DkStep | None = None
-    found: list[float] = []
-    failure: FlexplantError | None = None
-    with Progress(most + 1, "steps of D-K", progress=progress) as bar:
-        for number in range(most + 1):
-            bar.advance(int(number > 0))
-            try:
-                K = _scaled_controller(plant, scales, method, nominal=not number)
-                step = _robust_step(uncertain, K, w, z)
-            except FlexplantError as error:
-                failure = error
-                if number or not isinstance(error, AssumptionError | SolverError):
-                    break
-                scales = _DFilters.none(plant)
-                continue
-            found.append(step.mu)
-            settled = best is not None and number > 1 and step.mu > (1.0 - _SETTLED) * best.mu
-            if best is None or step.mu < best.mu:
-                best = step
-            if settled:
-                break
-            scales = _scales_of(plant, step.loop, states)
+    steps = _filter_steps(uncertain, w, z, method, most, states)
+    best, found = _best_step(steps, most + 1, _SETTLED, progress)
     if best is None:
-        raise failure or SolverError("no step of the D-K iteration gave a controller. Report it.")
-    steps = {f"mu of step {i}": value for i, value in enumerate(found)}
+        raise SolverError("no step of the D-K iteration gave a controller. Report it.")
     answer = Controller(
         best.controller,
         f"D-K iteration, {counted(len(found), 'step')}",
         gamma=best.mu,
-        certificate={"mu": best.mu, "at Hz": best.freq} | steps,
+        certificate={"mu": best.mu, "at Hz": best.freq} | found,
     )
     return with_left_out(answer, uncertain.plant, larger)
+
+
+def _best_step(
+    steps: Iterator[_DkStep], most: int, settled: float, progress: bool | None
+) -> tuple[_DkStep | None, dict[str, float]]:
+    """Return the step of the smallest mu, and mu of each; they end where mu falls no further."""
+    best: _DkStep | None = None
+    found: dict[str, float] = {}
+    with Progress(most, "steps of D-K", progress=progress) as bar:
+        try:
+            for step in steps:
+                bar.advance()
+                found[f"mu of step {step.number}"] = step.mu
+                known = np.inf if best is None or step.number < 2 else best.mu
+                if best is None or step.mu < best.mu:
+                    best = step
+                if step.mu > (1.0 - settled) * known:
+                    break
+        except FlexplantError:
+            if best is None:
+                raise
+    return best, found
+
+
+def _filter_steps(
+    uncertain: UncertainPlant[Any], w: Any, z: Any, method: Any, most: int, order: int
+) -> Iterator[_DkStep]:
+    """Yield the nominal controller, then those of plants scaled by D(s) of the loop before."""
+    plant = open_plant(uncertain, w=w, z=z)
+    scales = _DFilters.none(plant)
+    for number in range(most + 1):
+        try:
+            K = _scaled_controller(plant, scales, method, nominal=not number)
+            step = _robust_step(uncertain, number, K, w, z)
+        except (AssumptionError, SolverError):
+            if number:
+                raise
+            continue
+        yield step
+        scales = _scales_of(plant, step.after, order)
 
 
 class _DFilters(NamedTuple):
@@ -155,7 +202,7 @@ class _DFilters(NamedTuple):
     into: tuple[StateSpace, ...]
 
     @classmethod
-    def none(cls, plant: OpenPlant) -> _DFilters:
+    def none(cls, plant: UncertainLoop) -> _DFilters:
         """Return ones, and the weights of neglected modes by few states."""
         n = sum(block.z for block in plant.blocks)
         m = sum(block.w for block in plant.blocks)
@@ -174,7 +221,7 @@ def _fit_grid(g: StateSpace) -> FloatArray:
 
 
 def _scaled_controller(
-    plant: OpenPlant, scales: _DFilters, method: SynthesisMethod | None, *, nominal: bool
+    plant: UncertainLoop, scales: _DFilters, method: SynthesisMethod | None, *, nominal: bool
 ) -> StateSpace:
     """Return the H-infinity controller of the scaled plant, sampled like the plant."""
     g, n, m = plant.system, len(scales.out), len(scales.into)
@@ -185,20 +232,23 @@ def _scaled_controller(
         into = [*scales.into, *ones * (len(g.inputs) - m)]
         out = [*scales.out, *ones * (len(g.outputs) - n)]
         scaled = series(series(side_by_side(into, g.inputs), g), side_by_side(out, g.outputs))
-    standard = StandardPlant.from_statespace(scaled, u=plant.u, y=plant.y)
+    own = plant.uncertain.plant
+    standard = StandardPlant.from_statespace(scaled, u=own.u, y=own.y)
     K = design_hinf(standard, method).system
     return tustin(K, 1.0 / plant.dt) if plant.dt else K
 
 
-def _robust_step(uncertain: UncertainPlant[Any], K: StateSpace, w: Any, z: Any) -> _DkStep:
+def _robust_step(
+    uncertain: UncertainPlant[Any], number: int, K: StateSpace, w: Any, z: Any
+) -> _DkStep:
     """Return mu of robust performance of a controller, real Deltas real."""
     loop = uncertain_loop(uncertain, [K], w=w, z=z)
     blocks = [*loop.blocks, loop.performance]
-    found = covered(loop.system, blocks, heights=loop.heights, accuracy=0.02)
-    return _DkStep(float(np.sqrt(found.level)), K, loop, loop.freq(found.omega))
+    found = Cover(loop.system, blocks, heights=loop.heights, accuracy=0.02).run()
+    return _DkStep(number, float(np.sqrt(found.level)), K, loop, float(loop.freq(found.omega)))
 
 
-def _scales_of(plant: OpenPlant, loop: UncertainLoop, order: int) -> _DFilters:
+def _scales_of(plant: UncertainLoop, loop: UncertainLoop, order: int) -> _DFilters:
     """Return D of a loop as filters: one for each block, its Delta taken as complex."""
     blocks = [FullBlock(block.w, block.z) for block in (*loop.blocks, loop.performance)]
     scalings, where = Scalings(blocks), block_places(blocks)
@@ -278,3 +328,113 @@ def _scaled_series(k: float, a: FloatArray, b: FloatArray) -> StateSpace:
         one = StateSpace([[-pole]], [[root]], [[(zero - pole) / root]], [[1.0]])
         g = one * g
     return g
+
+
+def _by_mode_channels(
+    uncertain: UncertainPlant[Any],
+    w: Any,
+    z: Any,
+    most: int,
+    method: SynthesisMethod | None,
+    progress: bool | None,
+) -> Controller | None:
+    """Return the controller of the smallest mu over the steps; None where no step shows any.
+
+    Step k solves the H-infinity problem of Deltas and weights divided by the mu of the step before:
+    at a fixed point the norm is 1 and mu what it was divided by.
+    """
+    plant = uncertain.plant
+    weighted = _performance_plant(plant, w, z)
+    stated = None
+    with attempted("mode by mode", AssumptionError):  # no disturbance moves them: no D to begin
+        stated = mode_channels(weighted, uncertain)
+    if stated is None:
+        return None
+    steps = _mode_steps(weighted, stated, method, most)
+    best, found = _best_step(steps, most, _SETTLED_BY_MODES, progress)
+    if best is None or not np.isfinite(best.mu):
+        return None
+    largest = {"largest gain of machines over mu": _corner_ratio(uncertain, best, w, z)}
+    return Controller(
+        best.controller,
+        f"D-K iteration with one channel a mode, {counted(len(found), 'step')}",
+        gamma=best.mu,
+        certificate={"mu": best.mu} | found | largest,
+    )
+
+
+def _mode_steps(
+    weighted: StandardPlant, channels: Sequence[ModeChannel], method: Any, most: int
+) -> Iterator[_DkStep]:
+    """Yield controllers, each for Deltas and weights over the mu of the step before."""
+    level = 1.0
+    for number in range(1, most + 1):
+        step = None
+        with attempted(f"step {number} of the D-K iteration"):
+            step = _dk_iteration(weighted, number, channels, level, method)
+        if step is None:
+            return
+        yield step
+        level, channels = min(step.mu, 2.0 * level), step.after
+
+
+def _dk_iteration(
+    weighted: StandardPlant,
+    number: int,
+    channels: Sequence[ModeChannel],
+    level: float,
+    method: SynthesisMethod | None,
+) -> _DkStep:
+    """Return the controller for Deltas and weights over a level, its mu, and channels for it."""
+    sized = [one.of_size(1.0 / level) for one in channels]
+    plant = with_mode_channels(weighted, sized)
+    g = plant.system
+    scale = np.ones(len(g.outputs))
+    scale[g.output_index(weighted.z)] = 1.0 / level
+    system = g.replace(C=g.C * scale[:, None], D=g.D * scale[:, None])
+    problem = prepared(system, plant.u, plant.y)
+    found = quick_answer(problem) if method is None else method.solve(problem)
+    K = problem.restored(found.A, found.B, found.C, found.D).replace(name="mu", units=plant.units)
+    if not lft(system, K).is_stable:
+        raise SolverError("the controller does not stabilise in rounding.")
+    again = rebalanced(channels, with_mode_channels(weighted, channels), K)
+    loop = ModeLoop.of(again, with_mode_channels(weighted, again), K, 2.0, weighted=True)
+    mu = loop.level(level)
+    if abs(mu / level - 1.0) > _NEAR:  # D is found for a level
+        mu = min(mu, loop.level(mu))
+    return _DkStep(number, mu, K, again)
+
+
+def _performance_plant(plant: StandardPlant, w: Any, z: Any) -> StandardPlant:
+    """Return a plant with the channels of performance alone, weighted."""
+    sides = {}
+    for side, given in (("z", z), ("w", w)):
+        names, weights = weighted_names(given, side)
+        own = {name: weights.get(name, 1.0) for name in names}
+        sides[side] = dict.fromkeys(getattr(plant, side)) | own  # None leaves one out
+    return plant.weighted(**sides)
+
+
+def _corner_ratio(uncertain: UncertainPlant[Any], best: _DkStep, w: Any, z: Any) -> float:
+    """Return the largest weighted gain of machines at corners, each closed exactly, over mu."""
+    chance, size = np.random.default_rng(0), min(1.0, 1.0 / best.mu)
+    names = [delta.name for delta in uncertain.deltas]
+    most = 0.0
+    for _ in range(_MACHINES):
+        ends = size * chance.choice([-1.0, 1.0], len(names))
+        machine = uncertain.lft(dict(zip(names, ends.tolist(), strict=True)))
+        loop = lft(_performance_plant(machine, w, z).system, best.controller)
+        most = max(most, _grid_peak(loop) / best.mu if loop.is_stable else np.inf)
+    if most > 1.0 + _BEYOND:
+        raise CertificateError(
+            f"of machines within {size:.3g} of the uncertainty one has {most:.4g} times the gain "
+            f"of mu <= {best.mu:.4g} (inf: it is unstable): the changes are too large for the "
+            "first order of one channel a mode. State less uncertainty, or raise the rate."
+        )
+    return most
+
+
+def _grid_peak(loop: StateSpace) -> float:
+    """Return the largest singular value over a grid through the resonances."""
+    gains = responder(loop)(resonance_grid(loop.poles(), loop.dt))
+    return float(largest_gains(gains).max())

@@ -1,0 +1,537 @@
+"""What a loop keeps on every machine of an uncertainty: `robust_stability`, `worst_case_gain`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+
+from ...certificates import stability
+from ...checks import MOST, ComplexArray, FloatArray, Value, generator, whole
+from ...errors import AssumptionError, CertificateError, FlexplantError, ModelError, counted
+from ...loop import ClosedLoop, SpillOver, close_loop
+from ...lti.frequency import frequency_response
+from ...lti.frequency_sweep import largest_gains
+from ...lti.norms import peak_gain
+from ...lti.statespace import StateSpace
+from ...parallel import Progress, one_thread
+from ...plant import StandardPlant, larger_plant
+from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ..hinf.mode_channels import mode_channels, tolerated, with_mode_channels
+from .lower import Destabilising, destabilising, power_iteration, smallest_with_block
+from .mu import INTERVALS, Cover, Covered, sought
+from .uncertain_loop import UncertainLoop, uncertain_loop
+from .uncertainty_blocks import Perturbation, block_places, matrix_of
+
+#: mu below this is not resolved
+_RESOLVED = 0.05
+#: starts of a search at each frequency
+_STARTS = 3
+#: the worst machine is shown this much beyond its edge of stability
+_BEYOND = 1e-3
+#: largest multiple of an uncertainty that the quick bound tries
+_REACH = 2.0
+#: frequencies that start a search for the largest gain, rounds over all real Deltas
+_SOUGHT, _ROUNDS = 5, 3
+#: frequencies around the worst one at which gains are compared
+_BAND = np.concatenate([[0.0], np.geomspace(1e-4, 0.3, 20), -np.geomspace(1e-4, 0.3, 20)])
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RobustStability(Value):
+    """Bounds on the uncertainty under which a loop is stable, and the smallest that is not.
+
+    Parameters
+    ----------
+    upper : float
+        mu: every machine with Deltas smaller than ``1 / upper`` is stable; below 1, all machines
+        of the uncertainty are. Values below 0.05 are not resolved.
+    lower : float
+        A machine with Deltas of ``1 / lower`` is not stable; 0 when none was found.
+    freq : float [Hz]
+        Where mu is largest; NaN where it is not resolved.
+    values : mapping {str: float}
+        The Deltas of that machine.
+    machine : StandardPlant, optional
+        That machine, a little beyond its edge of stability; it can be simulated. None when it is
+        none that could exist (without stiffness or damping) or none was found.
+    frequencies, bounds : (k,) arrays [Hz, 1]
+        Upper bounds at single frequencies; where they are not near the largest they need not be
+        the smallest.
+    certificate : mapping {str: float}
+        Machines that were drawn and closed exactly, and how stable the least stable was; the
+        distance of sampled channels from sampled machines; how many intervals between frequencies
+        were proven by Hamiltonian matrices (0 above 260 states: sampled); the check with modes
+        left out.
+    left_out : SpillOver, optional
+        How the nominal loop stands on the plant with the modes left out, where these are known.
+    """
+
+    upper: float
+    lower: float
+    freq: float
+    values: Mapping[str, float]
+    machine: StandardPlant | None
+    frequencies: FloatArray
+    bounds: FloatArray
+    certificate: Mapping[str, float]
+    left_out: SpillOver | None = None
+
+    @property
+    def is_robust(self) -> bool:
+        """Whether every machine of the uncertainty is proven stable."""
+        return self.upper < 1.0
+
+    def __repr__(self) -> str:
+        verdict = "every machine is stable" if self.is_robust else "not proven for every machine"
+        if self.lower >= 1.0:
+            verdict = "a machine of the uncertainty is unstable"
+        bounds = f"{self.lower:.4g} <= mu <= {self.upper:.4g}"
+        where = f", largest at {self.freq:.5g} Hz" if np.isfinite(self.freq) else ""
+        lines = [f"<RobustStability: {verdict}, {bounds}{where}"]
+        if self.lower:
+            shown = _largest_deltas(self.values)
+            lines.append(f"  unstable at {1 / self.lower:.4g} times the uncertainty: {shown}")
+        shown = ", ".join(f"{k} {v:.4g}" for k, v in self.certificate.items())
+        lines.append(f"  verified: {shown}")
+        if self.left_out is not None:
+            lines.append(f"  with the modes left out: {self.left_out.summary}")
+        return "\n".join(lines) + ">"
+
+
+def _largest_deltas(values: Mapping[str, float]) -> str:
+    most = sorted(values.items(), key=lambda one: -abs(one[1]))[:4]
+    return ", ".join(f"{name} {value:+.3g}" for name, value in most)
+
+
+@one_thread()
+def robust_stability(
+    uncertain: UncertainPlant[Any],
+    *blocks: Any,
+    quick: bool = False,
+    larger: Any = None,
+    machines: int = 20,
+    rng: Any = 0,
+    progress: bool | None = None,
+) -> RobustStability:
+    """Return bounds on the uncertainty under which a loop is stable: mu of all its Deltas.
+
+    Real Deltas (frequencies, damping, parameters) stay real, neglected modes are one full complex
+    block. The bound holds between grid points; a sampled loop is examined as it is sampled and
+    delayed. What it says is tried on machines drawn from the uncertainty, each closed exactly.
+
+    Parameters
+    ----------
+    uncertain : UncertainPlant
+        From `plant.uncertain(fit, neglected=larger)`.
+    *blocks : StateSpace, or values with a `system`
+        The controller, as for `close_loop`.
+    quick : bool
+        Where all Deltas are frequencies, first a bound with one channel a mode, the change of a
+        sampled mode to first order, on a grid through the resonances: a fraction of a second for
+        ten modes. Where it is below 1 it is the answer, without a lower bound; else the whole
+        search follows.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes that the plant left out, as for `larger_plant`: the nominal loop is
+        checked there too.
+    machines : int
+        How many are drawn, each Delta at an end of its interval.
+    rng : int, SeedSequence, Generator or None
+        Of the machines and of the search for the worst.
+    progress : bool, optional
+        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
+
+    Returns
+    -------
+    RobustStability
+
+    Raises
+    ------
+    AssumptionError
+        When the nominal loop is not stable.
+    CertificateError
+        When a machine is unstable for which stability was proven, or sampled machines are too far
+        from affine in their Deltas.
+    ModelError
+        When `uncertain` is no uncertain plant.
+    SolverError
+        When intervals do not cover the frequency axis.
+
+    References
+    ----------
+    [ZhouDoyleGlover1996]_, chapter 11.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5])
+    >>> modes = fx.solve_modes(model, count=2, damping=fx.ModalDamping(0.02))
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x"]))
+    >>> spread = [[1.0, 0.0], [0.0, 4.0]]
+    >>> measured = fx.MeasuredModes(poles=[-17 + 890j], modes=[2], covariance=spread)
+    >>> fit = fx.update(drawing, [fx.AddedMass("2:x")], [fx.Eigenvalues(measured)])
+    >>> ports = fx.Ports(
+    ...     w=[fx.Disturbance("d", "1:x", "x", asd=1e-3)],
+    ...     u=[fx.Actuator("u1", "1:x", "x")],
+    ...     z=[fx.Poi("tip", "2:x", ("x",))],
+    ...     y=[fx.Sensor("y1", "1:x", "x", asd=1e-9)],
+    ... )
+    >>> plant = fx.assemble_plant(fit.model, ports)
+    >>> lead = -1e3 * fx.lti.tf([0.05, 1.0], [0.002, 1.0]).replace(inputs=["y1"], outputs=["u1"])
+    >>> fx.synthesis.robust_stability(plant.uncertain(fit), lead, machines=3).is_robust
+    True
+    """
+    count = whole(machines, "machines", minimum=0, maximum=MOST)
+    chance = generator(rng)
+    if quick:
+        first = _quick(uncertain, blocks, larger, count, chance)
+        if first is not None:
+            return first
+    loop = uncertain_loop(uncertain, blocks)
+    with Progress(None, INTERVALS, progress=progress):
+        found = Cover(loop.system, loop.blocks, heights=loop.heights, least=_RESOLVED**2).run()
+    upper = float(np.sqrt(found.level))
+    values, machine, lower = _worst_machine(loop, _worst(loop, found, upper, chance))
+    names = [name for name, _ in loop.channels.deltas]
+    # systems of many states are covered by sampling between the frequencies instead
+    beside = {"intervals by Hamiltonians": float(found.intervals * found.by_hamiltonian)}
+    if loop.dt:
+        beside["distance of channels"] = loop.channels.distance
+    return RobustStability(
+        upper,
+        min(lower, upper),
+        float(loop.freq(found.omega)) if upper > _RESOLVED else float("nan"),
+        values,
+        machine,
+        loop.freq(found.frequencies),
+        np.sqrt(np.maximum(found.bounds, 0.0)),
+        *_tried_on(uncertain, loop.loop, names, upper, count, chance, larger, beside),
+    )
+
+
+def _worst(
+    loop: UncertainLoop, found: Covered, upper: float, rng: np.random.Generator
+) -> Destabilising | None:
+    """Return the smallest perturbation that destabilises, as far as it was found."""
+    omegas = sought(loop.system, found)
+    if loop.neglected is None:
+        return destabilising(loop.system, loop.blocks, omegas, upper, rng)
+    where, best = block_places(loop.blocks), None
+    for omega in omegas:
+        gain = loop.system.evaluated(1j * omega) * loop.heights(omega, omega)
+        for _ in range(_STARTS):
+            start = power_iteration(gain, where, rng, omega)
+            one = smallest_with_block(gain, where, start, 0.99 / upper)
+            if one is not None and (best is None or one[0] < best.size):
+                best = Destabilising(one[0], one[1], omega)
+    return best
+
+
+def _worst_machine(
+    loop: UncertainLoop, worst: Destabilising | None
+) -> tuple[dict[str, float], StandardPlant | None, float]:
+    """Return the Deltas of the worst machine, that machine and one over its size.
+
+    Only what is not stable when closed exactly counts.
+    """
+    if worst is None:
+        return {}, None, 0.0
+    values: dict[str, float] = {}
+    for beyond in (0.0, _BEYOND, 10 * _BEYOND, 50 * _BEYOND):
+        size = worst.size * (1.0 + beyond)
+        values = loop.deltas(worst.found, size)
+        try:
+            made = loop.machine(worst.found, size)
+        except FlexplantError:  # no stiffness left, say: it can only be computed
+            return values, None, 1.0 / worst.size
+        if not loop.loop.around(made).is_stable:
+            return values, made, 1.0 / size
+    return values, None, 0.0
+
+
+def _quick(
+    uncertain: UncertainPlant[Any],
+    blocks: tuple[Any, ...],
+    larger: Any,
+    count: int,
+    rng: np.random.Generator,
+) -> RobustStability | None:
+    """Return the answer of one channel a mode where it shows stability, None where it does not."""
+    if uncertain.neglected is not None or any(d.kind != "freq" for d in uncertain.deltas):
+        return None
+    loop = close_loop(uncertain.plant, *blocks)
+    if loop.obstacle is not None:
+        return None  # the whole search says what is wrong
+    channels = mode_channels(uncertain.plant, uncertain)
+    opened = with_mode_channels(uncertain.plant, channels)
+    controller = loop.controller.select(outputs=loop.driven)
+    upper = tolerated(channels, opened, controller)
+    if not upper < 1.0:
+        return None
+    # the grid goes through the places of the modes at Deltas of a size, not beyond
+    size = 1.0 / max(upper, 1.0 / _REACH)
+    upper = max(1.0 / size, tolerated(channels, opened, controller, size) / size)
+    none, beside = np.zeros(0), {"modes, each by one channel": float(len(channels))}
+    names = [delta.name for delta in uncertain.deltas]
+    tried = _tried_on(uncertain, loop, names, upper, count, rng, larger, beside)
+    return RobustStability(upper, 0.0, float("nan"), {}, None, none, none, *tried)
+
+
+def _tried_on(
+    uncertain: UncertainPlant[Any],
+    nominal: ClosedLoop,
+    names: Sequence[str],
+    upper: float,
+    count: int,
+    rng: np.random.Generator,
+    larger: Any,
+    beside: Mapping[str, float],
+) -> tuple[dict[str, float], SpillOver | None]:
+    """Return how stable machines at corners are, each closed exactly, and the modes left out."""
+    size, worst, found = min(1.0, 0.999 / upper), -np.inf, {}
+    for _ in range(count):
+        ends = (size * rng.choice([-1.0, 1.0], len(names))).tolist()
+        loop = nominal.around(uncertain.lft(dict(zip(names, ends, strict=True))))
+        worst = max(worst, stability(loop.poles(), loop.plant.dt))
+    if not worst < (1.0 if nominal.plant.dt else 0.0):
+        raise CertificateError(
+            f"a machine with Deltas of {size:.3g} is unstable ({worst:.9g}), but mu <= "
+            f"{upper:.4g} was found: the loop is too badly conditioned. Report it."
+        )
+    if count:
+        kind = "largest spectral radius" if nominal.plant.dt else "largest real part"
+        found[f"{kind} of {counted(count, 'machine')}"] = worst
+    if larger is not None:
+        nominal = nominal.replace(larger=larger_plant(nominal.plant, larger))
+    left_out = nominal.left_out
+    return found | dict(beside) | dict(left_out.certificate if left_out else {}), left_out
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class WorstCaseGain(Value):
+    """The largest gain from w to z over all machines of an uncertainty.
+
+    Parameters
+    ----------
+    upper : float
+        No machine of the uncertainty has a larger gain at any frequency.
+    lower : float
+        The gain of `machine`, its norm computed from its own closed loop.
+    nominal : float
+        The gain without uncertainty.
+    freq : float [Hz]
+        Where `machine` has it.
+    values : mapping {str: float}
+        The Deltas of that machine.
+    machine : StandardPlant
+        It can be simulated.
+    frequencies, bounds : (k,) arrays [Hz, gain]
+        Upper bounds at single frequencies.
+    """
+
+    upper: float
+    lower: float
+    nominal: float
+    freq: float
+    values: Mapping[str, float]
+    machine: StandardPlant
+    frequencies: FloatArray
+    bounds: FloatArray
+
+    def __repr__(self) -> str:
+        return (
+            f"<WorstCaseGain: {self.lower:.4g} to {self.upper:.4g}, nominal {self.nominal:.4g}\n"
+            f"  reached at {self.freq:.5g} Hz by {_largest_deltas(self.values)}>"
+        )
+
+
+@one_thread()
+def worst_case_gain(
+    uncertain: UncertainPlant[Any],
+    *blocks: Any,
+    w: Any,
+    z: Any,
+    rng: Any = 0,
+    progress: bool | None = None,
+) -> WorstCaseGain:
+    """Return bounds on the largest gain from w to z over an uncertainty, and the worst machine.
+
+    From above by skewed mu: ``|Delta| <= 1`` is kept and the size of the performance block grows,
+    on intervals that cover all frequencies. From below by the machine that a search found, closed
+    exactly, sampled and delayed as the plant is.
+
+    Parameters
+    ----------
+    uncertain, *blocks
+        As for `robust_stability`.
+    w, z : sequence of str, or mapping {name: weight}
+        Channels of the gain; weights are numbers or systems of one input and output.
+    rng : int, SeedSequence, Generator or None
+        Of the search.
+    progress : bool, optional
+        As for `robust_stability`.
+
+    Returns
+    -------
+    WorstCaseGain
+
+    Raises
+    ------
+    AssumptionError
+        When the nominal loop is not stable, or machines of the uncertainty may be unstable.
+    CertificateError
+        When the machine found has a larger gain than was proven possible.
+    ModelError, LabelError
+        When `uncertain` is no uncertain plant, or channels are missing or unknown.
+    SolverError
+        When intervals do not cover the frequency axis.
+
+    References
+    ----------
+    [FanTits1992]_.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5])
+    >>> modes = fx.solve_modes(model, count=2, damping=fx.ModalDamping(0.02))
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x"]))
+    >>> spread = [[1.0, 0.0], [0.0, 4.0]]
+    >>> measured = fx.MeasuredModes(poles=[-17 + 890j], modes=[2], covariance=spread)
+    >>> fit = fx.update(drawing, [fx.AddedMass("2:x")], [fx.Eigenvalues(measured)])
+    >>> ports = fx.Ports(
+    ...     w=[fx.Disturbance("d", "1:x", "x", asd=1e-3)],
+    ...     u=[fx.Actuator("u1", "1:x", "x")],
+    ...     z=[fx.Poi("tip", "2:x", ("x",))],
+    ...     y=[fx.Sensor("y1", "1:x", "x", asd=1e-9)],
+    ... )
+    >>> plant = fx.assemble_plant(fit.model, ports)
+    >>> lead = -1e3 * fx.lti.tf([0.05, 1.0], [0.002, 1.0]).replace(inputs=["y1"], outputs=["u1"])
+    >>> uncertain = plant.uncertain(fit)
+    >>> found = fx.synthesis.worst_case_gain(uncertain, lead, w=["d"], z=["tip:x"])
+    >>> found.nominal <= found.lower <= found.upper
+    True
+    """
+    chance = generator(rng)
+    if not w or not z:
+        raise ModelError(
+            "a gain is from some w to some z: name them, w=['die:ref'], z=['die:error']."
+        )
+    loop = uncertain_loop(uncertain, blocks, w=w, z=z)
+    listed = [*loop.blocks, loop.performance]
+    nominal, _ = peak_gain(loop.performed(uncertain.plant))
+    size = nominal or 1.0
+    M = _in_units(loop.system, size, loop.performance.z)
+    with Progress(None, INTERVALS, progress=progress):
+        found = Cover(M, listed, [*[False] * len(loop.blocks), True], loop.heights).run()
+    if not np.isfinite(found.level):
+        raise AssumptionError(
+            "machines of the uncertainty may be unstable (at "
+            f"{loop.freq(found.frequencies[np.argmax(found.bounds)]):.5g} Hz), so that the "
+            "largest gain is infinite. See synthesis.robust_stability(uncertain, ...): lower "
+            "the bandwidth, notch the mode there, or measure it better."
+        )
+    upper = size * float(np.sqrt(found.level))
+    reached = [_machine_gain(loop, one) for one in _candidates(loop, M, listed, found, chance)]
+    lower, freq, values, made = max(reached, key=itemgetter(0))
+    if not lower <= upper * (1.0 + 1e-2):
+        raise CertificateError(
+            f"a machine of the uncertainty has the gain {lower:.6g}, {upper:.6g} was proven as "
+            "largest: the loop is too badly conditioned. Report it."
+        )
+    return WorstCaseGain(
+        max(upper, lower),
+        lower,
+        nominal,
+        freq,
+        values,
+        made,
+        loop.freq(found.frequencies),
+        size * np.sqrt(np.maximum(found.bounds, 0.0)),
+    )
+
+
+def _in_units(M: StateSpace, size: float, p: int) -> StateSpace:
+    """Return the system with its last p outputs in units of a size: the level sought is near 1.
+
+    A level of 1e-18, of 1e-9 m/N, is below what is resolved beside Deltas of size one.
+    """
+    unit = np.ones((len(M.outputs), 1))
+    unit[len(unit) - p :] = 1.0 / size
+    return M.replace(C=unit * M.C, D=unit * M.D)
+
+
+def _machine_gain(
+    loop: UncertainLoop, one: Perturbation
+) -> tuple[float, float, dict[str, float], StandardPlant]:
+    """Return the gain of the machine of a perturbation, where it is, its Deltas, and itself."""
+    values, made = loop.deltas(one, 1.0), loop.machine(one, 1.0)
+    closed = loop.performed(made)
+    if loop.neglected is None:
+        return *peak_gain(closed), values, made
+    # its weights have many states: the gain at frequencies around the worst
+    freqs = np.unique(loop.freq(np.unique(np.abs(one.omega * (1.0 + _BAND)))))
+    gains = largest_gains(frequency_response(closed, freqs).data)
+    where = int(np.argmax(gains))
+    return float(gains[where]), float(freqs[where]), values, made
+
+
+def _candidates(
+    loop: UncertainLoop,
+    M: StateSpace,
+    listed: list[Any],
+    found: Covered,
+    rng: np.random.Generator,
+) -> list[Perturbation]:
+    """Return perturbations of size one that are bad at some frequency, the worst first."""
+    where = block_places(listed)
+    chosen = [float(found.omega)]
+    for omega in found.frequencies[np.argsort(-found.bounds)]:
+        if len(chosen) < _SOUGHT and all(abs(omega - one) > 1e-2 * one for one in chosen):
+            chosen.append(float(omega))
+    results: list[tuple[float, Perturbation]] = []
+    for omega in chosen:
+        band = np.abs(omega * (1.0 + _BAND))
+        tall = loop.heights(omega, omega)
+        gains = np.array([M.evaluated(1j * one) * tall for one in band])
+        skewed = gains[0].copy()
+        skewed[where[-1].z] /= np.sqrt(found.level)
+        for _ in range(_STARTS):
+            one = power_iteration(skewed, where, rng, omega)
+            results.append(_corner_gain(gains, where, one))
+    return [one for _, one in sorted(results, key=lambda pair: -pair[0])[:2]]
+
+
+def _corner_gain(
+    gains: ComplexArray, where: list[Any], one: Perturbation
+) -> tuple[float, Perturbation]:
+    """Return the largest gain in a band, real Deltas moved one after the other to an end or 0."""
+    one = one._replace(vectors=one.vectors[:-1])
+    best = _perturbed_gain(gains, where, one)
+    for _ in range(_ROUNDS):
+        before = best
+        for i, number in enumerate(one.scalars):
+            for value in (-1.0, 1.0, 0.0):
+                if value == number:
+                    continue
+                scalars = (*one.scalars[:i], complex(value), *one.scalars[i + 1 :])
+                moved = one._replace(scalars=scalars)
+                gain = _perturbed_gain(gains, where, moved)
+                if gain > best:
+                    best, one = gain, moved
+        if best <= before * (1.0 + 1e-4):
+            break
+    return best, one
+
+
+def _perturbed_gain(gains: ComplexArray, where: list[Any], one: Perturbation) -> float:
+    """Return the largest gain over a band of the loop with a perturbation."""
+    performance = where[-1]
+    delta = matrix_of(one, where[:-1])
+    w, z = performance.w.start, performance.z.start
+    inner = np.eye(z) - gains[:, :z, :w] @ delta
+    through = gains[:, z:, :w] @ delta @ np.linalg.solve(inner, gains[:, :z, w:])
+    return float(np.linalg.norm(gains[:, z:, w:] + through, 2, axis=(1, 2)).max())
