@@ -406,12 +406,7 @@ class Progress:
     """
 
     def __init__(
-        self,
-        total: int | None,
-        description: str,
-        *,
-        progress: bool | None = None,
-        advice: str = "",
+        self, total: int | None, description: str, *, progress: bool | None = None, advice: str = ""
     ) -> None:
         self.bar: Any = None
         #: items counted, of these what was known before, and the seconds expected in all

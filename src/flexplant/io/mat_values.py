@@ -27,8 +27,7 @@ _LONGEST = 63
 
 
 def write_mat(
-    path: str | Path,
-    value: System | StandardPlant | ReducedModel | Frf | Mapping[str, Any],
+    path: str | Path, value: System | StandardPlant | ReducedModel | Frf | Mapping[str, Any]
 ) -> None:
     """Write a system, a plant, a reduced model or frequency responses, or several, for MATLAB.
 

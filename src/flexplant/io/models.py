@@ -20,10 +20,7 @@ _NASTRAN = (
     "OUTPUT4='run.op4',UNIT=31 above it write them as .op4, read_op4"
 )
 ELSEWHERE += [
-    Elsewhere(
-        (".op2",),
-        f"results, of which flexplant.io.read_modes reads the modes. {_NASTRAN}",
-    ),
+    Elsewhere((".op2",), f"results, of which flexplant.io.read_modes reads the modes. {_NASTRAN}"),
     Elsewhere((".f06", ".f04", ".out"), f"what a run printed, with too few digits. {_NASTRAN}"),
     Elsewhere(
         (".odb", ".fil", ".sim"),

@@ -77,9 +77,7 @@ def read_nodes(path: str | Path) -> Nodes:
 
 
 def basic_nodes(
-    grids: Mapping[int, Sequence[Any]],
-    systems: dict[int, tuple[str, list[str]]],
-    path: str,
+    grids: Mapping[int, Sequence[Any]], systems: dict[int, tuple[str, list[str]]], path: str
 ) -> Nodes:
     """Return nodes of (system of the place, place, system of the displacements) by number."""
     known = _Systems(systems, path)
@@ -240,10 +238,7 @@ _LETTERS = {"stiffness": "K", "mass": "M", "damping": "B"}
 
 
 def named_matrices(
-    found: Mapping[str, Any],
-    given: Mapping[str, str | None],
-    endings: Sequence[str],
-    path: str,
+    found: Mapping[str, Any], given: Mapping[str, str | None], endings: Sequence[str], path: str
 ) -> list[str | None]:
     """Return the names of stiffness, mass and damping; of the latter two None where not there."""
     names: list[str | None] = []

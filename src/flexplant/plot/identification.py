@@ -89,12 +89,7 @@ def stabilisation(
 
 
 def identified(
-    frf: Frf,
-    modes: IdentifiedModes,
-    output: str,
-    input: str,
-    *,
-    ax: Axes | None = None,
+    frf: Frf, modes: IdentifiedModes, output: str, input: str, *, ax: Axes | None = None
 ) -> Axes:
     """Draw a measured response, the identified one and what is left between them.
 
