@@ -27,9 +27,9 @@ from flexplant.synthesis import FixedBlock, LoopDesign, ShapedAxis
 from flexplant.workbench import exports
 from flexplant.workbench.consequences import step_of_lines, step_of_model
 from flexplant.workbench.evaluation import Evaluator
-from flexplant.workbench.fields import fields_of, parsed
+from flexplant.workbench.controls import fields_of, parsed
 from flexplant.workbench.launch import open_file
-from flexplant.workbench.machine import BenchMachine
+from flexplant.workbench.evaluation import BenchMachine
 from flexplant.workbench.page import Page
 
 pytest.importorskip("panel")

@@ -26,6 +26,6 @@ from ..rooms import called_names as _called_names
 from .launch import Workbench as Workbench
 from .launch import open_file as open_file
 from .launch import workbench as workbench
-from .limits import LoopLimits as LoopLimits
+from .verdict import LoopLimits as LoopLimits
 
 __dir__ = _called_names(__name__)

@@ -14,19 +14,23 @@ import numpy as np
 from ..errors import FlexplantError
 from ..synthesis import LoopDesign, Notch, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
-from . import exports, style
-from .bench import Bench, crossing_axis, first_axis
-from .consequences import Consequences
-from .controls import ElementCards, Number
-from .evaluation import AxisLoop, Evaluator, coupling
-from .fields import new_elements, parsed, with_new
-from .gestures import Gestures
-from .history import DesignHistory
-from .machine import BenchMachine
-from .side import SideCards
-from .tuning import Tuning
-from .verdict import of_fleet
-from .views import KEPT, Views
+from .bench import Bench, DesignHistory, crossing_axis, first_axis
+from .consequences import Consequences, Tuning
+from .controls import ElementCards, Number, new_elements, parsed, with_new
+from .evaluation import AxisLoop, BenchMachine, Evaluator, coupling
+from .side import SideCards, given_file
+from .verdict import (
+    CARD,
+    COMPACT,
+    PAGE,
+    heading,
+    headline,
+    limit_verdicts,
+    of_fleet,
+    refusal,
+    verdict_rows,
+)
+from .views import KEPT, Gestures, Views
 
 #: of a burst of moves only the last is drawn; what takes longer waits until a hand rests [ms]
 _SOON, _LATER, _POLL = 3, 350, 300
@@ -68,7 +72,7 @@ class Page:
         import panel as pn
 
         small: dict[str, Any] = {
-            "stylesheets": [style.COMPACT],
+            "stylesheets": [COMPACT],
             "margin": (0, 3, 0, 0),
             "height": 28,
         }
@@ -107,7 +111,7 @@ class Page:
             width=86,
             margin=(0, 0, 6, 0),
             height=26,
-            stylesheets=[style.COMPACT],
+            stylesheets=[COMPACT],
         )
         self.anew = pn.widgets.Button(
             label="new law", width=74, variant="outline", **small,
@@ -137,12 +141,12 @@ class Page:
         )
         head = pn.FlexBox(
             name, label("axis"), self.axes, *several, *fleet, *self.buttons.values(), self.kept_row,
-            styles=style.CARD, margin=(0, 0, 6, 0), align_items="center", gap="4px 2px", **wide,
+            styles=CARD, margin=(0, 0, 6, 0), align_items="center", gap="4px 2px", **wide,
         )  # fmt: skip
         cross = pn.Row(label("crossover at"), self.crossover, self.anew, margin=0, **wide)
         law = pn.Column(
-            pn.pane.HTML(style.title("law of the axis"), margin=0), self.gain.row, cross,
-            self.cards.column, pn.Row(self.kind, self.add, margin=0, **wide), styles=style.CARD,
+            pn.pane.HTML(heading("law of the axis"), margin=0), self.gain.row, cross,
+            self.cards.column, pn.Row(self.kind, self.add, margin=0, **wide), styles=CARD,
             margin=(0, 0, 6, 0), **wide,
         )  # fmt: skip
         left = pn.Column(
@@ -152,7 +156,7 @@ class Page:
 
         def stack(*names: str, grow: str) -> Any:
             panes = [pn.pane.Bokeh(figures[n], margin=0, **wide) for n in names]
-            return pn.Column(*panes, margin=0, styles=style.CARD | {"flex": grow, "padding": "2px"})
+            return pn.Column(*panes, margin=0, styles=CARD | {"flex": grow, "padding": "2px"})
 
         pictures = pn.FlexBox(
             stack("magnitude", "phase", grow="1 1 430px"), stack("nyquist", grow="1 1 400px"),
@@ -163,12 +167,12 @@ class Page:
             gap="6px", **wide,
         )  # fmt: skip
         verdict = pn.Column(
-            self.message, self.verdict, self.judged, self.further, styles=style.CARD,
+            self.message, self.verdict, self.judged, self.further, styles=CARD,
             margin=(0, 0, 6, 0), **wide,
         )  # fmt: skip
         right = pn.Column(verdict, pictures, margin=0, styles={"flex": "1 1 420px"})
         body = pn.FlexBox(left, right, flex_wrap="wrap", align_items="flex-start", **wide)
-        return pn.Column(head, body, styles=style.PAGE, margin=0, sizing_mode="stretch_width")
+        return pn.Column(head, body, styles=PAGE, margin=0, sizing_mode="stretch_width")
 
     def _connect(self) -> None:
         import panel as pn
@@ -209,7 +213,7 @@ class Page:
 
     def refuse(self, text: str) -> None:
         """Say what is wrong; the last good design stands."""
-        self.message.object = style.error(text)
+        self.message.object = refusal(text)
         self.message.visible = True
 
     def change_axis(self, axis: ShapedAxis, key: Hashable, cards: bool) -> None:
@@ -279,7 +283,7 @@ class Page:
             button = pn.widgets.Button(
                 label=name, margin=(0, 3, 0, 0), height=28, variant="outline",
                 description="go back to this design",
-                stylesheets=[style.COMPACT, f".bk-btn{{border-color:{color};color:{color}}}"],
+                stylesheets=[COMPACT, f".bk-btn{{border-color:{color};color:{color}}}"],
             )  # fmt: skip
             button.on_click(lambda _, design=design: self.take(design))
             buttons.append(button)
@@ -380,7 +384,7 @@ class Page:
                 self._fitted = True
             self._draw_model(design)
             self._draw_fleet()
-            self.verdict.object = style.headline(loop)
+            self.verdict.object = headline(loop)
             self._judge()
         self._later("consequences", _LATER, self._consequences)
 
@@ -408,7 +412,7 @@ class Page:
         answer = self.answer
         fresh = self._answered == self._serial
         rms = answer.rms if answer is not None and fresh else None
-        self.judged.object = style.limit_verdicts(list(self.limits.judged(self.loop, rms)))
+        self.judged.object = limit_verdicts(list(self.limits.judged(self.loop, rms)))
         rows: list[tuple[str, str, bool | None]] = []
         if len(self.fleet) > 1:
             least = 1.0 / self.limits.peak
@@ -417,7 +421,7 @@ class Page:
         if answer is not None:
             said = self._said(answer)  # of the design before, while that of now is computed
             rows += said if fresh else [(f"{name} ...", text, None) for name, text, _ in said]
-        self.further.object = style.lines(rows)
+        self.further.object = verdict_rows(rows)
 
     def _said(self, answer: Consequences) -> list[tuple[str, str, bool | None]]:
         rows: list[tuple[str, str, bool | None]] = []
@@ -529,7 +533,7 @@ class Page:
     def hand_over(self, data: bytes) -> None:
         """Take a file that was handed over: a design, or elements of a law."""
         try:
-            given = exports.given_file(data)
+            given = given_file(data)
             if isinstance(given, LoopDesign):
                 self._take_design(given)
                 return

@@ -1,19 +1,127 @@
-"""SideCards: the smaller cards of the page: feedforward, limits, tuning, files."""
+"""SideCards: the smaller cards of the page (feedforward, limits, tuning, files), and the files."""
 
 from __future__ import annotations
 
 import io
+import tempfile
+import zipfile
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantError
-from ..synthesis import ShapedAxis
+from ..errors import FlexplantError, ModelError
+from ..io import write_mat
+from ..lti.statespace import StateSpace
+from ..store import load
+from ..synthesis import (
+    Controller,
+    FixedBlock,
+    Law,
+    LoopDesign,
+    ShapedAxis,
+    ShapedLoop,
+    second_order_sections,
+    write_c,
+)
 from ..synthesis.laws.hand_design import TERMS
-from . import exports, style
-from .fields import digits, parsed
+from ..synthesis.laws.law import LawElement
+from .controls import digits, parsed
+from .verdict import CARD, COMPACT, SMALL, heading, remark
+
+#: a file that a browser hands over, at most [bytes]
+_LARGEST = 64_000_000
+
+
+def design_file(design: LoopDesign) -> bytes:
+    """Return the design as `.save` writes it."""
+    return _written("design.npz", design.save)
+
+
+def c_code(design: LoopDesign) -> bytes:
+    """Return source and header of the controller as a zip archive."""
+    with tempfile.TemporaryDirectory() as folder:
+        files = write_c(design.controller(), Path(folder) / "loops.c")
+        return _zipped({file.name: file.read_bytes() for file in files})
+
+
+def matlab_file(design: LoopDesign) -> bytes:
+    """Return the controller, and the laws of the axes, for MATLAB."""
+    values: dict[str, Any] = {"controller": design.controller()}
+    for i, law in enumerate(design.laws.values(), 1):
+        values[f"law{i}"] = law.system
+    return _written("design.mat", lambda path: write_mat(path, values))
+
+
+def sections(design: LoopDesign) -> bytes:
+    """Return the second-order sections of each law as a table."""
+    rows = ["axis,section,b0,b1,b2,a0,a1,a2"]
+    for name, law in design.laws.items():
+        found = second_order_sections(law.system)["command", "error"]
+        rows += [
+            f"{name},{k}," + ",".join(repr(float(v)) for v in row) for k, row in enumerate(found, 1)
+        ]
+    return ("\n".join(rows) + "\n").encode()
+
+
+def script(design: LoopDesign, plant: str = "") -> bytes:
+    """Return the script that makes the design."""
+    return design.script(plant).encode()
+
+
+def report_page(design: LoopDesign, plant: Any, larger: Any = None) -> bytes:
+    """Return the report page of the design and its loops."""
+    from ..plot import report as write_report
+
+    loops = design.loops(plant, larger=larger)
+    parts = {"design": design, "loops": loops, "controller": loops.system}
+    return _written("loops.html", lambda path: write_report(path, parts, title="Loops by hand"))
+
+
+def _written(name: str, write: Callable[[Path], Any]) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        write(path)
+        return path.read_bytes()
+
+
+def _zipped(files: dict[str, bytes]) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return out.getvalue()
+
+
+def given_file(data: bytes) -> LoopDesign | tuple[Any, ...]:
+    """Return the design of a file that was handed over, or the elements that it gives a law.
+
+    Files are ours alone (`.save`): arrays and JSON, never a pickle.
+    """
+    if len(data) > _LARGEST:
+        raise ModelError(f"the file has {len(data) / 1e6:.0f} MB: a design has less than 64.")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "given.npz"
+        path.write_bytes(data)
+        try:
+            value = load(path)
+        except FlexplantError as problem:
+            raise FlexplantError(str(problem).replace(repr(str(path)), "the file")) from None
+    if isinstance(value, LoopDesign):
+        return value
+    if isinstance(value, Law):
+        return (*value.factors,) if value.gain == 1.0 else (*value.factors, value.gain)
+    if isinstance(value, LawElement):
+        return (value,)
+    if isinstance(value, StateSpace | Controller | ShapedLoop):
+        return (FixedBlock.of(value),)
+    raise ModelError(
+        f"the file holds a {type(value).__name__}: a LoopDesign, a Law, or a controller of one "
+        "channel can be taken."
+    )
+
 
 #: limits of the page: field of LoopLimits, label, unit; those in dB are typed so
 _LIMITS = (
@@ -38,9 +146,9 @@ class SideCards:
 
         inside = pn.Column(*items, margin=(0, 8, 6, 8), sizing_mode="stretch_width")
         return pn.Card(
-            inside, header=pn.pane.HTML(style.title(name), margin=(0, 0, 0, 4)),
+            inside, header=pn.pane.HTML(heading(name), margin=(0, 0, 0, 4)),
             collapsed=collapsed, sizing_mode="stretch_width", margin=(0, 0, 6, 0),
-            styles=style.CARD | {"padding": "0", "box-shadow": "none"},
+            styles=CARD | {"padding": "0", "box-shadow": "none"},
             header_background="#FFFFFF", hide_header=False,
         )  # fmt: skip
 
@@ -52,7 +160,7 @@ class SideCards:
             value=value,
             width=100,
             margin=(0, 4, 4, 0),
-            stylesheets=[style.COMPACT],
+            stylesheets=[COMPACT],
             **more,
         )
         text.param.watch(
@@ -111,24 +219,24 @@ class SideCards:
     def _tune_card(self) -> Any:
         import panel as pn
 
-        small: dict[str, Any] = style.SMALL | {"margin": (2, 4, 2, 0)}
+        small: dict[str, Any] = SMALL | {"margin": (2, 4, 2, 0)}
         self.start = pn.widgets.Button(label="tune", color="primary", width=64, **small)
         self.stop = pn.widgets.Button(
             label="stop", color="danger", width=56, disabled=True, **small
         )
         self.notches = pn.widgets.Select(options=[0, 1, 2, 3, 4, 5], value=3, width=56, **small)
         self.tuned = pn.pane.HTML(
-            style.remark("all axes, highest bandwidth below the peak of |S|"), margin=0
+            remark("all axes, highest bandwidth below the peak of |S|"), margin=0
         )
         self.start.on_click(lambda _: self.page.tune(int(self.notches.value)))
         self.stop.on_click(lambda _: self.page.stop_tuning())
-        label = pn.pane.HTML(style.remark("notches"), margin=(8, 4, 0, 0))
+        label = pn.pane.HTML(remark("notches"), margin=(8, 4, 0, 0))
         row = pn.Row(self.start, self.stop, label, self.notches, margin=0)
         return self._card("automatic", row, self.tuned, collapsed=False)
 
     def show_tuning(self, said: str, running: bool) -> None:
         """Show how far a search is."""
-        self.tuned.object = style.remark(said)
+        self.tuned.object = remark(said)
         self.start.disabled, self.stop.disabled = running, not running
 
     def _files_card(self) -> Any:
@@ -136,11 +244,11 @@ class SideCards:
 
         page = self.page
         kinds: tuple[tuple[str, str, Callable[[], bytes]], ...] = (
-            ("design", "design.npz", lambda: exports.design_file(page.design)),
-            ("C99", "loops.zip", lambda: exports.c_code(page.design)),
-            ("MATLAB", "loops.mat", lambda: exports.matlab_file(page.design)),
-            ("sections", "sections.csv", lambda: exports.sections(page.design)),
-            ("Python", "loops.py", lambda: exports.script(page.design, page.bench.source)),
+            ("design", "design.npz", lambda: design_file(page.design)),
+            ("C99", "loops.zip", lambda: c_code(page.design)),
+            ("MATLAB", "loops.mat", lambda: matlab_file(page.design)),
+            ("sections", "sections.csv", lambda: sections(page.design)),
+            ("Python", "loops.py", lambda: script(page.design, page.bench.source)),
             ("report", "loops.html", self._report),
         )
         sampled = page.design.rate > 0.0
@@ -150,17 +258,17 @@ class SideCards:
             pn.widgets.FileDownload(
                 callback=lambda make=make: self._made(make), filename=file, label=f"save {label}",
                 variant="outline", height=28, margin=(0, 4, 4, 0), embed=False, auto=True,
-                stylesheets=[style.COMPACT],
+                stylesheets=[COMPACT],
             )
             for label, file, make in kinds
         ]  # fmt: skip
         self.script = pn.widgets.TextAreaInput(
             value="", height=110, sizing_mode="stretch_width", margin=(4, 0, 0, 0),
-            stylesheets=[style.COMPACT], max_length=200_000,
+            stylesheets=[COMPACT], max_length=200_000,
         )  # fmt: skip
         copy = pn.widgets.Button(
             label="copy as Python", variant="outline", height=28, margin=(0, 4, 4, 0),
-            stylesheets=[style.COMPACT],
+            stylesheets=[COMPACT],
         )  # fmt: skip
         copy.js_on_click(
             args={"source": self.script}, code="navigator.clipboard.writeText(source.value)"
@@ -172,14 +280,14 @@ class SideCards:
         note = "load a design, or a law or controller as elements"
         if not sampled:
             note = f"C99 and sections need the controller's rate: open the page with it. {note}"
-        load = pn.pane.HTML(style.remark(note), margin=0)
+        load = pn.pane.HTML(remark(note), margin=0)
         box = pn.FlexBox(*buttons, copy, gap="0px", sizing_mode="stretch_width")
         return self._card("files", box, load, given, self.script, collapsed=False)
 
     def _report(self) -> bytes:
         page = self.page
         plant = page.bench.question_of(page.index).plant
-        return exports.report_page(page.design, plant or page.machine.given, page.bench.larger)
+        return report_page(page.design, plant or page.machine.given, page.bench.larger)
 
     def _made(self, make: Callable[[], bytes]) -> Any:
         """Return a file for the browser; what is wrong with it appears on the page."""

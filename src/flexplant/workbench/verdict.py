@@ -1,12 +1,105 @@
-"""The verdict of a loop and of a fleet, in words."""
+"""What a loop shall keep, what it reaches, in words and in HTML."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from typing import NamedTuple
 
 import numpy as np
 
+from ..checks import Value, checked, positive
 from .evaluation import AxisLoop
+
+
+class Judged(NamedTuple):
+    """One limit: what is required, what was reached, whether it is met (None: not known)."""
+
+    name: str
+    required: str
+    reached: str
+    met: bool | None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopLimits(Value):
+    """Limits on each loop: None leaves one out.
+
+    Parameters
+    ----------
+    peak : float
+        Largest |S|; 2 is a modulus margin of 0.5, 6 dB.
+    gain_margin : float, optional
+        Least factor on the gain.
+    phase_margin : float, optional [deg]
+        The least.
+    bandwidth : float, optional [Hz]
+        The least at which |S| crosses 0 dB.
+    suppressed, below : float, optional
+        |S| shall stay under `suppressed` up to the frequency `below` [Hz].
+    rms : float, optional
+        Largest predicted rms of the error, in its unit.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.workbench.LoopLimits(peak=2.0, phase_margin=30.0)
+    LoopLimits(peak=2, phase_margin=30 deg)
+    """
+
+    peak: float = field(default=2.0, metadata=checked(positive))
+    gain_margin: float | None = field(default=None, metadata=checked(positive))
+    phase_margin: float | None = field(default=None, metadata=checked(positive, unit="deg"))
+    bandwidth: float | None = field(default=None, metadata=checked(positive, unit="Hz"))
+    suppressed: float | None = field(default=None, metadata=checked(positive))
+    below: float | None = field(default=None, metadata=checked(positive, unit="Hz"))
+    rms: float | None = field(default=None, metadata=checked(positive))
+
+    def judged(self, loop: AxisLoop, rms: float | None = None) -> Iterator[Judged]:
+        """Yield each limit with what a loop reaches.
+
+        Parameters
+        ----------
+        loop : AxisLoop
+            The loop.
+        rms : float, optional
+            The predicted rms, where it is known.
+        """
+        stable, margins = loop.is_stable, loop.margins
+
+        def at_least(name: str, wanted: float | None, value: float, unit: str) -> Iterator[Judged]:
+            if wanted is not None:
+                met = None if stable is None else bool(stable and value >= wanted)
+                yield Judged(name, f"at least {wanted:.4g}{unit}", f"{value:.4g}{unit}", met)
+
+        peak = 1.0 / margins.modulus_margin if margins.modulus_margin else np.inf
+        met = None if stable is None else bool(stable and peak <= self.peak)
+        decibel = 20.0 * np.log10([self.peak, peak])
+        yield Judged("peak of |S|", f"at most {decibel[0]:.3g} dB", f"{decibel[1]:.3g} dB", met)
+        gain = min(margins.gain_margin, 1.0 / (margins.gain_reduction or 1e-300))
+        yield from at_least("gain margin", self.gain_margin, gain, "")
+        yield from at_least("phase margin", self.phase_margin, margins.phase_margin, " deg")
+        yield from at_least("bandwidth", self.bandwidth, loop.bandwidth, " Hz")
+        low = loop.freq <= (self.below or 0.0)
+        if self.suppressed is not None and not np.any(low):
+            reached = "no frequency given" if self.below is None else "no line there"
+            yield Judged("|S| at low frequencies", f"at most {self.suppressed:.3g}", reached, None)
+        elif self.suppressed is not None and self.below is not None:
+            worst = float(np.abs(loop.S[low]).max(initial=0.0))
+            met = None if stable is None else bool(stable and worst <= self.suppressed)
+            level = 20.0 * np.log10([self.suppressed, max(worst, 1e-300)])
+            yield Judged(
+                f"|S| to {self.below:.4g} Hz",
+                f"at most {level[0]:.3g} dB",
+                f"{level[1]:.3g} dB",
+                met,
+            )
+        if self.rms is not None:
+            known = rms is not None and np.isfinite(rms)
+            met = bool(rms <= self.rms) if rms is not None and known else None
+            reached = f"{rms:.3g}" if known else "not known"
+            yield Judged("rms of the error", f"at most {self.rms:.3g}", reached, met)
 
 
 def decibels(gain: float) -> str:
@@ -69,3 +162,95 @@ def of_fleet(loops: Sequence[AxisLoop]) -> tuple[str, int]:
             )
             text += f"; least margin of the others {left.modulus_margin:.2f} on {left.machine.name}"
     return text, worst
+
+
+#: of all widgets: small, so that a law is seen as a whole
+COMPACT = """
+:host { --pane-gap: 4px; font-size: 12px; }
+.bk-input { height: 26px; font-size: 12px; padding: 0 6px; border-radius: 4px; }
+textarea.bk-input { height: auto; font-family: monospace; font-size: 11px; padding: 6px; }
+.bk-btn { font-size: 12px; padding: 2px 8px; border-radius: 4px; line-height: 1.5; }
+.bk-input-group label { font-size: 11px; color: #5B6670; }
+.noUi-target { margin-top: 2px; }
+.bk-clearfix, .bk-input-group { margin: 0; }
+"""
+SMALL = {"stylesheets": [COMPACT], "height": 28}
+CARD = {
+    "background": "#FFFFFF", "border": "1px solid #D5DADF", "border-radius": "6px",
+    "padding": "6px 8px",
+}  # fmt: skip
+ELEMENT = CARD | {"border-left": "3px solid #0B6FB8", "padding": "4px 6px"}
+OFF = ELEMENT | {"border-left": "3px solid #C9CFD5", "opacity": "0.55"}
+PAGE = {"background": "#F3F5F7", "font-family": "system-ui, sans-serif", "color": "#1D2730"}
+ERROR = (
+    '<div role="alert" style="background:#FCEBE8;border:1px solid #C23B22;border-radius:6px;'
+    'padding:6px 10px;font-size:12px;color:#7A2014">{}<br><span style="color:#5B6670">'
+    "The last good design stands.</span></div>"
+)
+_GOOD, _BAD, _OPEN = "#1F7A47", "#C23B22", "#9A6700"
+
+
+def heading(text: str) -> str:
+    """Return the heading of a group."""
+    return f'<div style="font-size:12px;font-weight:600;color:#33404D">{escape(text)}</div>'
+
+
+def refusal(text: str) -> str:
+    """Return a message of what is wrong."""
+    return ERROR.format(escape(text))
+
+
+def remark(text: str) -> str:
+    """Return a short remark."""
+    return f'<div style="font-size:11px;color:#5B6670">{escape(text)}</div>'
+
+
+def _state(stable: bool | None) -> str:
+    return {True: _GOOD, False: _BAD, None: _OPEN}[stable]
+
+
+def headline(loop: AxisLoop) -> str:
+    """Return the verdict of the axis that is shaped, with its figures."""
+    cells = "".join(
+        f'<td style="padding:0 14px 0 0;vertical-align:top"><div style="font-size:11px;'
+        f'color:#5B6670">{escape(name)}</div><div style="font-size:14px;font-weight:600" '
+        f'data-figure="{escape(name)}">{escape(value)}</div><div style="font-size:11px;'
+        f'color:#5B6670">{escape(where)}</div></td>'
+        for name, value, where in figures(loop)
+    )
+    word, how = stability_verdict(loop)
+    return (
+        f'<div data-verdict="{escape(loop.name)}" style="display:flex;flex-wrap:wrap;gap:4px 18px;'
+        'align-items:center"><div style="min-width:120px;max-width:290px"><div style="font-size:'
+        f'16px;font-weight:700;color:{_state(loop.is_stable)}">{escape(loop.name)}: {escape(word)}'
+        f'</div><div style="font-size:11px;color:#5B6670">{escape(how)}</div></div>'
+        f'<table style="border-collapse:collapse"><tr>{cells}</tr></table></div>'
+    )
+
+
+def limit_verdicts(limits: Sequence[Judged]) -> str:
+    """Return each limit with whether it is met."""
+    parts = []
+    for one in limits:
+        mark, word = {
+            True: ("&#10003;", "met"),
+            False: ("&#10007;", "not met"),
+            None: ("?", "open"),
+        }[one.met]
+        parts.append(
+            f'<span style="white-space:nowrap;color:{_state(one.met)}">{mark} {escape(one.name)} '
+            f"{escape(one.required)}: {escape(one.reached)}, {word}</span>"
+        )
+    look = "font-size:12px;display:flex;flex-wrap:wrap;gap:2px 16px"
+    return f'<div style="{look}">{"".join(parts)}</div>'
+
+
+def verdict_rows(rows: Sequence[tuple[str, str, bool | None]]) -> str:
+    """Return further verdicts: a name, what was found, whether that is good."""
+    found = "".join(
+        f'<tr><td style="padding:0 10px 1px 0;color:#5B6670;white-space:nowrap;vertical-align:top">'
+        f'{escape(name)}</td><td style="color:{"#1D2730" if good is None else _state(good)}">'
+        f"{escape(text)}</td></tr>"
+        for name, text, good in rows
+    )
+    return f'<table style="font-size:12px;border-collapse:collapse">{found}</table>'
