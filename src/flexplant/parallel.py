@@ -574,8 +574,13 @@ def watched() -> Any:
     """Return the stream of a terminal or notebook that somebody sees; None in pipes and files."""
     if sys.stderr is not None and sys.stderr.isatty():
         return sys.stderr
+    return sys.stdout if in_notebook() else None
+
+
+def in_notebook() -> bool:
+    """Return whether a notebook shows what a cell returns."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    return sys.stdout if type(shell).__name__ == "ZMQInteractiveShell" else None
+    return type(shell).__name__ == "ZMQInteractiveShell"
 
 
 def _open_bars() -> list[Progress]:

@@ -24,12 +24,11 @@ from bench_plants import (
     measured,
 )
 from flexplant.synthesis import FixedBlock, LoopDesign, ShapedAxis
-from flexplant.workbench import exports
+from flexplant.workbench import side
 from flexplant.workbench.consequences import step_of_lines, step_of_model
-from flexplant.workbench.evaluation import Evaluator
 from flexplant.workbench.controls import fields_of, parsed
+from flexplant.workbench.evaluation import BenchMachine, Evaluator
 from flexplant.workbench.launch import open_file
-from flexplant.workbench.evaluation import BenchMachine
 from flexplant.workbench.page import Page
 
 pytest.importorskip("panel")
@@ -230,7 +229,7 @@ def test_limits_are_drawn_and_judged():
 def test_feedforward_and_files(page, tmp_path):
     page.side.forward[2].value = "1.5"
     assert page.design.axes["y1"].feedforward == (0.0, 0.0, 1.5)
-    saved = exports.design_file(page.design)
+    saved = side._written("design.npz", page.design.save)
     other = Page(page.bench)
     other.hand_over(saved)
     assert np.array_equal(other.design.controller().A, page.design.controller().A)
@@ -259,19 +258,19 @@ def test_what_is_exported_is_the_controller(page, tmp_path):
     error = np.random.default_rng(1).normal(size=400)
     wanted = by_matrices(K, error)
     if shutil.which("cc"):
-        found = by_c(io.BytesIO(exports.c_code(page.design)), tmp_path, error)
+        found = by_c(io.BytesIO(side.c_code(page.design)), tmp_path, error)
         np.testing.assert_allclose(found, wanted, rtol=1e-7)
     table = np.genfromtxt(
-        io.BytesIO(exports.sections(page.design)), delimiter=",", skip_header=1, usecols=range(2, 8)
+        io.BytesIO(side.sections(page.design)), delimiter=",", skip_header=1, usecols=range(2, 8)
     )
     np.testing.assert_allclose(-signal.sosfilt(table, error), wanted, rtol=1e-6)
-    mat = scipy.io.loadmat(io.BytesIO(exports.matlab_file(page.design)), squeeze_me=True)
+    mat = scipy.io.loadmat(io.BytesIO(side.matlab_file(page.design)), squeeze_me=True)
     assert np.array_equal(np.atleast_2d(mat["controller"]["A"].item()), K.A)
     made = {}
-    exec(exports.script(page.design), made)
+    exec(page.design.script(""), made)
     assert np.array_equal(made["controller"].A, K.A)
     assert made["controller"].inputs == K.inputs
-    text = exports.report_page(page.design, page.machine.given).decode()
+    text = side.report_page(page.design, page.machine.given).decode()
     assert "LoopDesign" in text
     assert "y1" in text
 
@@ -434,7 +433,7 @@ def test_a_notebook_shows_the_page_in_its_cell(frf, monkeypatch):
 def test_wrong_options_are_refused(frf):
     for options, said in (
         ({"limits": 2.0}, "limits"), ({"move": 1.0}, "move"),
-        ({"design": 3}, "design is a LoopDesign"),
+        ({"design": 3}, "design must be of type LoopDesign"),
         ({"design": design(frf, **SAMPLED), "rate": 2e3}, "are in the design already"),
     ):  # fmt: skip
         with pytest.raises(fx.FlexplantError, match=said):

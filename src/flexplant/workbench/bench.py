@@ -9,8 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..checks import instance
-from ..errors import LabelError, ModelError, counted
+from ..errors import ModelError, counted
 from ..lti.frequency import Frf
 from ..plant import StandardPlant
 from ..simulation.motion import SetPoint
@@ -206,13 +205,3 @@ def crossing_axis(
     gain = 1.0 / abs(complex(axis.law.replace(rate=design.rate).at(there)[0]) * G)
     # a free body is half a turn behind its force, where the sign is right
     return axis.replace(gain=float(f"{gain if G.real < 0.0 else -gain:.6g}"))
-
-
-def checked_options(limits: Any, move: Any, design: Any) -> None:
-    """Refuse options of another kind."""
-    if limits is not None:
-        instance(limits, LoopLimits, "limits", "Pass LoopLimits(peak=2.0).")
-    if move is not None:
-        instance(move, SetPoint, "move", "Pass setpoint(...).")
-    if design is not None and not isinstance(design, LoopDesign):
-        raise LabelError(f"design is a LoopDesign, got {type(design).__name__}.")

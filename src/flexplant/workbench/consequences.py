@@ -16,7 +16,7 @@ import numpy as np
 
 from ..checks import FloatArray
 from ..errors import AssumptionError, FlexplantError, SolverError
-from ..loop import ClosedLoop, LoopReport, close_loop
+from ..loop import ClosedLoop, LoopReport, close_loop, report_loops
 from ..lti.discretisation import discretized
 from ..lti.interconnection import feedback, series
 from ..lti.recursion import Recursion
@@ -66,9 +66,8 @@ class Question:
     @property
     def plant(self) -> StandardPlant | None:
         """The standard plant, if there is one."""
-        given = (
-            None if self.model is None else getattr(self.model.given, "nominal", self.model.given)
-        )
+        given = None if self.model is None else self.model.given
+        given = getattr(given, "nominal", given)
         return given if isinstance(given, StandardPlant) else None
 
     def answer(self, design: LoopDesign, loop: AxisLoop) -> Consequences:
@@ -86,13 +85,8 @@ class Question:
         return found
 
     def _all_axes(self, found: Consequences, design: LoopDesign, loop: AxisLoop) -> None:
-        from ..loop import report_loops
-
-        axes = self.machine.axes
-        inner = axes_controller(axes, design.laws)
-        found.report = report_loops(
-            (axes.plant, inner), at="y", rigid=design.rigid, unstable=design.unstable
-        )
+        parts = self.machine.axes.plant, axes_controller(self.machine.axes, design.laws)
+        found.report = report_loops(parts, at="y", rigid=design.rigid, unstable=design.unstable)
 
     def _closed(self, design: LoopDesign) -> ClosedLoop | None:
         """Return the loop of the standard plant with the controller, reading what the plant has."""
@@ -155,16 +149,13 @@ def step_of_model(
     a = axes.names.index(name)
     T = T.select(T.outputs[a], T.inputs[a])
     if not T.dt:
-        T = discretized(T, max(200.0 / duration, 4.0 * _highest_frequency(T)))
+        size = np.abs(T.poles()) / (2.0 * np.pi)
+        T = discretized(
+            T, max(200.0 / duration, 4.0 * float(np.median(size)) if size.size else 4.0)
+        )
     steps = int(np.clip(duration / T.dt, 50, _SAMPLES))
     out, _ = Recursion(T.A, T.B, T.C, T.D).run(np.ones((steps, 1)), np.zeros(T.n_states))
     return np.asarray(np.arange(steps) * T.dt), np.asarray(1.0 - out[:, 0])
-
-
-def _highest_frequency(T: Any) -> float:
-    """Return the highest frequency [Hz] of poles that a step shows."""
-    size = np.abs(T.poles()) / (2.0 * np.pi)
-    return float(np.median(size)) if size.size else 1.0
 
 
 def step_of_lines(loop: AxisLoop, duration: float) -> tuple[FloatArray, FloatArray]:

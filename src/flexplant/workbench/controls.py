@@ -1,4 +1,4 @@
-"""The elements of an axis as cards: their numbers with sliders, what is typed for them, switches."""
+"""The elements of an axis as cards: numbers with sliders and what is typed for them, switches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A plant on the bench in the axes of a design, and the loop of one axis: its curves and its verdict."""
+"""AxisLoop: a plant on the bench in the axes of a design, and the loop of one axis on it."""
 
 from __future__ import annotations
 

@@ -10,16 +10,17 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from ..checks import FloatArray, whole
-from ..errors import FlexplantError, ModelError
+from ..checks import FloatArray, instance, whole
+from ..errors import FlexplantError, LabelError, ModelError
 from ..io import read_frf_csv, read_frf_mat, read_frf_npz, read_frf_uff, read_mat
 from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace, System
+from ..parallel import in_notebook
 from ..plant import StandardPlant
 from ..simulation.motion import SetPoint
 from ..store import load
 from ..synthesis import LoopDesign
-from .bench import Bench, checked_options
+from .bench import Bench
 from .page import Page
 from .verdict import LoopLimits
 
@@ -262,7 +263,9 @@ def workbench(
     >>> bench.design.loops(mass).report.is_stable
     True
     """
-    checked_options(limits, move, design)
+    instance(limits, LoopLimits | None, "limits", "Pass LoopLimits(peak=2.0).")
+    instance(move, SetPoint | None, "move", "Pass setpoint(...).")
+    instance(design, LoopDesign | None, "design", "Pass LoopDesign.on(plant).", LabelError)
     options = {
         "model": model, "larger": larger, "before": before, "after": after, "rate": rate,
         "delay": delay, "hold": hold, "rigid": rigid, "unstable": unstable,
@@ -274,12 +277,6 @@ def workbench(
         waits = not sys.flags.interactive and not hasattr(sys, "ps1")
         bench.serve(port, open_browser=True, block=waits if block is None else block)
     return bench
-
-
-def in_notebook() -> bool:
-    """Return whether a notebook shows what a cell returns."""
-    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    return type(shell).__name__ == "ZMQInteractiveShell"
 
 
 def open_file(path: str | Path) -> tuple[Any, LoopDesign | None, str]:
@@ -311,31 +308,26 @@ def open_file(path: str | Path) -> tuple[Any, LoopDesign | None, str]:
     file = Path(path)
     if not file.exists():
         raise FileNotFoundError(f"there is no file {str(file)!r}.")
-    readers: Mapping[str, tuple[str, Callable[[Path], Any]]] = {
-        ".uff": ("io.read_frf_uff", read_frf_uff), ".unv": ("io.read_frf_uff", read_frf_uff),
-        ".uf": ("io.read_frf_uff", read_frf_uff), ".csv": ("io.read_frf_csv", read_frf_csv),
-        ".mat": ("io.read_mat", read_mat), ".npz": ("load", load),
+    universal: dict[str, Callable[[Path], Any]] = {"io.read_frf_uff": read_frf_uff}
+    readers: dict[str, dict[str, Callable[[Path], Any]]] = {
+        ".uff": universal, ".unv": universal, ".uf": universal,
+        ".csv": {"io.read_frf_csv": read_frf_csv},
+        ".mat": {"io.read_mat": read_mat, "io.read_frf_mat": read_frf_mat},
+        ".npz": {"load": load, "io.read_frf_npz": read_frf_npz},
     }  # fmt: skip
     if file.suffix.lower() not in readers:
         raise FlexplantError(
             f"{str(file)!r} is of no kind that the workbench opens: {', '.join(readers)}."
         )
-    name, read = readers[file.suffix.lower()]
-    others: Mapping[str, tuple[str, Callable[[Path], Any]]] = {
-        "load": ("io.read_frf_npz", read_frf_npz),
-        "io.read_mat": ("io.read_frf_mat", read_frf_mat),
-    }
-    try:
-        value = read(file)
-    except FlexplantError as problem:
-        if name not in others:
-            raise
-        name, read = others[name]
+    problems = []
+    for name, read in readers[file.suffix.lower()].items():
         try:
-            value = read(file)
-        except FlexplantError:
-            raise problem from None
-    line = f"plant = fx.{name}({str(file)!r})"
+            value, line = read(file), f"plant = fx.{name}({str(file)!r})"
+            break
+        except FlexplantError as problem:
+            problems.append(problem)
+    else:
+        raise problems[0]
     if isinstance(value, LoopDesign):
         return None, value, ""
     if not isinstance(value, Frf | StandardPlant | StateSpace):

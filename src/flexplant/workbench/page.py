@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import in_unit
 from ..errors import FlexplantError
 from ..synthesis import LoopDesign, Notch, ShapedAxis
 from ..synthesis.laws.axis_law import MeasuredAxis
@@ -23,6 +24,7 @@ from .verdict import (
     CARD,
     COMPACT,
     PAGE,
+    SMALL,
     heading,
     headline,
     limit_verdicts,
@@ -71,11 +73,7 @@ class Page:
     def _widgets(self) -> None:
         import panel as pn
 
-        small: dict[str, Any] = {
-            "stylesheets": [COMPACT],
-            "margin": (0, 3, 0, 0),
-            "height": 28,
-        }
+        small: dict[str, Any] = SMALL | {"margin": (0, 3, 0, 0)}
         names = list(self.bench.start.axes)
         self.axes = pn.widgets.RadioButtonGroup(
             options=names, value=self.axis, color="primary", variant="outline", **small
@@ -97,22 +95,20 @@ class Page:
             options={m.name: i for i, m in enumerate(self.bench.machines)}, value=0, width=130,
             **small,
         )  # fmt: skip
-        self.message = pn.pane.HTML("", sizing_mode="stretch_width", margin=0, visible=False)
-        self.verdict = pn.pane.HTML("", sizing_mode="stretch_width", margin=0)
-        self.judged = pn.pane.HTML("", sizing_mode="stretch_width", margin=(3, 0, 0, 0))
-        self.further = pn.pane.HTML("", sizing_mode="stretch_width", margin=(3, 0, 0, 0))
+        self.message, self.verdict, self.judged, self.further = (
+            pn.pane.HTML("", sizing_mode="stretch_width", margin=(top, 0, 0, 0))
+            for top in (0, 0, 3, 3)
+        )
+        self.message.visible = False
         gain = self.design.axes[self.axis].gain or 1.0
         self.gain = Number(
             "gain", "", abs(gain) / 20.0, abs(gain) * 20.0, gain, self._set_gain, self.refuse,
             lambda: self.design.axes[self.axis].gain,
         )  # fmt: skip
         self.crossover = pn.widgets.TextInput(
-            placeholder="e.g. 60 Hz",
-            width=86,
-            margin=(0, 0, 6, 0),
-            height=26,
+            placeholder="e.g. 60 Hz", width=86, margin=(0, 0, 6, 0), height=26,
             stylesheets=[COMPACT],
-        )
+        )  # fmt: skip
         self.anew = pn.widgets.Button(
             label="new law", width=74, variant="outline", **small,
             description="PID and low-pass around this crossover, or well below the resonances",
@@ -435,8 +431,8 @@ class Page:
         if answer.left_out:
             rows.append(("modes left out", answer.left_out, answer.left_out_fine))
         if np.isfinite(answer.rms):
-            scale, unit = _prefixed(answer.rms, answer.unit)
-            rows.append((f"rms of {answer.channel}", f"{scale * answer.rms:.4g} {unit}", None))
+            factor, unit = in_unit(answer.rms, answer.unit)
+            rows.append((f"rms of {answer.channel}", f"{answer.rms / factor:.4g} {unit}", None))
         return [*rows, *(("not computed", text, None) for text in answer.missing)]
 
     # -- what takes longer ----------------------------------------------------------------------
@@ -475,10 +471,8 @@ class Page:
         self._working = 0
         self.answer, self._answered = answer, serial
         with hold():
-            scale, unit = _prefixed(answer.rms, answer.unit)
-            names = [name for name, _ in answer.sources]
-            values = [scale * value for _, value in answer.sources]
-            self.views.show_budget(names, values, unit)
+            factor, unit = in_unit(answer.rms, answer.unit)
+            self.views.show_budget({n: rms / factor for n, rms in answer.sources}, unit)
             self.views.show_time("main", answer.time, answer.error, answer.time_label)
             self.side.script.value = self.design.script(self.bench.source)
             self._judge()
@@ -539,11 +533,8 @@ class Page:
                 return
             axis = self.design.axes[self.axis]
             for one in given:
-                axis = (
-                    axis.replace(gain=axis.gain * one)
-                    if isinstance(one, float)
-                    else with_new(axis, one)
-                )
+                gain = isinstance(one, float)
+                axis = axis.replace(gain=axis.gain * one) if gain else with_new(axis, one)
             self.change_axis(axis, None, True)
         except FlexplantError as problem:
             self.refuse(str(problem))
@@ -559,12 +550,11 @@ class Page:
 
     def start_anew(self) -> None:
         """Take a new law of the axis: around the crossover that is typed, else a first one."""
-        i, freq = list(self.design.axes).index(self.axis), self._wanted()
-        if freq is None:
-            self.change_axis(first_axis(self.machine, i, self.design), None, True)
-        else:
-            axis = crossing_axis(self.machine, i, self.design, freq)
-            self.change_axis(axis, None, True)
+        at, freq = (
+            (self.machine, list(self.design.axes).index(self.axis), self.design),
+            self._wanted(),
+        )
+        self.change_axis(first_axis(*at) if freq is None else crossing_axis(*at, freq), None, True)
 
     def close(self) -> None:
         """End what the tab has started."""
@@ -583,13 +573,3 @@ def _loop_peak(loop: AxisLoop, above: float) -> float:
         return 2.0 * above
     size = np.abs(loop.L[np.searchsorted(loop.freq, found)])
     return float(found[np.argmax(size)])
-
-
-def _prefixed(size: float, unit: str) -> tuple[float, str]:
-    """Return a factor and the unit with its prefix for a size."""
-    if not np.isfinite(size) or size <= 0.0 or unit not in ("m", "rad", "N", "s"):
-        return 1.0, unit
-    for power, sign in ((1e-12, "p"), (1e-9, "n"), (1e-6, "u"), (1e-3, "m")):
-        if size < 1e3 * power:
-            return 1.0 / power, f"{sign}{unit}"
-    return 1.0, unit

@@ -35,23 +35,22 @@ from .verdict import CARD, COMPACT, SMALL, heading, remark
 _LARGEST = 64_000_000
 
 
-def design_file(design: LoopDesign) -> bytes:
-    """Return the design as `.save` writes it."""
-    return _written("design.npz", design.save)
-
-
 def c_code(design: LoopDesign) -> bytes:
     """Return source and header of the controller as a zip archive."""
-    with tempfile.TemporaryDirectory() as folder:
-        files = write_c(design.controller(), Path(folder) / "loops.c")
-        return _zipped({file.name: file.read_bytes() for file in files})
+    out = io.BytesIO()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive,
+    ):
+        for file in write_c(design.controller(), Path(folder) / "loops.c"):
+            archive.write(file, file.name)
+    return out.getvalue()
 
 
 def matlab_file(design: LoopDesign) -> bytes:
     """Return the controller, and the laws of the axes, for MATLAB."""
     values: dict[str, Any] = {"controller": design.controller()}
-    for i, law in enumerate(design.laws.values(), 1):
-        values[f"law{i}"] = law.system
+    values |= {f"law{i}": law.system for i, law in enumerate(design.laws.values(), 1)}
     return _written("design.mat", lambda path: write_mat(path, values))
 
 
@@ -64,11 +63,6 @@ def sections(design: LoopDesign) -> bytes:
             f"{name},{k}," + ",".join(repr(float(v)) for v in row) for k, row in enumerate(found, 1)
         ]
     return ("\n".join(rows) + "\n").encode()
-
-
-def script(design: LoopDesign, plant: str = "") -> bytes:
-    """Return the script that makes the design."""
-    return design.script(plant).encode()
 
 
 def report_page(design: LoopDesign, plant: Any, larger: Any = None) -> bytes:
@@ -85,14 +79,6 @@ def _written(name: str, write: Callable[[Path], Any]) -> bytes:
         path = Path(folder) / name
         write(path)
         return path.read_bytes()
-
-
-def _zipped(files: dict[str, bytes]) -> bytes:
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return out.getvalue()
 
 
 def given_file(data: bytes) -> LoopDesign | tuple[Any, ...]:
@@ -156,25 +142,18 @@ class SideCards:
         import panel as pn
 
         text = pn.widgets.TextInput(
-            label=label,
-            value=value,
-            width=100,
-            margin=(0, 4, 4, 0),
-            stylesheets=[COMPACT],
-            **more,
+            label=label, value=value, width=100, margin=(0, 4, 4, 0), stylesheets=[COMPACT], **more
         )
-        text.param.watch(
-            lambda event: None if self._own else self._guarded(take, event.new), "value"
-        )
-        return text
 
-    def _guarded(self, take: Callable[[str], None], text: str) -> None:
-        if self._own:
-            return
-        try:
-            take(text)
-        except FlexplantError as problem:
-            self.page.refuse(str(problem))
+        def typed(event: Any) -> None:
+            try:
+                if not self._own:
+                    take(event.new)
+            except FlexplantError as problem:
+                self.page.refuse(str(problem))
+
+        text.param.watch(typed, "value")
+        return text
 
     def _forward_card(self) -> Any:
         import panel as pn
@@ -244,11 +223,11 @@ class SideCards:
 
         page = self.page
         kinds: tuple[tuple[str, str, Callable[[], bytes]], ...] = (
-            ("design", "design.npz", lambda: design_file(page.design)),
+            ("design", "design.npz", lambda: _written("design.npz", page.design.save)),
             ("C99", "loops.zip", lambda: c_code(page.design)),
             ("MATLAB", "loops.mat", lambda: matlab_file(page.design)),
             ("sections", "sections.csv", lambda: sections(page.design)),
-            ("Python", "loops.py", lambda: script(page.design, page.bench.source)),
+            ("Python", "loops.py", lambda: page.design.script(page.bench.source).encode()),
             ("report", "loops.html", self._report),
         )
         sampled = page.design.rate > 0.0

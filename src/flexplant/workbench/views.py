@@ -10,7 +10,7 @@ import numpy as np
 
 from ..checks import FloatArray
 from ..synthesis import Notch, ShapedAxis
-from .controls import with_element
+from .controls import name_of, with_element
 from .evaluation import DEVIATIONS, AxisLoop
 from .verdict import LoopLimits
 
@@ -158,9 +158,8 @@ class Views:
         fig.add_tools(tool)
         fig.toolbar.active_drag = tool
         phase = self.figures["phase"]
-        phase.add_layout(
-            Span(location=-180.0, dimension="width", line_color="#5B6670", line_width=1)
-        )
+        level = {"dimension": "width", "line_color": "#5B6670", "line_width": 1}
+        phase.add_layout(Span(location=-180.0, **level))
         self._pale("phase")
         self._line("phase", "main", BLUE, 1.7)
         phase.xaxis.axis_label = "frequency [Hz]"
@@ -200,10 +199,11 @@ class Views:
         self._pale("nyquist")
         self._line("nyquist", "main", BLUE, 2.0)
         fig.scatter([-1.0], [0.0], marker="cross", size=14, color=RED, line_width=2)
-        fig.scatter("x", "y", source=self._source("closest"), size=8, color=BLUE)
+        closest = self._source("closest", x=[], y=[], text=[])
+        fig.scatter("x", "y", source=closest, size=8, color=BLUE)
         fig.text(
-            "x", "y", text="text", source=self._source("closest text", x=[], y=[], text=[]),
-            text_font_size="11px", text_color="#33404D", x_offset=8, y_offset=4,
+            "x", "y", text="text", source=closest, text_font_size="11px", text_color="#33404D",
+            x_offset=8, y_offset=4,
         )  # fmt: skip
 
     def _time(self) -> None:
@@ -272,43 +272,32 @@ class Views:
         i = loop.machine.axes.names.index(loop.name)
         marked = loop.machine.unresolved(i)
         self._put("unresolved", x=f[marked], y=magnitude_db(L[marked]))
-        closest = -1.0 + 0.0j
-        if np.isfinite(loop.margins.freq):
-            closest = complex(
-                np.interp(loop.margins.freq, f, L.real), np.interp(loop.margins.freq, f, L.imag)
-            )
-        self._put("closest", x=[closest.real], y=[closest.imag])
-        self._put(
-            "closest text", x=[closest.real], y=[closest.imag], text=[f"{loop.margins.freq:.4g} Hz"]
-        )
+        freq = loop.margins.freq
+        closest = complex(np.interp(freq, f, L)) if np.isfinite(freq) else -1.0 + 0.0j
+        self._put("closest", x=[closest.real], y=[closest.imag], text=[f"{freq:.4g} Hz"])
         if handles:
             self._handles(loop, axis)
 
     def _handles(self, loop: AxisLoop, axis: ShapedAxis) -> None:
         """Show where elements can be dragged: on the curve at their frequency."""
-        from .controls import name_of
-
-        x: list[float] = []
-        at: list[int] = []
-        names: list[str] = []
-        for k, (element, on) in enumerate(zip(axis.elements, axis.on, strict=True)):
-            freq = getattr(element, "freq", None)
-            if on and freq is not None and loop.freq[0] <= freq <= loop.freq[-1]:
-                x.append(float(freq))
-                at.append(k)
-                names.append(name_of(element))
+        shown = [
+            (float(freq), k, name_of(element))
+            for k, (element, on) in enumerate(zip(axis.elements, axis.on, strict=True))
+            if on and (freq := getattr(element, "freq", None)) is not None
+            and loop.freq[0] <= freq <= loop.freq[-1]
+        ]  # fmt: skip
+        x = [freq for freq, _, _ in shown]
         y = np.interp(x, loop.freq, magnitude_db(loop.L)) if x else np.zeros(0)
+        at, names = [k for _, k, _ in shown], [name for _, _, name in shown]
         self._put("handles", x=x, y=list(y), at=at, name=names)
 
     def _curves(self, name: str, loop: AxisLoop) -> None:
         """Show all curves of a loop under a name."""
         f, L = loop.freq, loop.L
-        self._put(f"magnitude {name}", x=f, y=magnitude_db(L))
+        for figure, gain in {"magnitude": L, "S": loop.S, "KS": loop.KS, "PS": loop.PS}.items():
+            self._put(f"{figure} {name}", x=f, y=magnitude_db(gain))
         self._put(f"phase {name}", x=f, y=_wrapped(L))
-        self._put(f"S {name}", x=f, y=magnitude_db(loop.S))
-        self._put(f"KS {name}", x=f, y=magnitude_db(loop.KS))
-        self._put(f"PS {name}", x=f, y=magnitude_db(loop.PS))
-        near = _clipped_curve(L)
+        near = L * np.minimum(1.0, _EDGE / np.maximum(np.abs(L), 1e-300))
         if name == "main":  # on the wrong side of -1
             color = RED if loop.is_stable is False else BLUE
             self._drawn["nyquist main"].glyph.line_color = color
@@ -358,29 +347,25 @@ class Views:
             fig.x_range.end = float(x[-1])
             fig.y_range.start, fig.y_range.end = low - room, high + room
 
-    def show_budget(self, names: Sequence[str], rms: Sequence[float], unit: str) -> None:
+    def show_budget(self, rms: Mapping[str, float], unit: str) -> None:
         """Show the sources of the error as bars, the largest on top."""
-        factors = list(names)[::-1] or [""]
-        values = [float(v) for v in rms][::-1]
+        names, values = list(rms)[::-1], list(rms.values())[::-1]
         fig = self.figures["budget"]
-        fig.y_range.factors = factors
+        fig.y_range.factors = names or [""]
         fig.x_range.end = 1.05 * max(values, default=1.0) or 1.0
         fig.title.text = f"error by source, rms [{unit}]"
-        labels = [f"{value:.3g}" for value in values]
-        self._put("budget", y=factors[: len(values)], right=values, label=labels)
+        self._put("budget", y=names, right=values, label=[f"{value:.3g}" for value in values])
 
     def fit(self, loop: AxisLoop) -> None:
         """Choose all ranges for a loop: at the start, and anew by a button."""
         f = loop.freq
-        low = f[0] if loop.machine.is_measured else max(f[0], 0.02 * _first_crossover(loop))
+        first = next(iter(loop.margins.crossovers), f[0])
+        low = f[0] if loop.machine.is_measured else max(f[0], 0.02 * first)
         self.freq_range.start, self.freq_range.end = float(low), float(f[-1])
         inside = f >= low
         for name, values in (("magnitude", loop.L), ("KS", loop.KS), ("PS", loop.PS)):
             size = magnitude_db(values[inside])
-            top, bottom = (
-                float(size.max()) + 6.0,
-                max(float(size.min()), float(size.max()) - _DEPTH),
-            )
+            top, bottom = float(size.max()) + 6.0, float(max(size.min(), size.max() - _DEPTH))
             if name == "magnitude":
                 top, bottom = min(top, 90.0), max(bottom, -110.0)
             fig = self.figures[name]
@@ -389,21 +374,11 @@ class Views:
         (fig.x_range.start, fig.x_range.end), (fig.y_range.start, fig.y_range.end) = _NYQUIST
 
 
-def _first_crossover(loop: AxisLoop) -> float:
-    return float(loop.margins.crossovers[0]) if loop.margins.crossovers else float(loop.freq[0])
-
-
 def _wrapped(L: Any) -> FloatArray:
     """Return the phase between -360 and 0 deg, with gaps where it is wrapped."""
     phase = -np.mod(-np.degrees(np.angle(L)), 360.0)
     jump = np.abs(np.diff(phase, prepend=phase[:1])) > 270.0
     return np.asarray(np.where(jump, np.nan, phase))
-
-
-def _clipped_curve(L: Any) -> Any:
-    """Return a curve that ends on a circle far outside the picture."""
-    size = np.abs(L)
-    return L * np.minimum(1.0, _EDGE / np.maximum(size, 1e-300))
 
 
 def _visible_part(loop: AxisLoop) -> tuple[Any, Any]:
