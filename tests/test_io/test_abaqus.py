@@ -6,7 +6,7 @@ import pytest
 import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError, ShapeError
 from flexplant.io.abaqus import read_abaqus
-from flexplant.io.dmig import read_dmig
+from flexplant.io.punch import read_dmig
 from flexplant.io.sierra import read_sierra
 from flexplant.labels import DofSet
 

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant.errors import FlexplantError, FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.io import models
-from flexplant.io.paths import Format
+from flexplant.io.files import Format
 from shared_data import DATA, needs
 
 FE = DATA / "fe"

@@ -5,7 +5,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import FlexplantError
-from flexplant.io.numbers import decimal, fixed_numbers, rows_of_numbers, wrong_line
+from flexplant.io.files import decimal, fixed_numbers, rows_of_numbers, wrong_line
 
 #: what a program may print for 7500
 RIGHT = ["7.5D+03", "7.5d3", "7.5+03", "7500", "7.5E+003", "+7500.", "75.Q+2"]
@@ -146,7 +146,7 @@ def test_plain_matrix_market_lines_go_through_the_fast_reader(tmp_path, monkeypa
     text = [f"%%MatrixMarket matrix coordinate real symmetric{end}400 400 {len(lines)}", *lines]
     (tmp_path / "K.mtx").write_bytes(end.join(text).encode())
     with monkeypatch.context() as patched:
-        patched.setattr("flexplant.io.matrix_market.rows_of_numbers", None)
+        patched.setattr("flexplant.io.matrix_files.rows_of_numbers", None)
         fast = fx.io.read_matrix_market(tmp_path / "K.mtx").K.toarray()
     assert np.array_equal(np.diag(fast), values)
     assert fast[6, 2] == fast[2, 6] == -0.5

@@ -16,16 +16,19 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from .assembled import from_triplets
-from .numbers import decimal, printed_digits, rows_of_numbers, wrong_line
-from .paths import (
+from .files import (
     FORMATS,
     Format,
     check_count,
     check_whole,
+    decimal,
     defined_twice,
     file_path,
     no_motion,
+    printed_digits,
+    rows_of_numbers,
     unread,
+    wrong_line,
     wrong_line_of,
 )
 

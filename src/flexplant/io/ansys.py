@@ -15,8 +15,8 @@ from ..labels import DIRECTIONS, DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, missing_extra
 from .child import in_child
-from .file_shapes import FileShapes, ModesFormat
-from .paths import ELSEWHERE, FORMATS, Elsewhere, Format, file_path, is_text, no_motion, unread
+from .fe_modes import MODE_READERS, FileShapes
+from .files import ELSEWHERE, FORMATS, Elsewhere, Format, file_path, is_text, no_motion, unread
 from .tables import read_nodes_table
 
 #: a local coordinate system turned less than this [deg] is none
@@ -198,4 +198,4 @@ def read_rst_shapes(path: Path, nodes: Path | None) -> FileShapes:
     return FileShapes(omega, phi, dofs, notes=(note,))
 
 
-RESULTS = ModesFormat((".rst",), read_rst_shapes)
+MODE_READERS[".rst"] = read_rst_shapes

@@ -15,8 +15,8 @@ from ..labels import DofSet
 from ..structure import FEMatrices
 from ..structure.matrices import completed
 from ..structure.precision import digits_of
+from .files import USUAL, damaged, file_path, parsing
 from .foreign_parsers import sound
-from .paths import USUAL, damaged, file_path, parsing
 from .tables import read_dofs
 
 #: the names under which K, M and D are looked for, in any case

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from . import foreign_parsers
-from .paths import file_path
+from .files import file_path
 
 #: children that wait for the next file, by the process that started them and their package
 _WAITING: dict[tuple[int, str], subprocess.Popen[bytes]] = {}

@@ -15,7 +15,7 @@ from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, chosen, missing_extra
 from .child import in_child
-from .paths import FORMATS, USUAL, Format, check_count, file_path, parsing
+from .files import FORMATS, USUAL, Format, check_count, file_path, parsing
 
 #: a byte of a compressed file holds no more bytes than this
 _DEFLATED = 1100

@@ -18,8 +18,8 @@ from ..lti.statespace import StateSpace, System, as_statespace
 from ..plant import StandardPlant
 from ..reduction import ReducedModel
 from ..store import written
+from .files import parsing
 from .mat_matrices import mat_variables
-from .paths import parsing
 
 #: what a file holds one or several of
 MatValue: TypeAlias = StateSpace | StandardPlant | ReducedModel | Frf

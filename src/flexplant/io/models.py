@@ -12,7 +12,7 @@ from ..dof_columns import at_nodes
 from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices, FEModel
-from .paths import ELSEWHERE, FORMATS, HEAD, USUAL, Elsewhere, Format, ends, file_path, three_units
+from .files import ELSEWHERE, FORMATS, HEAD, USUAL, Elsewhere, Format, ends, file_path, three_units
 from .tables import read_dofs, read_nodes_table
 
 _NASTRAN = (

@@ -17,9 +17,8 @@ from ..errors import FlexplantError, ModelError, require_known
 from ..labels import DofSet
 from ..structure.matrices import FEMatrices, completed
 from ..structure.precision import digits_of
+from .files import FORMATS, USUAL, Format, check_count, damaged, file_path, fixed_numbers
 from .nastran import named_matrices
-from .numbers import fixed_numbers
-from .paths import FORMATS, USUAL, Format, check_count, damaged, file_path
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.units import units
-from .numbers import decimal
-from .paths import file_path, refused, text_of
+from .files import decimal, file_path, refused, text_of
 
 #: what other programs call the six directions
 _DIRECTION = {

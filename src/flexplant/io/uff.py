@@ -14,8 +14,8 @@ from ..identification import MeasuredModes
 from ..labels import DIRECTIONS, DofSet
 from ..lti.frequency import ORDERS, Frf
 from ..structure.units import Units
-from .file_shapes import FileShapes, ModesFormat
-from .paths import ELSEWHERE, GLOBAL, ONCE, Elsewhere, at_zero, damaged, file_path, refused, unread
+from .fe_modes import MODE_READERS, FileShapes
+from .files import ELSEWHERE, GLOBAL, ONCE, Elsewhere, at_zero, damaged, file_path, refused, unread
 from .tables import read_nodes_table
 from .uff_records import (
     KINDS,
@@ -36,6 +36,7 @@ from .uff_records import (
 
 #: of dataset 164: numbers divided by them are in SI
 _FACTORS = ("length", "force")
+_UNIVERSAL = (".uff", ".unv", ".uf")
 
 
 def read_frf_uff(
@@ -318,7 +319,7 @@ def read_uff_shapes(path: Path, nodes: Path | None) -> FileShapes:
         )
     ids = parts[0].nodes
     where = path if nodes is None else nodes
-    if where.suffix.lower() in UNIVERSAL_MODES.suffixes:
+    if where.suffix.lower() in _UNIVERSAL:
         known, xyz, factors = raw_nodes(where)
     else:
         (known, xyz), factors = read_nodes_table(where), (1.0, 1.0)
@@ -340,4 +341,4 @@ def read_uff_shapes(path: Path, nodes: Path | None) -> FileShapes:
     )
 
 
-UNIVERSAL_MODES = ModesFormat((".uff", ".unv", ".uf"), read_uff_shapes)
+MODE_READERS |= dict.fromkeys(_UNIVERSAL, read_uff_shapes)

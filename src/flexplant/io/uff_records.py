@@ -16,8 +16,7 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS
 from ..lti.frequency import ORDERS, Frf
 from ..tolerances import SAME
-from .numbers import spaced_numbers
-from .paths import GLOBAL, ONCE, at_zero, damaged, file_path, refused, unread
+from .files import GLOBAL, ONCE, at_zero, damaged, file_path, refused, spaced_numbers, unread
 
 
 def check_systems(parts: list[dict[str, Any]], path: str) -> None:

@@ -1,7 +1,8 @@
-"""Matrices that Nastran punches as DMIG cards, with nodes and components."""
+"""What Nastran punches: matrices as DMIG cards, with nodes and components; eigenvectors."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,21 @@ from ..checks import FloatArray, IntArray
 from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
-from .nastran import Nodes, named_matrices, nastran_float, read_nodes
-from .numbers import fixed_numbers, printed_digits
-from .paths import FORMATS, USUAL, Format, check_whole, damaged, file_path, unread, wrong_line_of
+from .fe_modes import MODE_READERS, FileShapes
+from .files import (
+    FORMATS,
+    USUAL,
+    Format,
+    check_whole,
+    damaged,
+    decimal,
+    file_path,
+    fixed_numbers,
+    printed_digits,
+    unread,
+    wrong_line_of,
+)
+from .nastran import Nodes, named_matrices, nastran_float, read_nodes, shapes_at
 
 _ENDINGS = ("AAX", "AA", "GG", "2GG", "2PP", "")
 
@@ -371,3 +384,69 @@ def _begins(head: bytes) -> bool:
 
 
 FORMATS.append(Format((".pch", ".dmig"), read_dmig, _begins, (".bdf", ".dat", ".nas"), "bdf"))
+
+
+_EIGENVALUE = re.compile(rb"\$EIGENVALUE\s*=\s*(\S+)\s+MODE\s*=\s*(\d+)")
+
+
+def read_punch_shapes(path: Path, nodes: Path | None) -> FileShapes:
+    """Return the mode shapes of a punch file.
+
+    Two lines a point: number, kind and three displacements, then `-CONT-` and three rotations;
+    columns 73 to 80 count lines. A header `$EIGENVALUE = ... MODE = ...` begins each mode.
+    """
+    lines = [line[:72] for line in path.read_bytes().splitlines()]
+    parts: list[tuple[float, dict[int, tuple[bytes, list[float]]]]] = []
+    inside, node, kind = False, 0, b""
+    first: list[float] = []
+    for at, line in enumerate(lines):
+        if line[:1] == b"$":
+            match = _EIGENVALUE.match(line)
+            if match:
+                parts.append((_punch_number(match[1], path, at, line), {}))
+            elif line[:2] == b"$D" or line[:12] == b"$EIGENVECTOR":
+                inside = line[:12] == b"$EIGENVECTOR"
+            continue
+        if not (inside and parts and line.strip()):
+            continue
+        values = [_punch_number(line[i : i + 18], path, at, line) for i in (18, 36, 54)]
+        if line[:6] == b"-CONT-":
+            if not first or node in parts[-1][1]:
+                raise _punch_line_error(path, at, line)
+            parts[-1][1][node] = (kind, first + values)
+            first = []
+        else:
+            words = line[:18].split()
+            if first or len(words) != 2 or not words[0].isdigit():
+                raise _punch_line_error(path, at, line)
+            node, kind, first = int(words[0]), words[1], values
+    if first or not any(points for _, points in parts):
+        raise FlexplantError(
+            f"{str(path)!r} holds no {'whole ' * bool(first)}eigenvectors. Write them in a run of "
+            "SOL 103 with DISPLACEMENT(PUNCH)=ALL; DMIG matrices are read by read_model."
+        )
+    parts = [part for part in parts if part[1]]
+    ids = np.array(list(parts[0][1]), dtype=np.int64)
+    if any(list(points) != list(parts[0][1]) for _, points in parts):
+        raise damaged(path, "the modes are at different nodes")
+    kinds = np.array([1 if kind == b"G" else 2 for kind, _ in parts[0][1].values()])
+    columns = [np.array([values for _, values in points.values()]) for _, points in parts]
+    eigenvalues: FloatArray = np.array([value for value, _ in parts])
+    omega = np.sign(eigenvalues) * np.sqrt(np.abs(eigenvalues))
+    table = (ids, kinds, np.stack(columns, axis=2))
+    return shapes_at(table, omega, nodes=nodes, turned=False, masses=None, path=str(path))
+
+
+def _punch_number(text: bytes, path: Path, at: int, line: bytes) -> float:
+    try:
+        return decimal(text.decode("latin-1"))
+    except (ValueError, OverflowError):
+        raise _punch_line_error(path, at, line) from None
+
+
+def _punch_line_error(path: Path, at: int, line: bytes) -> FlexplantError:
+    do = "The file is cut off or damaged: write it again."
+    return wrong_line_of(path, at + 1, "a point of an eigenvector is", line, do)
+
+
+MODE_READERS[".pch"] = read_punch_shapes

@@ -1,0 +1,255 @@
+"""Modes of the result files of all finite-element programs: shapes, masses, units, damping."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..checks import FloatArray, instance, positive, real_array
+from ..errors import FlexplantError, LabelError, ModelError, ShapeError, counted
+from ..labels import DofSet
+from ..modes import Modes
+from ..structure import FEMatrices, FEModel
+from ..structure.units import Units
+from ..structure.units import units as unit_system
+from .files import damaged, file_path, three_units, unread
+
+#: generalised masses nearer to 1 than this are those of mass-normalised shapes in few digits
+_ONE = 1e-5
+#: relative: what shapes in single precision may deviate from orthonormality
+_SINGLE = 1e-4
+MISSING = (
+    "no residual attachment vectors: what the modes left out move statically is missing "
+    "(write residual vectors as further modes: RESVEC)"
+)
+
+
+@dataclass(frozen=True)
+class FileShapes:
+    """Mode shapes as a file holds them, in its units."""
+
+    omega: FloatArray
+    phi: FloatArray
+    dofs: DofSet
+    masses: FloatArray | None = None
+    zeta: FloatArray | None = None
+    notes: tuple[str, ...] = ()
+    units: Units | None = None
+
+
+#: by suffix, what reads the shapes of a file (its path, that of its nodes); each reader registers
+MODE_READERS: dict[str, Callable[[Path, Path | None], FileShapes]] = {}
+
+
+def scaled_modes(
+    shapes: FileShapes,
+    *,
+    zeta: float | FloatArray | None,
+    rigid_below: float | None,
+    system: Units,
+    path: str,
+) -> Modes:
+    """Return the Modes of shapes, scaled to unit mass and SI."""
+    if not (np.all(np.isfinite(shapes.phi)) and np.all(np.isfinite(shapes.omega))):
+        raise damaged(path, "NaN or infinite numbers in its modes")
+    shapes = _unit_mass(shapes, path)
+    damping = shapes.zeta if zeta is None else zeta
+    if damping is None:
+        raise unread(path, "does not say how modes are damped", "Say it: zeta=0.01, or one a mode.")
+    k = shapes.omega.size
+    damping = real_array(damping, "zeta")
+    if damping.shape not in ((), (k,)):
+        raise ShapeError(
+            f"zeta must be one number or one of each of {counted(k, 'mode')}, got {damping.shape}."
+        )
+    damping = np.array(np.broadcast_to(damping, (k,)))
+    phi, moved = shapes.phi, np.any(shapes.phi != 0, axis=1)
+    notes = shapes.notes
+    if not moved.all():
+        held = int(np.count_nonzero(~moved))
+        notes = (
+            *notes,
+            f"left out, as no mode moves them: {counted(held, 'DOF')} (held, or not there)",
+        )
+    rows = np.flatnonzero(moved)
+    directions = tuple(shapes.dofs.directions[i] for i in rows.tolist())
+    dofs = DofSet(shapes.dofs.nodes[rows], directions, shapes.dofs.xyz[rows])
+    # q in SI, of M in SI: phi / sqrt(unit of mass), rotations per unit of length
+    unit = np.where([d.startswith("r") for d in directions], system.length, 1.0)
+    phi = phi[rows] / (unit * np.sqrt(system.mass))[:, np.newaxis]
+    omega, n_rigid, order = frequencies(shapes.omega / system.time, rigid_below, path)
+    damping = damping[order]
+    damping[:n_rigid] = 0.0
+    return Modes(
+        omega, damping, phi[:, order], system.placed(dofs), n_rigid, notes=(*notes, MISSING)
+    )
+
+
+def _unit_mass(shapes: FileShapes, path: str) -> FileShapes:
+    """Return shapes of generalised mass 1, as far as the file has them."""
+    masses = shapes.masses
+    if masses is None:
+        note = "taken as mass-normalised, which the file does not say"
+        return replace(shapes, notes=(*shapes.notes, note))
+    if np.any(~np.isfinite(masses)) or np.any(masses <= 0):
+        mode = int(np.argmax(~(masses > 0))) + 1
+        what = f"gives mode {mode} a generalised mass of {masses[mode - 1]:g}, not above 0"
+        raise unread(path, what, "Was it written by a modal analysis?")
+    off = float(np.max(np.abs(masses - 1)))
+    if off < _ONE:
+        note = f"mass-normalised: generalised masses of the file are 1 within {off:.1g}"
+        return replace(shapes, notes=(*shapes.notes, note))
+    note = f"scaled to unit mass by generalised masses of {masses.min():.3g} to {masses.max():.3g}"
+    return replace(shapes, phi=shapes.phi / np.sqrt(masses), notes=(*shapes.notes, note))
+
+
+def frequencies(omega: FloatArray, rigid_below: float | None, path: str) -> Any:
+    """Return frequencies [rad/s] in order, how many are 0, and which mode each was."""
+    limit = None if rigid_below is None else 2 * np.pi * positive(rigid_below, "rigid_below")
+    rigid = np.abs(omega) < limit if limit is not None else omega == 0
+    order = np.argsort(np.where(rigid, -np.inf, omega), kind="stable")
+    omega, rigid = omega[order], rigid[order]
+    elastic = omega[~rigid]
+    if elastic.size and (elastic[0] < 0 or (elastic[0] < 1e-3 * elastic[-1] and limit is None)):
+        raise ModelError(
+            f"{path!r} has modes at {np.array2string(elastic[:6] / 2 / np.pi, precision=3)} Hz: "
+            "some of them seem to be rigid-body modes that came out near zero. Say which: "
+            "rigid_below=... [Hz] sets those below to exactly 0 (a tiny one keeps them all)."
+        )
+    return np.where(rigid, 0.0, omega), int(np.count_nonzero(rigid)), order
+
+
+def check_mass(phi: FloatArray, M: Any, path: str) -> float:
+    """Return how far phi^T M phi is from the identity, which single precision may explain."""
+    n = phi.shape[0]
+    if M.shape != (n, n):
+        raise ShapeError(
+            f"M must have shape ({n}, {n}), node by node, got {M.shape}. Give that of the same "
+            "nodes and directions."
+        )
+    gram = phi.T @ np.asarray(M @ phi)
+    off = np.abs(gram - np.eye(gram.shape[0]))
+    if off.max(initial=0.0) > _SINGLE:
+        mode = int(np.argmax(off.max(axis=0)))
+        raise ModelError(
+            f"the shapes of {path!r} are not mass-normalised with M: phi^T M phi of mode "
+            f"{mode + 1} is {gram[mode, mode]:.6g}, the largest entry off by {off.max():.3g}. "
+            "Write them mass-normalised, or check the units and the order of M."
+        )
+    return float(off.max(initial=0.0))
+
+
+def read_modes(
+    path: str | Path,
+    *,
+    zeta: float | FloatArray | None,
+    nodes: str | Path | None = None,
+    rigid_below: float | None = None,
+    units: Sequence[str | float] | None = None,
+    matrices: FEMatrices | FEModel | None = None,
+) -> Modes:
+    r"""Return the modes that a finite-element program computed, whichever wrote the file.
+
+    For models that are too large to be solved here: shapes at all nodes become Modes, and these a
+    plant or a reduced model. By suffix: Nastran .op2, and .pch of DISPLACEMENT(PUNCH); ANSYS .rst;
+    Exodus .exo, .e (frequencies in Hz in the place of time); universal files .uff, .unv of normal
+    modes.
+
+    Residual attachment vectors are not in such files, and cannot be made without M and K: the
+    static motion that the modes left out have is missing, which `notes` say. Nastran and ANSYS
+    write residual vectors as further modes of high frequency (RESVEC), which bring most of it back.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    zeta : float, (k,) array or None
+        Damping ratios, which only universal files hold: None takes those of the file. Rigid-body
+        modes have none.
+    nodes : str or Path, optional
+        Where the nodes are, if not in the file: the bulk data of Nastran (.bdf, .dat), a universal
+        file, or a table `node, x, y, z`.
+    rigid_below : float [Hz], optional
+        Modes below this are rigid-body modes, and set to exactly 0.
+    units : (length, mass, time), optional
+        Of the file: ("mm", "t", "s") for instance; the modes are in SI. None: as a universal file
+        says (dataset 164), or SI.
+    matrices : FEMatrices or FEModel, optional
+        In SI, with the same nodes: the shapes are checked to be mass-normalised with its M.
+
+    Returns
+    -------
+    Modes
+        In global directions, with unit generalised masses where the file has them (LAMA, dataset
+        55) and else as they are. `certificate["mass"]` is the largest entry of phi^T M phi - I
+        where `matrices` are given.
+
+    Raises
+    ------
+    FileNotFoundError
+        When there is no such file, as with every reader.
+    FlexplantError
+        When the format is not known, holds no modes, or the file is damaged.
+    ModelError
+        When damping is not said, modes are near zero and `rigid_below` does not say what they are,
+        several sets of modes are there, or the shapes are not mass-normalised with `matrices`.
+    LabelError
+        When a node has no place or its coordinate system is not there.
+
+    Examples
+    --------
+    A file of one mode at one node, as Nastran punches it:
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> head = "$EIGENVECTOR\n$EIGENVALUE =  0.4000000E+05  MODE =     1\n"
+    >>> row = "".join(f"{number:18.6E}" for number in (0.0, 0.0, 2.0))
+    >>> text = f"{head}{7:10}       G{row}\n{'-CONT-':18}{3 * f'{0.0:18.6E}'}\n"
+    >>> _ = (folder / "run.pch").write_text(text)
+    >>> _ = (folder / "run.bdf").write_text("GRID,7,,0.1,0.2,0.\n")
+    >>> modes = read_modes(folder / "run.pch", zeta=0.01, nodes=folder / "run.bdf")
+    >>> modes.dofs.labels, modes.omega, modes.phi
+    (('7:z',), array([200.]), array([[2.]]))
+    """
+    path = file_path(path)
+    sizes = () if units is None else three_units(units)
+    read = MODE_READERS.get(path.suffix.lower())
+    if read is None:
+        known = ", ".join(MODE_READERS)
+        raise FlexplantError(
+            f"{path.name!r} is no file of modes that is read here; known are {known}. Nastran "
+            "writes .op2 with DISPLACEMENT=ALL and PARAM,POST,-1, ANSYS .rst; of the others export "
+            "a universal file, or matrices, which read_model reads."
+        )
+    shapes = read(path, None if nodes is None else file_path(nodes, "nodes"))
+    system = shapes.units or unit_system() if units is None else unit_system(*sizes)
+    modes = scaled_modes(shapes, zeta=zeta, rigid_below=rigid_below, system=system, path=str(path))
+    if matrices is None:
+        return modes
+    instance(matrices, FEMatrices | FEModel, "matrices", "read_matrices(...) reads them.")
+    return modes.replace(certificate={"mass": _with_mass(modes, matrices, str(path))})
+
+
+def _with_mass(modes: Modes, matrices: FEMatrices | FEModel, path: str) -> float:
+    """Return how far the shapes are from mass-normalised with the M of a model."""
+    if matrices.M is None or matrices.dofs is None:
+        raise ModelError(
+            "matrices need M, and names of their rows, to check the shapes with. Give them: "
+            "read_matrices(..., mass=, dofs=)."
+        )
+    row = {label: i for i, label in enumerate(modes.dofs.labels)}
+    known = set(matrices.dofs.labels)
+    lost = [label for label in row if label not in known]
+    if lost:
+        raise LabelError(
+            f"the modes of {path!r} move {len(lost)} DOFs that the matrices do not have, the first "
+            f"{lost[:4]}. Are both of one model, with the same supports?"
+        )
+    # a row that no mode moves was left out
+    found = [row.get(label, -1) for label in matrices.dofs.labels]
+    phi = np.vstack([np.real(modes.phi), np.zeros(modes.n_modes)])[found]
+    return check_mass(phi, matrices.M, path)
