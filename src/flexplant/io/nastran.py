@@ -1,4 +1,4 @@
-"""Nastran: where nodes are and in which directions they move (bulk data), modes of OUTPUT2 files."""
+"""Nastran: where nodes are and in which directions they move; modes of OUTPUT2 files."""
 
 from __future__ import annotations
 

@@ -21,46 +21,32 @@ from .files import FORMATS, USUAL, Format, check_count, damaged, file_path, fixe
 from .nastran import named_matrices
 
 
-@dataclass(frozen=True)
-class _MatrixLayout:
-    """How integers and record lengths are stored."""
-
-    order: str  # "<" or ">"
-    integer: int  # bytes of an integer and of a word: 4 or 8
-    marker: int  # bytes of a record length: 4 or 8
-
-
-def _layout(content: bytes, path: str) -> _MatrixLayout:
-    for order in "<>":
-        for marker in (8, 4):  # 8 first: in little endian its first half looks like one of 4
-            length = int(np.frombuffer(content, f"{order}i{marker}", 1)[0])
-            if length in (24, 48):
-                return _MatrixLayout(order, length // 6, marker)
-    raise FlexplantError(
-        f"{path!r}, byte 0: an OUTPUT4 file begins with a record of 24 or 48 bytes, got "
-        f"{content[:8].hex(' ')}. It is another format (OUTPUT2?), or was changed in transfer: "
-        "copy it in binary mode."
-    )
-
-
 class _Words:
-    """The records of a binary file, seen as words."""
+    """The records of a binary file, seen as words of either byte order."""
 
     def __init__(self, content: bytes, path: str) -> None:
         self.path, self.content, self.size = path, content, len(content)
-        self.layout = _layout(content, path)
-        self.kind: Any = np.dtype(f"{self.layout.order}i{self.layout.integer}")
-        self.length: Any = np.dtype(f"{self.layout.order}i{self.layout.marker}")
-        self.real = (f"{self.layout.order}f{self.layout.integer}", f"{self.layout.order}f8")
+        for order in "<>":
+            for marker in (8, 4):  # 8 first: in little endian its first half looks like one of 4
+                length = int(np.frombuffer(content, f"{order}i{marker}", 1)[0])
+                if length in (24, 48):
+                    #: byte order; bytes of an integer or word, and of the length of a record
+                    self.order, self.integer, self.marker = order, length // 6, marker
+                    self.real = (f"{order}f{self.integer}", f"{order}f8")
+                    return
+        raise FlexplantError(
+            f"{path!r}, byte 0: an OUTPUT4 file begins with a record of 24 or 48 bytes, got "
+            f"{content[:8].hex(' ')}. It is another format (OUTPUT2?), or was changed in transfer: "
+            "copy it in binary mode."
+        )
 
     def record(self, at: int) -> tuple[int, int]:
         """Return the first and the last byte + 1 of the record that begins at a byte."""
-        marker = self.layout.marker
-        order = "little" if self.layout.order == "<" else "big"
+        marker, order = self.marker, "little" if self.order == "<" else "big"
         length = int.from_bytes(self.content[at : at + marker], order, signed=True)  # type: ignore[arg-type]
         start = at + marker
         stop = start + length
-        if at + marker > self.size or length < 0 or stop + marker > self.size:
+        if start > self.size or length < 0 or stop + marker > self.size:
             raise FlexplantError(
                 f"{self.path!r}, byte {at}: the record of {length} bytes goes beyond the end of "
                 f"the file ({self.size} bytes): it is cut off or damaged. Write or copy it again."
@@ -71,14 +57,14 @@ class _Words:
         return start, stop
 
     def integers(self, at: int, count: int) -> list[int]:
-        form = f"{self.layout.order}{count}{'i' if self.layout.integer == 4 else 'q'}"
+        form = f"{self.order}{count}{'i' if self.integer == 4 else 'q'}"
         return list(struct.unpack_from(form, self.content, at))
 
 
 def binary_matrices(content: bytes, path: str) -> Iterable[tuple[str, Any, int, int | None]]:
     """Yield (name, matrix, form, significant digits or None) of each matrix."""
     words = _Words(content, path)
-    size, marker = words.layout.integer, words.layout.marker
+    size, marker = words.integer, words.marker
     at = 0
     while at < words.size:
         start, stop = words.record(at)
@@ -90,10 +76,9 @@ def binary_matrices(content: bytes, path: str) -> Iterable[tuple[str, Any, int, 
         if columns < 1 or not rows or kind not in (1, 2, 3, 4) or not name.isprintable():
             got = f"{columns} columns, {rows} rows, type {kind}, name {name!r}"
             raise damaged(path, f"byte {start}: no header of a matrix: {got}")
-        check_shape(columns, rows, words.size, path)
+        check_count(max(columns, abs(rows)), words.size, path)
         at = stop + marker
-        starts: list[int] = []
-        stops: list[int] = []
+        places: list[tuple[int, int]] = []
         while True:
             start, stop = words.record(at)
             if stop - start < 3 * size:
@@ -105,9 +90,8 @@ def binary_matrices(content: bytes, path: str) -> Iterable[tuple[str, Any, int, 
                 break
             if column < 1:
                 raise damaged(path, f"byte {start}: column {column} of {name}")
-            starts.append(start)
-            stops.append(stop)
-        matrix = _matrix(words, name, (abs(rows), columns), rows < 0, kind, starts, stops)
+            places.append((start, stop))
+        matrix = _matrix(words, name, (abs(rows), columns), rows < 0, kind, places)
         yield name, matrix, form, digits_of(np.zeros(0, dtype=words.real[kind % 2 == 0]))
 
 
@@ -125,8 +109,7 @@ def _matrix(
     shape: tuple[int, int],
     big: bool,
     kind: int,
-    starts: list[int],
-    stops: list[int],
+    places: list[tuple[int, int]],
 ) -> Any:
     """Return one matrix from the places of its columns.
 
@@ -134,58 +117,58 @@ def _matrix(
     it is sparse, and the data are strings, each with a header: (L + 1, row) in the big form,
     row + 65536 (L + 1) in the other, for L words of values.
     """
-    size = words.layout.integer
-    dtype: Any = np.dtype(words.real[0] if kind in (1, 3) else words.real[1])
+    size, dtype = words.integer, np.dtype(words.real[0] if kind in (1, 3) else words.real[1])
     per = dtype.itemsize * (2 if kind > 2 else 1)
-    target = np.complex128 if kind > 2 else np.float64
-    value: Any = np.dtype(f"{words.layout.order}c{per}") if kind > 2 else dtype
-    heads = [words.integers(start, 3) for start in starts]
-    if not heads and not big:
-        thin = is_thin(shape, 0)
-        return sp.csc_array(shape, dtype=target) if thin else np.zeros(shape, dtype=target)
-    if heads and all(row > 0 for _, row, _ in heads):
-        parts: list[Any] = []
-        thin = is_thin(shape, words.size // per)
-        dense = np.zeros((0, 0) if thin else shape, dtype=target, order="F")
-        for start, stop, (column, row, _) in zip(starts, stops, heads, strict=True):
-            count = (stop - start - 3 * size) // per
-            if row - 1 + count > shape[0]:
-                raise _outside_error(words.path, start, name, row - 1 + count, shape)
-            part = np.frombuffer(words.content, value, count, start + 3 * size)
-            if thin:
-                parts.append(
-                    (part, np.arange(row - 1, row - 1 + count), np.full(count, column - 1))
-                )
-            else:
-                dense[row - 1 : row - 1 + count, column - 1] = part
-        if not thin:
-            return dense
-        data, rows, places = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return sp.csc_array(sp.coo_array((data.astype(target), (rows, places)), shape=shape))
-    first = np.array(starts, dtype=np.int64) + 3 * size
-    counts = np.clip([count for _, _, count in heads], 0, words.size)  # sums of them must not wrap
-    end = np.minimum(first + counts * size, np.array(stops, dtype=np.int64))
-    place, length, row, column = _strings(words, first, end, big, per, name)
-    column = np.array([c for c, _, _ in heads], dtype=np.int64)[column] - 1
+    value: Any = np.dtype(f"{words.order}c{per}") if kind > 2 else dtype
+    column, row, counts = (
+        np.array([words.integers(start, 3) for start, _ in places], np.int64).reshape(-1, 3).T
+    )
+    starts, stops = np.array(places, dtype=np.int64).reshape(-1, 2).T
+    first = starts + 3 * size
+    dense = bool(np.all(row > 0)) and not (big and not places)
+    if dense:
+        place, length = first, (stops - first) // per
+    else:
+        held = np.clip(counts, 0, words.size)  # sums of them must not wrap
+        place, length, row, of = _strings(
+            words, first, np.minimum(first + held * size, stops), big, per, name
+        )
+        column = column[of]
     outside = (row < 1) | (row > shape[0] + 1 - length)
     if np.any(outside):
         bad = int(np.argmax(outside))
-        raise _outside_error(
-            words.path, int(place[bad]), name, int(row[bad] - 1 + length[bad]), shape
+        raise _outside(
+            words.path, f"byte {place[bad]}", name, int(row[bad] - 1 + length[bad]), shape
         )
-    # strings in the order of columns, as they are in the file
-    order = np.argsort(column, kind="stable")
-    place, length, row, column = place[order], length[order], row[order], column[order]
-    # where each value of each string lies in the file, and which row it is of
-    inside = np.arange(int(length.sum())) - np.repeat(np.cumsum(length) - length, length)
-    at = np.repeat(place, length) + inside * per
-    data = _gather(words.content, at, per).view(value).astype(target)
-    rows = np.repeat(row - 1, length) + inside
-    counts = np.bincount(column, weights=length, minlength=shape[1])
-    pointers = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    matrix = sp.csc_array((data, rows, pointers), shape=shape)
-    matrix.sum_duplicates()
-    return matrix
+    if dense:
+        parts = zip(length.tolist(), place.tolist(), strict=True)
+        data = np.concatenate(
+            [np.zeros(0, value), *(np.frombuffer(words.content, value, n, at) for n, at in parts)]
+        )
+    else:
+        inside = np.arange(int(length.sum())) - np.repeat(np.cumsum(length) - length, length)
+        data = _gather(words.content, np.repeat(place, length) + inside * per, per).view(value)
+    target = np.complex128 if kind > 2 else np.float64
+    return _placed((column, row, length), data.astype(target), shape, sparse=not dense)
+
+
+def _placed(
+    strings: tuple[Any, Any, Any], numbers: Any, shape: tuple[int, int], *, sparse: bool
+) -> Any:
+    """Return the matrix of strings of numbers: each its column and first row (from 1), its length.
+
+    Sparse too where it would be too large for the numbers that the file holds of it.
+    """
+    column, row, count = strings
+    if not sparse and shape[0] * shape[1] <= max(_SMALL, _TIMES * numbers.size):
+        dense, ends = np.zeros(shape, dtype=numbers.dtype, order="F"), np.cumsum(count)
+        listed = zip(*(part.tolist() for part in (column, row, count, ends)), strict=True)
+        for j, i, length, end in listed:
+            dense[i - 1 : i - 1 + length, j - 1] = numbers[end - length : end]
+        return dense
+    inside = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+    at = np.repeat(row - 1, count) + inside, np.repeat(column - 1, count)
+    return sp.csc_array(sp.coo_array((numbers, at), shape=shape))
 
 
 def _strings(words: _Words, first: Any, end: Any, big: bool, per: int, name: str) -> Any:
@@ -193,7 +176,7 @@ def _strings(words: _Words, first: Any, end: Any, big: bool, per: int, name: str
 
     The strings of a column are a chain; those of all columns are followed at once.
     """
-    size = words.layout.integer
+    size, integer = words.integer, np.dtype(f"{words.order}i{words.integer}")
     head = 2 * size if big else size
     alive = np.arange(first.size)
     at = first.copy()
@@ -202,7 +185,7 @@ def _strings(words: _Words, first: Any, end: Any, big: bool, per: int, name: str
         here = at[alive]
         if np.any(here + head > end[alive]):
             raise _broken(words.path, int(here[np.argmax(here + head > end[alive])]), name)
-        numbers = _gather(words.content, here, head).view(words.kind).astype(np.int64)
+        numbers = _gather(words.content, here, head).view(integer).astype(np.int64)
         if big:
             length, row = numbers.reshape(-1, 2).T - np.array([[1], [0]])
         else:
@@ -230,10 +213,8 @@ def _gather(content: bytes, at: Any, width: int) -> Any:
     return np.ascontiguousarray(raw[index]).reshape(-1)
 
 
-def _outside_error(
-    path: str, at: int, name: str, row: int, shape: tuple[int, int]
-) -> FlexplantError:
-    return damaged(path, f"byte {at}: a string of {name} reaches row {row} of {shape[0]}")
+def _outside(path: str, where: str, name: str, row: int, shape: tuple[int, int]) -> FlexplantError:
+    return damaged(path, f"{where}: a string of {name} reaches row {row} of {shape[0]}")
 
 
 def _broken(path: str, at: int, name: str) -> FlexplantError:
@@ -318,7 +299,7 @@ class _Reader:
         if not 0 < self.per_line * self.width <= _LINE:
             self.at -= 1
             raise self.wrong(f"numbers as {shown!r}")
-        check_shape(columns, rows, sum(map(len, self.lines)), self.path)
+        check_count(max(columns, abs(rows)), sum(map(len, self.lines)), self.path)
         # Fortran's scale factor 1P puts one digit before the point
         digits = int(match[4]) + (int(match[1]) if match[1] else 0)
         digits = min(digits, _SINGLE) if kind in (1, 3) else digits
@@ -397,33 +378,15 @@ class _Reader:
         if complex_:
             numbers = numbers[0::2] + 1j * numbers[1::2]
         column, row, count = np.array(self.strings, dtype=np.int64).reshape(-1, 3).T
-        inside = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
-        rows = np.repeat(row - 1, count) + inside
-        if rows.size and rows.max() >= shape[0]:
-            reached = f"matrix {name} reaches row {int(rows.max()) + 1} of {shape[0]}"
-            raise damaged(self.path, f"before line {self.at + 1}: {reached}")
-        columns = np.repeat(column - 1, count)
-        if sparse or is_thin(shape, numbers.size):
-            return sp.csc_array(sp.coo_array((numbers, (rows, columns)), shape=shape))
-        dense = np.zeros(shape, dtype=numbers.dtype, order="F")
-        dense[rows, columns] = numbers
-        return dense
+        if (last := int(np.max(row + count - 1, initial=0))) > shape[0]:
+            raise _outside(self.path, f"before line {self.at + 1}", name, last, shape)
+        return _placed((column, row, count), numbers, shape, sparse=sparse)
 
 
 #: entries that are kept dense however few of them the file holds
 _SMALL = 2**20
 #: a dense matrix may take so many times the numbers in the file
 _TIMES = 16
-
-
-def check_shape(columns: int, rows: int, held: int, path: str) -> None:
-    """Refuse a size of a matrix that a file of `held` bytes cannot hold."""
-    check_count(max(columns, abs(rows)), held, path)
-
-
-def is_thin(shape: tuple[int, int], held: int) -> bool:
-    """Return whether a matrix of which the file holds so many numbers is too large to be dense."""
-    return shape[0] * shape[1] > max(_SMALL, _TIMES * held)
 
 
 #: a matrix of the file: dense where the file holds it dense, real or complex
@@ -487,7 +450,7 @@ def read_op4(
     >>> found.K.toarray().tolist(), found.digits
     ([[400000.0, -400000.0], [-400000.0, 400000.0]], 10)
     """
-    found = _read(path, None)
+    found = _read(path)
     given = {"stiffness": stiffness, "mass": mass, "damping": damping}
     chosen = named_matrices(found, given, _ENDINGS, str(path))
     K, M, D = (_real_matrix(found, name, path) for name in chosen)
@@ -517,27 +480,23 @@ def read_op4_matrices(
 
     Raises
     ------
-    FlexplantError
-        When the file is cut off, damaged, or no OUTPUT4 file; the byte or line is named.
-    LabelError
-        When there is no matrix of such a name.
+    FlexplantError, LabelError
+        As for `read_op4`.
 
     Examples
     --------
-    >>> import flexplant as fx
     >>> import pathlib, tempfile
-    >>> text = "       2       2       6       2KAA     1P,3E16.9\n"
-    >>> for i, (a, b) in enumerate([(4e5, -4e5), (-4e5, 4e5), (1.0, None)], 1):
-    ...     text += f"{i:8d}{1:8d}{2 if b else 1:8d}\n{a:16.9E}" + (f"{b:16.9E}\n" if b else "\n")
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     file = pathlib.Path(folder, "run.op4")
-    ...     _ = file.write_text(text)
-    ...     found = fx.io.read_op4_matrices(file)
-    >>> found["KAA"].tolist()
-    [[400000.0, -400000.0], [-400000.0, 400000.0]]
+    >>> file = pathlib.Path(tempfile.mkdtemp(), "run.op4")
+    >>> last = f"{2:8d}{1:8d}{1:8d}\n{1.0:16.9E}\n"
+    >>> _ = file.write_text(f"{1:8d}{1:8d}{2:8d}{2:8d}T       1P,3E16.9\n{1:8d}{1:8d}{1:8d}\n"
+    ...                     f"{7.5:16.9E}\n{last}")
+    >>> read_op4_matrices(file)
+    {'T': array([[7.5]])}
     """
-    found = _read(path, None if names is None else name_list(names, "matrices"))
-    return {name: matrix for name, (matrix, _, _) in found.items()}
+    found = _read(path)
+    wanted = found if names is None else name_list(names, "matrices")
+    require_known("matrix", wanted, found, repr(str(path)))
+    return {name: found[name][0] for name in wanted}
 
 
 def _is_absent(matrix: sp.csc_array | None, n: int) -> bool:
@@ -560,9 +519,7 @@ def _real_matrix(found: dict[str, Any], name: str | None, path: str | Path) -> s
     return sparse
 
 
-def _read(
-    path: str | Path, names: tuple[str, ...] | None
-) -> dict[str, tuple[Op4Matrix, int, int | None]]:
+def _read(path: str | Path) -> dict[str, tuple[Op4Matrix, int, int | None]]:
     """Return {name: (matrix, form, decimal digits of its entries)}; None is double precision."""
     content = file_path(path).read_bytes()
     if len(content) < 16:
@@ -577,7 +534,6 @@ def _read(
             f"{str(path)!r} holds a matrix that does not fit into memory. Write it again, sparse."
         ) from None
     found: dict[str, tuple[Op4Matrix, int, int | None]] = {}
-    matrix: Any
     for name, matrix, form, digits in parts:
         entries = matrix.data if hasattr(matrix, "indptr") else matrix
         if not np.all(np.isfinite(entries)):
@@ -590,10 +546,7 @@ def _read(
             count += 1
             key = f"{name}_{count}"
         found[key] = (matrix, form, digits)
-    if names is None:
-        return found
-    require_known("matrix", names, found, repr(str(path)))
-    return {name: found[name] for name in names}
+    return found
 
 
 FORMATS.append(Format((".op4",), read_op4))
