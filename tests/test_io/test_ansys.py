@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
-from flexplant.io import ansys, child
+from flexplant.io import ansys, foreign_parsers
 from flexplant.io.ansys import cosines_of
 from shared_data import DATA, needs
 
@@ -112,8 +112,8 @@ def test_what_is_no_structure_is_refused(monkeypatch, K, M, kinds, match):
 
 def test_a_missing_extra_gives_the_line_to_type(monkeypatch, tmp_path):
     (tmp_path / "x.full").write_bytes(b"")
-    child._close_all()  # one that waits has imported it
-    child._WAITING.clear()
+    foreign_parsers._close_all()  # one that waits has imported it
+    foreign_parsers._WAITING.clear()
     monkeypatch.setattr(sys, "path", [place for place in sys.path if "site-packages" not in place])
     with pytest.raises(FlexplantError, match=r"pip install 'flexplant\[ansys\]'"):
         fx.io.read_ansys(tmp_path / "x.full")

@@ -15,7 +15,7 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant import io
 from flexplant.errors import FlexplantError
-from flexplant.io import child
+from flexplant.io import foreign_parsers
 from fuzz_files import READERS
 
 SCRIPT = Path(__file__).parents[1] / "fuzz_files.py"
@@ -125,9 +125,9 @@ def test_a_parser_that_dies_leaves_this_process_alive(tmp_path):
         io.read_matlab(path)
     assert io.read_matlab(good).n_dof == 2
     # the next one finds the process of the last, or a new one
-    waiting = child._WAITING[os.getpid(), "matlab"]
+    waiting = foreign_parsers._WAITING[os.getpid(), "matlab"]
     assert io.read_matlab(good).n_dof == 2
-    assert child._WAITING[os.getpid(), "matlab"] is waiting
+    assert foreign_parsers._WAITING[os.getpid(), "matlab"] is waiting
     waiting.kill()
     waiting.wait()
     assert io.read_matlab(good).n_dof == 2
@@ -135,11 +135,11 @@ def test_a_parser_that_dies_leaves_this_process_alive(tmp_path):
 
 def test_without_an_interpreter_to_start_files_are_read_here(tmp_path, monkeypatch):
     scipy.io.savemat(tmp_path / "K.mat", {"K": np.eye(2), "s": {"a": 1.0}})
-    child._close_all()
-    child._WAITING.clear()
+    foreign_parsers._close_all()
+    foreign_parsers._WAITING.clear()
     monkeypatch.setattr(sys, "executable", "/opt/cad/bin/host")
     assert io.read_matlab(tmp_path / "K.mat").n_dof == 2
-    assert (os.getpid(), "matlab") not in child._WAITING
+    assert (os.getpid(), "matlab") not in foreign_parsers._WAITING
     resource = pytest.importorskip("resource")
     assert resource.getrlimit(resource.RLIMIT_DATA)[0] == resource.RLIM_INFINITY
 

@@ -14,9 +14,9 @@ from ..errors import FlexplantError, counted
 from ..labels import DIRECTIONS, DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, missing_extra
-from .child import in_child
 from .fe_modes import MODE_READERS, FileShapes
 from .files import ELSEWHERE, FORMATS, Elsewhere, Format, file_path, is_text, no_motion, unread
+from .foreign_parsers import in_child
 from .tables import read_nodes_table
 
 #: a local coordinate system turned less than this [deg] is none

@@ -14,8 +14,8 @@ from ..errors import FlexplantError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, chosen, missing_extra
-from .child import in_child
 from .files import FORMATS, USUAL, Format, check_count, file_path, parsing
+from .foreign_parsers import in_child
 
 #: a byte of a compressed file holds no more bytes than this
 _DEFLATED = 1100
