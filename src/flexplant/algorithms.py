@@ -59,7 +59,7 @@ trust region within the bounds. The second term, of the parameters with a prior,
 the noise of every residual is known (the answer is then the maximum a posteriori).
 
 Modes are found by their number in the model at `start` and followed by shape (see
-`flexplant.updating.point_model`), so they may swap order on the way; those with measured shapes
+`flexplant.updating.family`), so they may swap order on the way; those with measured shapes
 are assigned by MAC at each step. Modes that are exactly repeated there are first turned to the
 vectors in which the step splits them, the lower mode number going to the lower frequency. Steps
 are shortened while M or K would become indefinite, a measured mode would cease to oscillate, or

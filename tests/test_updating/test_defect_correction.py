@@ -12,7 +12,7 @@ from flexplant.updating import (
     AddedMass,
     Eigenvalues,
     MatrixParameter,
-    full_basis,
+    changed_model,
     update,
 )
 from other_plate import TRUTH, OtherPlate
@@ -75,7 +75,7 @@ def test_the_covariance_is_that_of_the_errors(machine, kind):
 def test_damping_of_the_reduced_model_is_that_of_the_full_one(machine):
     """D of the full model is not known: its first modes are damped as the reduced model's are."""
     full = machine.full.replace(D=None)
-    basis = full_basis.FullBasis(full, machine.unknowns[:2], [], machine.rom)
+    basis = changed_model.FullBasis(full, machine.unknowns[:2], [], machine.rom)
     wide = basis.at(np.zeros(2))
     modes = wide.modes()
     known = machine.rom.modes()
@@ -124,7 +124,7 @@ def test_what_does_not_go_together_is_refused(machine, monkeypatch):
     own = [MatrixParameter("E", dK=machine.rom.K)]
     with pytest.raises(ShapeError, match="full model needs the matrices of all"):
         update(machine.rom, own, data, full=machine.full)
-    monkeypatch.setattr(full_basis, "LARGE", 100)
-    monkeypatch.setattr(full_basis, "TOO_LARGE", 120)
+    monkeypatch.setattr(changed_model, "LARGE", 100)
+    monkeypatch.setattr(changed_model, "TOO_LARGE", 120)
     with pytest.raises(ModelError, match=r"126 DOFs \(limit 120\).*full=model"):
         update(machine.full, machine.unknowns, data)

@@ -14,10 +14,9 @@ from flexplant.updating import (
     ModeShapes,
     localise,
 )
-from flexplant.updating.family import Family
+from flexplant.updating.family import Family, first_point
 from flexplant.updating.judgement import subsets
 from flexplant.updating.judgement.subsets import coordinates, lifted_point, load_vectors
-from flexplant.updating.point_model import first_point
 
 
 @pytest.fixture(scope="module")

@@ -21,8 +21,7 @@ from flexplant.updating import (
     ShapeCorrelation,
     StaticCompliance,
 )
-from flexplant.updating.family import Family
-from flexplant.updating.point_model import first_point
+from flexplant.updating.family import Family, first_point
 from flexplant.updating.search import Objective
 
 BASE = np.array([0.3, 5.0, 1e5, 0.002])

@@ -10,8 +10,7 @@ from flexplant.modes import solve_modes
 from flexplant.reduction import DesiredDofs, reduce
 from flexplant.structure import ModalDamping, PointMass
 from flexplant.updating import AddedMass, Eigenvalues, localise
-from flexplant.updating.family import repeated_groups
-from flexplant.updating.point_model import Point
+from flexplant.updating.family import Point, repeated_groups
 from flexplant.updating.search import Objective
 
 

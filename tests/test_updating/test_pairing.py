@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flexplant.updating.point_model import pair
+from flexplant.updating.family import pair
 
 
 def turned(degrees):

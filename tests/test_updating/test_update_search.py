@@ -21,7 +21,7 @@ from flexplant.updating import (
     update,
 )
 from flexplant.updating.search import SearchEnd
-from flexplant.updating.search.update_method import Trail
+from flexplant.updating.search.objective import Trail
 
 
 @pytest.mark.slow

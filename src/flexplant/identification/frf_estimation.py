@@ -1,4 +1,4 @@
-"""From time records to frequency responses."""
+"""From time records to frequency responses, and whether feedback biases them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,93 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray, members, positive
-from ..errors import ModelError, ShapeError, require_known
+from ..errors import ModelError, ShapeError, require_known, warn
 from ..lti.frequency import Frf
+from ..tolerances import TINY
 from .periodic import Periodic, averages_advised, periodic_frf
 from .spectra import H1Estimator, SpectralMethod, dropouts_warned, records, spectral_frf
+
+#: samples next to zero lag where delays between channels and the taper act
+GUARD = 8
+#: share of the segment's lags that is used: beyond, what rings longer than it folds back
+LOOKED = 0.25
+#: lines over which power is averaged: at a quarter of the lags some ten are independent
+STRETCH = 41
+#: share of the band above which the taper leaves rounding
+HIGHEST = 0.7
+#: power over that of noise there: chi-square of 20 degrees of freedom passes 4 once in 10^8
+SEEN = 16.0
+#: share of the response below which it is leakage of the window or the channels' filters
+LEAST = 0.05
+
+
+def feedback_warned(frf: Frf) -> None:
+    r"""Warn of an FRF that responds before its input acts: feedback biases it.
+
+    With ``u = r - K y`` and noise v on y the direct estimate tends to
+
+    .. math:: S_{yu} S_{uu}^{-1} = \frac{G S_{rr} - K^* S_{vv}}{S_{rr} + |K|^2 S_{vv}}
+
+    whose K^* acts before its input: an impulse response at negative times, which no machine has
+    ([PintelonSchoukens2012]_, section 2.6.4).
+    Noise that returns through a set-point's controller alone, ``u = K (r - y)``, biases by 1/K,
+    which is causal: no record of u and y shows that. The response is taken from lines with s^2
+    and a taper, so that neither rigid-body modes nor the end of the band spread over all lags,
+    and compared with what the variance makes there. Hann-windowed segments only: others fold
+    what rings on at the end of a segment to these times.
+    """
+    n = frf.freq.size
+    if frf.window != "hann" or frf.variance is None or frf.resolution is None or n < 4 * STRETCH:
+        return
+    lines = np.arange(1, n + 1)
+    if not np.allclose(frf.freq, lines * frf.resolution):
+        return
+    weight = (lines / n) ** (0.0 if frf.quantity == "acceleration" else 2.0) * _taper(lines / n)
+    size = 2 * (n + 1)
+    lag = np.arange(size)
+    early = size - lag  # samples before the input
+    end = LOOKED * size
+    window = np.where((early > GUARD) & (early < end), np.cos(0.5 * np.pi * early / end) ** 2, 0.0)
+    spectrum = np.zeros((*frf.data.shape[:2], n + 2), dtype=np.complex128)
+    spectrum[..., 1:-1] = frf.data * weight
+    power = np.zeros(spectrum.shape)
+    power[..., 1:-1] = frf.variance * weight**2
+    seen = np.abs(np.fft.rfft(np.fft.irfft(spectrum, size) * window)) ** 2
+    # independent lines: their power is spread by that of the window's spectrum
+    spread = np.abs(np.fft.fft(window) / size) ** 2
+    both = np.concatenate([power, power[..., -2:0:-1]], axis=-1)
+    noise = np.fft.irfft(np.fft.rfft(both) * np.fft.rfft(spread), size)[..., : n + 2]
+    seen, noise, whole = (_moving_mean(x) for x in (seen, noise, np.abs(spectrum) ** 2))
+    ratio = seen / np.maximum(noise, TINY)
+    share = np.sqrt(seen / np.maximum(whole, TINY))
+    score: Any = np.where((ratio > SEEN) & (share > LEAST), ratio, 0.0)[..., 1:-1]
+    score[..., :STRETCH] = score[..., round(HIGHEST * n) :] = 0.0
+    if not score.any():
+        return
+    o, i, f = np.unravel_index(int(np.argmax(score)), score.shape)
+    warn(
+        f"the records were made in closed loop: near {frf.freq[f]:.4g} Hz "
+        f"{share[o, i, f + 1]:.1%} of the response, {np.sqrt(ratio[o, i, f + 1]):.2g} times its "
+        "noise, come before the input acts, which "
+        "noise that returns through a controller does. The direct estimate S_yu/S_uu is biased "
+        "there towards -1/K, by at least this share, and poles with it. Record the excitation or "
+        "set-point and pass reference=, or use whole periods, identification.Periodic(...)."
+    )
+
+
+def _taper(x: FloatArray) -> FloatArray:
+    """Return 1 at zero and 0 at one, with an impulse response that dies within a few samples."""
+    from scipy.signal.windows import kaiser
+
+    both = kaiser(2049, 12.0)
+    return np.asarray(np.interp(x, np.linspace(0.0, 1.0, 1025), both[1024:]))
+
+
+def _moving_mean(power: FloatArray) -> FloatArray:
+    import scipy.ndimage as ndi
+
+    return np.asarray(ndi.uniform_filter1d(power, STRETCH, axis=-1, mode="nearest"))
+
 
 Signals: TypeAlias = npt.ArrayLike | Mapping[str, Any]
 
@@ -117,7 +200,10 @@ def estimate_frf(
         return periodic_frf(data, method, quantity)
     if isinstance(method, SpectralMethod):
         averages_advised(data.u if data.r is None else data.r, data.rate, method.window)
-        return spectral_frf(data, method, quantity)
+        frf = spectral_frf(data, method, quantity)
+        if data.r is None:
+            feedback_warned(frf)
+        return frf
     raise ModelError(
         "method is identification.H1Estimator(...), identification.H2Estimator(...), "
         "identification.HvEstimator(...) or identification.Periodic(...), got "

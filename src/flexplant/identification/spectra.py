@@ -13,7 +13,6 @@ from ..errors import ModelError, ShapeError, warn
 from ..lti.frequency import Frf
 from ..lti.measured_lines import checked_overlap, checked_window
 from ..tolerances import ROUNDING, TINY
-from .feedback import feedback_bias, feedback_warned
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -209,7 +208,7 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
     left = _left_over(found, G, with_reference=data.r is not None)
     left = left * (found.count / (found.count - n_ref))
     variance, correlation = error_statistics(left, inverse / found.count)
-    frf = Frf(
+    return Frf(
         found.freq,
         G.transpose(1, 2, 0),
         inputs=data.inputs,
@@ -222,9 +221,6 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
         window=method.window,
         overlap=method.overlap,
     )
-    if data.r is None:
-        feedback_warned(feedback_bias(frf))
-    return frf
 
 
 #: averages times power of the inputs that references explain over the rest: below, the errors of

@@ -16,7 +16,7 @@ from ..labels import DofSet
 from ..lti.frequency import Frf
 from ..tolerances import TINY
 from ..updating import Correlation, FrfResidual, Localisation, Residual, UpdateResult, correlate
-from ..updating.parameters.added import Parameter, PointParameter
+from ..updating.parameters import Parameter, PointParameter
 from ..updating.search import Objective
 from ._axes import (
     BLUE,

@@ -1,4 +1,4 @@
-"""A model with parameters of an update at other values, and why a model may refuse them."""
+"""A model with its parameters at other values, and the full structure in a basis for them."""
 
 from __future__ import annotations
 
@@ -6,17 +6,26 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
 
 from ..checks import FloatArray, Matrix
-from ..errors import ModelError, attempted, warn
+from ..errors import ModelError, ShapeError, attempted, warn
 from ..modes import solve_modes
+from ..modes.dynamic_basis import static_shapes
 from ..modes.normal_form import RIGID_DRAG
+from ..modes.sparse_modes import counted_modes
+from ..reduction import ReducedModel
+from ..sparse.lanczos import beyond
 from ..structure.attachments import matrix_sum
 from ..structure.definite import why_indefinite
 from ..structure.model import FEModel
 from ..structure.rigid import orthonormalised
-from .family import Family
-from .parameters.added import Parameter
+from .family import Family, Point, pair
+from .parameters import Parameter, PointParameter
+from .residuals.residual import Residual
+from .search import Objective
+from .search.objective import compared_modes
 
 
 def changed_model(
@@ -146,3 +155,152 @@ def _impossible(
             "(0.0, None) for what can only be added, or measure more."
         )
     return ""
+
+
+#: modes of the basis for each coordinate of the reduced model
+WIDER = 4
+#: DOFs from which an FEModel is updated in such a basis, and from which it is too large for that
+LARGE, TOO_LARGE = 300, 20_000
+#: DOFs from which few modes (one of so many) are found faster by Lanczos than densely
+SPARSE, FEW = 600, 10
+#: bases of a large FEModel until its estimate moves no more
+MOST_ROUNDS = 10
+
+
+def is_large(model: Any) -> bool:
+    """Return whether a model is an FEModel that is updated in a basis."""
+    if not isinstance(model, FEModel) or model.n_dof <= LARGE:
+        return False
+    if model.n_dof > TOO_LARGE:
+        raise ModelError(
+            f"updating an FEModel of {model.n_dof} DOFs (limit {TOO_LARGE}) solves it anew for "
+            "each estimate. Reduce it, rom = reduce(...), and pass update(rom, ..., full=model): "
+            "a few solutions then do."
+        )
+    return True
+
+
+class FullBasis:
+    """The full model ``M + p dM`` and so on, at any `p`, as a large reduced model made at this p.
+
+    Its basis holds the lowest modes of the full structure at `p`, the static response ``u = G f``
+    to unit forces f at all places of measurement and parameters, and ``G M u``: responses have an
+    error of order ``(f / f_cut)^8`` of what the truncated modes give.
+    """
+
+    def __init__(
+        self,
+        full: Any,
+        parameters: Sequence[Parameter],
+        residuals: Sequence[Residual],
+        reduced: Any = None,
+    ) -> None:
+        if not isinstance(full, FEModel) or not isinstance(reduced, ReducedModel | None):
+            raise ModelError(
+                f"full= needs a reduced model and the FEModel it was made from, got "
+                f"{type(reduced).__name__} and {type(full).__name__}. Pass update(reduced, ..., "
+                "full=model)."
+            )
+        if reduced is not None and full.dofs.labels != reduced.full_dofs.labels:
+            raise ModelError(
+                f"full has {len(full.dofs)} DOFs that are not the {len(reduced.full_dofs)} of the "
+                "reduced model's structure, in this order: they are not of one structure. Pass "
+                "the FEModel that was reduced."
+            )
+        self.full, self.reduced = full, reduced
+        self.parameters, self.residuals = tuple(parameters), tuple(residuals)
+        loaded = [pair for residual in residuals for pair in residual.loaded]
+        loads = [full.dofs.row(place, direction) for place, direction in loaded]
+        for q in parameters:
+            if isinstance(q, PointParameter):
+                loads += q.rows(full)  # the force of p r r^T is along r
+        try:
+            for q in parameters:
+                q.matrices(full)
+        except ShapeError as error:
+            raise ShapeError(
+                f"{error} The full model needs the matrices of all its DOFs: give those, they are "
+                "projected on the reduced model."
+            ) from None
+        self.loads = np.array(loads).reshape(-1, full.n_dof).T
+
+    def at(self, p: FloatArray) -> ReducedModel:
+        """Return the full model, its parameters at zero, in the basis that is good at `p`."""
+        full, V = self.full, self._basis(p)
+        M, K = (np.asarray(V.T @ (part @ V)) for part in (full.M, full.K))
+        D = np.zeros_like(M)
+        if full.D is not None:
+            D = np.asarray(V.T @ (full.D @ V))
+        elif self.reduced is not None:
+            known = la.lstsq(self.reduced.M, self.reduced.T.T @ np.asarray(full.M @ V))[0]
+            D = known.T @ self.reduced.D @ known
+        rigid = V.T @ np.asarray(full.M @ full.rigid_body)
+        return ReducedModel(
+            M=(M + M.T) / 2,
+            D=(D + D.T) / 2,
+            K=(K + K.T) / 2,
+            T=V,
+            dofs=full.dofs.select(()),
+            full_dofs=full.dofs,
+            rigid_body=rigid,
+            method="a basis at the estimate",
+            coordinates=[f"vector {i + 1}" for i in range(V.shape[1])],
+        )
+
+    def objective(self, near: Point) -> Objective:
+        """Return the residuals of the full model at a point of the reduced one, modes paired."""
+        model = self.at(near.p)
+        objective = Objective(model, self.parameters, self.residuals, prior=False)
+        family, eigen = objective.family, objective.family.at(near.p)
+        # shapes of both in coordinates where the mass matrix is the unit matrix
+        known: Any = near.family.model
+        seen = known.T @ (near.family.V @ near.eigen.X)
+        old = family.V.T @ (model.T.T @ np.asarray(self.full.M @ seen))
+        found = pair(near.eigen.poles, old, family.weighted(eigen.X))
+        labels = np.zeros(eigen.poles.size, dtype=np.int64)
+        labels[found[found >= 0]] = near.labels[found >= 0]
+        objective.place(Point(family, near.p, eigen, labels))
+        return objective
+
+    def _basis(self, p: FloatArray) -> FloatArray:
+        """Return the M-orthonormal basis (n, k) at `p`, rigid-body motions of the model first."""
+        changed = self._changed(p)
+        phi, static = self._modes(changed), static_shapes(changed, self.loads)
+        M: Any = self.full.M
+        V = np.array(self.full.rigid_body)
+        for part in (phi, static):
+            V = np.hstack([V, beyond(M, V, part)])
+        return V
+
+    def _modes(self, model: FEModel) -> FloatArray:
+        """Return the shapes of a changed model that take part."""
+        n = model.n_dof
+        if self.reduced is not None:
+            return _lowest_modes(model, min(WIDER * self.reduced.n_dof, n))[1]
+        highest = max((number for r in self.residuals for number in compared_modes(r)), default=6)
+        top = WIDER * max(residual.top for residual in self.residuals)
+        omega, phi = _lowest_modes(model, min(WIDER * highest, n))
+        if omega.size < n and omega[-1] < top:
+            _, phi = _lowest_modes(model, n, top)
+        return phi
+
+    def _changed(self, p: FloatArray) -> FEModel:
+        changes: dict[str, Any] = {"M": self.full.M, "K": self.full.K}
+        for q, value in zip(self.parameters, p.tolist(), strict=True):
+            dM, _, dK = q.change(self.full, value)
+            changes = {"M": matrix_sum(changes["M"], dM), "K": matrix_sum(changes["K"], dK)}
+        return self.full.replace(**changes, D=None)
+
+
+def _lowest_modes(model: FEModel, count: int, top: float = np.inf) -> tuple[FloatArray, FloatArray]:
+    """Return omega and shapes of the lowest modes, up to `top` [rad/s]."""
+    r = model.rigid_body.shape[1]
+    sparse = sp.issparse(model.K) and sp.issparse(model.M) and not model.n_unstable
+    few = model.n_dof > SPARSE and FEW * count < model.n_dof
+    if sparse and few and np.isinf(top) and count > r:
+        squares, phi, _ = counted_modes(model, count - r)
+        omega = np.concatenate([np.zeros(r), np.sqrt(squares)])
+        return omega, np.hstack([model.rigid_body, phi])
+    below = None if np.isinf(top) else top / (2 * np.pi)
+    modes = solve_modes(model, count=None if below else count, below=below)
+    return modes.omega, np.real(modes.phi)

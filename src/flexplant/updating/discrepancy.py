@@ -1,4 +1,4 @@
-"""What a model cannot explain: one variance for each kind of residual, by restricted likelihood."""
+"""What a model cannot explain, and by what shares its modes may be off."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, Value
-from .point_model import Point
+from ..checks import ComplexArray, FloatArray, Value, instance
+from ..errors import ModelError, counted
+from ..modes.modes import MeshError, measured_poles
+from ..tolerances import divisor
+from .family import Point
+from .residuals.modes import USUAL, ZETA, Eigenvalues, growth
 from .residuals.residual import Bound, Kind
 from .search import Objective, SearchEnd, UpdateMethod
+from .sensitivities import eigenvalue_sensitivities
 
 #: degrees of freedom that the usual discrepancy of a kind counts: two measured modes outweigh it,
 #: and none measured leaves it
@@ -191,3 +196,180 @@ def weigh_discrepancy(
             break
         before = size
     return end, tuple(found)
+
+
+#: least relative errors of measured frequencies and damping: a machine drifts by more than its
+#: noise, and its damping depends on amplitude and temperature
+_DRIFT = (1e-3, 0.02)
+#: deviations that count of a measured pole
+_DEVIATIONS = 2.0
+#: of the error that two meshes show: it covered 55 to 100 % of modes
+_MESH = 1.5
+#: probability outside an interval, both sides together
+_OUTSIDE = 0.05
+#: relative deviation of measured poles whose noise is not known: that of rounding
+_EXACT = 1e-9
+#: deviation of the logarithm of a damping that says nothing
+_SILENT = 1e2
+#: by which relative change of poles parameters may be off before anything is measured
+_WIDE = 1.0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ModalUncertainty(Value):
+    """By what shares frequencies and damping ratios of a model's elastic modes may be off.
+
+    ``plant.uncertain(...)`` takes it. Made by ``fit.uncertainty(...)``.
+
+    Parameters
+    ----------
+    modes : sequence of m int
+        Elastic modes, from 1, rigid-body modes included.
+    share : (2 m,) array
+        Half-widths of the intervals of frequencies, then of damping ratios: 95 % of the true values
+        are meant to lie inside.
+    covariance : (2 m, 2 m) array
+        Of the logarithms of frequencies, then of damping ratios, jointly: noise of the
+        measured poles, parameters and what the model cannot explain. Half-widths hold bias, drift,
+        mesh and Student's distribution beside it.
+    poles : (m,) complex array [rad/s]
+        Of the model.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> measured = fx.MeasuredModes(poles=[615.0j], modes=[2])
+    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
+    >>> fit.uncertainty(measured).modes
+    (2, 3)
+    """
+
+    modes: tuple[int, ...]
+    share: FloatArray
+    covariance: FloatArray
+    poles: ComplexArray
+
+    @property
+    def frequency(self) -> dict[int, float]:
+        """The share of each mode's frequency."""
+        return dict(zip(self.modes, self.share.tolist(), strict=False))
+
+    @property
+    def damping(self) -> dict[int, float]:
+        """The share of each mode's damping ratio."""
+        return dict(zip(self.modes, self.share[len(self.modes) :].tolist(), strict=True))
+
+    def __repr__(self) -> str:
+        m = len(self.modes)
+        parts = [
+            f"{name} {100 * part.min():.2g} to {100 * part.max():.2g} %"
+            for name, part in (("frequency", self.share[:m]), ("damping", self.share[m:]))
+        ]
+        return f"<ModalUncertainty: {counted(m, 'mode')}, {', '.join(parts)}>"
+
+
+def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalUncertainty:
+    """Return by what shares modes may be off; see `UpdateResult.uncertainty`."""
+    instance(mesh, MeshError | None, "mesh", "Make it by modes.mesh_error(finer).")
+    calibrated = measured is not None
+    if measured is None:
+        measured = fit.fitted_poles
+        if measured is None:
+            raise ModelError(
+                "what the model is off by is judged by measured poles, and the fit was not made "
+                "from one set of them. Pass them: fit.uncertainty(measured)."
+            )
+    about = [q.about(v) for q, v in zip(fit.unknowns, fit.values.tolist(), strict=True)]
+    found = eigenvalue_sensitivities(fit.model, about)
+    # attachment vectors stand for modes left out: no machine has their frequencies
+    m = len(found.modes) - getattr(fit.model, "n_vectors", 0)
+    found = found.replace(modes=found.modes[:m], poles=found.poles[:m], S=found.S[:m])
+    known = range(found.modes[0], found.modes[-1] + 1)
+    places, poles = measured_poles(measured, known)
+    places = places + 1 - found.modes[0]
+    own = found.poles[places]
+    both = np.r_[places, m + places]
+    S = _relative_changes(found.poles, found.S)
+    ratio = _damping(poles) / divisor(_damping(own))
+    said = np.r_[np.full(ratio.size, True), ratio > ZETA]
+    gap = np.r_[np.log(np.abs(poles / own)), np.log(np.where(ratio > ZETA, ratio, 1.0))]
+    # the damping of a model or a measurement without any says nothing
+    noise = np.where(np.outer(said, said), _noise(measured, poles), np.eye(said.size) * _SILENT**2)
+    grown = growth(np.abs(found.poles), np.abs(poles))
+    mean, covariance, dof = _conditioned(S, both, gap, noise, np.r_[grown, np.ones(m)], fit)
+    model = found.poles.copy()
+    if calibrated:
+        mean[both], model[places] = 0.0, poles
+    from scipy.special import stdtrit
+
+    width = np.repeat(stdtrit(dof, 1 - 0.5 * _OUTSIDE), m)
+    width[both] = _DEVIATIONS
+    # of logarithms: the upper side is the wider one
+    share = np.expm1(np.abs(mean) + width * np.sqrt(np.diag(covariance)))
+    if mesh is not None:
+        for mode, error in zip(mesh.modes.tolist(), mesh.error.tolist(), strict=True):
+            if mode in known and mode - known[0] not in places:
+                share[mode - known[0]] = max(share[mode - known[0]], _MESH * abs(error))
+    share[both] = np.maximum(share[both], np.repeat(_DRIFT, places.size))
+    return ModalUncertainty(found.modes, share, covariance, model)
+
+
+def _conditioned(
+    S: FloatArray, both: FloatArray, gap: FloatArray, noise: FloatArray, grown: FloatArray, fit: Any
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return mean and covariance of the relative errors of all modes, given the measured ones.
+
+    ``d = S dp + s g (e + 1 c)`` with independent e of each mode and c of all, s by restricted
+    likelihood, g how errors grow with frequency; normal, conditioned on ``gap = d + noise``.
+    Degrees of freedom of s last.
+    """
+    m, measured = len(S) // 2, both.size // 2
+    shared = np.kron(np.eye(2), np.ones((m, 1))) * grown[:, None]
+    each = np.diag(grown[both])
+    kinds = [
+        Kind(name, np.hstack([each[:, part], shared[both][:, [i]]]), usual)
+        for i, (name, usual) in enumerate(zip(("frequency", "damping"), USUAL, strict=True))
+        for part in (slice(i * measured, (i + 1) * measured),)
+    ]
+    sizes, _ = restricted(gap, S[both], noise, kinds)
+    s = np.repeat([one.deviation for one in sizes], m)
+    alone = all(isinstance(one, Eigenvalues) for one in fit.residuals)
+    if alone or fit.covariance is None:
+        length = divisor(np.linalg.norm(S[both], axis=0))
+        parameters = (S * _WIDE / length) @ (S * _WIDE / length).T
+    else:
+        parameters = S @ fit.covariance @ S.T
+    before = parameters + np.outer(s, s) * (np.diag(grown**2) + shared @ shared.T)
+    factor = la.cho_factor(before[np.ix_(both, both)] + noise, lower=True)
+    gain = la.cho_solve(factor, before[both]).T
+    after = before - gain @ before[both]
+    # rounding of what is known well must not make a variance negative
+    least = np.zeros(2 * m)
+    least[both] = 0.5 * np.diag(noise)
+    after = 0.5 * (after + after.T)
+    after[np.diag_indices(2 * m)] = np.maximum(np.diag(after), least)
+    return gain @ gap, after, np.array([one.dof for one in sizes])
+
+
+def _damping(poles: ComplexArray) -> FloatArray:
+    return np.asarray(-poles.real / np.abs(poles))
+
+
+def _noise(measured: Any, poles: ComplexArray) -> FloatArray:
+    """Return the covariance of relative errors of frequencies and damping of measured poles."""
+    m = poles.size
+    exact = np.eye(2 * m) * _EXACT**2
+    if measured.covariance is None:
+        return exact
+    G = _relative_changes(poles, np.hstack([np.eye(m), 1j * np.eye(m)]))
+    return np.asarray(G @ measured.covariance @ G.T + exact)
+
+
+def _relative_changes(poles: ComplexArray, changes: ComplexArray) -> FloatArray:
+    """Return relative changes (2m, q) of frequencies and of damping ratios by those of poles."""
+    part = np.real(changes / poles[:, None])
+    # an undamped pole has no relative damping: nothing is said of it
+    damped = np.where(_damping(poles) > ZETA, poles.real, np.inf)
+    return np.vstack([part, changes.real / damped[:, None] - part])

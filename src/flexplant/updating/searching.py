@@ -20,15 +20,14 @@ from ..errors import (
 )
 from ..tolerances import TINY, divisor
 from .changed_model import changed_model
+from .family import Point
 from .judgement.goodness import chance, chi_square, is_bad
-from .parameters.added import PointParameter
-from .point_model import Point
-from .residuals.eigenvalues import Eigenvalues
+from .parameters import PointParameter
 from .residuals.frf_residual import FrfResidual
-from .residuals.mode_shapes import ModeShapes
+from .residuals.modes import Eigenvalues, ModeShapes
 from .residuals.residual import Residual
 from .search import Objective, SearchEnd, TrustRegion, UpdateMethod
-from .search.update_method import Trail
+from .search.objective import Trail
 from .sensitivities import checked_values
 from .update_result import Starts
 

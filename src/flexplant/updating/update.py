@@ -12,16 +12,14 @@ from ..errors import FlexplantError, ModelError, counted, warn
 from ..parallel import Progress
 from ..structure.model import FEModel
 from ..tolerances import TINY
-from .changed_model import changed_model
+from .changed_model import MOST_ROUNDS, FullBasis, changed_model, is_large
 from .discrepancy import weigh_discrepancy
-from .full_basis import MOST_ROUNDS, FullBasis, is_large
 from .judgement.goodness import chi_square, covariance, is_bad, worst
-from .parameters.added import Parameter
-from .residuals.eigenvalues import Eigenvalues
+from .parameters import Parameter
+from .residuals.modes import Eigenvalues
 from .residuals.residual import Residual
 from .search import Objective, SearchEnd, Secured, TrustRegion, UpdateMethod, checked_residuals
-from .search.objective import Defect
-from .search.update_method import ITERATIONS, unit_changes
+from .search.objective import ITERATIONS, Defect, unit_changes
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
 from .sensitivities import checked_parameters, checked_values
 from .update_result import History, UpdateResult

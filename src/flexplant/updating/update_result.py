@@ -23,11 +23,10 @@ from ..errors import ModelError, counted, require_known
 from ..identification import MeasuredModes
 from ..modes import MeshError, Modes, solve_modes
 from .changed_model import applied
-from .discrepancy import USUAL_DOF, Discrepancy
+from .discrepancy import USUAL_DOF, Discrepancy, ModalUncertainty, modal_uncertainty
 from .judgement.goodness import chance, is_bad
-from .modal_uncertainty import ModalUncertainty, modal_uncertainty
-from .parameters.added import AddedMass, Parameter
-from .residuals.eigenvalues import Eigenvalues
+from .parameters import AddedMass, Parameter
+from .residuals.modes import Eigenvalues
 from .residuals.residual import Residual
 
 #: share of machines that two printed deviations hold

@@ -17,8 +17,8 @@ from ...labels import Place
 from ...lti.statespace import StateSpace
 from ...tolerances import SAME, TINY
 from ...updating import ModalUncertainty, UpdateResult, eigenvalue_sensitivities
-from ...updating.parameters.added import Parameter
-from ...updating.parameters.matrix_parameters import MatrixParameter
+from ...updating.matrix_parameters import MatrixParameter
+from ...updating.parameters import Parameter
 from ..building import P, continuous_plant
 from ..partition import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort

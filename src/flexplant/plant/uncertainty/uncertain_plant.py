@@ -16,7 +16,7 @@ from ...lti.statespace import StateSpace, as_statespace
 from ...sparse.factor import dense
 from ...structure.rigid import orthonormalised
 from ...updating import UpdateResult
-from ...updating.parameters.added import Parameter
+from ...updating.parameters import Parameter
 from ..building import P, rebuilt, sampled
 from ..partition import Partition
 from ..port import ForcePort

@@ -13,8 +13,8 @@ from ...checks import whole as counted
 from ...errors import ModelError, require_known, some_names, warn
 from ...parallel import Progress
 from ...structure.model import FEModel
-from ..full_basis import FullBasis
-from ..parameters.added import Parameter
+from ..changed_model import FullBasis
+from ..parameters import Parameter
 from ..search import Objective, checked_residuals
 from ..sensitivities import checked_parameters
 from .goodness import chance, is_bad

@@ -11,7 +11,7 @@ import numpy as np
 from ...checks import FloatArray, Rng, Value, between, generator
 from ...errors import ModelError
 from ...parallel import Progress
-from ..parameters.added import Parameter
+from ..parameters import Parameter
 from ..search import Objective, checked_residuals
 from ..sensitivities import checked_parameters
 from ..update_result import UpdateResult

@@ -13,11 +13,10 @@ from ...checks import FloatArray
 from ...errors import ModelError, SolverError
 from ...modes.matching import mac_matrix
 from ...tolerances import TINY, divisor
-from ..family import ROUNDING, Eigen, Family, factors
-from ..point_model import Point
+from ..family import ROUNDING, Eigen, Family, Point, factors
 from ..search import Objective, TrustRegion
-from ..search.lasso import bic
-from ..search.update_method import SearchEnd
+from ..search.objective import SearchEnd
+from ..search.penalised import bic
 from .goodness import chance, chi_square, is_bad, worst
 
 #: best subsets of each size that grow

@@ -15,8 +15,7 @@ from ...labels import DIRECTIONS, Place
 from ...lti import Frf
 from ...lti.frequency import ORDERS
 from ...tolerances import divisor
-from ..family import Family
-from ..point_model import Point
+from ..family import Family, Point
 from .point_residuals import Held
 from .residual import Bound, Kind, Residual, channel_places, place_rows, split_parts
 

@@ -14,9 +14,8 @@ from ...errors import ModelError, ShapeError, counted, require_known
 from ...labels import DIRECTIONS, Place
 from ...modes.matching import assigned
 from ...tolerances import SPLIT, TINY
-from ..family import Family
-from ..parameters.added import named_place
-from ..point_model import Point
+from ..family import Family, Point
+from ..parameters import named_place
 from .residual import Bound, Residual, place_rows, split_parts
 
 #: generalised eigenvalues beyond this multiple of the largest frequency are infinite

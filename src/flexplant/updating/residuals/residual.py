@@ -11,8 +11,7 @@ import numpy as np
 from ...checks import ComplexArray, FloatArray, Matrix, Value, mapping
 from ...errors import LabelError
 from ...labels import Place
-from ..family import Family
-from ..point_model import Point
+from ..family import Family, Point
 
 
 class Residual(Value):

@@ -9,10 +9,9 @@ import numpy as np
 
 from ...checks import FloatArray, between
 from ...errors import ModelError, SolverError, counted
-from ..point_model import Point
-from .objective import Objective
+from ..family import Point
+from .objective import Objective, SearchEnd, Trail, UpdateMethod
 from .trust_region import TrustRegion
-from .update_method import SearchEnd, Trail, UpdateMethod
 
 #: what rounding leaves of an eigenvalue, relatively; the error may rise by as much
 ROUNDING = 1e-11

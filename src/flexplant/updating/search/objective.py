@@ -1,20 +1,23 @@
-"""All residuals and priors as one least-squares problem over the parameters."""
+"""All residuals and priors as one least-squares problem, and what searches of its least share."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ...checks import ComplexArray, FloatArray, instance
+from ...checks import ComplexArray, FloatArray, Value, checked, instance, positive
 from ...errors import ModelError
-from ..family import Eigen, Family, repeated_groups
-from ..parameters.added import Parameter
-from ..point_model import Point, first_point
-from ..residuals.eigenvalues import BoundEigenvalues
+from ...parallel import tick
+from ...tolerances import divisor
+from ..family import Family, Point, first_point
+from ..parameters import Parameter
+from ..residuals.modes import BoundEigenvalues
 from ..residuals.residual import Bound, Residual
-from ..sensitivities import GroupDerivatives, group_derivatives, mode_columns, split_rotation
+from ..sensitivities import PoleRows, mode_columns, split_point
 
 
 class Defect(NamedTuple):
@@ -217,93 +220,121 @@ def compared_modes(residual: Residual) -> tuple[int, ...]:
     return tuple(getattr(measured, "modes", None) or ())
 
 
-#: a parameter's effect below this share of what it could have is rounding
-UNSEEN = 1e-9
-#: singular values of S, its columns of length one, below which a step leaves them out
-SINGULAR = 1e-7
+#: what a bar calls the steps of all searches
+ITERATIONS = "update, iterations"
 
 
-class PoleRows:
-    """All measured eigenvalues of an objective, weighted as its residuals weigh them."""
+@dataclass
+class Trail:
+    """The points a search has moved to."""
 
-    def __init__(self, bounds: Sequence[BoundEigenvalues]) -> None:
-        self.bounds = bounds
-        self.numbers = tuple(n for bound in bounds for n in bound.numbers)
-        self.target = np.concatenate([bound.target for bound in bounds])
+    p: list[FloatArray] = field(default_factory=list)
+    poles: list[Any] = field(default_factory=list)
+    error: list[float] = field(default_factory=list)
+    fraction: list[float] = field(default_factory=list)
 
-    def whitened(self, rows: ComplexArray) -> FloatArray:
-        """Return weighted [Re; Im] of complex rows (m,) or (m, q)."""
-        found, first = [], 0
-        for bound in self.bounds:
-            last = first + len(bound.numbers)
-            found.append(bound.whitened(rows[first:last]))
-            first = last
-        return np.concatenate(found)
+    def add(self, objective: Objective, p: FloatArray, fraction: float) -> None:
+        """Add the point at `p`, where the objective is."""
+        tick(ITERATIONS)
+        point = objective.at(p)
+        self.p.append(np.array(p))
+        self.poles.append(objective.poles(point))
+        self.error.append(float(np.sum(objective.values(point, prior=False) ** 2)))
+        self.fraction.append(fraction)
+
+    def joined(self, later: Trail) -> Trail:
+        """Return this way and the one that goes on where it ends."""
+        parts = zip(vars(self).values(), vars(later).values(), strict=True)
+        return Trail(*(own + more[1:] for own, more in parts))
 
 
-def split_point(point: Point, data: PoleRows) -> Point:
-    """Return the point with exactly repeated modes turned to the split of the next step.
+@dataclass
+class SearchEnd:
+    """What a search ended with."""
 
-    How repeated modes split depends on the step, and the step on how they split: try both
-    directions of every parameter, and keep the step that fits best by the split it causes itself.
-    Their numbers rise with the frequencies they move to: which of equal modes came first is a
-    matter of rounding.
+    p: FloatArray
+    cost: float
+    trail: Trail
+    converged: bool
+    reason: str
+    #: methods that were tried and how each of them ended, where there were several
+    tried: tuple[str, ...] = ()
+
+
+class UpdateMethod(Value):
+    """The base class of methods that minimise the residuals.
+
+    A new method is a subclass with a `search`, in a module of its own.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> isinstance(fx.updating.GaussNewton(), fx.updating.UpdateMethod)
+    True
     """
-    groups = repeated_groups(point.eigen.poles)
-    if not groups:
-        return point
-    repeated = {i for group in groups for i in group}
-    labels = point.labels.copy()
-    for group in groups:
-        labels[group] = np.sort(labels[group])
-    point = Point(point.family, point.p, point.eigen, labels)
-    try:
-        columns = point.columns(data.numbers)
-    except ModelError:
-        return point  # a mode is lost: an error where it is needed
-    family = point.family
-    S = family.sensitivity(point.eigen, columns)
-    eigen = point.eigen
-    if repeated.intersection(columns):
-        S, eigen = _best_split(point, columns, S, data)
-    found = Point(family, point.p, eigen, point.labels)
-    found.turned = dict(zip(data.numbers, S, strict=True))
-    return found
+
+    #: most steps when nothing else is said
+    steps: ClassVar[int] = 200
+    #: whether it keeps to the bounds of parameters
+    keeps_bounds: ClassVar[bool] = True
+    #: whether eigenvalues alone are weighted by W of the paper's (12), not by their covariance
+    weighs_poles: ClassVar[bool] = False
+
+    @property
+    def least_squares(self) -> bool:
+        """Whether the answer is that of least squares: no penalty, no robust loss, all data."""
+        return True
+
+    @property
+    def penalised(self) -> bool:
+        """Whether the answer is drawn towards the start, so that its covariance is not known."""
+        return False
+
+    @abstractmethod
+    def search(
+        self,
+        objective: Objective,
+        start: FloatArray,
+        *,
+        most: int | None = None,
+        tolerance: float = 1e-10,
+    ) -> SearchEnd:
+        """Return where the search from `start` ends.
+
+        Parameters
+        ----------
+        objective : Objective
+            What to minimise.
+        start : (q,) array
+            Parameters to begin with.
+        most : int, optional
+            Most steps; `steps` when not given.
+        tolerance : float
+            Relative change of what is fitted that counts as none.
+
+        Raises
+        ------
+        ModelError, SolverError
+            When no step from the start helps.
+        """
 
 
-def _best_split(
-    point: Point, columns: list[int], S: ComplexArray, data: PoleRows
-) -> tuple[ComplexArray, Eigen]:
-    """Return S of (11) and the modes as the best step splits them."""
-    family, poles = point.family, point.eigen.poles[columns]
-    gap = data.target - poles
-    scale = family.strength(float(np.median(np.abs(data.target))))
-    best = (np.inf, S, point.eigen)
-    groups = group_derivatives(family, point.eigen)
-    for way in np.vstack([np.eye(scale.size), -np.eye(scale.size)]) / scale:
-        S, eigen = _split_along(groups, point.eigen, columns, S, way)
-        # rounding in the row of a vector that stays would give a step without bounds
-        felt = np.where(np.abs(S) > UNSEEN * scale, S, 0.0)
-        scaled, *_ = np.linalg.lstsq(
-            data.whitened(felt) / scale, data.whitened(gap), rcond=SINGULAR
-        )
-        step = scaled / scale
-        if np.any(step):
-            S, eigen = _split_along(groups, point.eigen, columns, S, step)
-        left = float(np.sum(data.whitened(gap - S @ step) ** 2))
-        if left < best[0]:
-            best = (left, S, eigen)
-    return best[1], best[2]
+def unit_changes(objective: Objective, J: FloatArray) -> FloatArray:
+    """Return what counts as one change of each parameter."""
+    width = (objective.upper - objective.lower) / 2
+    length = np.linalg.norm(J, axis=0)
+    felt = 1 / divisor(length)
+    unit = np.where(np.isfinite(width), width, felt)
+    return np.asarray(np.where(objective.has_prior, objective.prior_std, unit), dtype=np.float64)
 
 
-def _split_along(
-    groups: GroupDerivatives,
-    eigen: Eigen,
-    columns: list[int],
-    S: ComplexArray,
-    direction: FloatArray,
-) -> tuple[ComplexArray, Eigen]:
-    """Return S with the rows of repeated modes as they split along a direction, and the modes."""
-    rotation = split_rotation(groups, eigen, direction)
-    rows = [rotation.sensitivity.get(c, row) for c, row in zip(columns, S, strict=True)]
-    return np.array(rows), rotation.eigen
+@dataclass(frozen=True, eq=False)
+class PenalisedMethod(UpdateMethod):
+    """A method with a penalty of some weight; None: the weight is chosen from the data."""
+
+    weight: float | None = field(default=None, kw_only=True, metadata=checked(positive))
+
+    @property
+    def penalised(self) -> bool:
+        """Whether the answer is drawn towards the start."""
+        return True

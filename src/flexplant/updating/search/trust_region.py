@@ -12,8 +12,7 @@ import scipy.linalg as la
 from ...checks import FloatArray, checked, one_of, positive, whole
 from ...errors import ModelError
 from ...tolerances import divisor
-from .objective import Objective
-from .update_method import SearchEnd, Trail, UpdateMethod, unit_changes
+from .objective import Objective, SearchEnd, Trail, UpdateMethod, unit_changes
 
 Loss: TypeAlias = Literal["linear", "huber", "soft_l1", "cauchy"]
 LOSSES = ("linear", "huber", "soft_l1", "cauchy")

@@ -10,11 +10,11 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
-from ...checks import FloatArray, Matrix, Value, real_array, short, with_deviation
-from ...errors import LabelError, ModelError, require_known
-from ...labels import DIRECTIONS, Place
-from ...reduction import ReducedModel
-from ...structure import FEModel
+from ..checks import FloatArray, Matrix, Value, real_array, short, with_deviation
+from ..errors import LabelError, ModelError, require_known
+from ..labels import DIRECTIONS, Place
+from ..reduction import ReducedModel
+from ..structure import FEModel
 
 #: how the function that builds a model is written
 MAKES = "It returns an FEModel: lambda t: kirchhoff_plate(thickness=t, ...), say."
