@@ -16,7 +16,8 @@ from ..tolerances import divisor
 from .family import Point
 from .residuals.modes import USUAL, ZETA, Eigenvalues, growth
 from .residuals.residual import Bound, Kind
-from .search import Objective, SearchEnd, UpdateMethod
+from .search import Objective, SearchEnd
+from .search.objective import Search
 from .sensitivities import eigenvalue_sensitivities
 
 #: degrees of freedom that the usual discrepancy of a kind counts: two measured modes outweigh it,
@@ -139,12 +140,7 @@ class _Weighed(Bound):
 
 
 def weigh_discrepancy(
-    objective: Objective,
-    method: UpdateMethod,
-    end: SearchEnd,
-    *,
-    most: int | None,
-    tolerance: float,
+    objective: Objective, search: Search, end: SearchEnd
 ) -> tuple[SearchEnd, tuple[Discrepancy, ...]]:
     """Return the end of a search with the discrepancy as part of the noise, and the discrepancy.
 
@@ -187,10 +183,7 @@ def weigh_discrepancy(
                 values=np.concatenate([b.white(defect.values[at]) for b, at in parts]),
                 slopes=np.vstack([b.white(defect.slopes[at]) for b, at in parts]),
             )
-        objective.path = end.trail.p[:-1]
-        way = end.trail
-        end = method.search(objective, end.p, most=most, tolerance=tolerance)
-        end.trail = way.joined(end.trail)
+        end = search.resumed(objective, end)
         size = np.array([one.deviation for one in found])
         if before.size and np.all(np.abs(size - before) <= _SETTLED * size):
             break

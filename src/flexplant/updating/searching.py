@@ -26,8 +26,8 @@ from .parameters import PointParameter
 from .residuals.frf_residual import FrfResidual
 from .residuals.modes import Eigenvalues, ModeShapes
 from .residuals.residual import Residual
-from .search import Objective, SearchEnd, TrustRegion, UpdateMethod
-from .search.objective import Trail
+from .search import Objective, SearchEnd, TrustRegion
+from .search.objective import Search, Trail
 from .sensitivities import checked_values
 from .update_result import Starts
 
@@ -40,10 +40,8 @@ EVEN = 0.1
 ENOUGH = 1e-3
 
 
-def _approach(
-    objective: Objective, begin: FloatArray, most: int | None, tolerance: float
-) -> Trail | None:
-    """Return the way from `begin` to a better start, None if there is none; `objective` follows it.
+def _led(search: Search, objective: Objective, begin: FloatArray) -> SearchEnd:
+    """Return the end of a search from `begin` that goes through easier problems first.
 
     Complex responses have a minimum wherever a peak of the model lies between two measured ones;
     the logarithm of their magnitude, all entries weighted equally, hardly any. Shapes turn when
@@ -51,7 +49,7 @@ def _approach(
     """
     easier = _easier(objective.residuals)
     if easier is None:
-        return None
+        return search.begun(objective, begin)
     stage = Objective(
         objective.family.model,
         objective.parameters,
@@ -59,32 +57,31 @@ def _approach(
         prior=objective.uses_prior,
         family=objective.family,
     )
-    trail, near = Trail(), max(tolerance, ENOUGH)
+    objective.path = []
+    near = Search(TrustRegion(), search.most, max(search.tolerance, ENOUGH))
+    before = None
     with attempted("poles first, before shapes and responses"):
-        found = TrustRegion().search(stage, begin, most=most, tolerance=near)
-        path = [begin, *found.trail.p[1:]]
+        points = near.begun(stage, begin).trail.p
         # the modes are numbered at the start, and followed from there
         objective.begin(begin)
-        for p in path:
+        trail = Trail()
+        for p in [begin, *points[1:]]:
             objective.at(p, refer=True)
             trail.add(objective, p, 1.0 if trail.p else 0.0)
-        objective.path = path[:-1]
-        return trail if len(path) > 1 else None
-    return None
+        if len(points) > 1:
+            before = SearchEnd(points[-1], np.inf, trail, converged=False, reason="")
+    return search.resumed(objective, before) if before else search.begun(objective, begin)
 
 
 def _easier(residuals: Sequence[Residual]) -> list[Residual] | None:
     """Return residuals that converge from farther away, None when they are those given."""
     has_poles = any(isinstance(r, Eigenvalues) for r in residuals)
-    found: list[Residual] = []
-    for residual in residuals:
-        if isinstance(residual, ModeShapes) and has_poles:
-            continue
-        found.append(_magnitude(residual) if isinstance(residual, FrfResidual) else residual)
-    same = len(found) == len(residuals) and all(
-        a is b for a, b in zip(found, residuals, strict=True)
-    )
-    return None if same else found
+    found = [
+        _magnitude(r) if isinstance(r, FrfResidual) else r
+        for r in residuals
+        if not (has_poles and isinstance(r, ModeShapes))
+    ]
+    return None if list(map(id, found)) == list(map(id, residuals)) else found
 
 
 def _magnitude(residual: FrfResidual) -> FrfResidual:
@@ -135,13 +132,9 @@ class _GradedEnd(NamedTuple):
 class _Tried:
     """Searches from one start after the other; the objective is where the last one left it."""
 
-    def __init__(
-        self, objective: Objective, method: UpdateMethod, most: int | None, tolerance: float
-    ) -> None:
+    def __init__(self, objective: Objective, search: Search) -> None:
         self.objective = objective
-        self.method = method
-        self.most = most
-        self.tolerance = tolerance
+        self.search = search
         self.begins: list[FloatArray] = []
         self.ends: list[Reached] = []
         self.found: list[_GradedEnd] = []
@@ -150,15 +143,16 @@ class _Tried:
 
     def add(self, begin: FloatArray, *, led: bool, named: bool = False) -> None:
         """Search from a start; `led`: through easier problems first."""
-        best, search = self.best, _led if led else _direct_search
+        best, search = self.best, self.search
+        if self.ends:
+            search = search._replace(tolerance=max(search.tolerance, NEARLY))
         sound = best is not None and not best.improvable
-        limit = GLANCE if sound and self.most is None else self.most
-        enough = max(self.tolerance, NEARLY) if self.ends else self.tolerance
-        end = _try_search(search, self.objective, begin, self.method, limit, enough)
-        if isinstance(end, SearchEnd) and best is not None and limit != self.most:
+        glance = search._replace(most=GLANCE) if sound and search.most is None else search
+        end = _reached(_led if led else Search.begun, glance, self.objective, begin)
+        if glance is not search and best is not None and isinstance(end, SearchEnd):
             near = end.cost < WORTH * best.end.cost
             if near and not end.converged:
-                end = _try_search(_continue_search, self.objective, end, self.method, None, enough)
+                end = _reached(Search.resumed, search, self.objective, end)
         self.begins.append(begin)
         self.ends.append(end)
         if isinstance(end, SearchEnd):
@@ -188,9 +182,7 @@ class _Tried:
 def from_one_start(
     objective: Objective,
     begin: FloatArray,
-    method: UpdateMethod,
-    most: int | None,
-    tolerance: float,
+    search: Search,
     rng: Rng,
     *,
     given: bool,
@@ -206,7 +198,7 @@ def from_one_start(
         # a start that is no model is a mistake of the call
         objective.family.at(begin)
     default = objective.default_start
-    tried = _Tried(objective, method, most, tolerance)
+    tried = _Tried(objective, search)
     tried.add(begin, led=not given, named=True)
     # modes are numbered at each start
     middles = [(begin, not given)]
@@ -229,7 +221,7 @@ def from_one_start(
         raise none_found(objective, tried.begins, tried.ends)
     end = best.end
     if end is not tried.ends[0]:
-        settled = _try_search(_continue_search, objective, end, method, most, tolerance)
+        settled = _reached(Search.resumed, search, objective, end)
         end = settled if isinstance(settled, SearchEnd) else end
     objective.path = []
     objective.follow(end.trail.p)
@@ -291,51 +283,12 @@ def _is_possible(objective: Objective, p: FloatArray) -> bool:
     return True
 
 
-def _continue_search(
-    objective: Objective, end: SearchEnd, method: UpdateMethod, most: int | None, tolerance: float
-) -> SearchEnd:
-    """Return the end of a search that goes on from another's."""
-    objective.path = end.trail.p[:-1]
-    found = method.search(objective, end.p, most=most, tolerance=tolerance)
-    found.trail, found.tried = end.trail.joined(found.trail), end.tried or found.tried
-    return found
-
-
-def _try_search(search: Callable[..., SearchEnd], *given: Any) -> Reached:
+def _reached(search: Callable[..., SearchEnd], *given: Any) -> Reached:
     """Return the end of a search, or why there is none."""
     try:
         return search(*given)
     except FlexplantError as error:
         return error
-
-
-def _direct_search(
-    objective: Objective,
-    begin: FloatArray,
-    method: UpdateMethod,
-    most: int | None,
-    tolerance: float,
-) -> SearchEnd:
-    """Return the end of a search for the answer itself."""
-    objective.path = []
-    return method.search(objective, begin, most=most, tolerance=tolerance)
-
-
-def _led(
-    objective: Objective,
-    begin: FloatArray,
-    method: UpdateMethod,
-    most: int | None,
-    tolerance: float,
-) -> SearchEnd:
-    """Return the end of a search from `begin` that goes through easier problems first."""
-    objective.path = []
-    before = _approach(objective, begin, most, tolerance)
-    first = begin if before is None else before.p[-1]
-    found = method.search(objective, first, most=most, tolerance=tolerance)
-    if before is not None:
-        found.trail = before.joined(found.trail)
-    return found
 
 
 def _improvable(objective: Objective, end: SearchEnd, point: Point) -> bool:
@@ -353,14 +306,10 @@ def _improvable(objective: Objective, end: SearchEnd, point: Point) -> bool:
 
 
 def from_starts(
-    objective: Objective,
-    begins: list[FloatArray],
-    method: UpdateMethod,
-    most: int | None,
-    tolerance: float,
+    objective: Objective, begins: list[FloatArray], search: Search
 ) -> tuple[SearchEnd, list[Reached]]:
     """Return the best end, the objective being there, and what every start led to."""
-    ends = [_try_search(_direct_search, objective, one, method, most, tolerance) for one in begins]
+    ends = [_reached(Search.begun, search, objective, one) for one in begins]
     reached = [found for found in ends if isinstance(found, SearchEnd)]
     if not reached:
         raise none_found(objective, begins, ends)

@@ -2,53 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, Value, instance, real_array, several, short
 from ..errors import LabelError, ModelError, ShapeError, counted
+from ..tolerances import divisor
 from .family import Eigen, Family, Point, repeated_groups
 from .parameters import Parameter
 from .residuals.modes import BoundEigenvalues
 
-
-class Rotation(NamedTuple):
-    """Repeated modes turned to the vectors in which a change of parameters splits them."""
-
-    eigen: Eigen
-    #: (q, s) derivatives along the vectors, by the group's columns
-    sensitivity: dict[int, ComplexArray]
+#: what turns exactly repeated modes to the vectors in which a change of parameters splits them; and
+#: the derivatives (q,) along these, by the modes' columns
+Split: TypeAlias = Callable[[FloatArray], tuple[Eigen, dict[int, ComplexArray]]]
 
 
-#: columns of exactly repeated modes and their group derivative G (q, s, s)
-GroupDerivatives = Sequence[tuple[list[int], ComplexArray]]
+def splitting(family: Family, eigen: Eigen) -> Split:
+    """Return how repeated modes split along a direction, to eigenvectors of their derivative.
 
-
-def group_derivatives(family: Family, eigen: Eigen) -> GroupDerivatives:
-    """Return G of every group of exactly repeated modes: the same for all directions."""
-    return [
-        (columns, family.group_derivative(eigen, columns))
-        for columns in repeated_groups(eigen.poles)
-    ]
-
-
-def split_rotation(groups: GroupDerivatives, eigen: Eigen, direction: FloatArray) -> Rotation:
-    """Return exactly repeated modes turned to the eigenvectors of their derivative.
-
-    Along `direction`; the modes of a group come in the order of the frequencies they move to.
+    The modes of a group come in the order of the frequencies they move to.
     """
-    rows: dict[int, ComplexArray] = {}
-    for columns, G in groups:
-        moved, Q = la.eig(np.tensordot(direction, G, axes=1))
-        Q = Q[:, np.lexsort((moved.real, moved.imag))]
-        eigen = eigen.rotated(columns, Q)
-        own = np.diagonal(la.solve(Q, G @ Q), axis1=1, axis2=2)
-        rows |= {column: own[:, i] for i, column in enumerate(columns)}
-    return Rotation(eigen, rows)
+    groups = [(one, family.group_derivative(eigen, one)) for one in repeated_groups(eigen.poles)]
+
+    def split(direction: FloatArray) -> tuple[Eigen, dict[int, ComplexArray]]:
+        turned = eigen
+        rows: dict[int, ComplexArray] = {}
+        for columns, G in groups:
+            moved, Q = la.eig(np.tensordot(direction, G, axes=1))
+            Q = Q[:, np.lexsort((moved.real, moved.imag))]
+            turned = turned.rotated(columns, Q)
+            own = np.diagonal(la.solve(Q, G @ Q), axis1=1, axis2=2)
+            rows |= {column: own[:, i] for i, column in enumerate(columns)}
+        return turned, rows
+
+    return split
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -133,14 +124,14 @@ def eigenvalue_sensitivities(
     eigen = family.at(checked_values(values, listed, "values"))
     numbers = range(eigen.n_rigid + 1, eigen.n_rigid + eigen.poles.size + 1)
     columns = mode_columns(numbers if modes is None else modes, eigen)
-    growing = 1 / _divisor(family.strength(float(np.abs(eigen.poles[0]))))
-    rotation = split_rotation(group_derivatives(family, eigen), eigen, growing)
-    S = family.sensitivity(rotation.eigen, columns)
+    growing = 1 / divisor(family.strength(float(np.abs(eigen.poles[0]))))
+    turned, _ = splitting(family, eigen)(growing)
+    S = family.sensitivity(turned, columns)
     for group in repeated_groups(eigen.poles):
         if set(group) & set(columns):
-            G = family.group_derivative(rotation.eigen, group)
+            G = family.group_derivative(turned, group)
             size = np.abs(G).max(axis=(1, 2), keepdims=True)
-            off = np.abs(G) * (1 - np.eye(len(group))) / _divisor(size)
+            off = np.abs(G) * (1 - np.eye(len(group))) / divisor(size)
             # within a group of equal eigenvalues, as accurate as these are equal
             if off.max() > 1e-6:
                 raise ModelError(
@@ -208,10 +199,6 @@ def checked_values(values: Any, parameters: Sequence[Parameter], name: str) -> F
     return array
 
 
-def _divisor(sizes: Any) -> Any:
-    return np.where(sizes == 0, 1.0, sizes)
-
-
 #: a parameter's effect below this share of what it could have is rounding
 UNSEEN = 1e-9
 #: singular values of S, its columns of length one, below which a step leaves them out
@@ -228,12 +215,9 @@ class PoleRows:
 
     def whitened(self, rows: ComplexArray) -> FloatArray:
         """Return weighted [Re; Im] of complex rows (m,) or (m, q)."""
-        found, first = [], 0
-        for bound in self.bounds:
-            last = first + len(bound.numbers)
-            found.append(bound.whitened(rows[first:last]))
-            first = last
-        return np.concatenate(found)
+        ends = np.cumsum([len(bound.numbers) for bound in self.bounds])[:-1]
+        parts = zip(self.bounds, np.split(rows, ends), strict=True)
+        return np.concatenate([bound.whitened(part) for bound, part in parts])
 
 
 def split_point(point: Point, data: PoleRows) -> Point:
@@ -274,31 +258,21 @@ def _best_split(
     gap = data.target - poles
     scale = family.strength(float(np.median(np.abs(data.target))))
     best = (np.inf, S, point.eigen)
-    groups = group_derivatives(family, point.eigen)
+    split = splitting(family, point.eigen)
+
+    def along(direction: FloatArray) -> tuple[ComplexArray, Eigen]:
+        eigen, rows = split(direction)
+        return np.array([rows.get(c, row) for c, row in zip(columns, S, strict=True)]), eigen
+
     for way in np.vstack([np.eye(scale.size), -np.eye(scale.size)]) / scale:
-        S, eigen = _split_along(groups, point.eigen, columns, S, way)
+        turned, eigen = along(way)
         # rounding in the row of a vector that stays would give a step without bounds
-        felt = np.where(np.abs(S) > UNSEEN * scale, S, 0.0)
-        scaled, *_ = np.linalg.lstsq(
-            data.whitened(felt) / scale, data.whitened(gap), rcond=SINGULAR
-        )
-        step = scaled / scale
+        felt = np.where(np.abs(turned) > UNSEEN * scale, turned, 0.0)
+        white = data.whitened(felt) / scale
+        step = np.linalg.lstsq(white, data.whitened(gap), rcond=SINGULAR)[0] / scale
         if np.any(step):
-            S, eigen = _split_along(groups, point.eigen, columns, S, step)
-        left = float(np.sum(data.whitened(gap - S @ step) ** 2))
+            turned, eigen = along(step)
+        left = float(np.sum(data.whitened(gap - turned @ step) ** 2))
         if left < best[0]:
-            best = (left, S, eigen)
+            best = (left, turned, eigen)
     return best[1], best[2]
-
-
-def _split_along(
-    groups: GroupDerivatives,
-    eigen: Eigen,
-    columns: list[int],
-    S: ComplexArray,
-    direction: FloatArray,
-) -> tuple[ComplexArray, Eigen]:
-    """Return S with the rows of repeated modes as they split along a direction, and the modes."""
-    rotation = split_rotation(groups, eigen, direction)
-    rows = [rotation.sensitivity.get(c, row) for c, row in zip(columns, S, strict=True)]
-    return np.array(rows), rotation.eigen

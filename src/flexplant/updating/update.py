@@ -19,7 +19,7 @@ from .parameters import Parameter
 from .residuals.modes import Eigenvalues
 from .residuals.residual import Residual
 from .search import Objective, SearchEnd, Secured, TrustRegion, UpdateMethod, checked_residuals
-from .search.objective import ITERATIONS, Defect, unit_changes
+from .search.objective import ITERATIONS, Defect, Search, unit_changes
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
 from .sensitivities import checked_parameters, checked_values
 from .update_result import History, UpdateResult
@@ -156,7 +156,7 @@ def update(
         )
     if max_iterations is not None:
         whole(max_iterations, "max_iterations")
-    enough = positive(tolerance, "tolerance")
+    tolerance = positive(tolerance, "tolerance")
     rng = generator(rng)
     takes_part = flag(prior, "prior")
     rounds = whole(rounds, "rounds")
@@ -172,6 +172,7 @@ def update(
         )
     if plain and method.weighs_poles:
         given = tuple(r.replace(weights=r.W) for r in given if isinstance(r, Eigenvalues))
+    search = Search(method, max_iterations, tolerance)
     basis, used = None, model
     if full is not None:
         basis = FullBasis(full, listed, given, model)
@@ -185,16 +186,14 @@ def update(
         # where an answer that is drawn to its start ends is no minimum of the misfit
         if starts is None and not method.penalised:
             best, begins, ends = from_one_start(
-                objective, begins[0], method, max_iterations, enough, rng, given=start is not None
+                objective, begins[0], search, rng, given=start is not None
             )
         else:
-            best, ends = from_starts(objective, begins, method, max_iterations, enough)
+            best, ends = from_starts(objective, begins, search)
         tried = summary(objective, best, begins, ends)
         estimates = [best.p]
         if basis is not None:
-            best, estimates = corrected(
-                objective, basis, method, best, rounds=rounds, most=max_iterations, tolerance=enough
-            )
+            best, estimates = corrected(objective, basis, search, best, rounds)
     lost = ends[0] if start is not None and starts is None else None
     _ends_warned(objective, best, estimates, lost if isinstance(lost, FlexplantError) else None)
     fit = _result(model, objective, method, best, begins[0])
@@ -202,7 +201,7 @@ def update(
     if not method.least_squares or not is_bad(fit.p_value):
         return fit
     named = worst(objective, objective.at(best.p))
-    end, found = weigh_discrepancy(objective, method, best, most=max_iterations, tolerance=enough)
+    end, found = weigh_discrepancy(objective, search, best)
     if found:
         again = _result(model, objective, method, end, begins[0])
         kept = {"starts": fit.starts, "rounds": fit.rounds, "residuals": given}
@@ -318,14 +317,7 @@ STILL = 1e-2
 
 
 def corrected(
-    objective: Objective,
-    basis: FullBasis,
-    method: UpdateMethod,
-    end: SearchEnd,
-    *,
-    rounds: int,
-    most: int | None,
-    tolerance: float,
+    objective: Objective, basis: FullBasis, search: Search, end: SearchEnd, rounds: int
 ) -> tuple[SearchEnd, list[FloatArray]]:
     """Return the end of the last round, the objective being there, and the estimates on the way.
 
@@ -349,12 +341,9 @@ def corrected(
             full.values(there, prior=False) - objective.values(point, prior=False),
             full.slopes(there, prior=False) - objective.slopes(point, prior=False),
         )
-        before = end.trail
         # what is drawn to the start is so anew; modes keep the numbers they have there
-        objective.path = [] if method.penalised else before.p[:-1]
-        begin = first if method.penalised else end.p
-        end = method.search(objective, begin, most=most, tolerance=tolerance)
-        end.trail = end.trail if method.penalised else before.joined(end.trail)
+        drawn = search.method.penalised
+        end = search.begun(objective, first) if drawn else search.resumed(objective, end)
         estimates.append(end.p)
         if normalised_step(objective, end.p, estimates[-2]) < STILL:
             break

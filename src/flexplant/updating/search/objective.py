@@ -319,6 +319,29 @@ class UpdateMethod(Value):
         """
 
 
+class Search(NamedTuple):
+    """A method, and how far it goes: most steps (None: its own) and relative tolerance."""
+
+    method: UpdateMethod
+    most: int | None
+    tolerance: float
+
+    def begun(self, objective: Objective, begin: FloatArray) -> SearchEnd:
+        """Return the end of a search whose modes are numbered where it begins."""
+        objective.path = []
+        return self._ended(objective, begin)
+
+    def resumed(self, objective: Objective, end: SearchEnd) -> SearchEnd:
+        """Return the end of a search that goes on from another's."""
+        objective.path = end.trail.p[:-1]
+        found = self._ended(objective, end.p)
+        found.trail, found.tried = end.trail.joined(found.trail), end.tried or found.tried
+        return found
+
+    def _ended(self, objective: Objective, begin: FloatArray) -> SearchEnd:
+        return self.method.search(objective, begin, most=self.most, tolerance=self.tolerance)
+
+
 def unit_changes(objective: Objective, J: FloatArray) -> FloatArray:
     """Return what counts as one change of each parameter."""
     width = (objective.upper - objective.lower) / 2
