@@ -245,8 +245,7 @@ def identifiability(
     Examples
     --------
     >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[630.0j], modes=[2]))
     >>> found = fx.identifiability(drawing, [fx.AddedMass("1:x"), fx.AddedMass("3:x")], [poles])
     >>> found.rank  # of two: one pole is the same for both ends

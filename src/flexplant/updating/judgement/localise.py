@@ -89,8 +89,7 @@ def localise(
     Examples
     --------
     >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 2.0, 1.5], stiffnesses=[4e5, 3e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> drawing = fx.chain(masses=[1.0, 2.0, 1.5], stiffnesses=[4e5, 3e5])
     >>> heavier = fx.chain(masses=[1.0, 2.0, 1.8], stiffnesses=[4e5, 3e5])
     >>> measured = fx.MeasuredModes(poles=fx.solve_modes(heavier, count=3).poles[1:], modes=[2, 3])
     >>> masses = [fx.AddedMass(place, name=place) for place in drawing.dofs.labels]

@@ -124,8 +124,7 @@ def sample_posterior(
     Examples
     --------
     >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> measured = fx.MeasuredModes(poles=[615.0j], modes=[2], covariance=[[1.0, 0.0], [0.0, 1.0]])
     >>> data, mass = [fx.Eigenvalues(measured)], [fx.AddedMass("3:x")]
     >>> draws = fx.sample_posterior(drawing, mass, data, fx.update(drawing, mass, data), steps=100)

@@ -42,8 +42,7 @@ class GaussNewton(UpdateMethod):
     Examples
     --------
     >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))
     >>> method = fx.updating.GaussNewton()
     >>> fx.update(drawing, [fx.AddedMass("3:x")], [poles], method=method).converged

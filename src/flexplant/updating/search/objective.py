@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ...checks import ComplexArray, FloatArray, Value, checked, instance, positive
+from ...checks import ComplexArray, FloatArray, Value, instance
 from ...errors import ModelError
 from ...parallel import tick
 from ...tolerances import divisor
@@ -27,6 +27,13 @@ class Defect(NamedTuple):
     p: FloatArray
     values: FloatArray
     slopes: FloatArray
+
+
+class Penalty(NamedTuple):
+    """Residuals ``weight (p - start)`` beside those of the data."""
+
+    start: FloatArray
+    weight: FloatArray
 
 
 class Objective:
@@ -72,6 +79,8 @@ class Objective:
         self.path: list[FloatArray] = []
         #: what is added to the residuals, to first order about the parameters it was found at
         self.defect: Defect | None = None
+        #: what a search may add to draw the answer to its start
+        self.penalty: Penalty | None = None
 
     @property
     def default_start(self) -> FloatArray:
@@ -90,7 +99,7 @@ class Objective:
             )
             if self.numbers and not stopped:
                 mode_columns(self.numbers, point.eigen)
-            self._first = self._assigned(self._turned(point))
+            self._first = self._numbered(point)
         point = self._set(self._first, refer=True)
         for step in path[1:]:
             point = self.at(step, refer=True)
@@ -111,13 +120,11 @@ class Objective:
             return self.begin(p)
         if np.array_equal(self.reference.p, p):
             return self._set(self.reference, refer=refer)
-        point = self.reference.continued(np.array(p))
-        point = self._assigned(self._turned(point))
-        return self._set(point, refer=refer)
+        return self._set(self._numbered(self.reference.continued(np.array(p))), refer=refer)
 
     def place(self, point: Point) -> Point:
         """Return a point whose modes are numbered already, as the reference."""
-        return self._set(self._assigned(self._turned(point)), refer=True)
+        return self._set(self._numbered(point), refer=True)
 
     def _set(self, point: Point, *, refer: bool) -> Point:
         self._point = point
@@ -125,18 +132,17 @@ class Objective:
             self.reference = point
         return point
 
-    def _assigned(self, point: Point) -> Point:
+    def _numbered(self, point: Point) -> Point:
+        """Return the point as residuals number it, repeated modes turned to the next split."""
+        if self.poles_measured is not None:
+            point = split_point(point, self.poles_measured)
         for bound in self.bounds:
             point = bound.assigned(point)
         point.columns(self.numbers)
         return point
 
-    def _turned(self, point: Point) -> Point:
-        """Return the point with exactly repeated modes turned to the split of the next step."""
-        return point if self.poles_measured is None else split_point(point, self.poles_measured)
-
     def values(self, point: Point, *, prior: bool = True) -> FloatArray:
-        """Return the residuals, then those of the priors."""
+        """Return the residuals, then those of the priors and a penalty."""
         rows = [bound.values(point) for bound in self.bounds]
         if self.defect is not None:
             moved = self.defect.slopes @ (point.p - self.defect.p)
@@ -144,6 +150,8 @@ class Objective:
         if prior and self.uses_prior:
             gap = (self.prior_mean - point.p) / self.prior_std
             rows.append(gap[self.has_prior])
+        if prior and self.penalty is not None:
+            rows.append(self.penalty.weight * (point.p - self.penalty.start))
         return np.concatenate(rows)
 
     def slopes(self, point: Point, *, prior: bool = True) -> FloatArray:
@@ -153,6 +161,8 @@ class Objective:
             rows = [np.vstack(rows) + self.defect.slopes]
         if prior and self.uses_prior:
             rows.append(-np.diag(1 / self.prior_std)[self.has_prior])
+        if prior and self.penalty is not None:
+            rows.append(np.diag(self.penalty.weight))
         return np.vstack(rows)
 
     def size(self, point: Point) -> FloatArray:
@@ -194,13 +204,9 @@ class Objective:
 def checked_residuals(residuals: Any) -> tuple[Residual, ...]:
     """Return the residuals as a tuple, checked."""
     listed = tuple(residuals) if isinstance(residuals, Sequence) else (residuals,)
+    hint = "Pass the measurement as one: [Eigenvalues(measured)]."
     for residual in listed:
-        instance(
-            residual,
-            Residual,
-            "a residual",
-            "Pass the measurement as one: [Eigenvalues(measured)].",
-        )
+        instance(residual, Residual, "a residual", hint)
     if not listed:
         raise ModelError("residuals is empty: nothing was measured to update from.")
     return listed
@@ -349,15 +355,3 @@ def unit_changes(objective: Objective, J: FloatArray) -> FloatArray:
     felt = 1 / divisor(length)
     unit = np.where(np.isfinite(width), width, felt)
     return np.asarray(np.where(objective.has_prior, objective.prior_std, unit), dtype=np.float64)
-
-
-@dataclass(frozen=True, eq=False)
-class PenalisedMethod(UpdateMethod):
-    """A method with a penalty of some weight; None: the weight is chosen from the data."""
-
-    weight: float | None = field(default=None, kw_only=True, metadata=checked(positive))
-
-    @property
-    def penalised(self) -> bool:
-        """Whether the answer is drawn towards the start."""
-        return True

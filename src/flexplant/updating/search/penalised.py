@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray
+from ...checks import FloatArray, checked, positive
 from ...errors import ModelError, SolverError
 from ...tolerances import ROUNDING, TINY
-from .objective import Objective, PenalisedMethod, SearchEnd, Trail, unit_changes
-from .trust_region import TrustRegion, minimised
+from .objective import Objective, Penalty, SearchEnd, Trail, UpdateMethod, unit_changes
+from .trust_region import TrustRegion
 
 #: weights tried for an L-curve, or on a path of sparse changes
 PATH = 13
+#: convex problems for each weight of the path
+PATH_STEPS = 5
+#: a change of less than so many units is the solver's rounding
+NOTHING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class PenalisedMethod(UpdateMethod):
+    """A method with a penalty of some weight; None: the weight is chosen from the data."""
+
+    weight: float | None = field(default=None, kw_only=True, metadata=checked(positive))
+
+    @property
+    def penalised(self) -> bool:
+        """Whether the answer is drawn towards the start."""
+        return True
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +53,7 @@ class Tikhonov(PenalisedMethod):
     Examples
     --------
     >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))
     >>> ends = [fx.AddedMass("1:x"), fx.AddedMass("3:x")]  # alike: the smallest change has both
     >>> fx.update(drawing, ends, [poles], method=fx.updating.Tikhonov(weight=1e-3)).values.round(3)
@@ -63,50 +78,35 @@ class Tikhonov(PenalisedMethod):
         unit = unit_changes(objective, J)
 
         def solved(size: float, begin: FloatArray) -> SearchEnd:
-            def extra(p: FloatArray) -> tuple[FloatArray, FloatArray]:
-                return size * (p - start) / unit, np.diag(size / unit)
-
-            return minimised(
-                objective,
-                begin,
-                TrustRegion(),
-                most=most or self.steps,
-                tolerance=tolerance,
-                extra=extra,
-            )
+            objective.penalty = Penalty(start, size / unit)
+            try:
+                return TrustRegion().search(objective, begin, most=most, tolerance=tolerance)
+            finally:
+                objective.penalty = None
 
         if self.weight is not None:
             return solved(self.weight, start)
         largest = float(np.linalg.norm(J * unit, 2))
-        # from all to next to nothing of the prior
-        sizes = np.geomspace(largest, 1e-6 * largest, PATH)
         curve, found, begin = [], [], start
-        for size in sizes.tolist():
+        # from all to next to nothing of the prior
+        for size in np.geomspace(largest, 1e-6 * largest, PATH).tolist():
             one = solved(size, begin)
             begin = one.p
             change = float(np.linalg.norm((one.p - start) / unit))
             curve.append((np.log(max(one.trail.error[-1], TINY)) / 2, np.log(max(change, TINY))))
             found.append(one)
-        return found[corner(np.array(curve))]
+        return found[_corner(np.array(curve))]
 
 
-def corner(curve: FloatArray) -> int:
+def _corner(curve: FloatArray) -> int:
     """Return the point of an L-curve (m, 2) with the largest curvature, of three points each."""
-    best, at = -np.inf, len(curve) // 2
-    for i in range(1, len(curve) - 1):
-        a, b = curve[i] - curve[i - 1], curve[i + 1] - curve[i]
-        c = curve[i + 1] - curve[i - 1]
-        area = -(a[0] * b[1] - a[1] * b[0])
-        sides = float(np.prod([np.linalg.norm(side) for side in (a, b, c)]))
-        if sides > 0 and 2 * area / sides > best:
-            best, at = 2 * area / sides, i
-    return at
-
-
-#: convex problems for each weight of the path
-PATH_STEPS = 5
-#: a change of less than so many units is the solver's rounding
-NOTHING = 1e-9
+    before, after = np.diff(curve, axis=0)[:-1], np.diff(curve, axis=0)[1:]
+    area = before[:, 1] * after[:, 0] - before[:, 0] * after[:, 1]
+    sides = np.prod(
+        [np.linalg.norm(one, axis=1) for one in (before, after, before + after)], axis=0
+    )
+    turn = np.where(sides > 0, 2 * area / np.where(sides > 0, sides, 1.0), -np.inf)
+    return int(np.argmax(turn)) + 1 if np.any(sides > 0) else len(curve) // 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +129,7 @@ class Lasso(PenalisedMethod):
     Examples
     --------
     >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.5], stiffnesses=[4e5, 4e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> drawing = fx.chain(masses=[1.0, 1.0, 1.5], stiffnesses=[4e5, 4e5])
     >>> heavier = fx.chain(masses=[1.0, 1.0, 1.7], stiffnesses=[4e5, 4e5])
     >>> measured = fx.MeasuredModes(poles=fx.solve_modes(heavier, count=3).poles[1:], modes=[2, 3])
     >>> masses = [fx.AddedMass(f"{i}:x") for i in (1, 2, 3)]
@@ -153,49 +152,43 @@ class Lasso(PenalisedMethod):
         tolerance: float = 1e-10,
     ) -> SearchEnd:
         """Return where the search from `start` ends; see `UpdateMethod.search`."""
-        return _lasso(objective, start, self.weight, most=most or self.steps, tolerance=tolerance)
+        steps = most or self.steps
+        J = objective.slopes(objective.begin(start), prior=False)
+        r = objective.values(objective.at(start), prior=False)
+        unit = unit_changes(objective, J)
+        if self.weight is not None:
+            return _sparse(objective, start, unit, self.weight, steps, tolerance)
+        best: tuple[float, tuple[int, ...], SearchEnd] | None = None
+        tried: set[tuple[int, ...]] = set()
 
+        def judged(key: tuple[int, ...], begin: FloatArray) -> None:
+            nonlocal best
+            if key in tried or not key or len(key) >= r.size:
+                return
+            tried.add(key)
+            found = _refitted(objective, start, begin, key, steps, tolerance)
+            score = bic(found.trail.error[-1], r.size, len(key), objective.noisy)
+            if best is None or score < best[0]:
+                best = (score, key, found)
 
-def _lasso(
-    objective: Objective, start: FloatArray, weight: float | None, *, most: int, tolerance: float
-) -> SearchEnd:
-    """Minimise with an l1 penalty on the change; None: the weight of least BIC, refitted."""
-    J = objective.slopes(objective.begin(start), prior=False)
-    r = objective.values(objective.at(start), prior=False)
-    unit = unit_changes(objective, J)
-    if weight is not None:
-        return _sparse(objective, start, unit, weight, most, tolerance)
-    largest = float(np.abs((J * unit).T @ r).max())
-    best: tuple[float, tuple[int, ...], SearchEnd] | None = None
-    tried: set[tuple[int, ...]] = set()
-
-    def judged(key: tuple[int, ...], begin: FloatArray) -> None:
-        nonlocal best
-        if key in tried or not key or len(key) >= r.size:
-            return
-        tried.add(key)
-        active = np.isin(np.arange(start.size), key)
-        found = refitted(objective, start, begin, active, most, tolerance)
-        score = bic(found.trail.error[-1], r.size, len(key), objective.noisy)
-        if best is None or score < best[0]:
-            best = (score, key, found)
-
-    for size in np.geomspace(0.9 * largest, 1e-3 * largest, PATH).tolist():
-        # the path only has to say which parameters change; these are fitted anew
-        found = _sparse(objective, start, unit, size, PATH_STEPS, 1e-4)
-        change = np.abs((found.p - start) / unit)
-        # zeros of the l1 problem, as accurate as its solver is
-        judged(tuple(np.flatnonzero(change > 1e-6 * change.max()).tolist()), found.p)
-    if best is None:
-        raise SolverError("no weight of the l1 penalty leaves a sparse change: nothing differs.")
-    # a path that entered by a wrong parameter keeps it: drop what the criterion can spare
-    while len(best[1]) > 1:
-        before = best[1]
-        for out in before:
-            judged(tuple(i for i in before if i != out), best[2].p)
-        if best[1] == before:
-            break
-    return best[2]
+        largest = float(np.abs((J * unit).T @ r).max())
+        for size in np.geomspace(0.9 * largest, 1e-3 * largest, PATH).tolist():
+            # the path only has to say which parameters change; these are fitted anew
+            found = _sparse(objective, start, unit, size, PATH_STEPS, 1e-4)
+            change = np.abs((found.p - start) / unit)
+            # zeros of the l1 problem, as accurate as its solver is
+            judged(tuple(np.flatnonzero(change > 1e-6 * change.max()).tolist()), found.p)
+        if best is None:
+            raise SolverError(
+                "no weight of the l1 penalty leaves a sparse change: nothing differs."
+            )
+        # a path that entered by a wrong parameter keeps it: drop what the criterion can spare
+        before: tuple[int, ...] = ()
+        while best[1] != before and len(best[1]) > 1:
+            before = best[1]
+            for out in before:
+                judged(tuple(i for i in before if i != out), best[2].p)
+        return best[2]
 
 
 def bic(error: float, rows: int, count: int, noisy: bool) -> float:
@@ -204,16 +197,17 @@ def bic(error: float, rows: int, count: int, noisy: bool) -> float:
     return misfit + count * float(np.log(rows))
 
 
-def refitted(
+def _refitted(
     objective: Objective,
     start: FloatArray,
     begin: FloatArray,
-    active: Any,
+    places: tuple[int, ...],
     most: int,
     tolerance: float,
 ) -> SearchEnd:
     """Minimise over some parameters, the others held at the start."""
     lower, upper = objective.lower, objective.upper
+    active = np.isin(np.arange(start.size), places)
     # bounds must differ: nine digits are held
     held = 1e-9 * np.maximum(np.abs(start), 1e-9)
     try:
@@ -241,25 +235,22 @@ def _sparse(
 
     cp: Any = cvxpy
 
-    trail = Trail()
-    point = objective.begin(start)
-    trail.add(objective, start, 0.0)
-    p = start
-    converged, reason = False, "max_iterations reached"
-
     def total(r: FloatArray, p: FloatArray) -> float:
         return float(r @ r) / 2 + weight * float(np.abs((p - start) / unit).sum())
 
+    trail = Trail()
+    p, point = start, objective.begin(start)
+    trail.add(objective, start, 0.0)
     r = objective.values(point)
     for _ in range(most):
         J = objective.slopes(point) * unit
         x = cp.Variable(p.size)
         now = (p - start) / unit
-        limits = (
-            [x <= (objective.upper - start) / unit] if np.isfinite(objective.upper).all() else []
-        )
-        if np.isfinite(objective.lower).all():
-            limits.append(x >= (objective.lower - start) / unit)
+        limits = [
+            sign * x[finite] <= sign * (edge - start)[finite] / unit[finite]
+            for sign, edge in ((1.0, objective.upper), (-1.0, objective.lower))
+            if (finite := np.flatnonzero(np.isfinite(edge))).size
+        ]
         loss = cp.sum_squares(r + J @ (x - now)) / 2 + weight * cp.norm1(x)
         problem = cp.Problem(cp.Minimize(loss), limits)
         problem.solve(solver=cp.CLARABEL)
@@ -271,22 +262,17 @@ def _sparse(
         for _ in range(20):
             try:
                 trial = objective.at(p + fraction * step)
-                changed = objective.values(trial)
+                if total(objective.values(trial), trial.p) <= total(r, p) * (1 + ROUNDING):
+                    break
             except ModelError:
-                fraction /= 2
-                continue
-            if total(changed, trial.p) <= total(r, p) * (1 + ROUNDING):
-                break
+                pass
             fraction /= 2
         else:
-            converged, reason = True, "no part of a step helps"
-            break
-        size = float(np.abs(step / unit).max())
+            return SearchEnd(p, total(r, p), trail, True, "no part of a step helps")
         p = start + aim * unit if fraction == 1.0 else p + fraction * step
         point = objective.at(p, refer=True)
         r = objective.values(point)
         trail.add(objective, p, fraction)
-        if size < max(tolerance, 1e-6) * max(1.0, float(np.abs(aim).max())):
-            converged, reason = True, "step below the tolerance"
-            break
-    return SearchEnd(p, total(r, p), trail, converged, reason)
+        if np.abs(step / unit).max() < max(tolerance, 1e-6) * max(1.0, float(np.abs(aim).max())):
+            return SearchEnd(p, total(r, p), trail, True, "step below the tolerance")
+    return SearchEnd(p, total(r, p), trail, False, "max_iterations reached")

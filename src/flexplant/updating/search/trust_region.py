@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
@@ -30,9 +31,6 @@ STUCK = (
 )
 PROMISED = 1e-2
 
-#: rows (r, J) added to those of the objective
-Extra = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-
 
 class _ImpossibleError(Exception):
     """No step from the last point is possible."""
@@ -58,8 +56,7 @@ class TrustRegion(UpdateMethod):
     Examples
     --------
     >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))
     >>> bounded = [fx.AddedMass("3:x", bounds=(0.0, 0.1))]
     >>> fx.update(drawing, bounded, [poles], method=fx.updating.TrustRegion()).values.round(4)
@@ -83,124 +80,94 @@ class TrustRegion(UpdateMethod):
         tolerance: float = 1e-10,
     ) -> SearchEnd:
         """Return where the search from `start` ends; see `UpdateMethod.search`."""
-        return minimised(objective, start, self, most=most or self.steps, tolerance=tolerance)
+        most = whole(
+            most or self.steps, "most"
+        )  # the steps are counted up to it: nothing else ends
+        bounded = objective.lower, objective.upper
+        # steps that keep away from bounds cost half as much again where none of them is active
+        if np.any(np.isfinite(bounded)):
+            free = np.full(start.size, np.inf)
+            with suppress(ModelError, np.linalg.LinAlgError):
+                found = self._fitted(objective, start, -free, free, most, tolerance)
+                inside = np.all(found.p >= objective.lower) and np.all(found.p <= objective.upper)
+                if found.converged and inside:
+                    return found
+        return self._fitted(objective, start, *bounded, most, tolerance)
 
+    def _fitted(
+        self,
+        objective: Objective,
+        start: FloatArray,
+        low: FloatArray,
+        high: FloatArray,
+        most: int,
+        tolerance: float,
+    ) -> SearchEnd:
+        """Minimise by least_squares; points that it moves to are references to pair modes with."""
+        from scipy.optimize import least_squares
 
-def minimised(
-    objective: Objective,
-    start: FloatArray,
-    method: TrustRegion,
-    *,
-    most: int,
-    tolerance: float,
-    extra: Extra | None = None,
-) -> SearchEnd:
-    """Minimise by least_squares, first as if there were no bounds, again within them if needed.
+        trail = Trail()
+        point = objective.begin(start)
+        rows, count = (objective.values(point, prior=prior).size for prior in (False, True))
+        loss: Any = self.loss if self.loss == "linear" else _data_loss(self.loss, rows)
 
-    Steps that keep away from bounds cost half as much again where none of them is active. Only
-    points that the search moves to become references for the pairing of modes.
-    """
-    most = whole(most, "most")  # the steps are counted up to it: no other number ends them
-    free = np.full(start.size, np.inf)
-    if np.any(np.isfinite(objective.lower)) or np.any(np.isfinite(objective.upper)):
+        def values(p: FloatArray) -> FloatArray:
+            try:
+                return objective.values(objective.at(p))
+            except ModelError:
+                # least_squares would shorten the step to the last digit: the tolerance is enough
+                if trail.p and la.norm((p - trail.p[-1]) / unit) <= tolerance * max(
+                    1.0, float(la.norm(trail.p[-1] / unit))
+                ):
+                    raise _ImpossibleError from None
+                return np.full(count, np.inf)
+
+        def slopes(p: FloatArray) -> FloatArray:
+            point = objective.at(p, refer=True)
+            if not trail.p or not np.array_equal(trail.p[-1], p):
+                trail.add(objective, p, 1.0 if trail.p else 0.0)
+            return objective.slopes(point)
+
+        # a start on its bound has nowhere to go
+        room = np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(start), 1.0)) * 1e-8
+        inside = np.clip(start, low + room, high - room)
+        if not np.array_equal(inside, start):
+            point = objective.begin(inside)
+        unit = unit_changes(objective, objective.slopes(point, prior=False))
+
+        def searched(start: FloatArray, most: int) -> Any:
+            return least_squares(
+                values,
+                start,
+                slopes,
+                bounds=(low, high),
+                method="trf",
+                x_scale=unit,
+                # the cost is flat at its least: 1e-12 of it are 1e-6 standard deviations
+                ftol=max(1e-2 * tolerance, 2.3e-16),
+                xtol=max(tolerance, 2.3e-16),
+                gtol=1e-15,
+                loss=loss,
+                f_scale=self.scale,
+                max_nfev=most,
+            )
+
+        stopped = "max_iterations reached"
         try:
-            found = _bounded_fit(objective, start, method, (-free, free), most, tolerance, extra)
-        except (ModelError, np.linalg.LinAlgError):
-            found = None
-        if (
-            found is not None
-            and found.converged
-            and np.all(found.p >= objective.lower)
-            and np.all(found.p <= objective.upper)
-        ):
-            return found
-    limits = (objective.lower, objective.upper)
-    return _bounded_fit(objective, start, method, limits, most, tolerance, extra)
-
-
-def _bounded_fit(
-    objective: Objective,
-    start: FloatArray,
-    method: TrustRegion,
-    limits: tuple[FloatArray, FloatArray],
-    most: int,
-    tolerance: float,
-    extra: Extra | None,
-) -> SearchEnd:
-    from scipy.optimize import least_squares
-
-    trail = Trail()
-    point = objective.begin(start)
-    rows = objective.values(point, prior=False).size
-
-    def values(p: FloatArray) -> FloatArray:
-        try:
-            r = objective.values(objective.at(p))
-        except ModelError:
-            # least_squares would shorten the step to the last digit: the tolerance is enough
-            if trail.p and la.norm((p - trail.p[-1]) / unit) <= tolerance * max(
-                1.0, float(la.norm(trail.p[-1] / unit))
-            ):
-                raise _ImpossibleError from None
-            r = np.full(count, np.inf)
-        return r if extra is None else np.concatenate([r, extra(p)[0]])
-
-    def slopes(p: FloatArray) -> FloatArray:
-        point = objective.at(p, refer=True)
-        if not trail.p or not np.array_equal(trail.p[-1], p):
-            trail.add(objective, p, 1.0 if trail.p else 0.0)
-        J = objective.slopes(point)
-        return J if extra is None else np.vstack([J, extra(p)[1]])
-
-    count = objective.values(point).size
-    low, high = limits
-    # a start on its bound has nowhere to go
-    room = np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(start), 1.0)) * 1e-8
-    inside = np.clip(start, low + room, high - room)
-    if not np.array_equal(inside, start):
-        point = objective.begin(inside)
-    loss: Any = method.loss
-    if method.loss != "linear":
-        loss = _data_loss(method.loss, rows)
-    unit = unit_changes(objective, objective.slopes(point, prior=False))
-
-    def searched(start: FloatArray, most: int) -> Any:
-        return least_squares(
-            values,
-            start,
-            slopes,
-            bounds=(low, high),
-            method="trf",
-            x_scale=unit,
-            # the cost is flat at its least: 1e-12 of it are 1e-6 standard deviations
-            ftol=max(1e-2 * tolerance, 2.3e-16),
-            xtol=max(tolerance, 2.3e-16),
-            gtol=1e-15,
-            loss=loss,
-            f_scale=method.scale,
-            max_nfev=most,
-        )
-
-    stopped = "max_iterations reached"
-    try:
-        answer = searched(inside, most)
-    except _ImpossibleError:
-        answer, stopped = searched(trail.p[-1], 1), EDGE
-    p = np.asarray(answer.x, dtype=np.float64)
-    objective.at(p, refer=True)
-    if not np.array_equal(trail.p[-1], p):
-        trail.add(objective, p, 1.0)
-    reason = {0: stopped, 1: "gradient is zero", 2: "error no longer falls"}.get(
-        answer.status, "step below the tolerance"
-    )
-    converged = answer.status > 0
-    if (
-        converged
-        and method.loss == "linear"
-        and _is_stuck(answer, objective.size(point), tolerance)
-    ):
-        converged, reason = False, STUCK
-    return SearchEnd(p, float(answer.cost), trail, converged, reason)
+            answer = searched(inside, most)
+        except _ImpossibleError:
+            answer, stopped = searched(trail.p[-1], 1), EDGE
+        p = np.asarray(answer.x, dtype=np.float64)
+        objective.at(p, refer=True)
+        if not np.array_equal(trail.p[-1], p):
+            trail.add(objective, p, 1.0)
+        known = {0: stopped, 1: "gradient is zero", 2: "error no longer falls"}
+        reason = known.get(answer.status, "step below the tolerance")
+        converged = answer.status > 0
+        judged = converged and self.loss == "linear"
+        if judged and _is_stuck(answer, objective.size(point), tolerance):
+            converged, reason = False, STUCK
+        return SearchEnd(p, float(answer.cost), trail, converged, reason)
 
 
 def _is_stuck(answer: Any, size: FloatArray, tolerance: float) -> bool:
