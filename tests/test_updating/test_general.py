@@ -330,6 +330,17 @@ def test_lasso_finds_the_one_changed_spring(chain):
     assert not np.any(heavy.values)
 
 
+@pytest.mark.slow
+def test_lasso_keeps_bounds_beside_a_parameter_without(chain):
+    pytest.importorskip("cvxpy")
+    parts = changed(chain, mass=[(1, 0.3), (3, 0.2)])
+    masses = [AddedMass("2:z", bounds=(-0.1, 0.1)), AddedMass("4:z")]
+    data = [Eigenvalues(measured(parts, 1e-4))]
+    fit = update(chain, masses, data, method=Lasso(weight=1e-3), prior=False)
+    assert fit.values[0] == pytest.approx(0.1, rel=1e-4)
+    assert fit.values[1] > 0.1
+
+
 def test_tikhonov_and_truncation_bound_what_cannot_be_told(chain):
     parts = changed(chain, mass=[(1, 0.3)])
     # a mass everywhere from one pole: the sum of all effects is known, nothing else

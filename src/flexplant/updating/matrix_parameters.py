@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import zip_longest
 from math import comb
 from typing import Any
@@ -36,8 +37,62 @@ SYMMETRIC = 1e-9
 DENSE_DAMPING_LIMIT = 5000
 
 
+#: the matrices that parameters name
+PARTS = ("dM", "dD", "dK")
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class MatrixParameter(Parameter):
+class _GivenParameter(Parameter):
+    """A parameter with given matrices of its powers, of the model or of its full structure."""
+
+    name: str
+    dM: Any = field(default=None, kw_only=True)
+    dD: Any = field(default=None, kw_only=True)
+    dK: Any = field(default=None, kw_only=True)
+    unit: str = field(default="", kw_only=True)
+    bounds: tuple[float, float] | None = field(default=None, kw_only=True)
+    prior: tuple[float, float] | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise LabelError(
+                f"a {type(self).__name__} needs a name, got {short(self.name)}. Pass a text."
+            )
+        for label in PARTS:
+            part = self._checked(getattr(self, label), f"{label} of {self.name}")
+            self._set(**{label: part})
+        if not any(self._powers(label) for label in PARTS):
+            raise ModelError(f"{self.name} changes nothing: give dM=, dD= or dK=, not all zero.")
+        self._set(unit=checked_text(self.unit, "unit"))
+        self._check_known()
+
+    def _checked(self, part: Any, name: str) -> Any:
+        return _checked_matrix(part, name)
+
+    def _powers(self, label: str) -> Sequence[Matrix | None]:
+        """Return the matrices of the first, second, ... power."""
+        part = getattr(self, label)
+        return part if isinstance(part, tuple) else () if part is None else (part,)
+
+    def terms(self, model: FEModel | ReducedModel) -> list[Derivatives]:
+        """Return the matrices of all powers in the model's DOFs.
+
+        Raises
+        ------
+        ShapeError
+            When the matrices belong neither to the model nor to its full structure.
+        """
+        project = partial(_projected_matrix, model=model, name=self.name)
+        powers = zip_longest(*(self._powers(label) for label in PARTS))
+        return [(project(M), project(D), project(K)) for M, D, K in powers]
+
+    def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
+        """Return the derivatives (dM, dD, dK) at p = 0; see `terms`."""
+        return self.terms(model)[0]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MatrixParameter(_GivenParameter):
     """A parameter with given derivatives of the matrices: M + p dM, D + p dD, K + p dK.
 
     A group of elements (the stiffness of a region, say, with p its relative change) is the sum of
@@ -65,30 +120,8 @@ class MatrixParameter(Parameter):
     <MatrixParameter: joint of K>
     """
 
-    name: str
-    dM: Matrix | None = field(default=None, kw_only=True)
-    dD: Matrix | None = field(default=None, kw_only=True)
-    dK: Matrix | None = field(default=None, kw_only=True)
-    unit: str = field(default="", kw_only=True)
-    bounds: tuple[float, float] | None = field(default=None, kw_only=True)
-    prior: tuple[float, float] | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name:
-            raise LabelError(
-                f"a MatrixParameter needs a name, got {short(self.name)}. Pass a text."
-            )
-        parts = {
-            label: checked_matrix(getattr(self, label), f"{label} of {self.name}")
-            for label in ("dM", "dD", "dK")
-        }
-        if all(part is None for part in parts.values()):
-            raise ModelError(f"{self.name} changes nothing: give dM=, dD= or dK=, not all zero.")
-        self._set(**parts, unit=checked_text(self.unit, "unit"))
-        self._check_known()
-
     def __repr__(self) -> str:
-        parts = ", ".join(a[1] for a in ("dM", "dD", "dK") if getattr(self, a) is not None)
+        parts = ", ".join(label[1] for label in PARTS if self._powers(label))
         unit = f" [{self.unit}]" if self.unit else ""
         return f"<MatrixParameter: {self.name}{unit} of {parts}>"
 
@@ -134,13 +167,7 @@ class MatrixParameter(Parameter):
         middle = float(real_array(value, "value", ()))
         h = positive(1e-3 * abs(middle) if step is None else step, "step")
         low, high = build(middle - h), build(middle + h)
-        if tuple(low.dofs) != tuple(high.dofs):
-            raise ShapeError(f"build of {name} changes the DOFs: the matrices cannot be compared.")
-        if not getattr(low, "is_physical", True):
-            raise ShapeError(
-                f"build of {name} gives generalised coordinates, which change with the parameter: "
-                "matrices in them cannot be compared. Build FEModels; they are projected."
-            )
+        _check_comparable([low, high], name)
         parts: dict[str, Any] = {}
         for label in "MDK":
             before, after = getattr(low, label), getattr(high, label)
@@ -197,7 +224,10 @@ class MatrixParameter(Parameter):
         """
         mapping(regions, "regions", "Give {'left': mask}.", error=LabelError, least=1)
         function(build, "build", MAKES)
-        masks = {name: _mask(mask, name) for name, mask in regions.items()}
+        for name in regions:
+            if not isinstance(name, str) or not name:
+                raise LabelError(f"a region needs a name, got {short(name)}. Use a text.")
+        masks = {name: element_mask(mask, f"region {name!r}") for name, mask in regions.items()}
         shape = next(iter(masks.values())).shape
         given = real_array(value, "value")
         if given.ndim and given.shape != shape:
@@ -220,20 +250,6 @@ class MatrixParameter(Parameter):
             )
             found.append(one)
         return found
-
-    def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
-        """Return (dM, dD, dK) in the model's DOFs.
-
-        Raises
-        ------
-        ShapeError
-            When the matrices belong neither to the model nor to its full structure.
-        """
-        return (
-            projected_matrix(self.dM, model, self.name),
-            projected_matrix(self.dD, model, self.name),
-            projected_matrix(self.dK, model, self.name),
-        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -305,7 +321,7 @@ class ModeDamping(Parameter):
         return None, 2 * float(omega[-1]) * np.outer(force, force), None
 
 
-def projected_matrix(part: Matrix | None, model: Any, name: str) -> Matrix | None:
+def _projected_matrix(part: Matrix | None, model: Any, name: str) -> Matrix | None:
     """Return a matrix of a model's own DOFs, ``T^T A T`` of one of its full structure."""
     if part is None:
         return None
@@ -321,13 +337,19 @@ def projected_matrix(part: Matrix | None, model: Any, name: str) -> Matrix | Non
     return (product + product.T) / 2
 
 
-def _mask(value: Any, name: Any) -> Any:
-    if not isinstance(name, str) or not name:
-        raise LabelError(f"a region needs a name, got {short(name)}. Use a text.")
-    return element_mask(value, f"region {name!r}")
+def _check_comparable(models: Sequence[Any], name: str) -> None:
+    """Refuse models whose matrices cannot be compared."""
+    first = models[0]
+    if any(tuple(one.dofs) != tuple(first.dofs) for one in models):
+        raise ShapeError(f"build of {name} changes the DOFs: the matrices cannot be compared.")
+    if not getattr(first, "is_physical", True):
+        raise ShapeError(
+            f"build of {name} gives generalised coordinates, which change with the parameter: "
+            "matrices in them cannot be compared. Build FEModels; they are projected."
+        )
 
 
-def checked_matrix(value: Any, name: str) -> Matrix | None:
+def _checked_matrix(value: Any, name: str) -> Matrix | None:
     """Return a square, finite, symmetric matrix, None when it is None or zero."""
     if value is None:
         return None
@@ -360,7 +382,7 @@ CHECKS = (-0.97, -0.77, 0.31)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PolynomialParameter(Parameter):
+class PolynomialParameter(_GivenParameter):
     """A parameter with powers: ``M(p) = M + p M_1 + p^2 M_2 + ...``, and so D and K.
 
     Derivatives are exact at every p. A plate's thickness has K_1 to K_3 and M_1 (with rotary
@@ -395,43 +417,26 @@ class PolynomialParameter(Parameter):
     <PolynomialParameter: thickness [m], M of degree 1, K of degree 3>
     """
 
-    name: str
     dM: Sequence[Matrix | None] = field(default=(), kw_only=True)
     dD: Sequence[Matrix | None] = field(default=(), kw_only=True)
     dK: Sequence[Matrix | None] = field(default=(), kw_only=True)
-    unit: str = field(default="", kw_only=True)
-    bounds: tuple[float, float] | None = field(default=None, kw_only=True)
-    prior: tuple[float, float] | None = field(default=None, kw_only=True)
     missed: float = field(default=0.0, kw_only=True)
 
-    def __post_init__(self) -> None:
-        if not checked_text(self.name, "name"):
-            raise LabelError("a PolynomialParameter needs a name, got ''. Pass a text.")
-        parts: dict[str, Any] = {}
-        for label in ("dM", "dD", "dK"):
-            given = getattr(self, label)
-            if not isinstance(given, list | tuple):
-                raise ShapeError(f"{label} of {self.name} must be a list of matrices, one a power.")
-            checked = [
-                checked_matrix(part, f"{label}[{i}] of {self.name}") for i, part in enumerate(given)
-            ]
-            while checked and checked[-1] is None:
-                checked.pop()
-            parts[label] = tuple(checked)
-        if not any(parts.values()):
-            raise ModelError(f"{self.name} changes nothing: give dM=, dD= or dK=, not all zero.")
-        self._set(**parts, unit=checked_text(self.unit, "unit"))
-        self._check_known()
+    def _checked(self, part: Any, name: str) -> tuple[Matrix | None, ...]:
+        if not isinstance(part, list | tuple):
+            raise ShapeError(f"{name} must be a list of matrices, one a power.")
+        label, _, rest = name.partition(" ")
+        checked = [_checked_matrix(one, f"{label}[{i}] {rest}") for i, one in enumerate(part)]
+        while checked and checked[-1] is None:
+            checked.pop()
+        return tuple(checked)
 
     def __repr__(self) -> str:
-        parts = [
-            f"{label[1]} of degree {len(getattr(self, label))}"
-            for label in ("dM", "dD", "dK")
-            if getattr(self, label)
-        ]
+        degrees = {label[1]: len(self._powers(label)) for label in PARTS}
+        parts = ", ".join(f"{part} of degree {count}" for part, count in degrees.items() if count)
         unit = f" [{self.unit}]" if self.unit else ""
         about = f", good to {self.missed:.1g}" if self.missed > EXACT else ""
-        return f"<PolynomialParameter: {self.name}{unit}, {', '.join(parts)}{about}>"
+        return f"<PolynomialParameter: {self.name}{unit}, {parts}{about}>"
 
     @classmethod
     def from_build(
@@ -496,40 +501,24 @@ class PolynomialParameter(Parameter):
             bounds = max(low, -half), min(high, half)
         return cls(name, **found, unit=unit, bounds=bounds, prior=prior, missed=missed[worst][0])
 
-    def terms(self, model: FEModel | ReducedModel) -> list[Derivatives]:
-        """Return the matrices of all powers in the model's DOFs."""
-        powers = zip_longest(self.dM, self.dD, self.dK)
-        return [
-            (projected_matrix(M, model, self.name), projected_matrix(D, model, self.name),
-             projected_matrix(K, model, self.name))
-            for M, D, K in powers
-        ]  # fmt: skip
-
-    def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
-        """Return the derivatives (dM, dD, dK) at p = 0."""
-        return self.terms(model)[0]
-
     def curve(self, value: float) -> tuple[FloatArray, FloatArray]:
         """Return the powers of a value, and their derivatives."""
-        k = np.arange(1, self._degree + 1, dtype=np.float64)
-        powers, slopes = np.power(value, k), k * np.power(value, k - 1)
-        return np.asarray(powers, dtype=np.float64), np.asarray(slopes, dtype=np.float64)
+        k = np.arange(1, max(len(self._powers(label)) for label in PARTS) + 1, dtype=np.float64)
+        return np.asarray(value**k), np.asarray(k * value ** (k - 1))
 
     def about(self, value: float) -> PolynomialParameter:
         """Return the parameter counted from a value: ``(p + v)^k`` by the binomial theorem."""
         moved: dict[str, Any] = {}
-        for label in ("dM", "dD", "dK"):
-            parts = getattr(self, label)
+        for label in PARTS:
+            parts = self._powers(label)
+            count = len(parts) + 1
             moved[label] = [
-                _weighted_sum([comb(k, j) * value ** (k - j) for k in range(j, len(parts) + 1)],
-                     list(parts[j - 1 :]))
-                for j in range(1, len(parts) + 1)
-            ]  # fmt: skip
+                _weighted_sum(
+                    [comb(k, j) * value ** (k - j) for k in range(j, count)], parts[j - 1 :]
+                )
+                for j in range(1, count)
+            ]
         return self.replace(**moved)
-
-    @property
-    def _degree(self) -> int:
-        return max(len(self.dM), len(self.dD), len(self.dK))
 
 
 def _interpolated(
@@ -550,8 +539,7 @@ def _interpolated(
         if x not in points:
             points[x] = build(middle + half * x)
     start = points[0.0]
-    if any(tuple(one.dofs) != tuple(start.dofs) for one in points.values()):
-        raise ShapeError(f"build of {name} changes the DOFs: the matrices cannot be compared.")
+    _check_comparable(list(points.values()), name)
     # without a constant: p = 0 is the model itself
     table = np.array(nodes)[:, None] ** np.arange(1, powers + 1)
     weights = np.linalg.lstsq(table, np.eye(powers + 1))[0]
