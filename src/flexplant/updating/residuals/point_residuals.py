@@ -22,8 +22,26 @@ from .residual import Bound, Residual, place_rows, split_parts
 INFINITE = 1e3
 
 
+class _PointResidual(Residual):
+    """A residual between two places."""
+
+    output: Place
+    input: Place
+    direction: str
+
+    @property
+    def loaded(self) -> tuple[tuple[Place, str], ...]:
+        """Places and directions of the output and the input."""
+        return (self.output, self.direction), (self.input, self.direction)
+
+    def _check_places(self) -> None:
+        require_known("direction", [self.direction], DIRECTIONS)
+        for what in ("output", "input"):
+            named_place(getattr(self, what), self.direction, what)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Antiresonances(Residual):
+class Antiresonances(_PointResidual):
     """Residuals of complex transmission zeros of one response, ``z_exp - z``.
 
     Zeros of ``c (s^2 M + s D + K)^-1 b``: eigenvalues of ``[P(s) b; c 0]``, with
@@ -73,8 +91,14 @@ class Antiresonances(Residual):
             raise ShapeError("zeros is empty: leave the residual out.")
         if np.any(imag == 0):
             raise ModelError("zeros must have an imaginary part: an antiresonance oscillates.")
-        self._set(zeros=real + 1j * np.abs(imag), std=_checked_std(self.std, real.size))
-        _check_places(self)
+        std = self.std
+        if std is not None:
+            given = positive_array(std, "std")
+            std = (
+                np.full(real.shape, given) if not given.ndim else real_array(std, "std", real.shape)
+            )
+        self._set(zeros=real + 1j * np.abs(imag), std=std)
+        self._check_places()
         if self.hold is not None:
             rate = positive(self.hold, "hold")
             if np.abs(imag).max() >= np.pi * rate:
@@ -87,11 +111,6 @@ class Antiresonances(Residual):
     def __repr__(self) -> str:
         freq = ", ".join(f"{f:.1f}" for f in np.abs(self.zeros[:4]) / (2 * np.pi))
         return f"<Antiresonances: {self.input} -> {self.output} at {freq} Hz>"
-
-    @property
-    def loaded(self) -> tuple[tuple[Place, str], ...]:
-        """Places and directions of the output and the input."""
-        return (self.output, self.direction), (self.input, self.direction)
 
     @property
     def top(self) -> float:
@@ -122,27 +141,25 @@ class _BoundZeros(Bound):
         zero = self.target[row % self.target.size]
         return f"the antiresonance at {abs(zero) / (2 * np.pi):.4g} Hz"
 
-    def _sampled(self, point: Point) -> tuple[ComplexArray, ComplexArray]:
-        """Return the sampled zeros nearest to the measured ones and their slopes (m, q)."""
+    def _matched(self, point: Point) -> tuple[ComplexArray, ComplexArray]:
+        """Return the zeros nearest to the measured ones and their slopes (m, q)."""
         if self._last is None or self._last[0] is not point:
-            held = Held(
-                point, self.b[:, None], self.c[None], rate=self.hold or 1.0, delay=0.0, order=0
-            )
-            s, slopes = held.zeros()
-            columns = self._nearest(s)
+            if self.hold is None:
+                s, slopes = self._continuous(point)
+            else:
+                B, C = self.b[:, None], self.c[None]
+                s, slopes = Held(point, B, C, rate=self.hold, delay=0.0, order=0).zeros()
+            if s.size < self.target.size:
+                raise ModelError(
+                    f"the model has {counted(s.size, 'antiresonance')} there, {self.target.size} "
+                    "were measured."
+                )
+            columns = assigned(np.abs(self.target[:, None] - s))
             self._last = point, s[columns], slopes[columns]
         return self._last[1:]
 
-    def _nearest(self, s: Any) -> Any:
-        if s.size < self.target.size:
-            raise ModelError(
-                f"the model has {counted(s.size, 'antiresonance')} there, {self.target.size} were "
-                "measured."
-            )
-        return assigned(np.abs(self.target[:, None] - s))
-
-    def _found(self, point: Point) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Return the zeros nearest to the measured ones with right and left vectors."""
+    def _continuous(self, point: Point) -> tuple[ComplexArray, ComplexArray]:
+        """Return the zeros (m,) of the upper half plane and their slopes (m, q)."""
         M, D, K = point.matrices
         k = K.shape[0]
         w0 = float(np.median(np.abs(self.target)))
@@ -151,43 +168,32 @@ class _BoundZeros(Bound):
         # states (q, s q / w0, force): first order in s / w0
         E = np.zeros((2 * k + 1, 2 * k + 1))
         A = np.zeros_like(E)
-        eye = np.eye(k)
-        A[:k, k : 2 * k] = eye
-        E[:k, :k] = eye
+        A[:k, k : 2 * k] = E[:k, :k] = np.eye(k)
         A[k : 2 * k, :k], A[k : 2 * k, k : 2 * k] = -K / size, -D * w0 / size
         A[k : 2 * k, 2 * k], A[2 * k, :k] = b, c
         E[k : 2 * k, k : 2 * k] = M * w0**2 / size
         solve: Any = la.eig
         (alpha, beta), left, right = solve(A, E, left=True, homogeneous_eigvals=True)
-        finite = np.abs(beta) * INFINITE * np.sqrt(np.abs(K).max() / np.abs(M).max()) > (
-            np.abs(alpha) * w0
-        )
-        s = np.where(finite, alpha, 0) / np.where(finite, beta, 1) * w0
-        finite &= s.imag > SPLIT * w0
-        columns = np.flatnonzero(finite)
-        columns = columns[self._nearest(s[columns])]
-        zeros = np.asarray(s[columns], dtype=np.complex128)
-        return zeros, right[:k, columns], left[k : 2 * k, columns].conj()
+        largest = INFINITE * np.sqrt(size / np.abs(M).max())
+        finite = np.flatnonzero(np.abs(beta) * largest > np.abs(alpha) * w0)
+        s = np.asarray(alpha[finite] / beta[finite] * w0, dtype=np.complex128)
+        upper = s.imag > SPLIT * w0
+        s, finite = s[upper], finite[upper]
+        x, y = right[:k, finite], left[k : 2 * k, finite].conj()
+        moved = point.family.moved(x, (s**2, s, np.ones_like(s)))
+        scale = np.sum(y * (2 * (M @ (x * s)) + D @ x), axis=0)
+        return s, -(np.sum(y * moved, axis=1) / scale).T
 
     def values(self, point: Point) -> FloatArray:
-        zeros = self._found(point)[0] if self.hold is None else self._sampled(point)[0]
-        return split_parts((self.target - zeros) / self.std)
+        return split_parts((self.target - self._matched(point)[0]) / self.std)
 
     def slopes(self, point: Point) -> FloatArray:
-        if self.hold is not None:
-            # measured minus model
-            return split_parts(-self._sampled(point)[1] / self.std[:, None])
-        zeros, x, y = self._found(point)
-        M, D, _ = point.matrices
-        family = point.family
-        moved = family.moved(x, (zeros**2, zeros, np.ones_like(zeros)))
-        change = np.sum(y * moved, axis=1)
-        scale = np.sum(y * (2 * (M @ (x * zeros)) + D @ x), axis=0)
-        return split_parts((change / scale / self.std).T)
+        # measured minus model
+        return split_parts(-self._matched(point)[1] / self.std[:, None])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StaticCompliance(Residual):
+class StaticCompliance(_PointResidual):
     """Residuals of a static compliance, ``g_exp - c K^-1 b``.
 
     Of a free structure the elastic part (inertia relief): ``u`` of ``[K, M R; R^T M, 0]`` with the
@@ -229,15 +235,10 @@ class StaticCompliance(Residual):
         if value == 0:
             raise ModelError("a compliance of zero cannot be compared relatively: check the value.")
         self._set(value=value, std=None if self.std is None else positive(self.std, "std"))
-        _check_places(self)
+        self._check_places()
 
     def __repr__(self) -> str:
         return f"<StaticCompliance: {self.input} -> {self.output}, {self.value:.4g} m/N>"
-
-    @property
-    def loaded(self) -> tuple[tuple[Place, str], ...]:
-        """Places and directions of the output and the input."""
-        return (self.output, self.direction), (self.input, self.direction)
 
     def bound(self, family: Family) -> Bound:
         """Return the residual tied to a family."""
@@ -284,19 +285,6 @@ class _BoundStatic(Bound):
             loaded = family.dM @ R
             moved = moved + y[:k] @ (loaded @ u[k:]).T + (y[k:] @ np.swapaxes(loaded, 1, 2)) @ u[:k]
         return np.asarray(moved / self.std)[None, :]
-
-
-def _check_places(residual: Antiresonances | StaticCompliance) -> None:
-    require_known("direction", [residual.direction], DIRECTIONS)
-    for what in ("output", "input"):
-        named_place(getattr(residual, what), residual.direction, what)
-
-
-def _checked_std(value: Any, count: int) -> FloatArray | None:
-    if value is None:
-        return None
-    std = positive_array(value, "std")
-    return np.full(count, float(std)) if std.ndim == 0 else real_array(std, "std", (count,))
 
 
 class Held:
