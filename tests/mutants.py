@@ -75,7 +75,7 @@ LINES = [
      "between, weighted)"),
     ("simulation/motion.py", "t / 2.0 * (a",
      "t / 3.0 * (a"),
-    ("simulation/filters_along.py", "(1.0 - share) * gains[i]",
+    ("simulation/errors_along.py", "(1.0 - share) * gains[i]",
      "1.0 * gains[i]"),
     ("synthesis/hinf/ncf.py", "g.D.T @ g.C + g.B.T @ X",
      "g.B.T @ X"),

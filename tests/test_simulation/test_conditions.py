@@ -11,8 +11,8 @@ from flexplant.loop import close_loop
 from flexplant.loop.budget import white_noise
 from flexplant.plant import assemble_plant
 from flexplant.simulation import Quantiser, Saturation, simulate
-from flexplant.simulation.conditions import Conditions, finer_loop
-from flexplant.simulation.runs import InBlocks, SampleBySample, make_runner
+from flexplant.simulation.runs import Conditions, InBlocks, SampleBySample, make_runner
+from flexplant.simulation.simulate import finer_loop
 from flexplant.synthesis import design_servo
 from machines import block, matrices, observer, servo, stage
 from stages import L, ports, some_modes

@@ -69,6 +69,11 @@ with Client(n_workers=2, threads_per_worker=1, dashboard_address=None) as client
 """
 
 from ..rooms import public_names as _public_names
+from .errors_along import FiltersAlong as FiltersAlong
+from .errors_along import RmsAlong as RmsAlong
+from .errors_along import estimate_along as estimate_along
+from .errors_along import filters_along as filters_along
+from .errors_along import rms_along as rms_along
 from .estimator_comparison import EstimatorComparison as EstimatorComparison
 from .estimator_comparison import compare_estimators as compare_estimators
 from .estimator_comparison import reading_along as reading_along
@@ -81,9 +86,6 @@ from .feedforward import Feedforward as Feedforward
 from .feedforward import design_feedforward as design_feedforward
 from .feedforward import inverse_forces as inverse_forces
 from .feedforward import known_forces as known_forces
-from .filters_along import FiltersAlong as FiltersAlong
-from .filters_along import estimate_along as estimate_along
-from .filters_along import filters_along as filters_along
 from .learning import LearnedFeedforward as LearnedFeedforward
 from .learning import learn_feedforward as learn_feedforward
 from .machine_pipeline import MachinePipeline as MachinePipeline
@@ -100,12 +102,10 @@ from .nonlinear_elements import Jitter as Jitter
 from .nonlinear_elements import Quantiser as Quantiser
 from .nonlinear_elements import Saturation as Saturation
 from .response import Response as Response
-from .rms_along import RmsAlong as RmsAlong
-from .rms_along import rms_along as rms_along
 from .simulate import simulate as simulate
+from .simulate import spectral_noise as spectral_noise
 from .specification import Specification as Specification
 from .specification import Verdict as Verdict
-from .spectral_noise import spectral_noise as spectral_noise
 from .speed_certificate import SpeedCertificate as SpeedCertificate
 from .speed_certificate import certify_speed as certify_speed
 from .study import StudyTable as StudyTable

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray, real_array
+from ..checks import FloatArray, instance, real_array
 from ..errors import ModelError, require_known
 from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.budget import WhiteNoise, continuous_factor, white_noise
@@ -62,6 +62,24 @@ def trajectory(plant: StandardPlant, moving: Mapping[str, Any], time: FloatArray
         for value in (paths[name](ends).min(), paths[name](ends).max()):
             known[name].within(value)
     return Trajectory(tuple(ports.positions), paths, ports.values)
+
+
+def unscheduled(loop: ClosedLoop | ScheduledLoop) -> tuple[ClosedLoop, ScheduledLoop | None]:
+    """Return a loop, that of the standing machine where a schedule is given, and the schedule."""
+    schedule = loop if isinstance(loop, ScheduledLoop) else None
+    own = loop.standing if isinstance(loop, ScheduledLoop) else loop
+    return instance(own, ClosedLoop, "loop", "Pass close_loop(plant, *blocks)."), schedule
+
+
+def known_positions(plant: StandardPlant, what: str) -> tuple[Position, ...]:
+    """Return the positions of a plant; ModelError where a sampled plant's ports do not move."""
+    found = plant.assembled.ports.positions if plant.dt and plant.is_assembled else ()
+    if not found:
+        raise ModelError(
+            f"{what} a sampled plant whose ports move: Ports(..., positions=["
+            "fx.plant.Position('x', range=...)]) and plant.discretized(rate)."
+        )
+    return tuple(found)
 
 
 def _path(name: str, path: Any, time: FloatArray) -> Callable[[FloatArray], FloatArray]:
@@ -290,6 +308,24 @@ class MovingMachine(MovingPlant):
             return law.A, law.B, law.C, law.D
         at = self.path.at(np.array([k * float(self.plant.dt)]))
         return self.schedule.matrices(float(at[self.schedule.position][0]))
+
+    def closed(self, k: int, sample: Sample) -> tuple[FloatArray, ...]:
+        """Return A, G, C and D of sample k in closed loop: X+ = A X + G n, C X + D n is shown."""
+        nz, nu, columns = len(self.plant.z), len(self.loop.driven), self.noise.columns
+        law_A, law_B, law_C, law_D = self.law_at(k)
+        W = np.zeros((sample.B.shape[1], columns.size))
+        W[columns, np.arange(columns.size)] = self.noise.deviation
+        C1, C2, D2 = sample.C[:nz], sample.C[nz:], self.D[nz:] @ W
+        B_u, D_u = sample.B[:, self.u], self.D[:nz, self.u]
+        # commands and what is watched, over x, c and the noises of sensors
+        out = law_D @ C2, law_C, law_D @ D2
+        of_x, of_c, of_n = (part[:nu] for part in out)
+        A = np.block([[sample.A + B_u @ of_x, B_u @ of_c], [law_B @ C2, law_A]])
+        none = np.zeros((len(law_A), sample.G.shape[1]))
+        G = np.block([[sample.G, sample.B @ W + B_u @ of_n], [none, law_B @ D2]])
+        still = np.zeros((len(C2), len(law_A)))
+        C = np.block([[C1 + D_u @ of_x, D_u @ of_c], [C2, still], [out[0], out[1]]])
+        return A, G, C, np.vstack([self.D[:nz] @ W + D_u @ of_n, D2, out[2]])
 
     @staticmethod
     def _held(place: tuple[bool, int], x: FloatArray, inputs: FloatArray) -> FloatArray:

@@ -476,10 +476,10 @@ class Answering:
 
 def split_elements(
     elements: Any, plant: StandardPlant, driven: Sequence[str]
-) -> list[dict[str, Any]]:
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """Return the elements on sensors, on actuators and on disturbances, by channel."""
     if elements is None:
-        return [{}, {}, {}]
+        return {}, {}, {}
     instance(
         elements, Mapping, "elements", "Name the channel: {'u1': simulation.Saturation(10.0)}."
     )
@@ -489,7 +489,8 @@ def split_elements(
         if not any(name in side for side in sides):
             raise unknown_label("channel for an element", name, [*plant.y, *driven, *forces])
         _checked_elements(name, element)
-    return [{n: one for n, one in elements.items() if n in side} for side in sides]
+    on_y, on_u, on_w = ({n: e for n, e in elements.items() if n in side} for side in sides)
+    return on_y, on_u, on_w
 
 
 def _checked_elements(name: str, element: Any) -> list[Acts]:

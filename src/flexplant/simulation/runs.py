@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,8 +16,56 @@ from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, Recursion, cheapest
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..tolerances import divisor
-from .conditions import Conditions, Moving
 from .nonlinear_elements import Acting, Answering
+
+
+class Conditions(NamedTuple):
+    """What makes a run differ from that of the linear loop at its own samples.
+
+    `paths` are the places (n_time, 3) of POIs; the controller acts in every `finer`-th sample.
+    """
+
+    on_y: Mapping[str, Any] = {}
+    on_u: Mapping[str, Any] = {}
+    on_w: Mapping[str, Any] = {}
+    recovery: float | None = None
+    finer: int = 1
+    paths: Mapping[str, FloatArray] = {}
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether there is something that is not linear."""
+        return bool(self.on_y or self.on_u or self.on_w)
+
+
+class Rows(NamedTuple):
+    """Channels of z whose rows C (k, c, n) and D (k, c, m) over x and [w; u] differ by sample."""
+
+    shown: list[int]
+    C: FloatArray
+    D: FloatArray
+
+    def show(self, z: FloatArray, x: FloatArray, inputs: FloatArray) -> None:
+        """Put these channels into z (k, nz), for states x (k, n) and [w; u] (k, m)."""
+        z[:, self.shown] = np.einsum("kcn,kn->kc", self.C, x)
+        z[:, self.shown] += np.einsum("kcm,km->kc", self.D, inputs)
+
+
+class Moving:
+    """The rows of z that change with the places of POIs."""
+
+    def __init__(self, plant: StandardPlant, paths: Mapping[str, FloatArray]) -> None:
+        self.plant, self.paths = plant, paths
+
+    def rows(self, first: int, count: int) -> list[Rows]:
+        """Return the rows of the samples from `first`; a place that comes again is found once."""
+        found = []
+        for name, points in self.paths.items():
+            places, at = np.unique(points[first : first + count], axis=0, return_inverse=True)
+            along, again = self.plant.along(name, places), at.ravel()
+            shown = [self.plant.z.index(channel) for channel in along.channels]
+            found.append(Rows(shown, along.C[again], along.D[again]))
+        return found
 
 
 class Machine(NamedTuple):

@@ -12,6 +12,7 @@ from ..checks import (
     MOST_DRAWS,
     FloatArray,
     flag,
+    generator,
     instance,
     positive,
     real_array,
@@ -23,17 +24,16 @@ from ..checks import (
 )
 from ..errors import AssumptionError, LabelError, ModelError, require_known, warn
 from ..loop import ClosedLoop, ScheduledLoop
-from ..loop.blocks import DERIVATIVES, references
+from ..loop.blocks import DERIVATIVES, references, with_known
 from ..loop.budget import white_noise
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant
 from ..tolerances import SAME, TYPED
-from .conditions import conditions, finer_loop
 from .motion import SetPoint
-from .moving_machine import MovingMachine, trajectory
-from .nonlinear_elements import Acting, Acts
+from .moving_machine import MovingMachine, trajectory, unscheduled
+from .nonlinear_elements import Acting, Acts, split_elements
 from .response import Response
-from .runs import make_runner
+from .runs import Conditions, make_runner
 
 #: a signal over time: a set-point, one value per sample, a constant, or a function of time
 Signal: TypeAlias = "SetPoint | npt.ArrayLike | Callable[[FloatArray], npt.ArrayLike]"
@@ -137,9 +137,7 @@ def simulate(
     >>> simulate(close_loop(plant, law), reference=1.0, duration=0.5)["e"]
     array([1.    , 0.5   , 0.25  , 0.125 , 0.0625])
     """
-    schedule = loop if isinstance(loop, ScheduledLoop) else None
-    loop = loop.standing if isinstance(loop, ScheduledLoop) else loop
-    instance(loop, ClosedLoop, "loop", "Pass close_loop(plant, *blocks).")
+    loop, schedule = unscheduled(loop)
     _check_sampled(loop)
     closed, loop = loop, finer_loop(loop, finer)
     plant = loop.plant
@@ -160,7 +158,12 @@ def simulate(
             "positions move in runs without finer samples and without paths of single POIs: leave "
             "these out, or let the machine stand."
         )
-    met = conditions(loop, elements, anti_windup, finer, None if positions else moving, time)
+    met = Conditions(
+        *split_elements(elements, plant, loop.driven),
+        None if anti_windup is None else positive(anti_windup, "anti_windup"),
+        finer,
+        _paths(plant, None if positions else moving, time),
+    )
     numbers = _run_numbers(runs)
     given = _known_inputs(plant, reference, disturbance, time, 0 if runs is None else len(numbers))
     silent = plant if flag(noise, "noise") else plant.replace(asd={})
@@ -203,6 +206,46 @@ def simulate(
                     bar.advance()
     drawn = seed_of(seed) if white.factor.size or white.columns.size else None
     return Response(time, data[0] if runs is None else data, shown, loop.units, drawn)
+
+
+def finer_loop(loop: ClosedLoop, finer: int) -> ClosedLoop:
+    """Return a loop whose plant is sampled so many times in a sample of its controller.
+
+    The same plant before sampling, with the same delay in seconds.
+    """
+    if whole(finer, "finer", maximum=10_000) == 1:
+        return loop
+    plant = loop.plant
+    if plant.continuous.dt:
+        raise ModelError(
+            "finer= needs the plant before it was sampled, which is not known of a plant made "
+            "elsewhere. Make it by assemble_plant(model, ports).discretized(rate), or simulate at "
+            "its own samples."
+        )
+    fine = plant.continuous.discretized(finer / plant.dt, delay=finer * plant.delay)
+    fine = with_known(fine, loop.blocks)
+    if (fine.w, fine.u, fine.z, fine.y) != (plant.w, plant.u, plant.z, plant.y):
+        raise ModelError(
+            "the channels of the plant were changed after it was sampled, so that its motion "
+            "between samples is not known. Change the ports before plant.discretized(rate)."
+        )
+    fine = fine.replace(asd={name: level for name, level in plant.asd.items() if name in fine.w})
+    return ClosedLoop(fine, loop.blocks, loop.controller, loop.idle)
+
+
+def _paths(plant: StandardPlant, moving: Any, time: FloatArray) -> dict[str, FloatArray]:
+    if moving is None:
+        return {}
+    instance(moving, Mapping, "moving", "Name the POI: {'die': (n_time, 3) points}.")
+    pois = [poi.name for poi in plant.assembled.ports.z]
+    found = {}
+    for name, path in moving.items():
+        require_known("POI to move", [name], pois)
+        points: Callable[[FloatArray], Any] | Any = path(time) if callable(path) else path
+        found[name] = real_array(points, f"the path of {name!r}", (time.size, 3))
+        ends = [*found[name].argmin(axis=0), *found[name].argmax(axis=0)]
+        plant.along(name, found[name][ends])  # refuses places off the structure
+    return found
 
 
 def _positions(plant: StandardPlant, moving: Any) -> dict[str, Any]:
@@ -394,3 +437,103 @@ def _start(loop: ClosedLoop, start: npt.ArrayLike | None) -> FloatArray:
         size = plant if values.shape == (plant,) else total
         state[:size] = real_array(values, "start (plant, or plant and controller)", (size,))
     return state
+
+
+#: a density over frequency [Hz]: a function, or frequencies and densities
+Density: TypeAlias = (
+    "Callable[[FloatArray], npt.ArrayLike] | Sequence[npt.ArrayLike] | npt.NDArray[Any]"
+)
+#: length of the record of which one is a part, so that its ends do not meet
+_LONGER = 4
+
+
+def spectral_noise(
+    asd: Density, *, rate: float, duration: float, runs: int | None = None, rng: Any = None
+) -> FloatArray:
+    """Return Gaussian noise of a given spectrum, for `simulate(disturbance=)`.
+
+    A floor's measured vibration, 1/f noise of a sensor, slow drift: lines of random amplitude and
+    phase, ``E |X_k|^2 = asd(f_k)^2 rate n / 2``, four times as dense as the record can resolve.
+    Slower parts than a quarter of a period in the record are left out, a mean too: a drift beyond
+    that is an array of one's own. What the synthesis shall know of goes into a port
+    (`fx.plant.FirstOrder`, `NarrowBand`, `RandomWalk`, a shape).
+
+    Parameters
+    ----------
+    asd : function or (frequencies [Hz], densities)
+        One-sided amplitude spectral density [unit/sqrt(Hz)]. A function of an array of
+        frequencies; a measured one is interpolated, both scales logarithmic, and is nothing
+        outside its band.
+    rate : float [Hz]
+        Of the samples: that of the plant, or `finer` times it.
+    duration : float [s]
+        Of the record.
+    runs : int, optional
+        So many records; one without that axis when not given.
+    rng : int, SeedSequence, Generator or None
+        Seed.
+
+    Returns
+    -------
+    (n_time,) or (runs, n_time) array
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When a density is negative or not finite, frequencies do not rise, or a number is not
+        positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> slow = fx.simulation.spectral_noise(lambda f: 1e-9 / f**0.5, rate=1e3, duration=2.0, rng=1)
+    >>> slow.shape, bool(1e-9 < slow.std() < 5e-9)
+    ((2000,), True)
+    >>> floor = ([1.0, 10.0, 100.0], [1e-5, 1e-4, 1e-6])  # m/s^2/sqrt(Hz), measured
+    >>> fx.simulation.spectral_noise(floor, rate=1e3, duration=0.5, runs=3, rng=1).shape
+    (3, 500)
+    """
+    rate = positive(rate, "rate")
+    count = whole(round(positive(duration, "duration") * rate), "samples", maximum=10**8)
+    number = 1 if runs is None else whole(runs, "runs", maximum=MOST_DRAWS)
+    draws = generator(rng)
+    n = _LONGER * count
+    freq: FloatArray = np.asarray(np.arange(1, n // 2) * (rate / n), dtype=np.float64)
+    size = _density_at(asd, freq) * np.sqrt(rate * n / 4.0)
+    found = np.empty((number, count))
+    for one in found:
+        lines = np.zeros(n // 2 + 1, dtype=np.complex128)
+        drawn = draws.standard_normal((2, freq.size))
+        lines[1 : 1 + freq.size] = size * (drawn[0] + 1j * drawn[1])
+        one[:] = np.fft.irfft(lines, n)[:count]
+    return found[0] if runs is None else found
+
+
+def _density_at(asd: Any, freq: FloatArray) -> FloatArray:
+    """Return the density at frequencies."""
+    if callable(asd):
+        values = real_array(asd(freq), "asd")
+        values = real_array(values, "asd of the frequencies", freq.shape if values.ndim else ())
+    else:
+        if isinstance(asd, str) or not hasattr(asd, "__len__") or len(asd) != 2:
+            raise ModelError(
+                f"asd must be a function of frequency or (frequencies, densities), got {short(asd)}"
+                ". Pass lambda f: level / f**0.5, or both arrays."
+            )
+        at = real_array(asd[0], "frequencies of asd")
+        level = real_array(asd[1], "densities of asd", at.shape)
+        if at.ndim != 1 or at.size < 2 or at[0] <= 0 or np.any(np.diff(at) <= 0):
+            raise ModelError(
+                "the frequencies of asd must be positive and rise, and be two or more: they are "
+                "interpolated. Sort them, and leave 0 Hz out."
+            )
+        if np.any(level <= 0):
+            raise ModelError(
+                f"the densities of asd must be positive, got {level.min():.3g}: they are "
+                "interpolated by their logarithms. Leave lines without noise out."
+            )
+        inside = (freq >= at[0]) & (freq <= at[-1])
+        values = np.where(inside, np.exp(np.interp(np.log(freq), np.log(at), np.log(level))), 0.0)
+    if np.any(values < 0):
+        raise ModelError(f"asd must not be negative, got {values.min():.3g}.")
+    return np.asarray(values, dtype=np.float64)

@@ -14,15 +14,14 @@ from math import comb
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, Value, instance, positive, real_array, whole
-from ..errors import AssumptionError, LabelError, ModelError, counted, require_known
+from ..checks import FloatArray, Value, positive, real_array, whole
+from ..errors import AssumptionError, LabelError, counted, require_known
 from ..loop import ClosedLoop, ScheduledLoop
 from ..lti.equations import symmetrised
 from ..lti.lyapunov import solve_stein
 from ..parallel import Progress, expect, one_thread
 from ..plant import Ports
-from .moving_machine import MovingMachine, Trajectory
-from .rms_along import ClosedAlong
+from .moving_machine import MovingMachine, Trajectory, known_positions, unscheduled
 
 #: how much of the decay of the slowest pole the Stein equations of the nodes keep: P that decays as
 #: fast as the loop itself changes fast with the position
@@ -198,15 +197,8 @@ class _Motion:
     @classmethod
     def of(cls, loop: ClosedLoop | ScheduledLoop, position: str | None) -> _Motion:
         """Return the motion of a loop, refused when nothing moves."""
-        schedule = loop if isinstance(loop, ScheduledLoop) else None
-        own = loop.standing if isinstance(loop, ScheduledLoop) else loop
-        plant = instance(own, ClosedLoop, "loop", "Pass close_loop(plant, *blocks).").plant
-        known = [one.name for one in plant.assembled.ports.positions] if plant.is_assembled else []
-        if not plant.dt or not known:
-            raise ModelError(
-                "a speed is proven of a sampled plant whose ports move: Ports(..., positions=["
-                "fx.plant.Position('x', range=...)]) and plant.discretized(rate)."
-            )
+        own, schedule = unscheduled(loop)
+        known = [one.name for one in known_positions(own.plant, "a speed is proven of")]
         if schedule is not None and position is None:
             position = schedule.position
         if position is None:
@@ -234,7 +226,7 @@ class _Motion:
         low, high = self.range
         paths = {self.position: lambda t: np.clip(p + v * np.asarray(t), low, high)}
         self.machine.path = Trajectory(tuple(self._ports.positions), paths, self._ports.values)
-        A, G, _, _ = ClosedAlong(self.machine)(0, next(self.machine.each(1)))
+        A, G, _, _ = self.machine.closed(0, next(self.machine.each(1)))
         return A, G
 
     def A(self, p: float, v: float) -> FloatArray:

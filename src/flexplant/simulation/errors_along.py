@@ -1,25 +1,46 @@
-"""Kalman filters of a machine on the move: the exact one, and steady gains beside it.
+"""Errors of a machine on the move: of every channel of a loop, and of Kalman filters.
 
-All of them know where the machine is: the rows of sensors and POIs, and the columns of forces, are
+All filters know where the machine is: the rows of sensors and POIs, and the columns of forces, are
 those of the present position. They differ in the gain by which innovations correct the state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Value, flag, instance, positive, real_array, whole, with_unit
-from ..errors import ModelError, SolverError, counted, require_known
+from ..checks import (
+    FloatArray,
+    Value,
+    flag,
+    instance,
+    positive,
+    real_array,
+    sizes_of,
+    whole,
+    with_unit,
+)
+from ..errors import AssumptionError, ModelError, SolverError, counted, require_known
+from ..loop import ClosedLoop, ScheduledLoop
 from ..lti.equations import symmetrised
+from ..lti.lyapunov import solve_stein
 from ..lti.riccati import solve_dare
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..tolerances import SAME
-from .moving_machine import MovingPlant, Sample, Trajectory, trajectory
+from .moving_machine import (
+    MovingMachine,
+    MovingPlant,
+    Sample,
+    Trajectory,
+    known_positions,
+    trajectory,
+    unscheduled,
+)
 
 #: repetitions of a trajectory after which its errors have to repeat, and to which part
 _REPEATED, _SETTLED = 100, 1e-6
@@ -29,6 +50,160 @@ _DIVERGED = 100.0
 _LOST = 1e6
 #: the gains, in the order of their columns
 GAINS = ("exact", "scheduled", "frozen")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RmsAlong(Value):
+    """Standard deviations of a closed loop's channels along a trajectory; made by `rms_along`.
+
+    Parameters
+    ----------
+    time : (n_time,) array [s]
+        The samples.
+    rms : (n_channels, n_time) array
+        Of each channel, in its unit.
+    names : sequence of str
+        The channels: z, y, driven u and what blocks show.
+    units : mapping {str: str}
+        Of the channels.
+    """
+
+    time: FloatArray
+    rms: FloatArray
+    names: tuple[str, ...]
+    units: Mapping[str, str]
+
+    def __post_init__(self) -> None:
+        names = tuple(self.names)
+        time = real_array(self.time, "time", (None,))
+        rms = real_array(self.rms, "rms", (len(names), time.size))
+        self._set(time=time, rms=rms, names=names, units=dict(self.units))
+
+    def __repr__(self) -> str:
+        largest = {
+            name: float(self.rms[i].max())
+            for i, name in enumerate(self.names)
+            if name.endswith(":error")
+        }
+        shown = sizes_of(largest or {self.names[0]: float(self.rms[0].max())}, self.units)
+        return f"<RmsAlong: {self.time.size} samples; largest {shown}>"
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """Return the standard deviation (n_time,) of a channel."""
+        require_known("channel", [name], self.names)
+        return np.asarray(self.rms[self.names.index(name)])
+
+
+@one_thread()
+def rms_along(
+    loop: ClosedLoop | ScheduledLoop,
+    *,
+    moving: Mapping[str, Any],
+    duration: float,
+    repeats: bool = False,
+) -> RmsAlong:
+    """Return the standard deviation of every channel of a loop whose machine moves.
+
+    ``P[k + 1] = A[k] P[k] A[k]' + G[k] G[k]'`` of plant and controller together, with the matrices
+    of each sample of the moving machine: what the white noises of the plant cause, exactly. The
+    controller stays as it was designed, observer included, or follows its schedule.
+
+    Parameters
+    ----------
+    loop : ClosedLoop or ScheduledLoop
+        Around a sampled plant with positions.
+    moving : mapping {position: path}
+        As for `simulate`: SetPoints, functions of time, or a value for each sample.
+    duration : float [s]
+        Of the trajectory.
+    repeats : bool
+        Whether the trajectory repeats for ever: the variance is then the periodic one,
+        ``P[0] = P[duration]``. Else the machine has stood at the beginning for a long time.
+
+    Returns
+    -------
+    RmsAlong
+
+    Raises
+    ------
+    AssumptionError
+        When the loop is not stable: at the beginning, or over the trajectory that repeats.
+    LabelError
+        When a position is unknown.
+    ModelError
+        When nothing moves, or a port that moves has dynamics of its own.
+
+    References
+    ----------
+    [BittantiColaneri2009]_ (periodic Lyapunov equations).
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> machine = fx.testbeds.wafer_stage(damping=0.01)
+    >>> plate = fx.kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(8, 8),
+    ...     density=2702, youngs_modulus=70e9, poisson_ratio=0.35)
+    >>> places = [(x, y, 0.0) for y in (0.1, 0.5) for x in (0.2, 0.4)]
+    >>> ports = fx.Ports(
+    ...     w=[fx.Disturbance(f"amp{i}", at=p, asd=1e-3) for i, p in enumerate(places)],
+    ...     u=[fx.Actuator(f"u{i}", at=p) for i, p in enumerate(places)],
+    ...     z=[fx.Poi("die", at=(0.3, 0.3, 0.0), axes=("z", "rx", "ry"), moves={"x": (-1, 0, 0)})],
+    ...     y=[fx.Sensor(f"y{i}", at=p, asd=1e-12, moves={"x": (-1, 0, 0)})
+    ...        for i, p in enumerate(places)],
+    ...     references=[fx.Reference("die")],
+    ...     positions=[fx.plant.Position("x", range=(-0.1, 0.1))],
+    ... )
+    >>> modes = fx.solve_modes(plate, count=12, damping=fx.ModalDamping(0.01))
+    >>> plant = fx.assemble_plant(modes, ports).discretized(1e4, delay=1)
+    >>> observer = fx.design_kalman(plant)
+    >>> loop = fx.close_loop(plant, observer, fx.design_servo(plant, bandwidth=40.0,
+    ...     observer=observer))
+    >>> move = fx.setpoint(0.02, velocity=0.5, acceleration=10.0, jerk=1e3)
+    >>> found = fx.simulation.rms_along(loop, moving={"x": move}, duration=0.05)
+    >>> found["die:error"].shape
+    (500,)
+    """
+    loop, schedule = unscheduled(loop)
+    plant = loop.plant
+    known_positions(plant, "errors along a trajectory need")
+    steps = round(positive(duration, "duration") / plant.dt)
+    time = np.asarray(np.arange(steps) * float(plant.dt), dtype=np.float64)
+    machine = MovingMachine(loop, trajectory(plant, moving, time), noise=True, schedule=schedule)
+    P = _periodic(machine, steps) if flag(repeats, "repeats") else _standing(machine)
+    rms = np.zeros((len(plant.z) + len(plant.y) + len(loop.controller.outputs), steps))
+    for k, sample in enumerate(machine.each(steps)):
+        A, G, C, D = machine.closed(k, sample)
+        rms[:, k] = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", C, P, C) + np.sum(D**2, axis=1), 0))
+        P = A @ P @ A.T + G @ G.T
+    names = (*plant.z, *plant.y, *loop.driven, *loop.watched)
+    return RmsAlong(time, rms, names, {n: u for n, u in loop.units.items() if n in names})
+
+
+def _standing(machine: MovingMachine) -> FloatArray:
+    """Return the covariance of the loop that has stood where it is for a long time."""
+    A, G, _, _ = machine.closed(0, next(machine.each(1)))
+    if np.abs(np.linalg.eigvals(A)).max(initial=0.0) >= 1.0:
+        raise AssumptionError(
+            "the loop is not stable where the trajectory begins: it has no variance there. Design "
+            "it for that position, or pass repeats=True where it only passes by."
+        )
+    return solve_stein(A, G @ G.T)
+
+
+def _periodic(machine: MovingMachine, steps: int) -> FloatArray:
+    """Return the covariance at the beginning of a trajectory that repeats for ever."""
+    Phi = np.eye(machine.plant.system.n_states + machine.loop.controller.n_states)
+    P = np.zeros_like(Phi)
+    for k, sample in enumerate(machine.each(steps)):
+        A, G, _, _ = machine.closed(k, sample)
+        Phi, P = A @ Phi, A @ P @ A.T + G @ G.T
+    radius = float(np.abs(np.linalg.eigvals(Phi)).max(initial=0.0))
+    if radius >= 1.0:
+        raise AssumptionError(
+            f"the loop grows {radius:.3g} times in each repetition of the trajectory: it is not "
+            "stable along it. Lower its gain, or schedule it."
+        )
+    return solve_stein(Phi, P)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -152,11 +327,11 @@ def filters_along(
     True
     """
     filters = _Filters(plant, moving, duration, positions)
-    start = filters.steady(filters.machine.path.at(np.zeros(1)))
+    start = filters.steady()
     found: dict[str, FloatArray] = {}
     gains = dict(zip(GAINS, (None, filters.scheduled(), filters.frozen()), strict=True))
     for name, gain in gains.items():
-        rms, P = filters.run(start.P, gain)
+        rms, P = filters.run(start, gain)
         for _ in range(_REPEATED if flag(repeats, "repeats") else 0):
             before = rms
             rms, P = filters.run(P, gain)
@@ -183,41 +358,32 @@ class _Filters:
 
     def __init__(self, plant: Any, moving: Any, duration: Any, positions: Any) -> None:
         instance(plant, StandardPlant, "plant", "Pass a sampled plant with positions.")
-        if not plant.dt or not plant.is_assembled or not plant.assembled.ports.positions:
-            raise ModelError(
-                "filters along a trajectory need a sampled plant whose ports move: Ports(..., "
-                "positions=[fx.plant.Position('x', range=...)]) and plant.discretized(rate)."
-            )
-        self.plant = plant
+        known_positions(plant, "filters along a trajectory need")
+        self.plant, ports = plant, plant.assembled.ports
         self.steps = round(positive(duration, "duration") / plant.dt)
         self.time = np.arange(self.steps) * float(plant.dt)
         self.machine = MovingPlant(plant, trajectory(plant, moving, self.time))
-        ports = plant.assembled.ports
-        self.y = [len(plant.z) + plant.y.index(sensor.name) for sensor in ports.y]
+        rows = np.array([plant.y.index(sensor.name) for sensor in ports.y])
+        self.y = len(plant.z) + rows
         self.names = [poi.channel(axis) for poi in ports.z for axis in poi.axes]
         self.z = [plant.z.index(name) for name in self.names]
-        noise = {int(c): float(d) for c, d in zip(
-            self.machine.noise.columns, self.machine.noise.deviation, strict=True
-        )}  # fmt: skip
-        columns = [plant.w.index(f"{s.name}:noise") if s.asd else -1 for s in ports.y]
-        self.R = np.diag([noise.get(column, 0.0) ** 2 for column in columns])
+        self.R = plant.sensor_noise[np.ix_(rows, rows)]
         if not np.all(np.diag(self.R) > 0):
             raise ModelError("a filter needs noise of every sensor: Sensor(..., asd=...).")
         self.moved = list(self.machine.path.paths)
         self.count = whole(positions, "positions", minimum=2)
 
-    def _sample(self, values: Mapping[str, FloatArray]) -> Any:
+    def _sample(self, values: Mapping[str, FloatArray]) -> Sample:
         """Return the matrices of a plant that stands at values of the positions."""
         there = {name: float(value[0]) for name, value in values.items()}
-        standing = Trajectory(
-            self.machine.path.positions, {n: _constant(there[n]) for n in self.moved}, there
-        )
+        paths = {n: partial(_constant, there[n]) for n in self.moved}
+        standing = Trajectory(self.machine.path.positions, paths, there)
         return next(MovingPlant(self.plant, standing).each(1))
 
-    def steady(self, values: Mapping[str, FloatArray]) -> Any:
-        """Return the steady filter at values of the positions."""
-        sample = self._sample(values)
-        return solve_dare(sample.A, sample.C[self.y], Q=sample.G @ sample.G.T, R=self.R)
+    def steady(self, values: Mapping[str, FloatArray] | None = None) -> FloatArray:
+        """Return the covariance of the steady filter, where the trajectory begins if not told."""
+        sample = self._sample(self.machine.path.at(np.zeros(1)) if values is None else values)
+        return solve_dare(sample.A, sample.C[self.y], Q=sample.G @ sample.G.T, R=self.R).P
 
     def frozen(self) -> Callable[[int], FloatArray]:
         """Return the steady gain where the plant stands."""
@@ -232,13 +398,12 @@ class _Filters:
                 f"gains are scheduled by one position, and {', '.join(self.moved) or 'none'} "
                 "moves. Name one, or take others as functions of it in a PlaceTable."
             )
-        (name,) = self.moved
+        (name,), still = self.moved, self.machine.path.at(np.zeros(1))
         path = self.machine.path.at(self.time)[name]
         grid = np.linspace(path.min(), path.max(), self.count)
         if np.ptp(path) == 0.0:
-            gain = self._correcting(self.machine.path.at(np.zeros(1)))
+            gain = self._correcting(still)
             return lambda k: gain
-        still = self.machine.path.at(np.zeros(1))
         gains = np.array([self._correcting(still | {name: np.array([v])}) for v in grid])
         step = grid[1] - grid[0]
 
@@ -251,33 +416,40 @@ class _Filters:
         return gain_at
 
     def _correcting(self, values: Mapping[str, FloatArray]) -> FloatArray:
+        return self._best(self._sample(values), self.steady(values))
+
+    def _best(self, sample: Sample, P: FloatArray) -> FloatArray:
         """Return the gain M (n, ny) of the correction x[k|k] = x[k|k-1] + M e."""
-        C = self._sample(values).C[self.y]
-        P = self.steady(values).P
+        C = sample.C[self.y]
         return np.asarray(np.linalg.solve(C @ P @ C.T + self.R, C @ P).T)
+
+    def corrected(
+        self, P: FloatArray, gain: Callable[[int], FloatArray] | None
+    ) -> Iterator[tuple[Sample, FloatArray, FloatArray, FloatArray]]:
+        """Yield the matrices, the gain, P[k|k] and P[k+1|k] of each sample; None: the best gain."""
+        for k, sample in enumerate(self.machine.each(self.steps)):
+            M = self._best(sample, P) if gain is None else gain(k)
+            left = np.eye(len(P)) - M @ sample.C[self.y]
+            after = left @ P @ left.T + M @ self.R @ M.T
+            P = symmetrised(sample.A @ after @ sample.A.T + sample.G @ sample.G.T)
+            yield sample, M, after, P
 
     def run(
         self, P: FloatArray, gain: Callable[[int], FloatArray] | None
     ) -> tuple[FloatArray, FloatArray]:
         """Return the deviations along the trajectory, and the covariance after it."""
         rms = np.zeros((len(self.z), self.steps))
-        one = np.eye(len(P))
-        for k, sample in enumerate(self.machine.each(self.steps)):
-            C = sample.C[self.y]
-            M = np.linalg.solve(C @ P @ C.T + self.R, C @ P).T if gain is None else gain(k)
-            left = one - M @ C
-            P = left @ P @ left.T + M @ self.R @ M.T
-            shown = sample.C[self.z]
-            rms[:, k] = np.sqrt(np.einsum("ij,jk,ik->i", shown, P, shown))
+        for k, (sample, _, after, ahead) in enumerate(self.corrected(P, gain)):
+            P, shown = ahead, sample.C[self.z]
+            rms[:, k] = np.sqrt(np.einsum("ij,jk,ik->i", shown, after, shown))
             if np.any(rms[:, k] > _LOST * rms[:, 0]):
                 rms[:, k:] = rms[:, k : k + 1]  # grows for ever: soon beyond all numbers
                 break
-            P = symmetrised(sample.A @ P @ sample.A.T + sample.G @ sample.G.T)
         return rms, P
 
 
-def _constant(value: float) -> Callable[[FloatArray], FloatArray]:
-    return lambda time: np.full(time.size, value)
+def _constant(value: float, time: FloatArray) -> FloatArray:
+    return np.full(time.size, value)
 
 
 def estimate_along(
@@ -316,26 +488,13 @@ def estimate_along(
     needed = [*sensors, *plant.u]
     require_known("record", needed, list(getattr(records, "names", records)))
     count = np.asarray(records[needed[0]]).size
-    data = np.array([real_array(records[n], n, (count,)) for n in needed])
+    data = np.array([real_array(records[n], n, (count,)) for n in needed]).T
     filters = _Filters(plant, moving, count * float(plant.dt), 2)
-    P = filters.steady(filters.machine.path.at(np.zeros(1))).P
-    x, one = np.zeros(len(P)), np.eye(len(P))
-    found = np.zeros((len(filters.z), count))
-    u = slice(len(plant.w), None)
-    y, commands = data[: len(sensors)], data[len(sensors) :]
-    for k, sample in enumerate(filters.machine.each(count)):
-        x, P = _measurement_update(sample, filters, x, P, y[:, k], one)
+    P, found = filters.steady(), np.zeros((len(filters.z), count))
+    x = np.zeros(len(P))
+    for k, (sample, M, *_) in enumerate(filters.corrected(P, None)):
+        y, u = data[k, : len(sensors)], data[k, len(sensors) :]
+        x = x + M @ (y - sample.C[filters.y] @ x)
         found[:, k] = sample.C[filters.z] @ x
-        x = sample.A @ x + sample.B[:, u] @ commands[:, k]
-        P = symmetrised(sample.A @ P @ sample.A.T + sample.G @ sample.G.T)
+        x = sample.A @ x + sample.B[:, len(plant.w) :] @ u
     return dict(zip(filters.names, found, strict=True))
-
-
-def _measurement_update(
-    sample: Sample, filters: _Filters, x: FloatArray, P: FloatArray, y: FloatArray, one: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return state and covariance corrected by a measurement."""
-    C = sample.C[filters.y]
-    M = np.linalg.solve(C @ P @ C.T + filters.R, C @ P).T
-    left = one - M @ C
-    return x + M @ (y - C @ x), left @ P @ left.T + M @ filters.R @ M.T
