@@ -74,9 +74,6 @@ from .errors_along import RmsAlong as RmsAlong
 from .errors_along import estimate_along as estimate_along
 from .errors_along import filters_along as filters_along
 from .errors_along import rms_along as rms_along
-from .estimator_comparison import EstimatorComparison as EstimatorComparison
-from .estimator_comparison import compare_estimators as compare_estimators
-from .estimator_comparison import reading_along as reading_along
 from .exposure import ErrorMap as ErrorMap
 from .exposure import ExposureErrors as ExposureErrors
 from .exposure import error_map as error_map
@@ -108,7 +105,10 @@ from .specification import Specification as Specification
 from .specification import Verdict as Verdict
 from .speed_certificate import SpeedCertificate as SpeedCertificate
 from .speed_certificate import certify_speed as certify_speed
+from .study import EstimatorComparison as EstimatorComparison
 from .study import StudyTable as StudyTable
+from .study import compare_estimators as compare_estimators
+from .study import reading_along as reading_along
 from .study import study as study
 
 __dir__ = _public_names(__name__)

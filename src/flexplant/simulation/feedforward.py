@@ -189,11 +189,9 @@ def design_feedforward(
     highest = whole(order, "order", minimum=2, maximum=4)
     T, axes = force_axes(plant, poi)
     wanted = np.eye(len(poi.axes))[:, [poi.axes.index(axis)]]
-    if loop is None:
-        find = _of_plant(plant, poi, T, wanted, along)
-    else:
-        find = _loop_inverse(loop, poi, T, wanted, name, along)
-    gains = coefficients(find, plant.dt, axes)
+    blocks = () if loop is None else loop.blocks
+    forced = close_loop(plant, *blocks, known_forces(plant))
+    gains = coefficients(_inverse_of(forced, poi, T, wanted, name, along), plant.dt, axes)
     gains[:, :, highest + 1 :] = 0.0
     return Feedforward(name, axes, T, tuple(plant.u), gains, plant.dt)
 
@@ -248,43 +246,21 @@ def force_axes(plant: StandardPlant, poi: Poi) -> tuple[FloatArray, tuple[str, .
     return decoupled.T_u, tuple(decoupled.axes)
 
 
-def _of_plant(
-    plant: StandardPlant,
-    poi: Poi,
-    T: FloatArray,
-    wanted: FloatArray,
-    along: npt.ArrayLike | None,
-) -> Inverse:
-    """Return the function of s that gives F (p, r), the POI at p places."""
-    g, inputs = plant.system, plant.system.input_index(plant.u)
-    rows = g.output_index([poi.channel(axis) for axis in poi.axes])
-    C, D = g.C[rows][None], (g.D[np.ix_(rows, inputs)] @ T)[None]
-    if along is not None:
-        places = plant.along(poi.name, real_array(along, "along", (None, 3)))
-        C, D = places.C[:, : rows.size], places.D[:, : rows.size, inputs] @ T
-
-    def found(s: complex) -> tuple[ComplexArray, ComplexArray]:
-        return C @ _states(g, g.B[:, inputs] @ T, s) + D, wanted.astype(np.complex128)
-
-    return found
-
-
-def _loop_inverse(
-    loop: ClosedLoop,
+def _inverse_of(
+    forced: ClosedLoop,
     poi: Poi,
     T: FloatArray,
     wanted: FloatArray,
     name: str,
     along: npt.ArrayLike | None,
 ) -> Inverse:
-    """Return the function of s that gives F (p, r) in closed loop, the POI at p places.
+    """Return the function of s that gives F (p, r) in a loop with known forces, at p places.
 
     A place changes what is seen of the states and of u, which the feedback does not read.
     """
-    forced = close_loop(loop.plant, *loop.blocks, known_forces(loop.plant))
     g, plant, r = forced.monitored, forced.plant, len(poi.axes)
     acts = np.zeros((len(plant.w), T.shape[1] + 1))
-    acts[g.input_index([force_name(u) for u in loop.plant.u]), :-1] = T
+    acts[g.input_index([force_name(u) for u in plant.u]), :-1] = T
     acts[g.input_index([name]), -1] = 1.0
     rows = g.output_index([poi.channel(axis) for axis in poi.axes])
     C, D = g.C[rows][None], (g.D[rows] @ acts)[None]

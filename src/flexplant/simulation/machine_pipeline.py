@@ -5,14 +5,24 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..checks import Value, generator, instance, positive, real_array, several, short, whole
+from ..checks import (
+    Value,
+    checked,
+    generator,
+    instance,
+    positive,
+    real_array,
+    several,
+    short,
+    whole,
+)
 from ..errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, counted
 from ..estimation import Consistency, KalmanEstimator, consistency, design_kalman
 from ..identification import MeasuredModes, identify_modes, numbered
@@ -33,6 +43,23 @@ from .specification import Specification, Verdict
 _PAIRINGS = 5
 #: a mode of the full structure this far from the measured one, relative, is another one
 _SAME = 0.05
+_TYPE = "Give one of that type."
+
+
+def _listed(values: Any, name: str) -> tuple[Any, ...]:
+    return tuple(instance(values, Iterable, name, "Pass a list."))
+
+
+def _mode_numbers(values: Any, name: str) -> tuple[int, ...]:
+    return tuple(whole(n, "mode") for n in (values if several(values) else [values]))
+
+
+def _falling(values: Any, name: str) -> tuple[float, ...] | None:
+    """Return frequencies from the highest on; None stays."""
+    if values is None:
+        return None
+    found = [positive(one, name) for one in real_array(values, name).ravel()]
+    return tuple(sorted(found, reverse=True))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -127,71 +154,46 @@ class MachinePipeline(Value):
     <MachinePipeline: 1 parameter updated, H-infinity, 50 Hz>
     """
 
-    model: ReducedModel
-    full: FEModel | Modes | ReducedModel
-    parameters: Sequence[Any]
-    ports: Ports
-    rate: float
-    delay: float
-    modes: Sequence[int] | None = None
-    deviation: float = 0.0
-    measurement: Mapping[str, Any] | None = None
+    model: ReducedModel = field(metadata=checked(instance, kind=ReducedModel, hint=_TYPE))
+    full: FEModel | Modes | ReducedModel = field(
+        metadata=checked(instance, kind=FEModel | Modes | ReducedModel, hint=_TYPE)
+    )
+    parameters: Sequence[Any] = field(metadata=checked(_listed))
+    ports: Ports = field(metadata=checked(instance, kind=Ports, hint=_TYPE))
+    rate: float = field(metadata=checked(positive))
+    delay: float = field(metadata=checked(positive, zero=True))
+    modes: Sequence[int] | None = field(default=None, metadata=checked(_mode_numbers))
+    deviation: float = field(default=0.0, metadata=checked(positive, zero=True))
+    measurement: Mapping[str, Any] | None = field(
+        default=None,
+        metadata=checked(instance, kind=Mapping, hint="Give {'period': 0.5}, say, or {}."),
+    )
     band: tuple[float, float] | None = None
     hold: float | None = None
     starts: int | None = None
-    candidates: Sequence[Any] = ()
-    bandwidth: float | Sequence[float] | None = 50.0
-    margin: float = 0.4
+    candidates: Sequence[Any] = field(default=(), metadata=checked(_listed))
+    bandwidth: float | Sequence[float] | None = field(default=50.0, metadata=checked(_falling))
+    margin: float = field(default=0.4, metadata=checked(positive))
     mesh: MeshError | None = None
-    blocks: Sequence[Any] | None = None
+    blocks: Sequence[Any] | None = field(default=None, metadata=checked(_listed))
     specification: Specification | None = None
     reference: Any = None
-    duration: float = 1.0
-    larger: int = 80
+    duration: float = field(default=1.0, metadata=checked(positive))
+    larger: int = field(default=80, metadata=checked(whole))
     folder: str | None = None
-    damping: Damping | None = None
+    damping: Damping | None = field(
+        default=None,
+        metadata=checked(instance, kind=Damping, hint="Pass ModalDamping(0.01) for 1 %."),
+    )
 
     def __post_init__(self) -> None:
-        drawings = FEModel | Modes | ReducedModel
-        for name, kind in (("model", ReducedModel), ("full", drawings), ("ports", Ports)):
-            instance(getattr(self, name), kind, name, "Give one of that type.")
+        super().__post_init__()
         if self.damping is not None:
-            instance(self.damping, Damping, "damping", "Pass ModalDamping(0.01) for 1 %.")
             hint = "Leave damping= out: modes and reduced models have theirs."
             instance(self.full, FEModel, "with damping=, full", hint)
-        if self.measurement is not None:
-            instance(self.measurement, Mapping, "measurement", "Give {'period': 0.5}, say, or {}.")
         if not self.ports.references:
             raise ModelError("the ports need a reference for the POI: references=[Reference(...)].")
-        for name in ("parameters", "candidates", "blocks"):
-            if getattr(self, name) is not None:
-                instance(getattr(self, name), Iterable, name, "Pass a list.")
-        self._set(
-            parameters=tuple(self.parameters),
-            rate=positive(self.rate, "rate"),
-            delay=positive(self.delay, "delay", zero=True),
-            modes=None
-            if self.modes is None
-            else tuple(
-                whole(n, "mode") for n in (self.modes if several(self.modes) else [self.modes])
-            ),
-            measurement=None if self.measurement is None else dict(self.measurement),
-            deviation=positive(self.deviation, "deviation", zero=True),
-            candidates=tuple(self.candidates),
-            bandwidth=None
-            if self.bandwidth is None
-            else tuple(
-                sorted(
-                    positive(f, "bandwidth")
-                    for f in real_array(self.bandwidth, "bandwidth").ravel()
-                )[::-1]
-            ),
-            margin=positive(self.margin, "margin"),
-            blocks=None if self.blocks is None else tuple(self.blocks),
-            duration=positive(self.duration, "duration"),
-            larger=whole(self.larger, "larger"),
-            folder=None if self.folder is None else str(self.folder),
-        )
+        self._set(folder=None if self.folder is None else str(self.folder))
 
     def __repr__(self) -> str:
         tried = ", ".join(f"{one:g}" for one in self._tried if one is not None) or "highest"
@@ -200,7 +202,8 @@ class MachinePipeline(Value):
 
     @property
     def _tried(self) -> tuple[float | None, ...]:
-        return (None,) if self.bandwidth is None else tuple(np.atleast_1d(self.bandwidth).tolist())
+        given: Any = self.bandwidth
+        return (None,) if given is None else given
 
     @property
     def error(self) -> str:
@@ -311,23 +314,19 @@ class MachinePipeline(Value):
 
         Its numbers are the reduced model's, or it is left as it is where its order differs.
         """
-        many = self._updated_modes(fit)
+        known = self.full
+        if isinstance(known, FEModel):
+            count = min(self.larger, known.n_dof)
+            many = solve_modes(fit.applied_to(known), count=count, damping=self.damping)
+        else:
+            if isinstance(known, Modes):  # their attachment vectors count among the modes left out
+                known = reduce(known, ModalTruncation(known.n_modes))
+            many = fit.applied_to(known.completed()).modes()
         numbers = np.array(measured.modes) - 1
         if np.iscomplexobj(many.phi) or numbers.max() >= many.n_modes:
             return many
         near = np.abs(many.omega[numbers] / np.abs(measured.poles) - 1.0) < _SAME
         return many.calibrated(measured) if near.all() else many
-
-    def _updated_modes(self, fit: UpdateResult) -> Modes:
-        """Return the modes of the updated full structure."""
-        if isinstance(self.full, FEModel):
-            count = min(self.larger, self.full.n_dof)
-            return solve_modes(fit.applied_to(self.full), count=count, damping=self.damping)
-        known = self.full
-        if isinstance(known, Modes):  # their attachment vectors count among the modes left out
-            known = reduce(known, ModalTruncation(known.n_modes))
-        found: Modes = fit.applied_to(known.completed()).modes()
-        return found
 
     def _designed(
         self, plant: UncertainPlant[Any], many: Modes
