@@ -51,7 +51,7 @@ LINES = [
      "1.0 * at_zero"),
     ("loop/budget.py", "+ np.sum(one.D[row] ** 2)",
      ""),
-    ("estimation/smoothing.py", "+ model.A.T @ rest",
+    ("estimation/estimate.py", "+ model.A.T @ rest",
      "- model.A.T @ rest"),
     ("estimation/left_out.py", "asd / np.sqrt(2.0) *",
      "asd *"),

@@ -33,6 +33,8 @@ Names elsewhere: ``kalman``, ``lqe`` (MATLAB, python-control), filterpy
 from ..rooms import public_names as _public_names
 from .consistency import Consistency as Consistency
 from .consistency import consistency as consistency
+from .error import MachineTable as MachineTable
+from .error import errors_on_machines as errors_on_machines
 from .estimate import Estimate as Estimate
 from .estimator import KalmanEstimator as KalmanEstimator
 from .filter_model import FilterModel as FilterModel
@@ -47,9 +49,9 @@ from .lag_report import FixedLag as FixedLag
 from .lag_report import LagReport as LagReport
 from .lag_report import Predictor as Predictor
 from .lag_report import Smoother as Smoother
+from .lag_report import StaticEstimator as StaticEstimator
+from .lag_report import design_static as design_static
 from .left_out import LeftOut as LeftOut
-from .machine_table import MachineTable as MachineTable
-from .machine_table import errors_on_machines as errors_on_machines
 from .minimax import design_minimax_filter as design_minimax_filter
 from .moved_modes import MovedModes as MovedModes
 from .multirate import PeriodicCertificate as PeriodicCertificate
@@ -61,8 +63,6 @@ from .robust_filter import HinfFilterCertificate as HinfFilterCertificate
 from .robust_filter import MinimaxCertificate as MinimaxCertificate
 from .robust_filter import RobustFilter as RobustFilter
 from .robust_filter import design_hinf_filter as design_hinf_filter
-from .static import StaticEstimator as StaticEstimator
-from .static import design_static as design_static
 from .unknown_inputs import Augmented as Augmented
 from .unknown_inputs import InputCertificate as InputCertificate
 from .unknown_inputs import InputEstimator as InputEstimator

@@ -1,17 +1,39 @@
-"""The error of an observer on any sampled plant, in closed form; its design model is not used."""
+"""The error of an observer on any sampled plant, in closed form, and tables of it on machines.
+
+The model of its design is not used.
+"""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
-import scipy.sparse as sp
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value
-from ..errors import AssumptionError, CertificateError, ModelError, SolverError, warn
-from ..labels import DofSet
+from ..checks import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    Value,
+    in_unit,
+    instance,
+    members,
+    short,
+)
+from ..errors import (
+    AssumptionError,
+    CertificateError,
+    FlexplantWarning,
+    ModelError,
+    SolverError,
+    counted,
+    require_known,
+    warn,
+)
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
 from ..lti.discretisation import uncoupled_pairs
@@ -21,12 +43,9 @@ from ..lti.lyapunov import solve_stein
 from ..lti.modal import ModalMap
 from ..lti.square_roots import difference_of, dual_variances, stein_root
 from ..lti.statespace import StateSpace, System
-from ..modes import Modes
 from ..plant import StandardPlant
-from ..reduction import ReducedModel
-from ..structure import FEModel
 from ..tolerances import SAME, TINY, divisor
-from .estimator_channels import estimates, poi_channels, read_alike, row_of, same_pois, sensors
+from .estimator_channels import estimates, poi_channels, row_of, same_pois, sensors
 
 #: two ways to a variance agree to this, half a per cent of an rms: no machine is known so well;
 #: what may be off below it is stated
@@ -415,138 +434,139 @@ class PoiFilter(Value):
         return float(np.sqrt(max(variances[row], 0.0)))
 
 
-#: nodes per wavelength below which a mode is badly resolved: frequencies are off by some 5 %
-NODES = 4.0
-#: share of a variance up to which errors stay within about 10 % (5 % at 1 % damping), and from
-#: which they were up to 65 %: plates of four shapes on 6 x 6 to 16 x 16 elements beside 24 x 24
-NOTED, WARNED = 0.15, 0.5
-#: translations
-_MOVES = ("x", "y", "z")
-_NONE = np.zeros(0, dtype=np.int64)
-#: where a realisation keeps the nodes per wavelength of its modes
-_KEPT = "_nodes"
-#: relative: nodes whose extent is less are in a plane, or on a line
-_FLAT = 1e-9
-#: an edge is of the mesh up to this length beside the mean at its ends: elements of 1 to 3
-_LONG = 2.0
+@dataclass(frozen=True, eq=False, repr=False)
+class MachineTable(Value):
+    """The rms error of estimators of one POI motion on several machines; prints as a table.
 
+    Parameters
+    ----------
+    channel : str
+        The motion.
+    names : sequence of str
+        The estimators.
+    nominal : (k,) array [m or rad]
+        Each on its own model, as the machines run: in a closed loop where they are in one.
+    values : (k, n) array
+        On each machine; infinite where the closed loop is unstable.
+    unit : str
+        Of the motion.
 
-def nodes_per_wavelength(
-    model: FEModel | Modes | ReducedModel, shapes: FloatArray
-) -> FloatArray | None:
-    """Return how many nodes of a mesh there are per wavelength of each shape; None: no mesh.
-
-    Neighbours i, j are translations in one direction that the mass matrix couples; of modes, whose
-    matrices are not known, those of nodes side by side. In a wave of wave number k and nodes h
-    apart ``mean (p_i - p_j)^2 / mean (p_i^2 + p_j^2) = 1 - cos(k h)``, and ``2 pi / (k h)`` nodes
-    make a wavelength. Diagonals of elements count as neighbours, so that this is a mean over all
-    directions. Both kinds of neighbours differ by 2 % to 7 % on plates and blocks. A full mass
-    matrix has no mesh.
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> estimators = {"filter": fx.design_kalman(plant)}
+    >>> table = fx.estimation.errors_on_machines(estimators, [plant], "die")
+    >>> bool(abs(table.values[0, 0] / estimators["filter"].rms("die") - 1) < 1e-9)
+    True
     """
-    dofs = model.full_dofs if isinstance(model, ReducedModel) else model.dofs
-    count = np.count_nonzero(np.isin(dofs.directions, _MOVES))
-    i, j = _mass_coupling(model) if isinstance(model, FEModel) else (_NONE, _NONE)
-    if not i.size:  # masses are lumped, or not known
-        i, j = _side_by_side(dofs)
-    if not i.size or 4 * i.size > count * (count - 1):
-        return None
-    apart = np.sum((shapes[i] - shapes[j]) ** 2, axis=(0, 2))
-    size = np.sum(shapes[i] ** 2 + shapes[j] ** 2, axis=(0, 2))
-    turn = np.arccos(np.clip(1.0 - apart / divisor(size), -1.0, 1.0))
-    # a rigid-body motion has no wave: any large number of nodes will do
-    return np.asarray(2.0 * np.pi / np.maximum(turn, 1e-9))
+
+    channel: str
+    names: Sequence[str]
+    nominal: FloatArray
+    values: FloatArray
+    unit: str = ""
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """Return the rms errors (n,) of one estimator."""
+        require_known("estimator", [name], self.names)
+        return np.asarray(self.values[list(self.names).index(name)])
+
+    def __repr__(self) -> str:
+        finite = self.nominal[np.isfinite(self.nominal)]
+        factor, unit = in_unit(float(np.max(finite, initial=0.0)), self.unit)
+        width = max(10, *(len(name) for name in self.names)) + 2
+        heads = ("own model", "median", "95 %", "worst", "worst / own")
+        title = f"rms error of {self.channel} [{unit or '?'}]"
+        lines = [
+            f"{title} on {counted(self.values.shape[1], 'machine')}",
+            " " * width + "".join(f"{head:>13s}" for head in heads),
+        ]
+        for name, own, row in zip(self.names, self.nominal, self.values, strict=True):
+            ordered = np.sort(row)
+            cells = [own, np.median(row), ordered[int(np.ceil(0.95 * row.size)) - 1], ordered[-1]]
+            text = "".join(f"{value / factor:13.4g}" for value in cells)
+            lines.append(f"{name:{width}s}{text}{ordered[-1] / own:13.3g}")
+            if unstable := int(np.count_nonzero(np.isinf(row))):
+                lines.append(f"{'':{width}s}the loop is unstable on {unstable} of them")
+        return "\n".join(lines)
 
 
-def _nodes_of(model: Any, outputs: FloatArray) -> FloatArray | None:
-    """Return the nodes per wavelength of modes, from the outputs of their pairs of states."""
-    if not isinstance(model, FEModel | Modes | ReducedModel):
-        return None
-    if isinstance(model, ReducedModel):
-        outputs = model.T @ outputs
-    return nodes_per_wavelength(model, outputs.reshape(len(outputs), -1, 2))
+def errors_on_machines(
+    estimators: Mapping[str, Any] | Any,
+    machines: Sequence[StandardPlant],
+    channel: str,
+    *,
+    blocks: Sequence[Any] = (),
+) -> MachineTable:
+    """Return the rms errors of estimators on machines that differ from their model.
 
+    In closed form. A filter that trusts its model doubles its error when frequencies of light modes
+    are half a percent off; how much is lost on the machines that a fit allows is what this says.
 
-def _mass_coupling(model: FEModel) -> tuple[IntArray, IntArray]:
-    """Return the translations that the mass matrix couples."""
-    M, directions = sp.coo_matrix(model.M), np.array(model.dofs.directions)
-    alike = np.isin(directions, _MOVES)[M.row] & (directions[M.row] == directions[M.col])
-    pair = (M.row < M.col) & (M.data != 0.0) & alike
-    return M.row[pair].astype(np.int64), M.col[pair].astype(np.int64)
+    Parameters
+    ----------
+    estimators : KalmanEstimator, StaticEstimator or RobustFilter, or mapping {name: estimator}
+        All of the same POIs.
+    machines : sequence of StandardPlant
+        Sampled alike: `plant.uncertain(fit).sample(rng, 20)`.
+    channel : str
+        A POI's motion.
+    blocks : sequence of Controller or StateSpace
+        Controllers that close the loop on the estimates (or on y): each estimator runs in
+        `close_loop(machine, estimator, *blocks)`. None: u is at rest.
 
+    Raises
+    ------
+    ModelError
+        When there are no estimators or machines, or they are no such values.
+    LabelError
+        When the motion is none of a POI, or a machine lacks a channel.
+    AssumptionError
+        When the error contains a rigid-body motion of a machine, or the nominal loop is not stable.
 
-def _side_by_side(dofs: DofSet) -> tuple[IntArray, IntArray]:
-    """Return the translations of nodes that a Delaunay triangulation joins, of one component."""
-    owner = np.zeros(len(dofs), np.int64) if dofs.component_of is None else dofs.component_of
-    kinds, found = np.array(dofs.directions), [np.zeros((2, 0), np.int64)]
-    for direction in _MOVES:
-        for part in np.unique(owner):
-            rows = np.flatnonzero((kinds == direction) & (owner == part))
-            found.append(rows[_neighbours(dofs.xyz[rows])])
-    i, j = np.hstack(found)
-    return i, j
-
-
-def _neighbours(xyz: FloatArray) -> IntArray:
-    """Return pairs (2, e) of nodes side by side on a line, in a plane or in space."""
-    offset = xyz - xyz.mean(axis=0) if len(xyz) else xyz
-    _, size, axes = np.linalg.svd(offset, full_matrices=False)
-    flat = offset @ axes[size > _FLAT * np.max(size, initial=0.0)].T
-    if len(flat) <= flat.shape[1] + 1 or not flat.size:
-        return np.zeros((2, 0), np.int64)
-    if flat.shape[1] == 1:
-        order = np.argsort(flat[:, 0])
-        pairs = np.vstack([order[:-1], order[1:]])
-    else:
-        from scipy.spatial import Delaunay
-
-        simplices = Delaunay(flat).simplices
-        first, second = np.triu_indices(simplices.shape[1], 1)
-        both = np.hstack([simplices[:, [a, b]].T for a, b in zip(first, second, strict=True)])
-        pairs = np.unique(np.sort(both, axis=0), axis=1)
-    # across a notch or a hole an edge is longer than those of the mesh at both its ends
-    length = np.linalg.norm(flat[pairs[0]] - flat[pairs[1]], axis=1)
-    total, count = (
-        np.bincount(pairs.reshape(-1), weights, len(flat))
-        for weights in (np.tile(length, 2), np.ones(2 * length.size))
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> estimators = {"filter": fx.design_kalman(plant)}
+    >>> fx.estimation.errors_on_machines(estimators, [plant], "die").names
+    ('filter',)
+    """
+    instance(blocks, Iterable, "blocks", "Pass controllers in [...].")
+    given = estimators if isinstance(estimators, Mapping) else {"estimator": estimators}
+    listed = members(
+        machines, StandardPlant, "machines", "Pass plant.uncertain(fit).sample(rng, 20)."
     )
-    usual = total / np.maximum(count, 1)
-    near = length <= _LONG * np.minimum(usual[pairs[0]], usual[pairs[1]])
-    return np.asarray(pairs[:, near], dtype=np.int64)
-
-
-def unresolved_share(
-    plant: StandardPlant,
-    larger: StandardPlant,
-    modes: IntArray,
-    observer: StateSpace,
-    variances: FloatArray,
-) -> float | None:
-    """Return the largest share of POI variances from modes left out that the mesh resolves badly.
-
-    Their disturbances are taken away, and the error is computed once more.
-    """
-    if not larger.is_assembled:
-        return None
-    realisation = larger.assembled.realisation
-    if _KEPT not in realisation.__dict__:  # many plants are made of one
-        realisation.__dict__[_KEPT] = _nodes_of(larger.model, realisation.outputs)
-    nodes = realisation.__dict__[_KEPT]
-    if nodes is None:
-        return None
-    coarse = modes[nodes[modes - 1] < NODES] - 1
-    if not coarse.size:
-        return 0.0
-    factor = np.array(larger.noise_factor)
-    factor[larger.modal_states.reshape(-1, 2)[coarse].reshape(-1)] = 0.0
-    still = larger.replace(origin=larger.assembled.replace(noise_factor=factor))
-    rest = error_variances(read_alike(plant, still), observer).values
-    shares = 1.0 - rest / divisor(variances)
-    share = float(np.max(shares))
-    if share > WARNED:
-        named = [c for c, part in zip(poi_channels(plant), shares, strict=True) if part > WARNED]
-        warn(
-            f"{share:.0%} of the predicted variance of {', '.join(named)} is from modes "
-            f"that the mesh of larger= resolves with fewer than {NODES:g} nodes a wavelength: "
-            "these errors may be off by as much. Pass a model with a finer mesh as larger=."
+    if not given or not all(hasattr(one, "rms") for one in given.values()):
+        raise ModelError(
+            f"estimators must be estimators by name, got {short(estimators)}. Pass "
+            "{'Kalman': design_kalman(plant)}."
         )
-    return max(share, 0.0)
+    first = next(iter(given.values())).plant
+    name = poi_channels(first)[row_of(poi_channels(first), channel)]
+    nominal = [_rms(one, one.plant, name, blocks) for one in given.values()]
+    values = []
+    for one in given.values():
+        row = []
+        for machine in listed:
+            try:
+                row.append(_rms(one, machine, name, blocks))
+            except AssumptionError:
+                if not blocks:
+                    raise
+                row.append(np.inf)
+        values.append(row)
+    return MachineTable(
+        name, tuple(given), np.array(nominal), np.array(values), first.units.get(name, "")
+    )
+
+
+def _rms(estimator: Any, machine: StandardPlant, channel: str, blocks: Sequence[Any]) -> float:
+    if not blocks:
+        return float(estimator.rms(channel, on=machine))
+    with warnings.catch_warnings():  # the table itself says which loops are unstable
+        warnings.simplefilter("ignore", FlexplantWarning)
+        loop = close_loop(machine, estimator, *blocks)
+    row = row_of(poi_channels(estimator.plant), channel)
+    return float(np.sqrt(loop_variances(estimator.plant, estimator.system, loop)[row]))

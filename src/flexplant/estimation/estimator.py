@@ -14,12 +14,12 @@ from ..checks import FloatArray, positive, real_array, short, sizes_of
 from ..errors import LabelError, ModelError, ShapeError, counted, require_known
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from .error import NODES, NOTED, PoiFilter
+from .error import PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels
 from .filter_model import FilterModel, KalmanCertificate, Sight, filter_model
 from .lag_report import LAGS, Filter, Lag, LagReport, lag_errors
-from .left_out import LeftOut, left_out
+from .left_out import NODES, NOTED, LeftOut, left_out
 
 #: relative difference between two ways to a variance from which it is stated beside the rms: six
 #: digits are more than any model holds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -221,14 +222,20 @@ class Sight(NamedTuple):
 
 
 def filter_system(
-    plant: StandardPlant, model: FilterModel, K: FloatArray, L_z: FloatArray, name: str
+    plant: StandardPlant,
+    model: FilterModel,
+    K: FloatArray,
+    L_z: FloatArray,
+    name: str,
+    inputs: Sequence[str] = (),
 ) -> StateSpace:
-    """Return the filter, from sensors and u to the estimates.
+    """Return the filter, from sensors and u to the estimates of POIs and of unknown inputs.
 
     ``x+ = A x + B u + K e``, ``hat = C1 x + D1 u + L_z e`` with the innovation
     ``e = y - C2 x - D2 u``.
     """
-    m = model
+    m, more = model, len(model.A) - plant.system.n_states
+    units = {f"{one}:hat": plant.units[one] for one in inputs if one in plant.units}
     return StateSpace(
         m.A - K @ m.C2,
         np.hstack([K, m.B - K @ m.D2]),
@@ -236,10 +243,10 @@ def filter_system(
         np.hstack([L_z, m.D1 - L_z @ m.D2]),
         plant.dt,
         inputs=[*m.sensors, *m.commands],
-        outputs=estimates(m.channels),
-        states=plant.system.states,
+        outputs=[*estimates(m.channels), *(f"{one}:hat" for one in inputs)],
+        states=[*plant.system.states, *(f"{one}:state" for one in inputs[:more])],
         name=name,
-        units=plant.units,
+        units={**plant.units, **units},
     )
 
 
@@ -287,8 +294,8 @@ def filter_gains(model: FilterModel, P: FloatArray, seen: FloatArray) -> FilterG
     W = np.zeros_like(S)
     there = np.flatnonzero(seen)
     if there.size:
-        at = np.ix_(there, there)
-        W[at] = np.linalg.inv(innovation_root(S[at]))
+        at, size = np.ix_(there, there), np.sqrt(S.diagonal()[there])
+        W[at] = np.linalg.inv(innovation_root(S[at] / size / size[:, None])) / size
     weight = W.T @ W
     L = M @ weight
     return FilterGains(L, model.A @ L + model.S @ weight, W)

@@ -15,7 +15,7 @@ from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
-from .error import error_variances, unresolved_share
+from .error import error_variances
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike
 from .filter_model import (
@@ -31,7 +31,7 @@ from .filter_model import (
     stable_radius,
     weigh,
 )
-from .left_out import left_out
+from .left_out import LeftOut, left_out, unresolved_share
 
 #: least part of R that is the sensors' own: of less, six digits and more are lost in covariances
 _OWN = 1e-10
@@ -108,26 +108,19 @@ def design_kalman(
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")
     whole = None if larger is plant else larger_plant(plant, larger)
     found = None if whole is None else left_out(plant, whole)
-    model = filter_model(plant, found)
-    design = _filter_design(model)
-    own = plant if found is None else found.plant
-    system = filter_system(own, model, design.predictor, design.poi_gain, "kalman")
+    observer = _observer(plant, found)
+    certificate = observer.certificate
     if whole is None or found is None:
-        certificate = design.certificate
-        if larger is not None:
-            certificate = certificate.replace(left_out=0)
-        return KalmanEstimator(
-            system, plant, design.gain, design.covariance, certificate, design.variances
+        return observer.replace(
+            certificate=certificate.replace(left_out=None if larger is None else 0)
         )
-    honest = error_variances(read_alike(plant, whole), system)
-    certificate = design.certificate.replace(
-        difference=max(design.certificate.difference, honest.difference),
+    honest = error_variances(read_alike(plant, whole), observer.system)
+    certificate = certificate.replace(
+        difference=max(certificate.difference, honest.difference),
         left_out=int(found.modes.size),
-        unresolved=unresolved_share(plant, whole, found.modes, system, honest.values),
+        unresolved=unresolved_share(plant, whole, found.modes, observer.system, honest.values),
     )
-    return KalmanEstimator(
-        system, plant, design.gain, design.covariance, certificate, honest.values, found
-    )
+    return observer.replace(certificate=certificate, variances=honest.values)
 
 
 def redesigned(
@@ -137,30 +130,43 @@ def redesigned(
 
     Its predicted errors are those of its own model.
     """
-    plant, found = change(observer.plant), observer.left_out
+    found = observer.left_out
     if found is not None:
         found = found.replace(plant=change(found.plant))
+    return _observer(change(observer.plant), found)
+
+
+def _observer(plant: StandardPlant, found: LeftOut | None) -> KalmanEstimator:
+    """Return the filter of a plant and of modes left out, with its errors on its own model."""
     model = filter_model(plant, found)
-    design = _filter_design(model)
+    design = filter_design(model)
     own = plant if found is None else found.plant
-    system = filter_system(own, model, design.predictor, design.poi_gain, "kalman")
+    system = filter_system(own, model, design.K, design.L_z, "kalman")
+    certificate = KalmanCertificate(design.radius, design.residual, design.difference)
     return KalmanEstimator(
-        system, plant, design.gain, design.covariance, design.certificate, design.variances, found
+        system, plant, design.gain, design.covariance, certificate, design.variances, found
     )
 
 
-class _Design(NamedTuple):
+class FilterDesign(NamedTuple):
+    """Gains L, K and L_z, covariance after the measurement, POI variances, and what was checked."""
+
     gain: FloatArray
-    predictor: FloatArray
-    poi_gain: FloatArray
+    K: FloatArray
+    L_z: FloatArray
     covariance: FloatArray
     variances: FloatArray
-    certificate: KalmanCertificate
+    radius: float
+    residual: float
+    difference: float
 
 
-def _filter_design(model: FilterModel) -> _Design:
+def filter_design(model: FilterModel) -> FilterDesign:
     """Return the gains of a model whose sensors may have the noise of modes left out as well."""
-    if _hidden_noise(model):
+    G, H = noise_root(model)
+    own = np.sum(H[:, ~np.any(G, axis=0)] ** 2, axis=1)
+    # R is nearly all noise that moves the states too, the sensors' own part lost in it
+    if np.any(own < _OWN * np.sum(H**2, axis=1)):
         return _design_in_roots(model, None)
     try:
         return _design_by_covariance(model)
@@ -168,29 +174,21 @@ def _filter_design(model: FilterModel) -> _Design:
         return _design_in_roots(model, error)
 
 
-def _hidden_noise(model: FilterModel) -> bool:
-    """Return whether R is nearly all noise that moves the states too, its own part lost in it."""
-    G, H = noise_root(model)
-    own = np.sum(H[:, ~np.any(G, axis=0)] ** 2, axis=1)
-    return bool(np.any(own < _OWN * np.sum(H**2, axis=1)))
-
-
-def _design_by_covariance(model: FilterModel) -> _Design:
+def _design_by_covariance(model: FilterModel) -> FilterDesign:
     """Return the gains by the Riccati equation of P."""
     solution = solve_dare(model.A, model.C2, Q=model.Q, R=model.R, S=model.S)
     P = solution.P
     innovation = model.innovation(P)
     gain = weigh(P @ model.C2.T, innovation)
-    predictor = model.A @ gain + weigh(model.S, innovation)
-    poi_gain = weigh(model.C1 @ P @ model.C2.T + model.N, innovation)
+    K = model.A @ gain + weigh(model.S, innovation)
+    L_z = weigh(model.C1 @ P @ model.C2.T + model.N, innovation)
     covariance = model.updated(P, gain)
     variances = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
-    radius, difference = error_of(model, gain, predictor, covariance)
-    certificate = KalmanCertificate(radius, solution.residual, difference)
-    return _Design(gain, predictor, poi_gain, covariance, variances, certificate)
+    radius, difference = error_of(model, gain, K, covariance)
+    return FilterDesign(gain, K, L_z, covariance, variances, radius, solution.residual, difference)
 
 
-def _design_in_roots(model: FilterModel, why: Exception | None) -> _Design:
+def _design_in_roots(model: FilterModel, why: Exception | None) -> FilterDesign:
     """Return the gains where P itself has too few digits; raise `why` where there are none."""
     G, H = noise_root(model)
     try:
@@ -210,6 +208,5 @@ def _design_in_roots(model: FilterModel, why: Exception | None) -> _Design:
         np.linalg.norm(found.L, axis=1),
     ) + np.sum((poi_rows @ H) ** 2, axis=1)
     difference = agreement(variances, truth, ROUNDED)
-    certificate = KalmanCertificate(radius, found.change, difference)
-    poi_gain = model.C1 @ gain + found.weighed(model.N)
-    return _Design(gain, found.K, poi_gain, covariance, variances, certificate)
+    L_z = poi_rows + found.weighed(model.N)
+    return FilterDesign(gain, found.K, L_z, covariance, variances, radius, found.change, difference)

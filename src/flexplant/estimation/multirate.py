@@ -18,7 +18,14 @@ from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..tolerances import TINY
 from .estimator_channels import checked_plant, estimates, poi_channels, recorded, row_of, sensors
-from .filter_model import AGREEMENT, FilterModel, check_noises, filter_model, filter_system, weigh
+from .filter_model import (
+    AGREEMENT,
+    FilterModel,
+    check_noises,
+    filter_gains,
+    filter_model,
+    filter_system,
+)
 
 #: longest period [samples], and most measurements in one
 _LONGEST, _MOST = 1000, 2000
@@ -287,13 +294,7 @@ def _joseph_step(
     m: FilterModel, P: FloatArray, read: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return L, K, P[k|k] and P[k+1|k] of one sample, in Joseph's form."""
-    rows = np.flatnonzero(read)
-    gain, predictor = np.zeros(m.C2.T.shape), np.zeros(m.C2.T.shape)
-    if rows.size:
-        C, R = m.C2[rows], m.R[np.ix_(rows, rows)]
-        innovation = C @ P @ C.T + R
-        gain[:, rows] = weigh(P @ C.T, innovation)
-        predictor[:, rows] = m.A @ gain[:, rows] + weigh(m.S[:, rows], innovation)
-    closed = m.A - predictor @ m.C2
-    ahead = closed @ P @ closed.T + m.driven(predictor)
-    return gain, predictor, m.updated(P, gain), 0.5 * (ahead + ahead.T)
+    g = filter_gains(m, P, read)
+    closed = m.A - g.K @ m.C2
+    ahead = closed @ P @ closed.T + m.driven(g.K)
+    return g.L, g.K, m.updated(P, g.L), 0.5 * (ahead + ahead.T)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,9 +19,18 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..tolerances import TINY, divisor
-from .estimator_channels import checked_plant, estimates, poi_channels, row_of
-from .filter_model import AGREEMENT, FilterModel, check_noises, filter_model, weigh
+from .estimator_channels import checked_plant, poi_channels, row_of
+from .filter_model import (
+    AGREEMENT,
+    FilterModel,
+    check_noises,
+    filter_model,
+    filter_system,
+    noise_root,
+    weigh,
+)
 from .invertibility import InputEntry, Invertibility, input_entry, ranks_and_zeros, unknown_names
+from .kalman import filter_design
 from .noise_from_records import with_densities
 
 #: variance of white inputs at the start of the search, beside what the sensors resolve
@@ -151,17 +161,24 @@ def design_input_estimator(
     check_noises(quiet)
     model, d = filter_model(quiet), input_entry(plant, names)
     found = ranks_and_zeros(model, d, names)
-    design = _unbiased(model, d, found) if isinstance(method, Unbiased) else None
-    if design is None:
-        design = _augmented(model, d, method, found)  # type: ignore[arg-type]
+    find = _unbiased if isinstance(method, Unbiased) else partial(_augmented, method)
+    nz, k, ny, nu = len(model.C1), len(names), len(model.C2), model.B.shape[1]
+    # below the POIs the inputs themselves, which the states do not show
+    wider = model.replace(
+        C1=np.vstack([model.C1, np.zeros((k, len(model.A)))]),
+        D1=np.vstack([model.D1, np.zeros((k, nu))]),
+        V=np.zeros((nz + k, nz + k)),
+        N=np.zeros((nz + k, ny)),
+    )
+    design = find(wider, d._replace(at_pois=np.vstack([d.at_pois, np.eye(k)])), found)
     _check_certificate(design.certificate)
     return InputEstimator(
-        _system(plant, model, design, names),
+        filter_system(plant, design.model, design.K, design.L, "input_estimator", names),
         plant,
         names,
-        int(design.gains.late),
-        design.variances,
-        design.input_variances,
+        int(design.late),
+        design.variances[:nz],
+        design.variances[nz:],
         found,
         design.certificate,
     )
@@ -174,7 +191,7 @@ def _unbiased(model: FilterModel, d: InputEntry, found: Invertibility) -> _Input
             "use estimation.Augmented(drift=...), which assumes how fast they change."
         )
     late = found.delay == 1
-    if late and (np.any(model.S) or np.any(d.at_pois)):
+    if late and (np.any(model.S) or np.any(d.at_pois[: -len(found.inputs)])):
         raise AssumptionError(
             "inputs that the sensors show one sample late cannot be combined with noise that "
             "reaches a sensor, or inputs that reach a POI, at once. Use "
@@ -212,14 +229,12 @@ def _relative_gap(one: FloatArray, two: FloatArray) -> float:
 
 
 class _InputGains(NamedTuple):
-    """``x+ = A x + B u + K e``, ``[hat; d_hat] = C x + D u + L e``, e = y - C2 x - D2 u.
+    """``x+ = A x + B u + K e``, ``[hat; d_hat] = C1 x + D1 u + L e``, e = y - C2 x - D2 u.
 
     `closed` is the dynamics of the error and `driven` its noise (of x[k|k] when `late`, of
     x[k|k-1] otherwise), bias how much of d enters.
     """
 
-    A: FloatArray
-    C: FloatArray
     K: FloatArray
     L: FloatArray
     closed: FloatArray
@@ -241,10 +256,9 @@ def _direct_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
     L_x = weigh(P @ m.C2.T, spread) @ rest
     # noise that reaches state and sensors together: what the innovation shows of it beside d
     K = m.A @ L_x + d.G @ M + weigh(m.S, spread) @ rest
-    L = np.vstack([m.C1 @ L_x + d.at_pois @ M, M])
-    C = np.vstack([m.C1, np.zeros((len(M), len(P)))])
+    L = m.C1 @ L_x + d.at_pois @ M
     bias = max(_max_abs(M @ d.H - np.eye(len(M))), _max_abs((K @ d.H - d.G) / _column_sizes(d.G)))
-    return _InputGains(m.A, C, K, L, m.A - K @ m.C2, m.driven(K), False, bias)
+    return _InputGains(K, L, m.A - K @ m.C2, m.driven(K), False, bias)
 
 
 def _late_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
@@ -254,57 +268,56 @@ def _late_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
     plain = weigh(P @ m.C2.T, spread)
     L_x = plain + (d.G - plain @ F) @ M
     still = np.eye(len(P)) - L_x @ m.C2
-    L = np.vstack([m.C1 @ L_x, M])
-    C = np.vstack([m.C1, np.zeros((len(M), len(P)))])
+    L = m.C1 @ L_x + d.at_pois @ M
     bias = max(_max_abs(M @ F - np.eye(len(M))), _max_abs((L_x @ F - d.G) / _column_sizes(d.G)))
     driven = still @ m.Q @ still.T + L_x @ m.R @ L_x.T
-    return _InputGains(m.A, C, m.A @ L_x, L, still @ m.A, driven, True, bias)
+    return _InputGains(m.A @ L_x, L, still @ m.A, driven, True, bias)
 
 
 def _augmented(
-    m: FilterModel, d: InputEntry, method: Augmented, found: Invertibility
+    method: Augmented, m: FilterModel, d: InputEntry, found: Invertibility
 ) -> _InputDesign:
     """Return the Kalman filter of the plant with the inputs as states."""
     n, k = d.G.shape
     pole, variance = method.step(m.dt)
-    A = np.block([[m.A, d.G], [np.zeros((k, n)), pole * np.eye(k)]])
-    C2 = np.hstack([m.C2, d.H])
-    C = np.block([[m.C1, d.at_pois], [np.zeros((k, n)), np.eye(k)]])
+    (G, H), drift = noise_root(m), np.sqrt(variance) * np.eye(k)
     larger = m.replace(
-        A=A, C2=C2, Q=la.block_diag(m.Q, variance * np.eye(k)), S=np.vstack([m.S, 0 * d.H.T]),
-        root=None,
-    )  # fmt: skip
+        A=np.block([[m.A, d.G], [np.zeros((k, n)), pole * np.eye(k)]]),
+        B=np.vstack([m.B, np.zeros((k, m.B.shape[1]))]),
+        C1=np.hstack([m.C1, d.at_pois]),
+        C2=np.hstack([m.C2, d.H]),
+        Q=la.block_diag(m.Q, variance * np.eye(k)),
+        S=np.vstack([m.S, 0 * d.H.T]),
+        root=np.vstack([la.block_diag(G, drift), np.hstack([H, np.zeros((len(H), k))])]),
+    )
     try:
-        P = solve_dare(A, C2, Q=larger.Q, R=m.R, S=larger.S).P
+        design = filter_design(larger)
     except SolverError as error:
         raise AssumptionError(
             f"no filter holds {', '.join(found.inputs)} as states: {error} The condition without "
             f"assumptions: {found.text}. Add a sensor, or give Augmented a corner above 0."
         ) from error
-    spread = larger.innovation(P)
-    gain = weigh(P @ C2.T, spread)
-    K = A @ gain + weigh(larger.S, spread)
-    gains = _InputGains(A, C, K, C @ gain, A - K @ C2, larger.driven(K), False, 0.0)
-    return _input_design(larger, gains, P, gains.covariance(larger))
+    certificate = InputCertificate(design.radius, 0.0, design.difference)
+    return _InputDesign(larger, design.K, design.L_z, design.variances, certificate)
 
 
 class _InputDesign(NamedTuple):
-    gains: _InputGains
-    C2: FloatArray
+    model: FilterModel
+    K: FloatArray
+    L: FloatArray
     variances: FloatArray
-    input_variances: FloatArray
     certificate: InputCertificate
+    late: bool = False
 
 
 def _input_design(m: FilterModel, g: _InputGains, claim: FloatArray, P: FloatArray) -> _InputDesign:
     """Return the design with the variances of its errors, and what was checked about it."""
-    left, noise = g.C - g.L @ m.C2, np.sum((g.L @ m.R) * g.L, axis=1)
+    left, noise = m.C1 - g.L @ m.C2, np.sum((g.L @ m.R) * g.L, axis=1)
     both = [np.sum((left @ X) * left, axis=1) + noise for X in (claim, P)]
     difference = float(np.max(np.abs(both[0] - both[1]) / divisor(both[1])))
     radius = float(np.max(np.abs(np.linalg.eigvals(g.closed)), initial=0.0))
-    nz = len(m.C1)
     certificate = InputCertificate(radius, g.bias, difference)
-    return _InputDesign(g, m.C2, both[1][:nz], both[1][nz:], certificate)
+    return _InputDesign(m, g.K, g.L, both[1], certificate, g.late)
 
 
 def _check_certificate(found: InputCertificate) -> None:
@@ -315,28 +328,6 @@ def _check_certificate(found: InputCertificate) -> None:
             f"{found.difference:.1e} (allowed {AGREEMENT:.0e}). The sensors hardly determine the "
             "inputs. Add a sensor, or use estimation.Augmented(drift=...)."
         )
-
-
-def _system(
-    plant: StandardPlant, m: FilterModel, design: _InputDesign, names: tuple[str, ...]
-) -> StateSpace:
-    (A, C, K, L, *_), k = design.gains, len(names)
-    more = len(A) - len(m.A)
-    B = np.vstack([m.B, np.zeros((more, m.B.shape[1]))])
-    D = np.vstack([m.D1, np.zeros((k, m.B.shape[1]))])
-    units = {name: plant.units[name] for name in names if name in plant.units}
-    return StateSpace(
-        A - K @ design.C2,
-        np.hstack([K, B - K @ m.D2]),
-        C - L @ design.C2,
-        np.hstack([L, D - L @ m.D2]),
-        plant.dt,
-        inputs=[*m.sensors, *m.commands],
-        outputs=[*estimates(m.channels), *(f"{name}:hat" for name in names)],
-        states=[*plant.system.states, *(f"{name}:state" for name in names[:more])],
-        name="input_estimator",
-        units={**plant.units, **{f"{name}:hat": unit for name, unit in units.items()}},
-    )
 
 
 def _without_noise(plant: StandardPlant, names: Sequence[str]) -> StandardPlant:
