@@ -14,7 +14,6 @@ from ..lti import Frf
 from ..tolerances import divisor
 from .frf_joints import (
     FrfLink,
-    all_channels,
     channel_rows,
     channels_as_dofs,
     frf_links,
@@ -23,7 +22,7 @@ from .frf_joints import (
     softness,
     warn_of_bending,
 )
-from .joint import Joint
+from .joint import Joint, joint_list
 
 #: part of each response that is taken for its error where none is known: of a good measurement
 _USUAL = 0.01
@@ -129,8 +128,9 @@ def joined_frfs(
     multipliers (LM-FBS). [deKlerk2008]_, [vanderSeijs2013]_.
     """
     _same_lines(frfs)
-    parts, listed = all_channels(frfs, dofs), _joint_list(joints)
-    links = frf_links(listed, parts)
+    places, listed = known_places(dofs, frfs), joint_list(joints)
+    parts = [channels_as_dofs(name, frf, places.get(name)) for name, frf in frfs.items()]
+    links = [link for joint in listed for link in frf_links(joint, parts)]
     warn_of_bending(listed, parts, frfs)
     first = next(iter(frfs.values()))
     prefixed = {f"{name}/": frf for name, frf in frfs.items()}
@@ -222,7 +222,7 @@ def uncoupled(
     whose = None if isinstance(known, Frf) else known
     mapping(whose, "known", "Pass responses by component: {'frame': frf}.", least=1)
     _same_lines({"the machine": machine, **known})
-    links = _taken_out(machine, known, _joint_list(joints), dofs)
+    links = _taken_out(machine, known, joint_list(joints), dofs)
     kept_out = [i for i, name in enumerate(machine.outputs) if name.partition("/")[0] not in known]
     kept_in = [i for i, name in enumerate(machine.inputs) if name.partition("/")[0] not in known]
     if not kept_out or not kept_in:
@@ -247,7 +247,10 @@ def uncoupled(
 
 
 def _taken_out(
-    machine: Frf, known: Mapping[str, Frf], joints: Sequence[Any], dofs: Mapping[str, DofSet] | None
+    machine: Frf,
+    known: Mapping[str, Frf],
+    joints: Sequence[Joint],
+    dofs: Mapping[str, DofSet] | None,
 ) -> list[FrfLink]:
     """Return rigid joints between the machine and the negatives of known components."""
     labels = [*machine.outputs, *machine.inputs]
@@ -262,10 +265,10 @@ def _taken_out(
     ]
     found = []
     for joint in joints:
-        links, missing = frf_links([joint], alone), None
+        links, missing = frf_links(joint, alone), None
         inside = links
         try:
-            inside = frf_links([joint], there)
+            inside = frf_links(joint, there)
         except LabelError as error:
             missing = error
         for link, same in zip(links, inside, strict=True):
@@ -391,12 +394,6 @@ def _shared_rows(Y: MeasuredParts, known: Mapping[str, Frf]) -> tuple[FloatArray
                 rows.append(row)
         found.append(np.array(rows).reshape(-1, len(names)))
     return found[0], found[1]
-
-
-def _joint_list(joints: Any) -> list[Any]:
-    if isinstance(joints, Joint):
-        return [joints]
-    return list(instance(joints, Iterable, "joints", "Pass Joint(...) in [...]."))
 
 
 def _same_lines(frfs: Mapping[str, Any]) -> None:

@@ -45,13 +45,8 @@ class FrfLink(NamedTuple):
     rate: float
 
 
-def frf_links(joints: Sequence[Any], parts: Sequence[Channels]) -> list[FrfLink]:
-    """Return all axes of joints between responses."""
-    return [link for joint in joints for link in _frf_links(joint, parts)]
-
-
-def _frf_links(joint: Any, parts: Sequence[Channels]) -> list[FrfLink]:
-    instance(joint, Joint, "a joint", "Pass Joint('stage/41:z', 'frame/7:z').")
+def frf_links(joint: Joint, parts: Sequence[Channels]) -> list[FrfLink]:
+    """Return all axes of a joint between responses."""
     given = [joint.first] if joint.second is None else [joint.first, joint.second]
     owners = [_component_of(end, parts) for end in given]
     for end, owner in zip(given, owners, strict=True):
@@ -150,7 +145,7 @@ def channel_rows(links: Sequence[FrfLink], names: Sequence[str], side: str) -> F
 
 
 def warn_of_bending(
-    joints: Sequence[Any], parts: Sequence[Channels], frfs: Mapping[str, Frf]
+    joints: Sequence[Joint], parts: Sequence[Channels], frfs: Mapping[str, Frf]
 ) -> None:
     """Warn of patches whose measured motion is not that of a rigid body."""
     for joint in joints:
@@ -158,11 +153,8 @@ def warn_of_bending(
             if not isinstance(end, Patch):
                 continue
             owner = _component_of(end, parts)
-            side, frf, patch = (
-                owner.outputs,
-                frfs[owner.name],
-                _measured_patch(end, owner, "outputs"),
-            )
+            side, frf = owner.outputs, frfs[owner.name]
+            patch = _measured_patch(end, owner, "outputs")
             mean, A, _ = patch.mean(side.dofs, patch.point(side.dofs))
             channels = [side.channels[row] for row in patch.rows(side.dofs)]
             moved = frf.data[[frf.outputs.index(channel) for channel in channels]]
@@ -231,8 +223,7 @@ class Channels(NamedTuple):
 
     def side(self, which: str) -> Side:
         """Return the outputs or the inputs."""
-        found: Side = getattr(self, which)
-        return found
+        return self.outputs if which == "outputs" else self.inputs
 
     def named(self, row: FloatArray, which: str) -> dict[str, float]:
         """Return the weights of a row by the names of the channels, zeros left out."""
@@ -250,19 +241,15 @@ def channels_as_dofs(name: str, frf: Frf, dofs: DofSet | None, *, inside: bool =
 
 def _side(name: str, names: Sequence[str], dofs: DofSet | None, *, inside: bool) -> Side:
     nodes, directions, channels, owners = [], [], [], []
-    for channel in names:
-        label = channel
-        if inside:
-            owner, _, label = channel.partition("/")
-            if owner != name:
-                continue
-        component, _, label = label.removeprefix("u ").rpartition("/")
+    begin = f"{name}/" if inside else ""
+    for channel in (full[len(begin) :] for full in names if full.startswith(begin)):
+        component, _, label = channel.removeprefix("u ").rpartition("/")
         node, _, direction = label.partition(":")
         if direction in DIRECTIONS and node.isdigit():
             nodes.append(int(node))
             directions.append(direction)
             owners.append(component)
-            channels.append(channel.partition("/")[2] if inside else channel)
+            channels.append(channel)
     xyz = np.zeros((len(nodes), 3))
     if dofs is not None and nodes:
         first = np.unique(dofs.nodes, return_index=True)[1]
@@ -280,12 +267,6 @@ def _side(name: str, names: Sequence[str], dofs: DofSet | None, *, inside: bool)
     numbers = [listed.index(component) for component in owners]
     found = plain.replace(components=tuple(listed), component_of=np.array(numbers, dtype=np.int64))
     return Side(name, found, tuple(channels))
-
-
-def all_channels(frfs: Mapping[str, Frf], dofs: Mapping[str, DofSet] | None) -> list[Channels]:
-    """Return the channels of all components."""
-    places = known_places(dofs, frfs)
-    return [channels_as_dofs(name, frf, places.get(name)) for name, frf in frfs.items()]
 
 
 def known_places(dofs: object, names: Mapping[str, object] | Sequence[str]) -> dict[str, DofSet]:

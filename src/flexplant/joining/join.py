@@ -16,9 +16,8 @@ from ..errors import CertificateError, ModelError, counted, warn
 from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
 from ..modes.attachment_vectors import static_response
-from ..modes.shifted import stiffness_factor
 from ..reduction import ReducedModel
-from ..sparse.factor import DENSE_LIMIT, dense
+from ..sparse.factor import dense
 from ..structure import FEModel
 from ..structure.placed import SPANNED
 from ..structure.rigid import orthonormalised, rigid_body_basis
@@ -415,7 +414,9 @@ def compliances(
     W, A, _ = patch.mean(part.dofs, point)
     if rows.size > _MOST or part.model.n_unstable:
         return np.full(len(axes), np.nan), np.full(len(axes), np.nan)
-    C = _compliance(part, rows)
+    model, loads = part.model, dense(part.T[rows].T)
+    C = loads.T @ static_response(model.M, model.K, model.rigid_body, loads)
+    C = 0.5 * (C + C.T)
     W, A = W[list(axes)], A[:, list(axes)]
     mean = np.diag(W @ C @ W.T)
     # motions of A cost no energy here, so that C is invertible where the patch can move at all
@@ -423,18 +424,6 @@ def compliances(
     stiffness = la.pinvh(C + beside * A @ A.T, rtol=_RANK)
     rigid = np.diag(la.inv(A.T @ stiffness @ A)) - beside
     return np.asarray(mean), np.asarray(rigid)
-
-
-def _compliance(part: Component, rows: Any) -> FloatArray:
-    """Return the elastic compliance (m, m) of some DOFs of a component, free or held."""
-    model: Any = part.model
-    loads = dense(part.T[rows].T)
-    if sp.issparse(model.K) and model.n_dof > DENSE_LIMIT:
-        moved = stiffness_factor(model).static(loads)
-    else:
-        moved = static_response(model.M, model.K, model.rigid_body, loads)
-    found = loads.T @ moved
-    return np.asarray(0.5 * (found + found.T))
 
 
 #: largest gap, imbalance and error of the inertia, relative

@@ -325,7 +325,6 @@ class JointEnd:
         self.index, self._size = names.index(name), size
         self._dofs, self._motions = parts[self.index].dofs, motions[self.index]
         self.label = ":" in rest
-        self.axes: tuple[str, ...]
         if self.label:
             try:
                 self._rows = {rest.rpartition(":")[2]: self._dofs.row(rest)}
@@ -343,8 +342,8 @@ class JointEnd:
     def _at_node(self, node: str) -> None:
         dofs, self._rows = self._dofs, {}
         if dofs.component_of is None and node.lstrip("-").isdigit():
-            for row in np.flatnonzero(dofs.nodes == int(node)):
-                self._rows[dofs.directions[row]] = _unit_rows(len(dofs), row)
+            for row in np.flatnonzero(dofs.nodes == int(node)).tolist():
+                self._rows[dofs.directions[row]] = np.eye(1, len(dofs), row)[0]
                 self.point = np.asarray(dofs.xyz[row])
         else:  # of a machine: "frame/41", of which DOFs may follow others
             for axis in DIRECTIONS:
@@ -451,16 +450,16 @@ def joint_axes(joint: Joint, first: JointEnd, second: JointEnd | None) -> tuple[
     return first.axes
 
 
+def joint_list(joints: Any) -> list[Joint]:
+    """Return a joint, or several, as a list."""
+    listed = [joints] if isinstance(joints, Joint) else joints
+    hint = "Pass Joint('stage/41:z', 'frame/7:z')."
+    listed = instance(listed, Iterable, "joints", "Pass Joint(...) in [...].")
+    return [instance(joint, Joint, "a joint", hint) for joint in listed]
+
+
 def split_end(text: str, names: Sequence[str]) -> tuple[str, str]:
     """Return which component a text such as "stage/41:z" begins with, and the rest of it."""
-    names = name_list(names, "names of components")
-    for name in sorted(names, key=len, reverse=True):
-        if text.startswith(f"{name}/"):
-            return name, text[len(name) + 1 :]
-    return text.partition("/")[0], text.partition("/")[2]
-
-
-def _unit_rows(n: int, row: Any) -> FloatArray:
-    found = np.zeros(n)
-    found[row] = 1.0
-    return found
+    own = (name for name in sorted(names, key=len, reverse=True) if text.startswith(f"{name}/"))
+    name = next(own, text.partition("/")[0])
+    return name, text[len(name) + 1 :]

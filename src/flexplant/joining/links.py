@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -11,14 +11,14 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..checks import FloatArray, IntArray, instance, positive
+from ..checks import FloatArray, IntArray, positive
 from ..dof_columns import in_box
 from ..errors import ModelError, warn
 from ..labels import DIRECTIONS, DofSet
 from ..structure.rigid import rigid_motions
 from ..tolerances import TYPED
 from .component import Component, Model, Pose, components_of
-from .joint import Joint, JointEnd, joint_axes
+from .joint import Joint, JointEnd, joint_axes, joint_list
 
 #: relative: what a joint feels of a motion of the whole machine below this is rounding
 BALANCED = 1e-9
@@ -57,14 +57,9 @@ class Link(NamedTuple):
 
 def links_of(joints: Any, parts: Sequence[Component]) -> list[Link]:
     """Return all axes of all joints."""
-    listed = (
-        [joints]
-        if isinstance(joints, Joint)
-        else list(instance(joints, Iterable, "joints", "Pass Joint(...) in [...]."))
-    )
     size = machine_size(parts)
     motions = [rigid_motions(part.dofs) for part in parts]
-    return [link for joint in listed for link in _links(joint, parts, size, motions)]
+    return [link for one in joint_list(joints) for link in _links(one, parts, size, motions)]
 
 
 def machine_size(parts: Sequence[Component]) -> float:
@@ -74,9 +69,8 @@ def machine_size(parts: Sequence[Component]) -> float:
 
 
 def _links(
-    joint: Any, parts: Sequence[Component], size: float, motions: Sequence[FloatArray]
+    joint: Joint, parts: Sequence[Component], size: float, motions: Sequence[FloatArray]
 ) -> list[Link]:
-    instance(joint, Joint, "a joint", "Pass Joint('stage/41:z', 'frame/7:z').")
     first = JointEnd(parts, joint.first, size, motions)
     second = None if joint.second is None else JointEnd(parts, joint.second, size, motions)
     axes = joint_axes(joint, first, second)
@@ -148,7 +142,6 @@ def warn_of_missing_statics(links: Sequence[Link], parts: Sequence[Component]) -
         felt = [(link, end) for link in links for end in link.ends if end.component == index]
         if not felt:
             continue
-        names = [f"{link.joint!r} ({link.axis})" for link, _ in felt]
         wanted = np.zeros((len(felt), len(part.dofs)))
         for row, (_, end) in zip(wanted, felt, strict=True):
             row[end.columns] = end.values
@@ -159,13 +152,13 @@ def warn_of_missing_statics(links: Sequence[Link], parts: Sequence[Component]) -
             known, left, wanted = known[:, some], left[:, some], wanted[:, some]
             left = wanted - (wanted @ np.linalg.pinv(known)) @ known
         part_left = np.linalg.norm(left, axis=1) / np.linalg.norm(wanted, axis=1)
-        lost = [name for name, share in zip(names, part_left, strict=True) if share > _STATIC]
+        lost = [felt[i][0] for i in np.flatnonzero(part_left > _STATIC)]
         if lost:
             more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
             warn(
                 f"component {part.name!r} ({part.model!r}) holds no static shape for the load of "
-                f"{lost[0]}{more}: without the compliance of the modes left out, the joint is too "
-                "stiff. Solve with compliance_at=[...] there, or reduce by "
+                f"{lost[0].joint!r} ({lost[0].axis}){more}: without the compliance of the modes "
+                "left out, the joint is too stiff. Solve with compliance_at=[...] there, or by "
                 "CraigBampton(boundary=[...]) or Rubin."
             )
 
@@ -235,10 +228,8 @@ def _joints(one: Component, other: Component, box: Any, reach: float) -> list[Jo
     for i, j in pairs:
         both = _axes(one.dofs, i) & _axes(other.dofs, j)
         if both:
-            ends = (
-                f"{one.name}/{_row_label(one.dofs, i)}",
-                f"{other.name}/{_row_label(other.dofs, j)}",
-            )
+            rows = ((one, i), (other, j))
+            ends = [f"{p.name}/{p.dofs._label(row).partition(':')[0]}" for p, row in rows]
             found.append(Joint(*ends, axes=[axis for axis in DIRECTIONS if axis in both]))
     return found
 
@@ -252,10 +243,6 @@ def _box_nodes(dofs: DofSet, box: Any) -> Any:
 
 def _axes(dofs: DofSet, row: int) -> set[str]:
     return {dofs.directions[i] for i in np.flatnonzero(dofs.node_index == dofs.node_index[row])}
-
-
-def _row_label(dofs: DofSet, row: int) -> str:
-    return dofs._label(row).partition(":")[0]
 
 
 #: a diagonal entry of R below this part of the first one is none: the joint repeats others

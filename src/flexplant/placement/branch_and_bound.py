@@ -42,10 +42,9 @@ class Exchange(Search):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
     >>> method = fx.placement.Exchange(starts=2)
-    >>> fx.place_sensors(plant, candidates, 2, method=method, rng=0).chosen
-    ('s1', 's3')
+    >>> fx.place_sensors(plant, ["y1", "y2"], 1, method=method, rng=0).chosen
+    ('y1',)
     """
 
     starts: int = field(default=10, metadata=checked(whole))
@@ -67,7 +66,7 @@ def best_start(
     rounded = None if relaxed is None else problem.rounded(relaxed[1])
     runs = work.mapped(
         partial(_run, problem, starts),
-        ["greedy", *["random"] * (starts - 1), *([] if rounded is None else [rounded])],
+        ["greedy", *["random"] * (starts - 1), *([rounded] if rounded else [])],
         rng=work.rng,
         description="starts",
         advice=ADVICE,
@@ -82,7 +81,7 @@ def _run(
 ) -> tuple[tuple[int, ...], tuple[float, ...], int]:
     run = _Run(problem, starts)
     if isinstance(first, str):
-        return run.exchanged(run.greedy() if first == "greedy" else run.drawn(rng))
+        first = tuple(run.greedy() if first == "greedy" else run.drawn(rng))
     return run.exchanged(first)
 
 
@@ -127,9 +126,12 @@ class _Run:
         ten scores, and leaves few of hundreds to be computed.
         """
         low = np.full(len(trials), -np.inf)
-        if len(trials) >= _MANY and np.isfinite(value):
+        scorer = self.problem.layouts.scorer
+        if len(trials) >= _MANY and np.isfinite(value) and isinstance(scorer, Quadratic):
             if self.tangent is None or self.tangent[0] != tuple(chosen):
-                self.tangent = tuple(chosen), _touching(self.problem, chosen)
+                weights = np.zeros(self.problem.total)
+                weights[list(chosen)] = 1.0
+                self.tangent = tuple(chosen), scorer.inner_tangent(self.problem.root, weights)
             if self.tangent[1] is not None:
                 low = self.tangent[1].values(trials)
         found = np.full(len(trials), np.inf)
@@ -164,16 +166,6 @@ class _Run:
         return [*chosen, *rng.permutation(rest)[: self.problem.count - len(chosen)].tolist()]
 
 
-def _touching(problem: Problem, chosen: Sequence[int]) -> Below | None:
-    """Return the tangent of a convex cost at a choice; None where there is none."""
-    scorer = problem.layouts.scorer
-    if not isinstance(scorer, Quadratic):
-        return None
-    weights = np.zeros(problem.total)
-    weights[list(chosen)] = 1.0
-    return scorer.inner_tangent(problem.root, weights)
-
-
 def _flat(units: Sequence[tuple[int, ...]]) -> list[int]:
     return [i for unit in units for i in unit]
 
@@ -206,10 +198,9 @@ class Screened(Search):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> method = fx.placement.Screened(fx.PoiVariance("die"), starts=1)
-    >>> fx.place_sensors(plant, candidates, 1, fx.PoiVariance("die"), method=method, rng=0).chosen
-    ('s1',)
+    >>> method = fx.placement.Screened(fx.placement.AutoMac(), starts=1)
+    >>> fx.place_sensors(plant, ["y1", "y2"], 1, method=method, rng=0).chosen
+    ('y1',)
     """
 
     by: Any = field(
@@ -235,14 +226,12 @@ class Screened(Search):
             sets = list(problem.choices())
         else:
             chosen = Exchange(self.starts).search(problem, work).chosen
-            movable = [u for u in problem.units if set(u) <= set(chosen)]
             near = {chosen}
-            for out in movable:
+            for out in (u for u in problem.units if set(u) <= set(chosen)):
                 kept = set(chosen) - set(out)
                 others = [u for u in problem.units if len(u) == len(out) and not set(u) & kept]
                 near |= {tuple(sorted({*kept, *unit})) for unit in others}
-            sets = sorted(near)
-            sets = [s for s, holds in zip(sets, problem.rows.hold(sets), strict=True) if holds]
+            sets = problem.rows.holding(sorted(near))
         values = problem.layouts.scores(sets, work, "screened")
         return [sets[i] for i in np.argsort(values, kind="stable")[: self.keep].tolist()]
 
@@ -283,8 +272,8 @@ class BranchAndBound(Search):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> fx.place_sensors(plant, candidates, 1, method=fx.placement.BranchAndBound(), rng=0).proven
+    >>> method = fx.placement.BranchAndBound()
+    >>> fx.place_sensors(plant, ["y1", "y2"], 1, method=method, rng=0).proven
     True
     """
 
@@ -310,7 +299,7 @@ class BranchAndBound(Search):
                 "of ports without a filter or delay of their own. Use placement.Exhaustive() "
                 "or placement.Exchange()."
             )
-        opened = 0
+        opened, stopped = 0, ""
         chosen, history, evaluations = best_start(problem, self.starts, problem.relaxed(), work)
         value = min(steps[-1] for steps in history)
         tree = _Tree(problem, scorer, self.gap, chosen, value)
@@ -327,7 +316,6 @@ class BranchAndBound(Search):
                 )
                 bar.advance(sum(map(tree.take, found)))
         bound = tree.bound
-        stopped = ""
         if batch:
             stopped = f"the limit of {self.branches} branches was reached"
             warn(
@@ -379,10 +367,9 @@ class _Tree:
     ) -> None:
         self.chosen, self.value, self.gap = chosen, value, gap
         self.left, self.evaluations, self.count = np.inf, 0, 0
-        branch = problem.root
-        bound, weights = scorer.relaxation(branch)
+        bound, weights = scorer.relaxation(problem.root)
         self.heap: list[tuple[float, int, _Node]] = []
-        self._push(_Node(bound, branch.groups, weights))
+        self._push(_Node(bound, problem.root.groups, weights))
 
     @property
     def cutoff(self) -> float:
@@ -435,8 +422,7 @@ def _open(problem: Problem, scorer: Convex, cutoff: float, node: _Node) -> _Open
     if bound >= cutoff:
         return _Opened([], np.inf, (), branch.size, bound, 0)
     if branch.size <= _SCREENED:
-        sets = branch.choices()
-        sets = [s for s, holds in zip(sets, problem.rows.hold(sets), strict=True) if holds]
+        sets = problem.rows.holding(branch.choices())
         bounds = np.full(len(sets), bound)
         if tangent is not None:
             bounds = np.maximum(bounds, tangent.values(sets))

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from ..checks import FloatArray, Value, several, short
-from ..errors import LabelError, ModelError, require_known, unknown_label
+from ..errors import LabelError, ModelError, require_known
 from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
 from ..plant.scheduling import port_at, require_positions
 from ..structure import Disc, Rectangle
@@ -107,12 +107,11 @@ def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> d
         )
     own = _ports_of(plant, side)
     found: dict[str, Port] = {}
-    for item in given:
-        port = item
-        if isinstance(item, str):
-            port = found.get(item) or own.get(item)
-            if port is None:
-                raise unknown_label(_NAME[side].lower(), item, list(dict.fromkeys([*own, *found])))
+    for port in given:
+        if isinstance(port, str):
+            known = own | found
+            require_known(_NAME[side].lower(), [port], known)
+            port = known[port]
         if not plant.is_assembled and not isinstance(port, PlantChannel):
             raise ModelError(
                 f"the plant was not assembled from a structure, which would be needed for "

@@ -65,18 +65,15 @@ class LinearRows:
     @classmethod
     def stacked(cls, parts: Sequence[LinearRows], total: int) -> LinearRows:
         """Return the rows of all parts."""
-        found = cls(np.zeros((0, total)), np.zeros(0), np.zeros(0))
-        for part in parts:
-            found = found.and_(part)
-        return found
+        return cls(
+            np.vstack([np.zeros((0, total)), *(part.A for part in parts)]),
+            np.concatenate([np.zeros(0), *(part.lower for part in parts)]),
+            np.concatenate([np.zeros(0), *(part.upper for part in parts)]),
+        )
 
     def and_(self, other: LinearRows) -> LinearRows:
         """Return the rows of both."""
-        return LinearRows(
-            np.vstack([self.A, other.A]),
-            np.concatenate([self.lower, other.lower]),
-            np.concatenate([self.upper, other.upper]),
-        )
+        return LinearRows.stacked([self, other], self.A.shape[1])
 
     def hold(self, sets: Sequence[Sequence[int]]) -> npt.NDArray[np.bool_]:
         """Return which of some choices (m,) satisfy every row."""
@@ -86,6 +83,10 @@ class LinearRows:
         sums = x @ self.A.T
         within = (sums >= self.lower - self._slack) & (sums <= self.upper + self._slack)
         return np.asarray(np.all(within, axis=1))
+
+    def holding(self, sets: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]]:
+        """Return those of some choices that satisfy every row."""
+        return [s for s, holds in zip(sets, self.hold(sets), strict=True) if holds]
 
     def added(self, base: Sequence[int]) -> npt.NDArray[np.bool_]:
         """Return which candidates (N,) exceed no upper limit beside `base` that it does not."""
@@ -200,10 +201,9 @@ class Together(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> pair = fx.placement.Together([["s1", "s3"]])
-    >>> fx.place_sensors(plant, candidates, 2, constraints=[pair]).chosen
-    ('s1', 's3')
+    >>> pair = fx.placement.Together([["y1", "y2"]])
+    >>> fx.place_sensors(plant, ["y1", "y2"], 2, constraints=pair).chosen
+    ('y1', 'y2')
     """
 
     groups: Sequence[Sequence[str]]
@@ -245,10 +245,9 @@ class Mirrored(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
     >>> middle = fx.placement.Mirrored("x", at=1.0)
-    >>> fx.place_sensors(plant, candidates, 2, constraints=[middle]).chosen
-    ('s1', 's3')
+    >>> fx.place_sensors(plant, ["y1", "y2"], 2, constraints=middle).chosen
+    ('y1', 'y2')
     """
 
     axis: str = field(metadata=checked(one_of, choices="xyz"))
@@ -258,16 +257,21 @@ class Mirrored(Constraint):
         """Return x_i - x_j = 0 for images, x_i <= 0 without one."""
         places.require_points()
         k = "xyz".index(self.axis)
-        images = []
-        for points in places.points:
-            image = points.copy()
-            image[:, k] = 2.0 * self.at - image[:, k]
-            images.append(image)
+        flip = np.where(np.arange(3) == k, -1.0, 1.0)
+        images = [points * flip + (1.0 - flip) * self.at for points in places.points]
         near = np.array([[_largest_distance(p, q) for q in images] for p in places.points])
         found = near.argmin(axis=1)
         lone = near.min(axis=1) > places.same
         pairs = [(i, int(j)) for i, j in enumerate(found) if i < j and not lone[i]]
         return LinearRows.equal(pairs, places.total).and_(LinearRows.closed(lone))
+
+
+def _largest_distance(points: FloatArray, others: FloatArray) -> float:
+    """Return the largest distance from any point of one set to the other; inf if sizes differ."""
+    if len(points) != len(others):
+        return np.inf
+    between = np.linalg.norm(points[:, None] - others[None], axis=2)
+    return float(max(between.min(axis=0).max(), between.min(axis=1).max()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,10 +289,9 @@ class Among(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> last = fx.placement.Among(["s3"], at_least=1)
-    >>> fx.place_sensors(plant, candidates, 1, constraints=[last]).chosen
-    ('s3',)
+    >>> last = fx.placement.Among(["y2"], at_least=1)
+    >>> fx.place_sensors(plant, ["y1", "y2"], 1, constraints=last).chosen
+    ('y2',)
     """
 
     names: Sequence[str] = field(metadata=checked(name_list))
@@ -304,14 +307,6 @@ class Among(Constraint):
         row = np.zeros(places.total)
         row[places.index(self.names, "candidate among others")] = 1.0
         return LinearRows.counted(row, self.at_least, self.at_most)
-
-
-def _largest_distance(points: FloatArray, others: FloatArray) -> float:
-    """Return the largest distance from any point of one set to the other; inf if sizes differ."""
-    if len(points) != len(others):
-        return np.inf
-    between = np.linalg.norm(points[:, None] - others[None], axis=2)
-    return float(max(between.min(axis=0).max(), between.min(axis=1).max()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,10 +326,9 @@ class Budget(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> cheap = fx.placement.Budget(2.0, {"s1": 5.0})  # s1 costs 5, the others 1
-    >>> fx.place_sensors(plant, candidates, 1, constraints=[cheap]).chosen
-    ('s3',)
+    >>> cheap = fx.placement.Budget(2.0, {"y1": 5.0})  # y1 costs 5, y2 costs 1
+    >>> fx.place_sensors(plant, ["y1", "y2"], 1, constraints=cheap).chosen
+    ('y2',)
     """
 
     total: float = field(metadata=checked(positive, zero=True))
@@ -381,10 +375,9 @@ class Excluded(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
     >>> off = fx.placement.Excluded(fx.Disc((0.0, 0.0), radius=0.5))  # where the first mass is
-    >>> fx.place_sensors(plant, candidates, 1, constraints=[off]).chosen
-    ('s3',)
+    >>> fx.place_sensors(plant, ["y1", "y2"], 1, constraints=off).chosen
+    ('y2',)
     """
 
     zones: Zone | Sequence[Zone] = field(metadata=checked(_checked_zones, name="an excluded zone"))
@@ -451,10 +444,9 @@ class Within(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
     >>> right = fx.placement.Within(fx.Rectangle((1.5, -1.0), (2.5, 1.0)), at_least=1)
-    >>> fx.place_sensors(plant, candidates, 1, constraints=[right]).chosen
-    ('s3',)
+    >>> fx.place_sensors(plant, ["y1", "y2"], 1, constraints=right).chosen
+    ('y2',)
     """
 
     zones: Zone | Sequence[Zone] = field(metadata=checked(_checked_zones, name="a zone"))
@@ -490,10 +482,9 @@ class MinimumDistance(Constraint):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
     >>> apart = fx.placement.MinimumDistance(1.5)
-    >>> fx.place_sensors(plant, candidates, 2, constraints=[apart]).chosen
-    ('s1', 's3')
+    >>> fx.place_sensors(plant, ["y1", "y2"], 2, constraints=apart).chosen
+    ('y1', 'y2')
     """
 
     distance: float = field(metadata=checked(positive))
@@ -509,7 +500,7 @@ class MinimumDistance(Constraint):
 
 
 def constraint_rows(constraints: Any, places: Places, side: str) -> LinearRows:
-    """Return the rows of all constraints, OffPoi() among them for sensors unless one is given."""
+    """Return the rows of `all_of` the constraints."""
     return LinearRows.stacked([c.rows(places) for c in all_of(constraints, side)], places.total)
 
 
@@ -525,15 +516,14 @@ def constraints_of(constraints: Any) -> tuple[Constraint, ...]:
     given = (constraints,) if isinstance(constraints, Constraint) else constraints
     if isinstance(given, str) or not isinstance(given, Sequence):
         raise ModelError(
-            "constraints are a list of placement.Excluded(...), "
-            "placement.MinimumDistance(...) and others, got "
-            f"{short(given)}. Put them in a list."
+            "constraints are a list of placement.Excluded(...), placement.MinimumDistance(...) and "
+            f"others, got {short(given)}. Put them in a list."
         )
     for item in given:
         if not isinstance(item, Constraint):
             raise ModelError(
                 "a constraint is placement.Excluded(...), placement.MinimumDistance(...) or "
-                "another such value, got "
-                f"{short(item)}. Write placement.Excluded(Disc((0.3, 0.3), radius=0.05)), say."
+                f"another, got {short(item)}. Write placement.Excluded(Disc((0.3, 0.3), "
+                "radius=0.05)), say."
             )
     return tuple(given)

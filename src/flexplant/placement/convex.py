@@ -33,6 +33,13 @@ class Branch:
 
     groups: Groups
 
+    @classmethod
+    def beside(cls, required: Sequence[int], free: Sequence[int], count: int) -> Branch:
+        """Return all choices of `count` that hold the required and else any of the free ones."""
+        kept, more = np.array(sorted(required), np.int64), np.array(free, np.int64)
+        groups = ((kept, kept.size), (more, count - kept.size))
+        return cls(tuple((group, count) for group, count in groups if count))
+
     @property
     def members(self) -> IntArray:
         """Every candidate that appears in a choice."""
@@ -259,10 +266,8 @@ class Convex(Scorer, ABC):
 
     def bound(self, count: int, required: Sequence[int]) -> float:
         """Return a lower bound over all choices of `count` candidates: tangent after tangent."""
-        free = np.setdiff1d(np.arange(self.total), required)
-        kept = np.array(sorted(required), dtype=np.int64)
-        groups = ((kept, kept.size), (free, count - kept.size))
-        return self.relaxation(Branch(tuple((g, n) for g, n in groups if n)))[0]
+        free = [i for i in range(self.total) if i not in required]
+        return self.relaxation(Branch.beside(required, free, count))[0]
 
     def relaxation(self, branch: Branch) -> tuple[float, FloatArray]:
         """Return a lower bound over a branch, and weights near the least relaxed cost.

@@ -255,10 +255,8 @@ class ModalObservability(ModalGramian):
     Examples
     --------
     >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> fx.place_sensors(plant, candidates, 2, fx.placement.ModalObservability()).chosen
-    ('s1', 's3')
+    >>> round(fx.placement.ModalObservability()(fx.testbeds.three_masses()), 3)
+    -114.194
     """
 
     sides: ClassVar[str] = "y"
@@ -282,10 +280,8 @@ class ModalControllability(ModalGramian):
     Examples
     --------
     >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2, 3)]
-    >>> fx.place_actuators(plant, candidates, 1, fx.placement.ModalControllability()).side
-    'u'
+    >>> round(fx.placement.ModalControllability()(fx.testbeds.three_masses()), 3)
+    18.994
     """
 
     sides: ClassVar[str] = "u"

@@ -116,10 +116,8 @@ class AutoMac(ByShapes):
     Examples
     --------
     >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> fx.place_sensors(plant, candidates, 2, fx.placement.AutoMac()).chosen
-    ('s1', 's3')
+    >>> round(fx.placement.AutoMac()(fx.testbeds.three_masses()), 6)
+    0.0
     """
 
     def of(self, plant: StandardPlant, shapes: Shapes) -> LargestMac:
@@ -148,11 +146,9 @@ class KineticEnergy(ByShapes):
     Examples
     --------
     >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
     >>> masses = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
-    >>> fx.place_sensors(plant, candidates, 2, fx.placement.KineticEnergy(masses)).chosen
-    ('s1', 's3')
+    >>> round(fx.placement.KineticEnergy(masses)(fx.testbeds.three_masses()), 6)  # of two modes
+    -1.333333
     """
 
     model: Any = field(
@@ -202,10 +198,8 @@ class SensorIndices(ByShapes):
     Examples
     --------
     >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> fx.place_sensors(plant, candidates, 2, fx.placement.SensorIndices()).chosen
-    ('s1', 's3')
+    >>> round(fx.placement.SensorIndices()(fx.testbeds.three_masses()), 9)
+    -3.3333e-05
     """
 
     norm: str = field(default="h2", metadata=checked(one_of, choices=("h2", "hinf", "hankel")))
@@ -246,10 +240,8 @@ class ActuatorIndices(SensorIndices):
     Examples
     --------
     >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2, 3)]
-    >>> fx.place_actuators(plant, candidates, 1, fx.placement.ActuatorIndices()).side
-    'u'
+    >>> round(fx.placement.ActuatorIndices()(fx.testbeds.three_masses()), 3)
+    -0.167
     """
 
     sides: ClassVar[str] = "u"
@@ -286,10 +278,8 @@ class ModeInformation(ByShapes):
     Examples
     --------
     >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> fx.place_sensors(plant, candidates, 2, fx.placement.ModeInformation(elastic=True)).chosen
-    ('s1', 's3')
+    >>> round(fx.placement.ModeInformation(elastic=True)(fx.testbeds.three_masses()), 3)
+    19.519
     """
 
     sides: ClassVar[str] = "y"
@@ -328,10 +318,9 @@ class ByRows(Search):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
     >>> goal = fx.placement.ModeInformation(elastic=True)
-    >>> fx.place_sensors(plant, candidates, 2, goal, method=fx.placement.ByRows()).chosen
-    ('s1', 's3')
+    >>> fx.place_sensors(plant, ["y1", "y2"], 2, goal, method=fx.placement.ByRows()).chosen
+    ('y1', 'y2')
     """
 
     method: SelectionCriterion = field(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -31,13 +31,13 @@ def checked_names(given: Any, name: str) -> tuple[str, ...] | Mapping[str, float
     """Return names as a tuple, or as a mapping to factors; None stays None."""
     if given is None:
         return None
-    if isinstance(given, Mapping):
-        named = {str(a): positive(f, f"factor of {name} {a!r}") for a, f in given.items()}
-    elif isinstance(given, str | Sequence):
-        listed = (given,) if isinstance(given, str) else tuple(str(a) for a in given)
-        if len(set(listed)) != len(listed):
-            raise LabelError(f"{name} {listed} twice: name each once, with a factor.")
-        named = dict.fromkeys(listed, 1.0)
+    named: Any = (given,) if isinstance(given, str) else given
+    if isinstance(named, Mapping):
+        named = {str(a): positive(f, f"factor of {name} {a!r}") for a, f in named.items()}
+    elif isinstance(named, Sequence):
+        named = tuple(str(a) for a in named)
+        if len(set(named)) != len(named):
+            raise LabelError(f"{name} {named} twice: name each once, with a factor.")
     else:
         raise ModelError(
             f"{name} is a name, several, or a mapping to factors, got {short(given)}. Type "
@@ -45,19 +45,19 @@ def checked_names(given: Any, name: str) -> tuple[str, ...] | Mapping[str, float
         )
     if not named:
         raise LabelError(f"a criterion without any {name} has nothing to sum over: name one.")
-    return named if isinstance(given, Mapping) else tuple(named)
+    found: tuple[str, ...] | Mapping[str, float] = named
+    return found
 
 
 def poi_arguments(poi: Named, axes: Named) -> list[str]:
     """Return POIs and their axes as arguments, for a repr."""
-    parts = [] if poi is None else [repr(_unwrap(poi))]
-    return parts if axes is None else [*parts, f"axes={_unwrap(axes)!r}"]
 
+    def said(named: Any) -> str:
+        alone = isinstance(named, tuple) and len(named) == 1
+        return repr(named[0] if alone else dict(named) if isinstance(named, Mapping) else named)
 
-def _unwrap(named: Any) -> Any:
-    if isinstance(named, Mapping):
-        return dict(named)
-    return named[0] if isinstance(named, tuple) and len(named) == 1 else named
+    parts = [] if poi is None else [said(poi)]
+    return parts if axes is None else [*parts, f"axes={said(axes)}"]
 
 
 def channels_by_poi(plant: StandardPlant) -> dict[str, dict[str, str]]:
@@ -174,6 +174,8 @@ def bare(port: Any) -> bool:
 
 _LAGS = "The end of a record does not depend on a sample: pass one of these."
 _STRUCTURES = "Every choice of sensors gets a plant of its own: pass a structure."
+_STRUCTURE = checked(instance, kind=FEModel | Modes | ReducedModel, hint=_STRUCTURES)
+Lag: TypeAlias = Predictor | Filter | FixedLag
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -218,20 +220,11 @@ class PoiVariance(Criterion):
     sides = "y"
     poi: Named = field(default=None, metadata=checked(checked_names, name="POI"))
     axes: Named = field(default=None, metadata=checked(checked_names, name="axis"))
-    measure: str = field(
-        default="sum", kw_only=True, metadata=checked(one_of, choices=("sum", "max"))
-    )
-    lag: Predictor | Filter | FixedLag | None = field(
-        default=None,
-        kw_only=True,
-        metadata=checked(instance, kind=Predictor | Filter | FixedLag, hint=_LAGS),
-    )
-    larger: Any = field(
-        default=None,
-        kw_only=True,
-        metadata=checked(instance, kind=FEModel | Modes | ReducedModel, hint=_STRUCTURES),
-    )
-    own_modes: bool = field(default=False, kw_only=True, metadata=checked(flag))
+    _: KW_ONLY
+    measure: str = field(default="sum", metadata=checked(one_of, choices=("sum", "max")))
+    lag: Lag | None = field(default=None, metadata=checked(instance, kind=Lag, hint=_LAGS))
+    larger: Any = field(default=None, metadata=_STRUCTURE)
+    own_modes: bool = field(default=False, metadata=checked(flag))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -54,10 +54,8 @@ class Layouts:
     ) -> FloatArray:
         """Return the scores (n,) of many choices, computed on an executor."""
         blocks = [sets[i : i + _BLOCK] for i in range(0, len(sets), _BLOCK)]
-        found = work.mapped(
-            self.score, blocks, description=description, restored=_floats, advice=ADVICE
-        )
-        return np.concatenate(found) if found else np.zeros(0)
+        found = work.mapped(self.score, blocks, description=description, advice=ADVICE)
+        return np.concatenate([np.zeros(0), *found])
 
     def missing(self, chosen: Sequence[int]) -> int:
         """Return how many rigid-body modes a choice has no part in."""
@@ -98,10 +96,6 @@ class Layouts:
         report = assemble_plant(own.realisation, own.ports).check()
         found = [report[ASSUMPTION[part]] for part in self.side]
         return next((item for item in found if not item.holds), found[0])
-
-
-def _floats(row: Any) -> FloatArray:
-    return np.array(row, dtype=np.float64)
 
 
 def layouts_of(
@@ -207,10 +201,8 @@ class Placement(Value):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> best = fx.place_sensors(plant, candidates, 2)
-    >>> best.on(plant).y
-    ('s1', 's3', 'die:ref')
+    >>> fx.place_sensors(plant, ["y1", "y2"], 1).on(plant).y
+    ('y1', 'die:ref')
     """
 
     chosen: tuple[str, ...]
@@ -323,10 +315,8 @@ class Problem:
     @cached_property
     def subsets(self) -> int:
         """How many choices of units there are; some may be against other constraints."""
-        sizes = self._by_size
-        return sum(
-            prod(comb(len(sizes[size]), n) for size, n in mix.items()) for mix in self._mixes()
-        )
+        numbers = {size: len(units) for size, units in self._by_size.items()}
+        return sum(prod(comb(numbers[s], n) for s, n in mix.items()) for mix in self._mixes())
 
     def choices(self) -> Iterator[tuple[int, ...]]:
         """Yield every choice that satisfies the constraints, indices ascending."""
@@ -340,18 +330,12 @@ class Problem:
     @property
     def root(self) -> Branch:
         """All choices, apart from those constraints that exclude no single candidate."""
-        groups = (
-            (np.array(self.required, dtype=np.int64), len(self.required)),
-            (np.array(self.free, dtype=np.int64), self.count - len(self.required)),
-        )
-        return Branch(tuple((group, count) for group, count in groups if count))
+        return Branch.beside(self.required, self.free, self.count)
 
     def bound(self) -> float:
         """Return a number below the score of every choice; minus infinity when none is known."""
         relaxed = self.relaxed()
-        if relaxed is None:
-            return self.layouts.scorer.bound(self.count, self.required)
-        return relaxed[0]
+        return relaxed[0] if relaxed else self.layouts.scorer.bound(self.count, self.required)
 
     def relaxed(self) -> tuple[float, FloatArray] | None:
         """Return a lower bound and weights (N,) near the least relaxed cost, where it is convex."""
@@ -386,7 +370,7 @@ class Problem:
         if not self.rows.A.size:
             weights = None if random is None else random.uniform(0.1, 1.0, self.total)
             return tuple(self.spanning(weights))
-        draws = np.random.default_rng(0) if random is None else random
+        draws = random or np.random.default_rng(0)
         nearest: tuple[int, ...] = ()
         for draw in range(_DRAWS):
             worth = draws.uniform(0.0, 1.0, self.total)
@@ -405,18 +389,15 @@ class Problem:
 
     @cached_property
     def _by_size(self) -> dict[int, list[tuple[int, ...]]]:
-        found: dict[int, list[tuple[int, ...]]] = {}
-        for unit in self.units:
-            found.setdefault(len(unit), []).append(unit)
-        return dict(sorted(found.items()))
+        sizes = sorted({len(unit) for unit in self.units})
+        return {size: [unit for unit in self.units if len(unit) == size] for size in sizes}
 
     def _mixes(self) -> Iterator[dict[int, int]]:
         """Yield how many units of each size make up the count."""
         more, sizes = self.count - len(self.required), list(self._by_size)
         limits = [range(min(len(self._by_size[s]), more // s) + 1) for s in sizes]
-        for numbers in product(*limits):
-            if sum(s * n for s, n in zip(sizes, numbers, strict=True)) == more:
-                yield dict(zip(sizes, numbers, strict=True))
+        mixes = (dict(zip(sizes, numbers, strict=True)) for numbers in product(*limits))
+        return (mix for mix in mixes if sum(s * n for s, n in mix.items()) == more)
 
     def spanning(self, weights: FloatArray | None = None) -> list[int]:
         """Return the required and those that add most to the rigid-body modes seen, one by one.
@@ -425,13 +406,12 @@ class Problem:
         has. Weights (N,) favour some candidates.
         """
         chosen, shut = list(self.required), self.rows.shut(self.required)
-        left = self.layouts.rigid.rows.copy()
+        left = self.layouts.rigid.rows
         for i in self.required:
             left = _rows_without(left, left[i])
         while len(chosen) < self.count:
             sizes = np.linalg.norm(left, axis=1) * (1.0 if weights is None else weights)
-            sizes[chosen] = 0.0
-            sizes[shut] = 0.0
+            sizes[chosen] = sizes[shut] = 0.0
             pick = int(np.argmax(sizes))
             if np.linalg.norm(left[pick]) < WEAK:
                 break
@@ -448,14 +428,8 @@ class Found:
     ----------
     chosen : tuple of int
         Indices of the candidates chosen.
-    value, bound : float
-        Their score, and a number below the score of every choice.
-    evaluations : int
-        How many sets were scored.
-    history : tuple of tuple of float
-        The best score after each step, for each start.
-    stopped : str
-        Why the search ended before it had proven what it should; empty when it did not.
+    value, bound, evaluations, history, stopped
+        As those of a `Placement`.
 
     Examples
     --------

@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from ..checks import FloatArray, IntArray, Value, instance, positive, real_array, short, whole
 from ..errors import LabelError, ModelError, counted
-from ..parallel import mapped
 from ..plant import Sensor, StandardPlant
 from ..plant.port import Quantity
 from ..structure import Disc, Rectangle
@@ -61,10 +60,9 @@ class Scores(Value):
 
     def __repr__(self) -> str:
         feasible = int(np.count_nonzero(np.isfinite(self.values)))
-        head = (
-            f"<Scores of {counted(len(self), 'layout')} by {self.criterion}, {feasible} feasible>"
-        )
-        return "\n".join([head, *self._lines(5)])
+        listed = counted(len(self), "layout")
+        head = f"<Scores of {listed} by {self.criterion}, {feasible} feasible>"
+        return f"{head}\n{self.table(5)}"
 
     @property
     def best(self) -> tuple[str, ...]:
@@ -79,7 +77,11 @@ class Scores(Value):
         count : int
             How many.
         """
-        return "\n".join(self._lines(whole(count, "count")))
+        lines = []
+        for i, value in enumerate(self.values[: whole(count, "count")]):
+            why = f": {self.reasons[i]:.90}" if self.reasons[i] else ""
+            lines.append(f"  {in_words(value, self.unit):<13} {' '.join(self.layouts[i]):.80}{why}")
+        return "\n".join(lines)
 
     def on(self, plant: StandardPlant, *, rank: int = 0) -> StandardPlant:
         """Return the plant with the layout of a rank (0 is the best) instead of its own.
@@ -94,13 +96,6 @@ class Scores(Value):
         rank = whole(rank, "rank", minimum=0, maximum=len(self) - 1)
         known = {port.name: port for port in self.candidates}
         return with_side(plant, self.side, [known[name] for name in self.layouts[rank]])
-
-    def _lines(self, count: int) -> list[str]:
-        lines = []
-        for i, value in enumerate(self.values[:count]):
-            why = f": {self.reasons[i]:.90}" if self.reasons[i] else ""
-            lines.append(f"  {in_words(value, self.unit):<13} {' '.join(self.layouts[i]):.80}{why}")
-        return lines
 
 
 def score_sensors(
@@ -133,10 +128,8 @@ def score_sensors(
     constraints : sequence of Constraint, optional
         As for `place_sensors`: a layout that breaks one is infeasible. Sensors may lie on a POI
         here unless OffPoi() is among them: layouts that are named are scored.
-    executor : concurrent.futures.Executor, optional
-        Computes in chunks; the result is the same to the bit.
-    progress : bool, optional
-        A bar: None shows one on a terminal for work of more than two seconds.
+    executor, progress : optional
+        As for `place_sensors`.
 
     Returns
     -------
@@ -167,9 +160,8 @@ def score_sensors(
     >>> fx.score_sensors(plant, scores.layouts, candidates=candidates, constraints=off).reasons
     ('', '', 'against OffPoi(radius=0.0).')
     """
-    return _score_layouts(
-        plant, "y", layouts, criterion, candidates, constraints, executor, progress
-    )
+    work = Work(executor, progress)
+    return _score_layouts(plant, "y", layouts, criterion, candidates, constraints, work)
 
 
 def score_actuators(
@@ -188,16 +180,10 @@ def score_actuators(
     ----------
     plant : StandardPlant
         Sampled, assembled from a structure.
-    layouts : sequence of layouts
-        A layout is a sequence of `Actuator` values, or of names.
+    layouts, candidates, constraints, executor, progress : optional
+        As for `score_sensors`, of `Actuator` values.
     criterion : PoiLqr or callable, optional
         From a plant to a float, smaller is better; `PoiLqr()` when not given.
-    candidates : sequence of Actuator
-        What names may stand for, besides the plant's own actuators.
-    constraints : sequence of Constraint, optional
-        As for `place_actuators`: a layout that breaks one is infeasible.
-    executor, progress : optional
-        As for `score_sensors`.
 
     Returns
     -------
@@ -218,20 +204,18 @@ def score_actuators(
     >>> scores.best
     ('a2',)
     """
-    return _score_layouts(
-        plant, "u", layouts, criterion, candidates, constraints, executor, progress
-    )
+    work = Work(executor, progress)
+    return _score_layouts(plant, "u", layouts, criterion, candidates, constraints, work)
 
 
 def _score_layouts(
     plant: StandardPlant,
     side: Side,
     layouts: Sequence[Sequence[Any]],
-    criterion: Criterion | Callable[[StandardPlant], float] | None,
+    criterion: Any,
     candidates: Sequence[Any],
     constraints: Sequence[Constraint],
-    executor: Executor | None,
-    progress: bool | None,
+    work: Work,
 ) -> Scores:
     plant = sampled_plant(plant)
     if isinstance(layouts, str) or not isinstance(layouts, Sequence):
@@ -259,10 +243,9 @@ def _score_layouts(
         held = constraint.rows(places).hold(chosen)
         reasons |= dict.fromkeys(np.flatnonzero(~held).tolist(), f"against {constraint!r}.")
     kept = [i for i in range(len(chosen)) if i not in reasons]
-    values[kept] = judged.scores([chosen[i] for i in kept], Work(executor, progress))
+    values[kept] = judged.scores([chosen[i] for i in kept], work)
     lost = [i for i in kept if not np.isfinite(values[i])]
-    why = mapped(judged.reason, [chosen[i] for i in lost], executor=executor, progress=progress)
-    reasons |= dict(zip(lost, why, strict=True))
+    reasons |= dict(zip(lost, work.mapped(judged.reason, [chosen[i] for i in lost]), strict=True))
     order = np.argsort(values, kind="stable")
     judged.confirm(chosen[order[0]], float(values[order[0]]))
     return Scores(
@@ -300,9 +283,8 @@ class DeviceWorth(Value):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
-    >>> fx.placement.device_worth(plant, fx.place_sensors(plant, candidates, 2)).names
-    ('s1', 's3')
+    >>> fx.placement.device_worth(plant, fx.place_sensors(plant, ["y1", "y2"], 2)).names
+    ('y1', 'y2')
     """
 
     names: Sequence[str]
@@ -358,9 +340,8 @@ def device_worth(
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
-    >>> worth = fx.placement.device_worth(plant, fx.place_sensors(plant, candidates, 2))
-    >>> bool(worth.without[0] > worth.without[1])  # s1, beside the disturbance, is worth more
+    >>> worth = fx.placement.device_worth(plant, fx.place_sensors(plant, ["y1", "y2"], 2))
+    >>> bool(worth.without[0] > worth.without[1])  # y1, beside the disturbance, is worth more
     True
     """
     plant = sampled_plant(plant)
@@ -447,10 +428,8 @@ def sensor_map(
         From a plant to a float, smaller is better; `PoiVariance()` when not given.
     asd : float [m/sqrt(Hz), ...]
         Noise of the new sensor, as in `Sensor`.
-    direction : str
-        What it measures at the point.
-    quantity : {"displacement", "velocity", "acceleration"}
-        What it measures.
+    direction, quantity : str
+        What it measures, as in `Sensor`.
     constraints : sequence of Constraint, optional
         As for `place_sensors`: points at which one more sensor breaks one are left out. A point on
         a POI is, unless OffPoi(-1) is among them.
@@ -464,17 +443,12 @@ def sensor_map(
 
     Raises
     ------
-    ModelError
-        When the plant is not sampled or has no structure, something is no constraint, or no point
-        satisfies them.
+    ModelError, AssumptionError, CertificateError
+        As `score_sensors`; or when no point satisfies the constraints.
     ShapeError
         When the points are not (n, 3).
     LabelError
         When a point is off the structure or the direction is unknown.
-    AssumptionError
-        When even a sensor at every point misses a rigid-body mode, which is named.
-    CertificateError
-        When the best score is not confirmed by the other route.
 
     Examples
     --------
@@ -498,8 +472,7 @@ def sensor_map(
     free = constraint_rows(constraints, where, "y").added(range(len(own)))[len(own) :]
     if not np.any(free):
         raise ModelError(
-            "there is no point to try: give at least one"
-            + (" that satisfies the constraints." if len(tried) else ".")
+            "there is no point to try: give at least one that satisfies the constraints."
         )
     places, tried = places[free], [sensor for sensor, kept in zip(tried, free, strict=True) if kept]
     zones = tuple(zone for item in all_of(constraints, "y") for zone in item.drawn(where))
@@ -510,11 +483,5 @@ def sensor_map(
     values = layouts.scores(sets, Work(executor, progress), "points")
     best = 1 + int(np.argmin(values[1:]))
     layouts.confirm(sets[best], float(values[best]))
-    return SensorMap(
-        places,
-        values[1:],
-        float(values[0]),
-        repr(layouts.criterion),
-        zones,
-        layouts.criterion.unit(plant),
-    )
+    criterion, unit = layouts.criterion, layouts.criterion.unit(plant)
+    return SensorMap(places, values[1:], float(values[0]), repr(criterion), zones, unit)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, Rng, Value, instance, name_list, positive, short, whole
+from ..checks import FloatArray, Rng, Value, checked, instance, name_list, positive, short, whole
 from ..errors import InfeasibleError, LabelError, ModelError, counted, require_known
 from ..fingerprint import fingerprint
 from ..plant import Actuator, StandardPlant
@@ -102,8 +102,8 @@ def place_sensors(
     >>> best.chosen, best.proven
     (('s1',), True)
     """
-    options = (constraints, method, executor, checkpoint, progress, rng)
-    return _placement(plant, {"y": (candidates, count)}, criterion, required, *options)
+    problem = problem_of(plant, {"y": (candidates, count)}, criterion, required, constraints)
+    return _solution(problem, method, executor, checkpoint, progress, rng)
 
 
 def place_actuators(
@@ -153,8 +153,8 @@ def place_actuators(
     >>> fx.place_actuators(plant, candidates, 1).proven
     True
     """
-    options = (constraints, method, executor, checkpoint, progress, rng)
-    return _placement(plant, {"u": (candidates, count)}, criterion, required, *options)
+    problem = problem_of(plant, {"u": (candidates, count)}, criterion, required, constraints)
+    return _solution(problem, method, executor, checkpoint, progress, rng)
 
 
 def place_both(
@@ -182,20 +182,14 @@ def place_both(
     plant : StandardPlant
         Sampled, assembled from a structure; its own sensors and actuators are not used.
     sensors, actuators : sequence of Sensor, sequence of Actuator
-        Each may be chosen once; a name stands for one of the plant's own.
+        The candidates.
     counts : (int, int)
         How many sensors and how many actuators, `required` included.
     criterion : ClosedLoopH2 or callable, optional
         From a plant to a float, smaller is better; `ClosedLoopH2()` when not given.
-    required : sequence of str
-        Candidates of either kind that any choice includes.
-    constraints : sequence of Constraint, optional
-        What every choice satisfies, as for `place_sensors`. They see sensors and actuators alike:
-        a minimum distance is also one between a sensor and an actuator.
-    method : Search, optional
-        Every pair where there are at most 1500, else `Exchange()`, when not given.
-    executor, checkpoint, progress, rng : optional
-        As for `place_sensors`.
+    required, constraints, method, executor, checkpoint, progress, rng : optional
+        As for `place_sensors`, of candidates of either kind. Constraints see sensors and actuators
+        alike: a minimum distance is also one between a sensor and an actuator.
 
     Returns
     -------
@@ -221,34 +215,24 @@ def place_both(
         raise ModelError(
             f"counts are two numbers, of sensors and actuators, got {short(counts)}. Type (4, 3)."
         )
-    options = (constraints, method, executor, checkpoint, progress, rng)
-    chosen = {"y": (sensors, counts[0]), "u": (actuators, counts[1])}
-    return _placement(plant, chosen, criterion, required, *options)
+    wanted = {"y": (sensors, counts[0]), "u": (actuators, counts[1])}
+    problem = problem_of(plant, wanted, criterion, required, constraints)
+    return _solution(problem, method, executor, checkpoint, progress, rng)
 
 
-def _placement(
-    plant: StandardPlant,
-    wanted: Mapping[str, tuple[Sequence[Any], int]],
-    criterion: Criterion | Callable[[StandardPlant], float] | None,
-    required: Sequence[str],
-    constraints: Sequence[Constraint],
+def _solution(
+    problem: Problem,
     method: Search | None,
     executor: Executor | None,
     checkpoint: str | Path | None,
     progress: bool | None,
     rng: Rng,
 ) -> Placement:
-    plant = sampled_plant(plant)
-    problem = problem_of(plant, wanted, criterion, required, constraints)
-    layouts, ports = problem.layouts, problem.layouts.candidates
+    layouts, plant, ports = problem.layouts, problem.layouts.plant, problem.layouts.candidates
     if method is None:
         method = Exhaustive() if problem.subsets <= _FEW else Exchange()
-    instance(
-        method,
-        Search,
-        "method",
-        "Pass placement.Exchange(...), placement.BranchAndBound(...) or placement.Exhaustive().",
-    )
+    hint = "Pass placement.Exchange(...), placement.BranchAndBound(...) or placement.Exhaustive()."
+    instance(method, Search, "method", hint)
     header = {}
     if checkpoint is not None:
         parts = [plant, *ports, layouts.criterion, problem.count, problem.required, problem.rows]
@@ -261,17 +245,14 @@ def _placement(
             f"last reason: {layouts.reason(found.chosen)} Give more candidates or a larger count."
         )
     layouts.confirm(found.chosen, found.value)
+    chosen = tuple(ports[i] for i in found.chosen)
     return Placement(
-        tuple(ports[i].name for i in found.chosen),
-        found.value,
-        found.bound,
-        found.evaluations,
-        found.history,
-        repr(layouts.criterion),
-        tuple(ports[i] for i in found.chosen),
-        layouts.side,
-        found.stopped,
-        layouts.criterion.unit(plant),
+        chosen=tuple(port.name for port in chosen),
+        criterion=repr(layouts.criterion),
+        ports=chosen,
+        side=layouts.side,
+        unit=layouts.criterion.unit(plant),
+        **{name: value for name, value in vars(found).items() if name != "chosen"},
     )
 
 
@@ -288,15 +269,11 @@ class Exhaustive(Search):
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
-    >>> fx.place_sensors(plant, candidates, 1, method=fx.placement.Exhaustive()).proven
+    >>> fx.place_sensors(plant, ["y1", "y2"], 1, method=fx.placement.Exhaustive()).proven
     True
     """
 
-    limit: int = 200_000
-
-    def __post_init__(self) -> None:
-        self._set(limit=whole(self.limit, "limit"))
+    limit: int = field(default=200_000, metadata=checked(whole))
 
     def search(self, problem: Problem, work: Work) -> Found:
         """Return the best of all subsets; see `Search.search`. Nothing is random.
@@ -310,8 +287,7 @@ class Exhaustive(Search):
             raise ModelError(
                 f"there are {counted(problem.subsets, 'subset')}, more than "
                 f"placement.Exhaustive(limit={self.limit}) allows. Use placement.Exchange(), "
-                "whose bound shows how far "
-                "from the optimum it can be, or a higher limit."
+                "whose bound shows how far from the optimum it can be, or a higher limit."
             )
         sets = list(problem.choices())
         values = problem.layouts.scores(sets, work, "every subset")
@@ -328,21 +304,27 @@ def problem_of(
     constraints: Sequence[Constraint],
 ) -> Problem:
     """Return the problem of choosing so many candidates of each side, with everything checked."""
+    plant = sampled_plant(plant)
     listed = {side: _candidate_ports(plant, side, given) for side, (given, _) in wanted.items()}
     ports = tuple(port for part in listed.values() for port in part)
     names = [port.name for port in ports]
-    kept = _required(names, required)
-    counts = {
-        side: whole(count, "count", maximum=max(len(listed[side]), 1))
-        for side, (_, count) in wanted.items()
-    }
-    _check_counts(counts, [ports[i] for i in kept])
+    needed = name_list(required, "required candidates")
+    require_known("required candidate", needed, names)
+    kept = tuple(sorted({names.index(name) for name in needed}))
+    counts = {}
+    for part, (_, count) in wanted.items():
+        counts[part] = whole(count, "count", maximum=max(len(listed[part]), 1))
+        least = sum(side_of(ports[i]) == part for i in kept)
+        if least > counts[part]:
+            raise ModelError(f"count is {counts[part]}, and {least} candidates are required.")
     side: Any = "".join(wanted)
     layouts = layouts_of(plant, side, ports, criterion)
     layouts.require_any()
     rows = constraint_rows(constraints, candidate_places(plant, ports), side)
     if len(wanted) > 1:
-        rows = rows.and_(_count_rows(ports, counts))
+        own = np.array([[side_of(port) == part for port in ports] for part in counts], dtype=float)
+        exact = np.array(list(counts.values()), dtype=np.float64)
+        rows = rows.and_(LinearRows(own, exact, exact))
         if isinstance(layouts.scorer, Separation):
             numbers = (counts["y"], counts["u"])
             layouts = replace(layouts, scorer=replace(layouts.scorer, counts=numbers))
@@ -358,20 +340,6 @@ def _candidate_ports(plant: StandardPlant, side: str, given: Sequence[Any]) -> t
     if len(ports) != len(tuple(given)):
         raise LabelError("a candidate is listed twice: each may be chosen once.")
     return ports
-
-
-def _check_counts(counts: Mapping[str, int], kept: Sequence[Port]) -> None:
-    for side, count in counts.items():
-        needed = sum(side_of(port) == side for port in kept)
-        if needed > count:
-            raise ModelError(f"count is {count}, and {needed} candidates are required.")
-
-
-def _count_rows(ports: Sequence[Port], counts: Mapping[str, int]) -> LinearRows:
-    """Return the rows by which so many of each side are chosen."""
-    A = np.array([[side_of(port) == side for port in ports] for side in counts], dtype=np.float64)
-    exact = np.array(list(counts.values()), dtype=np.float64)
-    return LinearRows(A, exact, exact)
 
 
 def _require_start(
@@ -393,12 +361,6 @@ def _require_start(
             f"{what} will do; of the nearest one: {layouts.reason(first)} Choose more, or require "
             "others."
         )
-
-
-def _required(names: Sequence[str], required: Sequence[str]) -> tuple[int, ...]:
-    listed = name_list(required, "required candidates")
-    require_known("required candidate", listed, names)
-    return tuple(sorted({names.index(name) for name in listed}))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -425,14 +387,11 @@ class ParetoCurve(Value):
     def __repr__(self) -> str:
         what = "cost" if self.by_cost else "count"
         lines = [f"<ParetoCurve by {what}, {self.placements[0].criterion}>"]
-        for amount, best, bound in zip(
-            self.amounts[:6], self.placements[:6], self.bounds[:6], strict=True
-        ):
+        for i, best in enumerate(self.placements[:6]):
+            amount, bound = self.amounts[i], self.bounds[i]
             low = f", none below {in_words(bound, self.unit)}" if np.isfinite(bound) else ""
-            lines.append(
-                f"  {amount:<6g} {in_words(best.value, self.unit)}{low}: "
-                f"{' '.join(best.chosen):.60}"
-            )
+            value, chosen = in_words(best.value, self.unit), " ".join(best.chosen)
+            lines.append(f"  {amount:<6g} {value}{low}: {chosen:.60}")
         if len(self.placements) > 6:
             lines.append(f"  and {len(self.placements) - 6} more")
         return "\n".join(lines)
@@ -495,8 +454,7 @@ def pareto_curve(
     --------
     >>> import flexplant as fx
     >>> plant = fx.testbeds.three_masses()
-    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
-    >>> curve = fx.placement.pareto_curve(plant, candidates, [1, 2])
+    >>> curve = fx.placement.pareto_curve(plant, ["y1", "y2"], [1, 2])
     >>> bool(curve.values[1] < curve.values[0])
     True
     """

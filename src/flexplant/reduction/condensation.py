@@ -14,7 +14,7 @@ from ..errors import ModelError, ShapeError, SolverError, counted
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..sparse.factor import dense, unit_diagonal
-from ..structure import Damping, FEModel, ModalDamping
+from ..structure import FEModel, ModalDamping
 from ..tolerances import RANK, ROUNDING, SAME, TINY
 from .methods import (
     ReductionMethod,
@@ -201,7 +201,8 @@ class Irs(ReductionMethod):
             # rigid-body motions have no rate: rounding in K is kept out of them
             inertia = inertia - inertia @ rigid @ la.pinv(rigid) if rigid.shape[1] else inertia
             T = part.static + part.whole(np.zeros_like(rates), part.solver.solve(inertia))
-            if before.size and _is_settled(squares, before, self.tolerance):
+            floor = self.tolerance * np.abs(squares) + ROUNDING * squares[-1]
+            if before.size and np.all(np.abs(squares - before) <= floor):
                 break
             before = squares
         return projected_model(
@@ -230,11 +231,6 @@ def _rates(M: FloatArray, K: FloatArray) -> tuple[FloatArray, FloatArray]:
     half = la.solve_triangular(lower, stiffness, lower=True)
     squares = la.eigvalsh(la.solve_triangular(lower, half.T, lower=True))
     return np.asarray(rates), np.asarray(squares)
-
-
-def _is_settled(squares: FloatArray, before: FloatArray, tolerance: float) -> bool:
-    floor = ROUNDING * squares[-1]
-    return bool(np.all(np.abs(squares - before) <= tolerance * np.abs(squares) + floor))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -284,14 +280,13 @@ class Serep(ReductionMethod):
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the model in these DOFs; `reduce` is the public way."""
         model, labels = fe_model(structure, self), tuple(self.dofs)
-        rows = model.dofs.indices(labels)
-        numbers = tuple(range(1, len(labels) + 1)) if self.modes is None else tuple(self.modes)
+        numbers = tuple(self.modes or range(1, len(labels) + 1))
         modes = solve_modes(model, damping=ModalDamping(0.0), count=max(numbers))
         phi = np.real(modes.phi)[:, kept_columns(numbers, modes)]
-        condition = refused_partition(modes.dofs, phi, labels, f"{len(labels)} modes", 1e6)
+        condition = refused_partition(modes.dofs, phi, labels, f"{len(labels)} modes")
         return projected_model(
             model,
-            la.solve(phi[rows].T, phi.T).T,
+            la.solve(phi[model.dofs.indices(labels)].T, phi.T).T,
             dofs=model.dofs.select(labels),
             method=f"{counted(len(labels), 'mode')} (SEREP)",
             damping=self.damping,
@@ -402,20 +397,51 @@ class _FreeInterface(ReductionMethod):
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model; `reduce` is the public way."""
-        labels = tuple(self.boundary)
-        method = f"{counted(self.modes, 'free mode')} and {self._kind} ({type(self).__name__})"
-        parts = self._parts(fe_model(structure, self), labels)
-        return _built(*parts, labels, self.damping, massless=self._massless, method=method)
-
-    def _parts(
-        self, model: FEModel, labels: tuple[str, ...]
-    ) -> tuple[FEModel, Modes, FloatArray, FloatArray]:
-        """Return the model, its modes with vectors, T, and the map from (u_b, p) to (p, g)."""
-        b = len(labels)
+        model, labels, massless = fe_model(structure, self), tuple(self.boundary), self._massless
         modes = solve_modes(
             model, damping=ModalDamping(0.0), count=self.modes, compliance_at=list(labels)
         )
-        rows = model.dofs.indices(labels)
+        T, back = self._coordinates(modes, labels)
+        b, k, r = len(labels), modes.n_modes, modes.n_rigid
+        light = np.concatenate([np.ones(k), np.full(modes.n_vectors, 0.0 if massless else 1.0)])
+        M = (back.T * light) @ back
+        K = (back.T * modes.basis_omega**2) @ back
+        if self.damping is not None:
+            count = k if massless else light.size
+            shapes, omega = np.real(modes.basis)[:, :count], modes.basis_omega[:count]
+            rate = np.zeros(light.size)
+            rate[:count] = 2 * self.damping.ratios(omega, shapes, model.K, model.dofs) * omega
+            D = (back.T * rate) @ back
+        elif model.D is None:
+            D = np.zeros_like(M)
+        else:
+            D = inner(model.D, np.real(modes.basis)) * np.outer(light, light)
+            D = back.T @ D @ back
+        rigid = np.zeros((light.size, r))
+        rigid[:b], rigid[b : b + r] = np.real(modes.phi)[model.dofs.indices(labels), :r], np.eye(r)
+        if massless:
+            # exactly: zeros say which coordinates have no mass
+            for matrix in (M, D):
+                matrix[:b], matrix[:, :b] = 0.0, 0.0
+        values = la.eigvalsh(dense(unit_diagonal(M[b:, b:] if massless else M)[0]))
+        return ReducedModel(
+            M=0.5 * (M + M.T),
+            D=0.5 * (D + D.T),
+            K=0.5 * (K + K.T),
+            T=T,
+            dofs=model.dofs.select(labels),
+            full_dofs=model.dofs,
+            rigid_body=rigid,
+            method=f"{counted(self.modes, 'free mode')} and {self._kind} ({type(self).__name__})",
+            condition=float(values[-1] / values[0]),
+            condition_of="M*",
+            coordinates=(*labels, *(f"mode {i}" for i in range(1, k + 1))),
+            static_at=labels,
+        )
+
+    def _coordinates(self, modes: Modes, labels: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
+        """Return T, and the map from (u_b, p) to (p, g)."""
+        b, rows = len(labels), modes.dofs.indices(labels)
         phi, vectors = np.real(modes.phi), modes.vectors
         at = vectors[rows]
         scaled, _ = unit_diagonal(at @ at.T)
@@ -432,59 +458,7 @@ class _FreeInterface(ReductionMethod):
         back = np.block([[np.zeros((k, b)), np.eye(k)], [inverse, -inverse @ phi[rows]]])
         T = np.hstack([phi, vectors]) @ back
         T[rows] = np.eye(b, b + k)
-        return model, modes, T, back
-
-
-def _built(
-    model: FEModel,
-    modes: Modes,
-    T: FloatArray,
-    back: FloatArray,
-    labels: tuple[str, ...],
-    damping: Damping | None,
-    *,
-    massless: bool,
-    method: str,
-) -> ReducedModel:
-    k, r = modes.n_modes, modes.n_rigid
-    light = np.concatenate([np.ones(k), np.full(modes.n_vectors, 0.0 if massless else 1.0)])
-    M = (back.T * light) @ back
-    K = (back.T * modes.basis_omega**2) @ back
-    if damping is not None:
-        count = k if massless else light.size
-        shapes, omega = np.real(modes.basis)[:, :count], modes.basis_omega[:count]
-        zeta = damping.ratios(omega, shapes, model.K, model.dofs)
-        rate = np.zeros(light.size)
-        rate[: zeta.size] = 2 * zeta * modes.basis_omega[: zeta.size]
-        D = (back.T * rate) @ back
-    elif model.D is None:
-        D = np.zeros_like(M)
-    else:
-        D = inner(model.D, np.real(modes.basis)) * np.outer(light, light)
-        D = back.T @ D @ back
-    rigid = np.zeros((light.size, r))
-    b = len(labels)
-    rows = model.dofs.indices(labels)
-    rigid[:b], rigid[b : b + r] = np.real(modes.phi)[rows, :r], np.eye(r)
-    if massless:
-        # exactly: zeros say which coordinates have no mass
-        for matrix in (M, D):
-            matrix[:b], matrix[:, :b] = 0.0, 0.0
-    values = la.eigvalsh(dense(unit_diagonal(M[b:, b:] if massless else M)[0]))
-    return ReducedModel(
-        M=0.5 * (M + M.T),
-        D=0.5 * (D + D.T),
-        K=0.5 * (K + K.T),
-        T=T,
-        dofs=model.dofs.select(labels),
-        full_dofs=model.dofs,
-        rigid_body=rigid,
-        method=method,
-        condition=float(values[-1] / values[0]),
-        condition_of="M*",
-        coordinates=(*labels, *(f"mode {i}" for i in range(1, k + 1))),
-        static_at=labels,
-    )
+        return T, back
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, Self, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, real_array, short, whole
 from ..errors import ModelError, counted
-from ..labels import DofSet, Place
+from ..labels import Place
 from ..lti.frequency_sweep import climbed_grid
 from ..modes.attachment_vectors import labels_of, places, static_response
 from ..modes.dynamic_basis import DirectCheck, DynamicBasis, antiresonances, checked_response
@@ -24,6 +24,8 @@ from .ranking import ErrorBound
 
 #: refinements of the frequencies at which the error is largest
 _ROUNDS = 3
+#: a `ReducedModel`, whose module imports this one
+Reduced: TypeAlias = Any
 
 
 def quality_of(
@@ -43,7 +45,9 @@ def quality_of(
             f"a reduced model is compared with the FEModel or Modes it was made of, got {what}: "
             "pass that."
         )
-    low, high = _band(band)
+    low, high = real_array(band, "band", (2,)).tolist()
+    if not 0 <= low < high:
+        raise ModelError(f"band must be two rising frequencies [Hz], got {[low, high]}.")
     pushed, watched = _judged_places(reduced, inputs, outputs)
     own = _undamped_modes(reduced)
     modes = _full_modes(full, count, high)
@@ -81,12 +85,14 @@ def quality_of(
         # of the largest response there: a mode on a node line makes no resonance of that pair
         at_peaks = gap / larger.max(axis=(1, 2), keepdims=True, initial=0.0)
         at_dips = gap / larger
+    channels = labels_of(pushed, full.dofs), labels_of(watched, full.dofs)
     bound = reduced.bound
-    if bound is not None and (bound.inputs, bound.outputs) != (
-        labels_of(pushed, full.dofs),
-        labels_of(watched, full.dofs),
-    ):
+    if bound is not None and (bound.inputs, bound.outputs) != channels:
         bound = None
+    covered = bound is not None and (
+        bound.covers is None or (isinstance(full, Modes) and full.n_modes <= bound.covers)
+    )
+    true = np.linalg.norm(found - whole_response, 2, axis=(1, 2)) if gap.size else np.zeros(0)
     return ReductionQuality(
         **_mode_comparison(full, modes, own, count, high),
         check_freq=grid,
@@ -94,17 +100,14 @@ def quality_of(
         resonance_error=_largest_error(at_peaks, np.isin(grid, peaks)),
         antiresonance_error=_largest_error(at_dips, np.isin(grid, deep)),
         static_error=static_error(responses.static(), reduced, Br, Cr),
-        true_error=float(np.linalg.norm(found - whole_response, 2, axis=(1, 2)).max(initial=0.0))
-        if gap.size
-        else 0.0,
+        true_error=float(true.max(initial=0.0)),
         condition=reduced.condition,
-        inputs=labels_of(pushed, full.dofs),
-        outputs=labels_of(watched, full.dofs),
+        inputs=channels[0],
+        outputs=channels[1],
         full_error=np.nan if responses.check is None else responses.check.worst,
         route=str(responses),
         bound=bound,
-        bounded=bound is not None
-        and (bound.covers is None or (isinstance(full, Modes) and full.n_modes <= bound.covers)),
+        bounded=covered,
     )
 
 
@@ -113,13 +116,6 @@ def _largest_error(error: FloatArray, chosen: Any) -> FloatArray:
     if not chosen.any():
         return np.full(error.shape[1:], np.nan)
     return np.asarray(error[chosen].max(axis=0))
-
-
-def _band(band: Any) -> tuple[float, float]:
-    ends = real_array(band, "band", (2,))
-    if not 0 <= ends[0] < ends[1]:
-        raise ModelError(f"band must be two rising frequencies [Hz], got {ends.tolist()}.")
-    return float(ends[0]), float(ends[1])
 
 
 def _judged_places(reduced: Reduced, inputs: Any, outputs: Any) -> tuple[list[Place], list[Place]]:
@@ -154,8 +150,8 @@ def _loss(reduced: Reduced, own: Modes, loss: float | None) -> float:
 def _full_modes(full: FEModel | Modes, count: int | None, high: float) -> Modes:
     if isinstance(full, Modes):
         return full
-    number = 0 if count is None else whole(count, "count", maximum=full.n_dof)
-    return modes_reaching(full, high, least=number)
+    least = 0 if count is None else whole(count, "count", maximum=full.n_dof)
+    return modes_reaching(full, high, least=least)
 
 
 def _mode_comparison(
@@ -164,9 +160,7 @@ def _mode_comparison(
     """Return the pairs of full and reduced modes, and how alike they are."""
     wanted = whole(count, "count") if count is not None else int(np.sum(modes.freq <= high))
     phi: Any = np.asarray(modes.phi)[:, :wanted]
-    f = modes.freq[:wanted]
-    own = found.freq
-    shapes = np.real(found.phi)
+    f, own, shapes = modes.freq[:wanted], found.freq, np.real(found.phi)
     if isinstance(full, FEModel):
         loaded = np.asarray(full.M @ shapes)
         weighted, full_gram = loaded, phi.conj().T @ np.asarray(full.M @ phi)
@@ -175,7 +169,7 @@ def _mode_comparison(
         straight = np.array([":r" not in label for label in full.dofs.labels])
         seen = straight if straight.any() else np.ones_like(straight)
         weighted, full_gram = shapes * seen[:, None], phi[seen].conj().T @ phi[seen]
-        orthogonality = float("nan")
+        orthogonality = np.nan
     gram = shapes.T @ weighted
     pairs = pair_modes(f, own, full_gram, phi.conj().T @ weighted, gram, n_rigid=modes.n_rigid)
     found_freq = np.where(pairs.partner >= 0, own[pairs.partner], np.nan)
@@ -193,8 +187,7 @@ def _mode_comparison(
 
 
 def _undamped_modes(reduced: Reduced) -> Modes:
-    bare = reduced.replace(D=np.zeros_like(reduced.D))
-    found = bare.modes()
+    found: Modes = reduced.replace(D=np.zeros_like(reduced.D)).modes()
     if not reduced.is_physical:
         return found
     return found.replace(phi=reduced.T @ found.phi, dofs=reduced.full_dofs)
@@ -206,30 +199,6 @@ _GRID = 200
 _CHECKS, _SMALL = (6, 3), 2000
 #: their difference, of the peak, from which on they join the basis
 _TOLERANCE = 1e-4
-
-
-@dataclass(frozen=True, eq=False, repr=False, match_args=False)
-class Reduced(Protocol):
-    """What a comparison reads of a `ReducedModel`, which offers it as its `quality`."""
-
-    M: FloatArray
-    D: FloatArray
-    K: FloatArray
-    T: FloatArray
-    full_dofs: DofSet
-    rigid_body: FloatArray
-    condition: float
-    bound: ErrorBound | None
-
-    @property
-    def is_physical(self) -> bool:
-        """Whether all coordinates are DOFs of the structure."""
-
-    def modes(self) -> Modes:
-        """Return all modes."""
-
-    def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed."""
 
 
 #: gives the responses (f, p, q) at frequencies [Hz]

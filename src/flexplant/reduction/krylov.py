@@ -109,8 +109,7 @@ class Krylov(ReductionMethod):
 
 def _real_moments(model: FEModel, B: FloatArray, omega: float, count: int, D: Any) -> FloatArray:
     """Return a basis of the moments of an undamped model, or at 0 Hz."""
-    M: Any = model.M
-    K: Any = model.K
+    M, K = model.M, model.K
     if omega > 0:
         solve: Any = _factorised(K - omega**2 * M, omega)
     elif sp.issparse(K) and sp.issparse(M) and model.n_dof > DENSE_LIMIT:
@@ -123,9 +122,8 @@ def _real_moments(model: FEModel, B: FloatArray, omega: float, count: int, D: An
     found = [block]
     for _ in range(count - 1):
         # a new start in the same Krylov space: what is already there taken out first
-        block = _normed(
-            model, _orthogonal_to(model, np.hstack(found), solve(np.asarray(model.M @ block)))
-        )
+        fresh = solve(np.asarray(model.M @ block))
+        block = _normed(model, _orthogonal_to(model, np.hstack(found), fresh))
         found.append(block)
     return np.hstack(found)
 
@@ -133,8 +131,7 @@ def _real_moments(model: FEModel, B: FloatArray, omega: float, count: int, D: An
 def _moments(model: FEModel, D: Any, B: FloatArray, s: complex, count: int) -> FloatArray:
     """Return a real basis of the moments of a damped model at s."""
     M: Any = model.M
-    K: Any = model.K
-    solve = _factorised(s**2 * M + s * D + K, abs(s))
+    solve = _factorised(s**2 * M + s * D + model.K, abs(s))
     found = _second_order(solve, 2 * s * M + D, M, B, count)
     return np.hstack([found.real, found.imag])
 
@@ -162,9 +159,8 @@ def _second_order(
 def _factorised(matrix: Any, omega: float) -> Callable[[Any], Any]:
     """Return a solver of an indefinite or complex symmetric matrix."""
     at = f"{omega / (2 * np.pi):.6g} Hz"
-    kind, small = matrix.dtype, matrix.shape[0] <= DENSE_LIMIT
-    is_sparse = sp.issparse(matrix)
-    if small or not is_sparse:
+    kind = matrix.dtype
+    if matrix.shape[0] <= DENSE_LIMIT or not sp.issparse(matrix):
         full = matrix.toarray() if hasattr(matrix, "toarray") else np.asarray(matrix)
         size = 1.0 / np.sqrt(np.abs(np.diag(full)).clip(TINY))
         factor = la.lu_factor(full * size[:, None] * size)

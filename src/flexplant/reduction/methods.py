@@ -266,20 +266,16 @@ class DesiredDofs(ReductionMethod):
                 "dampers to the reduced model; or reduce(model, Serep(dofs)), which keeps D."
             )
         if len(labels) != k:
+            advice = f"Name {counted(k - len(labels), 'more DOF')} or keep fewer modes"
+            if len(labels) > k:
+                advice = f"Leave out {counted(len(labels) - k, 'DOF')} or keep more modes"
             raise ShapeError(
                 f"{counted(len(labels), 'desired DOF')} for {counted(modes.n_modes, 'mode')} plus "
                 f"{modes.n_vectors} attachment vectors = {k}: phi_kk in equation (7) must be "
-                "square. "
-                + (
-                    f"Name {counted(k - len(labels), 'more DOF')} or keep fewer modes"
-                    if len(labels) < k
-                    else f"Leave out {counted(len(labels) - k, 'DOF')} or keep more modes"
-                )
-                + f"; select_dofs(modes, {k}) finds a good set."
+                f"square. {advice}; select_dofs(modes, {k}) finds a good set."
             )
         basis = np.asarray(modes.basis, dtype=np.float64)
-        what = f"{k} modes and vectors"
-        condition = refused_partition(modes.dofs, basis, labels, what, _CONDITION_LIMIT)
+        condition = refused_partition(modes.dofs, basis, labels, f"{k} modes and vectors")
         partition = basis[modes.dofs.indices(labels)]
         inverse = la.inv(partition)
         return ReducedModel(
@@ -290,7 +286,8 @@ class DesiredDofs(ReductionMethod):
             dofs=modes.dofs.select(labels),
             full_dofs=modes.dofs,
             rigid_body=partition[:, : modes.n_rigid],
-            method=_modes_text(modes),
+            method=counted(modes.n_modes, "mode")
+            + (f" and {counted(modes.n_vectors, 'attachment vector')}" if modes.n_vectors else ""),
             condition=condition,
             truncated=truncated,
             n_vectors=modes.n_vectors,
@@ -310,18 +307,16 @@ class DesiredDofs(ReductionMethod):
         return solve_modes(structure, count=count, damping=self.damping, compliance_at=static)
 
 
-def refused_partition(
-    dofs: DofSet, basis: FloatArray, labels: tuple[str, ...], what: str, limit: float
-) -> float:
+def refused_partition(dofs: DofSet, basis: FloatArray, labels: tuple[str, ...], what: str) -> float:
     """Return the condition of phi_kk."""
-    partition = basis[dofs.indices(labels)]
-    singular = la.svdvals(partition)
+    singular = la.svdvals(basis[dofs.indices(labels)])
     condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else np.inf
-    if condition < limit:
+    if condition < _CONDITION_LIMIT:
         return condition
     raise ModelError(
-        f"phi_kk is near singular: condition {condition:.3g} (limit {limit:.0e}). The DOFs do not "
-        f"distinguish the {what}, and M*, K* would be rounding. " + _proposal(dofs, basis, labels)
+        f"phi_kk is near singular: condition {condition:.3g} (limit {_CONDITION_LIMIT:.0e}). The "
+        f"DOFs do not distinguish the {what}, and M*, K* would be rounding. "
+        + _proposal(dofs, basis, labels)
     )
 
 
@@ -402,9 +397,3 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
         refuse_unstable(model, f"reduction by {type(method).__name__}")
     with Progress(0, "reduction"):
         return method.reduced(model)
-
-
-def _modes_text(modes: Modes) -> str:
-    found = counted(modes.n_modes, "mode")
-    vectors = counted(modes.n_vectors, "attachment vector")
-    return f"{found} and {vectors}" if modes.n_vectors else found

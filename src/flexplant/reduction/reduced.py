@@ -33,99 +33,6 @@ from ..structure.rigid import orthonormalised, rigid_motions
 from .judging import ReductionQuality, quality_of
 from .ranking import ErrorBound
 
-
-class Spanned:
-    """A model whose k coordinates are amounts of shapes of n DOFs: ``q_n = T q_k``.
-
-    The counterpart of `Placed`, whose coordinates are the displacements themselves.
-    """
-
-    M: FloatArray
-    T: FloatArray
-    dofs: DofSet
-    full_dofs: DofSet
-
-    @property
-    def n_dof(self) -> int:
-        """Number of coordinates k."""
-        return int(self.M.shape[0])
-
-    @property
-    def is_physical(self) -> bool:
-        """Whether all coordinates are DOFs of the structure."""
-        return len(self.dofs) == self.n_dof
-
-    def expand(self, q: FloatArray | ComplexArray) -> FloatArray | ComplexArray:
-        """Return the motion ``T q`` of all n DOFs, of motions (k,) or (k, m) of the coordinates.
-
-        Shapes may be complex.
-
-        Raises
-        ------
-        ShapeError
-            When there are not k rows.
-        """
-        if isinstance(q, list | tuple):
-            listed = complex_array(q, "q")
-            q = listed if np.iscomplexobj(q) else listed.real
-        if np.iscomplexobj(q):
-            parts = np.asarray(q)
-            return np.asarray(self.expand(parts.real) + 1j * self.expand(parts.imag))
-        shape = (self.n_dof,) if np.ndim(q) == 1 else (self.n_dof, None)
-        return np.asarray(self.T @ real_array(q, "q", shape))
-
-    def row(self, at: Place, direction: str = "z") -> FloatArray:
-        """Return the row (k,) that gives the motion at a place of the full structure.
-
-        Its transpose is the reduced load f* of a unit force there.
-
-        Parameters
-        ----------
-        at : str, (3,) array [m] or mapping
-            A DOF label, a point, or {label: weight}: any of the full structure, not only of the
-            desired DOFs.
-        direction : str
-            The motion at a point.
-
-        Raises
-        ------
-        LabelError
-            When the place is unknown.
-        """
-        return np.asarray(self.full_dofs.row(at, direction) @ self.T)
-
-    def rows(self, points: FloatArray, direction: str = "z") -> FloatArray:
-        """Return the rows (p, k) of the motion at many points (p, 3) [m]; see `row`."""
-        return np.asarray(self.full_dofs.rows(points, direction) @ self.T)
-
-    def inertia(self, motions: FloatArray) -> FloatArray:
-        """Return the loads (k, r) ``M* motions`` of motions (k, r)."""
-        return np.asarray(self.M @ motions)
-
-    def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return the relative parts (6,) of the rigid-body motions that T cannot make."""
-        wanted = rigid_motions(self.full_dofs, real_array(about, "about", (3,)))
-        return relative_miss(self.T @ self.rigid_motions(about), wanted)
-
-    def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return the coordinates (k, 6) nearest to the six rigid-body motions of the geometry.
-
-        Parameters
-        ----------
-        about : (3,) array [m]
-            The point that rotations turn about.
-
-        Raises
-        ------
-        ShapeError
-            When `about` is no point.
-        """
-        centre = real_array(about, "about", (3,))
-        if self.is_physical:
-            return rigid_motions(self.dofs, centre)
-        return np.asarray(la.lstsq(self.T, rigid_motions(self.full_dofs, centre))[0])
-
-
 #: part of the largest eigenvalue of K* by which the lowest one is negative where K* is indefinite
 _DEFINITE = 1e-14
 #: how the names of coordinates begin that hold the static compliance of what was left out
@@ -133,7 +40,7 @@ STATIC = "static "
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ReducedModel(Spanned, Value):
+class ReducedModel(Value):
     """A reduced structure ``M* q_k'' + D* q_k' + K* q_k = T^T f``, ``q_n = T q_k``.
 
     Parameters
@@ -207,7 +114,7 @@ class ReducedModel(Spanned, Value):
     joining: Value | None = None
 
     def __post_init__(self) -> None:
-        names = tuple(str(name) for name in self.coordinates) or self.dofs.labels
+        names = tuple(map(str, self.coordinates)) or self.dofs.labels
         if names[: len(self.dofs)] != self.dofs.labels or len(set(names)) != len(names):
             raise ModelError(
                 f"the coordinates {list(names[:3])} ... must be unique and begin with the physical "
@@ -233,15 +140,11 @@ class ReducedModel(Spanned, Value):
             )
 
     def __repr__(self) -> str:
-        held = len(self.dofs)
-        shown = f"{held} of {counted(len(self.full_dofs), 'DOF')}"
-        if held < self.n_dof:
-            extra = counted(self.n_dof - held, "generalised coordinate")
-            shown = (
-                f"{shown} and {extra}"
-                if held
-                else f"{extra} for {counted(len(self.full_dofs), 'DOF')}"
-            )
+        held, every = len(self.dofs), counted(len(self.full_dofs), "DOF")
+        extra = counted(self.n_dof - held, "generalised coordinate")
+        shown = f"{held} of {every}" if held else f"{extra} for {every}"
+        if 0 < held < self.n_dof:
+            shown += f" and {extra}"
         left = ""
         if self.truncated is not None:
             count = self.truncated.n_modes
@@ -253,6 +156,82 @@ class ReducedModel(Spanned, Value):
             f"{counted(self.rigid_body.shape[1], 'rigid-body motion')}{grows}, "
             f"cond({self.condition_of}) {self.condition:.3g}{left}>"
         )
+
+    @property
+    def n_dof(self) -> int:
+        """Number of coordinates k."""
+        return int(self.M.shape[0])
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether all coordinates are DOFs of the structure."""
+        return len(self.dofs) == self.n_dof
+
+    def expand(self, q: FloatArray | ComplexArray) -> FloatArray | ComplexArray:
+        """Return the motion ``T q`` of all n DOFs, of motions (k,) or (k, m) of the coordinates.
+
+        Shapes may be complex.
+
+        Raises
+        ------
+        ShapeError
+            When there are not k rows.
+        """
+        shape = (self.n_dof,) if np.ndim(q) == 1 else (self.n_dof, None)
+        check: Any = complex_array if np.iscomplexobj(q) else real_array
+        moved: FloatArray | ComplexArray = self.T @ check(q, "q", shape)
+        return moved
+
+    def row(self, at: Place, direction: str = "z") -> FloatArray:
+        """Return the row (k,) that gives the motion at a place of the full structure.
+
+        Its transpose is the reduced load f* of a unit force there.
+
+        Parameters
+        ----------
+        at : str, (3,) array [m] or mapping
+            A DOF label, a point, or {label: weight}: any of the full structure, not only of the
+            desired DOFs.
+        direction : str
+            The motion at a point.
+
+        Raises
+        ------
+        LabelError
+            When the place is unknown.
+        """
+        return np.asarray(self.full_dofs.row(at, direction) @ self.T)
+
+    def rows(self, points: FloatArray, direction: str = "z") -> FloatArray:
+        """Return the rows (p, k) of the motion at many points (p, 3) [m]; see `row`."""
+        return np.asarray(self.full_dofs.rows(points, direction) @ self.T)
+
+    def inertia(self, motions: FloatArray) -> FloatArray:
+        """Return the loads (k, r) ``M* motions`` of motions (k, r)."""
+        return np.asarray(self.M @ motions)
+
+    def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+        """Return the relative parts (6,) of the rigid-body motions that T cannot make."""
+        wanted = rigid_motions(self.full_dofs, real_array(about, "about", (3,)))
+        return relative_miss(self.T @ self.rigid_motions(about), wanted)
+
+    def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+        """Return the coordinates (k, 6) nearest to the six rigid-body motions of the geometry.
+
+        Parameters
+        ----------
+        about : (3,) array [m]
+            The point that rotations turn about.
+
+        Raises
+        ------
+        ShapeError
+            When `about` is no point.
+        """
+        centre = real_array(about, "about", (3,))
+        if self.is_physical:
+            return rigid_motions(self.dofs, centre)
+        return np.asarray(la.lstsq(self.T, rigid_motions(self.full_dofs, centre))[0])
 
     @cached_property
     def n_unstable(self) -> int:
@@ -302,13 +281,13 @@ class ReducedModel(Spanned, Value):
             return self, np.eye(self.n_dof), np.zeros((self.n_dof, self.n_dof))
         heavy, follow, flexibility, K = static_followers(self.D, self.K, light)
         names = np.array(tuple(self.coordinates), dtype=object)[heavy].tolist()
-        kept = [label for label in names if label in self.dofs]
+        block = np.ix_(heavy, heavy)
         model = self.replace(
-            M=self.M[np.ix_(heavy, heavy)],
-            D=self.D[np.ix_(heavy, heavy)],
+            M=self.M[block],
+            D=self.D[block],
             K=K,
             T=self.T @ follow,
-            dofs=self.dofs.select(kept),
+            dofs=self.dofs.select([label for label in names if label in self.dofs]),
             rigid_body=self.rigid_body[heavy],
             joint_motions=None if self.joint_motions is None else self.joint_motions[heavy],
             coordinates=names,
@@ -356,9 +335,9 @@ class ReducedModel(Spanned, Value):
         ModelError
             When the truncated modes are complex.
         """
-        if self.truncated is None:
-            return self
         more = self.truncated
+        if more is None:
+            return self
         if np.iscomplexobj(more.phi):
             raise ModelError(
                 "the truncated modes are complex, they cannot stand beside real coordinates. "
@@ -367,23 +346,21 @@ class ReducedModel(Spanned, Value):
         names = tuple(self.coordinates)
         kept = [i for i, name in enumerate(names) if not name.startswith(STATIC)]
         block = np.ix_(kept, kept)
-        omega = more.basis_omega
+        k, r = more.basis_squares.size, self.rigid_body.shape[1]
         return ReducedModel(
-            M=la.block_diag(self.M[block], np.eye(omega.size)),
+            M=la.block_diag(self.M[block], np.eye(k)),
             D=la.block_diag(self.D[block], np.diag(more.basis_rates)),
             K=la.block_diag(self.K[block], np.diag(more.basis_squares)),
             T=np.hstack([self.T[:, kept], np.real(more.basis)]),
             dofs=self.full_dofs.select(()),
             full_dofs=self.full_dofs,
-            rigid_body=np.vstack(
-                [self.rigid_body[kept], np.zeros((omega.size, self.rigid_body.shape[1]))]
-            ),
+            rigid_body=np.vstack([self.rigid_body[kept], np.zeros((k, r))]),
             method=f"{self.method}, with {counted(more.n_modes, 'mode')} left out",
             condition=self.condition,
             condition_of=self.condition_of,
             coordinates=[
                 *(f"kept {names[i]}" for i in kept),
-                *(f"left out {i}" for i in range(1, omega.size + 1)),
+                *(f"left out {i}" for i in range(1, k + 1)),
             ],
         )
 
@@ -405,14 +382,8 @@ class ReducedModel(Spanned, Value):
             When overdamped motions have real poles among the modes.
         """
         model, _, _ = self.condensed()
-        form = normal_form(
-            model.M,
-            model.D,
-            model.K,
-            model.rigid_body,
-            lambda: model.body_motions,
-            lowest=model.n_dof,
-        )
+        held, k = model.rigid_body, model.n_dof
+        form = normal_form(model.M, model.D, model.K, held, lambda: model.body_motions, lowest=k)
         phi, dofs = form.phi, model.dofs
         if not self.is_physical:
             phi, dofs = model.expand(phi), model.full_dofs
@@ -479,10 +450,8 @@ def static_followers(
         inverse = la.inv(K[np.ix_(light, light)])
     except la.LinAlgError as error:
         raise ModelError("a massless coordinate has no stiffness: nothing holds it.") from error
-    flexibility = np.zeros((k, k))
+    flexibility, follow = np.zeros((k, k)), np.eye(k)[:, heavy]
     flexibility[np.ix_(light, light)] = 0.5 * (inverse + inverse.T)
-    follow = np.zeros((k, heavy.size))
-    follow[heavy] = np.eye(heavy.size)
     follow[light] = -inverse @ K[np.ix_(light, heavy)]
     left = follow.T @ K @ follow
     return heavy, follow, flexibility, np.asarray(0.5 * (left + left.T), dtype=np.float64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -102,21 +102,11 @@ class ModalTruncation(ReductionMethod):
         law = self.damping
         if law is not None:
             phi = np.real(solved.phi)
-            zeta = law.ratios(solved.omega, phi, model.K, model.dofs)
-            solved = solved.replace(zeta=zeta)
-        columns = kept_columns(numbers, solved)
-        kept = Modes(
-            solved.omega[columns],
-            solved.zeta[columns],
-            solved.phi[:, columns],
-            model.dofs,
-            n_rigid=solved.n_rigid,
-        )
+            solved = solved.replace(zeta=law.ratios(solved.omega, phi, model.K, model.dofs))
+        kept = solved.select(kept_columns(numbers, solved))
         if static:
             vectors, omega = attachment_vectors(model, np.real(kept.phi), static)
-            zeta = np.zeros(omega.size)
-            if law is not None:
-                zeta = law.ratios(omega, vectors, model.K, model.dofs)
+            zeta = 0.0 * omega if law is None else law.ratios(omega, vectors, model.K, model.dofs)
             kept = kept.replace(
                 vectors=vectors,
                 vector_omega=omega,
@@ -124,8 +114,7 @@ class ModalTruncation(ReductionMethod):
                 vector_dofs=labels_of(static, model.dofs),
             )
         bound = self._bound(model, kept) if self.inputs else None
-        names = [f"mode {i}" for i in numbers]
-        found = _modal_model(kept, names, "modal truncation", bound)
+        found = _modal_model(kept, numbers, "modal truncation", bound)
         if law is None and model.D is not None:
             found = found.replace(D=inner(model.D, found.T))
         return found
@@ -248,14 +237,12 @@ def truncated(
     columns = kept_columns(numbers, modes)
     basis, omega, zeta = np.real(modes.basis), modes.basis_omega, modes.basis_zeta
     others = np.setdiff1d(np.arange(omega.size), columns)
-    kept = Modes(
-        omega[columns], zeta[columns], basis[:, columns], modes.dofs, n_rigid=modes.n_rigid
-    )
+    gone = Modes(omega[others], zeta[others], basis[:, others], modes.dofs)
+    kept = modes.select(columns)
     if static:
-        kept = _with_static(kept, basis[:, others], omega[others], zeta[others], static)
+        kept = _with_static(kept, gone, static)
     bound = None
     if bound_of is not None:
-        gone = Modes(omega[others], zeta[others], basis[:, others], modes.dofs)
         into, out, _, _ = modal_channels(gone, *bound_of)
         terms, missed = _channel_terms(gone, bound_of)
         vectors, given = _channel_terms(_vectors_as_modes(kept), bound_of)
@@ -265,7 +252,7 @@ def truncated(
         if np.isfinite(value):
             covers = modes.n_modes if modes.n_modes < len(modes.dofs) else None
             bound = ErrorBound(value, into, out, _SUM, terms=terms, static=at_rest, covers=covers)
-    found = _modal_model(kept, [f"mode {i}" for i in numbers], method, bound)
+    found = _modal_model(kept, numbers, method, bound)
     return found.replace(truncated=_residual_modes(modes, columns))
 
 
@@ -282,10 +269,9 @@ def _residual_modes(modes: Modes, columns: IntArray) -> Modes | None:
     )
 
 
-def _with_static(
-    kept: Modes, shapes: FloatArray, omega: FloatArray, zeta: FloatArray, static: Any
-) -> Modes:
+def _with_static(kept: Modes, gone: Modes, static: Any) -> Modes:
     """Return modes with attachment vectors made of the other modes of a known set."""
+    shapes, omega, zeta = np.real(gone.phi), gone.omega, gone.zeta
     names = labels_of(static, kept.dofs)
     rows = np.array([kept.dofs.row(place) for place in static])
     moved = (rows @ shapes).T / omega[:, None] ** 2
@@ -325,23 +311,22 @@ def _peaks(terms: FloatArray) -> float:
 
 
 def _modal_model(
-    modes: Modes, names: list[str], method: str, bound: ErrorBound | None
+    modes: Modes, numbers: Sequence[int], method: str, bound: ErrorBound | None
 ) -> ReducedModel:
     """Return the reduced model whose coordinates are the modes themselves, equation (5)."""
-    omega, zeta = modes.basis_omega, modes.basis_zeta
-    k, r = omega.size, modes.n_rigid
+    k, r = modes.basis_omega.size, modes.n_rigid
     static = [f"{STATIC}{i}" for i in range(1, modes.n_vectors + 1)]
     extra = f" and {counted(modes.n_vectors, 'static vector')}" if modes.n_vectors else ""
     return ReducedModel(
         M=np.eye(k),
-        D=np.diag(2 * zeta * omega),
-        K=np.diag(omega**2),
+        D=np.diag(modes.basis_rates),
+        K=np.diag(modes.basis_squares),
         T=np.real(modes.basis),
         dofs=modes.dofs.select(()),
         full_dofs=modes.dofs,
         rigid_body=np.eye(k, r),
         method=f"{method}, {counted(modes.n_modes, 'mode')}{extra}",
-        coordinates=[*names, *static],
+        coordinates=[*(f"mode {i}" for i in numbers), *static],
         condition_of="M*",
         bound=bound if bound is None or np.isfinite(bound.value) else None,
         n_vectors=modes.n_vectors,
