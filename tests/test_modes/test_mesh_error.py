@@ -5,7 +5,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import ModelError
-from flexplant.testbeds.ritz_plate import plate_modes, ritz_plate
+from flexplant.testbeds.ritz import plate_modes, ritz_plate
 
 #: so thin that rotary inertia, which the meshes lack, is 1e-6
 THIN = {

@@ -9,8 +9,8 @@ import scipy.linalg as la
 import flexplant as fx
 from flexplant.errors import LabelError, ModelError
 from flexplant.plant import suspend
-from flexplant.testbeds.magnet_stage import BLOCK, PULL
-from flexplant.testbeds.ritz_block import ritz_block
+from flexplant.testbeds.ritz import ritz_block
+from flexplant.testbeds.stages import BLOCK, PULL
 
 RATE = 10e3
 AXES = ("x", "y", "z", "rx", "ry", "rz")

@@ -1,8 +1,8 @@
-"""A virtual wafer stage: a full-order truth with a hidden mass, which answers like hardware."""
+"""WaferStage: a full-order truth with hidden differences, measured and run like hardware."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -17,7 +17,6 @@ from ..checks import (
     instance,
     positive,
     several,
-    short,
     whole,
 )
 from ..errors import ModelError, unknown_label
@@ -32,7 +31,6 @@ from ..reduction import ReducedModel
 from ..simulation import Quantiser, Response, simulate
 from ..structure import FEModel, ModalDamping, kirchhoff_plate, solid_block
 from ..synthesis import design_servo
-from .ritz_plate import plate_modes, ritz_plate
 
 #: the plate of the paper's Table 1, as its drawing says
 DRAWING: Mapping[str, Any] = {
@@ -42,151 +40,8 @@ DRAWING: Mapping[str, Any] = {
     "youngs_modulus": 70e9,
     "poisson_ratio": 0.35,
 }
-
-
-#: of a machine: relative scatter of stiffness over the plate and of damping over its modes [-],
-#: delay [samples], step of its sensors [m], and a second mass [kg], at most
-STIFFNESS, SPREAD, LATENCY, STEP, SECOND = 0.003, 0.3, 1.3, 5e-11, 0.1
-#: dampings that a machine draws, of which its modes take the first: its second mass comes after
-#: them, and is the same for plates of any order
-DAMPINGS = 253
 #: Hz, of the servo that holds a stage on magnets while it is measured
 HELD = 50.0
-
-
-def wafer_stage(
-    *,
-    elements: tuple[int, int] | None = None,
-    size: Sequence[float] = (0.6, 0.6),
-    thickness: float = 0.0272,
-    damping: float = 0.01,
-    added_mass: float = 0.5,
-    rate: float = 10e3,
-    delay: float | None = None,
-    individual: int = 1,
-) -> WaferStage:
-    """Return the virtual machine: the paper's plate with an actuator's mass that no drawing shows.
-
-    A free plate of Table 1 with rotary inertia in polynomials, solved to convergence: no mesh of
-    any drawing has its frequencies. A point mass is added at
-    (L/2, L/4), the paper's z_8, and up to 0.1 kg somewhere; stiffness is scattered over the plate
-    by 0.3 %, damping over its modes by 30 %, sensors have steps of 0.05 nm, and the delay is no
-    whole number of samples.
-
-    Parameters
-    ----------
-    elements : (int, int), optional
-        In its place the drawing's own plate on such a mesh, without scatter, second mass or steps,
-        and a delay of 1: a machine of its models' family. (8, 8) is the paper's with 243 DOFs.
-    size : (float, float) [m]
-        Sides of the plate along x and y; the paper's when not given.
-    thickness : float [m]
-        Of the plate.
-    damping : float
-        Modal damping ratio of the bare plate's elastic modes; of a machine their mean.
-    added_mass : float [kg]
-        The hidden mass.
-    rate : float [Hz]
-        Sampling rate of its controller.
-    delay : float [samples], optional
-        From measurement to actuation; 1.3 when not given.
-    individual : int
-        Which machine: its scatter and its second mass.
-
-    Returns
-    -------
-    WaferStage
-        It answers with poles, FRFs and closed-loop runs; its matrices are for tests only.
-
-    Raises
-    ------
-    ModelError
-        When a value is out of range.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.testbeds.wafer_stage().poles([6]).freq.round(1)
-    array([455.1])
-    >>> fx.testbeds.wafer_stage(size=(0.5, 0.35), thickness=0.03).poles([6]).freq.round(1)
-    array([1260.7])
-    >>> fx.testbeds.wafer_stage(elements=(4, 4)).poles([4]).freq.round(1)
-    array([246.5])
-    """
-    mass = positive(added_mass, "added_mass", zero=True)
-    fast = positive(rate, "rate")
-    drawing = _plate_drawing(size, thickness)
-    mass_at: dict[tuple[float, ...], float] = {_spot(drawing): mass}
-    if elements is None:
-        late = positive(LATENCY if delay is None else delay, "delay", zero=True)
-        seed = whole(individual, "individual", minimum=0)
-        return WaferStage(_individual(drawing, damping, mass_at, seed), fast, late, STEP, drawing)
-    given = tuple(elements) if isinstance(elements, tuple | list) else ()
-    if len(given) != 2:
-        raise ModelError(
-            f"elements are two whole numbers (nx, ny), got {short(elements)}. Try (8, 8)."
-        )
-    elements = (whole(given[0], "elements along x"), whole(given[1], "elements along y"))
-    late = positive(1.0 if delay is None else delay, "delay", zero=True)
-    bare = kirchhoff_plate(elements=elements, name="wafer stage", **drawing)
-    truth = _with_masses(bare.with_damping(ModalDamping(damping)), mass_at)
-    return WaferStage(truth, fast, late, drawing=drawing)
-
-
-def _plate_drawing(size: Any, thickness: Any) -> Mapping[str, Any]:
-    """Return the drawing of a plate of this size."""
-    sides = tuple(size) if isinstance(size, Sequence) and not isinstance(size, str) else ()
-    if len(sides) != 2:
-        raise ModelError(f"size is two lengths (x, y) in m, got {short(size)}. Try (0.6, 0.6).")
-    x, y = (positive(side, "size") for side in sides)
-    return {**DRAWING, "size": (x, y), "thickness": positive(thickness, "thickness")}
-
-
-def _spot(drawing: Mapping[str, Any]) -> tuple[float, float, float]:
-    """Return where the hidden mass is: the paper's z_8."""
-    x, y = drawing["size"]
-    return x / 2, y / 4, 0.0
-
-
-def waves(random: np.random.Generator, sides: Sequence[float]) -> Callable[..., FloatArray]:
-    """Return a factor of stiffness over x and y (...): cosines of random heights."""
-    height = random.normal(size=(3, 3))
-
-    def factor(x: FloatArray, y: FloatArray) -> FloatArray:
-        over_x, over_y = (
-            np.cos(np.pi * np.arange(3) * at[..., None] / side)
-            for at, side in zip((x, y), sides[:2], strict=True)
-        )
-        seen = np.einsum("...i,ji,...j->...", over_x, height, over_y)
-        return np.asarray(1.0 + STIFFNESS * seen / np.sqrt(9.0 / 4.0))
-
-    return factor
-
-
-def _individual(
-    drawing: Mapping[str, Any], damping: float, known: Mapping[Any, float], seed: int
-) -> FEModel:
-    """Return one machine: its stiffness, damping and masses."""
-    random = np.random.default_rng([seed, 8])
-    sides = drawing["size"]
-    bare = ritz_plate(stiffer=waves(random, sides), **drawing)
-    omega, phi = plate_modes(bare)
-    own = random.normal(size=DAMPINGS)[: omega.size]
-    zeta = positive(damping, "damping", zero=True) * np.exp(SPREAD * own)
-    shapes = bare.M @ phi
-    D = shapes * (2.0 * zeta * omega) @ shapes.T
-    spot = (sides[0] * random.random(), sides[1] * random.random(), 0.0)
-    masses = {**known, spot: SECOND * random.random()}
-    return _with_masses(bare.replace(D=0.5 * (D + D.T), name="wafer stage"), masses)
-
-
-def _with_masses(bare: FEModel, masses: Mapping[tuple[float, ...], float]) -> FEModel:
-    """Return a damped plate with point masses [kg] added after its damping."""
-    M = bare.M
-    for at, mass in masses.items():
-        row = bare.dofs.row(np.array(at), "z")
-        M = M + mass * np.outer(row, row)
-    return FEModel(M, bare.K, bare.D, dofs=bare.dofs, name="wafer stage")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -354,14 +209,9 @@ class WaferStage(Value):
         schedule = blocks[0] if blocks and isinstance(blocks[0], ScheduledLoop) else None
         own = self.loop(ports, *blocks) if schedule is None else self.scheduled(ports, schedule)
         return simulate(
-            own,
-            reference=reference,
-            duration=duration,
-            rng=rng,
-            runs=runs,
+            own, reference=reference, duration=duration, rng=rng, runs=runs, moving=moving,
             elements=self._steps(ports),
-            moving=moving,
-        )
+        )  # fmt: skip
 
     @property
     def _middle(self) -> Poi:
@@ -424,20 +274,17 @@ class WaferStage(Value):
             raise ModelError(f"an FRF needs actuators and sensors, got {ports!r}.")
         random = generator(rng)
         count, samples = len(ports.u), round(positive(period, "period") * self.rate)
-        _check_multisine(samples, periods, discard)
-        shakers = [f"{port.name}:excitation" for port in ports.u]
-        own = Ports(
-            w=[
-                *ports.w,
-                *(
-                    Disturbance(name, at=port.at, direction=port.direction)
-                    for name, port in zip(shakers, ports.u, strict=True)
-                ),
-            ],
-            u=ports.u,
-            z=[self._middle],
-            y=ports.y,
-        )
+        if samples < 4:
+            raise ModelError(
+                f"a period of {samples} samples has no frequencies to measure at. Lengthen period."
+            )
+        whole(periods, "periods")
+        whole(discard, "discard", minimum=0)
+        shakers = [
+            Disturbance(f"{port.name}:excitation", at=port.at, direction=port.direction)
+            for port in ports.u
+        ]
+        own = Ports(w=[*ports.w, *shakers], u=ports.u, z=[self._middle], y=ports.y)
         loop = close_loop(self._plant(own), *_holding(own, self))
         lines = np.arange(1, samples // 2)
         spectrum = np.exp(2j * np.pi * random.random(lines.size)) * np.sqrt(samples / 2.0)
@@ -450,7 +297,7 @@ class WaferStage(Value):
         signal = np.tile(positive(amplitude, "amplitude") * waves, periods + discard)
         run = simulate(
             loop,
-            disturbance=dict(zip(shakers, signal, strict=True)),
+            disturbance=dict(zip((one.name for one in shakers), signal, strict=True)),
             duration=(periods + discard) * samples / self.rate,
             elements=self._steps(own),
             rng=random,
@@ -464,40 +311,25 @@ class WaferStage(Value):
         forces = shaken + lag * commands
         kinds = {sensor.quantity for sensor in ports.y}
         return frf_of_periods(
-            lines / period,
-            motions,
-            forces,
-            shaken,
-            periods,
+            lines / period, motions, forces, shaken, periods, resolution=1.0 / period,
             inputs=tuple(port.name for port in ports.u),
             outputs=tuple(port.name for port in ports.y),
             quantity=kinds.pop() if len(kinds) == 1 else None,
-            resolution=1.0 / period,
-        )
+        )  # fmt: skip
 
 
 def _holding(ports: Ports, machine: WaferStage) -> tuple[Any, ...]:
     """Return the slow controller that keeps the machine in place, made from its drawing."""
-    model: FEModel
     if machine.magnets:
         model = solid_block(elements=(4, 3, 1), **machine.drawing)
-        model = suspend(model.with_damping(ModalDamping(0.01)), machine.magnets)
     else:
         model = kirchhoff_plate(elements=(4, 4), **machine.drawing)
-        model = model.with_damping(ModalDamping(0.01))
+    model = model.with_damping(ModalDamping(0.01))
+    model = suspend(model, machine.magnets) if machine.magnets else model
     plant = assemble_plant(model, ports).discretized(machine.rate, delay=machine.delay)
     # against magnets a loop must be several times as fast as what they make grow
     slow = HELD if machine.magnets else 8.0
     return design_static(plant), design_servo(plant, bandwidth=slow, rolloff=5.0 * slow)
-
-
-def _check_multisine(samples: int, periods: int, discard: int) -> None:
-    if samples < 4:
-        raise ModelError(
-            f"a period of {samples} samples has no frequencies to measure at. Lengthen period."
-        )
-    for name, number, least in (("periods", periods, 1), ("discard", discard, 0)):
-        whole(number, name, minimum=least)
 
 
 def _multisine(spectrum: Any, lines: Any, samples: int) -> FloatArray:

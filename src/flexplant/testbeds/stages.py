@@ -1,0 +1,315 @@
+"""The virtual machines: a wafer stage, a stage on magnets in six axes, three masses in a row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..checks import (
+    FloatArray,
+    positive,
+    real_array,
+    short,
+    whole,
+)
+from ..errors import ModelError
+from ..modes import solve_modes
+from ..plant import (
+    Actuator,
+    Disturbance,
+    GroundSpring,
+    Poi,
+    Ports,
+    Reference,
+    Sensor,
+    StandardPlant,
+    assemble_plant,
+    suspend,
+)
+from ..reduction import ModalTruncation, reduce
+from ..structure import FEModel, ModalDamping, PointMass, chain, kirchhoff_plate
+from .ritz import plate_modes, ritz_block, ritz_plate
+from .virtual_machine import DRAWING, WaferStage
+
+#: of a machine: relative scatter of stiffness over the plate and of damping over its modes [-],
+#: delay [samples], step of its sensors [m], and a second mass [kg], at most
+STIFFNESS, SPREAD, LATENCY, STEP, SECOND = 0.003, 0.3, 1.3, 5e-11, 0.1
+#: dampings that a machine draws, of which its modes take the first: its second mass comes after
+#: them, and is the same for plates of any order
+DAMPINGS = 253
+
+
+def wafer_stage(
+    *,
+    elements: tuple[int, int] | None = None,
+    size: Sequence[float] = (0.6, 0.6),
+    thickness: float = 0.0272,
+    damping: float = 0.01,
+    added_mass: float = 0.5,
+    rate: float = 10e3,
+    delay: float | None = None,
+    individual: int = 1,
+) -> WaferStage:
+    """Return the virtual machine: the paper's plate with an actuator's mass that no drawing shows.
+
+    A free plate of Table 1 with rotary inertia in polynomials, solved to convergence: no mesh of
+    any drawing has its frequencies. A point mass is added at
+    (L/2, L/4), the paper's z_8, and up to 0.1 kg somewhere; stiffness is scattered over the plate
+    by 0.3 %, damping over its modes by 30 %, sensors have steps of 0.05 nm, and the delay is no
+    whole number of samples.
+
+    Parameters
+    ----------
+    elements : (int, int), optional
+        In its place the drawing's own plate on such a mesh, without scatter, second mass or steps,
+        and a delay of 1: a machine of its models' family. (8, 8) is the paper's with 243 DOFs.
+    size : (float, float) [m]
+        Sides of the plate along x and y; the paper's when not given.
+    thickness : float [m]
+        Of the plate.
+    damping : float
+        Modal damping ratio of the bare plate's elastic modes; of a machine their mean.
+    added_mass : float [kg]
+        The hidden mass.
+    rate : float [Hz]
+        Sampling rate of its controller.
+    delay : float [samples], optional
+        From measurement to actuation; 1.3 when not given.
+    individual : int
+        Which machine: its scatter and its second mass.
+
+    Returns
+    -------
+    WaferStage
+        It answers with poles, FRFs and closed-loop runs; its matrices are for tests only.
+
+    Raises
+    ------
+    ModelError
+        When a value is out of range.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.testbeds.wafer_stage().poles([6]).freq.round(1)
+    array([455.1])
+    >>> fx.testbeds.wafer_stage(size=(0.5, 0.35), thickness=0.03).poles([6]).freq.round(1)
+    array([1260.7])
+    >>> fx.testbeds.wafer_stage(elements=(4, 4)).poles([4]).freq.round(1)
+    array([246.5])
+    """
+    mass = positive(added_mass, "added_mass", zero=True)
+    fast = positive(rate, "rate")
+    drawing = _plate_drawing(size, thickness)
+    x, y = drawing["size"]
+    mass_at: dict[tuple[float, ...], float] = {(x / 2, y / 4, 0.0): mass}
+    if elements is None:
+        late = positive(LATENCY if delay is None else delay, "delay", zero=True)
+        seed = whole(individual, "individual", minimum=0)
+        return WaferStage(_individual(drawing, damping, mass_at, seed), fast, late, STEP, drawing)
+    given = tuple(elements) if isinstance(elements, tuple | list) else ()
+    if len(given) != 2:
+        raise ModelError(
+            f"elements are two whole numbers (nx, ny), got {short(elements)}. Try (8, 8)."
+        )
+    elements = (whole(given[0], "elements along x"), whole(given[1], "elements along y"))
+    late = positive(1.0 if delay is None else delay, "delay", zero=True)
+    bare = kirchhoff_plate(elements=elements, name="wafer stage", **drawing)
+    truth = _with_masses(bare.with_damping(ModalDamping(damping)), mass_at)
+    return WaferStage(truth, fast, late, drawing=drawing)
+
+
+def _plate_drawing(size: Any, thickness: Any) -> Mapping[str, Any]:
+    """Return the drawing of a plate of this size."""
+    sides = tuple(size) if isinstance(size, Sequence) and not isinstance(size, str) else ()
+    if len(sides) != 2:
+        raise ModelError(f"size is two lengths (x, y) in m, got {short(size)}. Try (0.6, 0.6).")
+    x, y = (positive(side, "size") for side in sides)
+    return {**DRAWING, "size": (x, y), "thickness": positive(thickness, "thickness")}
+
+
+def waves(random: np.random.Generator, sides: Sequence[float]) -> Callable[..., FloatArray]:
+    """Return a factor of stiffness over x and y (...): cosines of random heights."""
+    height = random.normal(size=(3, 3))
+
+    def factor(x: FloatArray, y: FloatArray) -> FloatArray:
+        over_x, over_y = (
+            np.cos(np.pi * np.arange(3) * at[..., None] / side)
+            for at, side in zip((x, y), sides[:2], strict=True)
+        )
+        seen = np.einsum("...i,ji,...j->...", over_x, height, over_y)
+        return np.asarray(1.0 + STIFFNESS * seen / np.sqrt(9.0 / 4.0))
+
+    return factor
+
+
+def _individual(
+    drawing: Mapping[str, Any], damping: float, known: Mapping[Any, float], seed: int
+) -> FEModel:
+    """Return one machine: its stiffness, damping and masses."""
+    random = np.random.default_rng([seed, 8])
+    sides = drawing["size"]
+    bare = ritz_plate(stiffer=waves(random, sides), **drawing)
+    omega, phi = plate_modes(bare)
+    own = random.normal(size=DAMPINGS)[: omega.size]
+    zeta = positive(damping, "damping", zero=True) * np.exp(SPREAD * own)
+    shapes = bare.M @ phi
+    D = shapes * (2.0 * zeta * omega) @ shapes.T
+    spot = (sides[0] * random.random(), sides[1] * random.random(), 0.0)
+    masses = {**known, spot: SECOND * random.random()}
+    return _with_masses(bare.replace(D=0.5 * (D + D.T), name="wafer stage"), masses)
+
+
+def _with_masses(bare: FEModel, masses: Mapping[tuple[float, ...], float]) -> FEModel:
+    """Return a damped plate with point masses [kg] added after its damping."""
+    M = bare.M
+    for at, mass in masses.items():
+        row = bare.dofs.row(np.array(at), "z")
+        M = M + mass * np.outer(row, row)
+    return FEModel(M, bare.K, bare.D, dofs=bare.dofs, name="wafer stage")
+
+
+#: an aluminium block
+BLOCK: Mapping[str, Any] = {
+    "size": (0.4, 0.3, 0.05),
+    "density": 2700.0,
+    "youngs_modulus": 70e9,
+    "poisson_ratio": 0.33,
+}
+#: N/m of the magnets at each corner as drawn, and by what share those of a machine differ
+PULL, OFF = {"x": -2e3, "y": -2e3, "z": -6e3}, 0.1
+#: modes of the truth: up to four times the highest frequency that 10 kHz shows
+MODES = 120
+
+
+def magnet_stage(
+    *,
+    size: Sequence[float] = BLOCK["size"],
+    damping: float = 0.005,
+    added_mass: float = 0.3,
+    rate: float = 10e3,
+    delay: float | None = None,
+    individual: int = 1,
+) -> WaferStage:
+    """Return a virtual machine that floats on magnets, with a mass that no drawing shows.
+
+    A block of linear elasticity in polynomials, solved to convergence: no mesh of bricks has its
+    frequencies. Magnets at its corners attract, ``K - sum_s |k_s| r_s' r_s``, so that six motions
+    of the rigid body grow until a loop holds them; theirs are up to 10 % off the drawn ones. A
+    mass is added on the bottom at (3/4, 1/4) of its sides, and another of up to 0.1 kg
+    somewhere; stiffness is scattered over the block by 0.3 %, damping over its modes by 30 %,
+    sensors have steps of 0.05 nm, and the delay is no whole number of samples.
+
+    Parameters
+    ----------
+    size : (float, float, float) [m]
+        Sides of the block along x, y and z, where it is thin.
+    damping : float
+        Modal damping ratio of the elastic modes, their mean.
+    added_mass : float [kg]
+        The hidden mass.
+    rate : float [Hz]
+        Sampling rate of its controller.
+    delay : float [samples], optional
+        From measurement to actuation; 1.3 when not given.
+    individual : int
+        Which machine: its scatter, its magnets and its second mass.
+
+    Returns
+    -------
+    WaferStage
+        Its `drawing` holds what `solid_block` takes, its `magnets` the drawn GroundSprings. Modes
+        1 to 6 are the motions of the rigid body; poles are of those from 7 on.
+
+    Raises
+    ------
+    ModelError
+        When a value is out of range.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.testbeds.magnet_stage().poles([7, 8]).freq.round(0)
+    array([1229., 1543.])
+    """
+    mass = positive(added_mass, "added_mass", zero=True)
+    late = positive(LATENCY if delay is None else delay, "delay", zero=True)
+    sides = tuple(real_array(size, "size", (3,)).tolist())
+    if not all(side > 0.0 for side in sides):
+        raise ModelError(f"size is three lengths (x, y, z) in m, got {sides}. Try {BLOCK['size']}.")
+    drawing = {**BLOCK, "size": sides}
+    random = np.random.default_rng([whole(individual, "individual", minimum=0), 32])
+    block = ritz_block(stiffer=waves(random, sides), **drawing)
+    places = (0.75 * sides[0], 0.25 * sides[1], 0.0), (*(sides[:2] * random.random(2)), 0.0)
+    loads = [
+        PointMass(at, size)
+        for at, size in zip(places, (mass, SECOND * random.random()), strict=True)
+        if size
+    ]
+    zeta = positive(damping, "damping", zero=True) * np.exp(SPREAD * random.normal(size=MODES))
+    modes = solve_modes(block.with_parts(loads), count=MODES, damping=ModalDamping(zeta))
+    drawn = tuple(
+        GroundSpring((x, y, 0.5 * sides[2]), pull, direction=along)
+        for x in (0.0, sides[0])
+        for y in (0.0, sides[1])
+        for along, pull in PULL.items()
+    )
+    own = [
+        spring.replace(stiffness=spring.stiffness * (1.0 + OFF * random.uniform(-1.0, 1.0)))
+        for spring in drawn
+    ]
+    truth = suspend(reduce(modes, ModalTruncation(MODES)), own)
+    return WaferStage(truth, positive(rate, "rate"), late, STEP, drawing, drawn)
+
+
+def three_masses(*, rate: float | None = 2e3, delay: int = 1) -> StandardPlant:
+    r"""Return the plant of three masses in a row: one to push, one to hold still, two to see.
+
+    ::
+
+        u1 --> [1 kg]--/\/\/--[1 kg]--/\/\/--[1 kg]     free along x
+                 y1            die              y2
+
+    The actuator u1, with amplifier noise `amp`, pushes the first mass; the sensors y1 and y2 see
+    the ends; the point of interest `die`, with a reference, is the middle mass, which no sensor
+    sees. Springs of 4e5 N/m give modes at 0, 100.7 and 174.3 Hz, 1 % damped. For first trials and
+    for the examples in docstrings.
+
+    Parameters
+    ----------
+    rate : float [Hz], optional
+        Sampling rate; None gives the continuous plant.
+    delay : int [samples]
+        From measurement to actuation.
+
+    Returns
+    -------
+    StandardPlant
+
+    Raises
+    ------
+    ModelError
+        When the rate is not positive, or the delay is negative.
+
+    Examples
+    --------
+    >>> three_masses()
+    <StandardPlant: 7 states, dt 0.0005 s, delay 1>
+      w (4) amp  y1:noise  y2:noise  die:ref
+      u (1) u1
+      z (3) die:x  die:error  u1:effort
+      y (3) y1  y2  die:ref
+    """
+    masses = chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
+    modes = solve_modes(masses, count=3, damping=ModalDamping(0.01))
+    ports = Ports(
+        w=[Disturbance("amp", at="1:x", asd=1e-3)],
+        u=[Actuator("u1", at="1:x")],
+        z=[Poi("die", at="2:x", axes=("x",))],
+        y=[Sensor("y1", at="1:x", asd=1e-10), Sensor("y2", at="3:x", asd=1e-10)],
+        references=[Reference("die")],
+    )
+    plant = assemble_plant(modes, ports)
+    return plant if rate is None else plant.discretized(rate, delay=delay)
