@@ -17,7 +17,7 @@ import pytest
 import flexplant as fx
 from flexplant.checks import with_unit
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
-from flexplant.plot.report import neighbours
+from flexplant.plot.page import neighbours
 from stages import RATE, full, ports, reduced, some_modes
 
 CHROMIUM = next(

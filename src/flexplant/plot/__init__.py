@@ -60,8 +60,8 @@ from .loops import sensitivities as sensitivities
 from .loops import sensitivity as sensitivity
 from .placement import pareto_curve as pareto_curve
 from .placement import placed as placed
+from .placement import position_map as position_map
 from .placement import sensor_map as sensor_map
-from .positions import position_map as position_map
 from .report import report as report
 from .response import response as response
 from .response import step as step

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from ..certificates import Certificate, figure
-from ..checks import FloatArray, IntArray, short, with_unit
-from ..errors import FlexplantError
+from ..certificates import Certificate, figure, one_line, stability_name
+from ..checks import Value, short, with_unit
+from ..errors import FlexplantError, ModelError, counted
 from ..estimation import LagReport, consistency
 from ..identification import StabilisationDiagram
-from ..loop import ClosedLoop, ErrorBudget
+from ..loop import (
+    ClosedLoop,
+    ErrorBudget,
+    LoopComparison,
+    LoopFigures,
+    compare_loops,
+    report_loops,
+)
+from ..loop.blocks import references
+from ..loop.report import axis_sensitivities, error_sensitivity
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import StateSpace
 from ..modes import Modes
@@ -27,16 +36,15 @@ from ..reduction import ReducedModel
 from ..simulation import ErrorMap, ExposureErrors, Response, Verdict
 from ..store import written
 from ..synthesis import Controller
-from ..tolerances import divisor
 from ..updating import Localisation, UpdateResult
 from ..versions import versions
 from ._axes import STYLES, bottom_only, decibel, finish, name_panel, panel_axes, readable
 from .bode import bode, singular_values
 from .errors import budget, error_map
 from .estimation import lag_report
-from .html.page import Chapter, Gallery, page, table
-from .html.result import Design, html_or_why, loops_section, result
 from .identification import stabilisation
+from .loops import nyquist, sensitivity
+from .page import Chapter, Gallery, moving_shapes, note, page, table, tiles
 from .placement import pareto_curve, placed, sensor_map
 from .response import response
 from .updating import localisation, parameters, residual
@@ -271,112 +279,221 @@ def _certificate_lines(value: Any) -> Iterator[tuple[str, Any]]:
         yield "no choice is below", in_words(value.bound, value.unit)
 
 
-#: nodes and modes that are drawn at most
-_NODES, _MODES = 1200, 24
-#: neighbours of a node among which its lines are searched
-_NEIGHBOURS = 27
-_SELECTED = ' selected="selected"'
+Tile = tuple[str, str, str, str]
 
 
-def moving_shapes(modes: Modes) -> str:
-    """Return a figure whose modes move; empty where no DOF is a translation."""
-    xyz, shapes = _translations(modes)
-    if not len(xyz):
-        return ""
-    chosen = _thinned(xyz)
-    xyz, shapes = xyz[chosen], shapes[chosen]
-    centre, size = (xyz.max(axis=0) + xyz.min(axis=0)) / 2, float(np.ptp(xyz, axis=0).max()) or 1.0
-    largest = np.linalg.norm(shapes, axis=1).max(axis=0)
-    shapes = shapes / divisor(largest)
-    count = shapes.shape[2]
-    data = {
-        "xyz": _whole_thousandths((xyz - centre) / size),
-        "edges": neighbours(xyz).tolist(),
-        "modes": [_whole_thousandths(shapes[:, :, k]) for k in range(count)],
-    }
-    first = min(modes.n_rigid, count - 1)  # the first that deforms
-    options = "".join(
-        f'<option value="{k}"{_SELECTED if k == first else ""}>{escape(name)}</option>'
-        for k, name in enumerate(_mode_name(modes, k) for k in range(count))
+def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | None:
+    """Return the section of what matters most, of the first loop; None without a loop."""
+    loops = design.of(ClosedLoop)
+    if not loops:
+        return None
+    name, loop = next(iter(loops.items()))
+    main = _main(loop, channel)
+    compared = _loop_figures(loops, main)
+    found, why = _budget(loop, main)
+    parts = [tiles([_error_tile(main, found), *_stability(loop), *_margins(compared.rows[name])])]
+    for verdict in design.of(Verdict).values():
+        said = "The specification is met."
+        if not verdict.passed:
+            said = f"The specification is not met: {', '.join(verdict.failed)}."
+        parts.append(note(said, "note" if verdict.passed else "bad"))
+    for kind in (Verdict, ExposureErrors):
+        parts += [one._repr_html_() for one in design.of(kind).values()]
+    if len(loops) > 1:
+        parts += [note(f"These figures are of {name}; all loops:"), compared._repr_html_()]
+    if found is None:
+        return Chapter("Result", "".join([*parts, note(why, "bad")]))
+    caption = f"Where the error of {main} comes from, by frequency and source"
+    picture = gallery.picture(lambda: budget(found), caption)
+    # without reference an error is as large as the motion
+    errors = [n for n in loop.plant.z if n.endswith(":error")] if loop.plant.is_assembled else []
+    followed = loop.plant.assembled.ports.followed if errors else ()
+    twice = {poi.channel(axis) for poi, axis in followed}
+    shown = [n for n in loop.plant.z if n not in twice]
+    rows = [[n, with_unit(loop.rms(n), loop.units.get(n))] for n in shown]
+    motions = table(["channel", "rms under all noises"], rows)
+    parts.append(
+        f"<h3>Error budget of {escape(main)}</h3>"
+        f'<div class="pictures">{picture}<div>{found._repr_html_()}{motions}</div></div>'
     )
-    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-    return (
-        '<figure class="shape"><div class="bar">'
-        f'<label>mode <select>{options}</select></label><button type="button">pause</button>'
-        '<label>amplitude <input type="range" min="0" max="40" value="12"/></label></div>'
-        '<canvas role="img" aria-label="moving mode shape"></canvas>'
-        "<figcaption>Drag to turn. Colour: size of the displacement, grey to orange; light lines: "
-        "at rest. Amplitudes are exaggerated.</figcaption>"
-        f'<script type="application/json">{text}</script></figure>\n'
-    )
+    others = [n for n in loop.plant.z if n != main and n.endswith(":error")]
+    drawn = "".join(html_or_why(lambda n=n: _other_budget(loop, n, gallery)) for n in others)  # type: ignore[misc]
+    if drawn:
+        parts.append(f'<h3>Error budgets of the other axes</h3><div class="pictures">{drawn}</div>')
+    return Chapter("Result", "".join(parts))
 
 
-def _mode_name(modes: Modes, k: int) -> str:
-    if k < modes.n_rigid:
-        return f"{k + 1}: rigid-body"
-    return f"{k + 1}: {modes.freq[k]:.4g} Hz, damping {100 * modes.zeta[k]:.2g} %"
+def _other_budget(loop: ClosedLoop, channel: str, gallery: Gallery) -> str:
+    found = loop.budget(channel)
+    return gallery.picture(lambda: budget(found, most=3), f"Where {channel} comes from")
 
 
-def _whole_thousandths(values: FloatArray) -> list[int]:
-    """Return thousandths, row by row."""
-    return [int(v) for v in np.rint(1000.0 * values).ravel()]
+def _main(loop: ClosedLoop, channel: str | None) -> str:
+    """Return the channel that comes first: the one asked for, else the first error."""
+    return channel or next((n for n in loop.plant.z if n.endswith(":error")), loop.plant.z[0])
 
 
-def _translations(modes: Modes) -> tuple[FloatArray, FloatArray]:
-    """Return the nodes (n, 3) that translate, and how they do in each mode (n, 3, modes)."""
-    dofs, count = modes.dofs, min(modes.n_modes, _MODES)
-    axis = {"x": 0, "y": 1, "z": 2}
-    rows = [i for i, direction in enumerate(dofs.directions) if direction in axis]
-    nodes = dofs.nodes[rows]
-    unique, first, place = np.unique(nodes, return_index=True, return_inverse=True)
-    shapes = np.zeros((unique.size, 3, count))
-    phi = np.asarray(modes.phi)[:, :count]
-    if np.iscomplexobj(phi):  # nearly real shapes, turned so that they are
-        largest = phi[np.argmax(np.abs(phi), axis=0), np.arange(count)]
-        phi = (phi * np.exp(-1j * np.angle(largest))).real
-    shapes[place, [axis[dofs.directions[i]] for i in rows]] = phi[rows]
-    return dofs.xyz[rows][first], shapes
+def loops_section(design: Design, gallery: Gallery, channel: str | None) -> Chapter | None:
+    """Return the section of margins, loop by loop, and of sensitivities; None without a loop."""
+    loops = design.of(ClosedLoop)
+    if not loops:
+        return None
+    parts = []
+    compared = _loop_figures(loops, _main(next(iter(loops.values())), channel))
+    stable = {name: loop for name, loop in loops.items() if compared.rows[name].stable}
+    if compared.channel and stable:
+        name, first = next(iter(stable.items()))
+        axes = axis_sensitivities(first)
+        caption, drawn = f"Sensitivity |S|, {compared.channel}", ""
+        if len(axes) < 2 or len(stable) > 1:
+            pair = compared.channel.split(" to ")
+            lines = {label: error_sensitivity(one, *pair) for label, one in stable.items()}
+            drawn = gallery.picture(lambda: sensitivity(lines), caption)
+        if len(axes) > 1:
+            caption = f"{name}: sensitivity |S| of each axis, from its reference to its error"
+            drawn += gallery.picture(lambda: sensitivity(axes), caption)
+        caption = f"{name}: each loop broken at its actuator while the others stay closed"
+        drawn += gallery.picture(lambda: nyquist(first), caption)
+        parts.append(f'<div class="pictures">{drawn}</div>')
+    for name, loop in loops.items():
+        parts += [f"<h3>{escape(name)}</h3>", loop._repr_html_()]
+        parts.append(html_or_why(lambda loop=loop: _margin_table(loop)))  # type: ignore[misc]
+    return Chapter("Loop", "".join(parts))
 
 
-def _thinned(xyz: FloatArray) -> IntArray:
-    """Return about so many nodes as can be drawn, one for each cell of a grid."""
-    cells = 4 * _NODES
-    chosen: IntArray = np.arange(len(xyz))
-    while chosen.size > _NODES:
-        # a plane has no third extent to be divided into cells
-        extent = np.maximum(np.ptp(xyz, axis=0), 1e-12)
-        present = extent > 1e-6 * extent.max()
-        edge = (np.prod(extent[present]) / cells) ** (1.0 / max(int(present.sum()), 1))
-        place = np.floor((xyz - xyz.min(axis=0)) / edge).astype(np.int64)
-        chosen = np.sort(np.unique(place, axis=0, return_index=True)[1])
-        cells = int(0.7 * cells)
-    return chosen
+def _loop_figures(loops: Mapping[str, ClosedLoop], channel: str) -> LoopComparison:
+    """Return the figures of loops, of S from the reference of an error, else from the first."""
+    known = references(next(iter(loops.values())).plant)
+    own = f"{channel.removesuffix(':error')}:ref"
+    return compare_loops(loops, reference=own if own in known else next(iter(known), None))
 
 
-def neighbours(xyz: FloatArray) -> IntArray:
-    """Return the pairs (m, 2) of nodes between which no other lies (a Gabriel graph).
+def html_or_why(make: Callable[[], str]) -> str:
+    """Return HTML, or in its place why it cannot be computed."""
+    try:
+        return make()
+    except FlexplantError as error:
+        return note(f"Not shown: {error}")
 
-    A pair is joined when the sphere with it as diameter holds no third node: the lines of a
-    regular mesh without its diagonals, whatever its ratio of sides.
-    """
-    from scipy.spatial import cKDTree
 
-    count = min(len(xyz), _NEIGHBOURS)
-    if count < 2:
-        return np.zeros((0, 2), dtype=np.int64)
-    tree: Any = cKDTree(xyz)
-    distance, near = tree.query(xyz, k=count)
-    i = np.repeat(np.arange(len(xyz)), count)
-    pairs = np.column_stack([i, near.ravel()])[distance.ravel() > 0]
-    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
-    a, b = xyz[pairs[:, 0]], xyz[pairs[:, 1]]
-    radius = 0.5 * np.linalg.norm(b - a, axis=1)
-    closest, _ = tree.query((a + b) / 2, k=min(3, len(xyz)))
-    # the pair itself is at the radius; a third node inside or on the sphere is nearer or as near
-    # nodes of a regular mesh lie on the sphere: rounding must not decide
-    inside = np.atleast_2d(closest)[:, : min(3, len(xyz))] < radius[:, None] * (1.0 - 1e-6)
-    on = np.sum(closest <= radius[:, None] * (1.0 + 1e-6), axis=1) > 2
-    return np.asarray(pairs[~inside.any(axis=1) & ~on], dtype=np.int64)
+def _budget(loop: ClosedLoop, channel: str) -> tuple[ErrorBudget | None, str]:
+    """Return the error budget, or why there is none."""
+    try:
+        return loop.budget(channel), ""
+    except FlexplantError as error:
+        return None, f"No error budget: {error}"
+
+
+def _error_tile(channel: str, found: ErrorBudget | None) -> Tile:
+    if found is None:
+        return (f"{channel}, rms", "none", "see below", "bad")
+    beside, kind = "modes left out: not known", ""
+    if np.isinf(found.left_out):
+        beside, kind = "unstable with the modes left out", "bad"
+    elif np.isfinite(found.left_out):
+        beside = f"with the modes left out {with_unit(found.left_out, found.unit)}"
+    return (f"{channel}, rms", with_unit(found.rms, found.unit), beside, kind)
+
+
+def _stability(loop: ClosedLoop) -> list[Tile]:
+    stable = loop.obstacle is None
+    sampled = bool(loop.plant.dt)
+    size = loop.spectral_radius if sampled else loop.spectral_abscissa
+    own = one_line({stability_name(sampled): size})
+    found = [("stability", "stable" if stable else "UNSTABLE", own, "good" if stable else "bad")]
+    left = loop.left_out
+    if left is None:
+        return [*found, ("with the modes left out", "not checked", "close_loop(larger=...)", "")]
+    figure = "stable" if left.is_stable else "UNSTABLE"
+    beside = one_line({stability_name(sampled): left.stability})
+    if left.modes:
+        beside = left.named_modes
+    kind = "good" if left.is_fine else "bad"
+    return [
+        *found,
+        (f"with the modes left out ({counted(left.states, 'state')})", figure, beside, kind),
+    ]
+
+
+def _margins(row: LoopFigures) -> list[Tile]:
+    if not row.stable:
+        return []
+    peak = 20.0 * np.log10(1.0 / row.margin)
+    tiles: list[Tile] = [
+        ("|S| at u, largest", f"{peak:.1f} dB", f"modulus margin {row.margin:.3g}", "")
+    ]
+    if np.isfinite(row.bandwidth):
+        most = f"|S| at most {20.0 * np.log10(row.peak):.1f} dB, at {row.peak_freq:.4g} Hz"
+        tiles.append(("|S| < 1 up to", f"{row.bandwidth:.4g} Hz", most, ""))
+    return tiles
+
+
+def _margin_table(loop: ClosedLoop) -> str:
+    if loop.obstacle is not None:
+        return note(f"No margins: {loop.obstacle.reason}.", "bad")
+    found: Any = report_loops(loop)
+    rows = []
+    for one in found.values():
+        gain = f"{20.0 * np.log10(one.gain_margin):.1f}" if np.isfinite(one.gain_margin) else "none"
+        if one.gain_reduction:
+            gain += f" and {20.0 * np.log10(one.gain_reduction):.1f}"
+        crosses = ", ".join(f"{f:.4g}" for f in one.crossovers[:3]) or "none"
+        rows.append([
+            one.name, crosses, gain, f"{one.phase_margin:.0f}",
+            f"{one.modulus_margin:.3f}", f"{one.freq:.4g}",
+        ])  # fmt: skip
+    head = [
+        *("loop broken at", "crosses 1 at [Hz]", "gain margin [dB]", "phase margin [deg]"),
+        *("modulus margin", "at [Hz]"),
+    ]
+    return table(head, rows, "Each loop broken at its actuator while the others stay closed")
+
+
+Kind = TypeVar("Kind")
+
+
+class Design:
+    """Named values in the order in which they were given."""
+
+    def __init__(self, parts: Sequence[Any]) -> None:
+        self.named: dict[str, Any] = {}
+        for name, value in _named_parts(parts):
+            own = name or _free_name(type(value).__name__, self.named)
+            if own in self.named:
+                raise ModelError(f"two parts of the report are named {own!r}: rename one.")
+            self.named[own] = value
+        if not self.named:
+            raise ModelError(
+                "there is nothing to report: pass values, such as a closed loop and its run."
+            )
+
+    def of(self, kind: type[Kind]) -> dict[str, Kind]:
+        """Return the values of a kind by name."""
+        return {name: one for name, one in self.named.items() if isinstance(one, kind)}
+
+    @property
+    def plant(self) -> StandardPlant | None:
+        """The plant that was given, else that of the first loop."""
+        own: list[StandardPlant] = list(self.of(StandardPlant).values())
+        return next(iter([*own, *(loop.plant for loop in self.of(ClosedLoop).values())]), None)
+
+
+def _named_parts(parts: Sequence[Any]) -> Iterator[tuple[str, Any]]:
+    for part in parts:
+        named = isinstance(part, Mapping) and not isinstance(part, Value)
+        for name, value in part.items() if named else [("", part)]:
+            if not isinstance(value, Value):
+                raise ModelError(
+                    f"a report holds values of flexplant, got {short(value)}. Pass plants, loops, "
+                    "controllers, runs and so on, or mappings of names to such."
+                )
+            yield str(name), value
+
+
+def _free_name(name: str, taken: Mapping[str, Any]) -> str:
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).capitalize()
+    numbers = (f" {i}" if i > 1 else "" for i in range(1, len(taken) + 2))
+    return next(f"{name}{number}" for number in numbers if f"{name}{number}" not in taken)
 
 
 def report(
