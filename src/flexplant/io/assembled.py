@@ -88,38 +88,34 @@ def from_triplets(
 
 
 def chosen(
-    names: Iterable[str], wanted: Mapping[str, str | None], source: str
-) -> dict[str, str | None]:
-    """Return which of the names of a file are K, M and D; those named must be there.
+    variables: Mapping[str, Any], wanted: Mapping[str, str | None], source: str
+) -> dict[str, Any]:
+    """Return which variables of a file are K, M and D, where there; those named must be.
 
     "usual" stands for one that has a usual name, as does None, but for D: None leaves it out.
     """
-    there = list(names)
-    found: dict[str, str | None] = {}
+    # the shortest path first: K before model.K
+    there = sorted(variables, key=lambda text: (text.count("."), text))
+    found: dict[str, Any] = {}
     for part, name in wanted.items():
-        if part == "D" and name is None:
-            found[part] = None
-            continue
-        if name not in (None, USUAL):
-            if name not in there:
-                raise ModelError(
-                    f"{source!r} has no variable {name!r}: it holds {there[:10]}. Names are "
-                    "case-sensitive; fields of a structure are written 'structure.field'."
-                )
-            found[part] = name
-            continue
-        # the shortest path first: K before model.K
+        if name not in (None, USUAL) and name not in variables:
+            raise ModelError(
+                f"{source!r} has no variable {name!r}: it holds {list(variables)[:10]}. Names are "
+                "case-sensitive; fields of a structure are written 'structure.field'."
+            )
         usual = [
-            name
+            known
             for usual_name in USUAL_NAMES[part]
-            for name in sorted(there, key=lambda text: (text.count("."), text))
-            if name.rsplit(".", 1)[-1].lower() == usual_name
+            for known in there
+            if known.rsplit(".", 1)[-1].lower() == usual_name and (name or part != "D")
         ]
-        found[part] = usual[0] if usual else None
-    if found["K"] is None:
+        own = name if name not in (None, USUAL) else next(iter(usual), None)
+        if own is not None:
+            found[part] = variables[own]
+    if "K" not in found:
         raise ModelError(
-            f"{source!r} holds {there[:10]}, none of which looks like a stiffness matrix. Say "
-            "which it is: stiffness='...', mass='...'."
+            f"{source!r} holds {list(variables)[:10]}, none of which looks like a stiffness "
+            "matrix. Say which it is: stiffness='...', mass='...'."
         )
     return found
 

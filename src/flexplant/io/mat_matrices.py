@@ -87,17 +87,13 @@ def read_npz(
     stiffness, mass, damping : str or Path
         One file each, as `scipy.sparse.save_npz` or `numpy.save` writes it; or as `stiffness` alone
         an .npz of `numpy.savez(path, K=K, M=M, D=D)`.
-    dofs : DofSet, or path of a table for `read_dofs`, optional
-        What the rows stand for: the files do not say.
+    dofs : optional
+        As for `read_matlab`.
 
     Raises
     ------
-    FlexplantError
-        When a file is neither.
-    ModelError
-        When there is no K, or entries are no finite real numbers.
-    ShapeError
-        When sizes differ.
+    FlexplantError, ModelError, ShapeError
+        As for `read_matlab`.
 
     Examples
     --------
@@ -134,16 +130,14 @@ def _numpy(path: Path, name: str) -> dict[str, Any]:
         if len(arrays) != 1:
             raise FlexplantError(f"{str(path)!r} holds {list(arrays)}: one array was expected.")
         return {name: next(iter(arrays.values()))}
-    names = chosen(arrays, {"K": None, "M": None, "D": USUAL}, path.name)
-    return {part: arrays[key] for part, key in names.items() if key is not None}
+    return chosen(arrays, {"K": None, "M": None, "D": USUAL}, path.name)
 
 
 def _version5(path: Path, wanted: Mapping[str, str | None]) -> dict[str, Any]:
     variables: dict[str, Any] = {}
     for name, value in mat_variables(path).items():
         _flatten(name, value, variables)
-    names = chosen(variables, wanted, path.name)
-    return {part: variables[key] for part, key in names.items() if key is not None}
+    return chosen(variables, wanted, path.name)
 
 
 def _flatten(name: str, value: Any, found: dict[str, Any]) -> None:
@@ -180,9 +174,8 @@ def _version73(path: Path, wanted: Mapping[str, str | None]) -> dict[str, Any]:
                     variables[name] = item
 
         visit("", file)
-        names = chosen(variables, wanted, path.name)
-        size = path.stat().st_size
-        return {p: _hdf5(variables[key], path, size) for p, key in names.items() if key is not None}
+        size, found = path.stat().st_size, chosen(variables, wanted, path.name)
+        return {part: _hdf5(item, path, size) for part, item in found.items()}
 
 
 def _hdf5(item: Any, path: Path, size: int) -> Any:

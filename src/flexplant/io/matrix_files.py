@@ -17,6 +17,7 @@ from ..checks import FloatArray
 from ..errors import FlexplantError, ShapeError
 from ..labels import DofSet
 from ..structure import FEMatrices
+from ..structure.matrices import completed
 from .assembled import one_matrix_each
 from .files import (
     FORMATS,
@@ -106,7 +107,10 @@ def _matrix_market(path: Path) -> tuple[Any, int | None]:
         entries = _plain_entries(body, head)
         if entries is None:
             entries = _entries(_entry_table(body, head, path), head, path)
-        matrix = _complete_triangle(entries, head, path) if head.symmetric else entries
+        if head.symmetric:
+            _refuse_both_triangles(entries, head, path)
+            entries = completed(entries, path.name)[0]
+        matrix = entries
     else:
         matrix = _columns(_entry_table(body, head, path)[:, 0], head)
     if head.whole:
@@ -210,16 +214,6 @@ def _entries(table: FloatArray, head: _Header, path: Path) -> Any:
     return sp.coo_array((table[:, 2], (i, j)), shape=head.shape)
 
 
-def _complete_triangle(entries: Any, head: _Header, path: Path) -> Any:
-    """Return the symmetric matrix of which the file lists one of each pair of entries."""
-    i, j = entries.coords
-    _refuse_both_triangles(entries, head, path)
-    off = i != j
-    values = np.concatenate([entries.data, entries.data[off]])
-    places = np.concatenate([i, j[off]]), np.concatenate([j, i[off]])
-    return sp.coo_array((values, places), shape=head.shape)
-
-
 def _refuse_both_triangles(entries: Any, head: _Header, path: Path) -> None:
     """Refuse a symmetric file that lists entries on both sides of the diagonal."""
     i, j = (np.asarray(place, dtype=np.int64) for place in entries.coords)
@@ -269,23 +263,17 @@ def read_harwell_boeing(
     """Return the matrices of Harwell-Boeing (or Rutherford-Boeing) files.
 
     Assembled real or integer matrices, symmetric (RSA, of which the file holds the lower triangle)
-    or not (RUA). The rest is as in `read_matrix_market`.
+    or not (RUA).
 
     Parameters
     ----------
-    stiffness, mass, damping : str or Path
-        Files (.rsa, .rua, .hb, .rb) of K, M and D.
-    dofs : DofSet, or path of a table for `read_dofs`, optional
-        What the rows stand for: the files do not say.
+    stiffness, mass, damping, dofs
+        As for `read_matrix_market`; files .rsa, .rua, .hb, .rb.
 
     Raises
     ------
-    FlexplantError
-        When a file is no Harwell-Boeing file, or cut short.
-    ModelError
-        When a matrix is complex, skew-symmetric, a pattern, or not assembled.
-    ShapeError
-        When sizes differ.
+    FlexplantError, ModelError, ShapeError
+        As for `read_matrix_market`; ModelError for elements that are not assembled, too.
 
     Notes
     -----
@@ -331,9 +319,7 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
     blocks = []
     needed = (n_columns + 1, n_entries, n_entries)
     for count, form, size in zip(counts[1:4], forms, needed, strict=True):
-        blocks.append(
-            _read_number_block(lines[first : first + count], form, size, f"{str(path)!r}", first)
-        )
+        blocks.append(_number_block(lines[first : first + count], form, size, path, first))
         first += count
     with parsing(path), np.errstate(invalid="raise"):
         pointer, index = (block.astype(np.int64) - 1 for block in blocks[:2])
@@ -341,7 +327,7 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
         sound(matrix)
     matrix.sum_duplicates()
     if kind[1] == "S":
-        matrix = sp.csc_array(matrix + sp.tril(matrix, -1).T + sp.triu(matrix, 1).T)
+        matrix = completed(matrix, path.name)[0]
     if kind[0] == "I":
         return matrix, None
     per_line, width = forms[2]
@@ -363,8 +349,8 @@ def _fortran_format(text: str) -> tuple[int, int]:
     return per_line, width
 
 
-def _read_number_block(
-    lines: list[bytes], form: tuple[int, int], size: int, source: str, before: int
+def _number_block(
+    lines: list[bytes], form: tuple[int, int], size: int, path: Path, before: int
 ) -> Any:
     """Return the `size` numbers of a block that follows `before` lines."""
     per_line, width = form
@@ -375,22 +361,18 @@ def _read_number_block(
         # not in the fields that the header names, as some programs write; blanks still separate
         numbers = spaced_numbers(b" ".join(lines), size)
     if numbers is None:
+        where = ""
+        for place, line in enumerate(lines):
+            due = max(0, min(per_line, size - place * per_line))
+            fields = line[: due * width].ljust(due * width)
+            if fixed_numbers(fields, width) is None and spaced_numbers(line, due) is None:
+                where = f", line {before + place + 1} is {line[:72].decode('latin-1')!r}"
+                break
         raise FlexplantError(
-            f"{source} holds fewer than {size} numbers in fields of {width} characters"
-            f"{_damage(lines, form, size, before)}. Is it cut short, or were its blanks lost?"
+            f"{str(path)!r} holds fewer than {size} numbers in fields of {width} characters"
+            f"{where}. Is it cut short, or were its blanks lost?"
         )
     return numbers
-
-
-def _damage(lines: list[bytes], form: tuple[int, int], size: int, before: int) -> str:
-    """Return which line holds something else than numbers, in words; empty when none does."""
-    per_line, width = form
-    for place, line in enumerate(lines):
-        due = max(0, min(per_line, size - place * per_line))
-        fields = line[: due * width].ljust(due * width)
-        if fixed_numbers(fields, width) is None and spaced_numbers(line, due) is None:
-            return f", line {before + place + 1} is {line[:72].decode('latin-1')!r}"
-    return ""
 
 
 FORMATS.append(Format((".rsa", ".rua", ".hb", ".rb"), read_harwell_boeing))

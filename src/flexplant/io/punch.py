@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from ..checks import FloatArray, IntArray
 from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
 from ..labels import DIRECTIONS, DofSet
-from ..structure.matrices import FEMatrices
+from ..structure.matrices import FEMatrices, completed
 from .fe_modes import MODE_READERS, FileShapes
 from .files import (
     FORMATS,
@@ -176,12 +176,8 @@ class _Block:
             nodes = " and ".join(f"{code >> 4} component {code & 15}" for code in codes)
             do = "A symmetric matrix has one triangle only: write the file again."
             raise unread(path, f"gives the entry of {self.name}, node {nodes} twice", do)
-        half = sp.coo_array((self.values, (i, j)), shape=(n, n))
-        if self.form == 1:
-            return sp.csc_array(half)
-        off = i != j
-        mirrored = sp.coo_array((self.values[off], (j[off], i[off])), shape=(n, n))
-        return sp.csc_array(half + mirrored)
+        listed = sp.coo_array((self.values, (i, j)), shape=(n, n))
+        return sp.csc_array(listed) if self.form == 1 else completed(listed, self.name)[0]
 
 
 def _read_blocks(lines: list[bytes], path: str) -> dict[str, _Block]:
