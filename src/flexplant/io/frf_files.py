@@ -18,7 +18,6 @@ from ..errors import (
     ModelError,
     ShapeError,
     require_known,
-    unknown_label,
 )
 from ..lti.frequency import Frf
 from ..store import written
@@ -35,11 +34,10 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     """Write frequency response functions as a CSV file.
 
     A line `# quantity: displacement`, a header `frequency [Hz], y1 <- u1 real [m/N],
-    y1 <- u1 imag [m/N], ...` (and `... coherence`, `... variance` where
-    known), then one line a frequency, with
-    all digits. Where known, lines `# resolution: 0.5` [Hz], `# window: hann` and `# overlap: 0.5`
-    follow the first. The correlation between outputs and a window with parameters stay behind:
-    `.save` keeps them.
+    y1 <- u1 imag [m/N], ...` (and `... coherence`, `... variance` where known), then one line a
+    frequency, with all digits. Where known, lines `# resolution: 0.5` [Hz], `# window: hann` and
+    `# overlap: 0.5` follow the first. The correlation between outputs and a window with parameters
+    stay behind: `.save` keeps them.
 
     Parameters
     ----------
@@ -88,12 +86,10 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
             unit = f" [{above}/{below}]" if above and below else ""
             header += [f"{output}{_ARROW}{name} {part}{unit}" for part in ("real", "imag")]
             columns += [frf.data[i, j].real, frf.data[i, j].imag]
-            if frf.coherence is not None:
-                header.append(f"{output}{_ARROW}{name} coherence")
-                columns.append(frf.coherence[i, j])
-            if frf.variance is not None:
-                header.append(f"{output}{_ARROW}{name} variance")
-                columns.append(frf.variance[i, j])
+            for part in ("coherence", "variance"):
+                if (values := getattr(frf, part)) is not None:
+                    header.append(f"{output}{_ARROW}{name} {part}")
+                    columns.append(values[i, j])
     text = io.StringIO()
     text.write(f"# quantity: {frf.quantity or 'unknown'}\n")
     if frf.resolution is not None:
@@ -155,8 +151,7 @@ def read_frf_csv(path: str | Path) -> Frf:
             what = f"has {len(row)} numbers in line {line}, and {len(keys) + 1} columns"
             raise refused(path, what, "Complete it.")
     table = np.array(values, dtype=np.float64).reshape(len(values), len(keys) + 1)
-    outputs = list(dict.fromkeys(key[0] for key in keys))
-    inputs = list(dict.fromkeys(key[1] for key in keys))
+    outputs, inputs = (list(dict.fromkeys(key[side] for key in keys)) for side in (0, 1))
     column = {key: table[:, i] for i, key in enumerate(keys, 1)}
     missing = [
         f"{a}{_ARROW}{b} {part}"
@@ -285,14 +280,8 @@ def read_frf_mat(
 
     Raises
     ------
-    FlexplantError
-        When it is no MATLAB file, or the variables are not there.
-    ShapeError
-        When sizes do not match, or which axis is frequency is not clear.
-    ModelError
-        When frequencies do not increase, or entries are not finite.
-    LabelError
-        When a variable or the quantity is unknown.
+    FlexplantError, ShapeError, ModelError, LabelError
+        As for `read_frf_npz`.
 
     Examples
     --------
@@ -329,7 +318,7 @@ def _frf(
             )
     responses = _ordered(responses, grid.size, axis, data, path)
     others = {name: content[name] for name in _OPTIONAL if name in content}
-    said = "".join(str(part) for part in np.ravel(others.pop("quantity", "")))
+    said = "".join(map(str, np.ravel(others.pop("quantity", ""))))
     instance(quantity, str | None, "quantity", "Pass 'displacement', say.")
     if quantity is not None and said and said != quantity:
         raise ModelError(
@@ -337,8 +326,7 @@ def _frf(
             f".converted({quantity!r})."
         )
     kind = quantity or said or None
-    if kind not in (None, "displacement", "velocity", "acceleration"):
-        raise unknown_label("quantity", kind, ["displacement", "velocity", "acceleration"])
+    require_known("quantity", [kind] if kind else (), _UNITS)
     for name in ("coherence", "variance"):
         if name in others:
             others[name] = _ordered(np.asarray(others[name]), grid.size, axis, name, path).real

@@ -144,10 +144,8 @@ def read_mat_values(path: str | Path) -> dict[str, MatValue]:
 
     Raises
     ------
-    FlexplantError
-        When it is no MATLAB file (version 7.3 is HDF5: save with '-v7').
-    ModelError, ShapeError, LabelError
-        When there is no such structure, or what one holds does not belong together.
+    FlexplantError, ModelError, ShapeError, LabelError
+        As for `read_mat`; ModelError when there is no such structure.
 
     Examples
     --------
@@ -197,16 +195,16 @@ def _value_kind(content: Mapping[str, Any]) -> str:
 
 
 def _mat_value(content: Mapping[str, Any], where: str) -> MatValue:
-    kind = _value_kind(content)
-    if not kind:
+    makers: dict[str, Any] = {"system": system_of, "reduced": reduced_of, "frf": frf_of}
+    make = makers.get(_value_kind(content))
+    if make is None:
         missing = [name for name in "ABCD" if name not in content]
         raise ModelError(
             f"{where} has no {', '.join(missing)}: it holds {sorted(content)[:8]}. A system "
             "object must be taken apart in MATLAB: [A, B, C, D, dt] = ssdata(P)."
         )
-    makers: dict[str, Any] = {"system": system_of, "reduced": reduced_of, "frf": frf_of}
     with parsing(where):
-        value: MatValue = makers[kind](content)
+        value: MatValue = make(content)
     return value
 
 
@@ -228,15 +226,11 @@ def system_fields(system: Any) -> dict[str, Any]:
 def system_of(content: Mapping[str, Any]) -> StateSpace | StandardPlant:
     """Return the system of some fields, a plant when they say which channels are w, u, z and y."""
     blocks = content.get("blocks")
+    parts: dict[str, Any] = {name: content[name] for name in "ABCD"}
+    parts |= {one: names_in(content.get(one)) for one in ("inputs", "outputs", "states")}
     g = StateSpace(
-        content["A"],
-        content["B"],
-        content["C"],
-        content["D"],
-        float(np.squeeze(content.get("dt", 0.0))),
-        inputs=names_in(content.get("inputs")),
-        outputs=names_in(content.get("outputs")),
-        states=names_in(content.get("states")),
+        **parts,
+        dt=float(np.squeeze(content.get("dt", 0.0))),
         name=text_in(content.get("name", "")) or None,
         blocks=None if blocks is None else [int(size) for size in np.ravel(blocks)],
     )
@@ -272,12 +266,10 @@ _NUMBERS = ("coherence", "variance", "resolution", "overlap", "freedom")
 
 def reduced_fields(model: ReducedModel) -> dict[str, Any]:
     """Return M, D, K, T, the rigid-body motions, and the DOFs with their coordinates."""
-    content: dict[str, Any] = {name: getattr(model, name) for name in "MDKT"}
-    content["rigid_body"] = model.rigid_body
-    content["coordinates"] = cells(model.coordinates)
-    content["static_at"] = cells(model.static_at)
-    content |= {"method": model.method, "condition": model.condition}
-    content |= {"condition_of": model.condition_of, "n_vectors": float(model.n_vectors)}
+    plain = (*"MDKT", "rigid_body", "method", "condition", "condition_of")
+    content: dict[str, Any] = {name: getattr(model, name) for name in plain}
+    content |= {name: cells(getattr(model, name)) for name in ("coordinates", "static_at")}
+    content["n_vectors"] = float(model.n_vectors)
     content |= {"dofs": _dof_fields(model.dofs), "full_dofs": _dof_fields(model.full_dofs)}
     if model.joint_motions is not None:
         content["joint_motions"] = model.joint_motions
@@ -288,20 +280,17 @@ def reduced_of(content: Mapping[str, Any]) -> ReducedModel:
     """Return the reduced model of some fields."""
     n = content["M"].shape[0]
     motions = content.get("joint_motions")
+    names: Any = {name: names_in(content.get(name)) for name in ("coordinates", "static_at")}
     return ReducedModel(
-        M=content["M"],
-        D=content["D"],
-        K=content["K"],
-        T=content["T"],
+        **{name: content[name] for name in "MDKT"},
         dofs=_dofs_of(content["dofs"]),
         full_dofs=_dofs_of(content["full_dofs"]),
         rigid_body=np.asarray(content["rigid_body"]).reshape(n, -1),
         method=text_in(content.get("method", "")),
         condition=float(np.squeeze(content.get("condition", 1.0))),
-        coordinates=names_in(content.get("coordinates")),
+        **names,
         condition_of=text_in(content.get("condition_of", "phi_kk")),
         n_vectors=int(np.squeeze(content.get("n_vectors", 0))),
-        static_at=names_in(content.get("static_at")),
         joint_motions=None if motions is None else np.asarray(motions).reshape(n, -1),
     )
 
@@ -324,11 +313,8 @@ def frf_of(content: Mapping[str, Any]) -> Frf:
     options: dict[str, Any] = {}
     for name in _NUMBERS:
         if name in content:
-            value = np.asarray(content[name])
-            options[name] = value.reshape(shape) if value.size > 1 else float(np.squeeze(value))
-    for name in ("coherence", "variance"):
-        if name in options:
-            options[name] = np.reshape(options[name], shape)
+            value, each = np.asarray(content[name]), name in ("coherence", "variance")
+            options[name] = value.reshape(shape) if each else float(np.squeeze(value))
     return Frf(
         freq,
         data.reshape(shape) if inputs and data.size == np.prod(shape) else data,

@@ -62,12 +62,8 @@ def read_matrices(
 
     Raises
     ------
-    FileNotFoundError
-        When there is no such file, as with every reader.
-    FlexplantError
-        When the format is not known, holds no matrices, or the file is damaged.
-    ModelError, LabelError, ShapeError
-        When the reader of this format has no such option, and what it raises itself.
+    FileNotFoundError, FlexplantError, ModelError, LabelError, ShapeError
+        As for `read_model`.
 
     Examples
     --------
@@ -232,12 +228,10 @@ def _check_options(options: Iterable[str], form: Format, name: str) -> None:
 def _format(path: Path) -> Format:
     with path.open("rb") as file:
         head = file.read(HEAD)
-    for form in FORMATS:
-        if form.begins(head):
-            return form
-    for form in FORMATS:
-        if ends(path, form.suffixes):
-            return form
+    known = [form for form in FORMATS if form.begins(head)]
+    known += [form for form in FORMATS if ends(path, form.suffixes)]
+    if known:
+        return known[0]
     for other in ELSEWHERE:
         if ends(path, other.suffixes) and other.begins(head):
             raise FlexplantError(f"{path.name!r} holds no matrices but {other.reader}.")

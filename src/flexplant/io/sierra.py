@@ -112,10 +112,9 @@ def read_exodus_modes(
     omega, n_rigid, order = frequencies(omega, rigid_below, str(path))
     damping = np.broadcast_to(np.asarray(zeta, dtype=np.float64), omega.shape).copy()
     damping[:n_rigid] = 0.0
-    phi = phi[:, order]
     if M is not None:
-        check_mass(phi, M, str(path))
-    return Modes(omega, damping, phi, dofs, n_rigid)
+        check_mass(phi[:, order], M, str(path))
+    return Modes(omega, damping, phi[:, order], dofs, n_rigid)
 
 
 def read_shapes(
@@ -193,51 +192,35 @@ class ExodusFile:
     """Arrays of an Exodus file by name."""
 
     def __init__(self, path: str, file: Any) -> None:
-        self.path, self.file = path, file
-
-    def _wrong(self, what: str) -> FlexplantError:
-        return damaged(self.path, what)
-
-    def _names(self) -> Any:
-        return getattr(self.file, "variables", self.file)
+        self.path, self.held = path, getattr(file, "variables", file)
 
     def array(self, name: str) -> Any:
         """Return a variable as an array."""
-        if not self.holds(name):
-            raise self._wrong(f"it has no {name!r}")
-        array = np.array(self._names()[name][()] if self._hdf() else self._names()[name][:])
+        if name not in self.held:
+            raise damaged(self.path, f"it has no {name!r}")
+        array = np.array(self.held[name][...])
         return array.astype(array.dtype.newbyteorder("="))
-
-    def holds(self, name: str) -> bool:
-        """Return whether there is a variable of a name."""
-        return name in self._names()
-
-    def _hdf(self) -> bool:
-        return not hasattr(self.file, "variables")
 
     def nodes(self) -> tuple[FloatArray, Any]:
         """Return coordinates (n, 3) and node numbers (n,)."""
-        if self.holds("coord"):
+        if "coord" in self.held:
             rows = list(self.array("coord"))
         else:
-            rows = [self.array(f"coord{a}") for a in "xyz" if self.holds(f"coord{a}")]
+            rows = [self.array(f"coord{a}") for a in "xyz" if f"coord{a}" in self.held]
         if not rows:
-            raise self._wrong("it has no coordinates of nodes")
+            raise damaged(self.path, "it has no coordinates of nodes")
         rows += [np.zeros_like(rows[0])] * (3 - len(rows))
         xyz = real_array(np.stack(rows, axis=1), "coordinates", (None, 3))
-        ids = np.arange(1, xyz.shape[0] + 1)
-        for name in ("node_num_map", "node_map"):
-            if self.holds(name):
-                ids = self.array(name).astype(np.int64)
-                break
-        if ids.size != xyz.shape[0]:
-            raise self._wrong(f"{ids.size} node numbers, {xyz.shape[0]} nodes")
+        name = next((one for one in ("node_num_map", "node_map") if one in self.held), None)
+        ids = np.arange(1, len(xyz) + 1) if name is None else self.array(name).astype(np.int64)
+        if ids.size != len(xyz):
+            raise damaged(self.path, f"{ids.size} node numbers, {len(xyz)} nodes")
         return xyz, ids
 
     def variables(self) -> list[str]:
         """Return the names of the nodal variables."""
-        if not self.holds("name_nod_var"):
-            raise self._wrong("it has no nodal variables, hence no shapes")
+        if "name_nod_var" not in self.held:
+            raise damaged(self.path, "it has no nodal variables, hence no shapes")
         table = self.array("name_nod_var")
         return [
             b"".join(np.atleast_1d(row).tolist()).split(b"\0")[0].decode("latin-1").strip()
@@ -246,7 +229,7 @@ class ExodusFile:
 
     def shapes(self, place: int) -> Any:
         """Return a nodal variable (steps, nodes) by its place (from 0)."""
-        if self.holds("vals_nod_var"):
+        if "vals_nod_var" in self.held:
             return cast(Any, self.array("vals_nod_var"))[:, place]
         return self.array(f"vals_nod_var{place + 1}")
 
