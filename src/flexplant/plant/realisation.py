@@ -79,6 +79,11 @@ class ModalRealisation(Value):
         """Number of modes, rigid-body ones included, residual vectors not."""
         return sum(name.startswith("mode") for name in self.names) // 2
 
+    @property
+    def elastic(self) -> range:
+        """The numbers of the elastic modes, from 1, rigid-body ones included."""
+        return range(self.n_rigid + 1, self.n_modes + 1)
+
     def once(self, key: Hashable, found: Callable[[], T]) -> T:
         """Return what is known of the structure by a key, found at the first call only."""
         known: dict[Hashable, Any] = self.__dict__.setdefault("_known", {})

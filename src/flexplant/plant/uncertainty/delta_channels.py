@@ -14,10 +14,10 @@ from ...lti.discretisation import bilinear, discretized, tustin
 from ...lti.equations import state_scale
 from ...lti.interconnection import lft
 from ...lti.statespace import StateSpace
-from ...tolerances import ROUNDING, TINY, divisor
-from ..partition import Partition
+from ...tolerances import TINY, divisor
 from .neglected import NeglectedModes, with_neglected
-from .uncertain_plant import Delta, UncertainPlant, with_changes
+from .opening import system_matrix, with_channels, with_gain_channels
+from .uncertain_plant import UncertainPlant
 
 #: directions of a Delta's change below this, relative to the largest, are left out
 _RANK = 1e-5
@@ -303,110 +303,3 @@ def _distance(
         closed = units.scaled(tustin(_at_values(system, amounts), 1.0 / base.dt))
         found = max(found, float(la.norm(exact - closed) / la.norm(exact - units.scaled(base))))
     return found
-
-
-#: values of the Deltas at which the channels are compared with a plant assembled anew
-_PROBE = 0.5
-
-
-def system_matrix(g: StateSpace) -> FloatArray:
-    """Return ``[A B; C D]``."""
-    return np.block([[g.A, g.B], [g.C, g.D]])
-
-
-def with_channels(
-    g: StateSpace,
-    before: int,
-    names: Sequence[str],
-    left: FloatArray,
-    right: FloatArray,
-    feed: FloatArray | None = None,
-) -> StateSpace:
-    """Return a system with channels `name:w` and `name:z` after its first inputs and outputs.
-
-    left (n + p, k): what w adds to states and later outputs; right (k, n + m): what z reads of
-    states and all inputs; feed (k, k): from w to z, zero when not given.
-    """
-    n, k = g.n_states, len(names)
-    feed = np.zeros((k, k)) if feed is None else feed
-    D = np.block([
-        [g.D[:before, :before], np.zeros((before, k)), g.D[:before, before:]],
-        [right[:, n : n + before], feed, right[:, n + before :]],
-        [g.D[before:, :before], left[n:], g.D[before:, before:]],
-    ])  # fmt: skip
-    return StateSpace(
-        g.A,
-        np.hstack([g.B[:, :before], left[:n], g.B[:, before:]]),
-        np.vstack([g.C[:before], right[:, :n], g.C[before:]]),
-        D,
-        g.dt,
-        inputs=[*g.inputs[:before], *(f"{name}:w" for name in names), *g.inputs[before:]],
-        outputs=[*g.outputs[:before], *(f"{name}:z" for name in names), *g.outputs[before:]],
-        states=g.states,
-        name=g.name,
-        blocks=g.blocks,
-    )
-
-
-def with_gain_channels(
-    plant: Partition, system: StateSpace, deltas: Sequence[Delta]
-) -> tuple[StateSpace, list[tuple[str, int]]]:
-    """Return a system with a first channel for each Delta on a gain, and their names, in order.
-
-    ``(1 + d) u`` acts by d times the command's column more, all but its own effort, and so does
-    noise at the amplifier's input; ``(1 + d) y`` adds d times what the sensor shows of the motion,
-    with what the actuators' Deltas do.
-    """
-    order = sorted(deltas, key=lambda one: one.name.removesuffix(":gain") in plant.y)
-    for delta in order:
-        name = delta.name.removesuffix(":gain")
-        n, (k, m) = system.n_states, (len(system.outputs), len(system.inputs))
-        left, right = np.zeros((n + k, 1)), np.zeros((1, n + m))
-        if name in plant.u:
-            column = system.inputs.index(name)
-            left[:, 0] = np.concatenate([system.B[:, column], system.D[:, column]])
-            left[n + system.outputs.index(f"{name}:effort")] = 0.0
-            right[0, n + column] = delta.scale
-            if f"{name}:disturbance" in system.inputs:  # at the amplifier's input: scaled as well
-                noise = system.inputs.index(f"{name}:disturbance")
-                its = np.concatenate([system.B[:, noise], system.D[:, noise]])
-                share = float(left[:, 0] @ its) / float(left[:, 0] @ left[:, 0])
-                right[0, n + noise] = delta.scale * share
-        else:
-            row = system.outputs.index(name)
-            left[n + row] = 1.0
-            right[0] = delta.scale * np.concatenate([system.C[row], system.D[row]])
-            if f"{name}:noise" in system.inputs:
-                right[0, n + system.inputs.index(f"{name}:noise")] = 0.0
-        system = with_channels(system, 0, [delta.name], left, right)  # first: all others see it
-    return system, [(delta.name, 1) for delta in reversed(order)]
-
-
-def require_exact(
-    plant: Partition, system: StateSpace, deltas: Sequence[Delta], what: str, do: str
-) -> None:
-    """Raise ModelError unless the channels give the plant with all modes changed at once."""
-    values = {d.name: _PROBE * (1.0 if j % 2 else -0.5) for j, d in enumerate(deltas)}
-    changes = [(delta, values[delta.name] * delta.scale) for delta in deltas]
-    wanted = system_matrix(with_changes(plant, changes).system)
-    base, whole = system_matrix(plant.system), system_matrix(system)
-    n, count = system.n_states, len(system.inputs) - len(plant.system.inputs)
-    owner = [name.removesuffix(":w") for name in system.inputs[:count]]
-    amounts = np.diag([
-        next(v for name, v in values.items() if f"{one}:".startswith(f"{name}:")) for one in owner
-    ])  # fmt: skip
-    inner = np.arange(n, n + count)
-    outer, columns = (np.delete(np.arange(size), inner) for size in whole.shape)
-    closed = np.linalg.solve(
-        np.eye(count) - whole[np.ix_(inner, inner)] @ amounts, whole[np.ix_(inner, columns)]
-    )
-    made = whole[np.ix_(outer, columns)] + whole[np.ix_(outer, inner)] @ amounts @ closed
-    # of the change six digits, where rounding of the whole leaves them
-    allowed = 1e-6 * np.abs(wanted - base).max(axis=1) + ROUNDING * np.abs(wanted).max(axis=1)
-    bad = np.flatnonzero(np.abs(made - wanted).max(axis=1) > allowed)
-    if bad.size:
-        name = (*plant.system.states, *plant.system.outputs)[int(bad[0])]
-        raise ModelError(
-            f"{name!r} does not depend on {what} as displacements, velocities and accelerations "
-            f"do, so that no Deltas express it. {do}"
-        )

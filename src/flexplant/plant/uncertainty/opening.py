@@ -1,46 +1,57 @@
-"""Channels for Deltas: a plant whose modes are uncertain by a fit's covariance."""
+"""Channels for Deltas: a plant whose modes, shapes, gains or parameters are uncertain."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
-import scipy.sparse as sp
 
-from ...checks import ComplexArray, FloatArray, instance, members, positive, several
-from ...errors import LabelError, ModelError, require_known, unknown_label
+from ...checks import FloatArray, members, positive
+from ...errors import ModelError
 from ...identification import MeasuredModes
 from ...labels import Place
 from ...lti.statespace import StateSpace
-from ...tolerances import SAME, TINY
-from ...updating import ModalUncertainty, UpdateResult, eigenvalue_sensitivities
-from ...updating.matrix_parameters import MatrixParameter
+from ...sparse.factor import dense
+from ...tolerances import ROUNDING, SAME, TINY
+from ...updating import ModalUncertainty, UpdateResult
 from ...updating.parameters import Parameter
-from ..building import P, continuous_plant
+from ...updating.matrix_parameters import MatrixParameter
+from ..building import P, continuous_plant, rebuilt
 from ..partition import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
 from ..realisation import ModalRealisation
-from .delta_channels import require_exact, system_matrix, with_channels, with_gain_channels
-from .mode_deltas import KNOWN, SAME_MODEL, check_poles, correlated_deltas, stated
+from .deltas import (
+    Known,
+    about_fit,
+    check_range,
+    checked_fit,
+    correlated_deltas,
+    pole_deltas,
+    port_deltas,
+    shape_deltas,
+    stated_amounts,
+    stated_deltas,
+)
 from .neglected import NeglectedModes, neglected_modes, with_neglected
-from .shape_channels import shape_deltas, with_shape_channels
 from .uncertain_plant import (
     Delta,
     UncertainPlant,
     elastic_part,
     modal_realisation,
+    reshaped,
     with_changes,
 )
 
-#: relative: a dependence on the rates of the states below this is rounding
-_AFFINE = 1e-8
+#: relative: a dependence of what a mode's stiffness or damping changes, and of what its shape
+#: changes, below which it is rounding
+_AFFINE, _LEAST = 1e-8, 1e-9
 #: relative change at which the plant's dependence on a Delta is read off
-_PROBE = 0.25
-#: relative distance of measured poles from the plant's: they were typed, of that machine
-_TYPED_POLES = 0.1
+_READ_OFF = 0.25
+#: values of the Deltas at which the channels are compared with a plant assembled anew
+_PROBE = 0.5
 
 
 def uncertain(
@@ -61,7 +72,7 @@ def uncertain(
     many = positive(deviations, "deviations")
     by_mode = frequency is not None or damping is not None
     alone = source is None and shapes is None
-    beside = _of_ports(plant, gain, delay)
+    beside = port_deltas(plant, gain, delay)
     if by_mode or isinstance(parameters, Mapping):
         if not alone or not (parameters is None or isinstance(parameters, Mapping)):
             raise ModelError(
@@ -70,156 +81,76 @@ def uncertain(
                 "delay= go beside both."
             )
         if by_mode or modes is not None:
-            beside = stated(modal_realisation(plant), frequency, damping, modes) + beside
+            beside = stated_deltas(modal_realisation(plant), frequency, damping, modes) + beside
         if parameters is not None:
-            known, amounts = _amounts(plant, parameters)
+            known, amounts = stated_amounts(plant, parameters)
             return _by_parameters(plant, known, amounts, many, neglected, beside=beside)
     if beside and alone and parameters is None:
-        return _with_deltas(plant, beside, np.eye(len(beside)) / many**2, many, neglected)
+        return _by_modes(plant, Known(beside, np.eye(len(beside)) / many**2), many, neglected)
     if shapes is not None and not isinstance(source, MeasuredModes):
         raise ModelError(
             "deviations of shapes go with measured modes; those of a fit follow from its "
             "parameters, in sample. Leave shapes= out."
         )
-    if (
-        isinstance(source, UpdateResult)
-        and not plant.is_weighted
-        and plant.form.startswith("dense")
-    ):
-        unknowns = tuple(source.unknowns if parameters is None else parameters)
-        covariance = _checked_fit(source, unknowns)
+    fitted = source if isinstance(source, UpdateResult) else None
+    about: Sequence[Parameter] = ()
+    if fitted is not None:
+        about = fitted.unknowns if parameters is None else parameters
+        about = members(about, Parameter, "parameters", "Pass those of the fit.", least=0)
+    if fitted is not None and not plant.is_weighted and plant.form.startswith("dense"):
+        covariance = checked_fit(fitted, about)
         if modes is not None:
             raise ModelError(
                 f"the modes of this plant are coupled by damping ({plant.form}): its Deltas are "
                 "the parameters of the fit, which act on all modes. Leave modes out."
             )
-        _check_model(plant, source.model)
-        about = about_fit(source, unknowns)
-        return _by_parameters(plant, about, covariance, many, neglected, source, beside)
+        _check_model(plant, fitted.model)
+        return _by_parameters(
+            plant, about_fit(fitted, about), covariance, many, neglected, fitted, beside
+        )
     realisation = modal_realisation(plant)
-    if isinstance(source, UpdateResult) and source.discrepancy and source.fitted_poles is not None:
-        source = source.uncertainty()
+    if fitted is not None and fitted.discrepancy and fitted.fitted_poles is not None:
+        source, fitted = fitted.uncertainty(), None
     more: Sequence[Delta] = ()
     if isinstance(source, ModalUncertainty):
-        deltas, own = correlated_deltas(realisation, source, modes, many)
+        found = correlated_deltas(realisation, source, modes, many)
     else:
-        deltas, own, numbers = _of_poles(realisation, source, parameters, modes, many)
+        found = pole_deltas(realisation, source, about, modes, many)
         if shapes is not None and isinstance(source, MeasuredModes):
-            more = shape_deltas(plant, shapes, source.modes or (), numbers, many)
-    own = la.block_diag(own, np.eye(len(beside)) / many**2)
-    fit = source if isinstance(source, UpdateResult) else None
-    about = about_fit(fit, fit.unknowns if parameters is None else parameters) if fit else ()
-    return _with_deltas(plant, (*deltas, *beside), own, many, neglected, more, fit, about)
+            more = shape_deltas(plant, shapes, source.modes or (), found.modes, many)
+    own = la.block_diag(found.covariance, np.eye(len(beside)) / many**2)
+    found = Known((*found.deltas, *beside), own)
+    whole = _by_modes(plant, found, many, neglected, more)
+    return (
+        whole if fitted is None else whole.replace(fit=fitted, parameters=about_fit(fitted, about))
+    )
 
 
-def _of_poles(
-    realisation: ModalRealisation,
-    source: Any,
-    parameters: Sequence[Parameter] | None,
-    modes: Sequence[int] | None,
-    deviations: float,
-) -> tuple[tuple[Delta, ...], FloatArray, Sequence[int]]:
-    """Return Deltas of the poles of a fit or a measurement, their covariance, and the modes."""
-    if isinstance(source, UpdateResult):
-        parameters = source.unknowns if parameters is None else parameters
-        numbers, poles, covariance = _fitted_poles(realisation, source, parameters, modes)
-        check_poles(realisation, numbers, poles, SAME_MODEL, "fit")
-    elif isinstance(source, MeasuredModes):
-        numbers, poles, covariance = _measured_poles(source, modes)
-        check_poles(realisation, numbers, poles, _TYPED_POLES, "measurement")
-    else:
-        raise ModelError(
-            "uncertainty comes from an UpdateResult or MeasuredModes, got "
-            f"{type(source).__name__}: pass one, fit.uncertainty(measured), or state it: "
-            "frequency=0.005, damping=0.3."
-        )
-    G = _log_derivatives(poles)
-    covariance = G @ covariance @ G.T
-    scale = deviations * np.sqrt(np.diag(covariance))
-    kinds: tuple[Literal["freq", "damping"], ...] = ("freq", "damping")
-    named = [(kind, number) for kind in kinds for number in numbers]
-    every = [
-        Delta(f"mode{number}:{kind}", number, kind, float(size))
-        for (kind, number), size in zip(named, scale, strict=True)
-    ]
-    keep = sorted(np.flatnonzero(scale > KNOWN), key=lambda i: (every[i].mode, i))
-    if not keep:
-        raise ModelError(f"modes {list(numbers)} have no variance: there is nothing uncertain.")
-    own = covariance[np.ix_(keep, keep)] / np.outer(scale[keep], scale[keep])
-    return tuple(every[i] for i in keep), own, numbers
-
-
-def _of_ports(plant: Partition, gain: Any, delay: float | None) -> tuple[Delta, ...]:
-    """Return Deltas of stated gains of actuators and sensors, and of the delay."""
-    found: list[Delta] = []
-    if gain is not None:
-        ports = plant.assembled.ports
-        names = [*(port.name for port in ports.u), *(port.name for port in ports.y)]
-        if isinstance(gain, Mapping):
-            require_known("actuator or sensor", list(gain), names)
-        else:
-            gain = dict.fromkeys(names, gain)
-        sizes = {name: positive(size, f"gain of {name!r}") for name, size in gain.items()}
-        found += [Delta(f"{name}:gain", 0, "gain", size) for name, size in sizes.items()]
-    if delay is not None:
-        late = positive(delay, "delay")
-        if not plant.dt or late > plant.delay:
-            raise ModelError(
-                f"the delay is uncertain by {late:g} samples, and the plant has "
-                f"{plant.delay:g}: it is that of a sampled plant, and cannot become negative. "
-                "Pass plant.discretized(rate, delay=...) with the delay in the middle."
-            )
-        found.append(Delta("delay", 0, "delay", late))
-    return tuple(found)
-
-
-def _amounts(
-    plant: Partition, stated: Mapping[Parameter, Any]
-) -> tuple[tuple[Parameter, ...], FloatArray]:
-    """Return parameters and the covariance at which their amounts are one deviation each."""
-    if not stated:
-        raise ModelError("parameters= is empty: name at least one, {AddedMass('41:z'): 0.025}.")
-    for parameter in stated:
-        given: Any = parameter
-        instance(given, Parameter, "a key of parameters", "Such as AddedMass('41:z').")
-    if not hasattr(plant.model, "rigid_body") or not hasattr(plant.model, "replace"):
-        raise ModelError(
-            "parameters change the matrices of a model, and this plant was not assembled from "
-            "one: assemble it from a ReducedModel or an FEModel."
-        )
-    sizes = [positive(size, f"amount of {p.name}") for p, size in stated.items()]
-    return tuple(stated), np.diag(np.square(sizes))
-
-
-def _with_deltas(
-    plant: P,
-    deltas: tuple[Delta, ...],
-    covariance: FloatArray,
-    deviations: float,
-    neglected: Any,
-    shapes: Sequence[Delta] = (),
-    fit: UpdateResult | None = None,
-    parameters: tuple[Parameter, ...] = (),
+def _by_modes(
+    plant: P, known: Known, deviations: float, neglected: Any, shapes: Sequence[Delta] = ()
 ) -> UncertainPlant[P]:
     """Return a plant with channels for Deltas of modes, of shapes and of neglected modes."""
-    _check_range(deltas, deviations)
+    deltas, covariance = known.deltas, known.covariance
+    check_range(deltas, deviations)
     own = [delta for delta in deltas if delta.mode]
-    system = _opened(plant.continuous, own) if own else plant.continuous.system
     gains = [delta for delta in deltas if delta.kind == "gain"]
+    base = plant.continuous
+    matrix, system = system_matrix(base.system), base.system
+    if own:
+        found = {delta: _mode_channels(base, delta, matrix) for delta in own}
+        system = _opened(base, system, found)
+        do = "Give the sensor a `row` and a quantity."
+        _require_exact(base, system, own, "the modes", do)
     if gains:
-        system, _ = with_gain_channels(plant.continuous, system, gains)
-        require_exact(plant.continuous, system, [*own, *gains], "the gains", "Leave gain= out.")
+        system, _ = with_gain_channels(base, system, gains)
+        _require_exact(base, system, [*own, *gains], "the gains", "Leave gain= out.")
     if shapes:
-        system = with_shape_channels(plant.continuous, system, deltas, shapes)
+        found = {delta: _shape_channels(base, delta, matrix) for delta in shapes}
+        system = _opened(base, system, found)
+        every = [*deltas, *shapes]
+        _require_exact(base, system, every, "the shapes of modes", "Leave shapes= out.")
         covariance = la.block_diag(covariance, np.eye(len(shapes)) / deviations**2)
-    weight = None
-    if neglected is not None:
-        known = isinstance(neglected, NeglectedModes)
-        weight = neglected if known else neglected_modes(plant, neglected)
-        system = with_neglected(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
-    return UncertainPlant(
-        plant, system, (*deltas, *shapes), covariance, deviations, weight, fit, parameters
-    )
+    return _with_bound(plant, system, neglected, (*deltas, *shapes), covariance, deviations)
 
 
 def _by_parameters(
@@ -232,24 +163,38 @@ def _by_parameters(
     beside: tuple[Delta, ...] = (),
 ) -> UncertainPlant[P]:
     """Return a plant with Deltas on parameters, stated or of a fit, and others beside them."""
-    _check_range(beside, deviations)
+    check_range(beside, deviations)
     std = np.sqrt(np.diag(covariance))
     modes = tuple(delta for delta in beside if delta.mode)
     scale = np.array([*(std if fit is None else deviations * std), *(d.scale for d in modes)])
     every = (*parameters, *(_as_parameter(plant, delta) for delta in modes))
-    system, deltas = by_parameters(plant.continuous, every, scale)
+    base = plant.continuous
+    system, deltas = _parameter_channels(base, every, scale)
     if gains := [delta for delta in beside if delta.kind == "gain"]:
-        base = plant.continuous
         alone, _ = with_gain_channels(base, base.system, gains)
-        require_exact(base, alone, gains, "the gains", "Leave gain= out.")
+        _require_exact(base, alone, gains, "the gains", "Leave gain= out.")
         system, _ = with_gain_channels(base, system, gains)
-    weight = None
-    if neglected is not None:
-        weight = neglected_modes(plant, neglected)
-        system = with_neglected(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
     own = la.block_diag(covariance / np.outer(std, std), np.eye(len(beside))) / deviations**2
     deltas = (*deltas[: len(parameters)], *modes, *(one for one in beside if not one.mode))
-    return UncertainPlant(plant, system, deltas, own, deviations, weight, fit, every)
+    whole = _with_bound(plant, system, neglected, deltas, own, deviations)
+    return whole.replace(fit=fit, parameters=every)
+
+
+def _with_bound(
+    plant: P,
+    system: StateSpace,
+    neglected: Any,
+    deltas: tuple[Delta, ...],
+    covariance: FloatArray,
+    deviations: float,
+) -> UncertainPlant[P]:
+    """Return an uncertain plant, the modes that it lacks bounded where a larger model is given."""
+    if neglected is not None and not isinstance(neglected, NeglectedModes):
+        neglected = neglected_modes(plant, neglected)
+    if neglected is not None:
+        count = len(system.inputs) - len(plant.system.inputs)
+        system = with_neglected(system, neglected, count)
+    return UncertainPlant(plant, system, deltas, covariance, deviations, neglected)
 
 
 def _as_parameter(plant: Partition, delta: Delta) -> MatrixParameter:
@@ -267,65 +212,52 @@ def _check_model(plant: Partition, other: Any) -> None:
     for name in "MDK":
         own, others = getattr(plant.model, name, None), getattr(other, name)
         if own is None or own.shape != others.shape or not np.allclose(
-            _to_dense(own), _to_dense(others), rtol=SAME, atol=0.0
+            dense(own), dense(others), rtol=SAME, atol=0.0
         ):  # fmt: skip
             raise ModelError(
                 f"the plant has another {name} than the fit's model. Assemble it from fit.model."
             )
 
 
-def _checked_fit(fit: UpdateResult, parameters: Sequence[Parameter]) -> FloatArray:
-    """Return the covariance of a fit whose parameters are given."""
-    names = tuple(parameter.name for parameter in parameters)
-    if names != tuple(fit.parameters):
-        raise LabelError(
-            f"the fit is of {list(fit.parameters)}, got the parameters {list(names)}: pass those "
-            "given to update, in the same order: plant.uncertain(fit, parameters)."
-        )
-    if fit.covariance is None:
-        raise ModelError(
-            "the fit has no covariance: as many numbers were measured as were fitted. Measure "
-            "another mode, or give MeasuredModes(covariance=...)."
-        )
-    return fit.covariance
+class _Channel(NamedTuple):
+    """A channel of a Delta: what it moves (n + p,), and what it reads of states and inputs.
 
-
-def about_fit(fit: UpdateResult, parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-    """Return the parameters counted from their estimates, which the fit's model has already."""
-    return tuple(q.about(v) for q, v in zip(parameters, fit.values.tolist(), strict=True))
-
-
-class _Channels(NamedTuple):
-    """How a plant depends on its Deltas: ``M0 + left W right + again W R (A0 + left_A W right)``.
-
-    With M = [A B; C D], W the diagonal of relative changes, and R the part of `right` (m, n + m)
-    over the states: accelerations see the rates of the states, which the Deltas change once more.
+    By `rate`, of the states' rates (n,) instead, with what all Deltas make of them.
     """
 
-    base: FloatArray
     left: FloatArray
     right: FloatArray
-    again: FloatArray
-    n: int
-
-    @property
-    def rates(self) -> FloatArray:
-        """R [A0 B0] (m, n + m): what the second copies of the Deltas see."""
-        return np.asarray(self.right[:, : self.n] @ self.base[: self.n])
-
-    @property
-    def crossed(self) -> FloatArray:
-        """What they see of the first copies (m, m)."""
-        return np.asarray(self.right[:, : self.n] @ self.left[: self.n])
-
-    @property
-    def repeated(self) -> FloatArray:
-        """Which Deltas (m,) have a second copy."""
-        return np.asarray(np.any(self.again != 0, axis=0))
+    name: str = ""
+    rate: FloatArray | None = None
 
 
-def _opened(plant: Partition, deltas: Sequence[Delta]) -> StateSpace:
-    """Return the continuous plant with a channel for each Delta, two where accelerations need it.
+def _opened(
+    plant: Partition, system: StateSpace, found: Mapping[Delta, Sequence[_Channel]]
+) -> StateSpace:
+    """Return a plant's system with the channels of Deltas after those that it has already.
+
+    First those of all Deltas, then their further ones.
+    """
+    n, m = plant.system.n_states, len(plant.system.inputs)
+    before = len(system.inputs) - m
+    rates = np.hstack([system.A, system.B])
+    every = [(delta, own[0]) for delta, own in found.items()]
+    every += [(delta, one) for delta, own in found.items() for one in own[1:]]
+    root = [np.sqrt(delta.scale) for delta, _ in every]
+    left = np.array([size * one.left for size, (_, one) in zip(root, every, strict=True)]).T
+    right, feed = np.zeros((len(every), n + before + m)), np.zeros((len(every), len(every)))
+    for i, (size, (_, one)) in enumerate(zip(root, every, strict=True)):
+        if one.rate is None:
+            right[i] = size * np.insert(one.right, [n] * before, 0.0)
+        else:
+            right[i], feed[i] = size * one.rate @ rates, size * one.rate @ left[:n]
+    return with_channels(
+        system, before, [f"{delta.name}{one.name}" for delta, one in every], left, right, feed
+    )
+
+
+def _mode_channels(plant: Partition, delta: Delta, base: FloatArray) -> list[_Channel]:
+    """Return the channel of a mode's stiffness or damping, two where accelerations need it.
 
     A mode's A is affine in its Deltas, ``A0 + sum_j delta_j l_j R_j``, and so are displacements and
     velocities. An acceleration ``S A (A x + N' f)`` holds products of them where the damping of a
@@ -334,110 +266,171 @@ def _opened(plant: Partition, deltas: Sequence[Delta]) -> StateSpace:
     ``R_j x'`` makes it exact. The columns are read off the plant assembled with one mode changed,
     so that they hold for any port.
     """
-    own = _delta_channels(plant, deltas)
-    twice = np.flatnonzero(own.repeated)
-    left = np.hstack([own.left, own.again[:, twice]])
-    right = np.vstack([own.right, own.rates[twice]])
-    feed = np.zeros((right.shape[0], right.shape[0]))
-    feed[len(deltas) :, : len(deltas)] = own.crossed[twice]
-    names = [d.name for d in deltas] + [f"{deltas[j].name}:rate" for j in twice.tolist()]
-    system = with_channels(plant.system, 0, names, left, right, feed)
-    do = "Give the sensor a `row` and a quantity."
-    require_exact(plant, system, deltas, "the modes", do)
-    return system
+    n = plant.system.n_states
+    changed = system_matrix(with_changes(plant, [(delta, _READ_OFF)]).system)
+    change = (changed - base) / _READ_OFF
+    # of a mode's block the second row changes
+    R = change[int(plant.modal_states[2 * delta.mode - 1])]
+    R = R / np.linalg.norm(R)
+    rate = R[:n] @ changed[:n]
+    rate_size = float(np.linalg.norm(rate))
+    seen = np.linalg.lstsq(np.array([R, rate / rate_size]).T, change.T, rcond=None)[0]
+    plain = np.abs(seen[1]) <= _AFFINE * np.linalg.norm(change, axis=1)
+    left = np.where(plain, change @ R, seen[0])
+    again = np.where(plain, 0.0, seen[1] / rate_size)
+    even = np.sqrt(max(float(np.abs(left[:n]).max()), TINY))
+    first = _Channel(left / even, even * R)
+    if not np.any(again):
+        return [first]
+    return [first, _Channel(again / even, even * R, ":rate", even * R[:n])]
 
 
-def _delta_channels(plant: Partition, deltas: Sequence[Delta]) -> _Channels:
-    """Return how the plant depends on its Deltas, read off with one mode changed at a time."""
-    base, n = system_matrix(plant.system), plant.system.n_states
-    left, right = np.zeros((base.shape[0], len(deltas))), np.zeros((len(deltas), base.shape[1]))
-    again = np.zeros_like(left)
-    for j, delta in enumerate(deltas):
-        changed = system_matrix(with_changes(plant, [(delta, _PROBE)]).system)
-        change = (changed - base) / _PROBE
-        # of a mode's block the second row changes
-        R = change[int(plant.modal_states[2 * delta.mode - 1])]
-        R = R / np.linalg.norm(R)
-        rate = R[:n] @ changed[:n]
-        rate_size = float(np.linalg.norm(rate))
-        seen = np.linalg.lstsq(np.array([R, rate / rate_size]).T, change.T, rcond=None)[0]
-        size = np.linalg.norm(change, axis=1)
-        plain = np.abs(seen[1]) <= _AFFINE * size
-        left[:, j] = np.where(plain, change @ R, seen[0])
-        again[:, j] = np.where(plain, 0.0, seen[1] / rate_size)
-        right[j] = R
-        even = np.sqrt(delta.scale * max(float(np.abs(left[:n, j]).max()), TINY))
-        right[j] *= even
-        left[:, j] *= delta.scale / even
-        again[:, j] *= delta.scale / even
-    return _Channels(base, left, right, again, n)
+def _shape_channels(plant: Partition, delta: Delta, base: FloatArray) -> list[_Channel]:
+    r"""Return the channels of the shape of a mode.
 
-
-def _fitted_poles(
-    realisation: ModalRealisation,
-    fit: UpdateResult,
-    parameters: Sequence[Parameter] | None,
-    modes: Sequence[int] | None,
-) -> tuple[tuple[int, ...], ComplexArray, FloatArray]:
-    """Return mode numbers, poles and J C J', the covariance of [Re lambda; Im lambda]."""
-    if parameters is not None:
-        parameters = members(parameters, Parameter, "parameters", "Pass those of the fit.", least=0)
-    covariance = _checked_fit(fit, tuple(parameters or ()))
-    elastic = range(realisation.n_rigid + 1, realisation.n_modes + 1)
-    chosen = list(elastic) if modes is None else modes
-    if several(chosen) and not len(tuple(chosen)):
-        raise ModelError("modes is empty: nothing would be uncertain. Name some, or leave it out.")
-    found = eigenvalue_sensitivities(fit.model, about_fit(fit, parameters or ()), modes=chosen)
-    J = np.vstack([found.S.real, found.S.imag])
-    return found.modes, found.poles, J @ covariance @ J.T
-
-
-def _measured_poles(
-    measured: MeasuredModes, modes: Sequence[int] | None
-) -> tuple[tuple[int, ...], ComplexArray, FloatArray]:
-    """Return mode numbers, poles and the covariance of [Re lambda; Im lambda], as measured."""
-    if measured.covariance is None or measured.modes is None:
-        raise ModelError(
-            "the measured modes need mode numbers and a covariance: "
-            "MeasuredModes(poles, modes=[...], covariance=...)."
+    ``phi + d v`` drives the mode by ``d v^T f`` more and shows ``d v q``, ``d v q'`` or
+    ``d v q''`` of its motion more: four channels at most, of which q'' feels what the first one
+    drives. Their columns are read off the plant assembled with forces or motions changed alone, so
+    that they hold for any port and filter.
+    """
+    q, v = (int(plant.modal_states[2 * delta.mode - i]) for i in (2, 1))
+    realisation = modal_realisation(plant)
+    driven, seen = (
+        system_matrix(rebuilt(plant, realisation=one).system) - base
+        for one in (
+            reshaped(realisation, delta, 1.0, outputs=False),
+            reshaped(realisation, delta, 1.0, inputs=False),
         )
-    chosen = list(measured.modes if modes is None else modes)
-    for number in chosen:
-        if number not in measured.modes:
-            raise unknown_label("measured mode", number, map(str, measured.modes))
-    at = [measured.modes.index(number) for number in chosen]
-    both = [*at, *(i + len(measured) for i in at)]
-    return tuple(chosen), measured.poles[at], measured.covariance[np.ix_(both, both)]
+    )
+    row = driven[v]
+    parts = [(driven @ row / (row @ row), row, None)] if np.any(row) else []
+    # displacements and velocities read the states, accelerations what else their rate holds
+    size, rest, beyond = np.linalg.norm(seen, axis=1), seen.copy(), base[v].copy()
+    rest[:, [q, v]], beyond[[q, v]] = 0.0, 0.0
+    amount = rest @ beyond / max(float(beyond @ beyond), TINY)
+    amount[np.linalg.norm(rest, axis=1) <= _LEAST * size] = 0.0
+    plain = seen - np.outer(amount, base[v])
+    motion, speed = (np.eye(base.shape[1])[i] for i in (q, v))
+    for column, right, rate in (
+        (plain[:, q], motion, None),
+        (plain[:, v], speed, None),
+        (amount, base[v], np.eye(plant.system.n_states)[v]),
+    ):
+        small = np.abs(column) * np.linalg.norm(right) <= _LEAST * size
+        parts += [] if np.all(small) else [(np.where(small, 0.0, column), right, rate)]
+    if not parts:
+        raise ModelError(f"{delta.name} moves no port of the plant: leave that mode out.")
+    found = []
+    for i, (left, right, rate) in enumerate(parts, 1):
+        even = np.sqrt(np.linalg.norm(left) / np.linalg.norm(right))
+        name = f":{i}" if i > 1 else ""
+        found.append(
+            _Channel(left / even, even * right, name, None if rate is None else even * rate)
+        )
+    return found
 
 
-def _log_derivatives(poles: ComplexArray) -> FloatArray:
-    """Return the derivatives of [log omega^2; log 2 zeta omega] to [Re lambda; Im lambda]."""
-    size = np.abs(poles) ** 2
-    damped = np.where(poles.real != 0, poles.real, np.inf)
-    zero = np.zeros((poles.size, poles.size))
-    return np.block(
-        [
-            [np.diag(2 * poles.real / size), np.diag(2 * poles.imag / size)],
-            [np.diag(1 / damped), zero],
-        ]
+def system_matrix(g: StateSpace) -> FloatArray:
+    """Return ``[A B; C D]``."""
+    return np.block([[g.A, g.B], [g.C, g.D]])
+
+
+def with_channels(
+    g: StateSpace,
+    before: int,
+    names: Sequence[str],
+    left: FloatArray,
+    right: FloatArray,
+    feed: FloatArray | None = None,
+) -> StateSpace:
+    """Return a system with channels `name:w` and `name:z` after its first inputs and outputs.
+
+    left (n + p, k): what w adds to states and later outputs; right (k, n + m): what z reads of
+    states and all inputs; feed (k, k): from w to z, zero when not given.
+    """
+    n, k = g.n_states, len(names)
+    feed = np.zeros((k, k)) if feed is None else feed
+    D = np.block([
+        [g.D[:before, :before], np.zeros((before, k)), g.D[:before, before:]],
+        [right[:, n : n + before], feed, right[:, n + before :]],
+        [g.D[before:, :before], left[n:], g.D[before:, before:]],
+    ])  # fmt: skip
+    return StateSpace(
+        g.A,
+        np.hstack([g.B[:, :before], left[:n], g.B[:, before:]]),
+        np.vstack([g.C[:before], right[:, :n], g.C[before:]]),
+        D,
+        g.dt,
+        inputs=[*g.inputs[:before], *(f"{name}:w" for name in names), *g.inputs[before:]],
+        outputs=[*g.outputs[:before], *(f"{name}:z" for name in names), *g.outputs[before:]],
+        states=g.states,
+        name=g.name,
+        blocks=g.blocks,
     )
 
 
-def _check_range(deltas: Sequence[Delta], deviations: float) -> None:
-    """Refuse Deltas that reach negative stiffness or damping."""
-    for delta in deltas:
-        if delta.kind == "gain" and delta.scale >= 1:
-            raise ModelError(
-                f"{delta.name} is uncertain by {100 * delta.scale:.3g} %: its sign is not known, "
-                "and no controller is robust to that. Calibrate it."
-            )
-        if delta.mode and delta.scale >= 1:
-            what = "stiffness" if delta.kind == "freq" else "damping"
-            raise ModelError(
-                f"the {what} of mode {delta.mode} is uncertain by {100 * delta.scale:.3g} % at "
-                f"{deviations:g} standard deviations, so it may be negative: no controller is "
-                "robust to that. Measure it better, leave the mode out, or lower deviations."
-            )
+def with_gain_channels(
+    plant: Partition, system: StateSpace, deltas: Sequence[Delta]
+) -> tuple[StateSpace, list[tuple[str, int]]]:
+    """Return a system with a first channel for each Delta on a gain, and their names, in order.
+
+    ``(1 + d) u`` acts by d times the command's column more, all but its own effort, and so does
+    noise at the amplifier's input; ``(1 + d) y`` adds d times what the sensor shows of the motion,
+    with what the actuators' Deltas do.
+    """
+    order = sorted(deltas, key=lambda one: one.name.removesuffix(":gain") in plant.y)
+    for delta in order:
+        name = delta.name.removesuffix(":gain")
+        n, (k, m) = system.n_states, (len(system.outputs), len(system.inputs))
+        left, right = np.zeros((n + k, 1)), np.zeros((1, n + m))
+        if name in plant.u:
+            column = system.inputs.index(name)
+            left[:, 0] = np.concatenate([system.B[:, column], system.D[:, column]])
+            left[n + system.outputs.index(f"{name}:effort")] = 0.0
+            right[0, n + column] = delta.scale
+            if f"{name}:disturbance" in system.inputs:  # at the amplifier's input: scaled as well
+                noise = system.inputs.index(f"{name}:disturbance")
+                its = np.concatenate([system.B[:, noise], system.D[:, noise]])
+                share = float(left[:, 0] @ its) / float(left[:, 0] @ left[:, 0])
+                right[0, n + noise] = delta.scale * share
+        else:
+            row = system.outputs.index(name)
+            left[n + row] = 1.0
+            right[0] = delta.scale * np.concatenate([system.C[row], system.D[row]])
+            if f"{name}:noise" in system.inputs:
+                right[0, n + system.inputs.index(f"{name}:noise")] = 0.0
+        system = with_channels(system, 0, [delta.name], left, right)  # first: all others see it
+    return system, [(delta.name, 1) for delta in reversed(order)]
+
+
+def _require_exact(
+    plant: Partition, system: StateSpace, deltas: Sequence[Delta], what: str, do: str
+) -> None:
+    """Raise ModelError unless the channels give the plant with all modes changed at once."""
+    values = {d.name: _PROBE * (1.0 if j % 2 else -0.5) for j, d in enumerate(deltas)}
+    changes = [(delta, values[delta.name] * delta.scale) for delta in deltas]
+    wanted = system_matrix(with_changes(plant, changes).system)
+    base, whole = system_matrix(plant.system), system_matrix(system)
+    n, count = system.n_states, len(system.inputs) - len(plant.system.inputs)
+    owner = [name.removesuffix(":w") for name in system.inputs[:count]]
+    amounts = np.diag([
+        next(v for name, v in values.items() if f"{one}:".startswith(f"{name}:")) for one in owner
+    ])  # fmt: skip
+    inner = np.arange(n, n + count)
+    outer, columns = (np.delete(np.arange(size), inner) for size in whole.shape)
+    closed = np.linalg.solve(
+        np.eye(count) - whole[np.ix_(inner, inner)] @ amounts, whole[np.ix_(inner, columns)]
+    )
+    made = whole[np.ix_(outer, columns)] + whole[np.ix_(outer, inner)] @ amounts @ closed
+    # of the change six digits, where rounding of the whole leaves them
+    allowed = 1e-6 * np.abs(wanted - base).max(axis=1) + ROUNDING * np.abs(wanted).max(axis=1)
+    bad = np.flatnonzero(np.abs(made - wanted).max(axis=1) > allowed)
+    if bad.size:
+        name = (*plant.system.states, *plant.system.outputs)[int(bad[0])]
+        raise ModelError(
+            f"{name!r} does not depend on {what} as displacements, velocities and accelerations "
+            f"do, so that no Deltas express it. {do}"
+        )
 
 
 #: relative: eigenvalues of a parameter's matrix below this are rounding
@@ -470,7 +463,7 @@ class _Felt(SensorPort):
         return self.along
 
 
-def by_parameters(
+def _parameter_channels(
     plant: Partition, parameters: Sequence[Parameter], scales: FloatArray
 ) -> tuple[StateSpace, tuple[Delta, ...]]:
     """Return the continuous plant with channels for Deltas on the parameters, and these.
@@ -490,7 +483,7 @@ def by_parameters(
         for order, part in zip((2, 1, 0), parameter.matrices(model), strict=True):
             if part is None:
                 continue
-            whole = _to_dense(part)
+            whole = dense(part)
             if order == 1:
                 whole = elastic_part(model, realisation, whole)
             values, vectors = np.linalg.eigh(0.5 * (whole + whole.T))
@@ -508,7 +501,3 @@ def by_parameters(
         ),
         tuple(deltas),
     )
-
-
-def _to_dense(matrix: object) -> FloatArray:
-    return np.asarray(matrix.toarray() if sp.issparse(matrix) else matrix)  # type: ignore[attr-defined]
