@@ -167,20 +167,8 @@ class ClosedLoop(Value):
         ``P11 + P12 K (I - P22 K)^-1 P21`` at each frequency: a plant in modal blocks costs O(n),
         where the closed loop as one system has lost its blocks.
 
-        Parameters
-        ----------
-        freq : (n_freq,) array [Hz]
-            Not above half the rate.
-
-        Returns
-        -------
-        Frf
-            Of all z and w.
-
-        Raises
-        ------
-        ModelError
-            When a frequency is not allowed, or the loop is singular at one.
+        `freq` (n_freq,) [Hz] is not above half the rate. ModelError when a frequency is not
+        allowed, or the loop is singular at one.
         """
         grid = sampled_freq(freq, self.plant.dt)
         data = self._responses(self.plant.w, self.plant.z)(grid)
@@ -235,10 +223,7 @@ class ClosedLoop(Value):
     def spectral_radius(self) -> float:
         """Largest magnitude of the closed loop's eigenvalues; stable below 1.
 
-        Raises
-        ------
-        ModelError
-            In continuous time, where the `spectral_abscissa` decides.
+        ModelError in continuous time, where the `spectral_abscissa` decides.
         """
         if not self.plant.dt:
             raise ModelError(
@@ -346,18 +331,12 @@ class ClosedLoop(Value):
         rng : int, SeedSequence, Generator or None
             Of the draws.
 
-        Returns
-        -------
-        ModeTolerances
-            Print it; `least`, `critical`, `draws` for scripts.
-
         Raises
         ------
-        AssumptionError
-            When the loop is unstable as it is.
-        ModelError
-            When the plant's modes are coupled by damping, it was not assembled from a structure, a
-            sensor sees accelerations, or a number is out of range.
+        AssumptionError, ModelError
+            When the loop is unstable as it is; when the plant's modes are coupled by damping, it
+            was not assembled from a structure, a sensor sees accelerations, or a number is out of
+            range.
 
         Warns
         -----
@@ -382,21 +361,15 @@ class ClosedLoop(Value):
         Parameters
         ----------
         channel : str
-            A z, y, driven u or monitored output.
-
-        Returns
-        -------
-        float
-            In the channel's unit.
+            A z, y, driven u or monitored output; the rms is in its unit.
 
         Raises
         ------
         LabelError
             When there is no such channel.
-        AssumptionError
-            When the loop is not stable, or white noise reaches an output directly.
-        ModelError
-            When the noise of the plant is not known, or the variance is infinite.
+        AssumptionError, ModelError
+            When the loop is not stable, or white noise reaches an output directly; when the noise
+            of the plant is not known, or the variance is infinite.
         CertificateError
             When two Lyapunov equations give different variances.
         """
@@ -413,19 +386,9 @@ class ClosedLoop(Value):
         Parameters
         ----------
         channel : str
-            A z, y, driven u or monitored output.
+            As for `rms`.
         freq : (n_freq,) array [Hz], optional
-            Not above half the rate; through all resonances when not given.
-
-        Returns
-        -------
-        Spectrum
-            Named tuple (freq [Hz], psd [unit^2/Hz]).
-
-        Raises
-        ------
-        LabelError, AssumptionError, ModelError
-            As for `rms`; or when a frequency is not allowed.
+            Not above half the rate, else ModelError; through all resonances when not given.
         """
         row, noises = self._noises(channel)
         grid = self.broken.grid if freq is None else sampled_freq(freq, self.plant.dt)
@@ -437,7 +400,7 @@ class ClosedLoop(Value):
         Parameters
         ----------
         channel : str
-            A z, y, driven u or monitored output.
+            As for `rms`.
         residue : Response, mapping {channel: samples} or (n_time,) array, optional
             A run of this loop without noise, ``simulate(loop, reference=move, noise=False, ...)``:
             what is left of the set-point is a source of its own, with its mean square.
@@ -451,10 +414,9 @@ class ClosedLoop(Value):
 
         Raises
         ------
-        LabelError, AssumptionError, ModelError
-            As for `rms`; or when the residue does not go with the loop.
-        CertificateError
-            When the Lyapunov equations or the integral of the spectrum give another variance.
+        LabelError, AssumptionError, ModelError, CertificateError
+            As for `rms`; or when the residue does not go with the loop, or the integral of the
+            spectrum gives another variance.
         """
         row, noises = self._noises(channel)
         left_out, whole = float("nan"), self.completed
@@ -517,15 +479,14 @@ def close_loop(
     FlexplantWarning
         When the closed loop is unstable, or is with the modes that the plant left out, or a mode of
         an uncertain plant holds to less than twice what is known of it; it is returned all the
-        same. Marginal poles (a rigid-body mode that nothing
-        holds) are named by its repr alone.
+        same. Marginal poles (a rigid-body mode that nothing holds) are named by its repr alone.
 
     Raises
     ------
     LabelError
         When the names of a system do not show which channels are w, u, z and y, an input is
-        connected to nothing, an actuator is driven by nothing (and not idle), or
-        a name other than an actuator's is driven twice.
+        connected to nothing, an actuator is driven by nothing (and not idle), or a name other than
+        an actuator's is driven twice.
     ModelError
         When there is no block, a block is no system or stands twice, sampling times differ, the
         algebraic loop is ill-posed, or `larger` does not go with the plant.
@@ -561,14 +522,13 @@ def close_loop(
         plant, systems, controller, resting, None if larger is None else with_known(larger, systems)
     )
     found = loop.left_out
-    if not loop.is_stable:
-        if loop.obstacle and loop.obstacle.reason.startswith("unstable"):
-            warn(
-                f"the closed loop is {loop.obstacle.reason} ({loop.decay}): its signals grow, and "
-                "it has no margin, bandwidth or norm. Check the sign (u = K y), lower the "
-                "bandwidth, or notch the mode at that frequency."
-            )
-    elif found is not None and not found.is_stable:
+    if not loop.is_stable and loop.obstacle and loop.obstacle.reason.startswith("unstable"):
+        warn(
+            f"the closed loop is {loop.obstacle.reason} ({loop.decay}): its signals grow, and it "
+            "has no margin, bandwidth or norm. Check the sign (u = K y), lower the bandwidth, or "
+            "notch the mode at that frequency."
+        )
+    elif loop.is_stable and found is not None and not found.is_stable:
         warn(
             f"the loop is stable on its plant, but with the modes left out it is {found.summary}. "
             "The machine has these modes: lower the bandwidth, keep them in the plant, or let the "

@@ -171,26 +171,16 @@ class SweptLoop(NamedTuple):
             [self.x[:, loops.fed], np.broadcast_to(np.eye(m), (self.z.size, m, m))], axis=1
         )
         Y = np.concatenate(
-            [self.x[at[:, None], loops.own[mode]], _real_times(loops.sums[mode], others[at])],
+            [self.x[at[:, None], loops.own[mode]], loops.sums[mode].astype(complex) @ others[at]],
             axis=1,
         )
         c, e = loops.seen
         q = (
-            _times_real(self.SK[at], c[mode])
+            self.SK[at] @ c[mode].astype(complex)
             if self.shown is None
             else self.SK[at] @ self.shown[at, mode]
         )
         return SweptModes(loops, at, mode, self.z[at], Y, q, Y @ q, e[mode])
-
-
-def _real_times(real: FloatArray, other: ComplexArray) -> ComplexArray:
-    """Return real matrices times complex ones."""
-    return np.asarray(real.astype(np.complex128) @ other)
-
-
-def _times_real(one: ComplexArray, real: FloatArray) -> ComplexArray:
-    """Return complex matrices times real ones."""
-    return np.asarray(one @ real.astype(np.complex128))
 
 
 class SweptModes(NamedTuple):
@@ -239,19 +229,6 @@ class SweptModes(NamedTuple):
         Y, q, Yq, e = self.Y[where], self.q[where], self.Yq[where], self.e[where]
         return SweptModes(self.loops, at, mode, z, Y, q, Yq, e)
 
-    def share(self, kind: str, delta: FloatArray, bound: SizeBound) -> FloatArray:
-        """Return what is at least 1 where |S| reaches a size with the modes changed (modes,)."""
-        A, T = self.loops.changes[kind].at(delta)
-        A, T = A[self.mode], T[self.mode]
-        # g = e (z I - A)^-1 T by the adjugate
-        a, d = self.z - A[:, 1, 1], self.z - A[:, 0, 0]
-        det = a * d - A[:, 0, 1] * A[:, 1, 0]
-        e = self.e
-        u = (e[:, :, 0] * a[:, None] + e[:, :, 1] * A[:, 1, 0, None]) / det[:, None]
-        v = (e[:, :, 0] * A[:, 0, 1, None] + e[:, :, 1] * d[:, None]) / det[:, None]
-        g = u[..., None] * T[:, None, 0] + v[..., None] * T[:, None, 1]
-        return bound.share(g)
-
 
 class SizeBound(NamedTuple):
     r"""Whether ``|S(delta)| < s`` where ``|S| < s``, without S(delta), at pairs of point and mode.
@@ -261,6 +238,7 @@ class SizeBound(NamedTuple):
     complement of the Hermitian matrix [[s I, S(delta)], [S(delta)*, s I]]).
     """
 
+    modes: SweptModes
     a: ComplexArray
     y: ComplexArray
     middle: ComplexArray
@@ -274,14 +252,23 @@ class SizeBound(NamedTuple):
         a = modes.q.conj().swapaxes(1, 2) @ Wq
         YW = modes.Y @ W
         Ys = modes.Y.conj().swapaxes(1, 2)
-        return cls(a, modes.Y @ Wq, YW @ Ys - modes.Y @ Ys)
+        return cls(modes, a, modes.Y @ Wq, YW @ Ys - modes.Y @ Ys)
 
     def take(self, where: BoolArray) -> SizeBound:
         """Return the bound at some of the pairs."""
-        return SizeBound(*(part[where] for part in self))
+        modes, *parts = self
+        return SizeBound(modes.take(where), *(part[where] for part in parts))
 
-    def share(self, g: ComplexArray) -> FloatArray:
-        """Return the largest eigenvalue, for rows g (n, k, 2 + r) of each pair."""
+    def share(self, delta: FloatArray) -> FloatArray:
+        """Return the largest eigenvalue, with frequencies changed (modes,)."""
+        mode, z, e = self.modes.mode, self.modes.z, self.modes.e
+        A, T = (part[mode] for part in self.modes.loops.changes["freq"].at(delta))
+        # g = e (z I - A)^-1 T by the adjugate
+        a, d = z - A[:, 1, 1], z - A[:, 0, 0]
+        det = a * d - A[:, 0, 1] * A[:, 1, 0]
+        u = (e[:, :, 0] * a[:, None] + e[:, :, 1] * A[:, 1, 0, None]) / det[:, None]
+        v = (e[:, :, 0] * A[:, 0, 1, None] + e[:, :, 1] * d[:, None]) / det[:, None]
+        g = u[..., None] * T[:, None, 0] + v[..., None] * T[:, None, 1]
         k = g.shape[1]
         if k == 1:
             row = g[:, 0]
@@ -293,6 +280,19 @@ class SizeBound(NamedTuple):
         inverse = np.linalg.inv(b)
         product = self.a @ inverse @ c @ inverse.conj().swapaxes(1, 2)
         return np.asarray(np.linalg.eigvals(product).real.max(axis=1))
+
+    def exceeds(self, delta: FloatArray, count: int) -> BoolArray:
+        """Return for which of the modes |S| reaches the size at any point."""
+        over = self.modes.mode[self.share(delta) >= 1.0]
+        return np.bincount(over, minlength=count) > 0
+
+    def halved(self, below: FloatArray, above: FloatArray, sign: float) -> FloatArray:
+        """Return the sizes of change (modes,) between two at which it is reached first."""
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (below + above)
+            over = self.exceeds(sign * middle, len(middle))
+            above, below = np.where(over, middle, above), np.where(over, below, middle)
+        return above
 
 
 def _polynomials(
@@ -415,7 +415,7 @@ def size_reached(
     """
     count = len(limits)
     high = np.linalg.norm(swept.S, 2, axis=(1, 2)) >= size
-    every = _Sized(modes, SizeBound.of(np.where(high[:, None, None], 0.0, swept.S), modes, size))
+    every = SizeBound.of(np.where(high[:, None, None], 0.0, swept.S), modes, size)
     ends = np.minimum(np.abs(stable), limits[:, None])
     near = passed.copy()
     for side, sign in enumerate((-1.0, 1.0)):
@@ -443,36 +443,8 @@ def size_reached(
         fine = modes.loops.swept(np.ravel(tops))
         mode = np.repeat(where, _WITHIN_PEAK)
         at_tops = fine.swept_modes(np.arange(mode.size), mode)
-        top = _Sized(at_tops, SizeBound.of(fine.S, at_tops, size))
+        top = SizeBound.of(fine.S, at_tops, size)
         change = top.halved(0.5 * change, change, sign)
         found[where, side] = sign * change[where]
     found[np.bincount(modes.mode[high[modes.at]], minlength=count) > 0] = 0.0
     return found
-
-
-class _Sized(NamedTuple):
-    """The equations of modes at points, and the bound of a size there."""
-
-    modes: SweptModes
-    bound: SizeBound
-
-    def take(self, where: BoolArray) -> _Sized:
-        """Return both at some of the pairs."""
-        return _Sized(self.modes.take(where), self.bound.take(where))
-
-    def share(self, delta: FloatArray) -> FloatArray:
-        """Return what is at least 1 where |S| reaches the size, frequencies changed (modes,)."""
-        return self.modes.share("freq", delta, self.bound)
-
-    def exceeds(self, delta: FloatArray, count: int) -> BoolArray:
-        """Return for which of the modes |S| reaches the size at any point."""
-        over = self.modes.mode[self.share(delta) >= 1.0]
-        return np.bincount(over, minlength=count) > 0
-
-    def halved(self, below: FloatArray, above: FloatArray, sign: float) -> FloatArray:
-        """Return the sizes of change (modes,) between two at which it is reached first."""
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (below + above)
-            over = self.exceeds(sign * middle, len(middle))
-            above, below = np.where(over, middle, above), np.where(over, below, middle)
-        return above

@@ -53,12 +53,9 @@ class LoopMargins(Value):
     Examples
     --------
     >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> observer = fx.design_kalman(plant)
-    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
-    >>> one = fx.loop.report_loops(fx.close_loop(plant, observer, servo))["u1"]
-    >>> round(one.gain_margin, 2), round(one.modulus_margin, 2)
-    (3.26, 0.57)
+    >>> one = fx.loop.report_loops(fx.lti.tf([60.0], [1.0, 0.0]))["in"]
+    >>> round(one.phase_margin), one.gain_margin
+    (90, inf)
     """
 
     name: str
@@ -112,16 +109,6 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
         changes it.
     units : tuple of str
         Of the channels, where they have several.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> observer = fx.design_kalman(plant)
-    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
-    >>> report = fx.loop.report_loops(fx.close_loop(plant, observer, servo))
-    >>> report.is_stable, report.modulus_margin > 0.5
-    (True, True)
     """
 
     loops: tuple[LoopMargins, ...]
@@ -203,12 +190,15 @@ def report_loops(
     unstable : int
         Of a measured plant: poles outside the stability region (negative stiffness).
 
+    Returns
+    -------
+    LoopReport
+
     Raises
     ------
-    LabelError
-        When channels of plant and controller do not match.
-    ModelError
-        When `loop` is of another type, or a number of poles is none.
+    LabelError, ModelError
+        When channels of plant and controller do not match; when `loop` is of another type, or a
+        number of poles is none.
 
     Examples
     --------
@@ -368,9 +358,8 @@ class LoopFigures(Value):
     >>> plant = fx.testbeds.three_masses()
     >>> observer = fx.design_kalman(plant)
     >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
-    >>> row = fx.compare_loops({"servo": fx.close_loop(plant, observer, servo)})["servo"]
-    >>> row.stable, round(row.margin, 2)
-    (True, 0.57)
+    >>> fx.compare_loops({"servo": fx.close_loop(plant, observer, servo)})["servo"].stable
+    True
     """
 
     stable: bool

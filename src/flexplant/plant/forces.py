@@ -18,8 +18,23 @@ from .realisation import ModalRealisation
 from .rigid_body import inertia_load, rigid_body_of
 
 
+class _PlacedForce(ForcePort):
+    """A force (or moment) at a place."""
+
+    at: Place
+
+    @property
+    def unit(self) -> str | None:
+        """N or N m; None for a sum of forces and moments."""
+        return force_unit(self.at, self.direction)
+
+    def push(self, realisation: ModalRealisation) -> FloatArray:
+        """Return the load (n,) over the model's DOFs of a unit force."""
+        return realisation.row(self.at, self.direction)
+
+
 @dataclass(frozen=True, eq=False)
-class Disturbance(ForcePort):
+class Disturbance(_PlacedForce):
     """A force (or moment) from outside, in w.
 
     Parameters
@@ -61,15 +76,6 @@ class Disturbance(ForcePort):
     shape: StateSpace | None = None
     held: bool = False
     moves: Any = None
-
-    @property
-    def unit(self) -> str | None:
-        """N or N m; None for a sum of forces and moments."""
-        return force_unit(self.at, self.direction)
-
-    def push(self, realisation: ModalRealisation) -> FloatArray:
-        """Return the load (n,) over the model's DOFs of a unit force."""
-        return realisation.row(self.at, self.direction)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,10 +157,8 @@ class OutputDisturbance(ForcePort):
 
     Parameters
     ----------
-    name : str
-        The channel's name.
-    sensor : str
-        The name of the sensor.
+    name, sensor : str
+        Of the channel, and of the sensor.
     asd : float [unit of the sensor/sqrt(Hz)]
         One-sided amplitude spectral density of white noise; 0 for none.
     shape : StateSpace, optional
@@ -188,29 +192,22 @@ class OutputDisturbance(ForcePort):
 
 
 @dataclass(frozen=True, eq=False)
-class Actuator(ForcePort):
+class Actuator(_PlacedForce):
     """A force (or moment) that the controller commands, in u.
 
     Parameters
     ----------
-    name : str
-        The channel's name.
-    at : str, (3,) array [m] or mapping
-        A DOF label, a point, or a sum {label or point: weight}: pairs and other combinations.
-    direction : str
-        At points: x, y, z [N] or rx, ry, rz [N m].
+    name, at, direction, moves
+        As for `Disturbance`: sums are pairs and other combinations.
     dynamics : StateSpace, optional
         Amplifier and motor, command to force: stable; its states join the plant's.
     latency : float [s]
         Delay of the command by cable or bus, in seconds, besides the `delay` in samples of
-        `discretized`. It acts exactly, also
-        between samples, once the plant is sampled; a continuous plant leaves it out and says so
-        (`ports.with_pade(order)` approximates it there).
+        `discretized`. It acts exactly, also between samples, once the plant is sampled; a
+        continuous plant leaves it out and says so (`ports.with_pade(order)` approximates it there).
     asd : float [N/sqrt(Hz), N m/sqrt(Hz)]
         One-sided amplitude spectral density of white noise at the amplifier's input, the channel
         `name:disturbance` of w. It passes the same `dynamics` as the command, not its latency.
-    moves : mapping {position: (3,) array} or PlaceTable, optional
-        How its point follows the positions of `Ports`; `at` is where all of them are zero.
 
     Raises
     ------
@@ -240,80 +237,28 @@ class Actuator(ForcePort):
         """Amplifier and motor."""
         return self.dynamics
 
-    @property
-    def unit(self) -> str | None:
-        """N or N m; None for a sum of forces and moments."""
-        return force_unit(self.at, self.direction)
-
-    def push(self, realisation: ModalRealisation) -> FloatArray:
-        """Return the load (n,) over the model's DOFs of a unit force."""
-        return realisation.row(self.at, self.direction)
-
 
 class _Spectrum(Value):
-    """White noise through a stable filter: `asd` of the noise, and the filter as `shape`."""
+    """White noise of one-sided density `asd` through a stable filter, `shape`."""
 
     @property
     @abstractmethod
-    def asd(self) -> float:
-        """One-sided amplitude spectral density of the white noise before the filter."""
+    def asd(self) -> float: ...
 
     @property
     @abstractmethod
-    def shape(self) -> StateSpace:
-        """The filter."""
+    def shape(self) -> StateSpace: ...
 
     def force(self, name: str, at: Place, direction: str = "z") -> Disturbance:
-        """Return the force of this spectrum at a place: a channel of w.
-
-        Parameters
-        ----------
-        name : str
-            The channel's name.
-        at : str, (3,) array [m] or mapping
-            A DOF label, a point, or a sum {label or point: weight}.
-        direction : str
-            At points: x, y, z or rx, ry, rz.
-
-        Raises
-        ------
-        LabelError, ModelError
-            For a bad name, place or direction.
-        """
+        """Return the force [N, N m] of this spectrum at a place; see `Disturbance`."""
         return Disturbance(name, at, direction, self.asd, self.shape)
 
     def rigid(self, name: str, direction: str = "z") -> RigidForce:
-        """Return the force of this spectrum on a rigid-body axis, which bends nothing.
-
-        Parameters
-        ----------
-        name : str
-            The channel's name.
-        direction : str
-            x, y, z [N] or rx, ry, rz [N m].
-
-        Raises
-        ------
-        LabelError, ModelError
-            For a bad name or direction.
-        """
+        """Return the force [N, N m] of this spectrum on a rigid-body axis; see `RigidForce`."""
         return RigidForce(name, direction, self.asd, self.shape)
 
     def floor(self, name: str, direction: str = "z") -> BaseAcceleration:
-        """Return the base acceleration of this spectrum [m/s^2 or rad/s^2].
-
-        Parameters
-        ----------
-        name : str
-            The channel's name.
-        direction : str
-            x, y, z or rx, ry, rz.
-
-        Raises
-        ------
-        LabelError, ModelError
-            For a bad name or direction.
-        """
+        """Return the base acceleration [m/s^2, rad/s^2] of this spectrum; see its class."""
         return BaseAcceleration(name, direction, self.asd, self.shape)
 
 
@@ -447,15 +392,7 @@ class RandomWalk(_Spectrum):
         """Root mean square [N] that the corner leaves: drift / (4 pi corner)^(1/2)."""
         return float(self.drift / np.sqrt(4 * np.pi * self.corner))
 
-    @property
-    def asd(self) -> float:
-        """Density [N/sqrt(Hz)] far below the corner."""
-        return FirstOrder(self.rms, self.corner).asd
-
-    @property
-    def shape(self) -> StateSpace:
-        """The low-pass."""
-        return FirstOrder(self.rms, self.corner).shape
+    asd, shape = FirstOrder.asd, FirstOrder.shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -467,14 +404,10 @@ class RigidForce(ForcePort):
 
     Parameters
     ----------
-    name : str
-        The channel's name.
+    name, asd, shape
+        As for `Disturbance`.
     direction : str
         x, y, z [N] or rx, ry, rz [N m].
-    asd : float [N/sqrt(Hz), N m/sqrt(Hz)]
-        One-sided amplitude spectral density of white noise; 0 for none.
-    shape : StateSpace, optional
-        A stable filter between the channel and the machine.
 
     Raises
     ------

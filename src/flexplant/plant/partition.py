@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self, TypeAlias, TypeGuard
+from typing import Any, Self, TypeAlias, TypeGuard
 
 import numpy as np
 
@@ -197,13 +197,7 @@ class Partition(Value):
         """Return a plant; of a system with labels when these name w, u, z and y.
 
         Of an `UncertainPlant` its nominal plant, with what is uncertain in `uncertainty`.
-
-        Raises
-        ------
-        LabelError
-            When the labels do not.
-        ModelError
-            When it is neither.
+        LabelError when the labels do not, ModelError when it is neither.
         """
         given = getattr(given, "nominal", given)
         if isinstance(given, cls):
@@ -284,12 +278,8 @@ class Partition(Value):
     def assembled(self) -> Assembled:
         """What it was assembled from: ports, realisation, noise, delay, the plant before sampling.
 
-        Of a weighted plant, what the plant underneath was assembled from.
-
-        Raises
-        ------
-        ModelError
-            When the plant was made elsewhere.
+        Of a weighted plant, what the plant underneath was assembled from. ModelError when it was
+        made elsewhere.
         """
         found: Assembled | None = self.unweighted.origin.structure
         if found is None:
@@ -315,10 +305,7 @@ class Partition(Value):
     def reading_gain(self) -> FloatArray:
         """The gain (ny, plain ny) of the static block that it is read through; I without one.
 
-        Raises
-        ------
-        ModelError
-            When the block has dynamics.
+        ModelError when the block has dynamics.
         """
         plain, reading = self.unweighted, self.origin.reading
         if reading is None:
@@ -409,10 +396,7 @@ class Partition(Value):
     def modal_states(self) -> IntArray:
         """Where the states of the structure's modes are; sensors' filters stand before them.
 
-        Raises
-        ------
-        ModelError
-            When the plant was not assembled from a structure, or has other states now.
+        ModelError when the plant was not assembled from a structure, or has other states now.
         """
         names = self.assembled.realisation.names
         if names[0] not in self.system.states:
@@ -424,10 +408,7 @@ class Partition(Value):
     def noise_factor(self) -> FloatArray:
         """G (n, r), G G' the covariance that white disturbances add to x in one sample.
 
-        Raises
-        ------
-        ModelError
-            When it is not known.
+        ModelError when it is not known.
         """
         found = self.origin.noise_factor
         if self.origin.reading is not None and not self.origin.scaled:
@@ -483,10 +464,7 @@ class Partition(Value):
     def channel(self, name: str, side: str = "z") -> str:
         """Return the channel of `side` that a name means: `die` or `die:hat` mean `die:z`.
 
-        Raises
-        ------
-        LabelError
-            When it means none.
+        LabelError when it means none.
         """
         names: tuple[str, ...] = getattr(self, side)
         if not isinstance(name, str) or name in names:
@@ -508,41 +486,17 @@ class Partition(Value):
     D21 = property(lambda self: self.Gyw.D, doc="w to y.")
     D22 = property(lambda self: self.Gyu.D, doc="u to y.")
 
-    @property
-    def Gzw(self) -> StateSpace:
-        """The system w -> z."""
-        return self.system.select(self.z, self.w)
-
-    @property
-    def Gzu(self) -> StateSpace:
-        """The system u -> z."""
-        return self.system.select(self.z, self.u)
-
-    @property
-    def Gyw(self) -> StateSpace:
-        """The system w -> y."""
-        return self.system.select(self.y, self.w)
-
-    @property
-    def Gyu(self) -> StateSpace:
-        """The system u -> y."""
-        return self.system.select(self.y, self.u)
+    Gzw = property(lambda self: self.system.select(self.z, self.w), doc="The system w -> z.")
+    Gzu = property(lambda self: self.system.select(self.z, self.u), doc="The system u -> z.")
+    Gyw = property(lambda self: self.system.select(self.y, self.w), doc="The system w -> y.")
+    Gyu = property(lambda self: self.system.select(self.y, self.u), doc="The system u -> y.")
 
 
 #: what to type for a system whose names do not show its channels
 TYPE_THIS = "StandardPlant.from_statespace(sys, w=[...], u=[...], z=[...], y=[...], asd={...})"
 
 
-class Sides(NamedTuple):
-    """The names of w, u, z and y."""
-
-    w: list[str]
-    u: list[str]
-    z: list[str]
-    y: list[str]
-
-
-def sides(g: StateSpace) -> Sides:
+def sides(g: StateSpace) -> tuple[list[str], list[str], list[str], list[str]]:
     """Return w, u, z, y of a system whose channels are named like those of an assembled plant.
 
     Each actuator `u1` has its effort `u1:effort` among the outputs: these inputs are u, the others
@@ -573,7 +527,7 @@ def sides(g: StateSpace) -> Sides:
             raise _untold(f"{name + ':' + what!r} is there, {name!r} is not")
     if not y:
         raise _untold("no output is a measurement")
-    return Sides([name for name in g.inputs if name not in u], u, z, y)
+    return [name for name in g.inputs if name not in u], u, z, y
 
 
 def _untold(why: str) -> LabelError:

@@ -7,28 +7,16 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from ..checks import FloatArray, Value, check_names, instance, members, name_list, several, short
-from ..errors import LabelError, ModelError, require_known, unknown_label
+from ..errors import LabelError, ModelError, require_known
 from ..labels import DIRECTIONS, Place
 from ..lti.filters import pade
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
 from ..structure.rigid import place_motion
-from .forces import Actuator as Actuator
-from .forces import Disturbance as Disturbance
-from .port import QUANTITIES as QUANTITIES
-from .port import (
-    ForcePort,
-    Quantity,
-    Seen,
-    SensorPort,
-    checked_choice,
-    checked_name,
-    checked_place,
-    motion_unit,
-    observed,
-)
+from .forces import Actuator
+from .port import ForcePort, Quantity, Seen, SensorPort, checked_port, motion_unit, observed
 from .realisation import ModalRealisation
-from .scheduling import Position, checked_moves, port_at, require_positions
+from .scheduling import Position, port_at, require_positions
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +27,8 @@ class Sensor(SensorPort):
     ----------
     name : str
         The channel's name; its noise is the channel `name:noise` of w.
-    at : str, (3,) array [m] or mapping
-        A DOF label, a point, or a sum {label or point: weight}.
-    direction : str
-        At points: x, y, z or rx, ry, rz.
+    at, direction, moves
+        As for `Disturbance`.
     quantity : {"displacement", "velocity", "acceleration"}
         What is measured. An acceleration answers forces at once (D21, D22); a white disturbance
         that reaches it would give its samples infinite variance, which Kalman filters and
@@ -61,8 +47,6 @@ class Sensor(SensorPort):
         Whether a BaseAcceleration moves it too: True of inertial sensors, as of a geophone
         (absolute velocity), False of what measures against the floor. When not given,
         accelerations are absolute, displacements and velocities are relative to the floor.
-    moves : mapping {position: (3,) array} or PlaceTable, optional
-        How its point follows the positions of `Ports`; `at` is where all of them are zero.
 
     Raises
     ------
@@ -151,24 +135,17 @@ class Poi(Value):
                 f"POI {self.name!r} is a combination of DOFs, so it has one axis, got {axes}. "
                 "Give a point or a DOF label, or one POI per combination."
             )
-        name, absolute = checked_name(self.name), checked_choice(self.name, self.absolute)
-        at = checked_place(name, self.at)
-        moves = checked_moves(name, at, self.moves)
-        self._set(axes=axes, name=name, at=at, absolute=bool(absolute), moves=moves)
+        found = checked_port(self)
+        self._set(**found | {"axes": axes, "absolute": bool(found["absolute"])})
 
     def channel(self, axis: str) -> str:
         """Return the name of an axis in z, such as `die:z`."""
         return f"{self.name}:{axis}"
 
     def derived(self, axis: str, kind: str) -> str:
-        """Return the name of a reference, error or estimate: `die:hat`, `die:rx:hat`.
+        """Return the name of a reference, error or estimate (`ref`, `error`, `hat`) of an axis.
 
-        Parameters
-        ----------
-        axis : str
-            One of the POI's axes; the first is left out of the name.
-        kind : str
-            `ref`, `error` or `hat`.
+        `die:hat`, `die:rx:hat`: the first axis is left out of the name.
         """
         return f"{self.name}:{kind}" if axis == self.axes[0] else f"{self.name}:{axis}:{kind}"
 
@@ -355,13 +332,8 @@ class Ports(Value):
         self._set(positions=positions, values=values, **there)
 
     def __repr__(self) -> str:
-        names = {
-            "w": [port.name for port in self.w],
-            "u": [port.name for port in self.u],
-            "z": [poi.name for poi in self.z],
-            "y": [port.name for port in self.y],
-            "references": [reference.poi for reference in self.references],
-        }
+        names = {side: [port.name for port in getattr(self, side)] for side in "wuzy"}
+        names["references"] = [reference.poi for reference in self.references]
         sides = ", ".join(f"{side}: {' '.join(listed)}" for side, listed in names.items() if listed)
         return f"<Ports {sides}{', at ' + self.standing if self.values else ''}>"
 
@@ -376,12 +348,7 @@ class Ports(Value):
     def at(self, values: Mapping[str, float]) -> Ports:
         """Return the ports where the machine stands elsewhere; positions not named stay.
 
-        Raises
-        ------
-        LabelError
-            When no position has such a name.
-        ModelError
-            When a value is out of its range.
+        LabelError when no position has such a name, ModelError when a value is out of its range.
         """
         return self.replace(values={**self.values, **values})
 
@@ -417,30 +384,16 @@ class Ports(Value):
         return {name: unit for name, unit in found.items() if unit is not None}
 
     def poi(self, name: str) -> Poi:
-        """Return the POI of a name.
-
-        Raises
-        ------
-        LabelError
-            When there is none.
-        """
-        for poi in self.z:
-            if isinstance(name, str) and poi.name == name:
-                return poi
-        raise unknown_label("POI", name, [poi.name for poi in self.z])
+        """Return the POI of a name; LabelError when there is none."""
+        known = {poi.name: poi for poi in self.z}
+        require_known("POI", [name], known)
+        return known[name]
 
     def sensor(self, name: str) -> SensorPort:
-        """Return the sensor of a name.
-
-        Raises
-        ------
-        LabelError
-            When there is none.
-        """
-        for sensor in self.y:
-            if isinstance(name, str) and sensor.name == name:
-                return sensor
-        raise unknown_label("sensor", name, [sensor.name for sensor in self.y])
+        """Return the sensor of a name; LabelError when there is none."""
+        known = {sensor.name: sensor for sensor in self.y}
+        require_known("sensor", [name], known)
+        return known[name]
 
     @property
     def followed(self) -> tuple[tuple[Poi, str], ...]:
@@ -462,15 +415,7 @@ class Ports(Value):
     def with_pade(self, order: int = 2) -> Ports:
         """Return the ports with every latency as an all-pass filter, for continuous designs.
 
-        Parameters
-        ----------
-        order : int
-            States of each; the phase is right up to about ``order / (6 latency)`` Hz.
-
-        Raises
-        ------
-        ModelError
-            When the order is not 1 or more.
+        `order`, 1 or more: states of each; the phase is right up to ``order / (6 latency)`` Hz.
         """
 
         def late(port: Any) -> Any:

@@ -131,10 +131,8 @@ class StandardPlant(Partition):
 
         Raises
         ------
-        LabelError
-            When a name is unknown.
-        ModelError
-            When a weight is not one by one, or of another sampling time.
+        LabelError, ModelError
+            When a name is unknown; when a weight is not one by one, or of another sampling time.
         """
         if weights is not None:
             if not isinstance(getattr(weights, "z", None), Mapping):
@@ -153,29 +151,18 @@ class StandardPlant(Partition):
         block : StateSpace
             Its inputs are channels of y; its outputs become y.
 
-        Returns
-        -------
-        StandardPlant
-            With the same w, u and z.
-
         Raises
         ------
-        LabelError
-            When an input of the block is not in y.
-        ModelError
-            When its sampling time differs.
+        LabelError, ModelError
+            When an input of the block is not in y; when its sampling time differs.
         """
         return measured_through(self, block)
 
     def with_ports(self, ports: Ports) -> StandardPlant:
         """Return the plant of the same structure, sampled alike, with other ports.
 
-        The modes are not solved again: this is what placement calls.
-
-        Raises
-        ------
-        ModelError
-            When the plant was not assembled from a structure.
+        The modes are not solved again: this is what placement calls. ModelError when the plant was
+        not assembled from a structure.
         """
         return rebuilt(self, ports=ports)
 
@@ -198,10 +185,9 @@ class StandardPlant(Partition):
 
         Raises
         ------
-        LabelError
-            When a name is unknown, or the plant has several POIs and none is named.
-        ModelError
-            When a position is out of its range.
+        LabelError, ModelError
+            When a name is unknown, or the plant has several POIs and none is named; when a
+            position is out of its range.
         """
         if poi is None and not positions:
             raise LabelError(
@@ -227,18 +213,11 @@ class StandardPlant(Partition):
         points : int or mapping {name: int or array}
             How many values of each position are taken over its range, or which [m or rad].
 
-        Returns
-        -------
-        PositionMap
-            For `flexplant.plot.position_map`.
-
         Raises
         ------
-        LabelError
-            When the plant has no positions.
-        ModelError
-            When it was not assembled from a structure, a value is out of range, or a judge gives
-            no number.
+        LabelError, ModelError
+            When the plant has no positions; when it was not assembled from a structure, a value is
+            out of range, or a judge gives no number.
         """
         return position_map(self, judge, points)
 
@@ -255,16 +234,11 @@ class StandardPlant(Partition):
         points : (p, 3) array [m]
             The places.
 
-        Returns
-        -------
-        Along
-
         Raises
         ------
-        LabelError
-            When the name is unknown or a point is off the structure.
-        ModelError
-            When the plant was not assembled from a structure, or more than B depends on the place.
+        LabelError, ModelError
+            When the name is unknown or a point is off the structure; when the plant was not
+            assembled from a structure, or more than B depends on the place.
         """
         return along(self, name, points)
 
@@ -357,13 +331,8 @@ class StandardPlant(Partition):
     def rigid_motions(self) -> RigidModes:
         """The rigid-body motions that cost no force, or only that of weak springs.
 
-        Raises
-        ------
-        ModelError
-            When it was not assembled from a structure.
-        AssumptionError
-            When the structure is held, or stiff springs bend an axis that its channels have part
-            in.
+        ModelError when it was not assembled from a structure; AssumptionError when this is held,
+        or stiff springs bend an axis that its channels have part in.
         """
         return rigid_modes_of(self)
 
