@@ -175,11 +175,8 @@ class SweptLoop(NamedTuple):
             axis=1,
         )
         c, e = loops.seen
-        q = (
-            self.SK[at] @ c[mode].astype(complex)
-            if self.shown is None
-            else self.SK[at] @ self.shown[at, mode]
-        )
+        # complex all of it: products of both kinds are slow
+        q = self.SK[at] @ (c[mode].astype(complex) if self.shown is None else self.shown[at, mode])
         return SweptModes(loops, at, mode, self.z[at], Y, q, Y @ q, e[mode])
 
 

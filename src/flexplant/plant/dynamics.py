@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -80,10 +79,9 @@ def with_filters(structure: StateSpace, realisation: ModalRealisation, ports: Po
     before = {port.name: _named_system(port.filter, port.name) for port in ports.forces}
     filters = {sensor.name: sensor.filter for sensor in ports.y}
     after = {name: _named_system(filters.get(name), name) for name in structure.outputs}
-    moving = _carried(realisation, ports)
-    if moving:
-        structure, before, after = with_ground(Parts(structure, before, after), moving)
     system = structure
+    if any(np.any(port.ground) for port in ports.forces):
+        system = _with_ground(structure, before, after, port_rows(realisation, ports))
     if any(part.n_states for part in before.values()):
         system = series(append(*before.values()), system)
     elif any(part.D[0, 0] != 1.0 for part in before.values()):
@@ -100,41 +98,12 @@ def with_filters(structure: StateSpace, realisation: ModalRealisation, ports: Po
     )
 
 
-def _carried(realisation: ModalRealisation, ports: Ports) -> dict[str, Carried]:
-    """Return which displacements and velocities move with the ground, and how far."""
-    grounds = {port.name: port.ground for port in ports.forces if np.any(port.ground)}
-    if not grounds:
-        return {}
-    own, found = port_rows(realisation, ports), {}
-    for output, order, one in zip(own.outputs, own.orders, own.seen, strict=True):
-        gains = {name: float(one.carried @ ground) for name, ground in grounds.items()}
-        moved = {name: gain for name, gain in gains.items() if gain}
-        if moved and order < 2:
-            found[output] = Carried(order, moved)
-    return found
-
-
 def _named_system(part: StateSpace | None, name: str) -> StateSpace:
     return (part or as_statespace(1.0)).replace(inputs=[name], outputs=[name])
 
 
 #: relative: a gain at 0 Hz smaller than this is a zero there
 _ZERO = 1e-9
-
-
-class Carried(NamedTuple):
-    """What moves with the ground."""
-
-    order: int
-    gains: Mapping[str, float]
-
-
-class Parts(NamedTuple):
-    """A structure, and the filters {channel: filter} before and after it."""
-
-    structure: StateSpace
-    before: dict[str, StateSpace]
-    after: dict[str, StateSpace]
 
 
 def direct_effect(
@@ -155,36 +124,45 @@ def direct_effect(
     return total
 
 
-def with_ground(parts: Parts, carried: Mapping[str, Carried]) -> Parts:
-    """Return the parts with absolute displacements and velocities added.
+def _with_ground(
+    structure: StateSpace,
+    before: dict[str, StateSpace],
+    after: dict[str, StateSpace],
+    own: PortRows,
+) -> StateSpace:
+    """Return the structure with absolute displacements and velocities, its filters changed for it.
 
     The ground moves by ``a / s^p``, p = 2 for displacements and 1 for velocities. A filter of a
     sensor with m zeros at 0 Hz integrates m times without a state more, ``F / s^m`` being
     ``(A, A^-m B, C, 0)``, and so does a shape, ``(A, B, C A^-m, 0)``.
     """
-    structure, before, after = parts.structure, dict(parts.before), dict(parts.after)
     needed: dict[str, set[int]] = {}
     entries: dict[tuple[str, str], float] = {}
-    for output, one in carried.items():
-        times = _integrals(after[output], 2 - one.order)
-        own = output
+    for output, order, one in zip(own.outputs, own.orders, own.seen, strict=True):
+        moved = {
+            n: float(g) for n, g in zip(own.inputs, own.ground @ one.carried, strict=True) if g
+        }
+        if order == 2 or not moved:
+            continue
+        times = _integrals(after[output], 2 - order)
+        shown, left = output, 2 - order - times
         if times:
             after[output] = _with_ground_input(after[output], output, times)
-            own = after[output].inputs[1]
-        for name, gain in one.gains.items():
-            left = 2 - one.order - times
+            shown = after[output].inputs[1]
+        for name, gain in moved.items():
             found = _integrals(before[name], left)
             if found < left:
-                raise ModelError(_unbounded(output, one.order, name, left, found))
+                raise ModelError(_unbounded(output, order, name, left, found))
             if left:
                 needed.setdefault(name, set()).add(left)
-            entries[own, _ground_name(name, left)] = gain
+            entries[shown, _ground_name(name, left)] = gain
+    if not entries:
+        return structure
     for name, lefts in needed.items():
         before[name] = _with_integrals(before[name], name, sorted(lefts))
     inputs = [name for part in before.values() for name in part.outputs]
     outputs = [name for part in after.values() for name in part.inputs]
-    wider = among(structure, inputs, outputs, entries)
-    return Parts(wider, before, after)
+    return among(structure, inputs, outputs, entries)
 
 
 def _ground_name(name: str, times: int) -> str:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -33,7 +32,8 @@ ILL_CONDITIONED = 30.0
 MODAL = "modal blocks"
 
 
-def _empty() -> FloatArray:
+def none() -> FloatArray:
+    """Return nothing (0,)."""
     return np.zeros(0)
 
 
@@ -62,17 +62,14 @@ class ModalRealisation(Value):
     outputs: FloatArray
     names: tuple[str, ...]
     n_rigid: int
-    static_outputs: FloatArray = field(default_factory=_empty)
-    static_inputs: FloatArray = field(default_factory=_empty)
+    static_outputs: FloatArray = field(default_factory=none)
+    static_inputs: FloatArray = field(default_factory=none)
     coupling: FloatArray | None = None
     form: str = MODAL
 
     def __post_init__(self) -> None:
-        n = self.inputs.shape[0]
-        outputs, inputs = (
-            part.reshape(n, -1) for part in (self.static_outputs, self.static_inputs)
-        )
-        self._set(**self._fields() | {"static_outputs": outputs, "static_inputs": inputs})
+        for name in ("static_outputs", "static_inputs"):
+            self._set(**{name: getattr(self, name).reshape(self.inputs.shape[0], -1)})
 
     @property
     def n_modes(self) -> int:
@@ -142,14 +139,8 @@ def realise(model: Structure | ModalRealisation) -> ModalRealisation:
     if isinstance(model, Modes):
         if np.iscomplexobj(model.phi):
             return _complex(model, model.omega, model.zeta, np.asarray(model.phi), model.n_rigid)
-        return _real(
-            model,
-            model.basis_omega,
-            model.basis_zeta,
-            np.real(model.basis),
-            model.n_rigid,
-            model.omega.size,
-        )
+        omega, zeta, basis = model.basis_omega, model.basis_zeta, np.real(model.basis)
+        return _real(model, omega, zeta, basis, model.n_rigid, model.omega.size)
     if isinstance(model, FEModel | ReducedModel):
         if model.M.shape[0] > LARGEST_DENSE:
             raise ModelError(
@@ -256,8 +247,7 @@ def _real(
     model: Structure, omega: FloatArray, zeta: FloatArray, phi: FloatArray, rigid: int, modes: int
 ) -> ModalRealisation:
     """Equation (5): states (omega q, dq/dt) of each mode; residual vectors are fast modes."""
-    # residual vectors are fast modes; an unstable one has [[0, |omega|], [|omega|, -2 zeta
-    # |omega|]]
+    # an unstable mode has [[0, |omega|], [|omega|, -2 zeta |omega|]]
     n, b = phi.shape
     size = np.abs(omega)
     scale = np.where(size > 0, size, size[rigid:].min(initial=np.inf) if size[rigid:].size else 1.0)
@@ -268,13 +258,9 @@ def _real(
     inputs, outputs = np.zeros((n, b, 2)), np.zeros((n, b, 2))
     inputs[:, :, 1] = phi
     outputs[:, :, 0] = phi / scale
+    names = _state_names(b, modes)
     return ModalRealisation(
-        model,
-        pairs,
-        inputs.reshape(n, -1),
-        outputs.reshape(n, -1),
-        _state_names(b, modes),
-        rigid,
+        model, pairs, inputs.reshape(n, -1), outputs.reshape(n, -1), names, rigid
     )
 
 
@@ -344,11 +330,11 @@ def _state_names(blocks: int, modes: int) -> tuple[str, ...]:
 
 
 class ResidualForm(Value):
-    """How the residual compliance of a reduction appears in a plant."""
+    """How the residual compliance of a reduction appears in a plant: as it is, unless said."""
 
-    @abstractmethod
     def applied(self, realisation: ModalRealisation) -> ModalRealisation:
         """Return the realisation in this form."""
+        return realisation
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,10 +350,6 @@ class FastStates(ResidualForm):
     >>> fx.plant.FastStates()
     FastStates()
     """
-
-    def applied(self, realisation: ModalRealisation) -> ModalRealisation:
-        """Return the realisation unchanged."""
-        return realisation
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,10 +385,7 @@ class Feedthrough(ResidualForm):
     def applied(self, realisation: ModalRealisation) -> ModalRealisation:
         """Return the realisation with its fast pairs replaced by their static gain.
 
-        Raises
-        ------
-        ModelError
-            When nothing would be replaced, or everything.
+        ModelError when nothing would be replaced, or everything.
         """
         b = realisation.pairs.shape[0]
         fast = np.array([name.startswith("residual") for name in realisation.names[::2]])
@@ -430,8 +409,7 @@ class Feedthrough(ResidualForm):
         if coupling is not None:
             # damping between a mode that stays and one that answers at once is left out with it
             coupling = coupling[np.ix_(~fast, ~fast)]
-        return replace(
-            realisation,
+        return realisation.replace(
             pairs=realisation.pairs[~fast],
             inputs=realisation.inputs[:, kept],
             outputs=realisation.outputs[:, kept],

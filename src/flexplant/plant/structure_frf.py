@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import Any, NamedTuple, overload
+from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -26,11 +26,7 @@ from ..reduction import ReducedModel
 from ..structure import Damping, FEModel
 from .dynamics import port_rows
 from .ports import Ports
-from .realisation import Structure, plant_modes
-
-
-def _none() -> FloatArray:
-    return np.zeros(0)
+from .realisation import Structure, none, plant_modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,9 +59,9 @@ class StructureFrf(Frf):
     """
 
     route: str = ""
-    check_freq: FloatArray = field(default_factory=_none)
-    error: FloatArray = field(default_factory=_none)
-    error_there: FloatArray = field(default_factory=_none)
+    check_freq: FloatArray = field(default_factory=none)
+    error: FloatArray = field(default_factory=none)
+    error_there: FloatArray = field(default_factory=none)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,11 +85,9 @@ class StructureFrf(Frf):
 
 
 @overload
-def frequency_response(model: System, ports: npt.ArrayLike | None = None) -> Frf: ...
-
-
-@overload
-def frequency_response(model: System, *, freq: npt.ArrayLike | None = None) -> Frf: ...
+def frequency_response(
+    model: System, ports: npt.ArrayLike | None = None, freq: npt.ArrayLike | None = None
+) -> Frf: ...
 
 
 @overload
@@ -226,14 +220,6 @@ def frequency_response(
     )
 
 
-class _PortTerm(NamedTuple):
-    """A displacement row, its time derivative, and the channel that it is part of."""
-
-    row: FloatArray
-    order: int
-    channel: int
-
-
 class _PortChannels:
     """The channels of ports over the coordinates of a model: loads, rows, filters, latencies."""
 
@@ -244,13 +230,10 @@ class _PortChannels:
         self._quantity = seen_as.pop() if len(seen_as) == 1 else None
         self.loads = own.push.T
         n = self.loads.shape[0]
-        self._terms = [
-            _PortTerm(row, order, i)
-            for i, one in enumerate(own.seen)
-            for order, row in enumerate(one.row.reshape(3, n))
-            if np.any(row)
-        ]
-        self.rows = np.array([term.row for term in self._terms]).reshape(-1, n)
+        # rows of displacements, and the channel and the time derivative that each is part of
+        rows = np.array([one.row.reshape(3, n) for one in own.seen])
+        self._channel, self._derivative = np.nonzero(rows.any(axis=2))
+        self.rows = rows[self._channel, self._derivative]
         self._carried = np.array([one.carried for one in own.seen]) @ own.ground.T
         self._orders, self._added = np.array(own.orders), own.added
         late = ports.latencies
@@ -287,14 +270,13 @@ class _PortChannels:
         """Return the responses (f, p, q) of the channels, of those of the displacement rows."""
         s = 2j * np.pi * freq
         found = np.zeros((freq.size, *self._carried.shape), dtype=np.complex128)
-        for i, term in enumerate(self._terms):
-            found[:, term.channel] += s[:, None] ** term.order * response[:, i]
+        for i, (channel, order) in enumerate(zip(self._channel, self._derivative, strict=True)):
+            found[:, channel] += s[:, None] ** order * response[:, i]
         for i in np.flatnonzero(np.any(self._carried, axis=1)).tolist():
             found[:, i] += s[:, None] ** (self._orders[i] - 2) * self._carried[i]
-        found += self._added
         after = np.array([_passed(*part, freq) for part in self._after])
         before = np.array([_passed(*part, freq) for part in self._before])
-        return np.asarray(found * after.T[:, :, None] * before.T[:, None])
+        return np.asarray((found + self._added) * after.T[:, :, None] * before.T[:, None])
 
 
 def _all_motions(model: Structure) -> Any:
