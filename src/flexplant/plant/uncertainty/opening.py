@@ -17,8 +17,8 @@ from ...lti.statespace import StateSpace
 from ...sparse.factor import dense
 from ...tolerances import ROUNDING, SAME, TINY
 from ...updating import ModalUncertainty, UpdateResult
-from ...updating.parameters import Parameter
 from ...updating.matrix_parameters import MatrixParameter
+from ...updating.parameters import Parameter
 from ..building import P, continuous_plant, rebuilt
 from ..partition import Partition
 from ..port import QUANTITIES, ForcePort, Quantity, SensorPort
