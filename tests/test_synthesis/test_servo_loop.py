@@ -171,7 +171,7 @@ def test_search_and_certificate_break_the_same_loop():
         task = servo_task(one, None, None, None, (), observer, None)
         for bandwidth in (5.0, 20.0):
             axis = task.axis(bandwidth)
-            found = task.loop.broken(axis).gain(task.loop.freq)
+            found = task.loop.gain(axis)
             wanted = task.closed(axis).broken.gain(task.loop.freq)
             np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
 

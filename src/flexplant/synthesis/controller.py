@@ -133,10 +133,8 @@ AGREEMENT = 1e-3
 _AROUND = (0.0, *np.geomspace(0.05, 20.0, 24).tolist())
 
 
-def certified_norm(
-    loop: StateSpace, claim: float, respond: Responder | None = None
-) -> dict[str, float]:
-    """Return what was verified of a closed loop: its norm by two routes, and its stability."""
+def required_stability(loop: StateSpace) -> float:
+    """Return the spectral abscissa or radius of a closed loop that has to be stable."""
     least = stability(loop.poles(), loop.dt)
     if not least < (1.0 if loop.dt else 0.0):
         raise CertificateError(
@@ -144,6 +142,14 @@ def certified_norm(
             "controller is refused. "
             "Is the sign of the feedback u = K y right, and is it the plant that it was made for?"
         )
+    return least
+
+
+def certified_norm(
+    loop: StateSpace, claim: float, respond: Responder | None = None
+) -> dict[str, float]:
+    """Return what was verified of a closed loop: its norm by two routes, and its stability."""
+    least = required_stability(loop)
     norm, _ = peak_gain(loop)
     swept = swept_norm(loop, respond)
     if not abs(norm - swept) <= AGREEMENT * norm:

@@ -197,12 +197,12 @@ def fixed_point(
             tried[f"{count} sections"] = str(error)
             continue
         form = two_state_form(own)
-        parts = _replayed_sizes(form, inputs, room)
+        powers = _replayed_powers(form, inputs, room)
         number = -(-own.n_states // 2)
         for length in range(_FEWEST, longest + 1) if given is None else (given,):
             if best is not None and number * length >= best[0]:
                 break
-            words = _words(form, parts, length, wide)
+            words = _WordForm.of(form, powers, length, wide)
             system = words.system(own)
             facts = loop_facts(closed.plant, system)
             lost = loss_text(before, facts, allowed)
@@ -219,8 +219,8 @@ def fixed_point(
     _, length, words, system, facts = best
     cycles, left = _limit_cycles(closed, system, words, generator(rng))
     was = {f"{name} before": value for name, value in before.certificate.items()}
-    held = [*np.exp2(words.into), *np.exp2(words.out)]
-    ranges = dict(zip((*system.inputs, *system.outputs), map(float, held), strict=True))
+    held = np.exp2([*words.D.of, *words.D.to]).tolist()
+    ranges = dict(zip((*system.inputs, *system.outputs), held, strict=True))
     _require_rest(cycles, ranges, room, wide)
     return FixedPointController(
         system,
@@ -265,16 +265,11 @@ def _fewer_sections(loop: ClosedLoop, K: StateSpace, count: Any, loss: float) ->
     return reduce_controller(loop.plant, K, order=2 * count, loss=loss).system
 
 
-class _Sizes(NamedTuple):
-    """Powers of two that hold inputs, states and outputs."""
+def _replayed_powers(form: TwoStateForm, inputs: FloatArray, headroom: float) -> list[Integers]:
+    """Return the powers of two of inputs, states and outputs above a run, replayed.
 
-    into: Integers
-    x: Integers
-    out: Integers
-
-
-def _replayed_sizes(form: TwoStateForm, inputs: FloatArray, headroom: float) -> _Sizes:
-    """Return the powers of two above what a run has, replayed through the form."""
+    A signal that is zero counts as 1.
+    """
     A = form.change
     x, most = np.zeros(len(A)), np.zeros(len(A))
     largest = np.zeros(len(form.C))
@@ -282,98 +277,92 @@ def _replayed_sizes(form: TwoStateForm, inputs: FloatArray, headroom: float) -> 
         largest = np.maximum(largest, np.abs(form.C @ x + form.D @ value))
         x = x + A @ x + form.B @ value
         most = np.maximum(most, np.abs(x))
-    sizes = (np.abs(inputs).max(axis=1, initial=0.0), most, largest)
-    return _Sizes(*(_powers(headroom * size) for size in sizes))
+    sizes = (headroom * one for one in (np.abs(inputs).max(axis=1, initial=0.0), most, largest))
+    return [np.ceil(np.log2(np.where(one > 0, one, 1.0))).astype(np.int64) for one in sizes]
 
 
-def _powers(size: FloatArray) -> Integers:
-    """Return the powers of two at or above sizes; one that is zero counts as 1."""
-    return np.ceil(np.log2(np.where(size > 0, size, 1.0))).astype(np.int64)
+class _Rounded(NamedTuple):
+    """A matrix of integers whose rows are shifted by bits, between powers of two of signals."""
+
+    entries: Integers
+    shift: Integers
+    to: Integers
+    of: Integers
+
+    @classmethod
+    def made(cls, matrix: FloatArray, to: Integers, of: Integers, bits: int) -> _Rounded:
+        """Return a matrix, each row with as many digits as its largest entry leaves."""
+        # y 2^-to = M 2^(of - to) (x 2^-of)
+        relative = matrix * np.exp2((of - to[:, None]).astype(np.float64))
+        largest = np.abs(relative).max(axis=1, initial=0.0)
+        most = 2 ** (bits - 1) - 1
+        shift = np.floor(np.log2(most / np.where(largest > 0, largest, most))).astype(np.int64)
+        shift = np.minimum(shift, _PRODUCT)
+        entries = np.rint(relative * np.exp2(shift[:, None].astype(float))).astype(np.int64)
+        return cls(entries, shift, to, of)
+
+    @property
+    def value(self) -> FloatArray:
+        """The matrix that the integers stand for."""
+        power = self.to[:, None] - self.of - self.shift[:, None]
+        return np.asarray(self.entries * np.exp2(power.astype(np.float64)))
+
+    def times(self, x: Integers) -> Integers:
+        """Return products with words (n, runs), rounded to nearest."""
+        right = np.maximum(self.shift, 0)[:, None]
+        half = np.where(right > 0, np.left_shift(1, np.maximum(right - 1, 0)), 0)
+        left = np.maximum(-self.shift, 0)[:, None]
+        return np.asarray(np.left_shift(np.right_shift(self.entries @ x + half, right), left))
 
 
 class _WordForm(NamedTuple):
-    """Integers of the coefficients, the bits that rows are shifted by, and powers of signals."""
+    """``x+ = x + A x + B in, out = C x + D in`` in integers of so many bits."""
 
-    A: Integers
-    B: Integers
-    C: Integers
-    D: Integers
-    shifts: tuple[Integers, Integers, Integers, Integers]
-    into: Integers
-    x: Integers
-    out: Integers
+    A: _Rounded
+    B: _Rounded
+    C: _Rounded
+    D: _Rounded
     wide: int
+
+    @classmethod
+    def of(cls, form: TwoStateForm, powers: list[Integers], bits: int, wide: int) -> _WordForm:
+        """Return the integers of a form, the powers of inputs, states and outputs known."""
+        into, x, out = powers
+        return cls(
+            _Rounded.made(form.change, x, x, bits),
+            _Rounded.made(form.B, x, into, bits),
+            _Rounded.made(form.C, out, x, bits),
+            _Rounded.made(form.D, out, into, bits),
+            wide,
+        )
 
     def system(self, like: StateSpace) -> StateSpace:
         """Return what the coefficients make, without states that only fill up."""
-        parts = []
-        for coefficients, shift, to, of in (
-            (self.A, self.shifts[0], self.x, self.x),
-            (self.B, self.shifts[1], self.x, self.into),
-            (self.C, self.shifts[2], self.out, self.x),
-            (self.D, self.shifts[3], self.out, self.into),
-        ):
-            power = (to[:, None] - of[None, :] - shift[:, None]).astype(np.float64)
-            parts.append(coefficients * np.exp2(power))
-        A, B, C, D = parts
+        A, B, C, D = (one.value for one in (self.A, self.B, self.C, self.D))
         used = np.any(B != 0, axis=1) | np.any(A != 0, axis=1) | np.any(C != 0, axis=0)
         full = (A + np.eye(len(A)))[np.ix_(used, used)]
         return like.replace(A=full, B=B[used], C=C[:, used], D=D, states=None, blocks=None)
 
     def outputs(self, x: Integers, into: Integers) -> Integers:
         """Return the outputs (p, runs) of a sample."""
-        return self._held(
-            _downshift(self.C @ x, self.shifts[2]) + _downshift(self.D @ into, self.shifts[3])
-        )
+        return self._held(self.C.times(x) + self.D.times(into))
 
     def following(self, x: Integers, into: Integers) -> Integers:
         """Return the states (n, runs) of the next sample."""
-        return self._held(
-            x + _downshift(self.A @ x, self.shifts[0]) + _downshift(self.B @ into, self.shifts[1])
-        )
+        return self._held(x + self.A.times(x) + self.B.times(into))
 
     def read(self, values: FloatArray) -> Integers:
         """Return inputs in words."""
-        steps = values * np.exp2(self.wide - 1.0 - self.into)[:, None]
+        steps = values * np.exp2(self.wide - 1.0 - self.D.of)[:, None]
         return self._held(np.rint(np.clip(steps, -(2.0**62), 2.0**62)).astype(np.int64))
 
     def written(self, out: Integers) -> FloatArray:
         """Return outputs in their units."""
-        return np.asarray(out * np.exp2(self.out - (self.wide - 1.0))[:, None])
+        return np.asarray(out * np.exp2(self.D.to - (self.wide - 1.0))[:, None])
 
     def _held(self, values: Integers) -> Integers:
         most = 2 ** (self.wide - 1) - 1
         return np.clip(values, -most, most)
-
-
-def _downshift(sums: Integers, shift: Integers) -> Integers:
-    """Return sums divided by powers of two, rounded to nearest."""
-    right = np.maximum(shift, 0)[:, None]
-    half = np.where(right > 0, np.left_shift(1, np.maximum(right - 1, 0)), 0)
-    return np.asarray(
-        np.left_shift(np.right_shift(sums + half, right), np.maximum(-shift, 0)[:, None])
-    )
-
-
-def _words(form: TwoStateForm, sizes: _Sizes, bits: int, wide: int) -> _WordForm:
-    """Return the integers of a form: each row with as many digits as its largest entry leaves."""
-    made, shifts = [], []
-    for matrix, to, of in (
-        (form.change, sizes.x, sizes.x),
-        (form.B, sizes.x, sizes.into),
-        (form.C, sizes.out, sizes.x),
-        (form.D, sizes.out, sizes.into),
-    ):
-        # y 2^-to = M 2^(of - to) (x 2^-of)
-        relative = matrix * np.exp2((of[None, :] - to[:, None]).astype(np.float64))
-        largest = np.abs(relative).max(axis=1, initial=0.0)
-        most = 2 ** (bits - 1) - 1
-        shift = np.floor(np.log2(most / np.where(largest > 0, largest, most))).astype(np.int64)
-        shift = np.minimum(shift, _PRODUCT)
-        made.append(np.rint(relative * np.exp2(shift[:, None].astype(float))).astype(np.int64))
-        shifts.append(shift)
-    A, B, C, D = made
-    return _WordForm(A, B, C, D, tuple(shifts), sizes.into, sizes.x, sizes.out, wide)
 
 
 def _limit_cycles(
@@ -387,10 +376,10 @@ def _limit_cycles(
     decays = np.log(_REST * 2.0**words.wide)
     samples = int(np.clip(2.0 * decays / max(-np.log(radius), TINY), _SHORTEST, _LONGEST))
     names = (*K.inputs, *driven)
-    powers = dict(zip(names, [*words.into.tolist(), *words.out.tolist()], strict=True))
+    powers = dict(zip(names, [*words.D.of.tolist(), *words.D.to.tolist()], strict=True))
     x = np.zeros((g.n_states, _STARTS))
     most = _PART * 2.0 ** (words.wide - 1)
-    state = np.rint(most * rng.uniform(-1.0, 1.0, (len(words.A), _STARTS))).astype(np.int64)
+    state = np.rint(most * rng.uniform(-1.0, 1.0, (len(words.A.to), _STARTS))).astype(np.int64)
     first = samples - samples // 2
     last = np.zeros((samples // 2, len(names), _STARTS))
     for k in range(samples):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product as every
@@ -255,18 +256,23 @@ class MeasuredAxis:
 
     def is_stable(self, law: Law) -> bool:
         """Return whether the loop of a law is stable, by the Nyquist count."""
+        return are_stable([law], self.freq, self.G[None, None], rigid=int(self.free))
 
-        def respond(freq: FloatArray) -> ComplexArray:
-            return -law.response(freq)[None, None]
 
-        if self.freq.size < FEWEST:
-            return False
-        plant, slope = self.G[None, None], 2 if self.free else 0
-        hidden = hidden_modes(self.freq, plant, respond(self.freq))
-        count = nyquist_count(
-            self.freq, plant, respond, hidden, slope=slope, at_zero=slope + 1, unstable=0
-        )
-        return count.unstable == 0
+def are_stable(laws: Sequence[Law], freq: FloatArray, P: ComplexArray, *, rigid: int) -> bool:
+    """Return whether laws, which integrate once each, stabilise axes (k, k, n_freq) on lines."""
+
+    def respond(freq: FloatArray) -> ComplexArray:
+        each = np.array([-law.response(freq) for law in laws])
+        return np.asarray(np.eye(len(laws))[:, :, None] * each)
+
+    if freq.size < FEWEST:
+        return False
+    hidden, slope, at_zero = hidden_modes(freq, P, respond(freq)), 2 * bool(rigid), 2 * rigid
+    count = nyquist_count(
+        freq, P, respond, hidden, slope=slope, at_zero=at_zero + len(laws), unstable=0
+    )
+    return count.unstable == 0
 
 
 def _scatter(freq: FloatArray, G: ComplexArray) -> FloatArray:
@@ -369,25 +375,11 @@ class LawSearch:
 
     def _step(self, x: FloatArray, room: FloatArray, radius: float) -> tuple[FloatArray, float]:
         """Return the step of the linear program, and the gain that it predicts."""
-        from scipy.optimize import linprog
-
         rows = _critical_points(room)
-        low, high, limits, most = self.of.limits(x)
-        none = np.zeros((most.size, 1))
-        answer = linprog(
-            np.concatenate([[-1.0], np.zeros(x.size - 1), [_PENALTY]]),
-            A_ub=np.block([
-                [-self._slopes(x, room, rows), -np.ones((rows.size, 1))],
-                [limits, none],
-            ]),
-            b_ub=np.concatenate([room[rows], np.maximum(most - limits @ x, 0.0)]),
-            bounds=np.vstack(
-[np.clip([low - x, high - x], -radius, radius).T, [0.0, np.inf]]
-).tolist(),
-        )  # fmt: skip
-        if answer.x is None or answer.fun is None:
-            return np.zeros(x.size), 0.0
-        return answer.x[:-1], float(-answer.fun) - _PENALTY * float(min(room.min(), 0.0))
+        slopes, (low, high, limits, most) = self._slopes(x, room, rows), self.of.limits(x)
+        bounds = (low - x, high - x, limits, np.maximum(most - limits @ x, 0.0))
+        step, gain = linear_step(slopes, room[rows], bounds, radius, aim=[0], penalty=_PENALTY)
+        return step, gain - _PENALTY * float(min(room.min(), 0.0))
 
     def _slopes(self, x: FloatArray, room: FloatArray, rows: IntArray) -> FloatArray:
         """Return the derivatives of some of the room by the numbers, by differences."""
@@ -448,6 +440,37 @@ class LawSearch:
             f"The axis has to be {need}; raise the rate, lower "
             f"the delay, or measure at lower frequencies.{poor}"
         )
+
+
+def linear_step(
+    slopes: FloatArray,
+    room: FloatArray,
+    bounds: tuple[FloatArray, ...],
+    radius: float,
+    *,
+    aim: Sequence[int] | IntArray,
+    penalty: float,
+) -> tuple[FloatArray, float]:
+    """Return the step that raises the mean of some numbers most, and its gain less a penalty.
+
+    On the largest lack of ``room + slopes step >= 0``, within a radius and within bounds: least
+    and largest steps, and ``rows @ step <= most``.
+    """
+    from scipy.optimize import linprog
+
+    low, high, rows, most = bounds
+    cost = np.zeros(low.size + 1)
+    cost[aim], cost[-1] = -1.0 / len(aim), penalty
+    within = np.clip([low, high], -radius, radius).T
+    answer = linprog(
+        cost,
+        A_ub=np.block([[-slopes, -np.ones((room.size, 1))], [rows, np.zeros((most.size, 1))]]),
+        b_ub=np.concatenate([room, most]),
+        bounds=np.vstack([within, [0.0, np.inf]]).tolist(),
+    )
+    if answer.x is None or answer.fun is None:
+        return np.zeros(low.size), -np.inf
+    return answer.x[:-1], float(-answer.fun)
 
 
 def lowest_of(room: FloatArray) -> IntArray:

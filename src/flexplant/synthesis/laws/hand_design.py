@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, Value, flag, instance, number, positive, real_array, short, whole
+from ...checks import Value, flag, instance, number, positive, real_array, short, whole
 from ...errors import AssumptionError, LabelError, ModelError, ShapeError, require_known
 from ...fingerprint import fingerprint
 from ...loop.blocks import DERIVATIVES
 from ...loop.measured_loop import static_map
 from ...lti.frequency import Frf
-from ...lti.interconnection import side_by_side
+from ...lti.interconnection import among
 from ...lti.statespace import StateSpace
 from .law import Law, LawElement, SingleElement
-from .loop_design import Axes, DesignedLoops, axes_of, connected, made
+from .loop_design import Axes, DesignedLoops, axes_controller, axes_of, connected, made
 
 #: what feedforward gains act on, in this order
 TERMS = ("position", *DERIVATIVES)
@@ -94,6 +94,11 @@ class ShapedAxis(Value):
         return tuple(e for e, on in zip(self.elements, self.on, strict=True) if on)
 
     @property
+    def forward(self) -> dict[str, float]:
+        """The gains of the feedforward that are not zero, by what they act on."""
+        return {term: g for term, g in zip(TERMS, self.feedforward, strict=False) if g}
+
+    @property
     def law(self) -> Law:
         """The law of the elements that are on, continuous."""
         rates = {element.own_rate for element in self.active} - {0.0}
@@ -104,7 +109,7 @@ class ShapedAxis(Value):
             f"{e!r}" if on else f"({e!r}, off)"
             for e, on in zip(self.elements, self.on, strict=True)
         ]
-        forward = [f"{t} {g:.4g}" for t, g in zip(TERMS, self.feedforward, strict=False) if g]
+        forward = [f"{term} {gain:.4g}" for term, gain in self.forward.items()]
         more = f"; feedforward {', '.join(forward)}" if forward else ""
         return " * ".join([f"{self.gain:.5g}", *shown]) + more + ("" if self.closed else "; open")
 
@@ -152,8 +157,8 @@ class LoopDesign(Value):
     """
 
     axes: Mapping[str, ShapedAxis]
-    before: StateSpace | None = None
-    after: StateSpace | None = None
+    before: Any = None
+    after: Any = None
     rate: float = 0.0
     delay: float = 0.0
     hold: bool = True
@@ -308,51 +313,25 @@ class LoopDesign(Value):
         ModelError
             As for `laws`.
         """
-        dt = 1.0 / self.rate if self.rate else 0.0
-        each = [(-law.system).replace(dt=dt) for law in self.laws.values()]
-        inner = side_by_side(each, self.axes).replace(outputs=self._before.inputs)
-        parts = Axes(None, self._before, self._after, self.rate)
-        feedback = connected(parts, inner, self._followed)
-        return self._with_feedforward(feedback).replace(name="loops")
-
-    @property
-    def _before(self) -> StateSpace:
-        assert self.before is not None  # noqa: S101 - made at construction
-        return self.before
-
-    @property
-    def _after(self) -> StateSpace:
-        assert self.after is not None  # noqa: S101 - made at construction
-        return self.after
+        axes = Axes(None, self.before, self.after, self.rate)
+        feedback = connected(axes, axes_controller(axes, self.laws), self._followed)
+        through: dict[tuple[str, str], float] = {}
+        for (name, axis), column in zip(self.axes.items(), self.before.D.T, strict=True):
+            for term, gain in axis.forward.items():
+                reference = self._followed[name]
+                channel = reference if term == "position" else f"{reference}:{term}"
+                for u, share in zip(self.before.outputs, column, strict=True):
+                    through[u, channel] = through.get((u, channel), 0.0) + gain * share
+        inputs = dict.fromkeys((*feedback.inputs, *(channel for _, channel in through)))
+        found = among(feedback, tuple(inputs), feedback.outputs, through)
+        return found.replace(name="loops")
 
     @property
     def _followed(self) -> dict[str, str]:
         """The reference of each axis that has one."""
-        wanted = {n: f"{n}:ref" for n, a in self.axes.items() if a.feedforward}
-        return {
-            n: {**wanted, **self.references}[n]
-            for n in self.axes
-            if n in {**wanted, **self.references}
-        }
-
-    def _with_feedforward(self, feedback: StateSpace) -> StateSpace:
-        columns: dict[str, FloatArray] = {}
-        for i, (name, axis) in enumerate(self.axes.items()):
-            for term, gain in zip(TERMS, axis.feedforward, strict=False):
-                if gain:
-                    reference = self._followed[name]
-                    channel = reference if term == "position" else f"{reference}:{term}"
-                    column = columns.setdefault(channel, np.zeros(len(self._before.outputs)))
-                    column += gain * self._before.D[:, i]
-        if not columns:
-            return feedback
-        inputs = [*feedback.inputs, *(c for c in columns if c not in feedback.inputs)]
-        B = np.zeros((feedback.n_states, len(inputs)))
-        D = np.zeros((len(feedback.outputs), len(inputs)))
-        B[:, : len(feedback.inputs)], D[:, : len(feedback.inputs)] = feedback.B, feedback.D
-        for channel, column in columns.items():
-            D[:, inputs.index(channel)] += column
-        return feedback.replace(B=B, D=D, inputs=inputs)
+        own = {name: f"{name}:ref" for name, axis in self.axes.items() if axis.feedforward}
+        found = {**own, **self.references}
+        return {name: found[name] for name in self.axes if name in found}
 
     def loops(self, plant: Any, *, larger: Any = None) -> DesignedLoops:
         """Return the loops on a plant, all axes closed: report, check with the modes left out.
@@ -388,8 +367,8 @@ class LoopDesign(Value):
         """
         if isinstance(plant, Frf) or hasattr(plant, "frdata"):
             rate = self.rate or None
-            return axes_of(plant, self._before, self._after, rate, self.delay, self.hold)
-        parts = axes_of(plant, self._before, self._after, None, 0.0, True)
+            return axes_of(plant, self.before, self.after, rate, self.delay, self.hold)
+        parts = axes_of(plant, self.before, self.after, None, 0.0, True)
         if abs(parts.rate - self.rate) > 1e-9 * self.rate:
             runs = f"runs at {parts.rate:g} Hz" if parts.rate else "is continuous"
             raise ModelError(

@@ -15,7 +15,7 @@ from ...checks import ComplexArray, FloatArray, Value, flag, instance, positive,
 from ...errors import ModelError
 from ...lti.discretisation import trapezoidal
 from ...lti.frequency import sampled_freq
-from ...lti.joining import Matrices, cascaded
+from ...lti.joining import Matrices, block_matrix, cascaded
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace
 
@@ -63,11 +63,6 @@ class Section(NamedTuple):
             np.array([[b0 - b2 * a0, b1 - b2 * a1]]),
             np.array([[b2]]),
         )
-
-    @property
-    def system(self) -> StateSpace:
-        """The section as a continuous system."""
-        return StateSpace(*self.matrices, inputs=["error"], outputs=["command"])
 
 
 class BlockSection(NamedTuple):
@@ -125,11 +120,25 @@ class LawElement(Value):
         ModelError
             When it is not.
         """
-        return self.law.sampled(rate)
+        return self.law.replace(rate=positive(rate, "rate"))
 
     def __mul__(self, other: LawElement | float) -> Law:
         """Return the law of both in series; a number scales it."""
-        return self.law * other
+        mine = self.law
+        if isinstance(other, LawElement):
+            law = other.law
+            if mine.rate and law.rate and mine.rate != law.rate:
+                raise ModelError(
+                    f"the laws run at {mine.rate:g} and {law.rate:g} Hz: multiply them continuous, "
+                    "then sample the product."
+                )
+            factors, gain = (*mine.factors, *law.factors), mine.gain * law.gain
+            return mine.replace(factors=factors, gain=gain, rate=mine.rate or law.rate)
+        if isinstance(other, int | float | np.number):
+            return mine.replace(gain=mine.gain * float(other))
+        raise ModelError(
+            f"a law is multiplied by elements and numbers, got {short(other)}. Pass one."
+        )
 
     def __rmul__(self, other: float) -> Law:
         """Return the law times a number."""
@@ -242,38 +251,6 @@ class Law(LawElement):
         """The law itself."""
         return self
 
-    def sampled(self, rate: float) -> Law:
-        """Return the law as it runs at a rate [Hz].
-
-        Parameters
-        ----------
-        rate : float [Hz]
-            Above twice the frequency of each notch and low-pass.
-
-        Raises
-        ------
-        ModelError
-            When it is not.
-        """
-        return self.replace(rate=positive(rate, "rate"))
-
-    def __mul__(self, other: LawElement | float) -> Law:
-        """Return the law of both in series; a number scales it."""
-        if isinstance(other, LawElement):
-            law = other.law
-            if self.rate and law.rate and self.rate != law.rate:
-                raise ModelError(
-                    f"the laws run at {self.rate:g} and {law.rate:g} Hz: multiply them continuous, "
-                    "then sample the product."
-                )
-            factors, gain = (*self.factors, *law.factors), self.gain * law.gain
-            return self.replace(factors=factors, gain=gain, rate=self.rate or law.rate)
-        if isinstance(other, int | float | np.number):
-            return self.replace(gain=self.gain * float(other))
-        raise ModelError(
-            f"a law is multiplied by elements and numbers, got {short(other)}. Pass one."
-        )
-
     @cached_property
     def _sections(self) -> tuple[Section | BlockSection, ...]:
         rate = self.rate if self.prewarped else 0.0
@@ -323,6 +300,12 @@ def chained(gain: float, parts: Iterable[Matrices]) -> Matrices:
     start = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1))
     A, B, C, D = reduce(cascaded, parts, start)
     return A, B, gain * C, gain * D
+
+
+def decoupled(laws: Iterable[Matrices], before: FloatArray, after: FloatArray) -> Matrices:
+    """Return A, B, C and D of ``-before diag(laws) after``, from those of laws."""
+    A, B, C, D = (block_matrix(parts) for parts in zip(*laws, strict=True))
+    return A, -B @ after, before @ C, -before @ D @ after
 
 
 def tustin_s(freq: FloatArray, rate: float) -> ComplexArray:

@@ -15,7 +15,6 @@ from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
 from ...loop.other_machines import growing_modes, modes_in_words
 from ...lti.interconnection import loop_poles
-from ...lti.joining import block_matrix
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import Poi, StandardPlant, larger_plant, standard_plant
@@ -23,6 +22,7 @@ from ...plant.rigid_motion import RigidModes, require_weak
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import SAME
 from ..controller import CLOSE, Controller, unchecked
+from .loop_design import Axes, axes_controller, connected
 from .servo_loop import (
     TARGET,
     Axis,
@@ -133,9 +133,16 @@ def design_servo(
         )
     require_weak(task.motions, bandwidth, "a servo")
     axis = task.notched(task.axis(float(bandwidth)))
+    radius = task.rigid_radius(axis)
+    if not radius < 1.0:
+        raise SolverError(
+            f"the rigid-body loop at {bandwidth:g} Hz is unstable (spectral radius {radius:.6f}): "
+            f"rate {task.rate:g} Hz and a delay of {task.plant.delay:g} samples leave too little "
+            "phase. Lower the bandwidth or the delay, or raise the rate or the roll-off."
+        )
     closed = task.closed(axis)
     certificate = {
-        "rigid-body spectral radius": task.rigid_radius(axis),
+        "rigid-body spectral radius": radius,
         "rigid-body modulus margin": 1.0 / task.rigid_peak(axis),
         "spectral radius": closed.spectral_radius,
         "modulus margin": closed.modulus_margin,
@@ -295,7 +302,7 @@ class ServoTask:
     def controller(self) -> Callable[[Axis], StateSpace]:
         """The function of an axis that gives [ref, hats] -> u: errors, axes and decoupling."""
         T_u = decoupling(self.plant, self.poi)
-        return cache(lambda axis: _servo_law(self.plant, self.poi, axis.system, T_u))
+        return cache(lambda axis: _servo_law(self.plant, self.poi, axis, T_u))
 
     def is_stable(self, axis: Axis) -> bool:
         """Return whether the loop is stable with the modes that the plant has."""
@@ -326,18 +333,7 @@ class ServoTask:
     def rigid_radius(self, axis: Axis) -> float:
         """Return the spectral radius of the worst axis of the rigid body."""
         # all axes have one controller: the loop falls apart into the body's own motions
-        radius = self._rigid_radius(axis)
-        if not radius < 1.0:
-            raise SolverError(
-                f"the rigid-body loop at {axis.bandwidth:g} Hz is unstable (spectral radius "
-                f"{radius:.6f}): rate {axis.rate:g} Hz and a delay of {self.plant.delay:g} samples "
-                "leave too little phase. Lower the bandwidth or the delay, or raise the rate or "
-                "the roll-off."
-            )
-        return radius
-
-    def _rigid_radius(self, axis: Axis) -> float:
-        poles = [loop_poles(body, axis.system) for body in self._bodies]
+        poles = [loop_poles(body, axis.law.system) for body in self._bodies]
         return float(max(np.abs(of_body).max() for of_body in poles))
 
     def rigid_peak(self, axis: Axis) -> float:
@@ -355,7 +351,7 @@ class ServoTask:
         def holds(bandwidth: float) -> bool:
             nonlocal best
             axis = self.axis(bandwidth)
-            if self._rigid_radius(axis) >= 1.0:
+            if self.rigid_radius(axis) >= 1.0:
                 return False
             axis = self.notched(axis)
             size, at = self.loop.peak(axis)
@@ -455,24 +451,20 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
     return ports.poi(name if name is not None else ports.z[0].name)
 
 
-def _servo_law(plant: StandardPlant, poi: Poi, axis: StateSpace, T_u: FloatArray) -> StateSpace:
-    """Return [refs, hats] -> u: ``T_u (I x c) E``, E the errors, c the controller of an axis."""
-    refs = [poi.derived(name, "ref") for name in poi.axes]
-    inputs = [name for name in refs if name in plant.y]
-    hats = [poi.derived(name, "hat") for name in poi.axes]
-    errors = -np.eye(len(hats), len(hats) + len(inputs), len(inputs))
-    for column, name in enumerate(inputs):
-        errors[refs.index(name), column] = 1.0
-    A, B, C, D = (block_matrix([one] * len(hats)) for one in (axis.A, axis.B, axis.C, axis.D))
-    return StateSpace(
-        A,
-        B @ errors,
-        T_u @ C,
-        T_u @ D @ errors,
-        plant.dt,
-        inputs=[*inputs, *hats],
-        outputs=plant.u,
-        states=[f"{name}|{state}" for name in hats for state in axis.states],
-        name="servo",
-        units=plant.units,
+def _servo_law(plant: StandardPlant, poi: Poi, axis: Axis, T_u: FloatArray) -> StateSpace:
+    """Return [refs, hats] -> u: the law of each axis of the POI, decoupled by T_u."""
+    hats = tuple(poi.derived(name, "hat") for name in poi.axes)
+    references = {
+        hat: ref
+        for hat, name in zip(hats, poi.axes, strict=True)
+        if (ref := poi.derived(name, "ref")) in plant.y
+    }
+    axes = Axes(
+        None,
+        StateSpace([], [], [], T_u, inputs=hats, outputs=plant.u),
+        StateSpace([], [], [], np.eye(len(hats)), inputs=hats, outputs=hats),
+        axis.rate,
     )
+    inner = axes_controller(axes, dict.fromkeys(hats, axis.law))
+    found = connected(axes, inner, references).select(inputs=[*references.values(), *hats])
+    return found.replace(name="servo", units=plant.units)

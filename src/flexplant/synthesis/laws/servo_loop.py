@@ -11,7 +11,7 @@ import numpy as np
 
 from ...checks import ComplexArray, FloatArray, frozen
 from ...errors import AssumptionError, FlexplantError, LabelError, counted
-from ...loop.broken import BrokenLoop, inverted
+from ...loop.broken import inverted, scaled_size, sensitivity_size
 from ...lti.discretisation import held_exactly
 from ...lti.frequency_sweep import highest, resonance_grid
 from ...lti.responses import responder, responses
@@ -47,28 +47,20 @@ class ServoLoop:
     modes: FloatArray
     plant: StandardPlant
 
-    def broken(self, axis: Axis) -> BrokenLoop:
-        """Return the loop of an axis on the grid, y seen as the u that it calls for."""
-        u = self.plant.u
-
-        def act(freq: FloatArray) -> ComplexArray:
-            c = axis.response(freq)[:, None, None]
-            if self.own is None:
-                return np.asarray((-c * np.eye(len(u))).transpose(1, 2, 0))
-            return np.asarray((-c * inverted(-c * self.own)).transpose(1, 2, 0))
-
-        return BrokenLoop(
-            u, u, act, lambda freq: self.moved.transpose(1, 2, 0),
-            lambda: np.zeros(0, dtype=complex), self.plant.dt, self.freq, self.plant.units,
-        )  # fmt: skip
+    def gain(self, axis: Axis) -> ComplexArray:
+        """Return the loop of an axis (n_freq, nu, nu) on the grid, broken at u."""
+        c = axis.law.at(self.freq)[:, None, None]
+        act = -c * np.eye(len(self.plant.u)) if self.own is None else -c * inverted(-c * self.own)
+        return np.asarray(act @ self.moved)
 
     def peak(self, axis: Axis) -> tuple[float, float]:
         """Return max_f sigma_max(S_u) over the grid and its frequency [Hz].
 
         Of an unstable loop too, so check that.
         """
-        loop = self.broken(axis)
-        size = loop.size(self.freq, "u", bool(loop.mixed("u")))
+        L = self.gain(axis)
+        mixed = len({self.plant.units.get(name) for name in self.plant.u}) > 1
+        size = scaled_size(inverted(L)) if mixed else sensitivity_size(L)
         top = int(np.argmax(size))
         return float(size[top]), float(self.freq[top])
 
@@ -81,7 +73,7 @@ class ServoLoop:
 
     def resonant(self, axis: Axis) -> FloatArray:
         """Return the modes [Hz] whose resonances have loop gain, the largest first."""
-        gain = np.abs(axis.response(self.freq))
+        gain = np.abs(axis.law.at(self.freq))
         peaks = np.max(gain[:, None] * self._near, axis=0, initial=0.0)
         order = np.argsort(-peaks, kind="stable")
         return np.asarray(self.modes[order][peaks[order] > _QUIET])
@@ -221,9 +213,9 @@ def highest_bandwidth(freq: Sequence[float], holds: Callable[[float], bool]) -> 
 
 #: the lead's zero lies this factor below the bandwidth, its pole above: |S| of the rigid body
 #: then peaks near 4 dB with the roll-off and integrator below
-LEAD = 4.0
+_LEAD = 4.0
 #: gain at a notch's centre, and damping ratio of its poles
-DEPTH, WIDTH = 0.05, 0.3
+_DEPTH, _WIDTH = 0.05, 0.3
 #: of a logarithmic grid, refined where |S| of the rigid body is largest
 _POINTS = 300
 
@@ -240,33 +232,16 @@ class Axis:
     integrator: float
     notches: tuple[float, ...]
     rate: float
-    lead: float = LEAD
-    prewarped: bool = False
 
     @cached_property
     def law(self) -> Law:
         """Error to acceleration."""
-        pid = Pid.corners(
-            1.0,
-            integrator=self.integrator,
-            zero=self.bandwidth / self.lead,
-            pole=self.bandwidth * self.lead,
-        )
-        notches = tuple(Notch(freq, DEPTH, WIDTH) for freq in self.notches)
-        shape = Law(
-            (pid, LowPass(self.rolloff), *notches), rate=self.rate, prewarped=self.prewarped
-        )
+        zero, pole = self.bandwidth / _LEAD, self.bandwidth * _LEAD
+        pid = Pid.corners(1.0, integrator=self.integrator, zero=zero, pole=pole)
+        notches = (Notch(freq, _DEPTH, _WIDTH) for freq in self.notches)
+        shape = Law((pid, LowPass(self.rolloff), *notches), rate=self.rate, prewarped=False)
         at = abs(shape.at(np.array([self.bandwidth]))[0])
         return shape * float((2.0 * np.pi * self.bandwidth) ** 2 / at)
-
-    @property
-    def system(self) -> StateSpace:
-        """Error to acceleration."""
-        return self.law.system
-
-    def response(self, freq: FloatArray) -> ComplexArray:
-        """Return the response at frequencies [Hz] below half the rate."""
-        return self.law.at(freq)
 
     def with_notch(self, freq: float) -> Axis:
         """Return the axis with one notch more [Hz]."""
@@ -294,7 +269,7 @@ def rigid_peak(body: StateSpace, axis: Axis) -> float:
     respond = responder(body)
 
     def size(freq: FloatArray) -> FloatArray:
-        return np.asarray(1.0 / np.abs(1.0 - respond(freq)[0, 0] * axis.response(freq)))
+        return np.asarray(1.0 / np.abs(1.0 - respond(freq)[0, 0] * axis.law.at(freq)))
 
     freq = np.geomspace(1e-2 * axis.bandwidth, 0.5 * axis.rate * (1.0 - SAME), _POINTS)
     return highest(size, freq, 1)[0]

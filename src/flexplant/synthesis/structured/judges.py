@@ -65,7 +65,7 @@ class ScaledLoop:
     """
 
     def __init__(self, p: Prepared, order: int) -> None:
-        n, k = p.A.shape[0], order
+        self.p, n, k = p, p.A.shape[0], order
         nu, ny = len(p.u), len(p.y)
         self.A = la.block_diag(p.A, np.zeros((k, k)))
         self.B1 = np.vstack([p.B1, np.zeros((k, p.B1.shape[1]))])
@@ -126,32 +126,6 @@ class ScaledLoop:
     def by_controller(self, slope: FloatArray) -> FloatArray:
         """Return a derivative by the scaled [A, B; C, D] as one by that in the user's units."""
         return np.asarray(self._out.T @ slope @ self._in.T)
-
-    def gain(self, K: Matrices) -> tuple[float, float]:
-        """Return the H-infinity norm, infinite when the loop is not stable, and its frequency."""
-        loop = self.stable(K)
-        return (np.inf, 0.0) if loop is None else peak_gain(loop.system)
-
-    def pieces(self, K: Matrices, jacobian: FloatArray, freq: float, *, sweep: bool) -> Pieces:
-        """Return the logarithms of the gains at a frequency, and where others are near them."""
-        loop = self.closed(K)
-        assert loop is not None  # noqa: S101 - K stabilises
-        by = self._out @ jacobian @ self._in
-        places = np.append(loop.high() if sweep else np.zeros(0), freq)
-        o, i, T, _ = loop.channels(places)
-        U, S, Vh = np.linalg.svd(T, full_matrices=False)
-        counted = S[:, :_SINGULAR] >= _PART * S[-1, 0]
-        counted[-1, 0] = True
-        at, which = np.nonzero(counted)
-        value = S[at, which]
-        alpha = np.einsum("kp,kpr->kr", U[at, :, which].conj(), o[at])
-        beta = np.einsum("kcm,km->kc", i[at], Vh[at, which].conj())
-        slope = np.einsum("kr,kc->krc", alpha, beta).real / value[:, None, None]
-        return Pieces(
-            np.log(value),
-            np.tensordot(slope, by, axes=([1, 2], [1, 2])),
-            cache(lambda j: loop.hessian(float(places[at[j]]), int(which[j]), by)),
-        )
 
 
 class Closed(NamedTuple):
@@ -303,26 +277,38 @@ class LoopObjective(Protocol):
         """Return what finds the number, the largest of several, for controllers of an order."""
 
 
-class GainJudge:
+class GainJudge(ScaledLoop):
     """The H-infinity norm: peaks at several frequencies count together."""
 
-    def __init__(self, p: Prepared, order: int) -> None:
-        self.loop = ScaledLoop(p, order)
-
     def value(self, K: Matrices) -> tuple[float, float]:
-        """Return the norm and its frequency."""
-        return self.loop.gain(K)
+        """Return the H-infinity norm, infinite when the loop is not stable, and its frequency."""
+        loop = self.stable(K)
+        return (np.inf, 0.0) if loop is None else peak_gain(loop.system)
 
-    def pieces(self, K: Matrices, by: FloatArray, place: float, *, sweep: bool) -> Pieces:
-        """Return the gains at this frequency, and where others are near them."""
-        return self.loop.pieces(K, by, place, sweep=sweep)
+    def pieces(self, K: Matrices, by: FloatArray, freq: float, *, sweep: bool) -> Pieces:
+        """Return the logarithms of the gains at a frequency, and where others are near them."""
+        loop = self.closed(K)
+        assert loop is not None  # noqa: S101 - K stabilises
+        by = self._out @ by @ self._in
+        places = np.append(loop.high() if sweep else np.zeros(0), freq)
+        o, i, T, _ = loop.channels(places)
+        U, S, Vh = np.linalg.svd(T, full_matrices=False)
+        counted = S[:, :_SINGULAR] >= _PART * S[-1, 0]
+        counted[-1, 0] = True
+        at, which = np.nonzero(counted)
+        value = S[at, which]
+        alpha = np.einsum("kp,kpr->kr", U[at, :, which].conj(), o[at])
+        beta = np.einsum("kcm,km->kc", i[at], Vh[at, which].conj())
+        slope = np.einsum("kr,kc->krc", alpha, beta).real / value[:, None, None]
+        return Pieces(
+            np.log(value),
+            np.tensordot(slope, by, axes=([1, 2], [1, 2])),
+            cache(lambda j: loop.hessian(float(places[at[j]]), int(which[j]), by)),
+        )
 
 
-class _SmoothJudge(ABC):
+class _SmoothJudge(ScaledLoop, ABC):
     """A number with one gradient, whose derivative is found by differences."""
-
-    def __init__(self, p: Prepared, order: int) -> None:
-        self.p, self.loop = p, ScaledLoop(p, order)
 
     @abstractmethod
     def found(self, loop: Closed) -> tuple[float, FloatArray]:
@@ -330,24 +316,20 @@ class _SmoothJudge(ABC):
 
     def value(self, K: Matrices) -> tuple[float, None]:
         """Return the number."""
-        loop = self.loop.stable(K)
+        loop = self.stable(K)
         return (np.inf if loop is None else self.found(loop)[0]), None
 
     def pieces(self, K: Matrices, by: FloatArray, place: None, *, sweep: bool) -> Pieces:
         """Return the logarithm of the number."""
         value, gradient = self._logarithm(K, by)
-        return Pieces(
-            np.array([value]),
-            gradient[None],
-            cache(lambda _: self._bent(K, by)),
-        )
+        return Pieces(np.array([value]), gradient[None], cache(lambda _: self._bent(K, by)))
 
     def _logarithm(self, K: Matrices, by: FloatArray) -> tuple[float, FloatArray]:
-        loop = self.loop.stable(K)
+        loop = self.stable(K)
         if loop is None:
             return np.inf, np.zeros(len(by))
         value, slope = self.found(loop)
-        along = np.tensordot(by, self.loop.by_controller(slope), axes=2)
+        along = np.tensordot(by, self.by_controller(slope), axes=2)
         return float(np.log(max(value, TINY))), along / max(value, TINY)
 
     def _bent(self, K: Matrices, by: FloatArray) -> FloatArray:

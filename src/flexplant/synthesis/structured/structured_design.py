@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ...certificates import stability, stability_name
+from ...certificates import stability_name
 from ...checks import MOST, FloatArray, Rng, generator, short, whole
 from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError
 from ...lti.interconnection import lft
@@ -18,10 +18,16 @@ from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant, standard_plant
 from ...tolerances import SAME
-from ..controller import Controller, certified_norm, reached_norms, with_left_out
+from ..controller import (
+    Controller,
+    certified_norm,
+    reached_norms,
+    required_stability,
+    with_left_out,
+)
 from ..objectives.specifications import H2, Hinf
 from ..synthesis_plants import PlantRange, require_stabilisable
-from .judges import DECAY, GainJudge, Judge, LoopObjective, ScaledLoop
+from .judges import DECAY, GainJudge, Judge, LoopObjective, Matrices, ScaledLoop
 from .nonsmooth import Pieces, bfgs, decrease_left, joined_pieces, minimax
 from .structures import ControllerFamily, ControllerStructure, as_system
 
@@ -315,12 +321,7 @@ def _verified_loop(
     """Return what was verified of a closed loop: `norm` is the largest, over its bound."""
     if _measure_word(objectives) == "H-infinity":
         return certified_norm(loop, claim)
-    least = stability(loop.poles(), loop.dt)
-    if not least < (1.0 if loop.dt else 0.0):
-        raise CertificateError(
-            f"the closed loop is not stable ({stability_name(loop.dt)} {least:.6g}): the "
-            "controller is refused."
-        )
+    least = required_stability(loop)
     found, norm = {}, 0.0
     for one in objectives:
         w, z = one.chosen(plant)
@@ -363,11 +364,15 @@ class _StructureSearch:
     def _spent(self, share: float = 1.0) -> Callable[[], bool]:
         return lambda: self.evaluations >= share * self.limit
 
-    def stability(self, theta: FloatArray) -> tuple[float, FloatArray]:
-        """Return the largest spectral abscissa of the loops and its gradient."""
+    def _controller(self, theta: FloatArray) -> Matrices | None:
+        """Return the controller; None where parameters are beyond their limits or overflow."""
         self.evaluations += 1
         K = self.family.matrices(theta)
-        if not np.all(np.isfinite(K.joined)):
+        return K if self.family.allows(theta) and np.all(np.isfinite(K.joined)) else None
+
+    def stability(self, theta: FloatArray) -> tuple[float, FloatArray]:
+        """Return the largest spectral abscissa of the loops and its gradient."""
+        if (K := self._controller(theta)) is None:
             return np.inf, np.zeros(theta.size)
         value, by, _ = max((loop.stability(K) for loop in self.loops), key=lambda one: one[0])
         return value, np.tensordot(self.family.jacobian(theta), by, axes=2)
@@ -375,9 +380,7 @@ class _StructureSearch:
     def value(self, theta: FloatArray) -> tuple[float, tuple[int, Any]]:
         """Return the logarithm of the largest number of the loops, and which and where it is."""
         # a little more for large parameters: ends infima that are only neared as gains grow
-        self.evaluations += 1
-        K = self.family.matrices(theta)
-        if not np.all(np.isfinite(K.joined)):
+        if (K := self._controller(theta)) is None:
             return np.inf, (0, 0.0)
         each = []
         for judge, below in self.judged:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import partial
-from typing import NamedTuple, Protocol, TypeAlias
+from functools import lru_cache
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,7 @@ from ...checks import (
 from ...errors import ModelError, ShapeError, attempted, counted, require_known
 from ...lti.balancing import balanced
 from ...lti.discretisation import bilinear, tustin
+from ...lti.joining import Matrices as LawMatrices
 from ...lti.preparation import Prepared
 from ...lti.riccati import control_care, solve_care
 from ...lti.statespace import StateSpace, System
@@ -35,11 +36,8 @@ from ..laws.law import Law, LawElement, SingleElement, chained
 from ..laws.loop_design import axes_of, checked_laws
 from .judges import Matrices
 
-#: step of a derivative by differences, and the steps and weights of fourth order
-_STEP = 1e-3
-_DIFFERENCES = tuple(
-    (k * _STEP, w / (12.0 * _STEP)) for k, w in ((-2, 1.0), (-1, -8.0), (1, 8.0), (2, -1.0))
-)
+#: steps of a derivative by differences of fourth order, and their weights
+_STEPS = tuple((k * 1e-3, w / 12e-3) for k, w in ((-2, 1.0), (-1, -8.0), (1, 8.0), (2, -1.0)))
 
 #: entries of B and C of a state that is added to a controller of lower order
 _COUPLING = 0.1
@@ -48,21 +46,36 @@ _COUPLING = 0.1
 Minimise: TypeAlias = "Callable[[ControllerFamily], FloatArray | None]"
 
 
-class ControllerFamily(Protocol):
-    """A structure made ready for a plant: from parameters of size 1 to a controller."""
+class ControllerFamily:
+    """A structure made ready for a plant: from parameters of size 1 to a controller.
 
-    order: int
-    first: FloatArray
-    spread: float
+    `matrices` gives the controller y -> u, of a sampled plant in the s of Tustin's rule;
+    `structure` the structure with some parameters as its own, where it is a value; `allows`
+    says whether parameters are within their limits.
+    """
 
-    def matrices(self, theta: FloatArray) -> Matrices:
-        """Return the controller y -> u; of a sampled plant in the s of Tustin's rule."""
+    def __init__(
+        self,
+        matrices: Callable[[FloatArray], Matrices],
+        first: FloatArray,
+        spread: float,
+        structure: Callable[[FloatArray], Value | None] = lambda _: None,
+        allows: Callable[[FloatArray], bool] = lambda _: True,
+    ) -> None:
+        self.matrices, self.first, self.spread = matrices, first, spread
+        self.structure, self.allows, self.order = structure, allows, matrices(first).A.shape[0]
 
     def jacobian(self, theta: FloatArray) -> FloatArray:
-        """Return the derivatives (n, rows, columns) of [A, B; C, D] by the parameters."""
+        """Return the derivatives (n, rows, columns) of [A, B; C, D] by the parameters.
 
-    def structure(self, theta: FloatArray) -> Value | None:
-        """Return the structure with these parameters as its own, where it is a value."""
+        By differences, exact for polynomials up to the fourth power.
+        """
+        return np.array(
+            [
+                sum(weight * self.matrices(theta + step * one).joined for step, weight in _STEPS)
+                for one in np.eye(theta.size)
+            ]
+        )
 
     def nested(self, minimise: Minimise) -> FloatArray | None:
         """Return a start that comes from smaller structures, each minimised; None without."""
@@ -138,8 +151,9 @@ class FixedOrder(Value):
             raise ModelError(
                 f"start is {known!r}: pass {counted(self.order, 'state')}, {ny} y and {nu} u."
             )
-        g = bilinear(known, 1.0 / plant.dt) if plant.dt else known
-        return entries.starting(Matrices(g.A, g.B, g.C, g.D))
+        K = _continuous_matrices(known, plant.dt)
+        entries.first = (K.joined / entries.scale)[entries.free]
+        return entries
 
 
 def _reduced_controller(plant: StandardPlant, order: int) -> StateSpace | None:
@@ -155,8 +169,6 @@ def _reduced_controller(plant: StandardPlant, order: int) -> StateSpace | None:
 class _Entries(ControllerFamily):
     """Entries in units of the plant's speed and of its u and y; all zero but for decay, first."""
 
-    spread = 1.0
-
     def __init__(
         self, order: int, pattern: npt.NDArray[np.bool_], p: Prepared, *, nests: bool
     ) -> None:
@@ -170,10 +182,9 @@ class _Entries(ControllerFamily):
         self.scale, self.free = np.outer(rows, columns), free
         rest = np.zeros(free.shape)
         rest[range(order), range(order)] = -1.0
-        self.first: FloatArray = rest[free]
+        super().__init__(self._scaled, rest[free], 1.0, self._fixed)
         self._jacobian = np.zeros((self.first.size, *free.shape))
-        at, to = np.nonzero(free)
-        self._jacobian[np.arange(self.first.size), at, to] = self.scale[free]
+        self._jacobian[np.arange(self.first.size), *np.nonzero(free)] = self.scale[free]
 
     def nested(self, minimise: Minimise) -> FloatArray | None:
         """Return the best controller of each order in turn, with one state more that acts little.
@@ -204,27 +215,28 @@ class _Entries(ControllerFamily):
         entries[k - 1, k - 1] = -1.0
         return np.asarray(entries[self.free])
 
-    def starting(self, K: Matrices) -> _Entries:
-        """Return itself with the parameters of a controller as its first ones."""
-        self.first = (K.joined / self.scale)[self.free]
-        return self
-
-    def matrices(self, theta: FloatArray) -> Matrices:
-        entries = np.zeros(self.scale.shape)
-        entries[self.free] = theta
-        entries, k = entries * self.scale, self.order
+    def _scaled(self, theta: FloatArray) -> Matrices:
+        entries, k = np.zeros(self.scale.shape), self.order
+        entries[self.free] = theta * self.scale[self.free]
         return Matrices(entries[:k, :k], entries[:k, k:], entries[k:, :k], entries[k:, k:])
 
     def jacobian(self, theta: FloatArray) -> FloatArray:
+        """Return the derivatives, which are constant."""
         return self._jacobian
 
-    def structure(self, theta: FloatArray) -> FixedOrder:
+    def _fixed(self, theta: FloatArray) -> FixedOrder:
         return FixedOrder(
             self.order,
             None if self.order else self.pattern,
             as_system(self.matrices(theta), self.names, self.dt),
             bool(self.pattern.any()),
         )
+
+
+def _continuous_matrices(g: StateSpace, dt: float) -> Matrices:
+    """Return a controller in continuous time, a sampled one by Tustin's rule."""
+    g = bilinear(g, 1.0 / dt) if dt and g.n_states else g
+    return Matrices(g.A, g.B, g.C, g.D)
 
 
 def as_system(K: Matrices, names: tuple[Sequence[str], Sequence[str]], dt: float) -> StateSpace:
@@ -248,53 +260,23 @@ class ObserverGains(Value):
     ObserverGains()
     """
 
-    def family(self, plant: StandardPlant, prepared: Prepared) -> _Gains:
+    def family(self, plant: StandardPlant, prepared: Prepared) -> ControllerFamily:
         """Return the structure made ready for a plant."""
-        return _Gains(prepared, self)
+        p, n, root = prepared, prepared.A.shape[0], np.sqrt(prepared.speed)
+        first = -control_care(p.A, p.B2, Q=np.eye(n), R=np.eye(len(p.u))).gain
+        gain = -solve_care(p.A, p.C2, Q=np.eye(n), R=np.eye(len(p.y))).gain
 
+        def matrices(theta: FloatArray) -> Matrices:
+            F, L = theta[: first.size].reshape(-1, n), theta[first.size :].reshape(n, -1)
+            return Matrices(
+                p.speed * (p.A + p.B2 @ F + L @ (p.C2 + p.D22 @ F)),
+                -root * L @ p.y_scale,
+                root * p.u_scale @ F,
+                np.zeros((len(p.u), len(p.y))),
+            )
 
-class _Gains(ControllerFamily):
-    spread = 0.1
-
-    def __init__(self, p: Prepared, structure: ObserverGains) -> None:
-        self.p, self.order, self._structure = p, p.A.shape[0], structure
-        n = self.order
-        F = -control_care(p.A, p.B2, Q=np.eye(n), R=np.eye(len(p.u))).gain
-        L = -solve_care(p.A, p.C2, Q=np.eye(n), R=np.eye(len(p.y))).gain
-        self.first = np.concatenate([F.ravel(), L.ravel()])
-
-    def _parts(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        split = len(self.p.u) * self.order
-        return theta[:split].reshape(-1, self.order), theta[split:].reshape(self.order, -1)
-
-    def matrices(self, theta: FloatArray) -> Matrices:
-        p, root = self.p, np.sqrt(self.p.speed)
-        F, L = self._parts(theta)
-        return Matrices(
-            p.speed * (p.A + p.B2 @ F + L @ (p.C2 + p.D22 @ F)),
-            -root * L @ p.y_scale,
-            root * p.u_scale @ F,
-            np.zeros((F.shape[0], L.shape[1])),
-        )
-
-    def jacobian(self, theta: FloatArray) -> FloatArray:
-        p, root, n = self.p, np.sqrt(self.p.speed), self.order
-        F, L = self._parts(theta)
-        by = np.zeros((theta.size, n + F.shape[0], n + L.shape[1]))
-        split, onto = F.size, p.B2 + L @ p.D22
-        # an entry of F at (i, j): column j of A by column i of B2 + L D22; of L: a row of A
-        on_F, on_L = by[:split].reshape(*F.shape, *by.shape[1:]), by[split:]
-        for j in range(n):
-            on_F[:, j, :n, j] = p.speed * onto.T
-            on_F[:, j, n:, j] = root * p.u_scale.T
-        rows = on_L.reshape(*L.shape, *by.shape[1:])
-        for i in range(n):
-            rows[i, :, i, :n] = p.speed * (p.C2 + p.D22 @ F)
-            rows[i, :, i, n:] = -root * p.y_scale
-        return by
-
-    def structure(self, theta: FloatArray) -> ObserverGains:
-        return self._structure
+        start = np.concatenate([first.ravel(), gain.ravel()])
+        return ControllerFamily(matrices, start, 0.1, lambda _: self)
 
 
 class Parametrised:
@@ -340,51 +322,15 @@ class Parametrised:
     def __repr__(self) -> str:
         return f"Parametrised({counted(self.start.size, 'parameter')})"
 
-    def family(self, plant: StandardPlant, prepared: Prepared) -> Differenced:
+    def family(self, plant: StandardPlant, prepared: Prepared) -> ControllerFamily:
         """Return the structure made ready for a plant."""
         unit = np.where(self.start != 0, np.abs(self.start), 1.0)
 
         def matrices(theta: FloatArray) -> Matrices:
             made = instance(self.make(unit * theta), StateSpace, "what make returns", "Return one.")
-            g = made.select(plant.u, plant.y)
-            g = bilinear(g, 1.0 / plant.dt) if plant.dt and g.n_states else g
-            return Matrices(g.A, g.B, g.C, g.D)
+            return _continuous_matrices(made.select(plant.u, plant.y), plant.dt)
 
-        return Differenced(matrices, self.start / unit, self.spread)
-
-
-def differenced(
-    matrices: Callable[[FloatArray], Matrices], theta: FloatArray, number: int
-) -> FloatArray:
-    """Return the derivative of [A, B; C, D] by one parameter."""
-    along = np.eye(theta.size)[number]
-    return np.asarray(
-        sum(weight * matrices(theta + step * along).joined for step, weight in _DIFFERENCES)
-    )
-
-
-class Differenced:
-    """A family whose matrices are differentiated by differences, exact for polynomials up to 4."""
-
-    def __init__(
-        self,
-        matrices: Callable[[FloatArray], Matrices],
-        first: FloatArray,
-        spread: float,
-    ) -> None:
-        self.matrices, self.first, self.spread = matrices, first, spread
-        self.order = matrices(first).A.shape[0]
-
-    def nested(self, minimise: Minimise) -> FloatArray | None:
-        """Return None: there are no smaller structures."""
-        return None
-
-    def jacobian(self, theta: FloatArray) -> FloatArray:
-        """Return the derivatives (n, rows, columns) of [A, B; C, D] by the parameters."""
-        return np.array([differenced(self.matrices, theta, i) for i in range(theta.size)])
-
-    def structure(self, theta: FloatArray) -> None:
-        """Return None: a function is no value that could be kept in a file."""
+        return ControllerFamily(matrices, self.start / unit, self.spread)
 
 
 #: what an element may have free; the depth of a notch is not, unless it is named
@@ -436,7 +382,7 @@ class TunedLaws(Value):
         super().__post_init__()
         require_known("number of an element", self.free, _NUMBERS)
 
-    def family(self, plant: StandardPlant, prepared: Prepared) -> _Laws:
+    def family(self, plant: StandardPlant, prepared: Prepared) -> ControllerFamily:
         """Return the structure made ready for a plant."""
         axes = axes_of(plant, self.before, self.after, None, 0.0, True)
         laws = checked_laws(axes, self.laws)
@@ -446,128 +392,75 @@ class TunedLaws(Value):
         after[:, [plant.y.index(name) for name in axes.after.inputs]] = axes.after.D
         fastest = np.abs(plant.system.poles()).max(initial=0.0) / (2.0 * np.pi)
         highest = 0.5 * _HIGHEST * axes.rate if axes.rate else _FASTER * float(fastest)
-        return _Laws(self, laws, before, after, axes.rate, highest)
-
-
-class _Number(NamedTuple):
-    """A number of an element: which axis, factor (-1: the gain of the law) and field it is."""
-
-    axis: int
-    factor: int
-    name: str
-
-
-class _Laws(ControllerFamily):
-    """Laws whose numbers are ``value exp(theta)``."""
-
-    spread = 0.3
-
-    def __init__(
-        self,
-        given: TunedLaws,
-        laws: Mapping[str, Law],
-        before: FloatArray,
-        after: FloatArray,
-        rate: float,
-        highest: float,
-    ) -> None:
-        self._given, self._laws, self.before, self.after = given, dict(laws), before, after
-        self.rate = rate
-        self._each = list(laws.values())
-        factors = [factor for law in self._each for factor in law.factors]
-        self._highest = max([highest, *(corner for one in factors for corner in _corners(one))])
-        self.numbers = [n for i, law in enumerate(self._each) for n in _free(i, law, given.free)]
-        if not self.numbers:
+        highest = max([highest, *(corner for law in laws.values() for corner in _corners(law))])
+        each = [_FreeLaw(law, _free(law, self.free)) for law in laws.values()]
+        ends = np.cumsum([len(one.numbers) for one in each])
+        if not ends[-1]:
             raise ModelError(f"no number of the laws is free: name some of {_NUMBERS} in free=.")
-        self.first = np.zeros(len(self.numbers))
-        self.order = sum(self._matrices(i, self.first)[0].shape[0] for i in range(len(self._each)))
 
-    def matrices(self, theta: FloatArray) -> Matrices:
-        """Return the controller y -> u; NaN for corners too high."""
-        corners = [
-            corner
-            for i, law in enumerate(self._each)
-            for j in range(len(law.factors))
-            for corner in _corners(self._element(i, j, theta))
-        ]
-        K = self._joined([self._matrices(i, theta) for i in range(len(self._each))])
-        return K if max(corners, default=0.0) <= self._highest else K._replace(D=np.nan * K.D)
+        @lru_cache(maxsize=2 * len(each))  # differences by a number change one law alone
+        def part(i: int, own: tuple[float, ...]) -> tuple[Law, LawMatrices]:
+            law = each[i].at(own)
+            rate = axes.rate if law.prewarped else 0.0
+            sections = [factor.section.at(rate).matrices for factor in law.factors]
+            return law, chained(law.gain, sections)
 
-    def _joined(self, parts: Sequence[tuple[FloatArray, ...]]) -> Matrices:
-        A, B, C, D = (la.block_diag(*(part[j] for part in parts)) for j in range(4))
-        return Matrices(A, -B @ self.after, self.before @ C, -self.before @ D @ self.after)
+        def found(theta: FloatArray) -> list[tuple[Law, LawMatrices]]:
+            split = np.split(theta, ends[:-1])
+            return [part(i, tuple(own.tolist())) for i, own in enumerate(split)]
 
-    def jacobian(self, theta: FloatArray) -> FloatArray:
-        """Return the derivatives (n, rows, columns) of [A, B; C, D] by the parameters."""
-        parts = [self._matrices(i, theta) for i in range(len(self._each))]
+        def matrices(theta: FloatArray) -> Matrices:
+            A, B, C, D = (
+                la.block_diag(*each) for each in zip(*(K for _, K in found(theta)), strict=True)
+            )
+            return Matrices(A, -B @ after, before @ C, -before @ D @ after)
 
-        def moved(axis: int, to: FloatArray) -> Matrices:
-            return self._joined([*parts[:axis], self._matrices(axis, to), *parts[axis + 1 :]])
+        def allows(theta: FloatArray) -> bool:
+            return all(corner <= highest for law, _ in found(theta) for corner in _corners(law))
 
-        return np.array(
-            [
-                differenced(partial(moved, number.axis), theta, i)
-                for i, number in enumerate(self.numbers)
-            ]
-        )
+        def structure(theta: FloatArray) -> TunedLaws:
+            return self.replace(laws=dict(zip(laws, (law for law, _ in found(theta)), strict=True)))
 
-    def structure(self, theta: FloatArray) -> TunedLaws:
-        """Return the structure with its laws at these parameters, continuous."""
-        laws = {name: self._law(i, theta) for i, name in enumerate(self._laws)}
-        return self._given.replace(laws=laws)
-
-    def _element(self, axis: int, factor: int, theta: FloatArray) -> SingleElement:
-        element = self._each[axis].factors[factor]
-        scaled = {
-            name: getattr(element, name) * _clipped_exp(value)
-            for value, (i, place, name) in zip(theta, self.numbers, strict=True)
-            if (i, place) == (axis, factor)
-        }
-        return _with(element, scaled)
-
-    def _gain(self, axis: int, theta: FloatArray) -> float:
-        own = [v for v, n in zip(theta, self.numbers, strict=True) if n[:2] == (axis, -1)]
-        return self._each[axis].gain * _clipped_exp(sum(own))
-
-    def _law(self, axis: int, theta: FloatArray) -> Law:
-        law = self._each[axis]
-        factors = tuple(self._element(axis, i, theta) for i in range(len(law.factors)))
-        return law.replace(factors=factors, gain=self._gain(axis, theta), rate=0.0)
-
-    def _rate(self, axis: int) -> float:
-        return self.rate if self._each[axis].prewarped else 0.0
-
-    def _matrices(self, axis: int, theta: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the matrices of a law in the s of Tustin's rule."""
-        sections = [
-            self._element(axis, i, theta).section.at(self._rate(axis)).matrices
-            for i in range(len(self._each[axis].factors))
-        ]
-        return chained(self._gain(axis, theta), sections)
+        return ControllerFamily(matrices, np.zeros(ends[-1]), 0.3, structure, allows)
 
 
-def _clipped_exp(theta: float) -> float:
-    return float(np.exp(np.clip(theta, -_FARTHEST, _FARTHEST)))
+class _FreeLaw(NamedTuple):
+    """A law, and its free numbers: of which factor (-1: the gain of the law), and its field."""
+
+    law: Law
+    numbers: list[tuple[int, str]]
+
+    def at(self, theta: tuple[float, ...]) -> Law:
+        """Return the law, continuous where its blocks are, with its numbers times exp(theta)."""
+        gain, factors = self.law.gain, list(self.law.factors)
+        growth = np.exp(np.clip(theta, -_FARTHEST, _FARTHEST)).tolist()
+        for (i, name), times in zip(self.numbers, growth, strict=True):
+            if i < 0:
+                gain *= times
+            else:
+                factors[i] = _with(factors[i], {name: getattr(factors[i], name) * times})
+        rate = max((factor.own_rate for factor in factors), default=0.0)
+        return self.law.replace(factors=tuple(factors), gain=gain, rate=rate)
 
 
-def _corners(element: SingleElement) -> list[float]:
-    """Return the corners [Hz] of an element."""
-    given = (getattr(element, name, None) for name in ("pole", "freq"))
+def _corners(law: Law) -> list[float]:
+    """Return the corners [Hz] of a law."""
+    given = (getattr(one, name, None) for one in law.factors for name in ("pole", "freq"))
     return [float(one) for one in given if one is not None]
 
 
-def _with(element: SingleElement, numbers: Mapping[str, float]) -> SingleElement:
+def _with(element: SingleElement, numbers: Mapping[str, float]) -> Any:
     """Return an element with other positive numbers, which need no check."""
-    made = rebuild(type(element), dict(element._fields()) | dict(numbers))
-    assert isinstance(made, SingleElement)  # noqa: S101 - rebuild returns the class it is given
-    return made
+    return rebuild(type(element), dict(element._fields()) | dict(numbers))
 
 
-def _free(axis: int, law: Law, names: Sequence[str]) -> list[_Number]:
+def _free(law: Law, names: Sequence[str]) -> list[tuple[int, str]]:
     """Return the free numbers of a law; its gain only where no Pid has one."""
-    found = []
-    for i, factor in enumerate(law.factors):
-        own = [f.name for f in fields(factor) if f.name in names]  # type: ignore[arg-type]
-        found += [_Number(axis, i, name) for name in own if getattr(factor, name)]
-    gains = any(number.name in "pid" for number in found)
-    return found if gains or "p" not in names else [_Number(axis, -1, "gain"), *found]
+    found = [
+        (i, field.name)
+        for i, factor in enumerate(law.factors)
+        for field in fields(factor)  # type: ignore[arg-type]
+        if field.name in names and getattr(factor, field.name)
+    ]
+    gains = any(name in "pid" for _, name in found)
+    return found if gains or "p" not in names else [(-1, "gain"), *found]
