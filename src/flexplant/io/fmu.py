@@ -21,7 +21,8 @@ from ..errors import LabelError, ModelError, warn
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..store import written
-from ..synthesis.aftercare.c_code import CProgram, c_name, c_program
+from ..synthesis.aftercare.c_code import c_name, c_program
+from ..synthesis.aftercare.c_text import CText
 from .files import file_path
 
 #: the types are those that the specification names, spelled out where they are pointers or numbers
@@ -477,7 +478,7 @@ def variable_names(K: StateSpace) -> tuple[list[str], list[str]]:
 
 
 def _description(
-    program: CProgram, name: str, version: str, token: str, sources: Sequence[str]
+    program: CText, name: str, version: str, token: str, sources: Sequence[str]
 ) -> str:
     """Return modelDescription.xml."""
     K = program.system

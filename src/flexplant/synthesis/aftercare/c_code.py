@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ from ...lti.statespace import StateSpace, as_statespace
 from ...store import written
 from ...tolerances import SAME
 from .c_text import CText
-from .forms import TwoStateForm, back_gain, scheduled_form, two_state_form
+from .forms import back_gain, scheduled_form, two_state_form
 
 #: words of C, and what its library has with the ending _t
 _RESERVED = frozenset(
@@ -155,16 +154,6 @@ class _Law(NamedTuple):
     back: FloatArray | None
 
 
-@dataclass(frozen=True)
-class CProgram:
-    """The text of a system in C, and the system."""
-
-    system: StateSpace
-    form: TwoStateForm
-    header: str
-    source: str
-
-
 def c_program(
     controller: Any,
     name: str,
@@ -174,7 +163,7 @@ def c_program(
     schedule: str | None = None,
     single: bool = False,
     driven: bool = True,
-) -> CProgram:
+) -> CText:
     """Return the C text of a sampled controller, or of a system without commands (a plant)."""
     recovery = None if anti_windup is None else positive(anti_windup, "anti_windup")
     if isinstance(controller, ScheduledLoop):
@@ -205,11 +194,10 @@ def c_program(
     groups = [slice(q * p, q * p + law.driven) for q in range(len(laws) if law.driven else 0)]
     form = two_state_form(whole, driven=groups, inputs=m, single=flag(single, "single"))
     at = K.inputs.index(str(schedule)) if len(laws) > 1 else 0
-    text = CText(name, K, form, law.driven, ends, places, at, single)
-    return CProgram(K, form, text.header, text.source)
+    return CText(name, K, form, law.driven, ends, places, at, single)
 
 
-def _following(loop: ScheduledLoop, name: str, single: bool) -> CProgram:
+def _following(loop: ScheduledLoop, name: str, single: bool) -> CText:
     """Return the C text of a loop whose controller follows a position, its last input."""
     laws = []
     for one in loop.loops:
@@ -219,8 +207,7 @@ def _following(loop: ScheduledLoop, name: str, single: bool) -> CProgram:
     K, driven = laws[0], len(loop.loops[0].driven)
     _check_rate(K.dt, K.n_states)
     form = scheduled_form(laws, driven=driven, single=single)
-    text = CText(name, K, form, driven, None, loop.places, len(K.inputs) - 1, single)
-    return CProgram(K, form, text.header, text.source)
+    return CText(name, K, form, driven, None, loop.places, len(K.inputs) - 1, single)
 
 
 def _scheduled(

@@ -282,7 +282,7 @@ _STATES = """\
 
 
 class CText:
-    """The files of one form."""
+    """The text of a system in C: `header` and `source`."""
 
     def __init__(
         self,
@@ -295,7 +295,7 @@ class CText:
         at: int,
         single: bool,
     ) -> None:
-        self.form, self.single, self.limits = form, single, limits
+        self.system, self.form, self.single, self.limits = K, form, single, limits
         states, self.m, self.p = form.B.shape[-2], len(K.inputs), len(K.outputs)
         #: whether A and B follow the place too
         self.moving = form.rest.ndim == 3
@@ -339,16 +339,11 @@ class CText:
         return template.format(**{**self.fields, **more})
 
     @property
-    def starts(self) -> bool:
-        """Whether there are commands to start from."""
-        return bool(self.driven)
-
-    @property
     def header(self) -> str:
         """The header file."""
         real, name = self.fields["real"], self.fields["name"]
         head = f"void {name}_start({name}_t *self, const {real} *in, const {real} *applied);\n"
-        return self.filled(_HEADER, start_head=head if self.starts else "")
+        return self.filled(_HEADER, start_head=head if self.driven else "")
 
     @property
     def source(self) -> str:
@@ -366,7 +361,7 @@ class CText:
             _SOURCE,
             tables=self._tables(),
             functions="\n".join(functions),
-            start=self._start() if self.starts else "",
+            start=self._start() if self.driven else "",
             outputs_at=self.filled(_BETWEEN)
             if self.count > 1
             else "        outputs_of(self->x, in, out, 0);\n",
@@ -388,7 +383,7 @@ class CText:
             self.table("D", form.D[:, :m]),
             self.table("place", self.places),
         ]
-        if self.starts and self.states:
+        if self.driven and self.states:
             found.append(self.table("start", form.start))
         if self.limits is not None:
             most = float(np.finfo(np.float32 if self.single else np.float64).max)

@@ -56,24 +56,20 @@ class _FactoredController(NamedTuple):
         # K_r = N_r M_r^-1
         Cn, Cm, Dn = found.C[:p], found.C[p:], found.D[:p]
         inverse = np.linalg.inv(found.D[p:])
-        reduced = StateSpace(
-            found.A - found.B @ inverse @ Cm,
-            found.B @ inverse,
-            size * (Cn - Dn @ inverse @ Cm),
-            size * Dn @ inverse,
-            K.dt,
-            inputs=K.inputs,
-            outputs=K.outputs,
-            units=K.units,
-            name=K.name,
+        reduced = K.replace(
+            A=found.A - found.B @ inverse @ Cm,
+            B=found.B @ inverse,
+            C=size * (Cn - Dn @ inverse @ Cm),
+            D=size * Dn @ inverse,
+            states=None,
+            blocks=None,
         )
         same = found.replace(inputs=self.factors.inputs, outputs=self.factors.outputs)
         error = peak_gain(series(self.factors - same, self.weight))[0]
         if self.kept.n_states:
             kept = self.kept.replace(units=K.units, name=K.name)
             reduced = reduced + kept.replace(D=np.zeros_like(kept.D))
-        names = [f"x{i}" for i in range(1, reduced.n_states + 1)]
-        return reduced.replace(states=names, name=K.name), error
+        return reduced.replace(states=None, name=K.name), error
 
 
 @one_thread()
@@ -192,14 +188,9 @@ def _fewest_states(
     low, high = problem.kept.n_states - 1, full
     while high - low > 1:
         middle = (low + high) // 2
-        if tried(middle):
-            high = middle
-        else:
-            low = middle
+        low, high = (low, middle) if tried(middle) else (middle, high)
     if best is None:  # an odd order may keep what the halves lose
-        for order in range(full - 1, full // 2, -1):
-            if tried(order):
-                break
+        next(filter(tried, range(full - 1, full // 2, -1)), None)
     if best is None:
         raise CertificateError(
             f"no controller of fewer states than {full} keeps the loop: with "
@@ -214,9 +205,9 @@ def _controller_gain(plant: StandardPlant, K: StateSpace) -> float:
     grid = resonance_grid(np.concatenate([loop.poles(), K.poles()]), K.dt, points=60)
     grid = grid[grid < 0.49 / K.dt] if K.dt else grid
     rows = [name for name in K.outputs if name in plant.u]
-    gain = np.abs(frequency_response(K.select(rows), grid).data).max(axis=(0, 1))
-    through = np.abs(frequency_response(plant.system.select(K.inputs, rows), grid).data).max(
-        axis=(0, 1)
+    gain, through = (
+        np.abs(frequency_response(one, grid).data).max(axis=(0, 1))
+        for one in (K.select(rows), plant.system.select(K.inputs, rows))
     )
     acts = gain * through > 0.1
     return float(np.median(gain[acts])) if acts.any() else float(gain.max())
@@ -242,13 +233,8 @@ def _factor_weight(
     pushed, v = [f"{name}|u" for name in rows], [f"v{i}" for i in range(m)]
     y, read, missed = ([f"{kind}{i}" for i in range(m)] for kind in ("y", "in", "b"))
     plant = P.replace(B=size * P.B, D=size * P.D, inputs=pushed, outputs=y, units={})
-    law = own.replace(
-        C=np.vstack([own.C, -F]),
-        D=np.vstack([own.D, np.eye(m)]),
-        inputs=read,
-        outputs=[*rows, *v],
-        units={},
-    )
+    C, D = np.vstack([own.C, -F]), np.vstack([own.D, np.eye(m)])
+    law = own.replace(C=C, D=D, inputs=read, outputs=[*rows, *v], units={})
     gains = la.block_diag(np.tile(np.eye(len(rows)), 2), np.hstack([np.eye(m), -np.eye(m)]))
     entering = [*rows, *(f"a:{name}" for name in rows), *y, *missed]
     sums = StateSpace([], [], [], gains, K.dt, inputs=entering, outputs=[*pushed, *read])
@@ -282,33 +268,25 @@ def loop_facts(plant: StandardPlant, controller: StateSpace) -> LoopFacts:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FlexplantWarning)
         loop = close_loop(plant, controller, larger=None)
-    poles = loop.poles()
-    dt = loop.plant.dt
-    size = np.abs(poles) if dt else poles.real
-    least = poles[np.argmax(size)] if poles.size else np.nan
-    freq = np.abs(np.angle(least) / dt if dt else np.imag(least)) / (2.0 * np.pi)
-    gamma = float("nan")
-    if plant.is_weighted and loop.obstacle is None:
-        gamma = peak_gain(lft(plant.system, controller))[0]
-    stable = loop.obstacle is None
+    poles, dt, stable = loop.poles(), loop.plant.dt, loop.obstacle is None
+    least = poles[np.argmax(np.abs(poles) if dt else poles.real)] if poles.size else np.nan
+    freq = float(np.abs(np.angle(least) / dt if dt else np.imag(least)) / (2.0 * np.pi))
+    weighted = plant.is_weighted and stable
+    gamma = peak_gain(lft(plant.system, controller))[0] if weighted else float("nan")
     margin = loop.modulus_margin if stable else 0.0
-    return LoopFacts(bool(dt), stability(poles, dt), float(freq), stable, margin, gamma)
+    return LoopFacts(bool(dt), stability(poles, dt), freq, stable, margin, gamma)
 
 
 def loss_text(before: LoopFacts, after: LoopFacts, loss: float) -> str:
     """Return what was lost in words; empty when nothing was."""
+    beyond = f"by more than {100 * loss:.3g} %"
     if not after.is_stable:
         return f"the loop becomes unstable ({after.why})"
     if after.margin < (1.0 - loss) * before.margin:
-        return (
-            f"the modulus margin falls from {before.margin:.3g} to {after.margin:.3g}, by more "
-            f"than {100 * loss:.3g} %"
-        )
+        margins = f"from {before.margin:.3g} to {after.margin:.3g}"
+        return f"the modulus margin falls {margins}, {beyond}"
     if after.gamma > (1.0 + loss) * before.gamma:
-        return (
-            f"gamma grows from {before.gamma:.4g} to {after.gamma:.4g}, by more than "
-            f"{100 * loss:.3g} %"
-        )
+        return f"gamma grows from {before.gamma:.4g} to {after.gamma:.4g}, {beyond}"
     return ""
 
 

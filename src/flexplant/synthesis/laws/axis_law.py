@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product as every
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -61,14 +60,14 @@ class AxisLaw:
         factors = (pid, LowPass(w * c), *(Notch(*one) for one in notches.tolist()))
         return Law(factors, self._scale(numbers), self.axis.rate)
 
-    def room(self, law: Law) -> FloatArray:
-        """Return what the distance to the critical point has to spare, at each point."""
-        # at the last line also what the gain has below a tenth of 1 - 1 / peak: a mode above may
-        # rise tenfold
-        return self.room_of(law.response(self.axis.points[0]))
+    def room(self, numbers: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
+        """Return what the distance to the critical point has to spare, at some of the points."""
+        return self.room_of(self.response(numbers, self.s[rows]), rows)
 
     def room_of(self, gain: ComplexArray, rows: IntArray | slice = slice(None)) -> FloatArray:
         """Return `room` by the response of a law (..., n) at some of the points."""
+        # at the last line also what the gain has below a tenth of 1 - 1 / peak: a mode above may
+        # rise tenfold
         freq, G, bound = (one[rows] for one in self.axis.points)
         room = np.abs(1.0 + gain * G) - np.abs(gain) * bound
         if self.axis.ends_early and freq[-1] == self.axis.freq[-1]:
@@ -78,12 +77,8 @@ class AxisLaw:
             room[..., -1] = np.minimum(room[..., -1], 1.0 / self.peak + last)
         return np.asarray(room - 1.0 / self.peak)
 
-    def gain(self, numbers: FloatArray, rows: IntArray | slice = slice(None)) -> ComplexArray:
-        """Return the response of `law` at some of the points, without making its elements."""
-        return self.response(numbers, self.s[rows])
-
     def response(self, numbers: FloatArray, s: ComplexArray) -> ComplexArray:
-        """Return the response of `law` at any s, by Tustin's rule where it is sampled."""
+        """Return the response of `law`, whose elements are not made, at any s of Tustin's rule."""
         return self._scale(numbers) * product(self.sections(numbers), s)
 
     def _scale(self, numbers: FloatArray) -> float:
@@ -305,46 +300,34 @@ _SPARE = 5e-4
 _POOR = 0.2
 
 
-class FoundLaw(NamedTuple):
-    """A law and the logarithms of its numbers."""
-
-    law: Law
-    numbers: FloatArray
-
-    @property
-    def bandwidth(self) -> float:
-        """Where the loop of the rigid body alone crosses 1 [Hz]."""
-        return float(np.exp(self.numbers[0]))
-
-    @property
-    def notches(self) -> int:
-        """The number of its notches."""
-        return (self.numbers.size - 4) // 3
-
-
 @dataclass(frozen=True)
 class LawSearch:
-    """The search for the law of one axis with the highest bandwidth that holds |S|."""
+    """The search for the law of one axis with the highest bandwidth that holds |S|.
+
+    Laws are the logarithms of their numbers, the bandwidth the first.
+    """
 
     of: AxisLaw
     notches: int
 
-    def best(self) -> FoundLaw:
+    def best(self) -> FloatArray:
         """Return the law of the highest bandwidth."""
         given = starts(self.of, self.notches)
         rough = [one for start in given if (one := self.raised(start, _FEW)) is not None]
         if not rough:
             raise SolverError(self.failure())
-        rough.sort(key=lambda one: -one.bandwidth)
-        best = max((self._finished(one) for one in rough[:_KEPT]), key=lambda one: one.bandwidth)
-        while best.notches < self.notches and (more := self._with_notch(best)) is not None:
+        rough.sort(key=_first, reverse=True)
+        best = max((self._finished(one) for one in rough[:_KEPT]), key=_first)
+        full = 4 + 3 * self.notches
+        while best.size < full and (more := self._with_notch(best)) is not None:
             best = more
         return self._without_idle(best)
 
-    def _finished(self, found: FoundLaw) -> FoundLaw:
-        return self.raised(found.numbers) or found
+    def _finished(self, numbers: FloatArray) -> FloatArray:
+        found = self.raised(numbers)
+        return numbers if found is None else found
 
-    def raised(self, numbers: FloatArray, steps: int = _MANY) -> FoundLaw | None:
+    def raised(self, numbers: FloatArray, steps: int = _MANY) -> FloatArray | None:
         """Return what steps from some numbers lead to; None when that does not hold the peak."""
         # linear programs within a radius, with an exact penalty [Fletcher1987]_, chapter 14
         x, radius, best = numbers, _RADIUS, None
@@ -366,12 +349,11 @@ class LawSearch:
                 radius *= 0.4
         if best is None or best[0] <= np.log(self.of.lowest):
             return None
-        law = self.of.law(best)
-        return FoundLaw(law, best) if self.of.room(law).min() >= 0.0 else None
+        return best if self.of.room(best).min() >= 0.0 else None
 
     def _spare(self, numbers: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
         """Return the room beyond a little that steps may violate."""
-        return self.of.room_of(self.of.gain(numbers, rows), rows) - _SPARE
+        return self.of.room(numbers, rows) - _SPARE
 
     def _step(self, x: FloatArray, room: FloatArray, radius: float) -> tuple[FloatArray, float]:
         """Return the step of the linear program, and the gain that it predicts."""
@@ -390,28 +372,29 @@ class LawSearch:
             found[:, k] = (self._spare(x + step, rows) - room[rows]) / _DIFFERENCE
         return found
 
-    def _with_notch(self, found: FoundLaw) -> FoundLaw | None:
+    def _with_notch(self, numbers: FloatArray) -> FloatArray | None:
         """Return the law with the notch that raises the bandwidth most; None when none is worth it.
 
         At the points closest to the critical point, at modes and above the bandwidth.
         """
-        close = self.of.axis.points[0][lowest_of(self.of.room(found.law))[:_TRIED]]
-        above = found.bandwidth * np.array(_ABOVE)
-        trials = []
-        for f in [*close.tolist(), *self.of.axis.resonances[:_TRIED].tolist(), *above.tolist()]:
-            if self.of.axis.freq[0] < f < self.of.axis.ceiling:
-                slight = np.log([f, *_SLIGHT])
-                trials.append(self.raised(np.append(found.numbers, slight), _FEW))
-        best = max((one for one in trials if one), key=lambda one: one.bandwidth, default=None)
-        return self._finished(best) if best and best.bandwidth > _WORTH * found.bandwidth else None
+        axis = self.of.axis
+        close = axis.points[0][lowest_of(self.of.room(numbers))[:_TRIED]]
+        above = np.exp(numbers[0]) * np.array(_ABOVE)
+        trials = [
+            self.raised(np.append(numbers, np.log([f, *_SLIGHT])), _FEW)
+            for f in np.concatenate([close, axis.resonances[:_TRIED], above]).tolist()
+            if axis.freq[0] < f < axis.ceiling
+        ]
+        best = max((one for one in trials if one is not None), key=_first, default=numbers)
+        return self._finished(best) if best[0] > numbers[0] + np.log(_WORTH) else None
 
-    def _without_idle(self, found: FoundLaw) -> FoundLaw:
+    def _without_idle(self, numbers: FloatArray) -> FloatArray:
         """Return the law without notches that bring little."""
-        for i in reversed(range(4, found.numbers.size, 3)):
-            less = self.raised(np.delete(found.numbers, slice(i, i + 3)), _FEW)
-            if less and less.bandwidth * _WORTH > found.bandwidth:
-                found = less
-        return found
+        for i in reversed(range(4, numbers.size, 3)):
+            less = self.raised(np.delete(numbers, slice(i, i + 3)), _FEW)
+            if less is not None and less[0] + np.log(_WORTH) > numbers[0]:
+                numbers = less
+        return numbers
 
     def failure(self) -> str:
         """Return why no law was found, in words."""
@@ -473,6 +456,10 @@ def linear_step(
     return answer.x[:-1], float(-answer.fun)
 
 
+def _first(numbers: FloatArray) -> float:
+    return float(numbers[0])
+
+
 def lowest_of(room: FloatArray) -> IntArray:
     """Return the local minima, the lowest first."""
     wide = np.concatenate([[np.inf], room, [np.inf]])
@@ -515,22 +502,15 @@ def starts(of: AxisLaw, notches: int) -> list[FloatArray]:
         return []
     rows = _axis_points(of)
     sets = _sets(of, notches)
-    found: list[list[_Start]] = [[] for _ in sets]
+    found: list[list[tuple[float, FloatArray]]] = [[] for _ in sets]
     for w in np.geomspace(of.highest, of.lowest, _TRIALS).tolist():
-        for own, start in zip(found, _best_starts(of, w, sets, rows), strict=True):
+        for own, (score, numbers) in zip(found, _best_starts(of, w, sets, rows), strict=True):
             # far enough from the last of the same notches to end elsewhere
-            apart = not own or start.score < own[-1].score - _APART
-            if np.isfinite(start.score) and len(own) < _EACH and apart:
-                own += [start] if of.axis.is_stable(of.law(start.numbers)) else []
-    best = sorted((one for own in found for one in own), key=lambda one: -one.score)
-    return [one.numbers for one in best[:_STARTS]]
-
-
-class _Start(NamedTuple):
-    """The logarithm of a bandwidth, less where the peak is not held yet, and all numbers."""
-
-    score: float
-    numbers: FloatArray
+            apart = not own or score < own[-1][0] - _APART
+            if np.isfinite(score) and len(own) < _EACH and apart:
+                own += [(score, numbers)] if of.axis.is_stable(of.law(numbers)) else []
+    best = sorted((one for own in found for one in own), key=lambda one: -one[0])
+    return [numbers for _, numbers in best[:_STARTS]]
 
 
 def _sets(of: AxisLaw, notches: int) -> list[FloatArray]:
@@ -542,8 +522,13 @@ def _sets(of: AxisLaw, notches: int) -> list[FloatArray]:
     return [np.log([one for one in chosen if one]).reshape(-1) for chosen in every(*each)]
 
 
-def _best_starts(of: AxisLaw, w: float, sets: list[FloatArray], rows: IntArray) -> list[_Start]:
-    """Return for each set of notches the best start at one bandwidth [Hz]."""
+def _best_starts(
+    of: AxisLaw, w: float, sets: list[FloatArray], rows: IntArray
+) -> list[tuple[float, FloatArray]]:
+    """Return for each set of notches the numbers of the best start at one bandwidth [Hz].
+
+    With a score: the logarithm of the bandwidth, less where the peak is not held yet.
+    """
     top, s = of.axis.ceiling, np.append(of.s[rows], tustin_s(np.array([w]), of.axis.rate))
     shapes = sorted({(a, min(b, top / w), min(c, top / w)) for a, b in _LEADS for c in _TAILS})
     numbers = [np.log([w, *shape]) for shape in shapes]
@@ -557,7 +542,7 @@ def _best_starts(of: AxisLaw, w: float, sets: list[FloatArray], rows: IntArray) 
     best, each = np.argmax(room, axis=1), np.arange(len(sets))
     scores = np.log(w) + _LATER * np.minimum(room[each, best], 0.0)
     return [
-        _Start(float(score), np.append(numbers[i], one))
+        (float(score), np.append(numbers[i], one))
         for score, i, one in zip(scores, best, sets, strict=True)
     ]
 

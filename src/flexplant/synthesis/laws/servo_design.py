@@ -18,10 +18,10 @@ from ...lti.interconnection import loop_poles
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import Poi, StandardPlant, larger_plant, standard_plant
-from ...plant.rigid_motion import RigidModes, require_weak
+from ...plant.rigid_motion import require_weak
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import SAME
-from ..controller import CLOSE, Controller, unchecked
+from ..controller import CLOSE, Controller, with_checks
 from .loop_design import Axes, axes_controller, connected
 from .servo_loop import (
     TARGET,
@@ -131,7 +131,7 @@ def design_servo(
             f"bandwidth {bandwidth:g} Hz is not well below the rate, {task.rate:g} Hz: the lead "
             f"needs room above it. Stay below {0.2 * task.rate:g} Hz, or raise the rate."
         )
-    require_weak(task.motions, bandwidth, "a servo")
+    require_weak(task.plant.rigid_motions, bandwidth, "a servo")
     axis = task.notched(task.axis(float(bandwidth)))
     radius = task.rigid_radius(axis)
     if not radius < 1.0:
@@ -147,12 +147,9 @@ def design_servo(
         "spectral radius": closed.spectral_radius,
         "modulus margin": closed.modulus_margin,
     }
-    left_out = closed.left_out
-    if left_out is not None:
-        certificate |= left_out.certificate
-    worst = min(certificate[key] for key in certificate if key.startswith("modulus margin"))
-    advice = ""
-    if worst < 1.0 / TARGET:
+    left_out, advice = closed.left_out, ""
+    known = certificate | ({} if left_out is None else left_out.certificate)
+    if min(known[key] for key in known if key.startswith("modulus margin")) < 1.0 / TARGET:
         try:
             reach = task.largest(TARGET)
         except SolverError as none:
@@ -170,15 +167,12 @@ def design_servo(
         )
     if closed.tolerances is not None:
         closed.tolerances.warn_of_critical()
-        certificate |= closed.tolerances.certificate
-    return Controller(
-        task.controller(axis),
-        f"servo {bandwidth:g} Hz on {task.poi.name!r}",
-        certificate=certificate,
-        left_out=left_out,
-        tolerances=closed.tolerances,
-        notes=_notes(task, axis, left_out is not None),
-    )
+    notes = [f"notches at {', '.join(f'{f:.4g}' for f in axis.notches)} Hz"] if axis.notches else []
+    if observer is None:
+        notes.append("certified on the POI itself: observer= certifies the loop that will run")
+    method = f"servo {bandwidth:g} Hz on {task.poi.name!r}"
+    answer = Controller(task.controller(axis), method, certificate=certificate, notes=tuple(notes))
+    return with_checks(answer, task.plant, closed)
 
 
 @one_thread()
@@ -246,15 +240,6 @@ def _refuse(closed: ClosedLoop, bandwidth: float, observed: bool, advice: str) -
     warn(f"{text} Pass observer= to check the loop that will run.")
 
 
-def _notes(task: ServoTask, axis: Axis, checked: bool) -> tuple[str, ...]:
-    notes = []
-    if axis.notches:
-        notes.append(f"notches at {', '.join(f'{f:.4g}' for f in axis.notches)} Hz")
-    if task.observer is None:
-        notes.append("certified on the POI itself: observer= certifies the loop that will run")
-    return (*notes, *(() if checked else unchecked(task.plant)))
-
-
 #: bandwidths that `ServoTask.largest` tries from 0.19 of the rate down, before it halves intervals
 _TRIALS = 80
 
@@ -270,11 +255,6 @@ class ServoTask:
     notches: tuple[float, ...] | None
     observer: StateSpace | None
     larger: StandardPlant | None
-
-    @property
-    def motions(self) -> RigidModes:
-        """The plant's rigid-body motions, free or on springs."""
-        return self.plant.rigid_motions
 
     @property
     def rate(self) -> float:
@@ -296,17 +276,15 @@ class ServoTask:
 
     def notched(self, axis: Axis) -> Axis:
         """Return the axis with notches where they serve, unless they were given."""
-        return axis if self.notches is not None else self.loop.notched(axis, self.is_stable)
+        if self.notches is not None:
+            return axis
+        return self.loop.notched(axis, lambda one: self.closed(one).is_stable)
 
     @cached_property
     def controller(self) -> Callable[[Axis], StateSpace]:
         """The function of an axis that gives [ref, hats] -> u: errors, axes and decoupling."""
         T_u = decoupling(self.plant, self.poi)
         return cache(lambda axis: _servo_law(self.plant, self.poi, axis, T_u))
-
-    def is_stable(self, axis: Axis) -> bool:
-        """Return whether the loop is stable with the modes that the plant has."""
-        return self.closed(axis).is_stable
 
     @cached_property
     def closed(self) -> Callable[[Axis], ClosedLoop]:
@@ -327,7 +305,7 @@ class ServoTask:
     @cached_property
     def _bodies(self) -> list[StateSpace]:
         """The motions of the rigid body, each as a system of its own."""
-        free = np.unique(self.motions.freq)
+        free = np.unique(self.plant.rigid_motions.freq)
         return [rigid_body(self.rate, self.plant.delay, float(f)) for f in free]
 
     def rigid_radius(self, axis: Axis) -> float:
@@ -342,7 +320,9 @@ class ServoTask:
 
     def largest(self, peak: float) -> float:
         """Return the largest bandwidth that holds a peak of |S| at u."""
-        slowest = max(3.0 * float(np.abs(self.motions.freq).max()) * (1 + SAME), 2e-4 * self.rate)
+        slowest = max(
+            3.0 * float(np.abs(self.plant.rigid_motions.freq).max()) * (1 + SAME), 2e-4 * self.rate
+        )
         best: tuple[float, float, float] = (np.inf, np.nan, np.nan)
 
         def fine(loop: Any) -> bool:
@@ -355,7 +335,7 @@ class ServoTask:
                 return False
             axis = self.notched(axis)
             size, at = self.loop.peak(axis)
-            if size < best[0] and self.is_stable(axis):
+            if size < best[0] and self.closed(axis).is_stable:
                 best = size, at, bandwidth
             if size > peak:
                 return False

@@ -120,7 +120,7 @@ def tune_loops(
             variance = None if frf.variance is None else frf.variance[i, i]
             one = MeasuredAxis(name, frf.freq, frf.data[i, i], axes.rate, rigid > 0, variance)
             of.append(AxisLaw(one, float(peak)))
-            alone.append(LawSearch(of[i], most).best().numbers)
+            alone.append(LawSearch(of[i], most).best())
             bar.advance()
     found = JointSearch(of, plants, float(peak), alone).best()
     design = made(axes, dict(zip(axes.names, found.laws, strict=True)), rigid, 0, None, larger)
@@ -239,13 +239,10 @@ class JointPlant:
 
     def worst(self, laws: Sequence[Law]) -> Worst:
         """Return the largest |S| of a stable loop, the grid refined at its peaks."""
-
-        def sizes(freq: FloatArray) -> FloatArray:
-            return 1.0 / self.coupling(freq).distances(_law_gains(laws, freq))
-
         rounds = 0 if isinstance(self.plant, Frf) else _REFINEMENTS
-        size, freq = highest(lambda f: sizes(f).max(axis=0), self._closed_grid(laws), rounds)
-        place = self.places[int(np.argmax(sizes(np.array([freq]))[:, 0]))]
+        grid = self._closed_grid(laws)
+        size, freq = highest(lambda f: 1.0 / self._distances(laws, f).min(axis=0), grid, rounds)
+        place = self.places[int(np.argmin(self._distances(laws, np.array([freq]))[:, 0]))]
         return Worst(size, freq, f"{place}{self.kind}")
 
     def high(self, laws: Sequence[Law], size: float) -> FloatArray:
@@ -254,8 +251,10 @@ class JointPlant:
         A mode is as narrow as its damping, and the loop moves it off the grid of the plant.
         """
         grid = self._closed_grid(laws)
-        least = self.coupling(grid).distances(_law_gains(laws, grid)).min(axis=0)
-        return np.asarray(grid[least * size < 1.0])
+        return np.asarray(grid[self._distances(laws, grid).min(axis=0) * size < 1.0])
+
+    def _distances(self, laws: Sequence[Law], freq: FloatArray) -> FloatArray:
+        return self.coupling(freq).distances(np.stack([law.at(freq) for law in laws], axis=-1))
 
     def _closed_grid(self, laws: Sequence[Law]) -> FloatArray:
         return self.grid if isinstance(self.plant, Frf) else self._through(self._poles(laws))
@@ -270,10 +269,6 @@ class JointPlant:
         parts = [(one.A, one.B, one.C, one.D) for one in (law.system for law in laws)]
         K = StateSpace(*decoupled(parts, self.before, self.after), self.plant.dt)
         return loop_poles(self.plant, K)
-
-
-def _law_gains(laws: Sequence[Law], freq: FloatArray) -> ComplexArray:
-    return np.stack([law.at(freq) for law in laws], axis=-1)
 
 
 class Coupling(NamedTuple):
