@@ -30,7 +30,7 @@ LINES = [
     ("lti/peaks.py", " + radius**3 * model.rest(centre, radius, 2)", ""),
     ("lti/peaks.py", "return centre[unsure[_largest(T0[unsure]) > level]], bound <= level",
      "return centre[unsure[_largest(T0[unsure]) > level]], bound <= 1.1 * level"),
-    ("synthesis/hinf/central.py", "return bool(values[0] <", "return bool(values[0] + 1e300 <"),
+    ("synthesis/hinf/lower_bound.py", "return bool(values[0] <", "return bool(values[0] + 1e300 <"),
     ("synthesis/hinf/mode_channels.py", "with_G = -1j *", "with_G = 1j *"),
     ("placement/quadratic.py", "<= RESIDUAL:", "<= 1e300:"),
     ("placement/branch_and_bound.py", "bound = max(bound, found)", "bound = 1.2 * found"),

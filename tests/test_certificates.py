@@ -12,6 +12,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import CertificateError, ModelError
+from flexplant.lti.preparation import prepared
 from flexplant.synthesis import FixedOrder, PoleRegion
 
 
@@ -260,7 +261,7 @@ WRONG = {
     "no feedback": (
         "synthesis.hinf.hinf_design._certified_answer", unproven,
         lambda: import_module("flexplant.synthesis.hinf.hinf_design").idle_answer(
-            problem(), None, ""
+            problem(), prepared(problem().system, problem().u, problem().y), ""
         ), "cannot be verified",
     ),
     "two degrees of freedom": (

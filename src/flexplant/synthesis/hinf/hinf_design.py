@@ -37,8 +37,7 @@ from ..controller import (
 )
 from ..lmi.lmi_programs import Lmi
 from ..synthesis_plants import posed, require_reach
-from .central import require_shown
-from .hinf_riccati import Riccati
+from .hinf_riccati import Riccati, require_shown
 from .lower_bound import pointwise_bound, raised_bound
 from .mode_channels import (
     ModeChannel,
@@ -180,38 +179,43 @@ def design_hinf(
     plant = posed(plant, u, y, "H-infinity synthesis")
     if bandwidth is not None:
         plant = plant.weighted(stage_weights(plant, bandwidth, uncertainty=uncertain))
-    known = uncertain
-    if known is None and plant.uncertainty is not None and plant.uncertainty.frequencies:
-        known = plant.uncertainty
-    if known is not None:
-        found = tolerant(plant, known, method, progress, damped_below)
-        return with_left_out(found, plant, larger)
-    return with_left_out(_design_one(plant, method, progress), plant, larger)
+    known = plant.uncertainty if uncertain is None else uncertain
+    if uncertain is not None or (known is not None and known.frequencies):
+        instance(known, UncertainPlant, "uncertain", "Make it by plant.uncertain(frequency=0.005).")
+        found = tolerant(
+            plant, evened(plant, known, method, progress, damped_below), known, method, progress
+        )
+    else:
+        found = _design_one(plant, method, progress)
+    return with_left_out(found, plant, larger)
+
+
+class Evened(NamedTuple):
+    """Channels for modes, scaled in closed loop, and gamma before they were."""
+
+    channels: tuple[ModeChannel, ...]
+    first: float
+    #: what `Riccati` finds with them, where that is known
+    found: SolvedController | None = None
 
 
 def tolerant(
     plant: StandardPlant,
+    given: Evened,
     uncertain: UncertainPlant[Any],
     method: SynthesisMethod | None = None,
     progress: bool | None = None,
-    damped_below: float = 0.0,
-    solved: Solved | None = None,
 ) -> Controller:
-    """Return the controller of a plant with channels for its modes, evened out in closed loop."""
-    instance(uncertain, UncertainPlant, "uncertain", "Make it by plant.uncertain(frequency=0.005).")
-    if solved is None:
-        channels, first = _even_channels(plant, uncertain, method, progress, damped_below)
-        answer = _design_one(with_mode_channels(plant, channels), method, progress)
-    else:
-        channels, first = solved.channels, solved.first
-        answer = _design_one(with_mode_channels(plant, channels), None, progress, solved.found)
+    """Return the verified controller of a plant with channels for its modes."""
+    channels = given.channels
+    answer = _design_one(with_mode_channels(plant, channels), method, progress, given.found)
     scales = {one.mode: one.D for one in channels}
     stated = [one.replace(D=scales[one.mode]) for one in mode_channels(plant, uncertain)]
     share = tolerated(stated, with_mode_channels(plant, stated), answer.system)
     return answer.replace(
         certificate=dict(answer.certificate or {}) | {TOLERATED: share},
         reached={},  # of the weights beside the channels of modes
-        tried={"before the scales were evened out": first, "after": answer.gamma},
+        tried={"before the scales were evened out": given.first, "after": answer.gamma},
         notes=(
             *answer.notes,
             f"gamma is with a channel for each of {counted(len(channels), 'mode')}",
@@ -219,44 +223,37 @@ def tolerant(
     )
 
 
-class Solved(NamedTuple):
-    """What `tolerant` verifies: channels evened out, gamma before they were, and an answer."""
-
-    channels: tuple[ModeChannel, ...]
-    first: float
-    found: SolvedController
+def evened(
+    plant: StandardPlant,
+    uncertain: UncertainPlant[Any],
+    method: SynthesisMethod | None = None,
+    progress: bool | None = None,
+    damped_below: float = 0.0,
+) -> Evened:
+    """Return channels for the modes, their scales evened out in closed loop."""
+    channels, first = mode_channels(plant, uncertain, damped_below), np.inf
+    # only the scales hang on it: where it fails, the design itself says all
+    with attempted("evening out the scales of modes"):
+        opened = with_mode_channels(plant, channels)
+        loop, found = _solved(opened, method or Riccati(progress=progress))
+        channels, first = rebalanced(channels, opened, loop), found.gamma
+    return Evened(channels, first)
 
 
 def tolerant_system(
     plant: StandardPlant, uncertain: UncertainPlant[Any], damped_below: float
-) -> tuple[StateSpace, Solved]:
+) -> tuple[StateSpace, Evened]:
     """Return the controller that `tolerant` verifies, by itself, and what led to it."""
-    channels, first = _even_channels(plant, uncertain, None, False, damped_below)
-    open_plant = with_mode_channels(plant, channels)
-    problem = prepared(open_plant.system, open_plant.u, open_plant.y)
-    found = Riccati(progress=False).solve(problem)
-    system = problem.restored(found.A, found.B, found.C, found.D)
-    return system, Solved(channels, first, found)
+    given = evened(plant, uncertain, progress=False, damped_below=damped_below)
+    system, found = _solved(with_mode_channels(plant, given.channels), Riccati(progress=False))
+    return system, given._replace(found=found)
 
 
-def _even_channels(
-    plant: StandardPlant,
-    uncertain: UncertainPlant[Any],
-    method: SynthesisMethod | None,
-    progress: bool | None,
-    damped_below: float,
-) -> tuple[tuple[ModeChannel, ...], float]:
-    """Return channels for the modes, scaled in closed loop, and gamma before they were."""
-    channels = mode_channels(plant, uncertain, damped_below)
-    open_plant = with_mode_channels(plant, channels)
-    problem = prepared(open_plant.system, open_plant.u, open_plant.y)
-    first = np.inf
-    # only the scales hang on it: where it fails, the design itself says all
-    with attempted("evening out the scales of modes"):
-        found = (method or Riccati(progress=progress)).solve(problem)
-        loop = problem.restored(found.A, found.B, found.C, found.D)
-        channels, first = rebalanced(channels, open_plant, loop), found.gamma
-    return channels, first
+def _solved(plant: StandardPlant, method: SynthesisMethod) -> tuple[StateSpace, SolvedController]:
+    """Return the controller that a method finds, not verified, and what it says of it."""
+    problem = prepared(plant.system, plant.u, plant.y)
+    found = method.solve(problem)
+    return problem.restored(found.A, found.B, found.C, found.D), found
 
 
 def _design_one(
@@ -276,7 +273,9 @@ def _design_one(
         else:
             if progress is not None and isinstance(method, (Riccati, Lmi)):
                 method = method.replace(progress=progress)
-            answer = answer_of(plant, problem, method)
+            answer = _certified_answer(plant, problem, method, known or method.solve(problem))
+            lower = max(answer.lower, pointwise_bound(problem))
+            answer = answer._replace(lower=raised_bound(problem, answer.gamma, lower))
         _require_known(plant, problem, answer)
     except (AssumptionError, InfeasibleError, SolverError, CertificateError) as error:
         blamed = _blamed(problem, error)
@@ -375,13 +374,6 @@ class Answer(NamedTuple):
         return self.gamma <= _CLOSE * self.lower
 
 
-def answer_of(plant: StandardPlant, problem: Prepared, method: SynthesisMethod) -> Answer:
-    """Return the answer of one method, verified on the plant."""
-    one = _verified_answer(plant, problem, method, method.solve(problem))
-    known = max(one.lower, pointwise_bound(problem))
-    return one._replace(lower=raised_bound(problem, one.gamma, known))
-
-
 def best_answer(
     plant: StandardPlant,
     problem: Prepared,
@@ -400,25 +392,22 @@ def best_answer(
     lower = pointwise_bound(problem)
     for name, regularised in (("Riccati()", None), ("Riccati(regularised=True)", True)):
         method = Riccati(regularised=regularised, progress=progress)
-        tried[name] = np.inf
+        tried[name], found, known = np.inf, known, None
         try:
-            found = known or method.solve(problem)
-            known = None
+            found = found or method.solve(problem)
+            one = _certified_answer(plant, problem, method, found)
         except FlexplantError as error:
-            if isinstance(error, InfeasibleError) and not answers:
+            if found is None and isinstance(error, InfeasibleError) and not answers:
                 raise
             failures[name] = error
-            continue
-        try:
-            one = _verified_answer(plant, problem, method, found)
-        except FlexplantError as error:
-            failures[name] = error
-            broken.append((method, found))
+            if found is not None:
+                broken.append((method, found))
         else:
             answers.append(one)
             tried[name] = one.gamma
             lower = raised_bound(problem, one.gamma, max(lower, one.lower))
-        if ADDED in found.certificate or any(one.gamma <= _CLOSE * lower for one in answers):
+        added = found is not None and ADDED in found.certificate
+        if added or any(one.gamma <= _CLOSE * lower for one in answers):
             break
     if not answers:
         for tried_method, claimed in broken:
@@ -444,7 +433,7 @@ def _beyond_claim(
     plant: StandardPlant, problem: Prepared, method: SynthesisMethod, found: SolvedController
 ) -> Answer:
     """Return an answer whose norm is only what was verified, with a note."""
-    one = _verified_answer(plant, problem, method, found._replace(gamma=np.inf))
+    one = _certified_answer(plant, problem, method, found._replace(gamma=np.inf))
     note = (
         f"rounding costs {100 * (one.gamma / found.gamma - 1.0):.2g} % of gamma: "
         f"{found.gamma:.6g} was found for the scaled plant, {one.gamma:.6g} verified for this "
@@ -461,27 +450,23 @@ def idle_answer(plant: StandardPlant, problem: Prepared, failure: FlexplantError
     n_u, n_y = len(plant.u), len(plant.y)
     note = f"no feedback (K = 0), which is stable here, because no other was found: {failure}"
     parts = np.zeros((0, 0)), np.zeros((0, n_y)), np.zeros((n_u, 0)), np.zeros((n_u, n_y))
-    K = StateSpace(*parts, plant.system.dt, inputs=plant.y, outputs=plant.u)
-    found = SolvedController(*parts, np.inf, 0.0, {}, (note,))
-    one = _certified_answer(plant, None, found, K.replace(name="hinf", units=plant.units))
+    one = _certified_answer(
+        plant, problem, None, SolvedController(*parts, np.inf, 0.0, {}, (note,))
+    )
     if not np.isfinite(one.gamma):  # the poles are stable by no more than their rounding
         raise CertificateError("the norm of the plant without feedback cannot be verified.")
     return one._replace(lower=min(pointwise_bound(problem), one.gamma))
 
 
-def _verified_answer(
-    plant: StandardPlant, problem: Prepared, method: SynthesisMethod, found: SolvedController
-) -> Answer:
-    K = problem.restored(found.A, found.B, found.C, found.D)
-    return _certified_answer(plant, method, found, K.replace(name="hinf", units=plant.units))
-
-
 def _certified_answer(
     plant: StandardPlant,
+    problem: Prepared,
     method: SynthesisMethod | None,
     found: SolvedController,
-    controller: StateSpace,
 ) -> Answer:
+    """Return what a method found as an answer, its norm verified on the plant."""
+    controller = problem.restored(found.A, found.B, found.C, found.D)
+    controller = controller.replace(name="hinf", units=plant.units)
     loop = lft(plant.system, controller)
     respond = remembered(responder(loop))  # swept twice over the same frequencies
     certificate = certified_norm(loop, found.gamma, respond)

@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import Value, checked, positive
+from ...checks import FloatArray, Value, checked, positive
 from ...errors import (
     AssumptionError,
     FlexplantError,
     InfeasibleError,
     ModelError,
     SolverError,
-    attempted,
 )
-from ...lti.equations import OnAxisError
+from ...lti.equations import OnAxisError, stabilising
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
 from ...lti.preparation import Prepared
 from ...lti.responses import responses
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
+from ...tolerances import ROUNDING, SPLIT
 from ..controller import SolvedController
 from ..synthesis_plants import beyond_rounding
-from .central import central, h2_controller, is_indefinite, riccati_solutions
-from .lower_bound import parrott
+from .lower_bound import is_indefinite, parrott
 from .singular import LEVELS, Regularised, made_regular, missing_ranks, require_ranks
 
 #: distances from the smallest gamma: 5 % of it cost 3 to 5 % of rms and 0.02 of margin; near it
@@ -40,8 +40,9 @@ _QUICK = 0.005
 _BISECTION, _GROWTH = 60, 12
 #: a norm beside that of the least quadratic cost at which nothing is left to gain
 _NOTHING = 1e-9
-#: sensitivity at infinite frequency that is taken for zero
-_ILL_POSED = 1e-6
+#: sensitivity at infinite frequency that is taken for zero; below which a central controller is
+#: taken for one of infinite gain
+_ILL_POSED, _INFINITE = 1e-6, 1e-3
 #: relative: by how much rounding may put a gain above its gamma; what is nothing but rounding
 _SLACK, _ROUNDING = 1e-6, 1e-14
 
@@ -121,7 +122,13 @@ class Riccati(Value):
                 lacking = (str(error).rstrip("."),)
         return made_regular(problem, lambda regular: self._regular(regular, _SINGULAR), lacking)
 
-    def _regular(self, problem: Prepared, back_off: float) -> SolvedController:
+    def _regular(
+        self,
+        problem: Prepared,
+        back_off: float,
+        norm_of: Callable[[Prepared, StateSpace], float] | None = None,
+    ) -> SolvedController:
+        """Return the controller of a regular problem, accepted by some norm of its loop."""
         # the least quadratic cost stabilises: its norm is where the search for less begins
         try:
             least = h2_controller(problem)
@@ -135,37 +142,22 @@ class Riccati(Value):
             )
         if unit <= _ROUNDING * _open_size(problem):  # w reaches nothing in z
             return SolvedController(least.A, least.B, least.C, least.D, 0.0, 0.0)
-        scaled = problem.measured_in(unit)
+        scaled, norm_of = problem.measured_in(unit), norm_of or _loop_norm
         with Progress(_BISECTION, "steps of the bisection", progress=self.progress) as bar:
-            # what the equations promise of a step is seen at the end; where it does not hold there
-            # they are at their rounding, and each step is seen
-            high, low = self._searched(scaled, bar, _stable)
-            controller, norm, held = self._accepted(scaled, high, back_off)
-            if not held:
-                high, low = self._searched(scaled, bar, _below)
-                controller, norm, _ = self._accepted(scaled, high, back_off)
-        if controller is None:  # nothing below it holds
-            controller = least.replace(C=least.C / unit)
-            norm = _loop_norm(scaled, controller)
-        _require_finite_gain(scaled, controller, unit * norm)
+            high, low = self._searched(scaled, bar)
+            K, norm = self._accepted(scaled, high, back_off, norm_of)
+        if K is None:  # nothing below it holds
+            K = least.replace(C=least.C / unit)
+            norm = norm_of(scaled, K)
+        _require_finite_gain(scaled, K, unit * norm)
         return SolvedController(
-            controller.A,
-            controller.B,
-            unit * controller.C,
-            unit * controller.D,
-            unit * norm,
-            unit * min(low, norm),
+            K.A, K.B, unit * K.C, unit * K.D, unit * norm, unit * min(low, norm)
         )
 
-    def _searched(
-        self,
-        problem: Prepared,
-        bar: Progress,
-        holds: Callable[[Prepared, StateSpace, float], bool],
-    ) -> tuple[float, float]:
+    def _searched(self, problem: Prepared, bar: Progress) -> tuple[float, float]:
         """Return the smallest gamma that bisection reached from 1, and the largest refuted one.
 
-        One is reached where there is a controller, whose loop `holds` for it.
+        Reached: what the equations promise of a step is seen at the resonances of its loop.
         """
         high = 1.0
         low = tried = min(_direct_bound(problem), high)
@@ -173,34 +165,34 @@ class Riccati(Value):
             if high <= tried * (1.0 + self.tolerance) or high < _NOTHING:
                 break
             middle = float(np.sqrt(max(tried, 1e-2 * high) * high))
-            attempt = _attempt(problem, middle)
+            K, refuted = _attempt(problem, middle)
             bar.advance()
-            K = attempt.controller
-            if K is not None and holds(problem, K, middle):
+            if K is not None and _resonance_gain(problem, K) <= middle * (1.0 + _SLACK):
                 high = middle
                 continue
             tried = middle
-            if attempt.refuted:
+            if refuted:
                 low = middle
         return high, low
 
     def _accepted(
-        self, problem: Prepared, high: float, back_off: float
-    ) -> tuple[StateSpace | None, float, bool]:
-        """Return the backed-off controller with the norm of its loop, going up until it holds.
-
-        And whether it held at once.
-        """
+        self,
+        problem: Prepared,
+        high: float,
+        back_off: float,
+        norm_of: Callable[[Prepared, StateSpace], float],
+    ) -> tuple[StateSpace | None, float]:
+        """Return the backed-off controller with the norm of its loop, going up until it holds."""
         step = back_off if self.back_off is None else self.back_off
-        for number in range(_GROWTH):
+        for _ in range(_GROWTH):
             gamma = high * (1.0 + step)
             controller = _attempt(problem, gamma).controller
             if controller is not None:
-                norm = _loop_norm(problem, controller)
+                norm = norm_of(problem, controller)
                 if norm <= gamma * (1.0 + _SLACK):
-                    return controller, norm, number == 0
+                    return controller, norm
             step = max(2.0 * step, self.tolerance)
-        return None, 1.0, False
+        return None, 1.0
 
 
 def quick_answer(problem: Prepared) -> SolvedController:
@@ -209,26 +201,11 @@ def quick_answer(problem: Prepared) -> SolvedController:
     Where ranks are missing with the most noise and effort that `made_regular` adds; gains are seen
     at resonances alone.
     """
-    regular = Regularised(problem, LEVELS[0]) if missing_ranks(problem) else None
-    given = problem if regular is None else regular.problem
-    least = h2_controller(given)
-    unit = _resonance_gain(given, least)
-    if not np.isfinite(unit):
-        raise SolverError("no controller of least quadratic cost stabilises in rounding.")
-    scaled, K = given.measured_in(unit), None
-    step = _REGULAR if regular is None else _SINGULAR
-    with Progress(_BISECTION, "steps of the bisection", progress=False) as bar:
-        high = Riccati(tolerance=_QUICK)._searched(scaled, bar, _below)[0]
-    for _ in range(_GROWTH):
-        gamma = high * (1.0 + step)
-        K = _attempt(scaled, gamma).controller
-        if K is not None and _resonance_gain(scaled, K) <= gamma * (1.0 + _SLACK):
-            break
-        K, step = None, 2.0 * step
-    K, gain = (least, 1.0) if K is None else (K, unit)
-    found = SolvedController(K.A, K.B, gain * K.C, gain * K.D, unit * high, 0.0)
-    if regular is None:
-        return found
+    quick = Riccati(tolerance=_QUICK, progress=False)
+    if not missing_ranks(problem):
+        return quick._regular(problem, _REGULAR, _resonance_gain)
+    regular = Regularised(problem, LEVELS[0])
+    found = quick._regular(regular.problem, _SINGULAR, _resonance_gain)
     return SolvedController(*regular.restored(found), found.gamma, 0.0)
 
 
@@ -290,18 +267,6 @@ def _resonance_gain(problem: Prepared, controller: StateSpace) -> float:
     return max(float(gains.max()), float(np.linalg.norm(loop.D, 2)))
 
 
-def _below(problem: Prepared, controller: StateSpace, gamma: float) -> bool:
-    """Return whether the gains of the loop at its resonances are below gamma."""
-    return _resonance_gain(problem, controller) <= gamma * (1.0 + _SLACK)
-
-
-def _stable(problem: Prepared, controller: StateSpace, _gamma: float) -> bool:
-    """Return whether the loop is stable."""
-    with attempted("a loop of the bisection"):
-        return bool(lft(problem.system, controller).is_stable)
-    return False
-
-
 class _Attempt(NamedTuple):
     """The central controller for a gamma; without one: whether gamma is refuted for good."""
 
@@ -332,3 +297,123 @@ def _attempt(problem: Prepared, gamma: float) -> _Attempt:
         return _Attempt(central(problem, gamma, X, F, Y, H))
     except (la.LinAlgError, FlexplantError):
         return _Attempt(None)
+
+
+# The formulas of Glover and Doyle: for prepared problems, D12 = [0; I] and D21 = [0, I]
+
+
+def riccati_solutions(
+    p: Prepared, gamma: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return X, F, Y, H of Glover and Doyle's two Riccati equations."""
+    m1, m2, p1, p2 = p.B1.shape[1], p.B2.shape[1], p.C1.shape[0], p.C2.shape[0]
+    B, C = np.hstack([p.B1, p.B2]), np.vstack([p.C1, p.C2])
+    row, column = np.hstack([p.D11, p.D12]), np.vstack([p.D11, p.D21])
+    R = row.T @ row - la.block_diag(gamma**2 * np.eye(m1), np.zeros((m2, m2)))
+    Rt = column @ column.T - la.block_diag(gamma**2 * np.eye(p1), np.zeros((p2, p2)))
+    X, F = stabilising(p.A, B, p.C1.T @ p.C1, R, p.C1.T @ row)
+    Y, Ht = stabilising(p.A.T, C.T, p.B1 @ p.B1.T, Rt, p.B1 @ column.T)
+    return X, F, Y, Ht.T
+
+
+def central(
+    p: Prepared, gamma: float, X: FloatArray, F: FloatArray, Y: FloatArray, H: FloatArray
+) -> StateSpace:
+    """Return a controller of Glover and Doyle for ||w -> z|| < gamma: central unless D22 forbids.
+
+    Their normalisation is D12 = [0; I], D21 = [0, I]; D11 is partitioned accordingly. All
+    controllers are F_l(K, Q) with ||Q|| < gamma, the central one has Q = 0. It may need infinite
+    gain once D22 is put back (where D12 and D21 are square it makes the sensitivity zero at
+    infinite frequency); then Q is a constant that keeps I + D22 K away from singular.
+    """
+    m1, m2, p1, p2 = p.B1.shape[1], p.B2.shape[1], p.C1.shape[0], p.C2.shape[0]
+    B = np.hstack([p.B1, p.B2])
+    F12, F2 = F[m1 - p2 : m1], F[m1:]
+    H12, H2 = H[:, p1 - m2 : p1], H[:, p1:]
+    D11, D12 = p.D11[: p1 - m2, : m1 - p2], p.D11[: p1 - m2, m1 - p2 :]
+    D21, D22 = p.D11[p1 - m2 :, : m1 - p2], p.D11[p1 - m2 :, m1 - p2 :]
+    inner = np.linalg.solve(gamma**2 * np.eye(p1 - m2) - D11 @ D11.T, D12)
+    outer = np.linalg.solve(gamma**2 * np.eye(m1 - p2) - D11.T @ D11, D21.T)
+    Dk = -D21 @ D11.T @ inner - D22
+    Dk12 = la.cholesky(np.eye(m2) - D21 @ outer, lower=True)
+    Dk21 = la.cholesky(np.eye(p2) - D12.T @ inner)
+    Z = np.linalg.inv(np.eye(p.A.shape[0]) - Y @ X / gamma**2)
+    C2k = -Dk21 @ (p.C2 + F12)
+    B2k = Z @ (p.B2 + H12) @ Dk12
+    Q = gamma * _contraction(np.eye(p2) + p.D22 @ Dk, p.D22 @ Dk12, Dk21)
+    B1k = -Z @ H2 + Z @ (p.B2 + H12) @ Dk
+    C1k = F2 + Dk @ np.linalg.solve(Dk21, C2k)
+    Ak = p.A + B @ F + B1k @ np.linalg.solve(Dk21, C2k)
+    return StateSpace(
+        Ak + B2k @ Q @ C2k,
+        B1k + B2k @ Q @ Dk21,
+        C1k + Dk12 @ Q @ C2k,
+        Dk + Dk12 @ Q @ Dk21,
+        inputs=p.y,
+        outputs=p.u,
+    )
+
+
+def _contraction(M: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return Q, zero or of norm 1/2, that lifts the small singular values of M + left Q right."""
+    U, sizes, Vt = la.svd(M)
+    small = sizes < _INFINITE
+    pull = left.T @ U[:, small] @ Vt[small] @ right.T
+    W, gains, Xt = la.svd(pull, full_matrices=False)
+    reached = gains > ROUNDING * np.max(gains, initial=0.0)
+    return np.asarray(0.5 * W[:, reached] @ Xt[reached])
+
+
+#: what an undamped mode lacks, and what to do about it
+_MISSED = {
+    "z": "z does not feel all that u moves at {}: an undamped (rigid-body or integrating) mode "
+    "there is left out of z, or u -> z (a weight) has a zero there. Keep that motion in z with a "
+    "weight of finite gain, or give it damping.",
+    "w": "w does not excite all that y sees at {}: an undamped (rigid-body or integrating) mode "
+    "there has no disturbance, or w -> y (a weight) has a zero there. Add a disturbance that "
+    "reaches it, or give it damping.",
+}
+
+
+@contextmanager
+def _missed_by(p: Prepared, side: str) -> Iterator[None]:
+    """Say of an eigenvalue on the axis which mode z or w misses."""
+    try:
+        yield
+    except OnAxisError as found:
+        omega = float(np.min(found.omega))
+        # a double pole at zero comes out of rounding beside it
+        freq = p.frequency(omega if omega > 1e-6 else 0.0)
+        raise AssumptionError(_MISSED[side].format(f"{freq:.3g} Hz")) from found
+
+
+def require_shown(p: Prepared) -> None:
+    """Raise AssumptionError when z or w misses an undamped mode, whatever D12 and D21 are."""
+    with _missed_by(p, "z"):
+        _require_full_columns(p.A, p.B2, p.C1, p.D12)
+    with _missed_by(p, "w"):
+        _require_full_columns(p.A.T, p.C2.T, p.B1.T, p.D21.T)
+
+
+def h2_controller(p: Prepared) -> StateSpace:
+    """Return the controller of least H2 norm, feedthrough apart (gamma without bound)."""
+    rows, columns = p.B2.shape[1], p.C2.shape[0]
+    require_shown(p)
+    with _missed_by(p, "z"):
+        _, F = stabilising(p.A, p.B2, p.C1.T @ p.C1, np.eye(rows), p.C1.T @ p.D12)
+    with _missed_by(p, "w"):
+        _, Ht = stabilising(p.A.T, p.C2.T, p.B1 @ p.B1.T, np.eye(columns), p.B1 @ p.D21.T)
+    A, D = p.A + p.B2 @ F + Ht.T @ p.C2, np.zeros((rows, columns))
+    return StateSpace(A, -Ht.T, F, D, inputs=p.y, outputs=p.u)
+
+
+def _require_full_columns(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> None:
+    """Raise OnAxisError when [A - s I, B; C, D] loses rank at an undamped pole s of A."""
+    # of the Hamiltonian four eigenvalues meet at a rigid-body mode, spread by rounding over 1e-4
+    poles = np.linalg.eigvals(A)
+    size = float(np.linalg.norm(A, 2)) if A.size else 0.0
+    near = poles[np.abs(poles.real) <= SPLIT * size]
+    for omega in np.unique(np.where(np.abs(near) < SPLIT * size, 0.0, np.abs(near.imag))):
+        pencil = np.block([[A - 1j * omega * np.eye(A.shape[0]), B], [C, D]])
+        if la.svdvals(pencil)[-1] < ROUNDING * size:
+            raise OnAxisError(np.array([omega]))

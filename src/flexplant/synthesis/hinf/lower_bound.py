@@ -16,7 +16,6 @@ from ...lti.responses import responses
 from ...lti.roots import axis_zeros
 from ...lti.statespace import StateSpace
 from ...tolerances import divisor
-from .central import is_indefinite
 
 #: points of the sweep, and times that it is refined
 _POINTS, _REFINEMENTS = 200, 2
@@ -247,3 +246,10 @@ def _refuted(sides: tuple[FullInformation, FullInformation], gamma: float) -> bo
         return False
     coupling = float(np.max(la.eigvals(values[0] @ values[1]).real, initial=0.0))
     return coupling > gamma**2 * (1.0 + _BEYOND)
+
+
+def is_indefinite(X: FloatArray, size: float) -> bool:
+    """Return whether X has a negative eigenvalue beyond rounding; size is what X comes from."""
+    values = la.eigvalsh(X) if X.size else np.zeros(1)
+    # an accurate X to 1e-6 of its size (the residual), and beyond what its equation rounds
+    return bool(values[0] < -1e-5 * max(values[-1], -values[0]) and values[0] < -1e-9 * size)

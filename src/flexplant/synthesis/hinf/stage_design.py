@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,6 @@ from ...errors import (
 from ...loop import ClosedLoop, close_loop
 from ...loop.other_machines import BEYOND, mode_tolerances
 from ...lti.interconnection import series
-from ...lti.joining import equal_matrices
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ...plant import (
@@ -34,7 +34,7 @@ from ...plant.larger_plant import damped_less, draws_with_left_out
 from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import Controller, with_left_out
-from .hinf_design import Solved, tolerant, tolerant_system
+from .hinf_design import evened, tolerant, tolerant_system
 from .hinf_riccati import Riccati
 
 #: |S| crosses 1 at about two thirds of the bandwidth of these weights, which bound the efforts
@@ -187,45 +187,46 @@ class _StageTask:
         weighted = self.through.weighted(z=weights.z, w=weights.w)
         self.tried[bandwidth], damped = 0.0, None
         for factor in _DAMPED:
-            now = self._below(factor * bandwidth)
+            now = int(np.count_nonzero(self._frequencies < factor * bandwidth))
             if now == damped:
                 break
             damped = now
-            one = _StageTry(bandwidth, weighted, factor * bandwidth)
-            found = self._designed(one)
-            if found is None:
+            one = self._designed(bandwidth, weighted, factor * bandwidth)
+            if one is None:
                 continue
-            system, solved = found
-            margin, drawn = self._judged(system)
+            margin, drawn = self._judged(one.system)
             if margin < self.margin:  # of the model itself: more damping is no cure
                 self.tried[bandwidth] = max(self.tried[bandwidth], margin)
                 break
             if drawn >= _KEPT * self.margin:
                 self.tried[bandwidth] = margin
                 if self.best is None or bandwidth > self.best.bandwidth:
-                    self.best = one._replace(system=system, drawn=drawn, solved=solved)
+                    self.best = one._replace(drawn=drawn)
                 return True
         return False
 
-    def _designed(self, one: _StageTry) -> tuple[StateSpace, Solved | None] | None:
+    def _designed(
+        self, bandwidth: float, weighted: StandardPlant, damped_below: float
+    ) -> _StageTry | None:
         """Return a controller, from the other methods where the first finds none."""
+        known = self.uncertain
         with attempted(
-            f"one Riccati method for {one.bandwidth:.4g} Hz",
+            f"one Riccati method for {bandwidth:.4g} Hz",
             (SolverError, InfeasibleError, CertificateError),
         ):
-            return tolerant_system(one.weighted, self.uncertain, one.damped_below)
+            system, given = tolerant_system(weighted, known, damped_below)
+            return _StageTry(
+                bandwidth, system, partial(tolerant, weighted, given, known, Riccati())
+            )
         try:
-            found = tolerant(one.weighted, self.uncertain, damped_below=one.damped_below)
-            return found.system, None
+            given = evened(weighted, known, damped_below=damped_below)
+            found = tolerant(weighted, given, known)
+            return _StageTry(bandwidth, found.system, lambda: found)
         except (AssumptionError, ModelError):
             raise
         except FlexplantError as error:
-            self.failures[one.bandwidth] = error
+            self.failures[bandwidth] = error
             return None
-
-    def _below(self, freq: float) -> int:
-        """Return how many modes of uncertain frequency lie below one [Hz]."""
-        return int(np.count_nonzero(self._frequencies < freq))
 
     def _judged(self, system: StateSpace) -> tuple[float, float]:
         """Return the modulus margin of a controller, and the least with its modes off.
@@ -306,18 +307,10 @@ class _StageTask:
                 "on machines drawn. Measure their poles, lower margin=, or move the actuators."
                 + (f" ({causes})" if causes else "")
             )
-        best, drawn = self.best, self.best.drawn
-        options: dict[str, Any] = {"damped_below": best.damped_below}
-        found = tolerant(best.weighted, self.uncertain, **options, solved=best.solved)
-        if best.system is None or not equal_matrices(found.system, best.system):
-            # a better answer than that of one Riccati method: it must hold as well
-            margin, drawn = self._judged(found.system)
-            if margin < self.margin or drawn < _KEPT * self.margin:
-                found = tolerant(best.weighted, self.uncertain, Riccati(), **options)
-                drawn = best.drawn
+        found = self.best.verified()
         certificate = dict(found.certificate or {}) | {
-            f"least modulus margin of {_DRAWS} machines drawn": drawn,
-            "weights for Hz": best.bandwidth,
+            f"least modulus margin of {_DRAWS} machines drawn": self.best.drawn,
+            "weights for Hz": self.best.bandwidth,
         }
         return found.replace(
             system=self._block(found.system),
@@ -329,14 +322,12 @@ class _StageTask:
 
 
 class _StageTry(NamedTuple):
-    """Weights of a bandwidth [Hz], the controller for them, and the machines' least margin."""
+    """The controller for the weights of a bandwidth [Hz], and the machines' least margin."""
 
     bandwidth: float
-    weighted: StandardPlant
-    damped_below: float
-    system: StateSpace | None = None
+    system: StateSpace
+    verified: Callable[[], Controller]
     drawn: float = 0.0
-    solved: Solved | None = None
 
 
 class _Drawn:
