@@ -16,6 +16,7 @@ from ...lti.interconnection import lft
 from ...lti.responses import points, responder
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
+from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import RANK, TINY
 from ..robustness.uncertainty_blocks import FullBlock, Place, block_places, osborne
@@ -67,6 +68,11 @@ class ModeChannel(Value):
             root = np.sqrt(2.0 * self.theta)
             shift = -self.theta, root, -self.c * root * size, self.c * size
         return self.h / self.D, self.D * self.v * size, *shift
+
+    def shift(self, z: ComplexArray, dt: float) -> ComplexArray:
+        """Return the all-pass at points, before it is scaled."""
+        *_, a, b, c, d = self.parts(dt)
+        return np.asarray((d + b * c / (z - a)) * np.hypot(1.0, self.c))
 
 
 def mode_channels(
@@ -155,8 +161,7 @@ def _moved_by_force(pair: FloatArray, dt: float) -> tuple[FloatArray, FloatArray
 
 def _pole(pair: FloatArray) -> tuple[float, float]:
     """Return the frequency [rad/s] and damping ratio of a mode."""
-    omega = float(np.sqrt(np.linalg.det(pair)))
-    zeta = -0.5 * float(np.trace(pair)) / omega
+    omega, zeta = (float(found[0]) for found in natural(pair[None]))
     if not 0.0 < zeta < 1.0:
         raise AssumptionError(
             f"a mode of uncertain frequency has the damping ratio {zeta:.3g}: its resonance must "
@@ -252,7 +257,7 @@ class ModeLoop:
         freq = np.union1d(resonance_grid(loop.poles(), loop.dt), _swept(channels, times, loop.dt))
         z = points(loop, freq)
         M: ComplexArray = np.moveaxis(responder(part)(freq), 2, 0).copy()
-        shift = np.array([_shift(one, z, loop.dt) for one in channels]).T
+        shift = np.array([one.shift(z, loop.dt) for one in channels]).T
         M[:, :m] *= np.hypot(1.0, [one.c for one in channels])[:, None]
         M[:, range(m), range(m)] -= shift
         blocks = [FullBlock(1, 1) for _ in channels]
@@ -312,11 +317,3 @@ def _swept(channels: Sequence[ModeChannel], times: float, dt: float) -> FloatArr
         found.append(freq * (1.0 + reach * np.linspace(-1.0, 1.0, 2 * count + 1)))
     whole = np.concatenate(found)
     return np.asarray(whole[whole < 0.5 / dt] if dt else whole)
-
-
-def _shift(one: ModeChannel, z: ComplexArray, dt: float) -> ComplexArray:
-    """Return the all-pass at points, before it is scaled."""
-    if not dt:
-        return np.asarray(one.c * (z - one.theta) / (z + one.theta))
-    a = (1.0 - np.sin(one.theta)) / np.cos(one.theta)
-    return np.asarray(-one.c * (1.0 - a * z) / (z - a))

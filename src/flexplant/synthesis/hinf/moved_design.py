@@ -44,15 +44,13 @@ def over_positions(
     ... + (B + delta dB) u``, whose size and scale are searched.
     """
     moving = PlantRange.of(given)
-    search = _Search(moving, design)
-    mean = _mean_plant(moving)
-    motion = _MotionChannels(moving, mean)
+    search, motion = _Search(moving, design), _MotionChannels(moving)
     with Progress(_MOST, _DESIGNS, progress=progress):
-        first = search.tried_with("the mean plant", mean)
-        middle = len(moving.plants) // 2
-        for i in sorted({0, middle, len(moving.plants) - 1}):
+        first = search.tried_with("the mean plant", motion.mean)
+        last = len(moving.plants) - 1
+        for i in sorted({0, len(moving.plants) // 2, last}):
             search.tried_with(f"the plant at {moving.places[i]:.4g}", moving.plants[i])
-        if motion.moves and first is not None:
+        if motion.scales.size and first is not None:
             motion.even(first.system)
             search.over_channels(motion)
         return search.answer()
@@ -76,7 +74,7 @@ class _Search:
         found, worst = None, np.inf
         with attempted(f"the design for {name}"):
             found = self.design(plant)
-            worst = max(_norms(self.moving, found.system, self.least))
+            worst = _worst_norm(self.moving, found.system, self.least)
             if worst < self.least:
                 self.best = found
         self.tried[name] = worst
@@ -87,12 +85,11 @@ class _Search:
         """Halve or double the scale of the channels, then their size, while that helps."""
         point = (1.0, _SIZE)
         value = self._at(motion, point)
-        for axis in (0, 1):
+        for axis in ((1, 0), (0, 1)):
             for factor in (0.5, 2.0):
                 start = point
                 for _ in range(_STEPS):
-                    new = (point[0] * factor, point[1]) if axis == 0 else (
-                        point[0], point[1] * factor)  # fmt: skip
+                    new = point[0] * factor ** axis[0], point[1] * factor ** axis[1]
                     reached = self._at(motion, new)
                     if not reached < value:
                         break
@@ -131,37 +128,29 @@ class _Search:
         )
 
 
-def _mean_plant(moving: PlantRange) -> StandardPlant:
-    """Return the plant with the mean matrices."""
-    systems = [one.system for one in moving.plants]
-    mixed = {m: np.mean([getattr(g, m) for g in systems], axis=0) for m in "ABCD"}
-    first = moving.plants[0]
-    sides = {side: getattr(first, side) for side in "wuzy"}
-    return StandardPlant.from_statespace(systems[0].replace(**mixed, blocks=None), **sides)
-
-
 class _MotionChannels:
     """How rows and columns of the plant change over the range, and channels for it."""
 
-    def __init__(self, moving: PlantRange, mean: StandardPlant) -> None:
-        self.mean = mean
+    def __init__(self, moving: PlantRange) -> None:
+        first, systems = moving.plants[0], [one.system for one in moving.plants]
+        mixed = {m: np.mean([getattr(g, m) for g in systems], axis=0) for m in "ABCD"}
+        #: the plant with the mean matrices
+        self.mean = StandardPlant.from_statespace(
+            systems[0].replace(**mixed, blocks=None),
+            **{side: getattr(first, side) for side in "wuzy"},
+        )
         x = moving.places - 0.5 * (moving.places[0] + moving.places[-1])
         x = x / (np.abs(x).max() or 1.0)
-        g = mean.system
+        g = self.mean.system
         power = float(x @ x) or 1.0
         dC, dB = (
-            np.sum([t * (getattr(one.system, m) - getattr(g, m))
-                    for t, one in zip(x, moving.plants, strict=True)], axis=0) / power
+            np.sum([t * (getattr(one, m) - getattr(g, m))
+                    for t, one in zip(x, systems, strict=True)], axis=0) / power
             for m in "CB"
         )  # fmt: skip
         self.rows, self.columns = _changed_rows(dC, g.C), _changed_rows(dB.T, g.B.T)
         self.dC, self.dB = dC[self.rows], dB[:, self.columns]
         self.scales = np.ones(self.rows.size + self.columns.size)
-
-    @property
-    def moves(self) -> bool:
-        """Whether anything does."""
-        return self.scales.size > 0
 
     def channels(self, scale: float, size: float) -> StandardPlant:
         """Return the mean plant with a disturbance and an output for each row and column."""
@@ -188,8 +177,6 @@ class _MotionChannels:
     def even(self, K: StateSpace) -> None:
         """Scale each channel so that, in closed loop, w reaches it as it reaches z."""
         k = self.scales.size
-        if not k:
-            return
         loop = lft(self.channels(1.0, 1.0).system, K)
         freq = resonance_grid(loop.poles(), loop.dt, points=300)
         T = frequency_response(loop, freq).data
@@ -205,19 +192,22 @@ def _changed_rows(change: FloatArray, rows: FloatArray) -> Any:
     return np.flatnonzero(size > _STILL * np.abs(rows).max(axis=1, initial=0.0))
 
 
-def _norms(moving: PlantRange, K: StateSpace, least: float) -> list[float]:
-    """Return norms at the positions, the ends first, until one is above what is known."""
+def _worst_norm(moving: PlantRange, K: StateSpace, least: float) -> float:
+    """Return the largest norm at the positions, the ends first, until one is above what is known.
+
+    Infinite where a loop is not stable.
+    """
     order = sorted(range(len(moving.plants)), key=lambda i: -abs(2 * i - len(moving.plants) + 1))
     plants = [moving.plants[i] for i in order] + [moving.at(x) for x in moving.middles.tolist()]
-    found: list[float] = []
+    worst = 0.0
     for one in plants:
         try:
-            found.append(_position_norm(one, K))
+            worst = max(worst, _position_norm(one, K))
         except FlexplantError:
-            found.append(np.inf)
-        if found[-1] > least:
+            return np.inf
+        if worst > least:
             break
-    return found
+    return worst
 
 
 def _position_norm(plant: StandardPlant, K: StateSpace) -> float:

@@ -28,7 +28,7 @@ from ..controller import Controller, with_left_out
 from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati
-from ..lmi.lmi_solution import Plant
+from ..lmi.lmi_programs import Plant
 from ..structured.judges import require_finite_h2
 from ..synthesis_plants import require_stabilisable
 from .lmis import ObjectivePrograms

@@ -12,8 +12,14 @@ import numpy as np
 from ...errors import SolverError
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
-from ..lmi.lmi_programs import modelling, solve_program, symmetric_blocks
-from ..lmi.lmi_solution import Matrices, Plant, changed_back
+from ..lmi.lmi_programs import (
+    Matrices,
+    Plant,
+    changed_back,
+    modelling,
+    solve_program,
+    symmetric_blocks,
+)
 from .specifications import H2, PeakGain, PoleRegion
 
 #: strictness of the inequalities, relative to unit scale

@@ -167,21 +167,10 @@ def robust_stability(
     Examples
     --------
     >>> import flexplant as fx
-    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5])
-    >>> modes = fx.solve_modes(model, count=2, damping=fx.ModalDamping(0.02))
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x"]))
-    >>> spread = [[1.0, 0.0], [0.0, 4.0]]
-    >>> measured = fx.MeasuredModes(poles=[-17 + 890j], modes=[2], covariance=spread)
-    >>> fit = fx.update(drawing, [fx.AddedMass("2:x")], [fx.Eigenvalues(measured)])
-    >>> ports = fx.Ports(
-    ...     w=[fx.Disturbance("d", "1:x", "x", asd=1e-3)],
-    ...     u=[fx.Actuator("u1", "1:x", "x")],
-    ...     z=[fx.Poi("tip", "2:x", ("x",))],
-    ...     y=[fx.Sensor("y1", "1:x", "x", asd=1e-9)],
-    ... )
-    >>> plant = fx.assemble_plant(fit.model, ports)
+    >>> plant = fx.testbeds.three_masses(rate=None)
     >>> lead = -1e3 * fx.lti.tf([0.05, 1.0], [0.002, 1.0]).replace(inputs=["y1"], outputs=["u1"])
-    >>> fx.synthesis.robust_stability(plant.uncertain(fit), lead, machines=3).is_robust
+    >>> uncertain = plant.uncertain(frequency=0.01)
+    >>> fx.synthesis.robust_stability(uncertain, lead, machines=3).is_robust
     True
     """
     count = whole(machines, "machines", minimum=0, maximum=MOST)
@@ -396,22 +385,10 @@ def worst_case_gain(
     Examples
     --------
     >>> import flexplant as fx
-    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5])
-    >>> modes = fx.solve_modes(model, count=2, damping=fx.ModalDamping(0.02))
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x"]))
-    >>> spread = [[1.0, 0.0], [0.0, 4.0]]
-    >>> measured = fx.MeasuredModes(poles=[-17 + 890j], modes=[2], covariance=spread)
-    >>> fit = fx.update(drawing, [fx.AddedMass("2:x")], [fx.Eigenvalues(measured)])
-    >>> ports = fx.Ports(
-    ...     w=[fx.Disturbance("d", "1:x", "x", asd=1e-3)],
-    ...     u=[fx.Actuator("u1", "1:x", "x")],
-    ...     z=[fx.Poi("tip", "2:x", ("x",))],
-    ...     y=[fx.Sensor("y1", "1:x", "x", asd=1e-9)],
-    ... )
-    >>> plant = fx.assemble_plant(fit.model, ports)
+    >>> plant = fx.testbeds.three_masses(rate=None)
     >>> lead = -1e3 * fx.lti.tf([0.05, 1.0], [0.002, 1.0]).replace(inputs=["y1"], outputs=["u1"])
-    >>> uncertain = plant.uncertain(fit)
-    >>> found = fx.synthesis.worst_case_gain(uncertain, lead, w=["d"], z=["tip:x"])
+    >>> uncertain = plant.uncertain(frequency=0.01)
+    >>> found = fx.synthesis.worst_case_gain(uncertain, lead, w=["amp"], z=["die:x"])
     >>> found.nominal <= found.lower <= found.upper
     True
     """
