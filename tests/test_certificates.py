@@ -306,7 +306,7 @@ def test_a_wrong_answer_is_refused(what, monkeypatch):
 
 def test_a_loop_is_held_to_each_objective():
     """`design_lmi` computes what it reached from the loop: a norm and a region not kept."""
-    design = import_module("flexplant.synthesis.objectives.design")
+    design = import_module("flexplant.synthesis.lmi.objective_design")
     plant, found = problem(), fx.design_hinf(problem())
     norm = fx.synthesis.Hinf(below=0.9 * found.gamma)
     with pytest.raises(CertificateError, match="in the closed loop"):

@@ -12,8 +12,8 @@ from flexplant.errors import AssumptionError, InfeasibleError, LabelError, Model
 from flexplant.lti import StateSpace, lft
 from flexplant.lti.discretisation import held_exactly
 from flexplant.synthesis import H2, Hinf, PeakGain, PoleRegion, design_lmi
-from flexplant.synthesis.objectives.design import _balanced_plant
-from flexplant.synthesis.objectives.lmis import ObjectivePrograms, damped, within
+from flexplant.synthesis.lmi.objective_design import _balanced_plant
+from flexplant.synthesis.lmi.objectives import ObjectivePrograms, damped, within
 
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,7 @@ import flexplant as fx
 from flexplant.errors import AssumptionError, InfeasibleError
 from flexplant.lti import StateSpace
 from flexplant.synthesis import H2, FixedOrder, Hinf, PeakGain, PoleRegion
-from flexplant.synthesis.objectives.design import require_reachable
+from flexplant.synthesis.lmi.objective_design import require_reachable
 from oracles_lmi import output_feedback_gamma
 
 DESIGNS = {

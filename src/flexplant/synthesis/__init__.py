@@ -70,11 +70,11 @@ from .laws.servo_design import design_servo as design_servo
 from .laws.servo_design import servo_bandwidth as servo_bandwidth
 from .laws.tune import tune_loops as tune_loops
 from .lmi.lmi_programs import Lmi as Lmi
-from .objectives.design import design_lmi as design_lmi
-from .objectives.specifications import H2 as H2
-from .objectives.specifications import Hinf as Hinf
-from .objectives.specifications import PeakGain as PeakGain
-from .objectives.specifications import PoleRegion as PoleRegion
+from .lmi.objective_design import design_lmi as design_lmi
+from .lmi.objectives import H2 as H2
+from .lmi.objectives import Hinf as Hinf
+from .lmi.objectives import PeakGain as PeakGain
+from .lmi.objectives import PoleRegion as PoleRegion
 from .robustness.dk import design_mu as design_mu
 from .robustness.guarantees import RobustStability as RobustStability
 from .robustness.guarantees import WorstCaseGain as WorstCaseGain

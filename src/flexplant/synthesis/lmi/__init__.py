@@ -1,1 +1,1 @@
-"""H-infinity by linear matrix inequalities."""
+"""Controllers by linear matrix inequalities: H-infinity, and several objectives at once."""

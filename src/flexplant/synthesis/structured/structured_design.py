@@ -25,7 +25,7 @@ from ..controller import (
     required_stability,
     with_left_out,
 )
-from ..objectives.specifications import H2, Hinf
+from ..lmi.objectives import H2, Hinf
 from ..synthesis_plants import PlantRange, require_stabilisable
 from .judges import DECAY, GainJudge, Judge, LoopObjective, Matrices, ScaledLoop
 from .nonsmooth import Pieces, bfgs, decrease_left, joined_pieces, minimax

@@ -28,11 +28,10 @@ from ..controller import Controller, with_left_out
 from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati
-from ..lmi.lmi_programs import Plant
 from ..structured.judges import require_finite_h2
 from ..synthesis_plants import require_stabilisable
-from .lmis import ObjectivePrograms
-from .specifications import H2, Hinf, PeakGain, PoleRegion
+from .lmi_programs import Plant
+from .objectives import H2, Hinf, ObjectivePrograms, PeakGain, PoleRegion
 
 #: what a verified norm may exceed its bound by
 _EXCESS = 1e-3

@@ -1,1 +1,0 @@
-"""Several objectives for one controller: specifications as values, and their LMIs."""
