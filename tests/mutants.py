@@ -69,7 +69,7 @@ LINES = [
      "/ cost"),
     ("modes/matching.py", "** 2 / sizes",
      "/ sizes"),
-    ("modes/attachment_vectors.py", "response = response - phi @",
+    ("modes/statics.py", "response = response - phi @",
      "response = response - 0.0 * phi @"),
     ("joining/frf_coupling.py", "between, weighted.conj())",
      "between, weighted)"),

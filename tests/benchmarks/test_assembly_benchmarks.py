@@ -13,7 +13,7 @@ import scipy.sparse.linalg as spla
 
 from flexplant.labels import DofSet
 from flexplant.structure import FEModel, Rib, Spring, kirchhoff_plate, solid_block
-from flexplant.structure.mesh.element_matrices import Grid, plate_mass, plate_stiffness
+from flexplant.structure.element_matrices import Grid, plate_mass, plate_stiffness
 from plates import PLATE, make_plate
 
 pytestmark = pytest.mark.benchmark

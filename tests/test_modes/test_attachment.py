@@ -7,7 +7,7 @@ import scipy.sparse as sp
 import oracles_structure as oracle
 from flexplant.errors import LabelError, ModelError
 from flexplant.modes import solve_modes
-from flexplant.modes.attachment_vectors import attachment_vectors, static_response
+from flexplant.modes.statics import attachment_vectors, static_response
 from flexplant.structure import FEModel, ModalDamping, Rayleigh
 from plates import make_plate
 

@@ -6,7 +6,7 @@ import pytest
 from flexplant.loop import ClosedLoop, close_loop
 from flexplant.loop.budget import white_noise
 from flexplant.lti import StateSpace
-from flexplant.lti.recursion import Recursion
+from flexplant.lti.discretisation import Recursion
 from flexplant.plant import StandardPlant
 from flexplant.simulation.runs import InBlocks, SampleBySample, make_runner
 from machines import observer, servo, stage

@@ -10,9 +10,13 @@ from hypothesis import strategies as st
 import meshes
 from flexplant.errors import SolverError
 from flexplant.sparse import ordering
-from flexplant.sparse.factor import is_positive_definite, lowest_eigenvalue_bound
+from flexplant.sparse.factor import (
+    ComplexSymmetricFactor,
+    MultifrontalCholesky,
+    is_positive_definite,
+    lowest_eigenvalue_bound,
+)
 from flexplant.sparse.lowest import SignedFactor, multifrontal_inertia
-from flexplant.sparse.multifrontal import ComplexSymmetricFactor, MultifrontalCholesky
 from flexplant.sparse.ordering import dissect
 
 

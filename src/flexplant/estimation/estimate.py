@@ -23,9 +23,9 @@ from ..checks import (
     sizes_of,
 )
 from ..errors import LabelError, SolverError, counted, unknown_label, warn
+from ..lti.discretisation import Recursion
 from ..lti.equations import scale_of
 from ..lti.lyapunov import solve_stein
-from ..lti.recursion import Recursion
 from ..parallel import one_thread
 from .estimator_channels import estimates, recorded
 from .filter_model import FEW_DIGITS, FilterModel, Sight, Steady, innovation_root

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.sparse import csgraph
 
 from ..checks import BoolArray, FloatArray, IntArray
+from ..lti.discretisation import Recursion
 from ..lti.equations import sylvester
 from ..lti.lyapunov import solve_stein
-from ..lti.recursion import Recursion
 from .estimator_channels import Recorded
 from .filter_model import FilterGains, FilterModel, Sight, Steady, filter_gains, innovation_root
 

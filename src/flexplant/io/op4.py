@@ -16,7 +16,7 @@ from ..checks import name_list
 from ..errors import FlexplantError, ModelError, require_known
 from ..labels import DofSet
 from ..structure.matrices import FEMatrices, completed
-from ..structure.precision import digits_of
+from ..structure.zero_energy import digits_of
 from .files import FORMATS, USUAL, Format, check_count, damaged, file_path, fixed_numbers
 from .nastran import named_matrices
 

@@ -15,12 +15,11 @@ from ..checks import FloatArray, IntArray, Value, frozen
 from ..errors import CertificateError, ModelError, counted, warn
 from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
-from ..modes.attachment_vectors import static_response
+from ..modes.statics import static_response
 from ..reduction import ReducedModel
 from ..sparse.factor import dense
 from ..structure import FEModel
-from ..structure.placed import SPANNED
-from ..structure.rigid import orthonormalised, rigid_body_basis
+from ..structure.rigid import SPANNED, orthonormalised, rigid_body_basis
 from ..tolerances import TINY, divisor
 from .component import Component, JoinedShape, Model, Pose, components_of
 from .frf_coupling import joined_frfs

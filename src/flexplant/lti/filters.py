@@ -9,7 +9,7 @@ from ..checks import between, positive, real_array, whole
 from ..errors import ModelError
 from ..tolerances import SAME
 from .interconnection import series
-from .roots import tf_fields, zpk_fields
+from .joining import tf_fields, zpk_fields
 from .statespace import StateSpace, System, as_statespace
 
 

@@ -33,10 +33,13 @@ from .joining import (
     chosen_pair,
     in_parallel,
     in_series,
+    invariant_zeros,
+    matrix_fields,
     rows_of,
     short_list,
+    tf_fields,
+    zpk_fields,
 )
-from .roots import invariant_zeros, matrix_fields, tf_fields, zpk_fields
 
 if TYPE_CHECKING:
     import control

@@ -12,16 +12,14 @@ import scipy.sparse as sp
 
 from ..checks import ComplexArray, FloatArray
 from ..errors import ModelError, SolverError
-from ..sparse.factor import DENSE_LIMIT, dense
+from ..sparse.factor import DENSE_LIMIT, ComplexSymmetricFactor, dense
 from ..sparse.lanczos import beyond
-from ..sparse.multifrontal import ComplexSymmetricFactor
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping, Rayleigh
 from ..structure.definite import signed_root, unstable_stiffness
 from ..tolerances import TINY, divisor
-from .attachment_vectors import static_response
-from .damped_modes import damper_forces
 from .modes import Modes
-from .shifted import StiffnessFactor, dissection_of, held_factor
+from .solve import damper_forces
+from .statics import StiffnessFactor, dissection_of, held_factor, static_response
 
 #: loads above which the second static response of each is left out
 _MANY = 30

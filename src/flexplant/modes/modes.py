@@ -22,7 +22,7 @@ from ..checks import (
 from ..errors import ModelError, ShapeError, SolverError, counted, unknown_label
 from ..labels import DofSet, Place
 from ..structure.definite import signed_square
-from ..structure.placed import Placed, relative_miss
+from ..structure.rigid import Placed, relative_miss
 from .matching import pair_modes
 
 #: places at which shapes of two meshes are compared, at most

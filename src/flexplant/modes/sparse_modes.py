@@ -12,7 +12,6 @@ import scipy.linalg as la
 from ..checks import FloatArray, IntArray, Matrix, Rng
 from ..errors import ModelError, SolverError, counted
 from ..parallel import expect, one_thread, tick
-from ..sparse.cholmod import Cholmod
 from ..sparse.factor import by_rows
 from ..sparse.lanczos import (
     BLOCK,
@@ -28,11 +27,10 @@ from ..sparse.lanczos import (
     rayleigh_ritz,
     rounding_of,
 )
-from ..sparse.pardiso import Pardiso
-from ..structure.definite import are_rigid
-from ..structure.eigen import check_stiffness
+from ..sparse.other_factors import Cholmod, Pardiso
+from ..structure.definite import are_rigid, check_stiffness
 from ..structure.model import FEModel
-from .shifted import (
+from .statics import (
     CountingFactor,
     StiffnessFactor,
     counting_factor,

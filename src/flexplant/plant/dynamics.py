@@ -11,7 +11,7 @@ from ..errors import ModelError, counted
 from ..lti.interconnection import among, append, series
 from ..lti.statespace import StateSpace, as_statespace
 from ..structure import FEModel
-from ..structure.placed import SPANNED, Structure
+from ..structure.rigid import SPANNED, Structure
 from ..tolerances import ROUNDING, SAME
 from .port import QUANTITIES, Seen
 from .ports import Ports

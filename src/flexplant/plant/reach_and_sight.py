@@ -12,7 +12,7 @@ from ..checks import ComplexArray, FloatArray, Value
 from ..errors import counted
 from ..labels import DIRECTIONS
 from ..lti.equations import state_scale
-from ..lti.roots import axis_zeros
+from ..lti.joining import axis_zeros
 from ..lti.statespace import StateSpace
 from ..tolerances import ROUNDING, SAME, SPLIT, TINY, TYPED, divisor
 from .partition import Partition

@@ -19,7 +19,7 @@ from ..modes.normal_form import PROPORTIONAL, RealForm, modal, real_form
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..structure.definite import signed_square
-from ..structure.placed import Structure as Structure
+from ..structure.rigid import Structure as Structure
 from ..tolerances import SAME, TINY
 
 T = TypeVar("T")

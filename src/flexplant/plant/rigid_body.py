@@ -11,8 +11,7 @@ from ..checks import FloatArray, Value
 from ..errors import AssumptionError, ModelError
 from ..labels import DIRECTIONS
 from ..structure import FEModel
-from ..structure.placed import SPANNED
-from ..structure.rigid import turned_about
+from ..structure.rigid import SPANNED, turned_about
 from ..tolerances import SAME
 from .realisation import ModalRealisation, Structure
 

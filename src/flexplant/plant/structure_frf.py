@@ -19,8 +19,8 @@ from ..lti.responses import responses
 from ..lti.statespace import StateSpace, System
 from ..modes import Modes
 from ..modes.dynamic_basis import DynamicBasis, checked_response
-from ..modes.shifted import held_factor
 from ..modes.solve import modes_reaching
+from ..modes.statics import held_factor
 from ..parallel import Progress
 from ..reduction import ReducedModel
 from ..structure import Damping, FEModel

@@ -16,8 +16,7 @@ from ..modes import Modes, normal_form
 from ..modes.matching import runs
 from ..reduction import ReducedModel
 from ..structure import Damper, FEModel, Spring
-from ..structure.placed import SPANNED
-from ..structure.rigid import orthonormalised
+from ..structure.rigid import SPANNED, orthonormalised
 from ..tolerances import divisor
 from .port import checked_place, port_direction
 from .realisation import realise

@@ -12,12 +12,11 @@ from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, real_a
 from ..errors import ModelError, counted
 from ..labels import Place
 from ..lti.frequency_sweep import climbed_grid
-from ..modes.attachment_vectors import labels_of, places, static_response
 from ..modes.dynamic_basis import DirectCheck, DynamicBasis, antiresonances, checked_response
 from ..modes.matching import pair_modes
 from ..modes.modes import Modes
-from ..modes.shifted import held_factor
 from ..modes.solve import modes_reaching
+from ..modes.statics import held_factor, labels_of, places, static_response
 from ..structure import FEModel, Hysteretic
 from ..tolerances import SAME, divisor
 from .ranking import ErrorBound

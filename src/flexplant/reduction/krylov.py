@@ -14,9 +14,8 @@ import scipy.sparse as sp
 from ..checks import FloatArray, checked, real_array, whole
 from ..errors import ModelError, SolverError
 from ..labels import Place
-from ..modes.attachment_vectors import labels_of, places, static_response
 from ..modes.modes import Modes
-from ..modes.shifted import stiffness_factor
+from ..modes.statics import labels_of, places, static_response, stiffness_factor
 from ..sparse.factor import DENSE_LIMIT, dense, dynamic_lu
 from ..structure import FEModel
 from ..tolerances import RANK, TINY

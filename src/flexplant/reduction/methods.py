@@ -14,15 +14,13 @@ import scipy.sparse as sp
 from ..checks import FloatArray, Matrix, Value, checked, instance, name_list
 from ..errors import LabelError, ModelError, ShapeError, SolverError, attempted, counted, some_names
 from ..labels import DofSet, Place
-from ..modes.attachment_vectors import places
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
+from ..modes.statics import places
 from ..parallel import Progress
-from ..sparse.factor import DENSE_LIMIT, dense, unit_diagonal
-from ..sparse.multifrontal import MultifrontalCholesky
+from ..sparse.factor import DENSE_LIMIT, MultifrontalCholesky, dense, unit_diagonal
 from ..structure import Damping, FEModel
-from ..structure.definite import refuse_unstable
-from ..structure.eigen import elastic_modes
+from ..structure.definite import elastic_modes, refuse_unstable
 from ..tolerances import RANK, TINY
 from .criteria import PivotedQr
 from .ranking import ErrorBound

@@ -13,8 +13,8 @@ from ..labels import Place
 from ..lti.balancing import hankel_values
 from ..lti.discretisation import block_diagonal
 from ..lti.statespace import StateSpace
-from ..modes.attachment_vectors import labels_of, places
 from ..modes.modes import Modes
+from ..modes.statics import labels_of, places
 from ..structure.definite import refuse_unstable
 
 

@@ -22,14 +22,13 @@ from ..checks import (
 )
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
-from ..modes.damped_modes import leaving_overdamped
 from ..modes.modes import Modes, calibrated_matrices, measured_poles
 from ..modes.normal_form import normal_form
+from ..modes.solve import leaving_overdamped
 from ..parallel import Progress
 from ..structure import FEModel
 from ..structure.definite import refuse_unstable, unstable_stiffness
-from ..structure.placed import SPANNED, relative_miss
-from ..structure.rigid import orthonormalised, rigid_motions
+from ..structure.rigid import SPANNED, orthonormalised, relative_miss, rigid_motions
 from .judging import ReductionQuality, quality_of
 from .ranking import ErrorBound
 

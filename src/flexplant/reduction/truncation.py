@@ -12,9 +12,9 @@ import scipy.linalg as la
 from ..checks import FloatArray, IntArray, checked, whole
 from ..errors import ModelError, counted
 from ..labels import Place
-from ..modes.attachment_vectors import attachment_vectors, labels_of, places, static_response
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
+from ..modes.statics import attachment_vectors, labels_of, places, static_response
 from ..structure import FEModel, ModalDamping
 from ..tolerances import SAME
 from .condensation import kept_columns, mode_numbers

@@ -12,7 +12,7 @@ from ..checks import FloatArray, IntArray
 from ..loop import ClosedLoop
 from ..loop.blocks import applied_law
 from ..loop.budget import WhiteNoise
-from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, Recursion, cheapest
+from ..lti.discretisation import CALL, ONE_VECTOR, PIECE, Blocks, Recursion, cheapest
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..tolerances import divisor

@@ -25,7 +25,7 @@ with AVX-512, it took 66 s.
 """
 
 from ..rooms import public_names as _public_names
-from .cholmod import Cholmod as Cholmod
-from .pardiso import Pardiso as Pardiso
+from .other_factors import Cholmod as Cholmod
+from .other_factors import Pardiso as Pardiso
 
 __dir__ = _public_names(__name__)

@@ -1,18 +1,20 @@
-"""Symmetric sparse factorisation, with the inertia of the matrix as a by-product."""
+"""Symmetric sparse factors: Cholesky on the fronts of a nested dissection, SuperLU; inertia."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from scipy.linalg import blas, lapack
 
-from ..checks import FloatArray, IntArray, Matrix
+from ..checks import ComplexArray, FloatArray, IntArray, Matrix
 from ..errors import SolverError
-from .multifrontal import MultifrontalCholesky
-from .ordering import dissect
+from ..parallel import one_thread
+from .ordering import Dissection, Front, dissect
 
 #: up to this many DOFs dense LAPACK is as fast as a sparse factorisation, and safer
 DENSE_LIMIT = 1500
@@ -209,3 +211,262 @@ def lowest_eigenvalue_bound(matrix: Any) -> float:
         off.append(beta)
         vector = step / beta
     return bound
+
+
+#: blocks smaller than this (entries, on average) are added by index lists, larger ones as slices
+_SLICE = 600
+#: pivot blocks of up to this many DOFs are kept as inverses
+_INVERTED = 128
+
+
+class MultifrontalCholesky:
+    """``A = L L^T`` of a sparse symmetric positive definite matrix [DuffReid1983]_."""
+
+    def __init__(
+        self,
+        matrix: Any,
+        dissection: Dissection | None = None,
+        *,
+        keep: bool = True,
+        single: bool = False,
+    ) -> None:
+        lower = sp.csc_array(matrix)
+        # in single precision the range of numbers is small
+        self._single = single
+        self._scale = float(np.abs(lower.data).max(initial=0.0)) if single else 1.0
+        if single:
+            lower = in_single(lower, self._scale)
+        potrf, trtri, self._trsm, syrk = _kernels(lower.dtype)
+        self.dissection = dissect(lower) if dissection is None else dissection
+        self._blocks: list[tuple[FloatArray | None, FloatArray]] = []
+        with one_thread():
+            for front, pivots, below, rest in assembled_fronts(lower, self.dissection):
+                _, info = potrf(pivots, lower=1, overwrite_a=1, clean=0)
+                if info:
+                    raise SolverError(
+                        "a sparse Cholesky factorisation met a pivot that is not positive: the "
+                        "matrix is indefinite or singular. Look for a sign, or for DOFs without "
+                        "stiffness or mass."
+                    )
+                if front.rows.size:
+                    below = self._trsm(
+                        1.0, pivots, below, side=1, lower=1, trans_a=1, overwrite_b=1
+                    )
+                    syrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
+                if keep:
+                    self._blocks.append(_stored(pivots, below, trtri))
+
+    @property
+    def n_entries(self) -> int:
+        """Stored entries of the factor."""
+        return sum(below.size + (0 if top is None else top.size) for top, below in self._blocks)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return ``A^-1 right`` for (n,) or (n, m) right-hand sides, blocked."""
+        order = self.dissection.order
+        # rows in C order: one right-hand side after the other in each, for BLAS 3 on the fronts
+        x = np.ascontiguousarray(right.reshape(order.size, -1)[order], dtype=np.float64)
+        scale = None
+        if self._single:
+            largest = np.abs(x).max(axis=0, initial=np.finfo(np.float64).tiny)
+            x, scale = (x / largest).astype(np.float32), self._scale / largest
+        fronts = self.dissection.fronts
+        with one_thread():
+            for front, (pivots, below) in zip(fronts, self._blocks, strict=True):
+                first, last, rows = front.first, front.last, front.rows
+                part = x[first:last]
+                if pivots is None:
+                    moved = below @ part
+                    x[first:last] = moved[: last - first]
+                    if rows.size:
+                        x[rows] -= moved[last - first :]
+                    continue
+                self._trsm(1.0, pivots, part.T, side=1, lower=1, trans_a=1, overwrite_b=1)
+                if rows.size:
+                    x[rows] -= below @ part
+            for front, (pivots, below) in zip(fronts[::-1], self._blocks[::-1], strict=True):
+                first, last, rows = front.first, front.last, front.rows
+                part = x[first:last]
+                if pivots is None:
+                    size = last - first
+                    moved = below[:size].T @ part
+                    if rows.size:
+                        moved -= below[size:].T @ x[rows]
+                    x[first:last] = moved
+                    continue
+                if rows.size:
+                    part -= below.T @ x[rows]
+                self._trsm(1.0, pivots, part.T, side=1, lower=1, overwrite_b=1)
+        answer = np.empty(x.shape)
+        answer[order] = x if scale is None else x / scale
+        return answer.reshape(right.shape)
+
+
+def in_single(matrix: Any, scale: float) -> Any:
+    """Return a sparse matrix over `scale` in single precision."""
+    data = np.empty(matrix.data.shape, np.float32)
+    np.divide(matrix.data, scale, out=data, casting="same_kind")
+    return sp.csc_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
+
+
+def _kernels(dtype: Any) -> tuple[Any, Any, Any, Any]:
+    """Return LAPACK's potrf and trtri, and BLAS's trsm and syrk, of a precision."""
+    of_lapack: Any = lapack.get_lapack_funcs(("potrf", "trtri"), dtype=dtype)
+    of_blas: Any = blas.get_blas_funcs(("trsm", "syrk"), dtype=dtype)
+    return *of_lapack, *of_blas
+
+
+def _stored(
+    pivots: FloatArray, below: FloatArray, trtri: Any
+) -> tuple[FloatArray | None, FloatArray]:
+    """Return a front as it is kept: small ones as ``[L^-1; B L^-1]``, for one product per solve."""
+    if pivots.shape[0] > _INVERTED:
+        return pivots, below
+    inverse, _ = trtri(pivots, lower=1, overwrite_c=1)
+    inverse = np.tril(inverse)
+    return None, np.vstack([inverse, below @ inverse])
+
+
+def assembled_fronts(
+    lower: Any, dissection: Dissection
+) -> Iterator[tuple[Front, FloatArray, FloatArray, FloatArray]]:
+    """Yield each front with its assembled blocks: pivots, below, rest; its caller eliminates it.
+
+    The blocks are real or complex, as the matrix is, their lower triangles.
+
+    `rest` must hold what remains for the parent when the next front is allocated.
+    """
+    pointer, index, value = _permuted_triangle(lower, dissection.order)
+    place = np.zeros(dissection.order.size, dtype=np.int64)
+    left: dict[int, FloatArray] = {}
+    fronts = dissection.fronts
+    for k, front in enumerate(fronts):
+        first, last, rows = front.first, front.last, front.rows
+        p, q = last - first, rows.size
+        place[first:last] = np.arange(p)
+        place[rows] = np.arange(p, p + q)
+        pivots = np.zeros((p, p), value.dtype, order="F")
+        below = np.zeros((q, p), value.dtype, order="F")
+        rest = np.zeros((q, q), value.dtype, order="F")
+        begin, end = int(pointer[first]), int(pointer[last])
+        at = place[index[begin:end]]
+        column = np.repeat(np.arange(p), np.diff(pointer[first : last + 1]))
+        inside = at < p
+        entries = value[begin:end]
+        pivots.T[column[inside], at[inside]] = entries[inside]
+        if q:
+            outside = ~inside
+            below.T[column[outside], at[outside] - p] = entries[outside]
+        for child in front.children:
+            _add(pivots, below, rest, place[fronts[child].rows], left.pop(child))
+        yield front, pivots, below, rest
+        left[k] = rest
+
+
+def _permuted_triangle(matrix: Any, order: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the lower triangle of a matrix in an order, by columns."""
+    n = order.size
+    position = np.empty(n, dtype=np.int32)
+    position[order] = np.arange(n, dtype=np.int32)
+    rows = position[matrix.indices]
+    columns = np.repeat(position, np.diff(matrix.indptr))
+    keep = rows >= columns
+    triangle: Any = sp.csc_array(
+        sp.coo_array((matrix.data[keep], (rows[keep], columns[keep])), shape=(n, n))
+    )
+    pointer: IntArray = triangle.indptr.astype(np.int64)
+    return pointer, triangle.indices, triangle.data
+
+
+def _add(
+    pivots: FloatArray, below: FloatArray, rest: FloatArray, at: IntArray, child: FloatArray
+) -> None:
+    """Add a child's remainder (lower triangle) to its parent's blocks, row i at `at[i]`."""
+    p = pivots.shape[0]
+    if not at.size:
+        return
+    split = int(np.searchsorted(at, p))
+    cuts = np.flatnonzero(np.diff(at) != 1) + 1
+    runs = np.unique(np.concatenate([[0, split], cuts, [at.size]]))
+    if at.size**2 < _SLICE * (runs.size - 1) ** 2:
+        low, high = at[:split], at[split:] - p
+        if split:
+            pivots.T[low[:, None], low] += child.T[:split, :split]
+            if high.size:
+                below.T[low[:, None], high] += child.T[:split, split:]
+        if high.size:
+            rest.T[high[:, None], high] += child.T[split:, split:]
+        return
+    begins, ends = runs[:-1].tolist(), runs[1:].tolist()
+    targets = at[runs[:-1]].tolist()
+    for j, (cb, ce) in enumerate(zip(begins, ends, strict=True)):
+        c = targets[j]
+        for i in range(j, len(begins)):
+            rb, re, r = begins[i], ends[i], targets[i]
+            if r < p:
+                pivots[r : r + re - rb, c : c + ce - cb] += child[rb:re, cb:ce]
+            elif c < p:
+                below[r - p : r - p + re - rb, c : c + ce - cb] += child[rb:re, cb:ce]
+            else:
+                rest[r - p : r - p + re - rb, c - p : c - p + ce - cb] += child[rb:re, cb:ce]
+
+
+#: columns of a remainder that are updated at once: of its symmetric upper part little is computed
+_STRIP = 256
+
+
+class ComplexSymmetricFactor:
+    """``A = L D L^T`` (not conjugated) of a sparse complex symmetric matrix, by fronts.
+
+    Each pivot block D is factored with row exchanges of its own; pivots are not moved between
+    fronts. That is stable for the dynamic stiffness ``K + i omega D - omega^2 M`` of a damped
+    structure; the residual of a solution shows it.
+    """
+
+    def __init__(self, matrix: Any, dissection: Dissection | None = None) -> None:
+        lower = sp.csc_array(matrix, dtype=np.complex128)
+        self.dissection = dissect(lower) if dissection is None else dissection
+        #: of each front: LU of its pivot block, the exchanges, and ``D^-1 B^T``
+        self._blocks: list[tuple[ComplexArray, Any, ComplexArray]] = []
+        with one_thread():
+            for _, pivots, below, rest in assembled_fronts(lower, self.dissection):
+                block = np.asfortranarray(np.tril(pivots) + np.tril(pivots, -1).T)
+                factor, exchanges, info = lapack.zgetrf(block, overwrite_a=1)
+                if info:
+                    raise SolverError(
+                        "a dynamic stiffness is singular: its frequency is a resonance of an "
+                        "undamped structure. Move it a little, or give the structure damping."
+                    )
+                solved: Any = below.T
+                if rest.size:
+                    solved, _ = lapack.zgetrs(factor, exchanges, below.T)
+                    for j in range(0, rest.shape[0], _STRIP):
+                        strip = slice(j, j + _STRIP)
+                        # in the order in which both are stored, columns of `rest` as rows
+                        rest.T[strip, j:] -= solved[:, strip].T @ below[j:].T
+                self._blocks.append((factor, exchanges, solved))
+
+    @property
+    def n_entries(self) -> int:
+        """Stored entries of the factor."""
+        return sum(factor.size + solved.size for factor, _, solved in self._blocks)
+
+    def solve(self, right: FloatArray | ComplexArray) -> ComplexArray:
+        """Return ``A^-1 right`` for (n,) or (n, m) right-hand sides."""
+        order = self.dissection.order
+        x = np.ascontiguousarray(right.reshape(order.size, -1)[order], dtype=np.complex128)
+        fronts = self.dissection.fronts
+        with one_thread():
+            for front, (_, _, solved) in zip(fronts, self._blocks, strict=True):
+                if front.rows.size:
+                    x[front.rows] -= solved.T @ x[front.first : front.last]
+            for front, (factor, exchanges, solved) in zip(
+                fronts[::-1], self._blocks[::-1], strict=True
+            ):
+                part, _ = lapack.zgetrs(factor, exchanges, x[front.first : front.last])
+                if front.rows.size:
+                    part -= solved @ x[front.rows]
+                x[front.first : front.last] = part
+        answer = np.empty_like(x)
+        answer[order] = x
+        return answer.reshape(right.shape)

@@ -15,9 +15,18 @@ from scipy.linalg import blas, lapack
 from ..checks import FloatArray, IntArray
 from ..errors import SolverError, attempted
 from ..parallel import one_thread
-from .factor import DENSE_LIMIT, by_rows, dense, diagonal, negative_pivots, symmetric_lu
+from .factor import (
+    DENSE_LIMIT,
+    MultifrontalCholesky,
+    assembled_fronts,
+    by_rows,
+    dense,
+    diagonal,
+    in_single,
+    negative_pivots,
+    symmetric_lu,
+)
 from .lanczos import VALUE, BlockLanczos, beyond, iterated, rayleigh_ritz
-from .multifrontal import MultifrontalCholesky, assembled_fronts, in_single
 from .ordering import Dissection, Front, dissect
 
 #: rounding let pass in the energies that accompany a count

@@ -16,10 +16,9 @@ from ..tolerances import SAME, divisor
 from .definite import are_rigid, are_swapped, unstable_stiffness
 from .matrices import FEMatrices
 from .model import FEModel
-from .precision import loss, shown_digits
 from .rigid import RigidMass, farness, orthonormalised, pieces, rigid_mass, rigid_motions, unheld
 from .singular_mass import empty_rows, massless_dofs, null_motions
-from .zero_energy import ZeroEnergy, nonrigid, own_motions, zero_energy
+from .zero_energy import ZeroEnergy, loss, nonrigid, own_motions, shown_digits, zero_energy
 
 #: requested from the solver: six rigid-body motions and some elastic modes, a few beside more
 _MODES, _FEW = 10, 4

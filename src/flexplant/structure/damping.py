@@ -27,7 +27,7 @@ from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..sparse.factor import dense
 from ..tolerances import ROUNDING, divisor
-from .eigen import elastic_modes
+from .definite import elastic_modes
 
 
 class Damping(Value):

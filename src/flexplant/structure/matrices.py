@@ -28,10 +28,9 @@ from ..sparse.factor import is_positive_definite
 from ..tolerances import TYPED
 from .definite import SEMIDEFINITE, are_swapped
 from .model import FEModel
-from .precision import digits_of, endangered, held_by_rounding, shown_digits
 from .singular_mass import empty_rows, held_rows, inertial
 from .units import units
-from .zero_energy import freed
+from .zero_energy import digits_of, endangered, freed, held_by_rounding, shown_digits
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -20,16 +20,15 @@ from .damping import Damping, Rayleigh, damping_matrix
 from .definite import (
     MatrixLike,
     check_semidefinite,
+    has_negative_springs,
     slow,
     symmetric_matrix,
     unstable_stiffness,
     without_inertia,
 )
-from .eigen import has_negative_springs
-from .placed import Placed
-from .precision import digits_of, endangered, held_by_rounding
-from .rigid import body_motions, force_parts, orthonormalised, rigid_body_basis
+from .rigid import Placed, body_motions, force_parts, orthonormalised, rigid_body_basis
 from .units import units
+from .zero_energy import digits_of, endangered, held_by_rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)

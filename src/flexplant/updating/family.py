@@ -16,8 +16,7 @@ from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..modes.matching import assigned, clusters, in_span, mac_matrix
 from ..sparse.factor import dense
-from ..structure.definite import refuse_unstable
-from ..structure.eigen import elastic_modes
+from ..structure.definite import elastic_modes, refuse_unstable
 from ..structure.rigid import orthonormalised
 from .parameters import Parameter
 

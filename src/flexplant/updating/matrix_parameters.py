@@ -28,7 +28,7 @@ from ..modes import solve_modes
 from ..reduction import ReducedModel
 from ..sparse.factor import DENSE_LIMIT, dense
 from ..structure import FEModel, ModalDamping
-from ..structure.eigen import elastic_modes
+from ..structure.definite import elastic_modes
 from .parameters import MAKES, Derivatives, Parameter, checked_bounds, checked_text
 
 #: entries of a symmetric matrix differ by less than this, relatively, from their mirror images

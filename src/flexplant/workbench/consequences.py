@@ -17,9 +17,8 @@ import numpy as np
 from ..checks import FloatArray
 from ..errors import AssumptionError, FlexplantError, SolverError
 from ..loop import ClosedLoop, LoopReport, close_loop, report_loops
-from ..lti.discretisation import discretized
+from ..lti.discretisation import Recursion, discretized
 from ..lti.interconnection import feedback, series
-from ..lti.recursion import Recursion
 from ..parallel import bars_of_thread
 from ..plant import StandardPlant
 from ..simulation import simulate

@@ -11,9 +11,9 @@ from ...checks import ComplexArray, FloatArray
 from ...errors import SolverError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.frequency_sweep import highest, resonance_grid
+from ...lti.joining import axis_zeros
 from ...lti.preparation import Prepared
 from ...lti.responses import responses
-from ...lti.roots import axis_zeros
 from ...lti.statespace import StateSpace
 from ...tolerances import divisor
 

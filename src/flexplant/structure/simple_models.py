@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...checks import (
+from ..checks import (
     FloatArray,
     frozen,
     members,
@@ -19,9 +19,8 @@ from ...checks import (
     several,
     short,
 )
-from ...errors import ModelError, ShapeError
-from ...labels import DofSet
-from ..model import FEModel
+from ..errors import ModelError, ShapeError
+from ..labels import DofSet
 from .element_matrices import (
     Grid,
     beam_mass,
@@ -34,15 +33,18 @@ from .element_matrices import (
 from .grid_fields import (
     Field,
     Hole,
+    Rib,
+    Skin,
     counts_of,
     dofs_of,
     field_of,
     lengths_of,
     poisson_of,
     present_of,
+    rib_matrices,
     share_of,
 )
-from .ribs import Rib, Skin, rib_matrices
+from .model import FEModel
 from .shapes import BeamShape, BlockShape
 from .shapes import PlateShape as PlateShape
 

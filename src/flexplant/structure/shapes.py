@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, real_array
-from ...errors import LabelError, counted
-from ...labels import Interpolation
-from ...tolerances import SAME
+from ..checks import FloatArray, real_array
+from ..errors import LabelError, counted
+from ..labels import Interpolation
+from ..tolerances import SAME
 from .element_matrices import (
     Grid,
     brick_shape,

@@ -1,1 +1,0 @@
-"""Meshes that the library makes itself: plates, beams, chains, blocks, and their ribs."""
