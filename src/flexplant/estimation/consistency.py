@@ -98,16 +98,6 @@ class Consistency(Value):
     moved : MovedModes, optional
         The modes that are elsewhere on the machine, by how much and with which deviation, where
         this is a cause: ``model.calibrated(found.moved.measured)`` is the machine's model.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> observer = fx.design_kalman(plant)
-    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
-    >>> run = fx.simulate(fx.close_loop(plant, observer, servo), duration=2.0, rng=1)
-    >>> fx.estimation.consistency(observer, observer.estimate(run)).text
-    'the innovations are white and of the predicted size.'
     """
 
     nis: float
@@ -200,6 +190,10 @@ def consistency(
     level : float
         Share of records at which a right model passes.
 
+    Returns
+    -------
+    Consistency
+
     Raises
     ------
     ModelError
@@ -220,21 +214,18 @@ def consistency(
     >>> observer = fx.design_kalman(plant)
     >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
     >>> run = fx.simulate(fx.close_loop(plant, observer, servo), duration=2.0, rng=1)
-    >>> fx.estimation.consistency(observer, observer.estimate(run)).holds
-    True
+    >>> fx.estimation.consistency(observer, run).text
+    'the innovations are white and of the predicted size.'
     """
     if isinstance(observer, ClosedLoop):
         beyond = observer.larger if larger is None else larger
         plant = observer.plant
         observer = design_kalman(plant, larger=plant if beyond is None else beyond)
-    if (
-        isinstance(observer, KalmanEstimator)
-        and hasattr(estimate, "keys")
-        and not isinstance(estimate, Estimate)
-    ):
+    is_filter = isinstance(observer, KalmanEstimator)
+    if is_filter and hasattr(estimate, "keys") and not isinstance(estimate, Estimate):
         estimate = observer.estimate(estimate)
-    if not isinstance(observer, KalmanEstimator) or not isinstance(estimate, Estimate):
-        wrong = estimate if isinstance(observer, KalmanEstimator) else observer
+    if not is_filter or not isinstance(estimate, Estimate):
+        wrong = estimate if is_filter else observer
         raise ModelError(
             "consistency needs a KalmanEstimator or a ClosedLoop, and an Estimate or a record, got "
             f"{short(wrong)}. Pass observer and observer.estimate(records)."
@@ -277,19 +268,16 @@ def consistency(
     gated = int(estimate.gated.sum())
     without = f" {counted(gated, 'sample')} beyond the gate left out." if gated else ""
     rate = 1.0 / observer.plant.dt
+    capital = (one.text[:1].upper() + one.text[1:] for one in said[1:])
     return Consistency(
-        raw.nis.statistic,
-        raw.nis.p_value,
+        *raw.nis,
         raw.box.p_value,
         raw.bartlett.p_value,
         dict(zip(estimate.sensors, raw.ratios.tolist(), strict=True)),
         _nees(observer, estimate, truth, share),
         tuple((one.freq * rate, one.height) for one in rest.peaks[:6]),
         tuple(dict.fromkeys(one.cause for one in said)),
-        " ".join(
-            one.text if not i else one.text[:1].upper() + one.text[1:] for i, one in enumerate(said)
-        )
-        + without,
+        " ".join([said[0].text, *capital]) + without,
         share,
         _spectra(observer, raw),
         moved,
@@ -412,14 +400,12 @@ def _tested(
     last = white if whole is None else white[-_COMPARED:]
     lines = lines_of(last)
     # those of missing samples are as lost as their innovations
-    missing = np.isnan(last).any(axis=1, keepdims=True)
-    commands = np.where(missing, np.nan, u[-len(last) :])
+    commands = np.where(np.isnan(last).any(axis=1, keepdims=True), np.nan, u[-len(last) :])
     pooled = lines.pooled
-    parts = (
-        density_of(observer, None, lines.freq)
-        if whole is None
-        else expected(observer, whole, lines.samples)
-    )
+    if whole is None:
+        parts = density_of(observer, None, lines.freq)
+    else:
+        parts = expected(observer, whole, lines.samples)
     levels = _fitted_levels(parts.pooled, pooled.density)
     found = excess_peaks(pooled._replace(density=pooled.density / (levels @ parts.pooled)), alpha)
     ratios = np.sqrt(np.mean(normal[there] ** 2, axis=0))

@@ -78,13 +78,6 @@ class PeriodicEstimator(Value):
         Of the errors at the POIs in each sample of a period.
     certificate : PeriodicCertificate
         What was checked.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> found = fx.estimation.design_multirate(fx.testbeds.three_masses(), {"y2": 2})
-    >>> found.period, found.sensors
-    (2, ('y1', 'y2'))
     """
 
     plant: StandardPlant
@@ -175,6 +168,10 @@ def design_multirate(
         Sampled, not weighted. A sensor's noise per sample is that of its asd at the plant's rate.
     every : mapping {sensor: interval or (interval, offset)} [samples]
         Sensors that are not named are read in each sample.
+
+    Returns
+    -------
+    PeriodicEstimator
 
     Raises
     ------

@@ -122,6 +122,10 @@ def design_input_estimator(
     method : Unbiased or Augmented
         What is assumed of them.
 
+    Returns
+    -------
+    InputEstimator
+
     Raises
     ------
     AssumptionError
@@ -146,8 +150,8 @@ def design_input_estimator(
     >>> plant = fx.testbeds.three_masses()
     >>> method = fx.estimation.Augmented(drift=1.0)
     >>> found = fx.estimation.design_input_estimator(plant, ["amp"], method)
-    >>> found.inputs
-    ('amp',)
+    >>> found.inputs, found.system.outputs
+    (('amp',), ('die:hat', 'amp:hat'))
     """
     instance(
         method,
@@ -414,14 +418,6 @@ class InputEstimator(Value):
         Whether the sensors determine the inputs without any assumption of them.
     certificate : InputCertificate
         What was checked.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> method = fx.estimation.Augmented(drift=1.0)
-    >>> fx.estimation.design_input_estimator(plant, ["amp"], method).system.outputs
-    ('die:hat', 'amp:hat')
     """
 
     system: StateSpace

@@ -44,14 +44,6 @@ class ExposureErrors(Value):
         Largest |MA|, the |MA| that 99.7 % of the windows do not exceed; the same of the MSD.
     window : float [s]
         Length of the moving window.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> import numpy as np
-    >>> run = fx.Response(np.arange(100) * 1e-3, np.zeros((1, 100)), ["die:error"])
-    >>> fx.simulation.exposure_errors(run, "die:error", window=0.01).window
-    0.01
     """
 
     channels: tuple[str, ...]
@@ -101,6 +93,10 @@ def exposure_errors(
         Without `exposures`: all after this time is exposed.
     exposures : (k, 2) array [s], optional
         Beginning and end of each, such as `SetPoint.exposures`.
+
+    Returns
+    -------
+    ExposureErrors
 
     Raises
     ------
@@ -291,17 +287,6 @@ class ErrorMap(Value):
         Largest |MA| and MSD at each point.
     window : float [s]
         Of both.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> observer = fx.design_kalman(plant)
-    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
-    >>> loop = fx.close_loop(plant, observer, servo)
-    >>> found = fx.simulation.error_map(loop, [[1.0, 0.0, 0.0]], duration=0.1, axis="x", rng=1)
-    >>> found.axis, found.unit
-    ('x', 'm')
     """
 
     axis: str
@@ -360,6 +345,10 @@ def error_map(
         Whether the white noises act.
     rng : int, SeedSequence, Generator or None
         Seed of the noises.
+
+    Returns
+    -------
+    ErrorMap
 
     Raises
     ------

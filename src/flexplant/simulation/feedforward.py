@@ -55,14 +55,6 @@ class Feedforward(Value):
         On position, velocity, acceleration, jerk and snap; one row, or one for each of p places.
     dt : float [s]
         Sampling time of the plant.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> forward = fx.design_feedforward(fx.testbeds.three_masses())
-    >>> forward.up_to("acceleration")  # the mass alone
-    <Feedforward die:ref to 1 actuator>
-      x: acceleration 3
     """
 
     reference: str

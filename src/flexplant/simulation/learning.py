@@ -42,16 +42,6 @@ class LearnedFeedforward(Value):
         Rms of the error in each move.
     gains : (trials, r, 5) array
         The gains of each move.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> import numpy as np
-    >>> start = fx.design_feedforward(fx.testbeds.three_masses())
-    >>> fx.simulation.LearnedFeedforward(start, np.array([8e-9, 1e-9]), np.zeros((2, 1, 5)))
-    <LearnedFeedforward 2 moves>
-      move 1: rms 8 nm
-      move 2: rms 1 nm
     """
 
     feedforward: Feedforward
@@ -102,6 +92,10 @@ def learn_feedforward(
         Moves.
     step : float
         Part of each correction that is made: 1 unless noise is large beside what repeats.
+
+    Returns
+    -------
+    LearnedFeedforward
 
     Raises
     ------

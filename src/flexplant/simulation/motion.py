@@ -66,13 +66,6 @@ class SetPoint(Value):
         Whether there is a grid.
     exposures : (k, 2) array [s]
         Beginning and end of each exposure window.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> move = fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0)
-    >>> float(move.at(move.duration).position.round(9))
-    0.0001
     """
 
     edges: FloatArray
