@@ -9,7 +9,7 @@ from test_kalman import modes, plate_plant
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.estimation import Filter, FixedLag, Predictor, Smoother, design_kalman, design_static
 from flexplant.estimation.estimate import estimated
-from flexplant.estimation.passage import _Walk
+from flexplant.estimation.passage import Walk
 from flexplant.lti.riccati import solve_dare
 from machines import stage
 from oracles_estimation import batch, error_covariance
@@ -219,8 +219,8 @@ def test_a_start_that_lasts_for_long_goes_in_blocks_and_is_that_of_single_sample
     model = kalman.model
     y, u, _ = run(model, 2500, seed=5)
     y[900:905] = y[1700:1702, 0] = np.nan
-    singly, count = _Walk._step, []
-    monkeypatch.setattr(_Walk, "_step", lambda *given: count.append(1) or singly(*given))
+    singly, count = Walk._step, []
+    monkeypatch.setattr(Walk, "_step", lambda *given: count.append(1) or singly(*given))
     fast = kalman.estimate(records(model, y, u), method)
     assert len(count) < 100
     monkeypatch.setattr("flexplant.estimation.passage.excess", lambda *_: None)

@@ -36,7 +36,7 @@ from .passage import (
     Moment,
     Passage,
     Start,
-    passed,
+    Walk,
     stationary_start,
 )
 
@@ -117,15 +117,12 @@ class Estimate(Value, Mapping[str, FloatArray]):
 
     def __repr__(self) -> str:
         missing = int(np.count_nonzero(np.isnan(self.innovations)))
-        gaps = (
-            f", {missing} of {counted(self.innovations.size, 'innovation')} missing"
-            if missing
-            else ""
-        )
-        last = sizes_of(dict(zip(self.names, self._typical(), strict=True)), self.units)
+        of = f", {missing} of {counted(self.innovations.size, 'innovation')} missing"
+        typical = np.median(self.deviations, axis=1).tolist()
+        sizes = sizes_of(dict(zip(self.names, typical, strict=True)), self.units)
         return (
-            f"<Estimate by {self.lag!r}: {counted(self.time.size, 'sample')}{gaps};\n"
-            f"  {self._gated()}median deviation {last}>"
+            f"<Estimate by {self.lag!r}: {counted(self.time.size, 'sample')}{of if missing else ''}"
+            f";\n  {self._gated()}median deviation {sizes}>"
         )
 
     def _gated(self) -> str:
@@ -142,9 +139,6 @@ class Estimate(Value, Mapping[str, FloatArray]):
             f"{counted(int(self.gated.sum()), 'sample')} beyond {self.gate:g} deviations treated "
             f"as missing{': ' if listed else ''}{', '.join(listed)} ({chance:.2g} by chance);\n  "
         )
-
-    def _typical(self) -> list[float]:
-        return [float(value) for value in np.median(self.deviations, axis=1)]
 
     def __getitem__(self, channel: str) -> FloatArray:
         side, row = self._found(channel)
@@ -231,26 +225,22 @@ def estimated(
         else real_array(start, "start", (d.size,)) / d
     )
     later = isinstance(lag, FixedLag | Smoother)
-    passage = passed(
-        steady,
-        record,
-        s,
-        sight,
-        first,
-        predict=isinstance(lag, Predictor),
-        keep=later,
-        gate=gate,
-    )
-    hat, variance = _by(passage, sight, lag)
+    walk = Walk(steady, record, s, sight, predict=isinstance(lag, Predictor), keep=later, gate=gate)
+    passage = walk.done(first)
+    hat, variance = passage.hat, passage.variance
+    if isinstance(lag, FixedLag):
+        hat, variance = lagged(passage, sight, lag.samples)
+    elif later:
+        hat, variance = smoothed(passage, sight)
     return Estimate(
         record.time,
         estimates(model.channels),
-        _across(hat),
-        _across(np.sqrt(np.maximum(variance, 0.0))),
+        hat.T,
+        np.sqrt(np.maximum(variance, 0.0)).T,
         model.sensors,
-        _across(passage.innovations),
-        _across(passage.deviation),
-        _across(passage.whitened),
+        passage.innovations.T,
+        passage.deviation.T,
+        passage.whitened.T,
         lag,
         passage.state * d,
         known_units(units, estimates(model.channels))
@@ -280,23 +270,6 @@ def in_unit_states(
     return steady, sight, d, s
 
 
-def _across(columns: FloatArray) -> FloatArray:
-    """Return the transpose as a read-only array of its own, which a value takes without a copy."""
-    rows = columns.base
-    if rows is None or rows.strides != columns.strides[::-1]:
-        rows = np.array(columns.T, order="C")
-    rows.flags.writeable = False
-    return rows
-
-
-def _by(passage: Passage, sight: Sight, lag: Lag) -> tuple[FloatArray, FloatArray]:
-    if isinstance(lag, FixedLag):
-        return lagged(passage, sight, lag.samples)
-    if isinstance(lag, Smoother):
-        return smoothed(passage, sight)
-    return passage.hat, passage.variance
-
-
 #: samples whose later measurements are followed side by side
 _TOGETHER = 2048
 
@@ -317,9 +290,8 @@ def smoothed(passage: Passage, sight: Sight) -> tuple[FloatArray, FloatArray]:
     n = model.A.shape[0]
     r, M = np.zeros(n), np.zeros((n, n))
     first_seen = passage.moments.get(0)
-    count = 0 if first_seen is None else first_seen.seen.shape[1]
-    rest = np.zeros((n, count))
-    for first, last, stationary in passage.whole():
+    rest = np.zeros((n, 0 if first_seen is None else first_seen.seen.shape[1]))
+    for first, last, stationary in reversed(passage.stretches):
         if stationary:
             r, M = _backward(passage, sight, (first, last), r, M, hat, variance)
             continue

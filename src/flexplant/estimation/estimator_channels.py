@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,16 +74,20 @@ def same_pois(plant: StandardPlant, on: StandardPlant | System) -> StandardPlant
     return other
 
 
-def estimates(channels: Sequence[str]) -> tuple[str, ...]:
+def estimates(channels: Sequence[str], kind: str = "hat") -> tuple[str, ...]:
     """Return the names of the estimates, such as `die:hat` and `die:rx:hat`."""
-    return tuple(_estimate_names(channels, "hat"))
+    first = _firsts(channels)
+    owners = [channel.rpartition(":")[0] or channel for channel in channels]
+    return tuple(
+        f"{poi if first[poi] == i else channels[i]}:{kind}" for i, poi in enumerate(owners)
+    )
 
 
 def row_of(channels: Sequence[str], name: str) -> int:
     """Return which POI channel a name means: `die`, `die:z`, `die:hat` and `die:error` are one."""
     known: dict[str, int] = {}
     for kind in ("hat", "error"):
-        known |= {alias: i for i, alias in enumerate(_estimate_names(channels, kind))}
+        known |= {alias: i for i, alias in enumerate(estimates(channels, kind))}
     known |= _firsts(channels)
     known |= {channel: i for i, channel in enumerate(channels)}
     if not isinstance(name, str) or name not in known:
@@ -91,24 +95,10 @@ def row_of(channels: Sequence[str], name: str) -> int:
     return known[name]
 
 
-def _firsts(channels: Sequence[str]) -> Mapping[str, int]:
-    first: dict[str, int] = {}
-    for i, channel in enumerate(channels):
-        first.setdefault(channel.rpartition(":")[0] or channel, i)
-    return first
-
-
-def _estimate_names(channels: Sequence[str], kind: str) -> list[str]:
-    first = _firsts(channels)
-    names = []
-    for i, channel in enumerate(channels):
-        poi = channel.rpartition(":")[0] or channel
-        names.append(f"{poi if first[poi] == i else channel}:{kind}")
-    return names
-
-
-#: samples that are copied together
-_PIECE = 2048
+def _firsts(channels: Sequence[str]) -> dict[str, int]:
+    """Return the first channel of each POI."""
+    last_first = reversed([*enumerate(channels)])
+    return {channel.rpartition(":")[0] or channel: i for i, channel in last_first}
 
 
 class Recorded(NamedTuple):
@@ -150,28 +140,22 @@ def recorded(records: Any, model: Any) -> Recorded:
                 else "A command that was not given is an array of zeros"
             )
             raise LabelError(f"{missing} {what}: the filter needs all of its channels.")
-    y = [_run_values(records[name], name, missing=True) for name in model.sensors]
-    u = [_run_values(records[name], name) for name in model.commands]
-    sizes = {name: part.size for name, part in zip(model.sensors, y, strict=True)}
-    sizes |= {name: part.size for name, part in zip(model.commands, u, strict=True)}
+    names = (*model.sensors, *model.commands)
+    parts = [_run_values(records[n], n, missing=n in model.sensors) for n in names]
+    sizes = {name: part.size for name, part in zip(names, parts, strict=True)}
     if len(set(sizes.values())) > 1:
         raise ShapeError(
             f"channels of one record have one length, got {short(sizes)}. Cut them to the same "
             "samples, or fill what is missing of a sensor with NaN."
         )
-    count = next(iter(sizes.values()))
-    if not count:
+    both, ny = np.stack(parts, axis=1), len(model.sensors)
+    if not len(both):
         raise ShapeError("the record holds no samples: there is nothing to estimate from.")
-    both = np.empty((count, len(sizes)))
-    for first in range(0, count, _PIECE):  # a piece of all columns stays in the cache
-        piece = slice(first, first + _PIECE)
-        for i, part in enumerate((*y, *u)):
-            both[piece, i] = part[piece]
-    complete = all(bool(np.all(np.isfinite(part))) for part in y)
-    return Recorded(_time(records, known, count, model.dt), both, len(y), complete)
+    complete = bool(np.all(np.isfinite(both)))
+    return Recorded(_time(records, known, len(both), model.dt), both, ny, complete)
 
 
-def _run_values(values: Any, name: str, *, missing: bool = False) -> FloatArray:
+def _run_values(values: Any, name: str, *, missing: bool) -> FloatArray:
     array = floats(values, f"channel {name!r}")
     if array.ndim != 1:
         raise ShapeError(

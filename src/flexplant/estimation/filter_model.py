@@ -208,17 +208,10 @@ class Sight(NamedTuple):
         """Return the rows at some samples."""
         return self if self.c.shape[0] == 1 else Sight(*(part[at] for part in self))
 
-    def applied(self, watched: FloatArray) -> FloatArray:
-        """Return ``c watched`` (k, nz) for watched [x; b] (k, n + ny)."""
-        if self.c.shape[0] == 1:
-            return np.asarray(watched @ self.c[0].T)
-        return np.asarray(np.einsum("kzi,ki->kz", self.c, watched))
-
-    def commanded(self, u: FloatArray) -> FloatArray:
-        """Return ``D1 u`` (k, nz)."""
-        if self.c.shape[0] == 1:
-            return np.asarray(u @ self.D1[0].T)
-        return np.asarray(np.einsum("kzi,ki->kz", self.D1, u))
+    def applied(self, watched: FloatArray, u: FloatArray | None = None) -> FloatArray:
+        """Return ``c watched + D1 u`` (k, nz) for watched [x; b] (k, n + ny), POIs that move."""
+        found = np.einsum("kzi,ki->kz", self.c, watched)
+        return np.asarray(found if u is None else found + np.einsum("kzi,ki->kz", self.D1, u))
 
 
 def filter_system(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -50,27 +49,8 @@ class Passage(NamedTuple):
     state: FloatArray  # (n,), x[N|N-1]
     gated: BoolArray  # (N, ny), samples that the gate made missing
 
-    def whole(self) -> Iterator[tuple[int, int, bool]]:
-        """Yield the stretches from the last to the first."""
-        return reversed(self.stretches)
 
-
-def passed(
-    steady: Steady,
-    record: Recorded,
-    s: FloatArray,
-    sight: Sight,
-    start: Start | FloatArray,
-    *,
-    predict: bool = False,
-    keep: bool = False,
-    gate: float = np.inf,
-) -> Passage:
-    """Return the filter's way through a record."""
-    return _Walk(steady, record, s, sight, predict=predict, keep=keep, gate=gate).done(start)
-
-
-class _Walk:
+class Walk:
     """The filter on one record; its arrays are filled sample by sample."""
 
     def __init__(
@@ -97,11 +77,9 @@ class _Walk:
         self.gaps = np.flatnonzero(~self.whole)
         self.both, self.y, self.u = both, both[:, : record.ny], record.u
         (N, ny), nz = record.y.shape, sight.c.shape[1]
-        # channel by channel in memory: so the estimate takes them
-        self.hat, self.variance = np.empty((nz, N)).T, np.empty((nz, N)).T
+        self.hat, self.variance = np.empty((2, N, nz))
         self.white = np.zeros((N, ny) if keep else (0, ny))
-        self.innovations, self.deviation = np.empty((ny, N)).T, np.empty((ny, N)).T
-        self.whitened = np.empty((ny, N)).T
+        self.innovations, self.deviation, self.whitened = np.empty((3, N, ny))
         self.moments: dict[int, Moment] = {}
         self.found: KnownParameters | None = None
 
@@ -342,8 +320,7 @@ class _Walk:
             e = out[:, -ny:]
             watched = out[:, :-ny]
             if not fixed:
-                watched = here.part(piece).applied(watched)
-                watched += here.part(piece).commanded(self.u[now])
+                watched = here.part(piece).applied(watched, self.u[now])
             self.hat[now], self.innovations[now] = watched, e
             white = e @ whiten
             self.whitened[now] = white
