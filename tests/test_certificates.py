@@ -170,7 +170,7 @@ WRONG = {
         lambda: estimate().rms("die", on=masses()), "its dual differ",
     ),
     "minimax filter": (
-        "estimation.minimax._means", larger(1.001),
+        "estimation.robust_filter._means", larger(1.001),
         lambda: fx.estimation.design_minimax_filter(masses(), [masses()], iterations=3),
         "those of the filter in closed form differ",
     ),

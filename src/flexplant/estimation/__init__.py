@@ -52,7 +52,6 @@ from .lag_report import Smoother as Smoother
 from .lag_report import StaticEstimator as StaticEstimator
 from .lag_report import design_static as design_static
 from .left_out import LeftOut as LeftOut
-from .minimax import design_minimax_filter as design_minimax_filter
 from .moved_modes import MovedModes as MovedModes
 from .multirate import PeriodicCertificate as PeriodicCertificate
 from .multirate import PeriodicEstimator as PeriodicEstimator
@@ -63,6 +62,7 @@ from .robust_filter import HinfFilterCertificate as HinfFilterCertificate
 from .robust_filter import MinimaxCertificate as MinimaxCertificate
 from .robust_filter import RobustFilter as RobustFilter
 from .robust_filter import design_hinf_filter as design_hinf_filter
+from .robust_filter import design_minimax_filter as design_minimax_filter
 from .unknown_inputs import Augmented as Augmented
 from .unknown_inputs import InputCertificate as InputCertificate
 from .unknown_inputs import InputEstimator as InputEstimator
