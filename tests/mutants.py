@@ -32,7 +32,7 @@ LINES = [
      "return centre[unsure[_largest(T0[unsure]) > level]], bound <= 1.1 * level"),
     ("synthesis/hinf/lower_bound.py", "return bool(values[0] <", "return bool(values[0] + 1e300 <"),
     ("synthesis/hinf/mode_channels.py", "with_G = -1j *", "with_G = 1j *"),
-    ("placement/quadratic.py", "<= RESIDUAL:", "<= 1e300:"),
+    ("placement/convex.py", "<= RESIDUAL:", "<= 1e300:"),
     ("placement/branch_and_bound.py", "bound = max(bound, found)", "bound = 1.2 * found"),
     ("simulation/runs.py", "/= np.sqrt(hold)", "/= 1.0"),
     ("identification/refine.py", "self.cost += float(error @ error)",

@@ -16,9 +16,9 @@ from flexplant.errors import (
     SolverError,
 )
 from flexplant.lti import lowpass
-from flexplant.placement import PoiLqr, PoiVariance, quadratic, score_actuators, score_sensors
+from flexplant.placement import PoiLqr, PoiVariance, convex, score_actuators, score_sensors
+from flexplant.placement.convex import Quadratic
 from flexplant.placement.problem import layouts_of
-from flexplant.placement.quadratic import Quadratic
 from flexplant.plant import Sensor, StandardPlant
 from flexplant.store import load
 from oracles_placement import kalman_variance, lqr_cost
@@ -126,14 +126,14 @@ def test_names_stand_for_sensors(make):
 
 def test_a_doubling_that_is_wrong_is_refused_by_its_residual(monkeypatch):
     A, items = np.array([[0.9, 0.2], [0.0, 0.7]]), np.array([[1.0, 0.0], [0.5, 1.0]])
-    cost = quadratic.quadratic(A, np.eye(2), np.eye(2), items)
-    truth, exact = cost.value([0]), quadratic.doubled_riccati
+    cost = convex.quadratic(A, np.eye(2), np.eye(2), items)
+    truth, exact = cost.value([0]), convex.doubled_riccati
 
     def wrong(A, G, H, *, quick):
         X, steps = exact(A, G, H, quick=quick)
         return (1 + 1e-6) * X, steps
 
-    monkeypatch.setattr(quadratic, "doubled_riccati", wrong)
+    monkeypatch.setattr(convex, "doubled_riccati", wrong)
     assert cost.value([0]) == pytest.approx(truth, rel=1e-9, abs=0)
 
 

@@ -73,9 +73,9 @@ def components_of(models: Any, placed: Any) -> list[Component]:
     poses = {} if placed is None else dict(instance(placed, Mapping, "placed", "Pass {name: Pose}"))
     require_known("component", poses, names)
     found = []
+    hint = "Join models and reduced models; Modes by reduce(modes, ModalTruncation(k))."
     for name, model in models.items():
         pose = instance(poses.get(name, Pose()), Pose, f"placed[{name!r}]", "Pass Pose(shift=...).")
-        hint = "Join models and reduced models; Modes by reduce(modes, ModalTruncation(k))."
         instance(model, Model, f"component {name!r}", hint)
         found.append(Component(name, placed_model(model, pose), _static_rows(model, pose)))
     return found
@@ -90,10 +90,8 @@ def _static_rows(model: Model, pose: Pose) -> FloatArray:
             at = [float(x) for x in name.strip("()").split(",")]
         if " " not in name or name.startswith("("):
             rows.append(model.full_dofs.row(at))
-    if not rows:
-        return np.zeros((0, len(model.full_dofs)))
     C: Any = turned_dofs(model.full_dofs, pose)[1]
-    return np.asarray((C @ np.array(rows).T).T)
+    return np.asarray((C @ np.array(rows).reshape(-1, C.shape[1]).T).T)
 
 
 def placed_model(model: Model, pose: Pose) -> Model:
@@ -109,23 +107,20 @@ def placed_model(model: Model, pose: Pose) -> Model:
         dofs = dofs.replace(interpolation=PlacedShape(full.interpolation, pose, C))
     if isinstance(model, ReducedModel):
         return _placed_reduced(model, dofs, C, pose)
-    load = model.held_inertia
-    matrices = {
-        name: None if matrix is None else _turned_matrix(matrix, C)
-        for name, matrix in (("M", model.M), ("K", model.K), ("D", model.D))
-    }
-    motions = model.joint_motions
+
+    def turned(matrix: Any) -> Any:
+        moved: Any = C @ matrix @ C.T
+        return 0.5 * (moved + moved.T)
+
+    load, motions = model.held_inertia, model.joint_motions
     return model._with(
-        **matrices,
+        M=turned(model.M),
+        K=turned(model.K),
+        D=None if model.D is None else turned(model.D),
         dofs=dofs,
         held_inertia=None if load is None else C @ load @ pose.own_ground(),
         joint_motions=None if motions is None else C @ motions,
     )
-
-
-def _turned_matrix(matrix: Any, C: Any) -> Any:
-    moved: Any = C @ matrix @ C.T
-    return 0.5 * (moved + moved.T)
 
 
 def _placed_reduced(model: ReducedModel, full: DofSet, C: Any, pose: Pose) -> ReducedModel:
@@ -162,10 +157,8 @@ class PlacedShape(Interpolation):
 
     Parameters
     ----------
-    own : Interpolation
-        Of the component where it was made.
-    pose : Pose
-        Where it stands.
+    own, pose : Interpolation, Pose
+        Of the component where it was made, and where it stands.
     C : (n, n) sparse array
         Its DOFs in the directions of the machine by those of its own, ``q = C q_own``.
 
@@ -188,13 +181,7 @@ class PlacedShape(Interpolation):
         return f"<PlacedShape of {self.own!r}>"
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) of all DOFs in the motion `direction` at a point.
-
-        Raises
-        ------
-        LabelError
-            When the point is off the component, or its shapes do not give the motion.
-        """
+        """Return the weights (n,) of all DOFs in the motion `direction` at a point of it."""
         return np.asarray(self.rows(np.asarray(xyz, dtype=np.float64)[None], direction)[0])
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
@@ -264,11 +251,7 @@ class JoinedShape(Interpolation):
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) of the DOFs in the motion `direction` at a point.
 
-        Raises
-        ------
-        LabelError
-            When the point is on no component that has this motion, or on several that move
-            independently.
+        It must be on a component with this motion, and on no other that moves independently.
         """
         found: dict[str, FloatArray] = {}
         failed: list[str] = []
@@ -297,28 +280,24 @@ class JoinedShape(Interpolation):
         """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None."""
         for index, (name, part) in enumerate(zip(self.names, self.parts, strict=True)):
             rest = label.removeprefix(f"{name}/")
-            if rest != label and rest in part:
+            if rest == label:
+                continue
+            if rest in part:
                 return self._expanded(index, part.row(rest)), part.xyz[part.index(rest)]
-            if rest != label and part.interpolation is not None:
-                inner = part.interpolation.dependent(rest)
-                if inner is not None:
-                    return self._expanded(index, inner[0]), inner[1]
+            own = part.interpolation
+            inner = None if own is None else own.dependent(rest)
+            if inner is not None:
+                return self._expanded(index, inner[0]), inner[1]
         return None
 
     def _expanded(self, index: int, row: FloatArray) -> FloatArray:
-        sizes = [len(part) for part in self.parts]
-        start = sum(sizes[:index])
-        if self.expansion is None:
-            found = np.zeros(sum(sizes))
-            found[start : start + sizes[index]] = row
-            return found
-        rows = np.flatnonzero(row)
+        start, rows = sum(len(part) for part in self.parts[:index]), np.flatnonzero(row)
         return np.asarray(row[rows] @ self._by_rows[start + rows])
 
     @cached_property
     def _by_rows(self) -> Any:
-        expansion: Any = self.expansion
-        return sp.csr_array(expansion)
+        every = sp.eye_array(sum(len(part) for part in self.parts))
+        return sp.csr_array(every if self.expansion is None else self.expansion)
 
 
 #: entries of a rotation below this are zero: cos(pi/2) is 6e-17
@@ -413,7 +392,13 @@ def turned_dofs(dofs: DofSet, pose: Pose) -> tuple[DofSet, sp.csc_array]:
             R = pose.rotation[:, own]
             made = np.flatnonzero(np.any(np.abs(R) > _ORTHOGONAL, axis=1))
             if made.size != own.size:
-                raise _oblique(dofs, group[0], own + first)
+                has = ", ".join(DIRECTIONS[k] for k in own + first)
+                raise ModelError(
+                    f"node {dofs.nodes[group[0][0]]} has only the directions {has}, which this "
+                    "rotation turns out of x, y and z: its motion would be oblique. Turn by "
+                    "quarter turns, or about the axis that keeps them, or use a component with all "
+                    "directions (place those of a machine before they are joined)."
+                )
             kinds[group] = first + made
             rows.append(np.repeat(group, own.size, axis=1).ravel())
             columns.append(np.tile(group, (1, own.size)).ravel())
@@ -439,13 +424,3 @@ def _direction_groups(dofs: DofSet, rows: IntArray, first: int) -> list[tuple[In
         begin = starts[bits == mask]
         found.append((own, rows[begin[:, None] + np.arange(own.size)]))
     return found
-
-
-def _oblique(dofs: DofSet, rows: IntArray, own: IntArray) -> ModelError:
-    has = ", ".join(DIRECTIONS[k] for k in own)
-    return ModelError(
-        f"node {dofs.nodes[rows[0]]} has only the directions {has}, which this rotation turns out "
-        "of x, y and z: its motion would be oblique. Turn by quarter turns, or about the axis that "
-        "keeps them, or use a component with all directions (place those of a machine before "
-        "they are joined)."
-    )

@@ -354,8 +354,14 @@ def _coupled_response(
     inverse = (turned / values[:, None]) @ back / below[:, :, None] / above[:, None, :]
     forces = inverse @ gap
     found = lines - load @ forces
-    if more is None:
-        _check_gap(B_out, lines, load, found, forces, Z)
+    if more is None:  # what opens is what springs and dampers give way
+        left = np.abs(B_out @ found - Z.T[:, :, None] * forces)
+        most = np.abs(B_out) @ (np.abs(lines) + np.abs(load) @ np.abs(forces))
+        if not np.all(left <= _GAP * most):
+            raise CertificateError(
+                f"the coupled responses leave a gap of {float((left / most).max()):.2g} in a joint "
+                f"(limit {_GAP:g}): the interface is too badly conditioned. Join fewer channels."
+            )
     motions = load[:, rows] @ inverse
     left_of = np.eye(len(outputs))[rows] - motions @ B_out
     right_of = np.eye(len(inputs))[:, columns] - B_in.T @ forces[:, :, columns]
@@ -363,37 +369,17 @@ def _coupled_response(
     return np.moveaxis(found, 0, 2)[np.ix_(rows, columns)], error
 
 
-def _check_gap(
-    B_out: FloatArray,
-    lines: ComplexArray,
-    load: ComplexArray,
-    found: ComplexArray,
-    forces: ComplexArray,
-    Z: ComplexArray,
-) -> None:
-    """Refuse joints that stay open: what opens is what springs and dampers give way."""
-    left = np.abs(B_out @ found - Z.T[:, :, None] * forces)
-    most = np.abs(B_out) @ (np.abs(lines) + np.abs(load) @ np.abs(forces))
-    if not np.all(left <= _GAP * most):
-        raise CertificateError(
-            f"the coupled responses leave a gap of {float((left / most).max()):.2g} in a joint "
-            f"(limit {_GAP:g}): the interface is too badly conditioned. Join fewer channels."
-        )
-
-
 def _shared_rows(Y: MeasuredParts, known: Mapping[str, Frf]) -> tuple[FloatArray, FloatArray]:
     """Return rows over outputs and over inputs for channels that the machine and its parts have."""
-    found = []
-    for names in (Y.outputs, Y.inputs):
-        rows = []
-        for i, name in enumerate(names):
-            own = f"{_KNOWN}{name}"
-            if name.partition("/")[0] in known and own in names:
-                row = np.zeros(len(names))
-                row[i], row[names.index(own)] = 1.0, -1.0
-                rows.append(row)
-        found.append(np.array(rows).reshape(-1, len(names)))
-    return found[0], found[1]
+
+    def rows(names: list[str]) -> FloatArray:
+        both = [name for name in names if name.partition("/")[0] in known]
+        own = [name for name in both if f"{_KNOWN}{name}" in names]
+        one = np.eye(len(names))
+        taken = [names.index(f"{_KNOWN}{name}") for name in own]
+        return one[[names.index(name) for name in own]] - one[taken]
+
+    return rows(Y.outputs), rows(Y.inputs)
 
 
 def _same_lines(frfs: Mapping[str, Any]) -> None:

@@ -94,12 +94,11 @@ def _component_of(end: Any, parts: Sequence[Channels]) -> Channels:
 def _end(parts: Sequence[Channels], end: Any, side: str) -> JointEnd:
     sides = [part.side(side) for part in parts]
     size = np.ptp(np.vstack([part.dofs.xyz for part in sides]), axis=0).max(initial=0.0)
+    motions = [rigid_motions(part.dofs) for part in sides]
     try:
         if isinstance(end, Patch):
             end = _measured_patch(end, _component_of(end, parts), side)
-        return JointEnd(
-            sides, end, float(size) or 1.0, [rigid_motions(part.dofs) for part in sides]
-        )
+        return JointEnd(sides, end, float(size) or 1.0, motions)
     except LabelError as error:
         raise LabelError(
             f"{error} These are the {side}: a joint needs the response to a force at its own "

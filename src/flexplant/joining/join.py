@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, overload
 
 import numpy as np
@@ -25,7 +26,6 @@ from .component import Component, JoinedShape, Model, Pose, components_of
 from .frf_coupling import joined_frfs
 from .joint import Joint, Patch, split_end
 from .links import (
-    Elimination,
     Link,
     eliminated,
     links_of,
@@ -146,234 +146,300 @@ def joined(
     parts = components_of(components, placed)
     links = links_of(joints, parts)
     warn_of_missing_statics(links, parts)
-    rigid = [link for link in links if link.joint.is_rigid]
-    soft = [link for link in links if not link.joint.is_rigid]
-    B, S = stretch_rows(rigid, parts), stretch_rows(soft, parts)
-    _check_stiffness(soft, S, parts)
-    owners = np.repeat(np.arange(len(parts)), [part.n for part in parts])
-    done = eliminated(B, _coordinate_reach(parts), owners)
-    matrices = _machine_matrices(parts, soft, S, done)
-    groups, kept = groups_of(links, len(parts)), done.kept
-    motions = left_motions(parts, groups, B, matrices["M"], kept, free=False)
-    springs = [i for i, link in enumerate(soft) if link.stiffness]
-    every = sp.vstack([B, S[springs]], format="csr")
-    rigid_body = left_motions(parts, groups, every, matrices["M"], kept, free=True)
-    expected = rigid_body.shape[1]
-    if not any(part.is_reduced for part in parts):  # by energy, as the model finds them
-        xyz = _all_dofs(parts).xyz[done.kept]
-        rigid_body = rigid_body_basis(matrices["M"], matrices["K"], motions, xyz)
-    patches = patch_errors(links, parts)
-    certificate = certified(parts, links, done, matrices, groups, rigid_body, expected, patches)
-    common = {"joint_motions": motions, "joining": certificate}
-    if not any(part.is_reduced for part in parts):
-        return _joined_model(parts, done, matrices | common, name)
-    return _joined_reduced_model(parts, done, matrices | common, rigid_body)
+    machine = JoinedMachine(parts, links)
+    motions = machine.motions(machine.B, free=False)
+    springs = [i for i, link in enumerate(machine.soft) if link.stiffness]
+    every = sp.vstack([machine.B, machine.S[springs]], format="csr")
+    rigid = machine.motions(every, free=True)
+    expected = rigid.shape[1]
+    if not machine.is_reduced:  # by energy, as the model finds them
+        xyz = machine.all_dofs.xyz[machine.done.kept]
+        rigid = rigid_body_basis(machine.matrices["M"], machine.matrices["K"], motions, xyz)
+    certificate = machine.certified(rigid, expected, patch_errors(links, parts))
+    if machine.is_reduced:
+        return machine.reduced_model(motions, rigid, certificate)
+    return machine.model(motions, certificate, name)
 
 
-def _check_stiffness(soft: Sequence[Link], S: Any, parts: Sequence[Component]) -> None:
-    """Refuse springs beside which the digits of K are lost."""
-    if not soft:
-        return
-    own = np.concatenate([np.abs(part.model.K.diagonal()) for part in parts])
-    felt = abs(S)
-    there = felt.copy()
-    there.data = own[there.indices]
-    most, there = (part.max(axis=1).toarray().ravel() for part in (felt, there))
-    made = np.abs([link.stiffness for link in soft]) * most**2
-    ratio = np.divide(made, there, out=np.zeros(made.size), where=there > 0)
-    stiffest = int(np.argmax(ratio))
-    if ratio[stiffest] > _STIFFEST:
-        raise ModelError(
-            f"the spring {soft[stiffest].joint!r} is {ratio[stiffest]:.2g} times "
-            f"as stiff as its components there (limit {_STIFFEST:g}): the digits of their K would "
-            "be lost beside it. Leave stiffness= out: the joint is rigid."
-        )
-
-
-def _coordinate_reach(parts: Sequence[Component]) -> FloatArray:
-    """Return how far each coordinate (n,) moves its component at most, rotations times its size."""
-    length, found = machine_size(parts), []
-    for part in parts:
-        weight = np.where(part.dofs.kinds < 3, 1.0, length)
-        found.append(np.abs(weight[:, None] * part.T).max(axis=0) if part.is_reduced else weight)
-    return divisor(np.concatenate(found))
-
-
-def _machine_matrices(
-    parts: Sequence[Component], soft: Sequence[Link], S: Any, done: Elimination
-) -> dict[str, Any]:
-    """Return M, D and K of the machine; D is None where nothing has damping."""
-    reduced = any(part.is_reduced for part in parts)
-    if reduced and done.kept.size > _LARGEST:
-        raise ModelError(
-            f"a machine with reduced components has full matrices: {done.kept.size} coordinates "
-            f"are too many (limit {_LARGEST}). Reduce the large components first, by "
-            "CraigBampton(boundary=[...]) at their joints, or join models and reduce the machine."
-        )
-    damped = [part.is_damped for part in parts]
-    if any(damped) and not all(damped):
-        bare = [part.name for part, there in zip(parts, damped, strict=True) if not there]
-        warn(
-            f"components {bare} have no D, others have: they are undamped in the machine. Give "
-            "them one first, model.with_damping(ModalDamping(...)), or damp the machine's modes."
-        )
-    weights = {"K": [link.stiffness for link in soft], "D": [link.rate for link in soft]}
-    found: dict[str, Any] = {"D": None}
-    for name in "MDK" if any(damped) or reduced or any(weights["D"]) else "MK":
-        own = [(part, getattr(part.model, name)) for part in parts]
-        blocks = [sp.csc_array((part.n, part.n) if A is None else A) for part, A in own]
-        whole: Any = sp.block_diag(blocks, format="csc")
-        if name in weights and soft:
-            whole = whole + S.T @ sp.diags_array(np.array(weights[name])) @ S
-        whole = done.T.T @ whole @ done.T
-        whole = sp.csc_array(0.5 * (whole + whole.T))
-        found[name] = dense(whole) if reduced else whole
-    return found
-
-
-def _all_dofs(parts: Sequence[Component]) -> DofSet:
-    """Return all DOFs of all components; a machine in a machine brings the names of its own."""
-    names: list[str] = []
-    owners = []
-    for part in parts:
-        own = part.dofs.component_of
-        inner = part.dofs.components if own is not None else ("",)
-        start = len(names)
-        names += [f"{part.name}/{name}".rstrip("/") for name in inner]
-        owners.append(start + (np.zeros(len(part.dofs), np.int64) if own is None else own))
-    kinds = np.concatenate([part.dofs.kinds for part in parts])
-    return DofSet(
-        np.concatenate([part.dofs.nodes for part in parts]),
-        tuple(np.array(DIRECTIONS, dtype=object)[kinds]),
-        np.vstack([part.dofs.xyz for part in parts]),
-        components=tuple(names),
-        component_of=np.concatenate(owners),
-    )
-
-
-def _shape(parts: Sequence[Component], expansion: Any = None, motions: Any = None) -> JoinedShape:
-    names, dofs = zip(*((part.name, part.dofs) for part in parts), strict=True)
-    return JoinedShape(names, dofs, expansion, motions)
-
-
-def _joined_model(
-    parts: Sequence[Component], done: Elimination, fields: dict[str, Any], name: str | None
-) -> FEModel:
-    held = None
-    if any(part.model.held_inertia is not None for part in parts):
-        own = [(part.n, part.model.held_inertia) for part in parts]
-        loads = [np.zeros((n, 6)) if load is None else load for n, load in own]
-        held = np.asarray(done.T.T @ np.vstack(loads))
-    # sums of definite matrices are definite, and T has full rank: nothing to check again
-    return FEModel._proven(
-        **{key: frozen(value) for key, value in fields.items()},
-        dofs=_all_dofs(parts)._taken(done.kept).replace(interpolation=_shape(parts, done.T)),
-        name=name,
-        held_inertia=frozen(held),
-    )
-
-
-def _joined_reduced_model(
-    parts: Sequence[Component], done: Elimination, fields: dict[str, Any], rigid: FloatArray
-) -> ReducedModel:
-    full = _all_dofs(parts)
-    names = np.array([label for part in parts for label in part.coordinates], dtype=object)
-    left = names[done.kept].tolist()
-    of_dofs = [np.arange(part.n) < len(part.model.dofs) for part in parts]
-    physical = np.concatenate(of_dofs)[done.kept]
-    # DOFs first, generalised coordinates after them
-    order = np.argsort(~physical, kind="stable")
-    T = frozen(la.block_diag(*(dense(part.T) for part in parts)) @ done.T[:, order].toarray())
-    full = full.replace(interpolation=_shape(parts, motions=T))
-    listed = [left[i] for i in order.tolist()]
-    return ReducedModel(
-        **{name: fields[name][np.ix_(order, order)] for name in "MDK"},
-        T=T,
-        dofs=full.select(listed[: int(physical.sum())]),
-        full_dofs=full,
-        rigid_body=rigid[order],
-        method=f"components {', '.join(part.name for part in parts)} joined",
-        condition=max(part.model.condition if part.is_reduced else 1.0 for part in parts),
-        condition_of="their own",
-        coordinates=listed,
-        n_vectors=sum(part.model.n_vectors for part in parts if part.is_reduced),
-        static_at=[
-            f"{part.name}/{label}"
-            for part in parts
-            if part.is_reduced
-            for label in part.model.static_at
-            if label in part.dofs
-        ],
-        joint_motions=fields["joint_motions"][order],
-        joining=fields["joining"],
-    )
-
-
+#: largest gap, imbalance and error of the inertia, relative
+_LIMIT = 1e-7
+#: a rigid-body motion that a reduced component misses by less is one of its own
+_MADE = 1e-8
+#: the part of the largest entry of a motion that counts for the rounding of each
+_ENTRY = 1e-3
 #: a stretch below this part of the largest is none
 _NONE = 1e-9
 
 
-def groups_of(links: Sequence[Link], count: int) -> list[IntArray]:
-    """Return the components (from 0) of each part of the machine that joints hold together."""
-    pairs = [link.owners for link in links if link.holds and len(link.owners) == 2]
-    graph = sp.coo_array(
-        (np.ones(len(pairs)), ([p[0] for p in pairs], [p[1] for p in pairs])), shape=(count, count)
-    )
-    label = csgraph.connected_components(graph, directed=False)[1]
-    return [np.flatnonzero(label == number) for number in range(int(label.max()) + 1)]
+class JoinedMachine:
+    """Components and the axes of their joints: what is left when the rigid ones are fulfilled."""
+
+    def __init__(self, parts: Sequence[Component], links: Sequence[Link]) -> None:
+        self.parts, self.links = parts, links
+        self.is_reduced = any(part.is_reduced for part in parts)
+        self.soft = [link for link in links if not link.joint.is_rigid]
+        self.B = stretch_rows([link for link in links if link.joint.is_rigid], parts)
+        self.S = stretch_rows(self.soft, parts)
+        self._check_stiffness()
+        #: the component of each coordinate
+        self.owners = np.repeat(np.arange(len(parts)), [part.n for part in parts])
+        self.done = eliminated(self.B, self._reach(), self.owners)
+        self.matrices = self._matrices()
+
+    def _check_stiffness(self) -> None:
+        """Refuse springs beside which the digits of K are lost."""
+        if not self.soft:
+            return
+        own = np.concatenate([np.abs(part.model.K.diagonal()) for part in self.parts])
+        felt: Any = abs(self.S)
+        there = felt.copy()
+        there.data = own[there.indices]
+        most, there = (part.max(axis=1).toarray().ravel() for part in (felt, there))
+        made = np.abs([link.stiffness for link in self.soft]) * most**2
+        ratio = np.divide(made, there, out=np.zeros(made.size), where=there > 0)
+        stiffest = int(np.argmax(ratio))
+        if ratio[stiffest] > _STIFFEST:
+            raise ModelError(
+                f"the spring {self.soft[stiffest].joint!r} is {ratio[stiffest]:.2g} times as stiff "
+                f"as its components there (limit {_STIFFEST:g}): the digits of their K would be "
+                "lost beside it. Leave stiffness= out: the joint is rigid."
+            )
+
+    def _reach(self) -> FloatArray:
+        """Return how far each coordinate moves its component at most, rotations times its size."""
+        length, found = machine_size(self.parts), []
+        for part in self.parts:
+            weight = np.where(part.dofs.kinds < 3, 1.0, length)
+            size = np.abs(weight[:, None] * part.T).max(axis=0) if part.is_reduced else weight
+            found.append(size)
+        return divisor(np.concatenate(found))
+
+    def _matrices(self) -> dict[str, Any]:
+        """Return M, D and K of the machine; D is None where nothing has damping."""
+        if self.is_reduced and self.done.kept.size > _LARGEST:
+            raise ModelError(
+                f"a machine with reduced components has full matrices: {self.done.kept.size} "
+                f"coordinates are too many (limit {_LARGEST}). Reduce the large components first, "
+                "by CraigBampton(boundary=[...]) at their joints, or join models and reduce the "
+                "machine."
+            )
+        bare = [part.name for part in self.parts if not part.is_damped]
+        damped = len(bare) < len(self.parts)
+        if damped and bare:
+            warn(
+                f"components {bare} have no D, others have: they are undamped in the machine. Give "
+                "them one first, model.with_damping(ModalDamping(...)), or damp the machine's "
+                "modes."
+            )
+        soft, T = self.soft, self.done.T
+        weights = {"K": [link.stiffness for link in soft], "D": [link.rate for link in soft]}
+        found: dict[str, Any] = {"D": None}
+        for name in "MDK" if damped or self.is_reduced or any(weights["D"]) else "MK":
+            own = [(part.n, getattr(part.model, name)) for part in self.parts]
+            blocks = [sp.csc_array((n, n) if A is None else A) for n, A in own]
+            whole: Any = sp.block_diag(blocks, format="csc")
+            if name in weights and soft:
+                whole = whole + self.S.T @ sp.diags_array(np.array(weights[name])) @ self.S
+            whole = T.T @ whole @ T
+            whole = sp.csc_array(0.5 * (whole + whole.T))
+            found[name] = dense(whole) if self.is_reduced else whole
+        return found
+
+    @cached_property
+    def all_dofs(self) -> DofSet:
+        """All DOFs of all components; a machine in a machine brings the names of its own."""
+        names: list[str] = []
+        owners = []
+        for name, dofs in ((part.name, part.dofs) for part in self.parts):
+            own = np.zeros(len(dofs), np.int64) if dofs.component_of is None else dofs.component_of
+            owners.append(len(names) + own)
+            inner = ("",) if dofs.component_of is None else dofs.components
+            names += [f"{name}/{one}".rstrip("/") for one in inner]
+        kinds = np.concatenate([part.dofs.kinds for part in self.parts])
+        return DofSet(
+            np.concatenate([part.dofs.nodes for part in self.parts]),
+            tuple(np.array(DIRECTIONS, dtype=object)[kinds]),
+            np.vstack([part.dofs.xyz for part in self.parts]),
+            components=tuple(names),
+            component_of=np.concatenate(owners),
+        )
+
+    def _shape(self, expansion: Any = None, motions: Any = None) -> JoinedShape:
+        names, dofs = zip(*((part.name, part.dofs) for part in self.parts), strict=True)
+        return JoinedShape(names, dofs, expansion, motions)
+
+    def model(
+        self, motions: FloatArray, certificate: JoiningCertificate, name: str | None
+    ) -> FEModel:
+        """Return the machine of models."""
+        T, held = self.done.T, None
+        if any(part.model.held_inertia is not None for part in self.parts):
+            own = [(part.n, part.model.held_inertia) for part in self.parts]
+            loads = [np.zeros((n, 6)) if load is None else load for n, load in own]
+            held = np.asarray(T.T @ np.vstack(loads))
+        # sums of definite matrices are definite, and T has full rank: nothing to check again
+        return FEModel._proven(
+            **{key: frozen(value) for key, value in self.matrices.items()},
+            joint_motions=frozen(motions),
+            joining=frozen(certificate),
+            dofs=self.all_dofs._taken(self.done.kept).replace(interpolation=self._shape(T)),
+            name=name,
+            held_inertia=frozen(held),
+        )
+
+    def reduced_model(
+        self, motions: FloatArray, rigid: FloatArray, certificate: JoiningCertificate
+    ) -> ReducedModel:
+        """Return the machine of which some components are reduced."""
+        kept, reduced = self.done.kept, [part for part in self.parts if part.is_reduced]
+        names = np.array([x for part in self.parts for x in part.coordinates], dtype=object)[kept]
+        of_dofs = [np.arange(part.n) < len(part.model.dofs) for part in self.parts]
+        physical = np.concatenate(of_dofs)[kept]
+        # DOFs first, generalised coordinates after them
+        order = np.argsort(~physical, kind="stable")
+        expansion = la.block_diag(*(dense(part.T) for part in self.parts))
+        T = frozen(expansion @ self.done.T[:, order].toarray())
+        full = self.all_dofs.replace(interpolation=self._shape(motions=T))
+        listed = names[order].tolist()
+        return ReducedModel(
+            **{name: A[np.ix_(order, order)] for name, A in self.matrices.items()},
+            T=T,
+            dofs=full.select(listed[: int(physical.sum())]),
+            full_dofs=full,
+            rigid_body=rigid[order],
+            method=f"components {', '.join(part.name for part in self.parts)} joined",
+            condition=max(part.model.condition for part in reduced),
+            condition_of="their own",
+            coordinates=listed,
+            n_vectors=sum(part.model.n_vectors for part in reduced),
+            static_at=[
+                f"{part.name}/{label}"
+                for part in reduced
+                for label in part.model.static_at
+                if label in part.dofs
+            ],
+            joint_motions=motions[order],
+            joining=certificate,
+        )
+
+    @cached_property
+    def groups(self) -> list[IntArray]:
+        """The components (from 0) of each part of the machine that joints hold together."""
+        pairs = [link.owners for link in self.links if link.holds and len(link.owners) == 2]
+        ends = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        shape = (len(self.parts),) * 2
+        graph = sp.coo_array((np.ones(len(pairs)), tuple(ends)), shape=shape)
+        label = csgraph.connected_components(graph, directed=False)[1]
+        return [np.flatnonzero(label == number) for number in range(int(label.max()) + 1)]
+
+    def motions(self, rows: Any, *, free: bool) -> FloatArray:
+        """Return the M-orthonormal motions (k, m) of components as rigid bodies along joints.
+
+        They stretch none of the rows. For each part of the machine first those of the whole, then
+        those of one component against others (a slide, a hinge): all are combinations of the
+        components' own motions, those without energy or, unless `free`, the held ones too.
+        """
+        found = []
+        for group in self.groups:
+            several = [part.model for part in (self.parts[i] for i in group)]
+            own = [model.rigid_body if free else _body_motions(model) for model in several]
+            mixes = [
+                body.T @ model.inertia(model.rigid_motions())
+                for model, body in zip(several, own, strict=True)
+            ]
+            missed = np.max([model.missed_motions() for model in several], axis=0)
+            motions = np.zeros((self.owners.size, sum(part.shape[1] for part in own)))
+            motions[np.isin(self.owners, group)] = la.block_diag(*own)
+            scale = np.abs(motions).max(axis=0, initial=0.0)
+            motions = motions / divisor(scale)
+            whole = np.vstack(mixes) * scale[:, None]
+            stretch = np.asarray(rows @ motions)
+            most = np.asarray(abs(rows) @ np.abs(motions)).max(axis=1, initial=0.0)
+            stretch[np.abs(stretch) <= _NONE * most[:, None]] = 0.0  # rounding of what cancels
+            size = np.linalg.norm(stretch, axis=1)
+            allowed = la.null_space(stretch / divisor(size)[:, None], rcond=_NONE)
+            beside = np.linalg.norm(whole - allowed @ (allowed.T @ whole), axis=0)
+            size = np.linalg.norm(whole, axis=0)
+            clean = (missed < SPANNED) & (size > 0) & (beside <= _NONE * size)
+            candidates = motions[self.done.kept] @ np.hstack([whole[:, clean], allowed])
+            found.append(orthonormalised(self.matrices["M"], candidates, dependent="drop"))
+        return np.hstack(found)
+
+    def certified(
+        self, rigid: FloatArray, expected: int, patches: Mapping[str, float]
+    ) -> JoiningCertificate:
+        """Return the checks of the machine."""
+        both: Any = abs(self.B @ self.done.T), abs(self.B) @ abs(self.done.T)
+        opening, most = (part.max(axis=1).toarray().ravel() for part in both)
+        gap = float(np.max(opening / divisor(most), initial=0.0))
+        size = np.array([1.0] * 3 + [machine_size(self.parts)] * 3)
+        felt = [(link.joint.is_rigid, np.abs(link.carried / size).max()) for link in self.links]
+        balance = max((part for is_rigid, part in felt if is_rigid), default=0.0)
+        apart, error = self._inertia()
+        owner, pieces = self.owners[self.done.kept], {}
+        for group in self.groups:
+            moved = np.any(rigid[np.isin(owner, group)] != 0, axis=0)
+            names = ", ".join(self.parts[i].name for i in group)
+            pieces[names] = int(np.count_nonzero(moved))
+        found = JoiningCertificate(
+            gap=gap,
+            balance=float(max((part for _, part in felt), default=0.0)),
+            mass=float(max(np.diag(apart)[:3])) or float("nan"),
+            inertia_error=error,
+            constraints=self.B.shape[0],
+            rank=self.done.rank,
+            rigid={part.name: int(part.model.rigid_body.shape[1]) for part in self.parts},
+            pieces=pieces,
+            n_rigid=rigid.shape[1],
+            rigid_force=_force(self.matrices["K"], rigid),
+            patches=patches,
+        )
+        if not max(gap, balance, error, found.rigid_force) < _LIMIT:
+            raise CertificateError(
+                f"the joined machine fails its check (limit {_LIMIT:g}): {found!r}. Join fewer "
+                "axes, or look for joints that nearly repeat each other."
+            )
+        if found.n_rigid != expected:
+            raise CertificateError(
+                f"the machine has {counted(found.n_rigid, 'rigid-body motion')}, but {expected} of "
+                "its components' stretch no joint: a joint is too soft or too stiff for the digits "
+                "of the matrices. Look for a wrong unit of a stiffness, or leave the joint out."
+            )
+        return found
+
+    def _inertia(self) -> tuple[FloatArray, float]:
+        """Return the inertia (6, 6) of all components, and how far that of the machine is off.
+
+        Motions that a reduced component cannot make (it is held, say) have no inertia of the whole.
+        """
+        own = [part.model.rigid_motions() for part in self.parts]
+        apart, missed = np.zeros((6, 6)), np.zeros(6)
+        for part, motions in zip(self.parts, own, strict=True):
+            apart += motions.T @ part.model.inertia(motions)
+            if part.is_reduced:
+                missed = np.maximum(missed, part.model.missed_motions())
+        whole = np.vstack(own)[self.done.kept]
+        size = np.sqrt(np.maximum(np.diag(apart), TINY))
+        error = np.abs(whole.T @ np.asarray(self.matrices["M"] @ whole) - apart)
+        error, made = error / np.outer(size, size), missed < _MADE
+        return apart, float(error[np.ix_(made, made)].max(initial=0.0))
 
 
-def left_motions(
-    parts: Sequence[Component],
-    groups: Sequence[IntArray],
-    rows: Any,
-    M: Any,
-    kept: IntArray,
-    *,
-    free: bool,
-) -> FloatArray:
-    """Return the M-orthonormal motions (k, m) of components as rigid bodies that stretch no joint.
-
-    For each part of the machine first those of the whole, then those of one component against
-    others (a slide, a hinge): all are combinations of the components' own motions.
-    """
-    starts = np.concatenate([[0], np.cumsum([part.n for part in parts])])
-    found = []
-    for group in groups:
-        several = [parts[i] for i in group]
-        own = [_own_motions(part, free=free) for part in several]
-        mixes = [
-            body.T @ part.model.inertia(part.model.rigid_motions())
-            for part, body in zip(several, own, strict=True)
-        ]
-        missed = np.max([part.model.missed_motions() for part in several], axis=0)
-        rows_of = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in group])
-        motions = np.zeros((int(starts[-1]), sum(part.shape[1] for part in own)))
-        motions[rows_of] = la.block_diag(*own)
-        scale = np.abs(motions).max(axis=0, initial=0.0)
-        motions = motions / divisor(scale)
-        whole = np.vstack(mixes) * scale[:, None]
-        stretch = np.asarray(rows @ motions)
-        most = np.asarray(abs(rows) @ np.abs(motions)).max(axis=1, initial=0.0)
-        stretch[np.abs(stretch) <= _NONE * most[:, None]] = 0.0  # rounding of what cancels
-        size = np.linalg.norm(stretch, axis=1)
-        allowed = la.null_space(stretch / divisor(size)[:, None], rcond=_NONE)
-        beside = np.linalg.norm(whole - allowed @ (allowed.T @ whole), axis=0)
-        size = np.linalg.norm(whole, axis=0)
-        clean = (missed < SPANNED) & (size > 0) & (beside <= _NONE * size)
-        candidates = motions[kept] @ np.hstack([whole[:, clean], allowed])
-        found.append(orthonormalised(M, candidates, dependent="drop"))
-    return np.hstack(found)
-
-
-def _own_motions(part: Component, *, free: bool) -> FloatArray:
-    """Return the rigid-body motions (n, r) of a component: without energy, or held as well."""
-    rigid: FloatArray = part.model.rigid_body
-    if free:
-        return rigid
-    every: FloatArray = part.model.body_motions
+def _body_motions(model: Any) -> FloatArray:
+    """Return the rigid-body motions (n, r) of a component, held ones too."""
+    rigid: FloatArray = model.rigid_body
+    every: FloatArray = model.body_motions
     # those of a reduced model are known better than from its shapes
     return rigid if rigid.shape[1] == every.shape[1] else every
+
+
+def _force(K: Any, motions: FloatArray) -> float:
+    """Return the largest elastic force of motions (k, r), relative to what cancels in it."""
+    force = np.linalg.norm(np.asarray(K @ motions), axis=0)
+    # a motion that no spring feels has nothing but rounding of its largest entries there
+    moved = np.abs(motions) + _ENTRY * np.abs(motions).max(axis=0, initial=0.0)
+    most = np.linalg.norm(np.asarray(abs(K) @ moved), axis=0)
+    return float(np.max(force / divisor(most), initial=0.0))
 
 
 #: patches of more displacements are not examined: each is a load of the component
@@ -423,14 +489,6 @@ def compliances(
     stiffness = la.pinvh(C + beside * A @ A.T, rtol=_RANK)
     rigid = np.diag(la.inv(A.T @ stiffness @ A)) - beside
     return np.asarray(mean), np.asarray(rigid)
-
-
-#: largest gap, imbalance and error of the inertia, relative
-_LIMIT = 1e-7
-#: a rigid-body motion that a reduced component misses by less is one of its own
-_MADE = 1e-8
-#: the part of the largest entry of a motion that counts for the rounding of each
-_ENTRY = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -500,88 +558,3 @@ class JoiningCertificate(Value):
         text = [f"<JoiningCertificate: {head}, {self.mass:.6g} kg", f" {independent}, {errors}"]
         text += [f" {name}: compliance to {error:.2g}" for name, error in self.patches.items()]
         return "\n".join(text) + ">"
-
-
-def certified(
-    parts: Sequence[Component],
-    links: Sequence[Link],
-    done: Elimination,
-    matrices: Mapping[str, Any],
-    groups: Sequence[IntArray],
-    rigid: FloatArray,
-    expected: int,
-    patches: Mapping[str, float],
-) -> JoiningCertificate:
-    """Return the checks of a joined machine."""
-    B = stretch_rows([link for link in links if link.joint.is_rigid], parts)
-    opening: Any = abs(B @ done.T).max(axis=1)
-    most: Any = (abs(B) @ abs(done.T)).max(axis=1)
-    opening, most = (np.asarray(part.todense()).ravel() for part in (opening, most))
-    gap = float(np.max(opening / divisor(most), initial=0.0))
-    size = np.array([1.0] * 3 + [machine_size(parts)] * 3)
-    felt = [(link.joint.is_rigid, float(np.abs(link.carried / size).max())) for link in links]
-    balance = max((part for is_rigid, part in felt if is_rigid), default=0.0)
-    apart, error = _inertia(parts, matrices["M"], done.kept)
-    found = JoiningCertificate(
-        gap=gap,
-        balance=max((part for _, part in felt), default=0.0),
-        mass=float(max(np.diag(apart)[:3])) or float("nan"),
-        inertia_error=error,
-        constraints=B.shape[0],
-        rank=done.rank,
-        rigid={part.name: int(part.model.rigid_body.shape[1]) for part in parts},
-        pieces=_by_piece(parts, groups, rigid, done.kept),
-        n_rigid=rigid.shape[1],
-        rigid_force=_force(matrices["K"], rigid),
-        patches=patches,
-    )
-    if not max(gap, balance, error, found.rigid_force) < _LIMIT:
-        raise CertificateError(
-            f"the joined machine fails its check (limit {_LIMIT:g}): {found!r}. Join fewer axes, "
-            "or look for joints that nearly repeat each other."
-        )
-    if found.n_rigid != expected:
-        raise CertificateError(
-            f"the machine has {counted(found.n_rigid, 'rigid-body motion')}, but {expected} of its "
-            "components' stretch no joint: a joint is too soft or too stiff for the digits of the "
-            "matrices. Look for a wrong unit of a stiffness, or leave the joint out."
-        )
-    return found
-
-
-def _by_piece(
-    parts: Sequence[Component], groups: Sequence[IntArray], rigid: FloatArray, kept: IntArray
-) -> dict[str, int]:
-    """Return how many rigid-body motions move each piece."""
-    owner = np.repeat(np.arange(len(parts)), [part.n for part in parts])[kept]
-    moved = [np.any(rigid[np.isin(owner, group)] != 0, axis=0) for group in groups]
-    names = [", ".join(parts[i].name for i in group) for group in groups]
-    return {name: int(np.count_nonzero(some)) for name, some in zip(names, moved, strict=True)}
-
-
-def _force(K: Any, motions: FloatArray) -> float:
-    """Return the largest elastic force of motions (k, r), relative to what cancels in it."""
-    force = np.linalg.norm(np.asarray(K @ motions), axis=0)
-    # a motion that no spring feels has nothing but rounding of its largest entries there
-    moved = np.abs(motions) + _ENTRY * np.abs(motions).max(axis=0, initial=0.0)
-    most = np.linalg.norm(np.asarray(abs(K) @ moved), axis=0)
-    return float(np.max(force / divisor(most), initial=0.0))
-
-
-def _inertia(parts: Sequence[Component], M: Any, kept: IntArray) -> tuple[FloatArray, float]:
-    """Return the inertia (6, 6) of all components, and how far that of the machine is off.
-
-    Motions that a reduced component cannot make (it is held, say) have no inertia of the whole.
-    """
-    own = [part.model.rigid_motions() for part in parts]
-    apart = np.zeros((6, 6))
-    missed = np.zeros(6)
-    for part, motions in zip(parts, own, strict=True):
-        apart += motions.T @ part.model.inertia(motions)
-        if part.is_reduced:
-            missed = np.maximum(missed, part.model.missed_motions())
-    whole = np.vstack(own)[kept]
-    size = np.sqrt(np.maximum(np.diag(apart), TINY))
-    error = np.abs(whole.T @ np.asarray(M @ whole) - apart) / np.outer(size, size)
-    made = missed < _MADE
-    return apart, float(error[np.ix_(made, made)].max(initial=0.0))

@@ -109,13 +109,7 @@ class Joint(Value):
         return self.stiffness is None and self.rate is None
 
     def values(self, axes: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """Return the stiffness and the rate along each of some axes (k,).
-
-        Raises
-        ------
-        ModelError
-            When one number is to stand for displacements and rotations, or their number differs.
-        """
+        """Return the stiffness and the rate along each of some axes (k,)."""
         axes = name_list(axes, "axes")
         found = []
         for value, name in ((self.stiffness, "stiffness"), (self.rate, "rate")):
@@ -256,14 +250,8 @@ class Patch(Value):
     def mean(self, dofs: DofSet, point: FloatArray) -> tuple[FloatArray, FloatArray, list[str]]:
         """Return the mean motions of the patch at a point.
 
-        Returns
-        -------
-        (6, m) array
-            The six motions by the displacements of the nodes; zero for those it does not make.
-        (m, 6) array
-            A: the displacements of the nodes by the six motions.
-        list of str
-            Which of the six it determines.
+        The six motions by the displacements of the nodes (6, m), zero for those it does not make;
+        A, these displacements by the six motions (m, 6); and which of the six it determines.
         """
         rows = self.rows(dofs)
         return mean_motions(dofs._taken(rows), point, self._weight_of(dofs, rows))

@@ -140,17 +140,12 @@ def warn_of_missing_statics(links: Sequence[Link], parts: Sequence[Component]) -
         if not part.is_reduced or part.n == len(part.dofs):
             continue
         felt = [(link, end) for link in links for end in link.ends if end.component == index]
-        if not felt:
-            continue
         wanted = np.zeros((len(felt), len(part.dofs)))
         for row, (_, end) in zip(wanted, felt, strict=True):
             row[end.columns] = end.values
-        known = part.static_rows
-        left = wanted
-        if known.size:
-            some = np.flatnonzero(np.any(known, axis=0) | np.any(wanted, axis=0))
-            known, left, wanted = known[:, some], left[:, some], wanted[:, some]
-            left = wanted - (wanted @ np.linalg.pinv(known)) @ known
+        some = np.any(part.static_rows, axis=0) | np.any(wanted, axis=0)
+        known, wanted = part.static_rows[:, some], wanted[:, some]
+        left = wanted - (wanted @ np.linalg.pinv(known)) @ known
         part_left = np.linalg.norm(left, axis=1) / np.linalg.norm(wanted, axis=1)
         lost = [felt[i][0] for i in np.flatnonzero(part_left > _STATIC)]
         if lost:
@@ -283,8 +278,8 @@ def eliminated(B: sp.csr_array, size: FloatArray, order: IntArray) -> Eliminatio
     rest = sp.csr_array(sp.diags_array(-1.0 / pivot) @ some) if leads.size else some
     still = np.ones(n)
     still[leads] = 0.0
-    place = sp.csr_array((np.ones(leads.size), (leads, np.arange(leads.size))), (n, leads.size))
-    follow = sp.diags_array(still) + place @ rest @ sp.diags_array(still)
+    every = sp.eye_array(n, format="csc")
+    follow = (every + every[:, leads] @ rest) @ sp.diags_array(still)
     left = still[first.kept] > 0
     T = sp.csc_array(follow @ first.T[:, np.flatnonzero(left)])
     return Elimination(T, first.kept[left], first.rank + leads.size)

@@ -15,9 +15,8 @@ from ..checks import FloatArray, between, checked, function, whole
 from ..errors import ModelError, warn
 from ..parallel import Progress, expect
 from ..work import Work
-from .convex import Below, Branch, Convex, Groups
+from .convex import Below, Branch, Convex, Groups, Quadratic
 from .problem import ADVICE, Found, Problem, Search, layouts_of
-from .quadratic import Quadratic
 
 #: from so many trials on a lower bound shows first which of them could be better
 _MANY = 24
@@ -284,13 +283,7 @@ class BranchAndBound(Search):
     starts: int = field(default=4, metadata=checked(whole))
 
     def search(self, problem: Problem, work: Work) -> Found:
-        """Return the best choice and the bound that was proven; see `Search.search`.
-
-        Raises
-        ------
-        ModelError
-            When the criterion has no convex relaxation.
-        """
+        """Return the best choice and the bound that was proven; see `Search.search`."""
         scorer = problem.layouts.scorer
         if not isinstance(scorer, Convex):
             raise ModelError(

@@ -105,7 +105,10 @@ def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> d
             f"candidates are a list of {_NAME[side]}s or names, got {short(given)}. "
             "Put them in a list."
         )
-    own = _ports_of(plant, side)
+    if plant.is_assembled:
+        own = {port.name: port for port in getattr(plant.assembled.ports, side)}
+    else:
+        own = {name: PlantChannel(name, side) for name in (plant.y if side == "y" else plant.u)}
     found: dict[str, Port] = {}
     for port in given:
         if isinstance(port, str):
@@ -134,12 +137,6 @@ def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> d
                 "Rename one."
             )
     return found
-
-
-def _ports_of(plant: StandardPlant, side: str) -> dict[str, Port]:
-    if plant.is_assembled:
-        return {port.name: port for port in getattr(plant.assembled.ports, side)}
-    return {name: PlantChannel(name, side) for name in (plant.y if side == "y" else plant.u)}
 
 
 Zone = Rectangle | Disc

@@ -21,6 +21,7 @@ from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
 from ..synthesis import design_hinf
 from .candidates import PlantChannel, Port, side_of
+from .convex import Quadratic, measured, quadratic
 from .criterion import AGREEMENT, Criterion, Scorer
 from .poi_variance import (
     Named,
@@ -37,7 +38,6 @@ from .poi_variance import (
     structure_part,
     unit_of,
 )
-from .quadratic import Quadratic, measured, quadratic
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,7 +54,16 @@ class MotionAndEffort(Criterion):
 
     def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
         """Raise AssumptionError when w does not excite or the axes miss a rigid-body mode."""
-        _require_control(plant, self.factors(plant), repr(self))
+        plant.check().require(("excited",), "a stationary controller")
+        factors = self.factors(plant)
+        if not plant.is_assembled:
+            return
+        parts = []
+        for poi in plant.assembled.ports.z:
+            axes = tuple(axis for axis in poi.axes if poi.channel(axis) in factors)
+            parts += [poi.replace(axes=axes)] if axes else []
+        seen = plant.assembled.ports.replace(z=parts, references=())
+        plant.with_ports(seen).check().require(("performance",), f"a controller for {self!r}")
 
     def unit(self, plant: StandardPlant) -> str:
         """Return the unit of the square root."""
@@ -150,33 +159,14 @@ class PoiLqr(MotionAndEffort):
         held = np.arange(n, late.n_states).reshape(len(candidates), -1)
         S = np.zeros((noise.shape[1], late.n_states))
         S[:, :n] = noise.T
+        H, items = late.C.T @ late.C, late.B.T / self.effort
         try:
-            return quadratic(
-                late.A,
-                late.C.T @ late.C,
-                S @ late.A.T,
-                late.B.T / self.effort,
-                constant=constant,
-                owned=held,
-            )
+            return quadratic(late.A, H, S @ late.A.T, items, constant=constant, owned=held)
         except SolverError as error:
             raise SolverError(
                 f"{error} The effort of {self.effort:g} m/N may be too small to distinguish gains: "
                 "try a larger one."
             ) from error
-
-
-def _require_control(plant: StandardPlant, factors: Mapping[str, float], what: str) -> None:
-    """Raise AssumptionError when w does not excite or the axes miss a rigid-body mode."""
-    plant.check().require(("excited",), "a stationary controller")
-    if not plant.is_assembled:
-        return
-    parts = []
-    for poi in plant.assembled.ports.z:
-        axes = tuple(axis for axis in poi.axes if poi.channel(axis) in factors)
-        parts += [poi.replace(axes=axes)] if axes else []
-    seen = plant.assembled.ports.replace(z=parts, references=())
-    plant.with_ports(seen).check().require(("performance",), f"a controller for {what}")
 
 
 _WEIGHTS = "Type HinfLevel(z={'die:z': 1e9}, w={'amp1': 1e-3})."

@@ -36,23 +36,11 @@ class Scorer:
     """
 
     def value(self, chosen: Sequence[int]) -> Any:
-        """Return the score of one choice, smaller is better.
-
-        Raises
-        ------
-        FlexplantError
-            When the choice has none.
-        """
+        """Return the score of one choice, smaller is better; FlexplantError when it has none."""
         return float(self.score([chosen])[0])
 
     def outcome(self, chosen: Sequence[int]) -> tuple[float, str]:
-        """Return the score of one choice, infinite with the reason when it has none.
-
-        Raises
-        ------
-        ModelError
-            When `value` gives no number.
-        """
+        """Return the score of one choice, infinite with the reason when it has none."""
         try:
             found = self.value(chosen)
         except FlexplantError as error:
@@ -165,12 +153,8 @@ class Criterion(Value):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the scores of choices among candidates; what they share is computed once.
 
-        Parameters
-        ----------
-        plant : StandardPlant
-            Sampled, assembled from a structure.
-        candidates : sequence of Sensor or Actuator
-            All that may be chosen, of one kind.
+        The plant is sampled and assembled from a structure, the candidates are sensors, actuators
+        or both.
         """
         return OnPlant(plant, sides_of(candidates), tuple(candidates), self)
 

@@ -196,11 +196,6 @@ class ModalGramian(Criterion):
     frequency that are alike count as one, which the diagonal alone takes for two. Rigid-body modes,
     whose Gramian is infinite, are left out; filters and delays do not count. It is the sum of the
     Gramians of single devices. Of a POI it says next to nothing, as `ModeInformation`.
-
-    Parameters
-    ----------
-    measure : {"trace", "log det", "least"}
-        Sum of the eigenvalues, sum of their logarithms, or the least one.
     """
 
     scale: ClassVar[float] = 1.0
@@ -270,8 +265,8 @@ class ModalControllability(ModalGramian):
 
     Parameters
     ----------
-    measure : {"trace", "log det", "least"}
-        Sum of the eigenvalues, sum of their logarithms, or the least one.
+    measure
+        As for `ModalObservability`.
 
     References
     ----------

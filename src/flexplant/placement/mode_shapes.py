@@ -234,8 +234,8 @@ class ActuatorIndices(SensorIndices):
 
     Parameters
     ----------
-    norm : {"h2", "hinf", "hankel"}
-        By which modes are weighted.
+    norm
+        As for `SensorIndices`.
 
     Examples
     --------
@@ -337,15 +337,7 @@ class ByRows(Search):
             )
 
     def search(self, problem: Problem, work: Work) -> Found:
-        """Return the choice, bounded by relaxation; see `Search.search`. Nothing is random.
-
-        Raises
-        ------
-        ModelError
-            When the criterion has no rows of mode shapes.
-        InfeasibleError
-            When the choice does not satisfy the constraints.
-        """
+        """Return the choice, bounded by relaxation; see `Search.search`. Nothing is random."""
         scorer = problem.layouts.scorer
         if not isinstance(scorer, ModeRows):
             raise ModelError(

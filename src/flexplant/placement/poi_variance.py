@@ -20,8 +20,8 @@ from ..plant.dynamics import direct_effect
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from .candidates import Port, with_side
+from .convex import WorstRow, quadratic
 from .criterion import Criterion, OnBoth, OnPlant, Scorer
-from .quadratic import WorstRow, quadratic
 
 #: POIs, or axes of a POI, that count, each once or by a factor
 Named: TypeAlias = str | Sequence[str] | Mapping[str, float] | None

@@ -260,13 +260,7 @@ class Placement(Value):
         return self.gap <= 1e-8  # ten times what rounding adds to a bound
 
     def on(self, plant: StandardPlant) -> StandardPlant:
-        """Return the plant with the chosen sensors (actuators, or both) instead of its own.
-
-        Parameters
-        ----------
-        plant : StandardPlant
-            Of the same machine; assembled from a structure.
-        """
+        """Return a plant of the machine with the chosen sensors (actuators, or both)."""
         return with_side(plant, self.side, self.ports)
 
 
@@ -461,13 +455,9 @@ class Search(Value):
     def search(self, problem: Problem, work: Work) -> Found:
         """Return the best choice that was found.
 
-        Parameters
-        ----------
-        problem : Problem
-            With `score(sets)`, `bound()`, `choices()` and a `start`.
-        work : Work
-            Its `mapped` and `rng`: the result is the same to the bit on any executor, and work
-            that was stopped goes on from a file.
+        The problem has `score(sets)`, `bound()`, `choices()` and a `start`. With the work's
+        `mapped` and `rng` the result is the same to the bit on any executor, and work that was
+        stopped goes on from a file.
         """
 
 

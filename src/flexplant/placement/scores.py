@@ -70,13 +70,7 @@ class Scores(Value):
         return self.layouts[0]
 
     def table(self, count: int = 10) -> str:
-        """Return the best few as text, one per line.
-
-        Parameters
-        ----------
-        count : int
-            How many.
-        """
+        """Return the best few as text, one per line."""
         lines = []
         for i, value in enumerate(self.values[: whole(count, "count")]):
             why = f": {self.reasons[i]:.90}" if self.reasons[i] else ""
@@ -84,15 +78,7 @@ class Scores(Value):
         return "\n".join(lines)
 
     def on(self, plant: StandardPlant, *, rank: int = 0) -> StandardPlant:
-        """Return the plant with the layout of a rank (0 is the best) instead of its own.
-
-        Parameters
-        ----------
-        plant : StandardPlant
-            Of the same machine; assembled from a structure.
-        rank : int
-            Which layout.
-        """
+        """Return a plant of the machine with the layout of a rank (0 is the best)."""
         rank = whole(rank, "rank", minimum=0, maximum=len(self) - 1)
         known = {port.name: port for port in self.candidates}
         return with_side(plant, self.side, [known[name] for name in self.layouts[rank]])

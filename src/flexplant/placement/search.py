@@ -276,13 +276,7 @@ class Exhaustive(Search):
     limit: int = field(default=200_000, metadata=checked(whole))
 
     def search(self, problem: Problem, work: Work) -> Found:
-        """Return the best of all subsets; see `Search.search`. Nothing is random.
-
-        Raises
-        ------
-        ModelError
-            When there are more subsets than `limit`.
-        """
+        """Return the best of all subsets; see `Search.search`. Nothing is random."""
         if problem.subsets > self.limit:
             raise ModelError(
                 f"there are {counted(problem.subsets, 'subset')}, more than "

@@ -388,13 +388,11 @@ class OverPositions(Several):
 
     Parameters
     ----------
-    criterion : Criterion or callable
-        From plant to float.
+    criterion, measure
+        As for `OverMachines`, over the positions.
     points : int or mapping {name: int or array}
         How many values of each position are taken over its range, or which [m or rad]. Between
         them nothing is known: compare with more of them.
-    measure : {"worst", "mean"}
-        Over the positions.
 
     Raises
     ------

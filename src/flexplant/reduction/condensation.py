@@ -153,14 +153,12 @@ class Irs(ReductionMethod):
 
     Parameters
     ----------
-    dofs : sequence of str, DofSet or DofSelection
-        The DOFs that are kept.
+    dofs, damping
+        As for `Guyan`.
     iterations : int
         At most so many.
     tolerance : float
         Stop when no omega^2 changes by more than this part of itself.
-    damping : ModalDamping or Rayleigh, optional
-        Of the reduced model's own modes; None: ``T^T D T``.
 
     Notes
     -----
@@ -242,12 +240,10 @@ class Serep(ReductionMethod):
 
     Parameters
     ----------
-    dofs : sequence of str, DofSet or DofSelection
-        The DOFs that are kept.
+    dofs, damping
+        As for `Guyan`.
     modes : sequence of int, optional
         As many mode numbers (from 1, rigid-body modes included and all there); None: the lowest.
-    damping : ModalDamping or Rayleigh, optional
-        Of the reduced model's own modes; None: ``T^T D T``.
 
     Notes
     -----
@@ -506,10 +502,8 @@ class MacNeal(_FreeInterface):
 
     Parameters
     ----------
-    boundary, modes
-        As for `Rubin`.
-    damping : ModalDamping or Rayleigh, optional
-        Of the modes; None: their part of D.
+    boundary, modes, damping
+        As for `Rubin`; the damping is that of the modes alone, None: their part of D.
 
     References
     ----------

@@ -116,11 +116,10 @@ class EffectiveIndependence(SelectionCriterion):
         alive = np.arange(fixed + p)
         while alive.size > fixed + wanted:
             drops = min(_REFRESH, alive.size - fixed - wanted)
-            dropped = _dropped_rows(rows[alive], fixed, drops)
-            alive = np.delete(alive, dropped)
+            alive = np.delete(alive, _dropped_rows(rows[alive], fixed, drops))
         left = alive[fixed:] - fixed
         if wanted > count:
-            return [int(left[i]) for i in PivotedQr().chosen(required, pool[left], count)]
+            left = left[PivotedQr().chosen(required, pool[left], count)]
         return [int(i) for i in left]
 
     def values(self, rows: Rows) -> FloatArray:
@@ -229,11 +228,8 @@ class DofSelection(Value):
 
     def __repr__(self) -> str:
         more = f", ... {self.labels[-1]}" if len(self.labels) > 3 else ""
-        return (
-            f"<DofSelection: {counted(len(self.labels), 'DOF')} "
-            f"({', '.join(self.labels[:3])}{more}), "
-            f"condition {self.condition:.3g}>"
-        )
+        listed = f"{counted(len(self.labels), 'DOF')} ({', '.join(self.labels[:3])}{more})"
+        return f"<DofSelection: {listed}, condition {self.condition:.3g}>"
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.labels)
@@ -289,18 +285,15 @@ def select_dofs(
     """
     instance(modes, Modes, "modes", "Pass solve_modes(model, count=24).")
     rule = PivotedQr() if criterion is None else criterion
-    instance(
-        rule, SelectionCriterion, "criterion", "Pass reduction.PivotedQr() or reduction.Greedy()."
-    )
+    hint = "Pass reduction.PivotedQr() or reduction.Greedy()."
+    instance(rule, SelectionCriterion, "criterion", hint)
     basis = modes.basis
     kept = list(name_list(required, "required DOFs"))
     if len(set(kept)) != len(kept):
         raise LabelError(f"required DOFs appear twice: {kept}.")
-    if candidates is None:
-        pool = [label for label in modes.dofs.labels if ":r" not in label]
-    else:
-        pool = list(dict.fromkeys(name_list(candidates, "candidates")))
-    pool = [label for label in pool if label not in set(kept)]
+    straight = [label for label in modes.dofs.labels if ":r" not in label]
+    pool = straight if candidates is None else name_list(candidates, "candidates")
+    pool = [label for label in dict.fromkeys(pool) if label not in set(kept)]
     rows, open_rows = modes.dofs.indices(kept), modes.dofs.indices(pool)
     k = basis.shape[1]
     number = whole(count, "count", minimum=-(10**9))

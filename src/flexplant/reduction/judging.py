@@ -48,7 +48,9 @@ def quality_of(
     if not 0 <= low < high:
         raise ModelError(f"band must be two rising frequencies [Hz], got {[low, high]}.")
     pushed, watched = _judged_places(reduced, inputs, outputs)
-    own = _undamped_modes(reduced)
+    own: Modes = reduced.replace(D=np.zeros_like(reduced.D)).modes()
+    if reduced.is_physical:
+        own = own.replace(phi=reduced.T @ own.phi, dofs=reduced.full_dofs)
     modes = _full_modes(full, count, high)
     B, C = _place_rows(full, pushed).T, _place_rows(full, watched)
     Br, Cr = reduced.T.T @ B, C @ reduced.T
@@ -185,13 +187,6 @@ def _mode_comparison(
     }
 
 
-def _undamped_modes(reduced: Reduced) -> Modes:
-    found: Modes = reduced.replace(D=np.zeros_like(reduced.D)).modes()
-    if not reduced.is_physical:
-        return found
-    return found.replace(phi=reduced.T @ found.phi, dofs=reduced.full_dofs)
-
-
 #: points over the band, beside resonances and antiresonances
 _GRID = 200
 #: direct solutions that check the responses of a small and of a large structure
@@ -210,7 +205,7 @@ class FullResponses:
     def __init__(
         self, full: FEModel | Modes, modes: Modes, B: FloatArray, C: FloatArray, loss: float | None
     ) -> None:
-        self.full, self.B, self.C, self.loss = full, B, C, loss
+        self.full, self.modes, self.B, self.C, self.loss = full, modes, B, C, loss
         self.basis: DynamicBasis | None = None
         if isinstance(full, FEModel):
             law = None if loss is None else Hysteretic(loss)
@@ -223,19 +218,14 @@ class FullResponses:
             return np.zeros((freq.size, self.C.shape[0], 0), dtype=np.complex128)
         if self.basis is not None:
             return self.basis.response(freq, self.C, self.B)
-        assert isinstance(self.full, Modes)  # noqa: S101 - it is no FEModel
-        return _modal_response(self.full, freq, self.B, self.C, self.loss or 0.0)
+        return _modal_response(self.modes, freq, self.B, self.C, self.loss or 0.0)
 
     def checked(self, freq: FloatArray) -> None:
         """Compare the responses in a band with direct solutions, which mend the basis."""
         if self.basis is not None and self.B.shape[1]:
+            checks = _CHECKS[len(self.full.dofs) > _SMALL]
             self.basis, _, self.check = checked_response(
-                self.basis,
-                freq,
-                self.C,
-                self.B,
-                checks=_CHECKS[self.full.dofs.xyz.shape[0] > _SMALL],
-                tolerance=_TOLERANCE,
+                self.basis, freq, self.C, self.B, checks=checks, tolerance=_TOLERANCE
             )
 
     def static(self) -> FloatArray:
@@ -243,11 +233,11 @@ class FullResponses:
         loads = np.hstack([self.B, self.C.T])
         if self.basis is not None:
             return self.basis.compliance(loads.T, loads)
-        assert isinstance(self.full, Modes)  # noqa: S101 - it is no FEModel
-        if np.iscomplexobj(self.full.phi):
+        modes = self.modes
+        if np.iscomplexobj(modes.phi):
             return np.full((loads.shape[1],) * 2, np.nan)
-        r = self.full.n_rigid
-        motion = (loads.T @ np.real(self.full.basis))[:, r:] / self.full.basis_omega[r:]
+        r = modes.n_rigid
+        motion = (loads.T @ np.real(modes.basis))[:, r:] / modes.basis_omega[r:]
         return np.asarray(motion @ motion.T)
 
     def __str__(self) -> str:
@@ -274,17 +264,14 @@ def _modal_response(
 ) -> ComplexArray:
     s = 2j * np.pi * freq[:, None]
     if np.iscomplexobj(modes.phi):
-        r = modes.n_rigid
-        poles = np.asarray(modes.poles)
-        phi = np.asarray(modes.phi)
+        r, poles, phi = modes.n_rigid, np.asarray(modes.poles), np.asarray(modes.phi)
         swing = divisor(poles.imag)
         one = np.where(np.arange(poles.size) < r, 1 / s**2, 1 / (2j * swing * (s - poles)))
         two = np.where(np.arange(poles.size) < r, 0.0, 1 / (-2j * swing * (s - poles.conj())))
-        total = np.einsum("pk,fk,kq->fpq", C @ phi, one, phi.T @ B)
-        total = total + np.einsum("pk,fk,kq->fpq", C @ phi.conj(), two, phi.conj().T @ B)
-        return np.asarray(total, dtype=np.complex128)
-    gain = 1.0 / (modes.basis_squares * (1 + 1j * loss) + modes.basis_rates * s + s**2)
-    basis = np.real(modes.basis)
+        basis, gain = np.hstack([phi, phi.conj()]), np.hstack([one, two])
+    else:
+        basis = np.real(modes.basis)
+        gain = 1.0 / (modes.basis_squares * (1 + 1j * loss) + modes.basis_rates * s + s**2)
     return np.asarray(np.einsum("pk,fk,kq->fpq", C @ basis, gain, basis.T @ B))
 
 
@@ -293,8 +280,6 @@ def reduced_response(
 ) -> ComplexArray:
     """Return responses (f, p, q) of the reduced model: with a loss factor, or its own D."""
     omega = 2 * np.pi * freq[:, None, None]
-    if not B.shape[1]:
-        return np.zeros((freq.size, C.shape[0], 0), dtype=np.complex128)
     stiffness: Any = reduced.K * (1 + 1j * loss) if loss is not None else reduced.K
     damping = 0.0 if loss is not None else 1j * omega * reduced.D
     size = 1.0 / np.sqrt(np.abs(np.diag(reduced.K)) + np.abs(np.diag(reduced.M)))
@@ -404,9 +389,10 @@ class ReductionQuality(Value):
     @property
     def band_bound(self) -> float | None:
         """The a-priori bound [m/N] for frequencies up to the last one checked, if there is one."""
-        if self.bound is None or not self.check_freq[-1]:
-            return None if self.bound is None else self.bound.value
-        return self.bound.below(float(self.check_freq[-1]))
+        if self.bound is None:
+            return None
+        top = float(self.check_freq[-1])
+        return self.bound.below(top) if top else self.bound.value
 
     @property
     def holds(self) -> bool:
@@ -437,11 +423,10 @@ class ReductionQuality(Value):
                 f"{100 * self.frf_error[i, j]:.3g} % of the peak ({self.inputs[j]} -> "
                 f"{self.outputs[i]}), static {100 * self.static_error.max():.3g} %"
             )
-            if not np.all(np.isnan(self.resonance_error)):
-                lines[-1] += f", at resonance {100 * np.nanmax(self.resonance_error):.3g} %"
-            if not np.all(np.isnan(self.antiresonance_error)):
-                worst = 100 * np.nanmax(self.antiresonance_error)
-                lines[-1] += f", at antiresonance {worst:.3g} %"
+            for what in ("resonance", "antiresonance"):
+                error = getattr(self, f"{what}_error")
+                if not np.all(np.isnan(error)):
+                    lines[-1] += f", at {what} {100 * np.nanmax(error):.3g} %"
             if self.bound is not None:
                 lines.append(
                     f"error {self.true_error:.3g} m/N, bound {self.band_bound:.3g} m/N up to "
@@ -449,9 +434,8 @@ class ReductionQuality(Value):
                     + ("" if self.holds else ": BROKEN")
                 )
                 if not self.bounded:
-                    lines[-1] += (
-                        f", of the {self.bound.covers} modes solved: others add to the error"
-                    )
+                    solved = f"of the {self.bound.covers} modes solved"
+                    lines[-1] += f", {solved}: others add to the error"
             lines.append(f"by {self.route}")
         return "\n  ".join(lines) + ">"
 

@@ -94,7 +94,10 @@ class Krylov(ReductionMethod):
             if D is None or f == 0:
                 found = _real_moments(model, B, 2 * np.pi * float(f), self.moments, D)
             else:
-                found = _moments(model, D, B, 2j * np.pi * float(f), self.moments)
+                M, s = model.M, 2j * np.pi * float(f)
+                solve = _factorised(s**2 * M + s * D + model.K, abs(s))
+                moments = _second_order(solve, 2 * s * M + D, M, B, self.moments)
+                found = np.hstack([moments.real, moments.imag])
             basis = extended(model, basis, found)
         return projected_model(
             model,
@@ -119,20 +122,15 @@ def _real_moments(model: FEModel, B: FloatArray, omega: float, count: int, D: An
         return np.asarray(_second_order(solve, D, M, B, count))
     block = _normed(model, solve(B))
     found = [block]
-    for _ in range(count - 1):
+    for _step in range(count - 1):
         # a new start in the same Krylov space: what is already there taken out first
-        fresh = solve(np.asarray(model.M @ block))
-        block = _normed(model, _orthogonal_to(model, np.hstack(found), fresh))
+        fresh, basis = solve(np.asarray(model.M @ block)), np.hstack(found)
+        gram = basis.T @ np.asarray(model.M @ basis)
+        for _ in range(2):
+            fresh = fresh - basis @ la.lstsq(gram, basis.T @ np.asarray(model.M @ fresh))[0]
+        block = _normed(model, fresh)
         found.append(block)
     return np.hstack(found)
-
-
-def _moments(model: FEModel, D: Any, B: FloatArray, s: complex, count: int) -> FloatArray:
-    """Return a real basis of the moments of a damped model at s."""
-    M: Any = model.M
-    solve = _factorised(s**2 * M + s * D + model.K, abs(s))
-    found = _second_order(solve, 2 * s * M + D, M, B, count)
-    return np.hstack([found.real, found.imag])
 
 
 def _second_order(
@@ -191,15 +189,6 @@ def _factorised(matrix: Any, omega: float) -> Callable[[Any], Any]:
 def _normed(model: FEModel, vectors: FloatArray) -> FloatArray:
     square = np.sum(vectors * np.asarray(model.M @ vectors), axis=0)
     return np.asarray(vectors / np.sqrt(square.clip(TINY)))
-
-
-def _orthogonal_to(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Return vectors M-orthogonal to the span of others."""
-    gram = basis.T @ np.asarray(model.M @ basis)
-    for _ in range(2):
-        share = la.lstsq(gram, basis.T @ np.asarray(model.M @ vectors))[0]
-        vectors = vectors - basis @ share
-    return np.asarray(vectors)
 
 
 def extended(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArray:

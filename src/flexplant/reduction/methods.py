@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -37,28 +37,28 @@ class Solver:
 
     def __init__(self, matrix: Matrix, singular: str) -> None:
         self._matrix: Any = matrix
-        self._sparse = bool(sp.issparse(matrix) and matrix.shape[0] > DENSE_LIMIT)
         self._singular = singular
-        if self._sparse:
-            try:
-                self._factor: Any = MultifrontalCholesky(matrix)
-            except SolverError as error:
-                raise ModelError(singular) from error
-            return
-        scaled, self._scale = unit_diagonal(dense(matrix))
+        self._once: Callable[[FloatArray], Any]
         try:
-            self._factor = la.cho_factor(dense(scaled), lower=True)
-        except la.LinAlgError as error:
+            if sp.issparse(matrix) and matrix.shape[0] > DENSE_LIMIT:
+                factor = MultifrontalCholesky(matrix)
+                self._once = lambda loads: factor.solve(np.ascontiguousarray(loads))
+                return
+            scaled, size = unit_diagonal(dense(matrix))
+            lower = la.cholesky(dense(scaled), lower=True)
+        except (SolverError, la.LinAlgError) as error:
             raise ModelError(singular) from error
         # a root: pivots below 1e-14 of a unit diagonal are rounding
-        if matrix.shape[0] and np.diag(self._factor[0]).min() < 1e-7:
+        if np.diag(lower).min(initial=1.0) < 1e-7:
             raise ModelError(singular)
+        scale = size[:, None]
+        self._once = lambda loads: la.cho_solve((lower, True), loads * scale) * scale
 
     def solve(self, loads: FloatArray) -> FloatArray:
         """Return the (n, m) solution, refined once."""
         if not loads.size:
             return np.zeros_like(loads)
-        found = self._once(loads)
+        found: FloatArray = self._once(loads)
         found = found + self._once(loads - np.asarray(self._matrix @ found))
         left = np.linalg.norm(loads - np.asarray(self._matrix @ found))
         # a mechanism that rounding let through the factorisation takes no load
@@ -66,21 +66,14 @@ class Solver:
             raise ModelError(self._singular)
         return found
 
-    def _once(self, loads: FloatArray) -> FloatArray:
-        if self._sparse:
-            return np.asarray(self._factor.solve(np.ascontiguousarray(loads)))
-        scale = self._scale[:, None]
-        return np.asarray(la.cho_solve(self._factor, loads * scale) * scale)
-
 
 def labels_given(dofs: Iterable[str], name: str) -> tuple[str, ...]:
     """Return labels as a tuple, none of them twice."""
     labels = name_list(dofs, name)
     if not labels:
         raise LabelError(f"no {name} are given: name at least one DOF, such as '41:z'.")
-    seen = set(labels)
-    if len(seen) < len(labels):
-        doubled = sorted(label for label in seen if labels.count(label) > 1)
+    if len(set(labels)) < len(labels):
+        doubled = sorted({label for label in labels if labels.count(label) > 1})
         raise LabelError(f"{name} {doubled} appear twice: what must be inverted would be singular.")
     return labels
 
@@ -110,19 +103,6 @@ def inner(matrix: Matrix, T: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (product + product.T), dtype=np.float64)
 
 
-def modal_damping(
-    M: FloatArray, K: FloatArray, rigid: FloatArray, damping: Damping, model: FEModel, T: FloatArray
-) -> FloatArray:
-    """Return the D that gives the modes of a reduced model the ratios of a damping law."""
-    omega, phi = elastic_modes(M, K, rigid)
-    r = rigid.shape[1]
-    omega_all = np.concatenate([np.zeros(r), omega])
-    zeta = damping.ratios(omega_all, T @ np.hstack([rigid, phi]), model.K, model.dofs)[r:]
-    force = M @ phi
-    D = (force * (2 * zeta * omega)) @ force.T
-    return np.asarray(0.5 * (D + D.T), dtype=np.float64)
-
-
 def projected_model(
     model: FEModel,
     T: FloatArray,
@@ -147,20 +127,21 @@ def projected_model(
             f"{values[-1] / max(float(values[0]), TINY):.3g}): M* would be singular. "
             + (singular or "Take fewer.")
         )
-    rigid = np.zeros((T.shape[1], 0))
     full = model.rigid_body
-    if full.shape[1]:
-        load = scale[:, None] * (T.T @ np.asarray(model.M @ full))
-        rigid = scale[:, None] * la.solve(dense(scaled), load, assume_a="pos")
-        missed = float(np.abs(T @ rigid - full).max() / np.abs(full).max())
-        if not missed < _RIGID_TOLERANCE:
-            raise ModelError(
-                f"{method} does not hold the rigid-body motions of the structure (misses "
-                f"{missed:.2g} of them): its poles at 0 would be lost. "
-                + (singular or "Add coordinates that do.")
-            )
-    if damping is not None:
-        D = modal_damping(M, K, rigid, damping, model, T)
+    load = scale[:, None] * (T.T @ np.asarray(model.M @ full))
+    rigid = scale[:, None] * la.solve(dense(scaled), load, assume_a="pos")
+    missed = float(np.abs(T @ rigid - full).max(initial=0.0))
+    if missed > _RIGID_TOLERANCE * np.abs(full).max(initial=0.0):
+        raise ModelError(
+            f"{method} does not hold the rigid-body motions of the structure (misses "
+            f"{missed / np.abs(full).max():.2g} of them): its poles at 0 would be lost. "
+            + (singular or "Add coordinates that do.")
+        )
+    if damping is not None:  # modes with the ratios of the law
+        omega, phi = elastic_modes(M, K, rigid)
+        omega, phi = np.concatenate([np.zeros(rigid.shape[1]), omega]), np.hstack([rigid, phi])
+        zeta = damping.ratios(omega, T @ phi, model.K, model.dofs)
+        D = inner(np.diag(2 * zeta * omega), (M @ phi).T)
     else:
         D = np.zeros_like(M) if model.D is None else inner(model.D, T)
     return ReducedModel(

@@ -75,20 +75,12 @@ class ModeRanking(Value):
     def __repr__(self) -> str:
         first = ", ".join(str(i) for i in self.order[:6])
         more = ", ..." if self.modes.size > 6 else ""
-        return (
-            f"<ModeRanking: {counted(self.modes.size, 'elastic mode')}, "
-            f"{counted(len(self.inputs), 'input')} to "
-            f"{counted(len(self.outputs), 'output')}; by Hankel value: {first}{more}>"
-        )
+        channels = f"{counted(len(self.inputs), 'input')} to {counted(len(self.outputs), 'output')}"
+        found = counted(self.modes.size, "elastic mode")
+        return f"<ModeRanking: {found}, {channels}; by Hankel value: {first}{more}>"
 
     def table(self, most: int = 12) -> str:
-        """Return the most important modes as text, with the channels each matters most to.
-
-        Parameters
-        ----------
-        most : int
-            How many modes.
-        """
+        """Return the most important modes as text, with the channels each matters most to."""
         lines = [f"mode{'f [Hz]':>11s}{'Hankel':>11s}{'peak':>11s}  share of the largest, channel"]
         top = float(self.total.max(initial=0.0)) or 1.0
         for i in np.argsort(-self.total, kind="stable")[:most]:
@@ -235,30 +227,18 @@ class ErrorBound(Value):
     covers: int | None = field(default=None, kw_only=True, metadata=checked(whole))
 
     def __repr__(self) -> str:
-        some = (
-            "" if self.covers is None else f", of the {counted(self.covers, 'mode')} solved alone"
-        )
+        some = f", of the {counted(self.covers, 'mode')} solved alone" if self.covers else ""
         return (
             f"<ErrorBound {self.value:.4g} m/N, {counted(len(self.inputs), 'input')} to "
             f"{len(self.outputs)} outputs: {self.rule}{some}>"
         )
 
     def below(self, freq: float) -> float:
-        """Return the bound [m/N] for all frequencies up to one.
+        """Return the bound [m/N] for all frequencies up to `freq` [Hz].
 
         Modes above the band are far from their peaks: the sum over the neglected modes of the
         largest ``g_i |h_i(w)|`` there, or, where that is less, the static error and the sum of the
         largest ``g_i |h_i(w) - h_i(0)|``. Never more than `value`.
-
-        Parameters
-        ----------
-        freq : float [Hz]
-            The upper end of the band.
-
-        Raises
-        ------
-        ModelError
-            When it is not positive.
         """
         top = 2 * np.pi * positive(freq, "freq")
         if self.terms is None:

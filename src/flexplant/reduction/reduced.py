@@ -167,15 +167,7 @@ class ReducedModel(Value):
         return len(self.dofs) == self.n_dof
 
     def expand(self, q: FloatArray | ComplexArray) -> FloatArray | ComplexArray:
-        """Return the motion ``T q`` of all n DOFs, of motions (k,) or (k, m) of the coordinates.
-
-        Shapes may be complex.
-
-        Raises
-        ------
-        ShapeError
-            When there are not k rows.
-        """
+        """Return the motion ``T q`` of all n DOFs, of motions (k,) or (k, m), complex or not."""
         shape = (self.n_dof,) if np.ndim(q) == 1 else (self.n_dof, None)
         check: Any = complex_array if np.iscomplexobj(q) else real_array
         moved: FloatArray | ComplexArray = self.T @ check(q, "q", shape)
@@ -217,15 +209,7 @@ class ReducedModel(Value):
     def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return the coordinates (k, 6) nearest to the six rigid-body motions of the geometry.
 
-        Parameters
-        ----------
-        about : (3,) array [m]
-            The point that rotations turn about.
-
-        Raises
-        ------
-        ShapeError
-            When `about` is no point.
+        Rotations turn about the point `about` [m].
         """
         centre = real_array(about, "about", (3,))
         if self.is_physical:
@@ -259,16 +243,9 @@ class ReducedModel(Value):
     def condensed(self) -> tuple[ReducedModel, FloatArray, FloatArray]:
         """Return the model without its massless coordinates, and the flexibility they leave.
 
-        Massless coordinates follow at once: ``q_k = S q_c + G T^T f``, exactly.
-
-        Returns
-        -------
-        ReducedModel
-            In the c coordinates that have mass; itself when all have.
-        (k, c) array
-            S.
-        (k, k) array [m/N]
-            G, the displacement at once per load on the coordinates; zero when all have mass.
+        These follow at once: ``q_k = S q_c + G T^T f``, exactly. The model in the c coordinates
+        that have mass, S (k, c), and G (k, k) [m/N], the displacement at once per load on the
+        coordinates; the model itself, and zero, when all have mass.
 
         Raises
         ------

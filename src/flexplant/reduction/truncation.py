@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, IntArray, checked, whole
+from ..checks import FloatArray, checked, whole
 from ..errors import ModelError, counted
 from ..labels import Place
 from ..modes.modes import Modes
@@ -252,21 +252,12 @@ def truncated(
         if np.isfinite(value):
             covers = modes.n_modes if modes.n_modes < len(modes.dofs) else None
             bound = ErrorBound(value, into, out, _SUM, terms=terms, static=at_rest, covers=covers)
-    found = _modal_model(kept, numbers, method, bound)
-    return found.replace(truncated=_residual_modes(modes, columns))
-
-
-def _residual_modes(modes: Modes, columns: IntArray) -> Modes | None:
-    """Return the modes that are not kept, with the attachment vectors of all of them."""
-    others = np.setdiff1d(np.arange(modes.n_modes), columns)
-    if not others.size and not modes.n_vectors:
-        return None
-    return modes.select(others).replace(
-        vectors=modes.vectors,
-        vector_omega=modes.vector_omega,
-        vector_zeta=modes.vector_zeta,
-        vector_dofs=modes.vector_dofs,
-    )
+    left = None
+    if others.size:  # the modes that are not kept, with the attachment vectors of all of them
+        fields = ("vectors", "vector_omega", "vector_zeta", "vector_dofs")
+        left = modes.select(others[others < modes.n_modes])
+        left = left.replace(**{name: getattr(modes, name) for name in fields})
+    return _modal_model(kept, numbers, method, bound).replace(truncated=left)
 
 
 def _with_static(kept: Modes, gone: Modes, static: Any) -> Modes:
