@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..certificates import stability, stability_name
+from ..certificates import stability_name
+from ..checks import FloatArray
 from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
 from ..lti.interconnection import lft
 from ..lti.norms import h2_norm
@@ -16,7 +17,7 @@ from ..lti.riccati import control_care, control_dare, solve_care, solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from .controller import Controller, SolvedController, with_left_out
+from .controller import Controller, SolvedController, required_stability, with_left_out
 from .hinf.singular import made_regular, missing_ranks
 from .synthesis_plants import posed, require_reach
 
@@ -162,15 +163,12 @@ def _solve_regular(p: Prepared) -> SolvedController:
         raise AssumptionError(f"no optimal estimate of the states from y: {error}") from error
     residual = {"residual of the Riccati equations": max(control.residual, estimate.residual)}
     X, F, Y, L = control.P, -control.gain, estimate.P, -estimate.gain
-    if not p.direct:
-        square = np.sum(p.B1 * (X @ p.B1)) + np.sum((p.D12 @ F) * (p.D12 @ F @ Y))
-        zero = np.zeros((F.shape[0], L.shape[1]))
-        cost = float(np.sqrt(max(square, 0.0)))
-        return SolvedController(p.A + p.B2 @ F + L @ p.C2, -L, F, zero, cost, cost, residual)
-    R = p.D12.T @ p.D12 + p.B2.T @ X @ p.B2
-    S = p.D21 @ p.D21.T + p.C2 @ Y @ p.C2.T
-    F0 = -np.linalg.solve(R, p.B2.T @ X @ p.B1 + p.D12.T @ p.D11)
-    L0 = np.asarray(np.linalg.solve(S, (F @ Y @ p.C2.T + F0 @ p.D21.T).T).T, dtype=np.float64)
+    R, S = p.D12.T @ p.D12, p.D21 @ p.D21.T
+    L0: FloatArray = np.zeros((len(F), L.shape[1]))
+    if p.direct:
+        R, S = R + p.B2.T @ X @ p.B2, S + p.C2 @ Y @ p.C2.T
+        F0 = -np.linalg.solve(R, p.B2.T @ X @ p.B1 + p.D12.T @ p.D11)
+        L0 = np.asarray(np.linalg.solve(S, (F @ Y @ p.C2.T + F0 @ p.D21.T).T).T, dtype=float)
     square = np.sum(p.B1 * (X @ p.B1)) + np.sum(p.D11**2)
     square += np.sum(R * (F @ Y @ F.T - L0 @ S @ L0.T))
     cost = float(np.sqrt(max(square, 0.0)))
@@ -181,12 +179,12 @@ def _solve_regular(p: Prepared) -> SolvedController:
 def _certified(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:
     """Return what was verified of lft(P, K): its H2 norm by both Gramians, and its stability."""
     loop = lft(P, K)
-    least, norm = stability(loop.poles(), loop.dt), h2_norm(loop)
-    if not (least < (1.0 if loop.dt else 0.0) and np.isfinite(norm)):
+    least, norm = required_stability(loop), h2_norm(loop)
+    if not np.isfinite(norm):
         raise CertificateError(
-            f"the closed loop is not stable ({stability_name(loop.dt)} {least:.6g}) or its H2 "
-            "norm is infinite: the controller is refused. The plant is too badly conditioned, or a "
-            "mode that neither z nor w contains stays undamped: weight its motion and disturb it."
+            "the H2 norm of the closed loop is infinite: the controller is refused. The plant is "
+            "too badly conditioned, or a mode that neither z nor w contains stays undamped: weight "
+            "its motion and disturb it."
         )
     if not abs(norm - claim) <= AGREEMENT * norm:
         raise CertificateError(

@@ -22,7 +22,7 @@ from ...errors import (
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
 from ...lti.preparation import Prepared, departure_from_normal, prepared
-from ...lti.responses import Responder, remembered, responder
+from ...lti.responses import remembered, responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import StandardPlant, stage_weights
@@ -39,13 +39,7 @@ from ..lmi.lmi_programs import Lmi
 from ..synthesis_plants import posed, require_reach
 from .hinf_riccati import Riccati, require_shown
 from .lower_bound import pointwise_bound, raised_bound
-from .mode_channels import (
-    ModeChannel,
-    mode_channels,
-    rebalanced,
-    tolerated,
-    with_mode_channels,
-)
+from .mode_channels import ModeChannel, mode_channels, rebalanced, tolerated, with_mode_channels
 from .moved_design import over_positions
 from .singular import ADDED
 
@@ -288,18 +282,8 @@ def _design_one(
             answer = idle_answer(plant, problem, blamed)
         except FlexplantError:
             raise blamed from error
-        warn(answer.found.notes[0])
-    found = answer.found
-    return Controller(
-        answer.controller,
-        f"H-infinity by {type(answer.method).__name__}" if answer.method else "no feedback",
-        gamma=answer.gamma,
-        lower=answer.lower,
-        certificate=answer.certificate | dict(found.certificate),
-        reached=reached_norms(plant, answer.loop, answer.respond),
-        notes=found.notes,
-        tried=answer.tried,
-    )
+        warn(answer.controller.notes[0])
+    return answer.controller.replace(lower=answer.lower)
 
 
 def _require_known(plant: StandardPlant, problem: Prepared, answer: Answer) -> None:
@@ -327,7 +311,7 @@ def _moved_by_rounding(P: StateSpace, answer: Answer) -> float:
             name: part * (1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], size=part.shape))
             for name, part in (("A", P.A), ("B", P.B), ("C", P.C))
         }
-        gain = hinf_norm(lft(P.replace(**moved, blocks=None), answer.controller))
+        gain = hinf_norm(lft(P.replace(**moved, blocks=None), answer.controller.system))
         change = max(change, abs(gain / answer.gamma - 1.0) if answer.gamma else 0.0)
     return change
 
@@ -351,22 +335,11 @@ _SAME = 1.02
 
 
 class Answer(NamedTuple):
-    """A controller of the user's plant, what was verified of its loop, and how it was found."""
+    """A controller, the norm of its loop that was verified, and a bound on what any reaches."""
 
-    method: SynthesisMethod | None
-    found: SolvedController
-    controller: StateSpace
-    loop: StateSpace
-    respond: Responder
-    certificate: dict[str, float]
+    gamma: float
     lower: float
-    #: what was tried, and the gamma that each reached
-    tried: Mapping[str, float]
-
-    @property
-    def gamma(self) -> float:
-        """The verified norm."""
-        return self.certificate["norm"]
+    controller: Controller
 
     @property
     def is_close(self) -> bool:
@@ -419,7 +392,7 @@ def best_answer(
     if np.isfinite(least):  # of a broken answer too
         lower = raised_bound(problem, least, lower)
     best = next(one for one in answers if one.gamma <= _SAME * least)
-    return best._replace(lower=min(lower, best.gamma), tried=tried)
+    return Answer(best.gamma, min(lower, best.gamma), best.controller.replace(tried=tried))
 
 
 def _failure(failures: Mapping[str, FlexplantError]) -> FlexplantError:
@@ -439,10 +412,9 @@ def _beyond_claim(
         f"{found.gamma:.6g} was found for the scaled plant, {one.gamma:.6g} verified for this "
         "one. Its gains are close to infinite; weight the efforts and give the sensors noise."
     )
-    return one._replace(
-        found=found._replace(notes=(*found.notes, note)),
-        certificate=one.certificate | {"claim": found.gamma},
-    )
+    K = one.controller
+    certificate = dict(K.certificate or {}) | {"claim": found.gamma}
+    return one._replace(controller=K.replace(certificate=certificate, notes=(*K.notes, note)))
 
 
 def idle_answer(plant: StandardPlant, problem: Prepared, failure: FlexplantError) -> Answer:
@@ -459,16 +431,22 @@ def idle_answer(plant: StandardPlant, problem: Prepared, failure: FlexplantError
 
 
 def _certified_answer(
-    plant: StandardPlant,
-    problem: Prepared,
-    method: SynthesisMethod | None,
-    found: SolvedController,
+    plant: StandardPlant, problem: Prepared, method: SynthesisMethod | None, found: SolvedController
 ) -> Answer:
     """Return what a method found as an answer, its norm verified on the plant."""
-    controller = problem.restored(found.A, found.B, found.C, found.D)
-    controller = controller.replace(name="hinf", units=plant.units)
-    loop = lft(plant.system, controller)
+    K = problem.restored(found.A, found.B, found.C, found.D)
+    K = K.replace(name="hinf", units=plant.units)
+    loop = lft(plant.system, K)
     respond = remembered(responder(loop))  # swept twice over the same frequencies
     certificate = certified_norm(loop, found.gamma, respond)
-    tried = {f"{type(method).__name__}()": certificate["norm"]}
-    return Answer(method, found, controller, loop, respond, certificate, found.lower, tried)
+    gamma, name = certificate["norm"], type(method).__name__
+    controller = Controller(
+        K,
+        "no feedback" if method is None else f"H-infinity by {name}",
+        gamma=gamma,
+        certificate=certificate | dict(found.certificate),
+        reached=reached_norms(plant, loop, respond),
+        notes=found.notes,
+        tried={"no feedback" if method is None else f"{name}()": gamma},
+    )
+    return Answer(gamma, found.lower, controller)

@@ -11,13 +11,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...checks import FloatArray, Value, checked, positive
-from ...errors import (
-    AssumptionError,
-    FlexplantError,
-    InfeasibleError,
-    ModelError,
-    SolverError,
-)
+from ...errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, SolverError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -61,20 +62,19 @@ def pointwise_bound(problem: Prepared) -> float:
 
 def zero_bound(p: Prepared) -> float:
     """Return what no controller undercuts at the zeros of u -> z, and of w -> y, on the axis."""
-    sides = (
+    return max(_bound_at_zeros(*side) for side in _sides(p))
+
+
+def _sides(p: Prepared) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
+    """Return A, B1, B2, C1, D11 and D12 of a problem, and those of its dual: what y is for u."""
+    return (
         (p.A, p.B1, p.B2, p.C1, p.D11, p.D12),
         (p.A.T, p.C1.T, p.C2.T, p.B1.T, p.D11.T, p.D21.T),
     )
-    return max(_bound_at_zeros(*side) for side in sides)
 
 
 def _bound_at_zeros(
-    A: FloatArray,
-    B1: FloatArray,
-    B2: FloatArray,
-    C: FloatArray,
-    D11: FloatArray,
-    D12: FloatArray,
+    A: FloatArray, B1: FloatArray, B2: FloatArray, C: FloatArray, D11: FloatArray, D12: FloatArray
 ) -> float:
     """Return the largest ``|x' B1 + z' D11| / |z|`` with ``[x' z'] [A - s I, B2; C, D12] = 0``."""
     # z' z(s) = (x' B1 + z' D11) w(s) in any stable loop: x' times the equation of motion added
@@ -172,12 +172,7 @@ class FullInformation(NamedTuple):
 
 
 def full_information(
-    A: FloatArray,
-    B1: FloatArray,
-    B2: FloatArray,
-    C: FloatArray,
-    D11: FloatArray,
-    D12: FloatArray,
+    A: FloatArray, B1: FloatArray, B2: FloatArray, C: FloatArray, D11: FloatArray, D12: FloatArray
 ) -> FullInformation:
     """Return the problem of a plant with all states known, in which D12 has full rank.
 
@@ -210,10 +205,7 @@ def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
     values of the same problem with all states known and free states as inputs, and of its dual.
     [Stoorvogel1992]_ (the two quadratic matrix inequalities of singular problems).
     """
-    sides = (
-        full_information(p.A, p.B1, p.B2, p.C1, p.D11, p.D12),
-        full_information(p.A.T, p.C1.T, p.C2.T, p.B1.T, p.D11.T, p.D21.T),
-    )
+    sides = [full_information(*side) for side in _sides(p)]
     low = max(known, *(one.direct for one in sides))
     high = gamma
     for part in _PARTS:
@@ -232,7 +224,7 @@ def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
     return min(low, gamma)
 
 
-def _refuted(sides: tuple[FullInformation, FullInformation], gamma: float) -> bool:
+def _refuted(sides: Sequence[FullInformation], gamma: float) -> bool:
     values = []
     for one in sides:
         try:

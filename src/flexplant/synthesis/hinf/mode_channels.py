@@ -19,7 +19,7 @@ from ...plant import StandardPlant
 from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import RANK, TINY
-from ..robustness.uncertainty_blocks import FullBlock, Place, block_places, osborne
+from ..robustness.uncertainty_blocks import FullBlock, block_places, evened
 
 #: G over D of real mu, as a part of the response of a channel at its resonance
 _SHIFT = 0.7
@@ -186,11 +186,7 @@ def with_mode_channels(weighted: StandardPlant, channels: Sequence[ModeChannel])
         A, B, C, D, g.dt, inputs=[*into, *g.inputs], outputs=[*out, *g.outputs], units=g.units
     )
     return StandardPlant.from_statespace(
-        system,
-        w=[*into, *weighted.w],
-        u=weighted.u,
-        z=[*out, *weighted.z],
-        y=weighted.y,
+        system, w=[*into, *weighted.w], u=weighted.u, z=[*out, *weighted.z], y=weighted.y
     )
 
 
@@ -218,10 +214,9 @@ def tolerated(
 
     Below 1 no Deltas of a size (`times`), all at once, put a pole on the grid's frequencies.
     """
-    return times * ModeLoop.of(channels, plant, controller, times).level(1.0 / times)
+    return times * ModeLoop(channels, plant, controller, times).level(1.0 / times)
 
 
-@dataclass(frozen=True)
 class ModeLoop:
     r"""A loop from all d to all q without their shift, after these the weighted w and z.
 
@@ -235,23 +230,17 @@ class ModeLoop:
     between those of the grid.
     """
 
-    M: ComplexArray
-    shift: FloatArray
-    where: list[Place]
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         channels: Sequence[ModeChannel],
         plant: StandardPlant,
         controller: StateSpace,
         times: float,
         *,
         weighted: bool = False,
-    ) -> ModeLoop:
-        """Return the loop over a grid; with the weighted w and z after the channels, or without."""
-        loop = lft(plant.system, controller)
-        m = len(channels)
+    ) -> None:
+        # over a grid; with the weighted w and z after the channels, or without
+        loop, m = lft(plant.system, controller), len(channels)
         q, p = (len(side) if weighted else m for side in (loop.outputs, loop.inputs))
         part = loop.select(loop.outputs[:q], loop.inputs[:p])
         freq = np.union1d(resonance_grid(loop.poles(), loop.dt), _swept(channels, times, loop.dt))
@@ -260,10 +249,9 @@ class ModeLoop:
         shift = np.array([one.shift(z, loop.dt) for one in channels]).T
         M[:, :m] *= np.hypot(1.0, [one.c for one in channels])[:, None]
         M[:, range(m), range(m)] -= shift
+        self.M, self.shift = M, np.asarray(shift.imag)
         blocks = [FullBlock(1, 1) for _ in channels]
-        if weighted:
-            blocks.append(FullBlock(p - m, q - m))
-        return cls(M, np.asarray(shift.imag), block_places(blocks))
+        self.where = block_places([*blocks, FullBlock(p - m, q - m)] if weighted else blocks)
 
     def level(self, near: float) -> float:
         """Return beta, the largest over the grid: the Deltas and gains over it are all shown.
@@ -276,22 +264,11 @@ class ModeLoop:
         for part in np.array_split(np.argsort(-plain), -(-plain.size // _AT_ONCE)):
             if plain[part[0]] <= most:
                 break
-            rows, columns = self._even(self.M[part])
-            M = self.M[part] * rows[:, :, None] / columns[:, None]
+            M = evened(self.M[part], self.where)
             ways = [plain[part], self._levels(M, self.shift[part], near)]
             ways.append(self._levels(M, np.zeros_like(self.shift[part]), near))
             most = max(most, float(np.min(ways, axis=0).max()))
         return most
-
-    def _even(self, M: ComplexArray) -> tuple[FloatArray, FloatArray]:
-        """Return the D of all rows and of all columns that even out each matrix."""
-        d = np.sqrt(osborne(M, self.where))
-        rows, columns = (
-            np.repeat(d, [getattr(one, side).stop - getattr(one, side).start for one in self.where],
-                      axis=1)
-            for side in ("z", "w")
-        )  # fmt: skip
-        return rows, columns
 
     def _levels(self, M: ComplexArray, shift: FloatArray, near: float) -> FloatArray:
         """Return beta of each matrix, with ``D = (1 + shift^2 / beta^2)^-1/2`` at a beta near."""

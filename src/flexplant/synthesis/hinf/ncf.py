@@ -179,25 +179,19 @@ def _four_block(G: StateSpace, K: StateSpace) -> StateSpace:
             f"the controller has {len(K.inputs)} inputs and {len(K.outputs)} outputs, the plant "
             f"{p} y and {m} u: pass the K of u = K y for this plant."
         )
-    n = G.n_states
-    I_p, I_m = np.eye(p), np.eye(m)
     # [noise at y, force at u, u] -> [u, y, y], y = G (u + force) + noise
+    n, u, y = G.n_states, _names("u", m), _names("y", p)
+    row = np.hstack([np.eye(p), G.D, G.D])
     P = StateSpace(
         G.A,
         np.hstack([np.zeros((n, p)), G.B, G.B]),
         np.vstack([np.zeros((m, n)), G.C, G.C]),
-        np.block(
-            [
-                [np.zeros((m, p)), np.zeros((m, m)), I_m],
-                [I_p, G.D, G.D],
-                [I_p, G.D, G.D],
-            ]
-        ),
-        inputs=[*(f"n{i}" for i in range(p)), *(f"d{i}" for i in range(m)), *_names("u", m)],
-        outputs=[*(f"zu{i}" for i in range(m)), *(f"zy{i}" for i in range(p)), *_names("y", p)],
+        np.vstack([np.hstack([np.zeros((m, p + m)), np.eye(m)]), row, row]),
+        inputs=[*_names("n", p), *_names("d", m), *u],
+        outputs=[*_names("zu", m), *_names("zy", p), *y],
         dt=G.dt,
     )
-    return lft(P, K.replace(inputs=_names("y", p), outputs=_names("u", m), units={}))
+    return lft(P, K.replace(inputs=y, outputs=u, units={}))
 
 
 def verified_controller(
@@ -257,6 +251,12 @@ def hidden_mode(G: StateSpace, K: StateSpace) -> AssumptionError:
 
 def _names(letter: str, count: int) -> list[str]:
     return [f"{letter}{i}" for i in range(count)]
+
+
+def power(M: FloatArray, exponent: float) -> FloatArray:
+    """Return a power of a symmetric, positive definite matrix."""
+    values, vectors = np.linalg.eigh(M)
+    return np.asarray((vectors * values**exponent) @ vectors.T)
 
 
 def continuous(shaped: StateSpace) -> StateSpace:
@@ -339,13 +339,11 @@ def _least_by_factors(shaped: StateSpace) -> float:
     g = continuous(shaped)
     R = np.eye(len(g.outputs)) + g.D @ g.D.T
     H = -np.linalg.solve(R, (g.B @ g.D.T + Z @ g.C.T).T).T
-    values, vectors = np.linalg.eigh(R)
-    root = (vectors / np.sqrt(values)) @ vectors.T
+    root = power(R, -0.5)
     factors = StateSpace(
         g.A + H @ g.C,
         np.hstack([g.B + H @ g.D, H]),
         root @ g.C,
         root @ np.hstack([g.D, np.eye(R.shape[0])]),
     )
-    size = hankel_norm(factors)
-    return float(1.0 / np.sqrt(max(1.0 - size**2, TINY)))
+    return float(1.0 / np.sqrt(max(1.0 - hankel_norm(factors) ** 2, TINY)))

@@ -30,6 +30,7 @@ from .ncf import (
     integral_action,
     loop_margin,
     ncf_solutions,
+    power,
     require_model,
     verified_controller,
 )
@@ -166,8 +167,8 @@ def shape_loop(
     for _ in range(_STEPS):
         shaping = _shaping(axes, freq, rolloff)
         shaped = series(shaping, axes.plant)
-        found = _shaped_controller(shaped, T_ref, rho, back_off)
-        K = series(found.K, shaping)
+        K, gamma, least, certificate = _shaped_controller(shaped, T_ref, rho, back_off)
+        K = series(K, shaping)
         inner = K.select(inputs=K.inputs[-len(axes.names) :])
         inner = inner.replace(inputs=axes.names, outputs=axes.before.inputs)
         report = report_loops((axes.plant, inner), at="y")
@@ -195,9 +196,9 @@ def shape_loop(
     controller = Controller(
         system,
         f"loop shaping to {target:g} Hz{'' if T_ref is None else ', two degrees of freedom'}",
-        gamma=found.gamma,
-        lower=found.least,
-        certificate=found.certificate,
+        gamma=gamma,
+        lower=least,
+        certificate=certificate,
     )
     if axes.given is not None:
         controller = with_left_out(controller, axes.given, larger, feedback)
@@ -218,23 +219,16 @@ def _unusual(bandwidth: float, rolloff: float | None, rho: float | None) -> None
         )
 
 
-@dataclass(frozen=True)
-class _Designed:
-    """The controller of a shaped plant, y or [references; y] to u, and what was verified."""
-
-    K: StateSpace
-    gamma: float
-    least: float
-    certificate: dict[str, float]
-
-
 def _shaped_controller(
     shaped: StateSpace, model: StateSpace | None, rho: float, back_off: float
-) -> _Designed:
-    """Return the controller with one degree of freedom, or with two where there is a model."""
+) -> tuple[StateSpace, float, float, dict[str, float]]:
+    """Return the controller of a shaped plant, y or [references; y] to u, gamma, least, and more.
+
+    With one degree of freedom, or with two where there is a model; the last is what was verified.
+    """
     K, least, certificate = verified_controller(shaped, back_off)
     if model is None:
-        return _Designed(K, 1.0 / certificate["margin"], least, certificate)
+        return K, 1.0 / certificate["margin"], least, certificate
     K, gamma = following(shaped, model, rho)
     margin, stability = loop_margin(shaped, K.select(inputs=K.inputs[len(shaped.outputs) :]))
     if not margin >= (1.0 - 1e-3) / gamma:
@@ -243,10 +237,9 @@ def _shaped_controller(
             "claimed: the shaped plant is too badly conditioned to trust. Bring its gains at u "
             "and y to size 1."
         )
-    error = _following_error(shaped, model, K)
-    found = certificate | {"margin": margin, stability_name(shaped.dt): stability}
-    found["error of following"] = error
-    return _Designed(K, gamma, least, found)
+    certificate |= {"margin": margin, stability_name(shaped.dt): stability}
+    certificate["error of following"] = _following_error(shaped, model, K)
+    return K, gamma, least, certificate
 
 
 def _following_error(shaped: StateSpace, model: StateSpace, K: StateSpace) -> float:
@@ -301,49 +294,36 @@ def following(shaped: StateSpace, model: StateSpace, weight: float) -> tuple[Sta
     part = minimal(shaped)
     _, Z = ncf_solutions(part)
     g = continuous(part)
-    values, vectors = np.linalg.eigh(np.eye(p) + g.D @ g.D.T)
-    root, inverse = ((vectors * values**e) @ vectors.T for e in (0.5, -0.5))
-    P = _two_degrees(g, model, Z, root, inverse, weight)
+    P = _two_degrees(g, model, Z, weight)
     found = design_hinf(P, u=P.inputs[-m:], y=P.outputs[-2 * p :])
     K = tustin(found.system, 1.0 / shaped.dt) if shaped.dt else found.system
     W = la.block_diag(_scaling(shaped, model, K), np.eye(p))
     return K.replace(B=K.B @ W, D=K.D @ W), float(found.gamma or np.nan)
 
 
-def _two_degrees(
-    g: StateSpace,
-    model: StateSpace,
-    Z: FloatArray,
-    root: FloatArray,
-    inverse: FloatArray,
-    rho: float,
-) -> StateSpace:
+def _two_degrees(g: StateSpace, model: StateSpace, Z: FloatArray, rho: float) -> StateSpace:
     """Return [r; phi; u] -> [u; y; e; rho r; y]."""
     p, m = g.D.shape
-    n, q = g.n_states, model.n_states
-    zero = np.zeros
-    A = np.block([[g.A, zero((n, q))], [zero((q, n)), model.A]])
-    shake = (g.B @ g.D.T + Z @ g.C.T) @ inverse
+    n, q, zero = g.n_states, model.n_states, np.zeros
+    R = np.eye(p) + g.D @ g.D.T
+    root, shake = power(R, 0.5), (g.B @ g.D.T + Z @ g.C.T) @ power(R, -0.5)
+    seen, direct = np.hstack([g.C, zero((p, q))]), np.hstack([zero((p, p)), root, g.D])
+    C = [
+        zero((m, n + q)),
+        seen,
+        np.hstack([rho * g.C, -(rho**2) * model.C]),
+        zero((p, n + q)),
+        seen,
+    ]
+    D = [
+        np.hstack([zero((m, 2 * p)), np.eye(m)]),
+        direct,
+        np.hstack([-(rho**2) * model.D, rho * root, rho * g.D]),
+        np.hstack([rho * np.eye(p), zero((p, p + m))]),
+        direct,
+    ]
     B = np.block([[zero((n, p)), shake, g.B], [model.B, zero((q, p + m))]])
-    C = np.block(
-        [
-            [zero((m, n + q))],
-            [g.C, zero((p, q))],
-            [rho * g.C, -(rho**2) * model.C],
-            [zero((p, n + q))],
-            [g.C, zero((p, q))],
-        ]
-    )
-    D = np.block(
-        [
-            [zero((m, 2 * p)), np.eye(m)],
-            [zero((p, p)), root, g.D],
-            [-(rho**2) * model.D, rho * root, rho * g.D],
-            [rho * np.eye(p), zero((p, p + m))],
-            [zero((p, p)), root, g.D],
-        ]
-    )
-    return StateSpace(A, B, C, D)
+    return StateSpace(la.block_diag(g.A, model.A), B, np.vstack(C), np.vstack(D))
 
 
 def _scaling(shaped: StateSpace, model: StateSpace, K: StateSpace) -> FloatArray:

@@ -23,13 +23,7 @@ from ...loop.other_machines import BEYOND, mode_tolerances
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
-from ...plant import (
-    StandardPlant,
-    larger_plant,
-    reference_errors,
-    stage_weights,
-    standard_plant,
-)
+from ...plant import StandardPlant, larger_plant, reference_errors, stage_weights, standard_plant
 from ...plant.larger_plant import damped_less, draws_with_left_out
 from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
@@ -92,10 +86,8 @@ def design_stage(
         As for `stage_weights` and `reference_errors`.
     disturbance, effort : float
         As for `stage_weights` of an uncertain plant.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes that the plant left out, as for `larger_plant`.
-    progress : bool, optional
-        A bar, as for `design_hinf`.
+    larger, progress
+        As for `design_hinf`.
 
     Returns
     -------

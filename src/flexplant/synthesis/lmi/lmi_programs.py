@@ -17,7 +17,7 @@ from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError, 
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
 from ...lti.preparation import Prepared
-from ...lti.riccati import control_care, solve_care
+from ...lti.riccati import control_care, control_dare, solve_care, solve_dare
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, interruptible
 from ...tolerances import RANK, TINY, divisor
@@ -147,14 +147,29 @@ def lqg_states(p: Plant) -> Plant:
     Q, W = p.C1.T @ p.C1, p.B1 @ p.B1.T
     Q = Q + 1e-8 * np.linalg.norm(Q) * np.eye(n)
     W = W + 1e-8 * np.linalg.norm(W) * np.eye(n)
+    R, V = p.D12.T @ p.D12 + 0.1 * np.eye(nu), p.D21 @ p.D21.T + 0.1 * np.eye(ny)
     try:
-        control = control_care(p.A, p.B2, Q=Q, R=p.D12.T @ p.D12 + 0.1 * np.eye(nu))
-        filtered = solve_care(p.A, p.C2, Q=W, R=p.D21 @ p.D21.T + 0.1 * np.eye(ny))
+        return lqg_balanced(p, Q, W, R, V)
     except (SolverError, la.LinAlgError) as error:
         raise SolverError("rounding hides every stabilising controller.") from error
-    sizes = np.abs(np.concatenate([control.poles, filtered.poles]))
+
+
+def lqg_balanced(
+    p: Plant, Q: FloatArray, W: FloatArray, R: FloatArray, V: FloatArray, *, sampled: bool = False
+) -> Plant:
+    """Return a plant in states balanced by its LQG problem, A less one if it is sampled.
+
+    In the unit of frequency of the LQG loop; R and V weigh the effort and the noise of sensors.
+    """
+    solve_control, solve_filter = (
+        (control_dare, solve_dare) if sampled else (control_care, solve_care)
+    )
+    control, filtered = solve_control(p.A, p.B2, Q=Q, R=R), solve_filter(p.A, p.C2, Q=W, R=V)
+    one = float(sampled)
+    sizes = np.abs(np.concatenate([control.poles, filtered.poles]) - one)
     speed = float(np.exp(np.mean(np.log(np.maximum(sizes, TINY)))))
-    return p.balanced(control.P, filtered.P).timed(speed)
+    found = p.balanced(control.P, filtered.P)
+    return found._replace(A=found.A - one * np.eye(len(found.A))).timed(speed)
 
 
 def factor(P: FloatArray) -> FloatArray:

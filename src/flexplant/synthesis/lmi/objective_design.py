@@ -8,18 +8,11 @@ from typing import Any
 import numpy as np
 
 from ...checks import positive, short, whole
-from ...errors import (
-    CertificateError,
-    InfeasibleError,
-    ModelError,
-    SolverError,
-    attempted,
-)
+from ...errors import CertificateError, InfeasibleError, ModelError, SolverError, attempted
 from ...lti.equations import mean_speed, state_scale
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
 from ...lti.preparation import prepared
-from ...lti.riccati import control_care, control_dare, solve_care, solve_dare
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
@@ -30,7 +23,7 @@ from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati
 from ..structured.judges import require_finite_h2
 from ..synthesis_plants import require_stabilisable
-from .lmi_programs import Plant
+from .lmi_programs import Plant, lqg_balanced
 from .objectives import H2, Hinf, ObjectivePrograms, PeakGain, PoleRegion
 
 #: what a verified norm may exceed its bound by
@@ -195,23 +188,14 @@ def _balanced_plant(plant: StandardPlant) -> Plant:
         found = found.timed(mean_speed(g.poles()))
     found = found.with_unit_channels()
     n = A.shape[0]
-    # each channel counts alike: a little of everything, no rank is assumed
+    # each channel counts alike
     into = found.B1 / np.maximum(np.linalg.norm(found.B1, axis=0), TINY)
     out = found.C1 / np.maximum(np.linalg.norm(found.C1, axis=1), TINY)[:, None]
     # a little of everything: no rank of z or w is assumed
     Q, W = out.T @ out + 1e-6 * np.eye(n), into @ into.T + 1e-6 * np.eye(n)
-    solve_control, solve_filter = (
-        (control_dare, solve_dare) if plant.dt else (control_care, solve_care)
-    )
-    control = solve_control(found.A, found.B2, Q=Q, R=0.1 * np.eye(found.B2.shape[1]))
-    filtered = solve_filter(found.A, found.C2, Q=W, R=0.1 * np.eye(found.C2.shape[0]))
-    balanced = found.balanced(control.P, filtered.P)
-    closed = np.concatenate([control.poles, filtered.poles])
-    if plant.dt:
-        balanced = balanced._replace(A=balanced.A - np.eye(n))
-        closed = closed - 1.0
-    speeds = np.maximum(np.abs(closed), TINY)
-    return balanced.timed(float(np.exp(np.mean(np.log(speeds))))).with_unit_channels()
+    nu, ny = found.B2.shape[1], found.C2.shape[0]
+    R, V = 0.1 * np.eye(nu), 0.1 * np.eye(ny)
+    return lqg_balanced(found, Q, W, R, V, sampled=bool(plant.dt)).with_unit_channels()
 
 
 def _best_rate(problem: ObjectivePrograms) -> tuple[float, float]:

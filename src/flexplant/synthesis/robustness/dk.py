@@ -106,10 +106,8 @@ def design_mu(
         Most steps.
     order : int
         Most states of D for each Delta and side.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes that the plant left out, as for `larger_plant`.
-    progress : bool, optional
-        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
+    larger, progress
+        As for `design_hinf`.
 
     Returns
     -------
@@ -398,7 +396,7 @@ def _dk_iteration(
     if not lft(system, K).is_stable:
         raise SolverError("the controller does not stabilise in rounding.")
     again = rebalanced(channels, with_mode_channels(weighted, channels), K)
-    loop = ModeLoop.of(again, with_mode_channels(weighted, again), K, 2.0, weighted=True)
+    loop = ModeLoop(again, with_mode_channels(weighted, again), K, 2.0, weighted=True)
     mu = loop.level(level)
     if abs(mu / level - 1.0) > _NEAR:  # D is found for a level
         mu = min(mu, loop.level(mu))

@@ -457,11 +457,7 @@ def _machine_gain(
 
 
 def _candidates(
-    loop: UncertainLoop,
-    M: StateSpace,
-    listed: list[Any],
-    found: Covered,
-    rng: np.random.Generator,
+    loop: UncertainLoop, M: StateSpace, listed: list[Any], found: Covered, rng: np.random.Generator
 ) -> list[Perturbation]:
     """Return perturbations of size one that are bad at some frequency, the worst first."""
     where = block_places(listed)

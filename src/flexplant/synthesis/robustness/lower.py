@@ -56,16 +56,18 @@ def power_iteration(
         if not np.any(a):
             break
         a = _unit_vector(a)
-        left = np.zeros(M.shape[0], dtype=np.complex128)
-        for i, p in enumerate(where):
-            left[p.z] = _next_left(p, q, i, a, b, w)
-        w = M.conj().T @ left
+        _update_scalars(q, where, a, b, w)
+        w = M.conj().T @ np.concatenate([
+            q[i].conjugate() * w[p.w] if i in q else _along(a[p.z], w[p.w])
+            for i, p in enumerate(where)
+        ])  # fmt: skip
         if not np.any(w):
             break
         w = _unit_vector(w)
-        b = np.zeros(M.shape[1], dtype=np.complex128)
-        for i, p in enumerate(where):
-            b[p.w] = _right(p, q, i, a, old, w)
+        _update_scalars(q, where, a, old, w)
+        b = np.concatenate([
+            q[i] * a[p.z] if i in q else _along(w[p.w], a[p.z]) for i, p in enumerate(where)
+        ])  # fmt: skip
         b = _unit_vector(b)
         if la.norm(b - old) < _SETTLED:
             break
@@ -75,38 +77,25 @@ def power_iteration(
     return Perturbation(tuple(q.values()), tuple(vectors), omega)
 
 
-def _next_left(
-    p: Place, q: dict[int, complex], i: int, a: ComplexArray, b: ComplexArray, w: ComplexArray
-) -> ComplexArray:
-    """Return the block of the next left vector."""
-    if isinstance(p.block, FullBlock):
-        return np.asarray(a[p.z] * (la.norm(w[p.w]) / max(la.norm(a[p.z]), TINY)))
-    if p.block.real:
-        q[i] = _real_scalar(q[i].real, a[p.z], b[p.w], w[p.w])
-        return np.asarray(q[i] * w[p.w])
-    inner = np.vdot(w[p.w], a[p.z])
-    return np.asarray(inner / (abs(inner) or 1.0) * w[p.w])
+def _update_scalars(
+    q: dict[int, complex], where: Sequence[Place], a: ComplexArray, b: ComplexArray, w: ComplexArray
+) -> None:
+    """Set the next numbers of the scalar blocks, of real ones on their interval."""
+    for i, p in enumerate(where):
+        if isinstance(p.block, FullBlock):
+            continue
+        inner = complex(np.vdot(a[p.z], w[p.w]))
+        if p.block.real:
+            size = la.norm(b[p.w]) / max(la.norm(a[p.z]), TINY)
+            moved = (size if q[i].real >= 0 else -size) + inner.real
+            q[i] = complex(np.clip(moved, -1.0, 1.0))
+        else:
+            q[i] = inner / (abs(inner) or 1.0)
 
 
-def _right(
-    p: Place, q: dict[int, complex], i: int, a: ComplexArray, b: ComplexArray, w: ComplexArray
-) -> ComplexArray:
-    """Return the block of the next right vector."""
-    if isinstance(p.block, FullBlock):
-        return np.asarray(w[p.w] * (la.norm(a[p.z]) / max(la.norm(w[p.w]), TINY)))
-    if p.block.real:
-        q[i] = _real_scalar(q[i].real, a[p.z], b[p.w], w[p.w])
-        return np.asarray(q[i] * a[p.z])
-    inner = np.vdot(a[p.z], w[p.w])
-    q[i] = complex(inner / (abs(inner) or 1.0))
-    return np.asarray(q[i] * a[p.z])
-
-
-def _real_scalar(q: float, a: ComplexArray, b: ComplexArray, w: ComplexArray) -> float:
-    """Return the next number of a real scalar, on its interval."""
-    sign = 1.0 if q >= 0 else -1.0
-    moved = sign * la.norm(b) / max(la.norm(a), TINY) + float(np.vdot(a, w).real)
-    return float(np.clip(moved, -1.0, 1.0))
+def _along(direction: ComplexArray, like: ComplexArray) -> ComplexArray:
+    """Return a vector of a direction as long as another one."""
+    return np.asarray(direction * (la.norm(like) / max(la.norm(direction), TINY)))
 
 
 def _unit_vector(v: ComplexArray) -> ComplexArray:
@@ -127,11 +116,7 @@ class Destabilising(NamedTuple):
 
 
 def smallest_multiple(
-    M: StateSpace,
-    blocks: Sequence[Block],
-    found: Perturbation,
-    least: float,
-    most: float,
+    M: StateSpace, blocks: Sequence[Block], found: Perturbation, least: float, most: float
 ) -> Destabilising | None:
     """Return the multiple t between two sizes at which ``t Delta`` makes M's loop unstable.
 

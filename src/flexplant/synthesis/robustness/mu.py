@@ -31,10 +31,11 @@ from .uncertainty_blocks import (
     RepeatedScalar,
     Scalings,
     block_places,
+    evened,
     filled_blocks,
     matrix_of,
 )
-from .upper import WIDE, centred, reached_level, simple_bound, upper_level
+from .upper import WIDE, centred, reached_level, upper_level
 
 #: frequencies at which a perturbation is sought, starts at each
 _SOUGHT, _STARTS = 8, 6
@@ -303,13 +304,11 @@ class Cover:
         """Raise the level to what the most prominent frequencies need."""
         size, swing = np.abs(self.poles), self.poles.imag
         tried = np.unique(np.concatenate([[0.0], swing, size]))
-        M = self.at(tried)
-        simple = np.array([
-            simple_bound(one * self.tall(w, w), self.where)
-            for one, w in zip(M, tried, strict=True)
-        ])  # fmt: skip
+        # sigma_max of the evened M: a bound without optimisation, reals taken as complex
+        M = self.at(tried) * np.array([self.tall(w, w) for w in tried])[:, None]
+        simple = np.linalg.norm(evened(M, self.where), 2, axis=(1, 2))
         for i in np.argsort(-simple)[:6]:
-            self._raise(M[i] * self.tall(tried[i], tried[i]), float(tried[i]))
+            self._raise(M[i], float(tried[i]))
 
     def _raise(self, M: ComplexArray, omega: float) -> FloatArray:
         """Return scalings that hold at a frequency; the level is raised where it is too low."""

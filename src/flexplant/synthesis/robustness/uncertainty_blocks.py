@@ -10,6 +10,7 @@ import numpy as np
 
 from ...checks import ComplexArray, FloatArray, IntArray, Value, checked, flag, short, whole
 from ...errors import ModelError, ShapeError
+from ...lti.interconnection import series
 from ...lti.joining import block_matrix
 from ...lti.statespace import StateSpace, as_statespace
 from ...tolerances import ROUNDING, TINY
@@ -254,6 +255,15 @@ def osborne(M: ComplexArray, where: Sequence[Place]) -> FloatArray:
     return np.asarray(d / np.exp(np.mean(np.log(d), axis=-1, keepdims=True)))
 
 
+def evened(M: ComplexArray, where: Sequence[Place]) -> ComplexArray:
+    """Return ``d_i^(1/2) M_ij d_j^(-1/2)`` of Osborne's d, of one matrix or of each (n, z, w)."""
+    d = np.sqrt(osborne(M, where))
+    rows, columns = (
+        np.repeat(d, [getattr(one.block, side) for one in where], axis=-1) for side in "zw"
+    )
+    return np.asarray(rows[..., :, None] * M / columns[..., None, :])
+
+
 class Perturbation(NamedTuple):
     """A perturbation of size one, at a frequency.
 
@@ -294,12 +304,8 @@ def realised_delta(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
             parts.append(_rank_one(a, b, found.omega))
             continue
         number = complex(next(scalars))
-        if p.block.real or not number.imag:
-            parts.append(as_statespace(number.real * np.eye(p.block.size)))
-        else:
-            one = [_all_pass(number, found.omega) for _ in range(p.block.size)]
-            parts.append(_block_diagonal(one))
-    return _block_diagonal(parts)
+        parts += [_all_pass(number.real if p.block.real else number, found.omega)] * p.block.size
+    return _side_by_side(parts)
 
 
 def _all_pass(number: complex, omega: float) -> StateSpace:
@@ -316,23 +322,14 @@ def _all_pass(number: complex, omega: float) -> StateSpace:
     return StateSpace([[-p]], [[root]], [[-sign * root]], [[sign * size]])
 
 
-def _block_diagonal(parts: Sequence[StateSpace]) -> StateSpace:
+def _side_by_side(parts: Sequence[StateSpace]) -> StateSpace:
     A, B, C, D = (block_matrix([getattr(g, name) for g in parts]) for name in "ABCD")
     return StateSpace(A, B, C, D)
 
 
 def _rank_one(a: ComplexArray, b: ComplexArray, omega: float) -> StateSpace:
     """Return ``b(s) a(s)'`` with the values b and conj(a) at omega."""
-    into = [_all_pass(complex(v), omega) for v in a.conj()]
-    out = [_all_pass(complex(v), omega) for v in b]
-    first, second = _block_diagonal(into), _block_diagonal(out)
-    ones_in, ones_out = np.ones((1, len(into))), np.ones((len(out), 1))
-    row = StateSpace(first.A, first.B, ones_in @ first.C, ones_in @ first.D)
-    column = StateSpace(second.A, second.B @ ones_out, second.C, second.D @ ones_out)
-    n1, n2 = row.n_states, column.n_states
-    return StateSpace(
-        np.block([[row.A, np.zeros((n1, n2))], [column.B @ row.C, column.A]]),
-        np.vstack([row.B, column.B @ row.D]),
-        np.hstack([column.D @ row.C, column.C]),
-        column.D @ row.D,
-    )
+    into = _side_by_side([_all_pass(complex(v), omega) for v in a.conj()])
+    out = _side_by_side([_all_pass(complex(v), omega) for v in b])
+    one = series(into, as_statespace(np.ones((len(b), len(a)))))
+    return series(one, out)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -12,7 +11,7 @@ import scipy.sparse as sp
 
 from ...checks import ComplexArray, FloatArray, IntArray
 from ...tolerances import TINY
-from .uncertainty_blocks import Place, Scalings, osborne
+from .uncertainty_blocks import Scalings, osborne
 
 #: Newton decrement at which a centre is left; steps for one
 _CENTRED, _STEPS = 0.3, 40
@@ -312,11 +311,3 @@ def _barrier(W: ComplexArray, scalings: Scalings, x: FloatArray, level: float) -
 
 def _half(M: ComplexArray) -> ComplexArray:
     return np.asarray(0.5 * (M + M.conj().T))
-
-
-def simple_bound(M: ComplexArray, where: Sequence[Place]) -> float:
-    """Return sigma_max of the evened M: a bound without optimisation, reals taken as complex."""
-    d = np.sqrt(osborne(M, where))
-    left = np.concatenate([np.full(p.block.z, s) for p, s in zip(where, d, strict=True)])
-    right = np.concatenate([np.full(p.block.w, s) for p, s in zip(where, d, strict=True)])
-    return float(np.linalg.norm(left[:, None] * M / right, 2))
