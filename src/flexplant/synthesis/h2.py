@@ -19,6 +19,7 @@ from ..parallel import one_thread
 from ..plant import StandardPlant
 from .controller import Controller, SolvedController, required_stability, with_left_out
 from .hinf.singular import made_regular, missing_ranks
+from .structured.judges import require_finite_h2
 from .synthesis_plants import posed, require_reach
 
 #: the H2 norm by the closed loop's Gramians and by the formula of the least cost agree to this
@@ -103,7 +104,7 @@ def design_h2(
     True
     """
     plant = posed(plant, u, y, "H2 synthesis")
-    _require_finite(plant)
+    require_finite_h2(plant, plant.w, plant.z)
     problem = prepared(plant.system, plant.u, plant.y, direct=True)
     try:
         found = _optimal_controller(problem)
@@ -122,19 +123,6 @@ def design_h2(
         notes=found.notes,
     )
     return with_left_out(answer, plant, larger)
-
-
-def _require_finite(plant: StandardPlant) -> None:
-    """Raise AssumptionError when white w reaches z at once in continuous time."""
-    D = plant.system.D[: len(plant.z), : len(plant.w)]
-    row, column = np.unravel_index(int(np.argmax(np.abs(D))), D.shape)
-    if plant.dt or not np.abs(D[row, column]) > 0.0:
-        return
-    raise AssumptionError(
-        f"white noise on {plant.w[column]} reaches {plant.z[row]} at once (D11 = "
-        f"{D[row, column]:.3g}): its variance, and the H2 norm, is infinite. Weight that w or z "
-        "by a low-pass, or sample the plant."
-    )
 
 
 def _optimal_controller(p: Prepared) -> SolvedController:

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...certificates import stability_name
-from ...checks import FloatArray, Value, positive
+from ...checks import ComplexArray, FloatArray, Value, positive
 from ...errors import CertificateError, ModelError, SolverError, warn
 from ...loop import LoopReport, report_loops
 from ...lti.discretisation import tustin
@@ -247,10 +247,18 @@ def _following_error(shaped: StateSpace, model: StateSpace, K: StateSpace) -> fl
     poles = np.abs(model.poles()) / (2.0 * np.pi)
     top = 0.499 / shaped.dt if shaped.dt else 1e3 * float(poles.max(initial=1.0))
     freq = np.geomspace(1e-3 * float(poles.min(initial=1.0)), top, 400)
+    closed, T = _followed(shaped, model, K, freq)
+    return float(np.linalg.norm(closed - T, 2, axis=(1, 2)).max())
+
+
+def _followed(
+    shaped: StateSpace, model: StateSpace, K: StateSpace, freq: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return ``(I - G K2)^-1 G K1`` and the model's response (n_freq, p, p)."""
     G, gains, T = (np.moveaxis(responses(s, freq), 2, 0) for s in (shaped, K, model))
     p = T.shape[1]
     closed = np.linalg.solve(np.eye(p) - G @ gains[:, :, p:], G @ gains[:, :, :p])
-    return float(np.linalg.norm(closed - T, 2, axis=(1, 2)).max())
+    return np.asarray(closed, dtype=np.complex128), T
 
 
 def _model(given: float | System, axes: Axes) -> StateSpace:
@@ -330,7 +338,5 @@ def _scaling(shaped: StateSpace, model: StateSpace, K: StateSpace) -> FloatArray
     """Return W with ``(I - G K2)^-1 G K1 W = T_ref`` at a frequency that stands for zero."""
     slowest = float(np.abs(model.poles()).min(initial=np.inf)) / (2.0 * np.pi)
     freq = np.array([_SLOW * (slowest if np.isfinite(slowest) else 1.0)])
-    G, gains, T = (responses(s, freq)[:, :, 0] for s in (shaped, K, model))
-    p = T.shape[0]
-    X = np.linalg.solve(np.eye(p) - G @ gains[:, p:], G @ gains[:, :p])
-    return np.asarray(np.linalg.solve(X, T).real)
+    closed, T = _followed(shaped, model, K, freq)
+    return np.asarray(np.linalg.solve(closed[0], T[0]).real)

@@ -141,8 +141,11 @@ class _StageTask:
     ) -> None:
         if margin >= 1.0:
             raise ModelError(f"margin must be below 1, got {margin}: no loop that acts keeps it.")
-        self.uncertain, self.margin, self.poi = uncertain, margin, poi
-        self.disturbance, self.effort = disturbance, effort
+        self.uncertain, self.margin = uncertain, margin
+        #: those of a bandwidth [Hz]
+        self.weights = partial(
+            stage_weights, uncertain.nominal, poi=poi, disturbance=disturbance, effort=effort
+        )
         self.ranges = uncertain.frequencies
         if not self.ranges:
             raise ModelError(
@@ -169,14 +172,7 @@ class _StageTask:
 
     def holds(self, bandwidth: float) -> bool:
         """Design for a bandwidth of the weights, and return whether the loop holds."""
-        weights = stage_weights(
-            self.uncertain.nominal,
-            bandwidth,
-            poi=self.poi,
-            disturbance=self.disturbance,
-            effort=self.effort,
-        )
-        weighted = self.through.weighted(z=weights.z, w=weights.w)
+        weighted = self.through.weighted(self.weights(bandwidth))
         self.tried[bandwidth], damped = 0.0, None
         for factor in _DAMPED:
             now = int(np.count_nonzero(self._frequencies < factor * bandwidth))

@@ -204,24 +204,21 @@ def _best_rate(problem: ObjectivePrograms) -> tuple[float, float]:
     values: dict[float, float] = {}
     failures: list[Exception] = []
 
-    def attempt(rate: float) -> None:
-        try:
-            values[rate] = problem.smallest(rate)
-        except (SolverError, InfeasibleError) as error:
-            failures.append(error)
+    def attempt(*rates: float) -> None:
+        for rate in rates:
+            try:
+                values[rate] = problem.smallest(rate)
+            except (SolverError, InfeasibleError) as error:
+                failures.append(error)
 
-    free = any(
-        isinstance(one, PeakGain) and one.decay is None
-        for one in (problem.minimize, *problem.subject_to)
-    )
-    for rate in _RATES if free else (1.0,):
-        attempt(rate)
+    specs = (problem.minimize, *problem.subject_to)
+    free = any(isinstance(one, PeakGain) and one.decay is None for one in specs)
+    attempt(*(_RATES if free else (1.0,)))
     if not values:
         raise failures[0]
     for ratio in _STEPS if free else ():
         best = min(values, key=values.__getitem__)
-        attempt(best / ratio)
-        attempt(best * ratio)
+        attempt(best / ratio, best * ratio)
     best = min(values, key=values.__getitem__)
     return values[best], best
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from itertools import islice
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -180,7 +181,9 @@ def _filter_steps(
 ) -> Iterator[_DkStep]:
     """Yield the nominal controller, then those of plants scaled by D(s) of the loop before."""
     plant = open_plant(uncertain, w=w, z=z)
-    scales = _DFilters.none(plant)
+    # the weights of neglected modes by few states, D one
+    omega = _fit_grid(plant.system)
+    scales = _filters(plant, omega, np.ones((omega.size, len(plant.blocks))), 1)
     for number in range(most + 1):
         try:
             K = _scaled_controller(plant, scales, method, nominal=not number)
@@ -193,23 +196,8 @@ def _filter_steps(
         scales = _scales_of(plant, step.after, order)
 
 
-class _DFilters(NamedTuple):
-    """Filters on each output and each input of the uncertainty's channels."""
-
-    out: tuple[StateSpace, ...]
-    into: tuple[StateSpace, ...]
-
-    @classmethod
-    def none(cls, plant: UncertainLoop) -> _DFilters:
-        """Return ones, and the weights of neglected modes by few states."""
-        n = sum(block.z for block in plant.blocks)
-        m = sum(block.w for block in plant.blocks)
-        omega = _fit_grid(plant.system)
-        tall = np.array([plant.heights(one, one) for one in omega])[:, :m]
-        return cls(
-            tuple(StateSpace([], [], [], [[1.0]]) for _ in range(n)),
-            tuple(fitted_magnitude(omega, column, 2) for column in tall.T),
-        )
+#: filters on each output and on each input of the uncertainty's channels
+_DFilters: TypeAlias = tuple[list[StateSpace], list[StateSpace]]
 
 
 def _fit_grid(g: StateSpace) -> FloatArray:
@@ -222,13 +210,13 @@ def _scaled_controller(
     plant: UncertainLoop, scales: _DFilters, method: SynthesisMethod | None, *, nominal: bool
 ) -> StateSpace:
     """Return the H-infinity controller of the scaled plant, sampled like the plant."""
-    g, n, m = plant.system, len(scales.out), len(scales.into)
+    g, (out, into) = plant.system, scales
+    n, m = len(out), len(into)
     if nominal:
         scaled = g.select(g.outputs[n:], g.inputs[m:])
     else:
         ones = [StateSpace([], [], [], [[1.0]])]
-        into = [*scales.into, *ones * (len(g.inputs) - m)]
-        out = [*scales.out, *ones * (len(g.outputs) - n)]
+        into, out = into + ones * (len(g.inputs) - m), out + ones * (len(g.outputs) - n)
         scaled = series(series(side_by_side(into, g.inputs), g), side_by_side(out, g.outputs))
     own = plant.uncertain.plant
     standard = StandardPlant.from_statespace(scaled, u=own.u, y=own.y)
@@ -261,20 +249,21 @@ def _scales_of(plant: UncertainLoop, loop: UncertainLoop, order: int) -> _DFilte
         x = upper_level(M, scalings, start).x
         rows.append(np.sqrt(scalings.stacks(x)[0][:, 0, 0].real))  # all are numbers
     d = np.array(rows)
-    d = d / d[:, -1:]  # performance is not scaled
-    tall = np.array([plant.heights(one, one) for one in omega])
-    out, into, column = [], [], 0
-    for i, block in enumerate(loop.blocks):
-        one = fitted_magnitude(omega, d[:, i], order)
+    return _filters(plant, omega, d / d[:, -1:], order)  # performance is not scaled
+
+
+def _filters(plant: UncertainLoop, omega: FloatArray, d: FloatArray, order: int) -> _DFilters:
+    """Return filters of D (n_freq, blocks), and of the weights of columns over D."""
+    weights = iter(np.array([plant.heights(one, one) for one in omega]).T)
+    out: list[StateSpace] = []
+    into: list[StateSpace] = []
+    for block, size in zip(plant.blocks, d.T, strict=False):
+        one = fitted_magnitude(omega, size, order)
         out += [one] * block.z
-        for _ in range(block.w):
-            weight = tall[:, column]
+        for weight in islice(weights, block.w):
             flat = np.ptp(weight) < ROUNDING * weight.max()
-            into.append(
-                inverse(one) if flat else fitted_magnitude(omega, weight / d[:, i], order + 1)
-            )
-            column += 1
-    return _DFilters(tuple(out), tuple(into))
+            into.append(inverse(one) if flat else fitted_magnitude(omega, weight / size, order + 1))
+    return out, into
 
 
 #: mean error of the logarithm with which a fit of fewer states is taken

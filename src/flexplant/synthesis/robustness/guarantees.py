@@ -400,8 +400,11 @@ def worst_case_gain(
     loop = uncertain_loop(uncertain, blocks, w=w, z=z)
     listed = [*loop.blocks, loop.performance]
     nominal, _ = peak_gain(loop.performed(uncertain.plant))
-    size = nominal or 1.0
-    M = _in_units(loop.system, size, loop.performance.z)
+    # in units of its size: a level of 1e-18, of 1e-9 m/N, is not resolved beside Deltas of one
+    size, g = nominal or 1.0, loop.system
+    unit = np.ones((len(g.outputs), 1))
+    unit[-loop.performance.z :] = 1.0 / size
+    M = g.replace(C=unit * g.C, D=unit * g.D)
     with Progress(None, INTERVALS, progress=progress):
         found = Cover(M, listed, [*[False] * len(loop.blocks), True], loop.heights).run()
     if not np.isfinite(found.level):
@@ -429,16 +432,6 @@ def worst_case_gain(
         loop.freq(found.frequencies),
         size * np.sqrt(np.maximum(found.bounds, 0.0)),
     )
-
-
-def _in_units(M: StateSpace, size: float, p: int) -> StateSpace:
-    """Return the system with its last p outputs in units of a size: the level sought is near 1.
-
-    A level of 1e-18, of 1e-9 m/N, is below what is resolved beside Deltas of size one.
-    """
-    unit = np.ones((len(M.outputs), 1))
-    unit[len(unit) - p :] = 1.0 / size
-    return M.replace(C=unit * M.C, D=unit * M.D)
 
 
 def _machine_gain(

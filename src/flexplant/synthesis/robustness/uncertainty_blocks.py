@@ -130,35 +130,34 @@ class Scalings:
     def __init__(self, blocks: Sequence[Block], leveled: Sequence[bool] | None = None) -> None:
         self.places = block_places(blocks)
         self.w, self.z = sum(b.w for b in blocks), sum(b.z for b in blocks)
-        chosen = [True] * len(blocks) if leveled is None else list(leveled)
-        self.skewed = not all(chosen)
+        #: which blocks are leveled
+        self.chosen = np.array([True] * len(blocks) if leveled is None else leveled)
+        self.skewed = not self.chosen.all()
         entries: list[tuple[int, int, int, complex, bool]] = []
         start: list[float] = []
         self.d_ranges: list[tuple[slice, ComplexArray]] = []
-        for place, level in zip(self.places, chosen, strict=True):
-            basis = _hermitian(place.block.size if isinstance(place.block, RepeatedScalar) else 1)
+        #: which x are those of each block
+        self.ranges: list[slice] = []
+        for place, level in zip(self.places, self.chosen, strict=True):
+            block, w, z = place.block, place.w.start, self.w + place.z.start
+            basis = _hermitian(block.size if isinstance(block, RepeatedScalar) else 1)
             first = len(start)
             for B in basis:
+                full = isinstance(block, FullBlock)
+                of_w, of_z = (np.eye(block.w), np.eye(block.z)) if full else (B, B)
                 p = len(start)
                 start.append(float(np.trace(B).real > 0))
-                if isinstance(place.block, FullBlock):
-                    entries += [(p, i, i, 1.0, level) for i in range(place.w.start, place.w.stop)]
-                    rows = range(self.w + place.z.start, self.w + place.z.stop)
-                    entries += [(p, i, i, -1.0, False) for i in rows]
-                    continue
-                for i, k in np.argwhere(B):
-                    w, z = place.w.start, self.w + place.z.start
-                    entries.append((p, w + i, w + k, B[i, k], level))
-                    entries.append((p, z + i, z + k, -B[i, k], False))
+                entries += [(p, w + i, w + k, of_w[i, k], level) for i, k in np.argwhere(of_w)]
+                entries += [(p, z + i, z + k, -of_z[i, k], False) for i, k in np.argwhere(of_z)]
             self.d_ranges.append((slice(first, len(start)), basis))
-            if isinstance(place.block, RepeatedScalar) and place.block.real:
+            if isinstance(block, RepeatedScalar) and block.real:
                 for B in basis:
                     p = len(start)
                     start.append(0.0)
                     for i, k in np.argwhere(B):
-                        w, z = place.w.start + i, self.w + place.z.start + k
-                        entries.append((p, w, z, 1j * B[i, k], False))
-                        entries.append((p, z, w, -1j * np.conj(B[i, k]), False))
+                        entries.append((p, w + i, z + k, 1j * B[i, k], False))
+                        entries.append((p, z + k, w + i, -1j * np.conj(B[i, k]), False))
+            self.ranges.append(slice(first, len(start)))
         self.count = len(start)
         sizes = [basis.shape[1] for _, basis in self.d_ranges]
         #: blocks of one size together: x of their D (n_blocks, size^2), and the basis of each
@@ -196,20 +195,15 @@ class Scalings:
         """Return D of the blocks of each size (n_blocks, size, size)."""
         return [np.einsum("bp,pij->bij", x[own], basis) for own, basis in self.alike]
 
-    @property
-    def ends(self) -> list[int]:
-        """Where D and G of each block end in x."""
-        return [own.start for own, _ in self.d_ranges[1:]] + [self.count]
-
     def shifted(self, x: FloatArray, M: ComplexArray) -> FloatArray:
         """Return x with G of real scalars that takes the imaginary part from the diagonal of M.
 
         ``G = -D Im M``: of one real scalar alone F is then ``D (level - |M|^2 + 2 (Im M)^2)``.
         """
         x = x.copy()
-        for place, (own, _), end in zip(self.places, self.d_ranges, self.ends, strict=True):
+        for place, (own, _), all_x in zip(self.places, self.d_ranges, self.ranges, strict=True):
             size = place.block.w
-            if end - own.stop:  # its G; the diagonal comes first, in D as in G
+            if all_x.stop > own.stop:  # its G; the diagonal comes first, in D as in G
                 turn = np.diagonal(M[place.z, place.w]).imag
                 x[own.stop : own.stop + size] = -x[own.start : own.start + size] * turn
         return x
@@ -217,8 +211,8 @@ class Scalings:
     def scaled(self, x: FloatArray, sizes: FloatArray) -> FloatArray:
         """Return x for D and G of each block times a number."""
         x = x.copy()
-        for (own, _), end, size in zip(self.d_ranges, self.ends, sizes, strict=True):
-            x[own.start : end] *= size
+        for own, size in zip(self.ranges, sizes, strict=True):
+            x[own] *= size
         return x
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -86,7 +87,8 @@ def upper_level(
 
 def _admissible(M: ComplexArray, scalings: Scalings, x: FloatArray) -> FloatArray | None:
     """Return scalings of a skewed problem for which some level is finite, None without any."""
-    inner = [p for p, lev in zip(scalings.places, _are_leveled(scalings), strict=True) if not lev]
+    kept = np.flatnonzero(~scalings.chosen)
+    inner = [scalings.places[i] for i in kept]
     plain = Scalings([p.block for p in inner])
     rows = np.concatenate([np.arange(p.z.start, p.z.stop) for p in inner])
     columns = np.concatenate([np.arange(p.w.start, p.w.stop) for p in inner])
@@ -96,14 +98,9 @@ def _admissible(M: ComplexArray, scalings: Scalings, x: FloatArray) -> FloatArra
         return None
     # D of the leveled blocks as small as they need to be beside those of the others
     own = centred(np.vstack([np.eye(plain.w), part]), plain, found.x, 1.0, steps=20)
-    x = np.array(x)
-    i = 0
-    for (own_range, _), end, lev in zip(
-        scalings.d_ranges, scalings.ends, _are_leveled(scalings), strict=True
-    ):
-        if not lev:
-            x[own_range.start : end] = own[plain.d_ranges[i][0].start : plain.ends[i]]
-            i += 1
+    x = x.copy()
+    for i, fro in zip(kept, plain.ranges, strict=True):
+        x[scalings.ranges[i]] = own[fro]
     for factor in 10.0 ** np.arange(0, -13, -1.0):
         tried = _leveled_by(scalings, x, factor)
         if np.isfinite(reached_level(np.vstack([np.eye(scalings.w), M]), scalings, tried)):
@@ -113,13 +110,7 @@ def _admissible(M: ComplexArray, scalings: Scalings, x: FloatArray) -> FloatArra
 
 def _leveled_by(scalings: Scalings, x: FloatArray, factor: float) -> FloatArray:
     """Return scalings whose leveled blocks' D is so many times larger."""
-    return scalings.scaled(x, np.where(_are_leveled(scalings), factor, 1.0))
-
-
-def _are_leveled(scalings: Scalings) -> list[bool]:
-    """Return which blocks are leveled."""
-    return [bool(np.any(scalings.leveled[scalings.owner == own.start]))
-            for own, _ in scalings.d_ranges]  # fmt: skip
+    return scalings.scaled(x, np.where(scalings.chosen, factor, 1.0))
 
 
 def reached_level(W: ComplexArray, scalings: Scalings, x: FloatArray) -> float:
@@ -156,34 +147,45 @@ def centred(
     from `widest` times the trace of D and the size of M on.
     """
     slopes = _Slopes.of(scalings, scalings.coefficients(level))
-    trace = scalings.start
-    size = float(np.linalg.norm(W[scalings.w :])) * float(trace @ x)
+    size = float(np.linalg.norm(W[scalings.w :])) * float(scalings.start @ x)
     wide = np.where(scalings.of_G, 1.0 / max(widest * size, TINY) ** 2, 0.0)
-    value = _barrier(W, scalings, x, level) + float(wide @ x**2)
+
+    def merit(x: FloatArray) -> float:
+        return _barrier(W, scalings, x, level) + float(wide @ x**2)
+
+    def derivatives(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        gradient, hessian = slopes.derivatives(W, scalings, x, level)
+        _add_of_D(scalings, x, gradient, hessian)
+        hessian.reshape(-1)[:: len(x) + 1] += 2.0 * wide
+        return gradient + 2.0 * wide * x, hessian
+
+    return _descended(x, merit, derivatives, steps, scalings.start)
+
+
+def _descended(
+    x: FloatArray,
+    merit: Callable[[FloatArray], float],
+    derivatives: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    steps: int,
+    trace: FloatArray | None = None,
+) -> FloatArray:
+    """Return x after Newton steps that lower a self-concordant function, to near its minimum."""
+    value = merit(x)
     if not np.isfinite(value):
         return x
     for _ in range(steps):
-        F = _half(W.conj().T @ scalings.matrix(x, level) @ W)
-        P = W @ np.linalg.solve(F, W.conj().T)
-        gradient, hessian = slopes.derivatives(P)
-        _add_of_D(scalings, x, gradient, hessian)
-        gradient += 2.0 * wide * x
-        hessian.reshape(-1)[:: len(x) + 1] += 2.0 * wide
+        gradient, hessian = derivatives(x)
         step, decrement = _newton_step(hessian, gradient, trace)
         # the value is off by the square of it
         if not decrement > 1e-6:
             break
         t = 1.0 / (1.0 + decrement) if decrement > _CENTRED else 1.0
         # shorter steps are rounding of x
-        while t > 1e-8:
-            moved = x + t * step
-            new = _barrier(W, scalings, moved, level) + float(wide @ moved**2)
-            if new < value:
-                x, value = moved, new
-                break
+        while t > 1e-10 and not (new := merit(x + t * step)) < value:
             t *= 0.5
-        else:
+        if t <= 1e-10:
             break
+        x, value = x + t * step, new
         if decrement < _CENTRED:
             break
     return x
@@ -210,8 +212,12 @@ class _Slopes(NamedTuple):
         across = size * (places % size)[:, None] + places // size
         return cls(across, values, np.empty((2, n, n), dtype=np.complex128))
 
-    def derivatives(self, P: ComplexArray) -> tuple[FloatArray, FloatArray]:
-        """Return -tr(P S_p) and tr(P S_p P S_q)."""
+    def derivatives(
+        self, W: ComplexArray, scalings: Scalings, x: FloatArray, level: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return -tr(P S_p) and tr(P S_p P S_q) with ``P = W F^-1 W*``: those of -log det F."""
+        F = _half(W.conj().T @ scalings.matrix(x, level) @ W)
+        P = W @ np.linalg.solve(F, W.conj().T)
         across, product = self.room
         P.take(self.across, out=across, mode="clip")
         np.multiply(across, across.T, out=product)
@@ -242,32 +248,31 @@ def _skewed(
     # the level takes the place of the parameter that is fixed at one
     moves = (scalings.owner != fixed) | scalings.leveled
     slopes = _Slopes.of(scalings, np.where(moves, scalings.value, 0.0))
-    level, best = 1.5 * max(reached, TINY), Certified(reached, x)
+    best = Certified(reached, x)
     barriers = scalings.w + sum(basis.shape[1] for _, basis in scalings.d_ranges) - 1
-    t = barriers / level
+    y = x.copy()
+    y[fixed] = 1.5 * max(reached, TINY)
+    t = barriers / y[fixed]
+
+    def split(y: FloatArray) -> tuple[FloatArray, float]:
+        x = y.copy()
+        x[fixed] = 1.0
+        return x, float(y[fixed])
+
+    def merit(y: FloatArray) -> float:
+        return float(_barrier(W, scalings, *split(y)) + t * y[fixed])
+
+    def derivatives(y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        x, level = split(y)
+        gradient, hessian = slopes.derivatives(W, scalings, x, level)
+        of_level = gradient[fixed] + t, hessian[fixed, fixed]
+        _add_of_D(scalings, x, gradient, hessian)
+        gradient[fixed], hessian[fixed, fixed] = of_level
+        return gradient, hessian
+
     for _ in range(_LEVELS):
-        merit = _barrier(W, scalings, x, level) + t * level
-        for _ in range(_STEPS):
-            F = _half(W.conj().T @ scalings.matrix(x, level) @ W)
-            P = W @ np.linalg.solve(F, W.conj().T)
-            gradient, hessian = slopes.derivatives(P)
-            level_gradient, level_curve = gradient[fixed], hessian[fixed, fixed]
-            _add_of_D(scalings, x, gradient, hessian)
-            gradient[fixed], hessian[fixed, fixed] = level_gradient + t, level_curve
-            step, decrement = _newton_step(hessian, gradient)
-            size = 1.0 if decrement < _CENTRED else 1.0 / (1.0 + decrement)
-            # shorter steps are rounding of x
-            while size > 1e-10:
-                moved = x + size * step
-                there = level + size * step[fixed]
-                moved[fixed] = 1.0
-                new = _barrier(W, scalings, moved, there) + t * there
-                if new < merit:
-                    x, level, merit = moved, there, new
-                    break
-                size *= 0.5
-            if size <= 1e-10 or decrement < _CENTRED or level <= enough:
-                break
+        y = _descended(y, merit, derivatives, _STEPS)
+        x, level = split(y)
         reached = reached_level(W, scalings, x)
         if reached < best.level:
             best = Certified(reached, x)
