@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -108,9 +109,11 @@ class Walk:
                 k += 1
                 if k < N and whole[k] and (k - first) % _LOOK == 0:
                     settled, x, Z = self._settled(x, P, Z)
-                    Y = None if settled or self.keep else self._excess(P, Z)
+                    found, Y = self.found if Z.shape[1] else None, None
+                    if not settled and not self.keep:
+                        Y = excess(self.steady, self._weight[0], P, Z, found)
                     if Y is not None:
-                        x = x + Z @ self.found.value if Z.shape[1] and self.found else x
+                        x = x + Z @ found.value if found else x
                         Z = Z[:, :0]
                         k, x, P, settled = self._fading(k, self._until(k), x, Y)
             stretches.append((first, k, False))
@@ -246,16 +249,10 @@ class Walk:
         # beside the rounding of both covariances
         return abs(excess) < SETTLED + 1e-13 * size, x, Z
 
-    @property
+    @cached_property
     def _weight(self) -> tuple[FloatArray, float]:
-        if not hasattr(self, "_kept_weight"):
-            weight = self.steady.weight(self.sight)
-            self._kept_weight = weight, float(np.sum(np.abs(weight) * np.abs(self.steady.P)))
-        return self._kept_weight
-
-    def _excess(self, P: FloatArray, Z: FloatArray) -> FloatArray | None:
-        found = self.found if Z.shape[1] else None
-        return excess(self.steady, self._weight[0], P, Z, found)
+        weight = self.steady.weight(self.sight)
+        return weight, float(np.sum(np.abs(weight) * np.abs(self.steady.P)))
 
     def _fading(
         self, k: int, until: int, x: FloatArray, Y: FloatArray

@@ -140,7 +140,6 @@ def rms_along(
     Examples
     --------
     >>> import flexplant as fx
-    >>> machine = fx.testbeds.wafer_stage(damping=0.01)
     >>> plate = fx.kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(8, 8),
     ...     density=2702, youngs_modulus=70e9, poisson_ratio=0.35)
     >>> places = [(x, y, 0.0) for y in (0.1, 0.5) for x in (0.2, 0.4)]

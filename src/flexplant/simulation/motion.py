@@ -265,10 +265,10 @@ def flank(t: tuple[float, ...], change: float) -> list[Phase]:
 
 def mirrored(rows: list[Phase], total: float) -> list[Phase]:
     """Return phases in reversed time: what rises from rest comes to rest, at the position total."""
-    back = []
-    for length, from_end, (p, v, a, j, s) in reversed(rows):
-        back.append(Phase(length, not from_end, np.array([total - p, v, -a, j, -s])))
-    return back
+    return [
+        Phase(length, not from_end, np.array([total - p, v, -a, j, -s]))
+        for length, from_end, (p, v, a, j, s) in reversed(rows)
+    ]
 
 
 def constant_snap(state: FloatArray, t: float | FloatArray) -> FloatArray:
@@ -405,8 +405,7 @@ def setpoint(
         raise ModelError("distance must not be 0: a motion of no length needs no set-point.")
     grid = _Grid(rate)
     length = abs(signed)
-    t = tuple(grid.tick * n for n in on_grid(length, bounds, 1.0 / grid.tick)) if grid else ()
-    t = t or shortest(length, bounds)
+    t = grid.durations(length, bounds)
     _, w = spans(t)
     up = flank(t[:-1], length / w[-1])
     waits = [grid.whole(one, name) for one, name in ((rest, "rest"), (settle, "settle"),
@@ -471,10 +470,7 @@ def scan(
     exposed = grid.whole(abs(signed) / bounds[0], "length / velocity")
     exposed = max(exposed, grid.tick) if grid else exposed  # a sample at least
     speed = abs(signed) / exposed
-    if grid:
-        t = tuple(grid.tick * n for n in on_grid(speed, bounds[1:], 1.0 / grid.tick))
-    else:
-        t = shortest(speed, bounds[1:])
+    t = grid.durations(speed, bounds[1:])
     up = flank(t, speed)
     total = speed * (spans(t)[0][-1] + wait[1]) + abs(signed)
     waits = [wait[0], wait[1], exposed]
@@ -496,19 +492,22 @@ class _Grid:
         length = positive(time, name, zero=True)
         return float(np.ceil(length / self.tick - ON_GRID)) * self.tick if self else length
 
+    def durations(self, distance: float, bounds: tuple[float, ...]) -> tuple[float, ...]:
+        """Return the durations [s] of each level of a motion."""
+        if not self:
+            return shortest(distance, bounds)
+        return tuple(self.tick * n for n in on_grid(distance, bounds, 1.0 / self.tick))
+
 
 def _bounds(velocity: Any, acceleration: Any, jerk: Any, snap: Any) -> tuple[float, ...]:
     """Return the bounds that are given, from velocity upwards."""
-    found = [positive(velocity, "velocity"), positive(acceleration, "acceleration")]
     if snap is not None and jerk is None:
         raise ModelError(
             "a bound on snap needs one on jerk, or the jerk would grow without bound: pass jerk=."
         )
-    if jerk is not None:
-        found.append(positive(jerk, "jerk"))
-    if snap is not None:
-        found.append(positive(snap, "snap"))
-    return tuple(found)
+    both = {"velocity": velocity, "acceleration": acceleration}
+    more = {name: one for name, one in {"jerk": jerk, "snap": snap}.items() if one is not None}
+    return tuple(positive(one, name) for name, one in {**both, **more}.items())
 
 
 def _assembled(

@@ -139,10 +139,13 @@ class MovingPlant:
         h = float(plant.dt)
         self.forces = [_force_at(plant, port, noise) for port in ports.forces if id(port) in moving]
         sensors: tuple[Any, ...] = tuple(ports.y)
-        self.seen = [(s, s.direction, [plant.y.index(s.name)]) for s in sensors if id(s) in moving]
+        # ports and axes, with the rows of [z; y] that show them and their signs
         self.shown = [
             (poi, axis, _axis_channels(plant, poi, axis)) for poi in ports.z if id(poi) in moving
             for axis in poi.axes
+        ] + [
+            (s, s.direction, [(len(plant.z) + plant.y.index(s.name), 1.0)]) for s in sensors
+            if id(s) in moving
         ]  # fmt: skip
         self.rule = _Rule(own.pairs, h)
         self._fixed(noise)
@@ -170,8 +173,7 @@ class MovingPlant:
                     kept.append((False, -1))
             for i in g.input_index([n for n in (f"{name}:disturbance",) if n in g.inputs]):
                 B[self.modal, i] = 0.0
-        rows = [*(i for *_, at in self.shown for i, _ in at)]
-        rows += [len(plant.z) + at[0] for *_, at in self.seen]
+        rows = [i for *_, at in self.shown for i, _ in at]
         C[np.ix_(np.array(rows, dtype=np.int64), self.modal)] = 0.0
         self.A, self.B, self.C, self.D = A, B, C, g.D
         loud = plant if noise else plant.replace(asd={})
@@ -207,33 +209,23 @@ class MovingPlant:
         h = float(self.plant.dt)
         time = np.asarray((self.first + 0.5 * np.arange(2 * k + 1)) * h, dtype=np.float64)
         values = self.path.at(time)
-        found = []
-        for force in self.forces:
-            rows = _rows_along(self.realisation, force.port, force.port.direction, values)
-            columns = rows @ self.realisation.inputs
-            found.append(np.stack([columns[:-2:2], columns[1:-1:2], columns[2::2]], axis=1))
-        return found
+        ports = [force.port for force in self.forces]
+        rows = [_rows_along(self.realisation, port, port.direction, values) for port in ports]
+        columns = [row @ self.realisation.inputs for row in rows]
+        return [np.stack([one[:-2:2], one[1:-1:2], one[2::2]], axis=1) for one in columns]
 
     def _acting(self, B: list[FloatArray]) -> tuple[list[FloatArray], list[FloatArray]]:
         """Return the effects (k, 2 b) of each force's new and old sample."""
-        h, new, old = float(self.plant.dt), [], []
-        for force, columns in zip(self.forces, B, strict=True):
-            new.append(self.rule.pushed(columns, force.fraction, h))
-            old.append(self.rule.pushed(columns, 0.0, force.fraction))
-        return new, old
+        h, parts = float(self.plant.dt), [*zip(self.forces, B, strict=True)]
+        new = [self.rule.pushed(columns, force.fraction, h) for force, columns in parts]
+        return new, [self.rule.pushed(columns, 0.0, force.fraction) for force, columns in parts]
 
     def _seen(self, k: int) -> list[tuple[list[tuple[int, float]], FloatArray]]:
         """Return where rows go, with which sign, and the rows (k, 2 b) at each sample."""
         time = np.asarray((self.first + np.arange(k)) * float(self.plant.dt), dtype=np.float64)
         values = self.path.at(time)
-        nz, found = len(self.plant.z), []
-        for port, axis, at in self.shown:
-            rows = _rows_along(self.realisation, port, axis, values) @ self.realisation.outputs
-            found.append((at, rows))
-        for sensor, axis, places in self.seen:
-            rows = _rows_along(self.realisation, sensor, axis, values) @ self.realisation.outputs
-            found.append(([(nz + places[0], 1.0)], rows))
-        return found
+        own, out = self.realisation, self.realisation.outputs
+        return [(at, _rows_along(own, port, axis, values) @ out) for port, axis, at in self.shown]
 
 
 class MovingMachine(MovingPlant):
@@ -442,13 +434,10 @@ def _noise_without(plant: StandardPlant, moving: set[str]) -> WhiteNoise:
     if not moving or not noise.factor.size:
         return noise
     ports = plant.assembled.ports
-    quiet = plant.with_ports(
-        ports.replace(
-            w=[p.replace(asd=0.0) if p.name in moving else p for p in ports.w],
-            u=[p.replace(asd=0.0) if p.name in moving else p for p in ports.u],
-        )
+    w, u = (
+        [p.replace(asd=0.0) if p.name in moving else p for p in side] for side in (ports.w, ports.u)
     )
-    return noise._replace(factor=continuous_factor(quiet))
+    return noise._replace(factor=continuous_factor(plant.with_ports(ports.replace(w=w, u=u))))
 
 
 def _require_plain(plant: StandardPlant, moves: list[Any]) -> None:
@@ -467,20 +456,18 @@ def _require_plain(plant: StandardPlant, moves: list[Any]) -> None:
             "sensors into the controller's blocks, or let forces stay."
         )
     for port in moves:
-        why = ""
-        if getattr(port, "filter", None) is not None:
-            why = "has dynamics"
-        elif getattr(port, "quantity", "displacement") != "displacement":
-            why = f"measures {port.quantity}"
-        elif not isinstance(port, Actuator) and bool(getattr(port, "latency", None)):
-            why = "is late"
-        elif getattr(port, "held", False):
-            why = "is held over samples"
-        elif bool(getattr(port, "absolute", None)):
-            why = "is absolute"
-        if why:
+        quantity = getattr(port, "quantity", "displacement")
+        late = not isinstance(port, Actuator) and bool(getattr(port, "latency", None))
+        refused = {
+            "has dynamics": getattr(port, "filter", None) is not None,
+            f"measures {quantity}": quantity != "displacement",
+            "is late": late,
+            "is held over samples": getattr(port, "held", False),
+            "is absolute": bool(getattr(port, "absolute", None)),
+        }
+        if why := [reason for reason, holds in refused.items() if holds]:
             raise ModelError(
-                f"{port.name!r} moves and {why}: what it does within a sample is not computed "
+                f"{port.name!r} moves and {why[0]}: what it does within a sample is not computed "
                 "along a trajectory. Leave that out of ports that move, or put its dynamics into "
                 "the controller's blocks."
             )
