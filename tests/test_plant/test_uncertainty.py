@@ -433,7 +433,7 @@ def test_values_of_delta_are_checked():
         uncertain.lft({"mode6:freq": -1e4})
     with pytest.raises(ModelError, match="the value of 'mode6:freq' has a NaN"):
         uncertain.lft({"mode6:freq": float("nan")})
-    with pytest.raises(ModelError, match=r"mapping \{name: value\}, got list"):
+    with pytest.raises(ModelError, match="values of Deltas must be a mapping, got"):
         uncertain.lft([0.1])
     with pytest.raises(ModelError, match="n must be a whole number"):
         uncertain.sample(0, 2.5)

@@ -125,16 +125,15 @@ def source_variances(
 ) -> tuple[FloatArray, float]:
     """Return the variance of an output by source, and its largest relative difference."""
     # by the observability Gramian, trace(G' Q G) + D D', and by the states' covariance
+    if not noises:
+        return np.zeros(0), 0.0
     c = monitored.C[[row]]
     solve = solve_stein if monitored.dt else solve_lyapunov
     Q = solve(monitored.A.T, c.T @ c)
     found = [float(np.sum(one.G * (Q @ one.G)) + np.sum(one.D[row] ** 2)) for one in noises]
     variances = np.maximum(np.array(found), 0.0)
-    if not noises:
-        return np.zeros(0), 0.0
-    G = np.hstack([one.G for one in noises])
-    direct = sum(float(np.sum(one.D[row] ** 2)) for one in noises)
-    other = float((c @ solve(monitored.A, G @ G.T) @ c.T)[0, 0]) + direct
+    G, D = (np.hstack(parts) for parts in zip(*((n.G, n.D[[row]]) for n in noises), strict=True))
+    other = float((c @ solve(monitored.A, G @ G.T) @ c.T + D @ D.T)[0, 0])
     total = float(variances.sum())
     difference = abs(other - total) / total if total else 0.0
     if not difference <= AGREEMENT:
@@ -159,9 +158,9 @@ def error_budget(
     channel = monitored.outputs[row]
     variances, between = source_variances(monitored, row, noises)
     freq, cumulative = integrated(densities(monitored, row, noises), monitored, variances)
-    summed = cumulative[:, -1]
     total = float(variances.sum())
-    integral = float(np.max(np.abs(summed - variances), initial=0.0)) / total if total else 0.0
+    off = float(np.max(np.abs(cumulative[:, -1] - variances), initial=0.0))
+    integral = off / total if total else 0.0
     if not integral <= AGREEMENT:
         raise CertificateError(
             f"the integral of the spectrum of {channel!r} differs from its variance by "
@@ -172,20 +171,18 @@ def error_budget(
     if residue is not None:
         part = _residue(residue, channel, start, monitored.dt)
         bins, density = periodogram(part, monitored.dt)
-        below = np.concatenate([[0.0], np.cumsum(density) * (bins[1] if bins.size > 1 else 0.0)])
+        below = np.append(0.0, np.cumsum(density) * bins[1])
         stairs = below[np.searchsorted(bins, freq, side="right")]
         names.append(RESIDUE)
         variances = np.append(variances, float(np.mean(part**2)))
         cumulative = np.vstack([cumulative, stairs])
+    certificate = {
+        "by both Lyapunov equations": between,
+        "by the integral of the spectrum": integral,
+    }
+    unit = monitored.units.get(channel, "")
     return ErrorBudget(
-        channel,
-        monitored.units.get(channel, ""),
-        tuple(names),
-        variances,
-        freq,
-        cumulative,
-        left_out,
-        {"by both Lyapunov equations": between, "by the integral of the spectrum": integral},
+        channel, unit, tuple(names), variances, freq, cumulative, left_out, certificate
     )
 
 
@@ -249,13 +246,6 @@ class Spectrum(NamedTuple):
     psd: FloatArray
 
 
-class Integral(NamedTuple):
-    """Integrals (n_source, n_edge) of densities from 0 to the edges [Hz]."""
-
-    edges: FloatArray
-    values: FloatArray
-
-
 def densities(monitored: StateSpace, row: int, noises: Sequence[Source]) -> Densities:
     """Return the function of frequency that gives each source's one-sided density in an output."""
     # 2 h |C (z I - A)^-1 G + D|^2, what folds back in it; continuous 2 |C (s I - A)^-1 G + D|^2
@@ -279,8 +269,11 @@ def densities(monitored: StateSpace, row: int, noises: Sequence[Source]) -> Dens
     return found
 
 
-def integrated(find: Densities, monitored: StateSpace, variances: FloatArray) -> Integral:
-    """Return the running integrals of densities, by adaptive Gauss-Kronrod quadrature."""
+def integrated(
+    find: Densities, monitored: StateSpace, variances: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return edges [Hz] and the integrals (n_source, n_edge) of densities from 0 to them."""
+    # by adaptive Gauss-Kronrod quadrature:
     # intervals are halved where 7 and 15 points differ; continuous: to infinity, t = f / (f + f_c)
     top = 0.5 / monitored.dt if monitored.dt else np.inf
     grid = _starts(monitored, top)
@@ -290,36 +283,35 @@ def integrated(find: Densities, monitored: StateSpace, variances: FloatArray) ->
 
     def values(left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
         middle, half = 0.5 * (left + right), 0.5 * (right - left)
-        t = middle[:, None] + half[:, None] * nodes
-        freq, speed = (t, np.ones_like(t))
+        freq = t = middle[:, None] + half[:, None] * nodes
+        speed = half[:, None]
         if not monitored.dt:
-            freq, speed = centre * t / (1.0 - t), centre / (1.0 - t) ** 2
-        density = find(freq.ravel()).reshape(-1, *t.shape) * speed * half[:, None]
+            freq, speed = centre * t / (1.0 - t), speed * centre / (1.0 - t) ** 2
+        density = find(freq.ravel()).reshape(-1, *t.shape) * speed
         fine = density @ kronrod
         return fine, np.abs(fine - density @ gauss)
 
-    left, right = edges[:-1], edges[1:]
-    fine, error = values(left, right)
+    known = np.vstack([edges[:-1], edges[1:]])  # of each interval its ends
+    fine, error = values(*known)
     size = divisor(variances)[:, None]
     for _ in range(ROUNDS):
         share = np.max(error / size, axis=0, initial=0.0)
         if share.sum() <= TOLERANCE:
             break
-        bad = np.flatnonzero(share > TOLERANCE / share.size)
-        middle = 0.5 * (left[bad] + right[bad])
-        fresh = np.concatenate([left[bad], middle]), np.concatenate([middle, right[bad]])
-        keep = np.setdiff1d(np.arange(left.size), bad)
-        more, missed = values(*fresh)
-        left, right = np.append(left[keep], fresh[0]), np.append(right[keep], fresh[1])
-        fine = np.concatenate([fine[:, keep], more], axis=1)
-        error = np.concatenate([error[:, keep], missed], axis=1)
-    order = np.argsort(left)
-    ends = np.append(left[order], right[order[-1]])
+        bad = share > TOLERANCE / share.size
+        middle = known[:, bad].mean(axis=0)
+        halves = np.hstack([[known[0, bad], middle], [middle, known[1, bad]]])
+        more, missed = values(*halves)
+        known, fine, error = (
+            np.hstack([old[:, ~bad], new])
+            for old, new in ((known, halves), (fine, more), (error, missed))
+        )
+    order = np.argsort(known[0])
+    ends = np.append(known[0, order], known[1].max())
     if not monitored.dt:
-        ends = centre * ends[:-1] / (1.0 - ends[:-1])
-        ends = np.append(ends, np.inf)
+        ends = np.append(centre * ends[:-1] / (1.0 - ends[:-1]), np.inf)
     total = np.cumsum(fine[:, order], axis=1)
-    return Integral(ends, np.concatenate([np.zeros((total.shape[0], 1)), total], axis=1))
+    return ends, np.concatenate([np.zeros((total.shape[0], 1)), total], axis=1)
 
 
 def _starts(monitored: StateSpace, top: float) -> FloatArray:
@@ -349,21 +341,16 @@ def _rule() -> tuple[FloatArray, FloatArray, FloatArray]:
     gauss: FloatArray = np.zeros(15)
     gauss[1::2] = weights[np.argsort(inner)]
     legendre = np.polynomial.legendre.legvander(nodes, 14).T
-    moments = np.zeros(15)
-    moments[0] = 2.0
+    moments = 2.0 * np.eye(15)[0]
     return nodes, gauss, np.asarray(np.linalg.solve(legendre, moments), dtype=np.float64)
 
 
 def periodogram(signal: FloatArray, dt: float) -> Spectrum:
     """Return the spectrum of a record whose sum times its spacing is the mean square exactly."""
     n = signal.size
-    size: FloatArray = np.asarray(np.abs(np.fft.rfft(signal)) ** 2, dtype=np.float64) * (
-        2.0 * dt / n
-    )
-    size[0] *= 0.5
-    if n % 2 == 0:
-        size[-1] *= 0.5
-    return Spectrum(np.asarray(np.fft.rfftfreq(n, dt), dtype=np.float64), size)
+    size: FloatArray = np.abs(np.fft.rfft(signal)) ** 2 * (2.0 * dt / n)
+    size[[0, -1] if n % 2 == 0 else [0]] *= 0.5
+    return Spectrum(np.fft.rfftfreq(n, dt).astype(np.float64), size)
 
 
 #: relative: the noise factors of single disturbances add up to the one that the plant has

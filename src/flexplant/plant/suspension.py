@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value, members, positive, real_array
+from ..checks import ComplexArray, FloatArray, Value, members, number, positive
 from ..errors import ModelError, counted
 from ..labels import Place
 from ..modes import Modes, normal_form
@@ -62,19 +62,44 @@ class GroundSpring(Value):
         self._set(
             at=checked_place("a ground spring", self.at),
             direction=port_direction("a ground spring", self.direction),
-            stiffness=_stiffness(self.stiffness),
+            stiffness=number(self.stiffness, "stiffness of a ground spring"),
             damping=positive(self.damping, "damping of a ground spring", zero=True),
         )
+        if not self.stiffness:
+            raise ModelError(
+                "the stiffness of a ground spring is 0: it holds nothing. Leave it out, or give it "
+                "a stiffness; a damper alone is model.with_parts([Damper(...)])."
+            )
 
 
-def _stiffness(stiffness: float) -> float:
-    value = float(real_array(stiffness, "stiffness of a ground spring", ()))
-    if not value:
-        raise ModelError(
-            "the stiffness of a ground spring is 0: it holds nothing. Leave it out, or give it a "
-            "stiffness; a damper alone is model.with_parts([Damper(...)])."
-        )
-    return value
+class _Springs(NamedTuple):
+    """Rows (s, n) of the motions that stretch springs, and their constants (s,)."""
+
+    rows: FloatArray
+    stiffness: FloatArray
+    damping: FloatArray
+
+    @classmethod
+    def of(cls, model: Any, springs: Sequence[GroundSpring]) -> _Springs:
+        """Return the springs on a structure."""
+        constants = np.array([(s.stiffness, s.damping) for s in springs]).T
+        return cls(np.array([model.row(s.at, s.direction) for s in springs]), *constants)
+
+    def terms(self, basis: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """Return what they add to K and D, over DOFs or the columns of a basis."""
+        rows = self.rows if basis is None else self.rows @ basis
+        k, d = (rows.T @ (c[:, None] * rows) for c in (self.stiffness, self.damping))
+        return k, d
+
+    def untouched(self, rigid: FloatArray) -> FloatArray:
+        """Return the combinations (r, left) of rigid-body motions (n, r) that stretch none."""
+        if not rigid.shape[1]:
+            return np.zeros((0, 0))
+        stretch = self.rows @ rigid
+        most = np.abs(self.rows).sum(axis=1, keepdims=True) * np.abs(rigid).max()
+        stretch[np.abs(stretch) <= _SLACK * most] = 0.0  # a spring on the axis of a hinge
+        size = np.linalg.norm(stretch, axis=1, keepdims=True)
+        return np.asarray(la.null_space(stretch / divisor(size), rcond=_SLACK))
 
 
 def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) -> Suspended:
@@ -117,34 +142,35 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
     (0, array([3.56]))
     """
     several = [springs] if isinstance(springs, GroundSpring) else springs
-    hint = "Pass GroundSpring(...) in [...]."
-    listed = list(members(several, GroundSpring, "springs", hint))
+    listed = members(several, GroundSpring, "springs", "Pass GroundSpring(...) in [...].")
     given: Any = model
     if isinstance(given, FEModel):
         return _suspend_model(given, listed)  # type: ignore[return-value]
     if isinstance(given, ReducedModel):
-        rows = np.array([given.row(s.at, s.direction) for s in listed])
-        stiffness, damping = _spring_terms(rows, listed)
+        own = _Springs.of(given, listed)
+        stiffness, damping = own.terms()
         return given.replace(  # type: ignore[return-value]
             K=given.K + stiffness,
             D=given.D + damping,
-            rigid_body=given.rigid_body @ _untouched(rows, given.rigid_body),
+            rigid_body=given.rigid_body @ own.untouched(given.rigid_body),
             truncated=None if given.truncated is None else _each(given.truncated, listed),
             method=f"{given.method}, {counted(len(listed), 'ground spring')}",
         )
     if isinstance(given, Modes):
-        return _suspend_modes(given, listed)  # type: ignore[return-value]
+        own = _Springs.of(given, listed)
+        way = _suspend_complex if np.iscomplexobj(given.phi) else _suspend_modes
+        return way(given, own)  # type: ignore[return-value]
     raise ModelError(
         f"suspend needs an FEModel, ReducedModel or Modes, got {type(model).__name__}."
     )
 
 
-def _each(modes: Modes, springs: list[GroundSpring]) -> Modes:
+def _each(modes: Modes, springs: Sequence[GroundSpring]) -> Modes:
     """Return modes that springs change each by itself: ``omega^2 + r k r'``, dampers likewise."""
-    rows = np.array([modes.row(s.at, s.direction) for s in springs]) @ modes.phi
-    size = np.abs(rows) ** 2
-    square = modes.omega**2 + np.array([s.stiffness for s in springs]) @ size
-    rate = 2.0 * modes.zeta * modes.omega + np.array([s.damping for s in springs]) @ size
+    own = _Springs.of(modes, springs)
+    size = np.abs(own.rows @ modes.phi) ** 2
+    square = modes.omega**2 + own.stiffness @ size
+    rate = 2.0 * modes.zeta * modes.omega + own.damping @ size
     order = np.argsort(square)
     omega = np.sqrt(square)
     return modes.replace(
@@ -152,30 +178,11 @@ def _each(modes: Modes, springs: list[GroundSpring]) -> Modes:
     )
 
 
-def _spring_terms(rows: FloatArray, springs: list[GroundSpring]) -> tuple[FloatArray, FloatArray]:
-    k = np.array([spring.stiffness for spring in springs])
-    d = np.array([spring.damping for spring in springs])
-    return rows.T @ (k[:, None] * rows), rows.T @ (d[:, None] * rows)
-
-
-def _untouched(rows: FloatArray, rigid: FloatArray) -> FloatArray:
-    """Return the combinations (r, left) of rigid-body motions (n, r) that stretch no row (s, n)."""
-    r = rigid.shape[1]
-    if not r:
-        return np.zeros((0, 0))
-    stretch = rows @ rigid
-    most = np.abs(rows).sum(axis=1, keepdims=True) * np.abs(rigid).max()
-    stretch[np.abs(stretch) <= _SLACK * most] = 0.0  # a spring on the axis of a hinge
-    size = np.linalg.norm(stretch, axis=1, keepdims=True)
-    return np.asarray(la.null_space(stretch / divisor(size), rcond=_SLACK))
-
-
-def _suspend_model(model: FEModel, springs: list[GroundSpring]) -> FEModel:
+def _suspend_model(model: FEModel, springs: Sequence[GroundSpring]) -> FEModel:
     dampers = [Damper(s.at, s.damping, direction=s.direction) for s in springs if s.damping]
     stiff = [Spring(s.at, s.stiffness, direction=s.direction) for s in springs]
     suspended = model.with_parts([*stiff, *dampers])
-    rows = np.array([model.row(s.at, s.direction) for s in springs])
-    expected = _untouched(rows, model.rigid_body).shape[1]
+    expected = _Springs.of(model, springs).untouched(model.rigid_body).shape[1]
     if suspended.rigid_body.shape[1] != expected:
         raise ModelError(
             "the springs are so weak that rounding of the structure's matrices exceeds them: "
@@ -186,18 +193,12 @@ def _suspend_model(model: FEModel, springs: list[GroundSpring]) -> FEModel:
     return suspended
 
 
-def _suspend_modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
-    if np.iscomplexobj(modes.phi):
-        return _suspend_complex(modes, springs)
-    basis = np.real(modes.basis)
+def _suspend_modes(modes: Modes, springs: _Springs) -> Modes:
+    basis, r = np.real(modes.basis), modes.n_rigid
     b = basis.shape[1]
-    places = np.array([modes.row(s.at, s.direction) for s in springs])
-    rows = places @ basis
-    stiffness, damping = _spring_terms(rows, springs)
-    free = np.zeros((b, 0))
-    if modes.n_rigid:
-        kept = _untouched(places, basis[:, : modes.n_rigid])
-        free = np.vstack([kept, np.zeros((b - modes.n_rigid, kept.shape[1]))])
+    stiffness, damping = springs.terms(basis)
+    kept = springs.untouched(basis[:, :r])
+    free = np.vstack([kept, np.zeros((b - r, kept.shape[1]))])
 
     def motions() -> FloatArray:
         made = modes.missed_motions() < SPANNED
@@ -211,38 +212,23 @@ def _suspend_modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
         free,
         motions,
     )
-    size, ratio = form.omega, form.zeta
     shapes = basis @ form.phi
+    found = Modes(form.omega, form.zeta, shapes, modes.dofs, n_rigid=form.n_rigid)
     if not form.is_real or not modes.n_vectors:
-        return Modes(size, ratio, shapes, modes.dofs, n_rigid=form.n_rigid)
+        return found
     # modes that are still mostly attachment vector stay attachment vectors
     share = np.linalg.norm(np.real(form.phi)[modes.n_modes :], axis=0)
     extra = np.sort(np.argsort(share)[-modes.n_vectors :])
     plain = np.setdiff1d(np.arange(b), extra)
-    return Modes(
-        size[plain],
-        ratio[plain],
-        shapes[:, plain],
-        modes.dofs,
-        n_rigid=form.n_rigid,
+    return found.replace(
+        omega=form.omega[plain],
+        zeta=form.zeta[plain],
+        phi=shapes[:, plain],
         vectors=np.real(shapes[:, extra]),
-        vector_omega=size[extra],
-        vector_zeta=ratio[extra],
+        vector_omega=form.omega[extra],
+        vector_zeta=form.zeta[extra],
         vector_dofs=modes.vector_dofs,
     )
-
-
-def _suspend_complex(modes: Modes, springs: list[GroundSpring]) -> Modes:
-    if modes.n_unstable:
-        raise ModelError(
-            "complex modes with an unstable pair cannot be suspended once more: suspend the "
-            "FEModel, or reduce and suspend that."
-        )
-    rows = np.array([modes.row(s.at, s.direction) for s in springs])
-    kept = _untouched(rows, np.real(modes.phi[:, : modes.n_rigid]))
-    stiffness = np.array([spring.stiffness for spring in springs])
-    damping = np.array([spring.damping for spring in springs])
-    return suspended(modes, rows, stiffness, damping, kept)
 
 
 #: relative: poles closer than this have eigenvectors in common
@@ -253,16 +239,21 @@ _REAL = 1e-9
 _SYMMETRIC = 1e-6
 
 
-def suspended(
-    modes: Modes, rows: FloatArray, stiffness: FloatArray, damping: FloatArray, kept: FloatArray
-) -> Modes:
-    """Return complex modes with springs and dampers at rows (s, n) of DOFs.
+def _suspend_complex(modes: Modes, springs: _Springs) -> Modes:
+    """Return complex modes on springs.
 
     In first-order form, as no mass is known for truncated complex modes: ``x' = A x + N' f``,
     ``q = S x`` and ``f = -rows' (k rows q + d rows q')`` give A', the residues of which,
     ``S v w' N' = phi phi' / (2i Im lambda)``, are the new shapes. Exact within the span.
     """
+    if modes.n_unstable:
+        raise ModelError(
+            "complex modes with an unstable pair cannot be suspended once more: suspend the "
+            "FEModel, or reduce and suspend that."
+        )
+    rows, stiffness, damping = springs
     given, r = realise(modes), modes.n_rigid
+    kept = springs.untouched(np.real(modes.phi[:, :r]))
     left = kept.shape[1]
     turned = np.hstack([kept, la.null_space(kept.T)]) if left else np.eye(r)
     turn = la.block_diag(np.kron(turned, np.eye(2)), np.eye(given.A.shape[0] - 2 * r))

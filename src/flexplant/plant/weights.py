@@ -25,7 +25,7 @@ from .standard import StandardPlant, standard_plant
 _HEADROOM = 1.6
 #: disturbance and effort: the middle of that table; and where frequencies are
 #: uncertain, with which tolerant designs of eleven machines had margins of 0.40 to 0.43
-_SURE, _UNSURE = 3.0, (20.0, 10.0)
+_SURE, _UNSURE = (3.0, 3.0), (20.0, 10.0)
 
 
 def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSpace:
@@ -49,13 +49,10 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
 
     Raises
     ------
-    AssumptionError
+    AssumptionError, LabelError, ModelError
         When the plant has no reference, no displacement sensors, or the POI's axes do not span
-        the rigid-body modes.
-    LabelError
-        When several POIs have a reference and none is named, or the named one has none.
-    ModelError
-        When the plant was not assembled from a structure.
+        the rigid-body modes; when several POIs have a reference and none is named, or the named
+        one has none; when the plant was not assembled from a structure.
 
     Examples
     --------
@@ -64,8 +61,8 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     >>> plant.through(fx.reference_errors(plant)).y
     ('y1:error', 'y2:error')
     """
-    plant, motions = _stage(plant)
-    ports = plant.assembled.ports
+    plant = standard_plant(plant)
+    motions, ports = plant.rigid_motions, plant.assembled.ports
     if not ports.references:
         raise AssumptionError("the plant has no reference: add Reference(...) to the ports.")
     followed = ports.poi(_only_poi([r.poi for r in ports.references], poi, "POI with a reference"))
@@ -87,16 +84,12 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     turned = np.linalg.pinv(axes)[:, [followed.axes.index(axis) for axis in own]]
     moved = rigid_rows(plant, motions, sensors) @ turned
     return StateSpace(
-        [],
-        [],
-        [],
-        np.hstack([-np.eye(len(sensors)), moved]),
-        plant.dt,
+        [], [], [], np.hstack([-np.eye(len(sensors)), moved]), plant.dt,
         inputs=[*sensors, *(followed.derived(axis, "ref") for axis in own)],
         outputs=[f"{name}:error" for name in sensors],
         name="reference errors",
         units=plant.units | {f"{n}:error": plant.units[n] for n in sensors if n in plant.units},
-    )
+    )  # fmt: skip
 
 
 def _only_poi(names: list[str], poi: str | None, kind: str) -> str:
@@ -182,12 +175,10 @@ def stage_weights(
 
     Raises
     ------
-    AssumptionError
-        When the structure is not free or weakly suspended, or has no POIs, actuators or sensors.
-    LabelError
-        When there are several POIs and none is named, or the name is unknown.
-    ModelError
-        When the plant was not assembled from a structure, or a number is out of range.
+    AssumptionError, LabelError, ModelError
+        When the structure is not free or weakly suspended, or has no POIs, actuators or sensors;
+        when there are several POIs and none is named, or the name is unknown; when the plant was
+        not assembled from a structure, or a number is out of range.
 
     Examples
     --------
@@ -197,14 +188,15 @@ def stage_weights(
     >>> sorted(weights.z), sorted(weights.w)
     (['die:error', 'die:x', 'u1:effort'], ['amp', 'y1:noise', 'y2:noise'])
     """
-    plant, motions = _stage(plant)
+    plant = standard_plant(plant)
+    motions, ports = plant.rigid_motions, plant.assembled.ports
     if uncertainty is not None and not hasattr(uncertainty, "nominal"):
         uncertainty = plant.uncertain(frequency=uncertainty)
     known = plant.uncertainty if uncertainty is None else uncertainty
-    if known is not None:
-        disturbance = _UNSURE[0] if disturbance is None else disturbance
-        effort = _UNSURE[1] if effort is None else effort
-    ports = plant.assembled.ports
+    usual = _SURE if known is None else _UNSURE
+    push_size = positive(usual[0] if disturbance is None else disturbance, "disturbance")
+    push_cost = positive(usual[1] if effort is None else effort, "effort")
+    sensed = positive(noise, "noise")
     if not ports.z or not ports.u or not ports.y:
         raise AssumptionError("stage weights need a POI, actuators and sensors in the ports.")
     scale = ports.poi(_only_poi([port.name for port in ports.z], poi, "POI"))
@@ -219,41 +211,35 @@ def stage_weights(
     require_weak(motions, bandwidth, "a set of weights")
     force = (2.0 * np.pi * crossing) ** 2 / float(push)
     arm = _arm(plant, ports, motions)
-    push_size = positive(_SURE if disturbance is None else disturbance, "disturbance")
-    push_cost = positive(_SURE if effort is None else effort, "effort")
     sense = inverse_sensitivity(crossing, peak=peak, floor=0.01)
     unit = 1.0 / (peak * push_size * push_cost)  # of z: gamma is |T| at u beside peak
     rolloff = leadlag(6.0 * crossing, 60.0 * crossing, gain=unit * push_cost / force)
+
+    def turned(direction: str) -> float:
+        return arm if direction.startswith("r") else 1.0
+
     z: dict[str, Any] = {}
     # one rigid body: where a reference takes one POI, the others cannot stay
     left = [goal.name for goal in ports.z if ports.references and goal is not scale]
     for goal in ports.z:
         for axis in goal.axes:
-            error = goal.derived(axis, "error")
-            if goal.name in left:
-                z |= {name: None for name in (goal.channel(axis), error) if name in plant.z}
-                continue
-            size = arm if axis.startswith("r") else 1.0
-            weight = _at_plant_rate(series(sense, np.array([[unit * size]])), plant)
-            if error in plant.z:
-                z[goal.channel(axis)], z[error] = None, weight
-            else:
-                z[goal.channel(axis)] = weight
+            channel, error = goal.channel(axis), goal.derived(axis, "error")
+            z |= {name: None for name in (channel, error) if name in plant.z}
+            if goal.name not in left:
+                weight = series(sense, np.array([[unit * turned(axis)]]))
+                z[error if error in plant.z else channel] = _at_plant_rate(weight, plant)
     z |= {f"{port.name}:effort": _at_plant_rate(rolloff, plant) for port in ports.u}
     w: dict[str, Any] = {}
     for port in ports.w:
         if port.added_to is not None:
-            w[port.name] = positive(noise, "noise")
+            w[port.name] = sensed
         elif isinstance(port, BaseAcceleration):
-            turned = 1.0 / arm if port.direction.startswith("r") else 1.0
-            w[port.name] = push_size * turned * (2.0 * np.pi * crossing) ** 2
+            w[port.name] = push_size / turned(port.direction) * (2.0 * np.pi * crossing) ** 2
         else:
-            w[port.name] = push_size * force * (arm if port.direction.startswith("r") else 1.0)
-    for actuator in ports.u:
-        if actuator.asd > 0:
-            turned = arm if actuator.direction.startswith("r") else 1.0
-            w[f"{actuator.name}:disturbance"] = push_size * force * turned
-    w |= {name: positive(noise, "noise") for name in plant.w if name.endswith(":noise")}
+            w[port.name] = push_size * force * turned(port.direction)
+    noisy = [port for port in ports.u if port.asd > 0]
+    w |= {f"{port.name}:disturbance": push_size * force * turned(port.direction) for port in noisy}
+    w |= {name: sensed for name in plant.w if name.endswith(":noise")}
     text = (
         f"{bandwidth:g} Hz: gamma 1 is |T| < {peak:g} at u, forces in {force:.4g} N, rotations in "
         f"1/{arm:.3g} rad, disturbance {push_size:g}, effort {push_cost:g}, noise {noise:g}"
@@ -261,12 +247,6 @@ def stage_weights(
     if left:
         text += f"; on {scale.name}, left out of z: {', '.join(left)} (moved by the reference)"
     return StageWeights(z, w, text, known)
-
-
-def _stage(given: StandardPlant) -> tuple[StandardPlant, RigidModes]:
-    """Return a plant that is a stage, and its rigid-body motions."""
-    plant = standard_plant(given)
-    return plant, plant.rigid_motions
 
 
 def _arm(plant: StandardPlant, ports: Ports, motions: RigidModes) -> float:

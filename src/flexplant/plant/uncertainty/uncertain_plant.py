@@ -10,7 +10,7 @@ from typing import Any, Generic, Literal
 import numpy as np
 import scipy.sparse as sp
 
-from ...checks import MOST_DRAWS, FloatArray, Value, generator, real_array, whole
+from ...checks import MOST_DRAWS, FloatArray, Value, generator, mapping, number, whole
 from ...errors import FlexplantWarning, ModelError, counted, require_known
 from ...lti.statespace import StateSpace, as_statespace
 from ...sparse.factor import dense
@@ -46,14 +46,9 @@ class Delta(Value):
     Examples
     --------
     >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
-    >>> measured = fx.MeasuredModes(poles=[615j], modes=[2], covariance=[[1.0, 0.0], [0.0, 4.0]])
-    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
-    >>> ports = fx.testbeds.three_masses().assembled.ports
-    >>> plant = fx.assemble_plant(fit.model, ports).discretized(2e3, delay=1)
-    >>> sorted({delta.kind for delta in plant.uncertain(fit).deltas})
-    ['freq']
+    >>> one = fx.testbeds.three_masses().uncertain(frequency=0.01).deltas[0]
+    >>> one.name, one.scale  # of the stiffness
+    ('mode2:freq', 0.02)
     """
 
     name: str
@@ -217,13 +212,8 @@ class UncertainPlant(Value, Generic[P]):
     Examples
     --------
     >>> import flexplant as fx
-    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
-    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
-    >>> measured = fx.MeasuredModes(poles=[615j], modes=[2], covariance=[[1.0, 0.0], [0.0, 4.0]])
-    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
-    >>> ports = fx.testbeds.three_masses().assembled.ports
-    >>> plant = fx.assemble_plant(fit.model, ports).discretized(2e3, delay=1)
-    >>> len(plant.uncertain(fit).sample(1, 5))  # machines that it may be
+    >>> known = fx.testbeds.three_masses().uncertain(frequency=0.01, damping=0.3)
+    >>> len(known.sample(1, 5))  # machines that it may be
     5
     """
 
@@ -259,33 +249,26 @@ class UncertainPlant(Value, Generic[P]):
     @property
     def channels(self) -> dict[str, str]:
         """The Delta of each of its channels: {`mode6:freq:rate`: `mode6:freq`, ...}, in order."""
-        names = [delta.name for delta in self.deltas]
-        inner = len(self.system.inputs) - len(self.plant.w) - len(self.plant.u)
-        found = {}
-        for channel in (name.removesuffix(":w") for name in self.system.inputs[:inner]):
-            for name in names:
-                if channel == name or channel.startswith(f"{name}:"):
-                    found[channel] = name
-        return found
+        inner = len(self.system.inputs) - len(self.plant.system.inputs)
+        return {
+            channel: delta.name
+            for channel in (name.removesuffix(":w") for name in self.system.inputs[:inner])
+            for delta in self.deltas
+            if f"{channel}:".startswith(f"{delta.name}:")
+        }
 
     def __repr__(self) -> str:
         more = f", {self.neglected!r}" if self.neglected is not None else ""
-        lines = [
-            (
-                f"<UncertainPlant: {counted(len(self.deltas), 'real Delta')} at "
-                f"{self.deviations:g} std{more}"
-            )
-        ]
-        for delta in self.deltas[:6]:
-            if delta.kind == "parameter":
-                unit = self.parameters[self.deltas.index(delta)].unit
-                lines.append(f"  {delta.name} +- {delta.scale:.3g} {unit}")
-                continue
-            if delta.kind == "delay":
-                lines.append(f"  {delta.name} +- {delta.scale:.3g} samples")
-                continue
-            half = 0.5 if delta.kind == "freq" else 1.0
-            lines.append(f"  {delta.name} +- {100 * half * delta.scale:.3g} %")
+        count = counted(len(self.deltas), "real Delta")
+        lines = [f"<UncertainPlant: {count} at {self.deviations:g} std{more}"]
+        for i, delta in enumerate(self.deltas[:6]):
+            amount, unit = 100 * delta.scale, "%"
+            if delta.kind == "freq":
+                amount *= 0.5
+            elif delta.kind in ("parameter", "delay"):
+                amount = delta.scale
+                unit = "samples" if delta.kind == "delay" else self.parameters[i].unit
+            lines.append(f"  {delta.name} +- {amount:.3g} {unit}")
         if len(self.deltas) > 6:
             lines.append(f"  ... and {len(self.deltas) - 6} more")
         return "\n".join(lines) + ">"
@@ -298,30 +281,20 @@ class UncertainPlant(Value, Generic[P]):
         values : mapping {name: float}, optional
             Such as {"mode6:freq": 0.5}; Deltas that are not named are 0. Beyond 1 is allowed.
 
-        Returns
-        -------
-        StandardPlant
-            Its realisation holds the changed modes.
-
         Raises
         ------
-        LabelError
-            When a Delta is unknown.
-        ModelError
-            When a mode would lose its stiffness or its damping would be negative.
+        LabelError, ModelError
+            When a Delta is unknown; when a mode would lose its stiffness or its damping would be
+            negative.
         """
-        if values is not None and not isinstance(values, Mapping):
-            raise ModelError(
-                f"values of Deltas are a mapping {{name: value}}, got {type(values).__name__}."
-                " Such as {'" + self.deltas[0].name + "': 0.5}."
-            )
-        given = dict(values or {})
+        hint = "Such as {'" + self.deltas[0].name + "': 0.5}."
+        given = {} if values is None else mapping(values, "values of Deltas", hint)
         known = {delta.name: delta for delta in self.deltas}
-        changes = []
-        for name, value in given.items():
-            require_known("Delta", [name], known)
-            amount = float(real_array(value, f"the value of {name!r}", ()))
-            changes.append((known[name], known[name].scale * amount))
+        require_known("Delta", given, known)
+        changes = [
+            (known[name], known[name].scale * number(value, f"the value of {name!r}"))
+            for name, value in given.items()
+        ]
         if not self.of_matrices:
             return with_changes(self.plant, changes)
         amounts = {delta.name: amount for delta, amount in changes}
@@ -342,10 +315,6 @@ class UncertainPlant(Value, Generic[P]):
             Seeds are spawned: machine i is the same whatever n is.
         n : int
             How many.
-
-        Returns
-        -------
-        list of StandardPlant
 
         Raises
         ------
