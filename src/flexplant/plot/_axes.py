@@ -75,6 +75,20 @@ def panel_axes(
     return drawn[:count]
 
 
+def three_axes(
+    ax: Sequence[Axes] | None, rows: int, columns: int, **options: Any
+) -> Sequence[Axes]:
+    """Return the three axes given, or those of a new figure."""
+    if ax is None:
+        drawn: list[Axes] = list(
+            plt.subplots(rows, columns, layout="constrained", **options)[1].ravel()
+        )
+        return drawn
+    if np.size(np.asarray(ax, dtype=object)) != 3:
+        raise ModelError("ax= takes three axes. Leave it out for a new figure.")
+    return ax
+
+
 def name_panel(ax: Axes, name: str) -> None:
     """Name the only line of a panel above it, in place of a legend."""
     if shown := ax.get_legend():
@@ -247,8 +261,10 @@ class _Decades(LogFormatter):
         return f"{x:g}" if super().__call__(x, pos) else ""
 
 
-def finish(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
-    """Label the axes, with units, and draw a light grid."""
+def finish(ax: Axes, *, x: str, y: str, title: str = "", given: bool | None = None) -> Axes:
+    """Label the axes, with units, and draw a light grid; `given` or new ones get a legend too."""
+    if given is not None:
+        legend(ax, given=given)
     ax.set(xlabel=x, ylabel=y)
     if title:
         ax.set_title(title)
@@ -501,6 +517,11 @@ def require_channels(rows: int, columns: int) -> None:
 def decibel(values: ComplexArray | FloatArray) -> FloatArray:
     """Return 20 log10 of sizes; zero is far below all."""
     return np.asarray(20.0 * np.log10(np.maximum(np.abs(values), TINY)))
+
+
+def singular(response: Frf) -> FloatArray:
+    """Return the singular values (n_freq, k) of a response, the largest first."""
+    return np.asarray(np.linalg.svd(np.moveaxis(response.data, 2, 0), compute_uv=False))
 
 
 def readable(ax: Axes) -> None:

@@ -28,6 +28,7 @@ from ._axes import (
     require_channels,
     role_of,
     shared_reference,
+    singular,
 )
 
 #: channels for which a grid of diagrams can still be read
@@ -111,14 +112,9 @@ def _panels(ax: Sequence[Axes] | None, rows: int, columns: int) -> Any:
         )
     if ax is None:
         return plt.subplots(
-            2 * rows,
-            columns,
-            sharex=True,
-            squeeze=False,
-            layout="constrained",
-            figsize=(max(7.0, 4.0 * columns), 5.0 * rows),
-            height_ratios=[2, 1] * rows,
-        )[1]
+            2 * rows, columns, sharex=True, squeeze=False, layout="constrained",
+            figsize=(max(7.0, 4.0 * columns), 5.0 * rows), height_ratios=[2, 1] * rows,
+        )[1]  # fmt: skip
     given = np.ravel(np.asarray(ax, dtype=object))
     if given.size != 2 or rows * columns != 1:
         raise ModelError(
@@ -179,10 +175,8 @@ def singular_values(
 
     Parameters
     ----------
-    systems : StateSpace, Frf, or mapping {label: one of these} or list of them
-        What to draw.
-    freq : (n_freq,) array [Hz], optional
-        Where systems are evaluated; a grid of each, refined at resonances, when not given.
+    systems, freq
+        As for `bode`.
     ax : Axes, optional
         Where to draw.
 
@@ -201,7 +195,7 @@ def singular_values(
     given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
     drawn = curves(systems, freq)
     for curve in drawn:
-        values = np.linalg.svd(np.moveaxis(curve.response.data, 2, 0), compute_uv=False)
+        values = singular(curve.response)
         rank = int(np.max(np.sum(values > _ROUNDING * values[:, :1], axis=1), initial=1))
         largest, smallest = (decibel(np.asarray(values[:, k])) for k in (0, rank - 1))
         ax.semilogx(curve.response.freq, largest, label=curve.label or None, **curve.line)
@@ -210,11 +204,9 @@ def singular_values(
             ax.fill_between(
                 curve.response.freq, smallest, largest, color=curve.line["color"], alpha=0.12
             )
-    reference = shared_reference(drawn[0].response)
     readable(ax)
-    if any(curve.label for curve in drawn):
-        legend(ax, given=given)
-    return finish(ax, x="frequency [Hz]", y=f"singular values [dB, 0 dB = {reference}]")
+    y = f"singular values [dB, 0 dB = {shared_reference(drawn[0].response)}]"
+    return finish(ax, x="frequency [Hz]", y=y, given=given)
 
 
 def frf(
@@ -321,9 +313,8 @@ def frf(
             ax.semilogx(curve.response.freq, decibel(error), label=text, **look)
     _require_measured(drawn, more)
     readable(ax)
-    legend(ax, given=given)
-    gain = known.pop() if known else None
-    finish(ax, x="" if below else "frequency [Hz]", y=gain_label(output, input, gain))
+    y = gain_label(output, input, known.pop() if known else None)
+    finish(ax, x="" if below else "frequency [Hz]", y=y, given=given)
     for part, panel in zip(below, panels[1:], strict=True):
         for _, response, line in drawn:
             if part == "phase":

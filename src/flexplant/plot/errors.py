@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
-from ..checks import in_unit, instance, short, with_unit
+from ..checks import in_unit, instance, one_of, short, with_unit
 from ..errors import LabelError, ModelError, counted
 from ..loop import ClosedLoop, ErrorBudget, Spectrum
 from ..simulation import ErrorMap, Response, exposure_errors
@@ -24,7 +24,6 @@ from ._axes import (
     axes,
     by_label,
     finish,
-    legend,
     legend_below,
     named,
     plan,
@@ -84,16 +83,10 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
     base = np.zeros(freq.size)
     for i, (name, rows, rms) in enumerate(layers):
         ax.fill_between(
-            freq,
-            base,
-            base + rows,
-            facecolor=CYCLE[i % len(CYCLE)]["color"],
-            hatch=_HATCHES[i % len(_HATCHES)],
-            alpha=0.75,
-            edgecolor="white",
-            linewidth=0.8,
+            freq, base, base + rows, facecolor=CYCLE[i % len(CYCLE)]["color"],
+            hatch=_HATCHES[i % len(_HATCHES)], alpha=0.75, edgecolor="white", linewidth=0.8,
             label=f"{name}: {with_unit(rms, found.unit)} rms",
-        )
+        )  # fmt: skip
         base = base + rows
     ax.set(xscale="log", ylim=(0.0, None))
     where = {"loc": "upper left"} if given else _BESIDE
@@ -161,8 +154,8 @@ def spectra(
     shown = shown or "SI unit/\N{SQUARE ROOT}Hz"
     for (label, (freq, size)), look in zip(lines.items(), styles(lines, colors), strict=True):
         ax.loglog(freq, size / factor, label=label or None, **look)
-    legend(ax, given=given)
-    return finish(ax, x="frequency [Hz]", y=named("amplitude spectral density", shown))
+    y = named("amplitude spectral density", shown)
+    return finish(ax, x="frequency [Hz]", y=y, given=given)
 
 
 def _spectrum(one: Any, channel: str | None) -> Spectrum:
@@ -235,42 +228,31 @@ def exposures(
     parts = [[max(start, run.time[0]), run.time[-1]]] if exposures is None else exposures
     given, ax = ax is not None, axes(ax, figsize=(9.5, 4.0))
     unit = run.units.get(name)
-    signal, average, deviation = (
-        np.atleast_2d(values)[0]
-        for values in (
-            run[name],
-            run.moving_average(name, window=window),
-            run.moving_std(name, window=window),
-        )
-    )
+    moving = (of(name, window=window) for of in (run.moving_average, run.moving_std))
+    signal, average, deviation = (np.atleast_2d(values)[0] for values in (run[name], *moving))
     inside = np.zeros(run.time.size, dtype=bool)
     for begin, end in np.asarray(parts, dtype=np.float64).tolist():
         inside |= (run.time >= begin) & (run.time <= end)
     factor, shown = shown_in(ax.yaxis, float(np.max(np.abs(signal[inside]))), unit)
     second, time = time_axis(ax, run)
     shade(ax, parts, run)
-    largest = found[name]
-    looks: tuple[dict[str, Any], ...] = (
-        {"label": name, "color": GREY, "linewidth": 0.6},
-        {"label": f"MA, at most {with_unit(largest.ma, unit)}", "color": BLUE, "linewidth": 1.8},
-        {
-            "label": f"MSD, at most {with_unit(largest.msd, unit)}",
-            "color": ORANGE,
-            "linewidth": 1.6,
-            "linestyle": "--",
-        },
+    largest, lines = found[name], (signal, average, deviation)
+    ma, msd = (f"at most {with_unit(one, unit)}" for one in (largest.ma, largest.msd))
+    looks = (
+        (name, GREY, 0.6, "-"),
+        (f"MA, {ma}", BLUE, 1.8, "-"),
+        (f"MSD, {msd}", ORANGE, 1.6, "--"),
     )
-    for values, look in zip((signal, average, deviation), looks, strict=True):
-        ax.plot(run.time / second, values / factor, **look)
+    for values, (label, color, width, style) in zip(lines, looks, strict=True):
+        ax.plot(run.time / second, values / factor, style, label=label, color=color, lw=width)
     ax.axhline(0.0, color=BLACK, linewidth=0.6)
     limit = 1.25 * float(np.max(np.abs(signal[inside]))) / factor
     if limit:
         ax.set_ylim(-limit, limit)
     begin, end = float(np.min(parts)), float(np.max(parts))
     ax.set_xlim((begin - 0.05 * (end - begin)) / second, (end + 0.02 * (end - begin)) / second)
-    legend(ax, given=given)
     text = f"moving windows of {with_unit(found.window, 's')}"
-    return finish(ax, x=named("time", time), y=named("error", shown), title=text)
+    return finish(ax, x=named("time", time), y=named("error", shown), title=text, given=given)
 
 
 def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> Axes:
@@ -306,8 +288,7 @@ def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> A
     'x [mm]'
     """
     instance(found, ErrorMap, "found", "Pass what error_map returned.")
-    if what not in ("ma", "msd"):
-        raise ModelError(f"what must be 'ma' or 'msd', got {short(what)}. Pass one of them.")
+    one_of(what, "what", ("ma", "msd"))
     if len(found.points) < 3:
         raise ModelError("a picture needs at least three points that span an area: add some.")
     ax = axes(ax, figsize=(6.0, 5.0))

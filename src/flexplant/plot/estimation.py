@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
@@ -30,6 +29,7 @@ from ._axes import (
     legend,
     named,
     shown_in,
+    three_axes,
 )
 
 
@@ -99,8 +99,14 @@ def predictions(
     _name_cases(ax, cases, next(iter(tables.values()))[:, 1] / factor, len(names) - 1)
     ax.set_yticks(range(len(names)), names[::-1])
     ax.set_ylim(-0.6, len(names) - 0.4)
+    handles = [
+        Line2D([], [], marker="D", fillstyle="none", linestyle="", color="0.4",
+               label="predicted by the design"),
+        Line2D([], [], marker="|", linestyle="", color=BLACK, markersize=12, markeredgewidth=2.0,
+               label="on the machine, 95 %"),
+    ]  # fmt: skip
     ax.legend(
-        handles=_legend(), frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2
+        handles=handles, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2
     )
     return finish(ax, x=named(f"rms error{title}", shown), y="")
 
@@ -157,8 +163,8 @@ def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None
         ax.set_yscale("log")
     else:
         ax.set_ylim(bottom=0.0)
-    legend(ax, given=given)
-    return finish(ax, x=named("lag", second), y=named(f"rms error of {name}", unit))
+    y = named(f"rms error of {name}", unit)
+    return finish(ax, x=named("lag", second), y=y, given=given)
 
 
 def estimate(
@@ -220,8 +226,7 @@ def estimate(
     ax.fill_between(result.time / second, low, high, color=BLUE, alpha=0.25, linewidth=0.0,
                     label=f"\N{PLUS-MINUS SIGN} {deviations:g} standard deviations")  # fmt: skip
     ax.plot(result.time / second, signal / factor, color=BLUE, linewidth=0.8, label=label)
-    legend(ax, given=given)
-    return finish(ax, x=named("time", time), y=named(label, unit))
+    return finish(ax, x=named("time", time), y=named(label, unit), given=given)
 
 
 def _name_cases(ax: Axes, cases: Sequence[str], found: FloatArray, place: float) -> None:
@@ -246,15 +251,6 @@ def _draw_row(ax: Axes, place: float, table: FloatArray, color: str) -> None:
                 markersize=14, markeredgewidth=2.0)  # fmt: skip
     ax.plot(predicted, np.full(found.size, place), "D", color=color, fillstyle="none",
             markersize=9, markeredgewidth=2.0)  # fmt: skip
-
-
-def _legend() -> Sequence[Line2D]:
-    diamond = {"marker": "D", "fillstyle": "none", "linestyle": "", "color": "0.4"}
-    bar = {"marker": "|", "linestyle": "", "color": BLACK, "markersize": 12}
-    return (
-        Line2D([], [], label="predicted by the design", **diamond),  # type: ignore[arg-type]
-        Line2D([], [], label="on the machine, 95 %", markeredgewidth=2.0, **bar),  # type: ignore[arg-type]
-    )
 
 
 #: windows of the mean NIS over a record, and samples in one at least
@@ -318,18 +314,13 @@ def consistency(
     instance(found, Consistency | None, "found", "Pass what consistency returned.")
     between(level, "level", 0.5, 1.0, "Pass 0.95.", ends="[")
     white = estimate.whitened.T
-    there = _there(white)
+    there = np.all(np.isfinite(white), axis=1)
     if int(there.sum()) < _FEWEST:
         raise ModelError(
             f"a picture needs at least {_FEWEST} samples with all innovations, got "
             f"{int(there.sum())}. Pass a longer record."
         )
-    if ax is not None and np.size(np.asarray(ax, dtype=object)) != 3:
-        raise ModelError("ax= takes three axes. Leave it out for a new figure.")
-    given = ax is not None
-    panels = ax if ax is not None else plt.subplots(
-        1, 3, figsize=(13.0, 3.8), layout="constrained"
-    )[1]  # fmt: skip
+    given, panels = ax is not None, three_axes(ax, 1, 3, figsize=(13.0, 3.8))
     _nis(panels[0], estimate.time[there], white[there], level)
     dt = float(np.median(np.diff(estimate.time)))
     _draw_correlation(panels[1], white, dt, level)
@@ -337,13 +328,7 @@ def consistency(
     legend(panels[0], given=True)
     if found is not None and not given:
         panels[0].figure.suptitle(found.text, fontsize="medium", wrap=True)
-    first: Axes = panels[0]
-    return first
-
-
-def _there(white: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return at which samples all innovations are known."""
-    return np.asarray(np.all(np.isfinite(white), axis=1))
+    return panels[0]
 
 
 def _nis(ax: Axes, time: FloatArray, white: FloatArray, level: float) -> None:
@@ -366,7 +351,7 @@ def _nis(ax: Axes, time: FloatArray, white: FloatArray, level: float) -> None:
 def _draw_correlation(ax: Axes, white: FloatArray, dt: float, level: float) -> None:
     from scipy.stats import norm
 
-    there = _there(white)
+    there = np.all(np.isfinite(white), axis=1)
     x = np.where(there[:, None], white, 0.0)
     count = int(there.sum())
     lags = min(100, count // 20)
@@ -374,18 +359,10 @@ def _draw_correlation(ax: Axes, white: FloatArray, dt: float, level: float) -> N
     for j, look in zip(range(x.shape[1]), CYCLE, strict=False):
         power = np.fft.rfft(x[:, j], 2 * len(x))
         whole = np.fft.irfft(np.abs(power) ** 2)[: lags + 1]
+        lag = dt * np.arange(1, lags + 1) / second
         marker = "o^sDvP"[j % 6]
-        ax.plot(
-            dt * np.arange(1, lags + 1) / second,
-            whole[1:] / whole[0],
-            marker,
-            color=look["color"],
-            markersize=2.5,
-        )
-    bound = float(norm.ppf(0.5 + 0.5 * level)) / np.sqrt(count)
-    for sign in (-1.0, 1.0):
-        ax.axhline(sign * bound, **STYLES["bound"])
-    ax.axhline(0.0, color=BLACK, linewidth=0.8)
+        ax.plot(lag, whole[1:] / whole[0], marker, color=look["color"], markersize=2.5)
+    _level_bounds(ax, float(norm.ppf(0.5 + 0.5 * level)) / np.sqrt(count))
     finish(ax, x=named("lag", unit), y="correlation of whitened innovations [-]")
 
 
@@ -399,7 +376,11 @@ def _periodogram(ax: Axes, white: FloatArray, rate: float, level: float) -> None
     factor, unit = shown_in(ax.xaxis, 0.5 * rate, "Hz")
     freq = found.freq * rate / factor
     ax.plot(freq, total - line, color=BLUE)
+    _level_bounds(ax, bound)
+    finish(ax, x=named("frequency", unit), y="cumulative periodogram less a straight line [-]")
+
+
+def _level_bounds(ax: Axes, bound: float) -> None:
     ax.axhline(0.0, color=BLACK, linewidth=0.8)
     for sign in (-1.0, 1.0):
         ax.axhline(sign * bound, **STYLES["bound"])
-    finish(ax, x=named("frequency", unit), y="cumulative periodogram less a straight line [-]")

@@ -23,7 +23,6 @@ from ._axes import (
     Style,
     axes,
     finish,
-    legend,
     named,
     shared_unit,
     shown_in,
@@ -63,7 +62,8 @@ def stabilisation(
     'frequency [Hz]'
     """
     instance(diagram, StabilisationDiagram, "diagram", "Pass what stabilisation_diagram returned.")
-    given, ax = ax is not None, axes(ax, figsize=(10.0, 5.0))
+    given: bool | None = ax is not None
+    ax = axes(ax, figsize=(10.0, 5.0))
     for flag, (marker, color, label) in enumerate(_MARKS):
         mine = diagram.flags == flag
         ax.plot(
@@ -80,12 +80,10 @@ def stabilisation(
         )
         behind.semilogy(frf.freq[inside], size[inside] / factor, color=GREY, linewidth=0.8)
         behind.set_ylabel(named("sum of all |FRF|", unit))
-    finish(ax, x="frequency [Hz]", y="model order")
-    if given or frf is None:
-        legend(ax, given=given)
-    else:  # beside is the ordinate of the responses
+    if frf is not None and not given:  # beside is the ordinate of the responses
         ax.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
-    return ax
+        given = None
+    return finish(ax, x="frequency [Hz]", y="model order", given=given)
 
 
 def identified(
@@ -142,9 +140,8 @@ def identified(
         draw(deviation, "standard deviation", {"color": GREY, "linewidth": 1.2, "linestyle": "--"})
     for pole in modes.freq.tolist():
         ax.axvline(pole, color=LIGHT, linestyle=":", linewidth=0.8, zorder=1.0)
-    legend(ax, given=given)
     ax.set_xlim(float(freq[0]), float(freq[-1]))
-    return finish(ax, x="frequency [Hz]", y=named(f"|{output} / {input}|", unit))
+    return finish(ax, x="frequency [Hz]", y=named(f"|{output} / {input}|", unit), given=given)
 
 
 #: lines of the table of poles: more do not fit beside the diagram

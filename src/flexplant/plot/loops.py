@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
@@ -40,7 +39,9 @@ from ._axes import (
     panel_axes,
     readable,
     shared_reference,
+    singular,
     styles,
+    three_axes,
 )
 
 #: step of L beside its distance from -1 that is filled in
@@ -232,8 +233,7 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
     ax.set_ylim(top=2.0)
     for ratio in _RATIOS:
         ax.axhline(ratio, color=GREY, linewidth=0.6, linestyle=":")
-    legend(ax, given=given)
-    return finish(ax, x="frequency |s| / 2 pi [Hz]", y="damping ratio [-]")
+    return finish(ax, x="frequency |s| / 2 pi [Hz]", y="damping ratio [-]", given=given)
 
 
 def _wide(ax: Axes) -> None:
@@ -406,18 +406,16 @@ def sensitivities(
     named, limits = by_label(loops), dict(weights or {})
     if unknown := set(limits) - set(_LIMITED):
         raise ModelError(f"weights are of {', '.join(_LIMITED)}, got {sorted(map(str, unknown))}.")
-    responses = {
-        what: [_kind_of(what, one, at, freq) for one in named.values()] for what in _LIMITED
+    responses: dict[str, list[Frf]] = {
+        "S": [sensitivity_of(one, freq=freq, at=at) for one in named.values()],
+        "T": [complementary_sensitivity(one, freq=freq, at=at) for one in named.values()],
+        "KS": [control_sensitivity(one, freq=freq) for one in named.values()],
     }
-    if ax is not None and np.size(np.asarray(ax, dtype=object)) != 3:
-        raise ModelError("ax= takes three axes: for S, T and KS. Leave it out for a new figure.")
-    panels = ax if ax is not None else plt.subplots(
-        3, 1, sharex=True, figsize=(8.0, 8.5), layout="constrained"
-    )[1]  # fmt: skip
+    panels = three_axes(ax, 3, 1, sharex=True, figsize=(8.0, 8.5))
     looks = styles(named, colors)
     for what, panel in zip(_LIMITED, panels, strict=True):
         found = responses[what]
-        lines = [(response.freq, largest_value(response)) for response in found]
+        lines = [(response.freq, singular(response)[:, 0]) for response in found]
         for label, line, style in zip(named, lines, looks, strict=True):
             text = label if label and what == "S" else None
             panel.semilogx(line[0], decibel(line[1]), label=text, **style)
@@ -429,10 +427,9 @@ def sensitivities(
         else:
             _draw_levels(panel)
         unit = f", 0 dB = {shared_reference(found[0])}" if what == "KS" else ""
-        finish(panel, x="frequency [Hz]" if what == "KS" else "", y=f"|{what}| [dB{unit}]")
-        legend(panel, given=ax is not None)
-    first: Axes = panels[0]
-    return first
+        x, y = "frequency [Hz]" if what == "KS" else "", f"|{what}| [dB{unit}]"
+        finish(panel, x=x, y=y, given=ax is not None)
+    return panels[0]
 
 
 def _draw_smallest(ax: Axes, found: Sequence[Frf], looks: Sequence[Style]) -> None:
@@ -453,27 +450,10 @@ def _from_where_it_rises(ax: Axes, lines: Sequence[_Line]) -> None:
         ax.set_xlim(left=0.01 * min(rises))
 
 
-def singular(response: Frf) -> FloatArray:
-    """Return the singular values (n_freq, k) of a response, the largest first."""
-    return np.asarray(np.linalg.svd(np.moveaxis(response.data, 2, 0), compute_uv=False))
-
-
-def largest_value(response: Frf) -> FloatArray:
-    """Return the largest singular value of a response at each frequency."""
-    return singular(response)[:, 0]
-
-
-def _kind_of(what: str, loop: Any, at: Literal["u", "y"], freq: FloatArray | None) -> Frf:
-    if what == "KS":
-        return control_sensitivity(loop, freq=freq)
-    found = sensitivity_of if what == "S" else complementary_sensitivity
-    return found(loop, freq=freq, at=at)
-
-
 def _sensitivity_size(one: Any, freq: FloatArray | None) -> _Line:
     """Return frequencies and sizes of one sensitivity."""
     if isinstance(one, Frf):
-        return one.freq, largest_value(one)
+        return one.freq, singular(one)[:, 0]
     if isinstance(one, ClosedLoop):
         try:
             return error_sensitivity(one)
@@ -490,7 +470,7 @@ def _sensitivity_size(one: Any, freq: FloatArray | None) -> _Line:
             "Type {'model': close_loop(plant, controller)}."
         )
     S = sensitivity_of(one, freq=freq)
-    return S.freq, largest_value(S)
+    return S.freq, singular(S)[:, 0]
 
 
 def _is_line(one: Any) -> bool:

@@ -29,7 +29,6 @@ from ._axes import (
     axes,
     differ,
     finish,
-    legend,
     legend_below,
     mark_devices,
     named,
@@ -147,8 +146,8 @@ def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
     if not found.by_cost:
         ax.set_xticks(found.amounts)
     ax.set_ylim(bottom=0.0 if found.unit else None)
-    legend(ax, given=given)
-    return finish(ax, x="cost" if found.by_cost else "number of devices", y=label)
+    x = "cost" if found.by_cost else "number of devices"
+    return finish(ax, x=x, y=label, given=given)
 
 
 def placed(

@@ -177,10 +177,9 @@ def _draw_panel(
     for name, signal in zip(group, signals, strict=True):
         look = looks[name] | {"linewidth": 0.8} | ({"color": color} if color else {})
         ax.plot(run.time / second, signal / factor, label=_curve_label(label, name, names), **look)
-    legend(ax, given=given)
     errors = all(name.endswith(":error") for name in group)
     quantity = "error" if errors else quantity_of(unit)
-    finish(ax, x=named("time", time), y=named(quantity, shown))
+    finish(ax, x=named("time", time), y=named(quantity, shown), given=given)
 
 
 #: channels for which a grid of panels can still be read

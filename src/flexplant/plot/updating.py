@@ -144,16 +144,9 @@ def _plan(
         mine = [i for i, (q, _) in enumerate(placed) if _candidate_kind(found, q.name) == kind]
         if mine:
             ax.scatter(
-                xy[mine, 0],
-                xy[mine, 1],
-                marker=marker,
-                s=260,
-                zorder=3,
-                label=kind,
-                facecolors="none",
-                edgecolors=COLOURS[kind],
-                linewidths=1.8,
-            )
+                xy[mine, 0], xy[mine, 1], marker=marker, s=260, zorder=3, label=kind,
+                facecolors="none", edgecolors=COLOURS[kind], linewidths=1.8,
+            )  # fmt: skip
     legend_below(ax)
     return ax
 
@@ -247,7 +240,7 @@ def update(
         if name in axs:
             _mac(axs[name], seen, name)
     _parameters(axs["parameters"], fit, level)
-    _convergence(axs["convergence"], fit)
+    _convergence(axs["convergence"], fit, "convergence")
     if shown:
         _draw_responses(axs["response"], shown[-1], before, fit.model)
     said = "converged" if fit.converged else "NOT CONVERGED"
@@ -262,25 +255,18 @@ def _draw_errors(ax: Axes, seen: Correlation, old: FloatArray, new: FloatArray, 
     # a bar as low as the line at 0 is seen by its edge
     ax.bar(place + 0.2, unit * new, 0.38, color=BLUE, edgecolor=BLUE, linewidth=2.0, label="after")
     for x, value in zip(place + 0.2, unit * new, strict=True):
-        above = value >= 0
+        side, off = ("bottom", 2) if value >= 0 else ("top", -2)
         ax.annotate(
-            f"{value:.1g}",
-            (float(x), float(value)),
-            (0, 2 if above else -2),
-            textcoords="offset points",
-            ha="center",
-            va="bottom" if above else "top",
-            fontsize=7,
-            color=BLUE,
+            f"{value:.1g}", (float(x), float(value)), (0, off), textcoords="offset points",
+            ha="center", va=side, fontsize=7, color=BLUE,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5},
-        )
+        )  # fmt: skip
     ax.axhline(0.0, color="0.3", linewidth=0.8)
     ax.margins(y=0.2)
     ax.set_xticks(place, [str(number) for number in seen.modes])
-    if what != "frequency":  # one legend serves both
-        legend(ax, given=False)
-    kind = "%" if what == "frequency" else "percentage points"
-    finish(ax, x="mode", y=f"error [{kind}]", title=f"{what}, model less measured")
+    # one legend serves both
+    kind, given = ("%", None) if what == "frequency" else ("percentage points", False)
+    finish(ax, x="mode", y=f"error [{kind}]", title=f"{what}, model less measured", given=given)
 
 
 def _mac(ax: Axes, seen: Correlation, name: str) -> None:
@@ -319,14 +305,10 @@ def _parameters(ax: Axes, fit: UpdateResult, level: float) -> None:
             ends = (prior[0] - 1.96 * prior[1]) / factor, 3.92 * prior[1] / factor
             row.barh(0.0, ends[1], 1.2, left=ends[0], color=LIGHT, label="prior, 95 %")
         row.axvline(0.0, color=GREY, linewidth=1.6, label="before")
+        bar = None if fit.std is None else [half[i] / factor]
+        text = f"after, bar: {100 * level:g} %"
         row.errorbar(
-            [fit.values[i] / factor],
-            [0.0],
-            xerr=None if fit.std is None else [half[i] / factor],
-            fmt="o",
-            color=BLUE,
-            capsize=4,
-            label=f"after, bar: {100 * level:g} %",
+            [fit.values[i] / factor], [0.0], xerr=bar, fmt="o", color=BLUE, capsize=4, label=text
         )
         row.set(ylim=(-1.0, 1.0), yticks=[])
         row.margins(x=0.08)
@@ -343,11 +325,14 @@ def _parameters(ax: Axes, fit: UpdateResult, level: float) -> None:
     ax.set_title(title + (f" ({more} more not drawn)" if more else ""), pad=16)
 
 
-def _convergence(ax: Axes, fit: UpdateResult) -> None:
+def _convergence(ax: Axes, fit: UpdateResult, title: str = "") -> Axes:
+    """Draw the error of an update over iterations, in units of the noise where that is known."""
     steps = np.arange(len(fit.history) + 1)
     ax.semilogy(steps, np.maximum(fit.history.error, TINY), "o-", color=BLUE, markersize=4)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    finish(ax, x="iteration", y=error_label(fit), title="convergence")
+    unit = "SI units squared" if fit.chi2 is None else "-"
+    y = f"sum of squares,\nmodel less measured [{unit}]"
+    return finish(ax, x="iteration", y=y, title=title)
 
 
 def _draw_responses(ax: Axes, residual: FrfResidual, before: Any, after: Any) -> None:
@@ -365,9 +350,8 @@ def _draw_responses(ax: Axes, residual: FrfResidual, before: Any, after: Any) ->
         H = tied.responses(objective.begin(np.zeros(0)))[:, o, i]
         look = STYLES["nominal" if label == "before" else "model"]
         ax.semilogy(freq, np.abs(H) / factor, label=label, **look)
-    legend(ax, given=False)
     name = f"|{frf.outputs[o]} / {frf.inputs[i]}|"
-    finish(ax, x="frequency [Hz]", y=named(name, shown), title="response")
+    finish(ax, x="frequency [Hz]", y=named(name, shown), title="response", given=False)
 
 
 def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = None) -> Axes:
@@ -413,9 +397,9 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
                 color=CYCLE[i % len(CYCLE)]["color"],
                 label=f"{part} of {goal[i]:.1f} rad/s",
             )
-    legend(ax, given=given)
     ax.set_xticks(steps)
-    return finish(ax, x="iteration", y="distance to the measured eigenvalue [rad/s]")
+    y = "distance to the measured eigenvalue [rad/s]"
+    return finish(ax, x="iteration", y=y, given=given)
 
 
 def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
@@ -445,12 +429,7 @@ def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
     >>> len(ax.get_lines()) > 0
     True
     """
-    ax = axes(ax, figsize=(7.0, 4.0))
-    steps = np.arange(len(fit.history) + 1)
-    error = np.maximum(fit.history.error, TINY)
-    ax.semilogy(steps, error, "o-", color=BLUE)
-    ax.set_xticks(steps)
-    return finish(ax, x="iteration", y=error_label(fit))
+    return _convergence(axes(ax, figsize=(7.0, 4.0)), fit)
 
 
 def parameters(
@@ -495,9 +474,3 @@ def parameters(
             ax.set_title(name, loc="left", fontsize="medium", pad=3.0)
     bottom_only(panels if axs is None else [])
     return panels
-
-
-def error_label(fit: UpdateResult) -> str:
-    """Return the label of an update's error: in units of the noise where that is known."""
-    unit = "SI units squared" if fit.chi2 is None else "-"
-    return f"sum of squares,\nmodel less measured [{unit}]"
