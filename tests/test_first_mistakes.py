@@ -20,7 +20,7 @@ from flexplant.errors import (
     SolverError,
     attempted,
 )
-from flexplant.foreign_names import OURS
+from flexplant.rooms import OURS
 from flexplant.structure import zero_energy
 
 

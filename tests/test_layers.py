@@ -18,9 +18,9 @@ ROOT = Path(flexplant.__file__).parent
 #: in import order; the first entry is the foundation, whose modules may use each other
 ROOMS = (
     (
-        *("errors", "calls", "rooms", "checks", "store", "certificates", "versions", "parallel"),
+        *("errors", "calls", "rooms", "checks", "store", "certificates", "parallel"),
         *("tolerances", "fingerprint", "work", "dof_columns", "labels", "bibliography"),
-        *("foreign_names", "algorithms"),
+        "algorithms",
     ),
     "lti",
     "sparse",

@@ -6,8 +6,8 @@ import numpy as np
 
 import flexplant as fx
 from flexplant.certificates import one_line
+from flexplant.rooms import versions
 from flexplant.store import as_html
-from flexplant.versions import versions
 from stages import RATE, ports, reduced
 
 

@@ -147,7 +147,7 @@ def __getattr__(name: str) -> _Any:
         where = "".join(
             f" Use flexplant.{room}.{name}." for room in rooms if hasattr(_imported(room), name)
         )
-        ours = _import_module(".foreign_names", __name__).OURS.get(name)
+        ours = _import_module(".rooms", __name__).OURS.get(name)
         if ours and not where:
             where = f" What MATLAB or python-control call so is flexplant.{ours}."
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}.{where}")

@@ -92,6 +92,7 @@ from .reduction import Serep as Serep
 from .reduction import rank_modes as rank_modes
 from .reduction import reduce as reduce
 from .reduction import select_dofs as select_dofs
+from .rooms import show_versions as show_versions
 from .simulation import Response as Response
 from .simulation import Specification as Specification
 from .simulation import compare_estimators as compare_estimators
@@ -148,6 +149,5 @@ from .updating import localise as localise
 from .updating import sample_posterior as sample_posterior
 from .updating import update as update
 from .updating import validate as validate
-from .versions import show_versions as show_versions
 
 __version__: str

@@ -1,16 +1,21 @@
-"""What a room shows: its public names, not the modules behind them; its functions as `calls` has.
+"""What the package and its rooms show: public names, what others call them, versions.
 
 Functions are replaced in the module that defines them too, where pickling looks for them.
 """
 
 from __future__ import annotations
 
+import os
+import platform
 import sys
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
 from .calls import answering
+from .errors import counted
 
 
 def public_names(room: str) -> Callable[[], list[str]]:
@@ -46,3 +51,73 @@ def called_names(room: str) -> Callable[[], list[str]]:
     """Return the `__dir__` of a package that is called itself, by its function of that name."""
     sys.modules[room].__class__ = _CalledRoom
     return public_names(room)
+
+
+#: what is called otherwise in MATLAB and python-control: its name here, and theirs
+_THEIRS = {
+    "StateSpace": "ss", "Frf": "frd", "StateSpace.poles": "pole", "StateSpace.zeros": "tzero zero",
+    "StateSpace.dcgain": "dcgain", "frequency_response": "freqresp",
+    "plot.bode": "bode bode_plot bodeplot", "plot.singular_values": "sigma",
+    "plot.nyquist": "nyquist nyquist_plot", "plot.pole_map": "pzmap",
+    "plot.step": "step step_response", "loop.report_loops": "margin allmargin stability_margins",
+    "loop.sensitivity": "loopsens", "discretized": "c2d sample_system",
+    "h2_norm (or hinf_norm)": "norm", "peak_gain": "getPeakGain", "minimal": "minreal",
+    "balanced": "balred balreal", "modal_form": "canon", "lti.solve_lyapunov": "lyap",
+    "lti.solve_stein": "dlyap", "lti.solve_care": "care icare", "lti.solve_dare": "dare idare",
+    "plant.mixed_sensitivity": "augw", "plant.mixed_sensitivity, then design_hinf": "mixsyn",
+    "design_hinf": "hinfsyn", "design_h2": "h2syn lqg", "design_h2 (or placement.PoiLqr)": "lqr",
+    "design_kalman": "kalman lqe", "design_ncf": "ncfsyn", "ncf_margin": "ncfmargin",
+    "synthesis.design_structured": "hinfstruct", "tune_loops": "systune", "design_servo": "pidtune",
+    "synthesis.mu": "mussv", "synthesis.robust_stability": "robstab",
+    "synthesis.worst_case_gain": "wcgain", "synthesis.design_mu": "musyn",
+    "simulate": "lsim forced_response", "estimate_frf": "tfestimate modalfrf",
+    "identify_modes": "modalfit",
+}  # fmt: skip
+OURS = {foreign: ours for ours, names in _THEIRS.items() for foreign in names.split()}
+
+#: what is imported when it is needed, in the order in which it is listed
+_PACKAGES = (
+    *("numpy", "scipy", "control", "slycot", "cvxpy", "clarabel", "filterpy", "matplotlib"),
+    *("threadpoolctl", "tqdm"),
+)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this package, Python, its libraries, BLAS, platform and threads."""
+    from threadpoolctl import threadpool_info
+
+    found = {"flexplant": sys.modules["flexplant"].__version__, "python": platform.python_version()}
+    found |= {name: _version(name) for name in _PACKAGES}
+    for pool in sorted(threadpool_info(), key=lambda pool: str(pool["filepath"])):
+        kind = {"blas": "BLAS", "openmp": "OpenMP"}.get(pool["user_api"], pool["user_api"])
+        parts = (pool.get("internal_api"), pool.get("version"), pool.get("architecture"))
+        own = " ".join(str(part) for part in parts if part)
+        path = Path(pool["filepath"])
+        owner = next((n for n in ("numpy", "scipy") if f"{n}.libs" in path.parts), path.parent.name)
+        name = f"{kind} of {owner}"
+        found[name] = f"{own}, {counted(pool['num_threads'], 'thread')}"
+    found["platform"] = platform.platform()
+    found["processors"] = str(os.cpu_count())
+    limits = [f"{n}={os.environ[n]}" for n in sorted(os.environ) if n.endswith("_NUM_THREADS")]
+    found["limits of threads"] = ", ".join(limits) or "none set"
+    return found
+
+
+def show_versions() -> None:
+    """Write the versions that results depend on to the standard output.
+
+    Examples
+    --------
+    >>> show_versions()  # doctest: +ELLIPSIS
+    flexplant ...
+    """
+    found = versions()
+    width = max(map(len, found)) + 2
+    sys.stdout.write("".join(f"{name:{width}s}{text}\n" for name, text in found.items()))
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -94,11 +94,9 @@ def read_abaqus(
     >>> found.dofs.labels, found.K.toarray().tolist()
     (('1:x', '2:x'), [[400000.0, -400000.0], [-400000.0, 400000.0]])
     """
-    files = [stiffness, mass, damping]
-    parts = [
-        None if file is None and i else _triplets(cast(Any, file)) for i, file in enumerate(files)
-    ]
-    there = [part for part in parts if part is not None]
+    first = _triplets(stiffness)
+    others = [None if file is None else _triplets(file) for file in (mass, damping)]
+    there = [first, *(part for part in others if part is not None)]
     if len({part.named for part in there}) > 1:
         raise ModelError(
             "the files are of two formats, MATRIX INPUT and COORDINATE: their rows cannot be "
@@ -107,25 +105,19 @@ def read_abaqus(
     order = np.unique(
         np.concatenate([code for part in there for code in (part.rows, part.columns)])
     )
-    if not there[0].named:
+    if not first.named:
         check_count(int(order[-1] >> 4), file_path(stiffness).stat().st_size, stiffness)
         order = np.arange(16, 16 * (order[-1] >> 4) + 1, 16)
-    K, M, D = (None if part is None else part.matrix(order) for part in parts)
-    assert K is not None  # noqa: S101 - its file is no option
+    M, D = (None if part is None else part.matrix(order) for part in others)
     located = True
-    if there[0].named:
+    if first.named:
         if dofs is not None:
             raise ModelError("the files name their rows: dofs= is for FORMAT=COORDINATE only.")
         dofs, located = _dofs(order, inp), inp is not None
     found = FEMatrices(
-        K,
-        M,
-        D,
-        dofs=dofs,
+        first.matrix(order), M, D, dofs=dofs, source=str(stiffness), located=located,
         digits=max(part.digits or 0 for part in there) or None,
-        source=str(stiffness),
-        located=located,
-    )
+    )  # fmt: skip
     held = found.K.diagonal() >= _HELD
     if not held.any():
         return found
@@ -173,9 +165,9 @@ def _triplets(path: str | Path) -> _Triplets:
         at = wrong_line((line.replace(b",", b" ") for line in data), width)
         raise _abaqus_line_error(path, lines, data[at or 0], width)
     labels = table[:, :-1]
-    if not np.all(np.isfinite(table)) or np.any(labels != np.round(labels)):
-        bad = np.argmax(~np.isfinite(table).all(axis=1) | (labels != np.round(labels)).any(axis=1))
-        raise _abaqus_line_error(path, lines, data[int(bad)], width)
+    wrong = ~np.isfinite(table).all(axis=1) | (labels != np.round(labels)).any(axis=1)
+    if np.any(wrong):
+        raise _abaqus_line_error(path, lines, data[int(np.argmax(wrong))], width)
     whole: Any = labels.astype(np.int64)
     inner = whole[:, :: 2 if width == 5 else 1]
     if np.any(inner < 1):

@@ -204,7 +204,19 @@ GetIntegerStatus($C, int which, int *value)
 GetBooleanStatus($C, int which, int *value)
 GetStringStatus($C, int which, const char * *value)
 """
-_THREE = """
+#: of FMI 3.0: kinds of variables that these units have none of
+_NUMBERS_OF_THREE = {
+    "Float32": "float", "Int8": "signed char", "UInt8": "unsigned char", "Int16": "short",
+    "UInt16": "unsigned short", "Int32": "int", "UInt32": "unsigned int", "Int64": "long long",
+    "UInt64": "unsigned long long", "Boolean": "_Bool",
+}  # fmt: skip
+_THREE = (
+    "".join(
+        f"Get{kind}($V, {number} *values, size_t count): none\n"
+        f"Set{kind}($V, const {number} *values, size_t count): none\n"
+        for kind, number in _NUMBERS_OF_THREE.items()
+    )
+    + """
 const char *GetVersion(void): return "3.0";
 SetDebugLogging($C, _Bool on, size_t n, const char *const *list): ok
 void *InstantiateModelExchange($M, void *owner, void (*log)(void)): return NULL;
@@ -223,26 +235,6 @@ GetFloat64($V, double *values, size_t count): return count < n ? ERROR : read((u
     values);
 SetFloat64($V, const double *values, size_t count): return count < n ? ERROR : write((unit \
     *)c, v, n, values);
-GetFloat32($V, float *values, size_t count): none
-SetFloat32($V, const float *values, size_t count): none
-GetInt8($V, signed char *values, size_t count): none
-SetInt8($V, const signed char *values, size_t count): none
-GetUInt8($V, unsigned char *values, size_t count): none
-SetUInt8($V, const unsigned char *values, size_t count): none
-GetInt16($V, short *values, size_t count): none
-SetInt16($V, const short *values, size_t count): none
-GetUInt16($V, unsigned short *values, size_t count): none
-SetUInt16($V, const unsigned short *values, size_t count): none
-GetInt32($V, int *values, size_t count): none
-SetInt32($V, const int *values, size_t count): none
-GetUInt32($V, unsigned int *values, size_t count): none
-SetUInt32($V, const unsigned int *values, size_t count): none
-GetInt64($V, long long *values, size_t count): none
-SetInt64($V, const long long *values, size_t count): none
-GetUInt64($V, unsigned long long *values, size_t count): none
-SetUInt64($V, const unsigned long long *values, size_t count): none
-GetBoolean($V, _Bool *values, size_t count): none
-SetBoolean($V, const _Bool *values, size_t count): none
 GetString($V, const char *const *values, size_t count): none
 SetString($V, const char *const *values, size_t count): none
 GetBinary($V, size_t *sizes, const unsigned char **values, size_t count): none
@@ -292,6 +284,7 @@ DoStep($C, double time, double step, _Bool keeps, _Bool *event, _Bool *end, _Boo
     time, step);
 ActivateModelPartition($C, unsigned int clock, double time)
 """
+)
 
 
 def interface(K: StateSpace, name: str, version: str) -> str:

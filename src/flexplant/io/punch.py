@@ -117,6 +117,9 @@ def read_dmig(
     nodes = None if bdf is None else read_nodes(bdf)
     ids = set((order >> 4).tolist())
     dofs = _matrix_dofs(order, nodes, scalar_direction, str(path))
+    most, n = max((part.size for part in given if part.form == 6), default=0), order.size
+    note = f"the header says {most} rows, {n} are named: the others are empty, or the file is cut"
+    notes = (note,) if most > n else ()
     found = FEMatrices(
         K.matrix(order, str(path)),
         None if M is None else M.matrix(order, str(path)),
@@ -125,7 +128,7 @@ def read_dmig(
         digits=max(part.digits or 0 for part in given) or None,
         source=str(path),
         located=nodes is not None,
-        notes=_rows_missing(given, order.size),
+        notes=notes,
     )
     local = {} if nodes is None else {n: axes.T for n, axes in nodes.axes.items() if n in ids}
     # axes that are those of the file, to the rounding of a rotation matrix
@@ -134,16 +137,6 @@ def read_dmig(
         return found
     note = f"{counted(len(turned), 'node')} moved in local directions: turned into the basic ones"
     return found.rotated(turned).replace(notes=(*found.notes, note))
-
-
-def _rows_missing(given: list[_Block], n: int) -> tuple[str, ...]:
-    """Return what to note when a header announces more rows than cards name."""
-    most = max((part.size for part in given if part.form == 6), default=0)
-    if most <= n:
-        return ()
-    return (
-        f"the header says {most} rows, {n} are named: the others are empty, or the file is cut",
-    )
 
 
 @dataclass

@@ -318,9 +318,7 @@ def read_sierra(
     n = max(int(table[:, :2].max()) for table, _ in tables.values())
     check_count(n, sum(file_path(file).stat().st_size for file in files), stiffness)
 
-    def matrix(file: str | Path | None) -> sp.csc_array | None:
-        if file is None:
-            return None
+    def matrix(file: str | Path) -> sp.csc_array:
         table = tables[str(file)][0]
         at = table[:, :2].astype(np.int64) - 1
         return from_triplets(table[:, 2], at[:, 0], at[:, 1], n, file)
@@ -328,17 +326,11 @@ def read_sierra(
     located = True
     if dof_map is not None:
         dofs, located = _read_row_names(dof_map, exodus, n)
-    K = matrix(stiffness)
-    assert K is not None  # noqa: S101 - its file is no option
+    M, D = (None if file is None else matrix(file) for file in (mass, damping))
     return FEMatrices(
-        K,
-        matrix(mass),
-        matrix(damping),
-        dofs=dofs,
+        matrix(stiffness), M, D, dofs=dofs, source=str(stiffness), located=located,
         digits=max(digits or 0 for _, digits in tables.values()) or None,
-        source=str(stiffness),
-        located=located,
-    )
+    )  # fmt: skip
 
 
 def _read_numbers(path: str | Path, width: int) -> tuple[FloatArray, int | None]:

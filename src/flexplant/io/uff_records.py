@@ -16,7 +16,17 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS
 from ..lti.frequency import ORDERS, Frf
 from ..tolerances import SAME
-from .files import GLOBAL, ONCE, at_zero, damaged, file_path, refused, spaced_numbers, unread
+from .files import (
+    GLOBAL,
+    ONCE,
+    at_zero,
+    damaged,
+    file_path,
+    parsing,
+    refused,
+    spaced_numbers,
+    unread,
+)
 
 
 def check_systems(parts: list[dict[str, Any]], path: str) -> None:
@@ -28,17 +38,6 @@ def check_systems(parts: list[dict[str, Any]], path: str) -> None:
             if label in (0, 1) and (kind or np.abs(np.asarray(matrix) - straight).max() > SAME):
                 what = f"gives nodes in coordinate system {int(label)}, turned, moved or curved"
                 raise unread(path, f"{what} by dataset 2420", GLOBAL)
-
-
-def dataset_types(path: str | Path) -> list[int]:
-    """Return the types of the datasets in a file."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            file = importlib.import_module("pyuff").UFF(str(path))
-            return [int(kind) for kind in file.get_set_types()]
-        except Exception as error:
-            raise _damaged(path, "its datasets", error) from None
 
 
 def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
@@ -58,8 +57,9 @@ def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
     found = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy's of what pyuff calls
-        types = dataset_types(path)
-        file = pyuff.UFF(str(path))
+        with parsing(f"{path}", "Export it again."):
+            file = pyuff.UFF(str(path))
+            types = [int(kind) for kind in file.get_set_types()]
         for place, kind in enumerate(types):
             if kind not in kinds:
                 continue
@@ -69,7 +69,8 @@ def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
                 if "node_nums" in part:
                     part["node_nums"] = np.atleast_1d(part["node_nums"]).astype(np.int64)
             except Exception as error:
-                raise _damaged(path, f"dataset {place + 1} (type {kind})", error) from None
+                what = f"dataset {place + 1} (type {kind}) cannot be read ({error!s:.100})"
+                raise damaged(path, what, "Export it again.") from None
             if kind == 58:
                 _check_58(part, path, place)
             found.append(part)
@@ -96,13 +97,6 @@ def _check_end(path: Path) -> None:
         raise refused(path, f"is cut off: {which} has no end", "Export it, or copy it, again.")
 
 
-def _damaged(path: str | Path, what: str, error: object) -> FlexplantError:
-    return FlexplantError(
-        f"{str(path)!r}: {what} cannot be read ({error!s:.100}). The file is cut off or damaged: "
-        "export it again."
-    )
-
-
 def _check_58(part: dict[str, Any], path: str | Path, place: int) -> None:
     data, x = np.asarray(part.get("data", ())), np.asarray(part.get("x", ()))
     points = whole_entry(part, "num_pts")
@@ -112,7 +106,8 @@ def _check_58(part: dict[str, Any], path: str | Path, place: int) -> None:
         wrong = "NaN or infinite numbers"
     else:
         return
-    raise _damaged(path, f"dataset {place + 1} (type 58)", wrong)
+    what = f"dataset {place + 1} (type 58) cannot be read ({wrong})"
+    raise damaged(path, what, "Export it again.")
 
 
 def whole_entry(part: dict[str, Any], name: str) -> int:

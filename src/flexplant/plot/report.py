@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any, TypeVar
@@ -33,11 +34,11 @@ from ..placement import ParetoCurve, Placement, SensorMap
 from ..placement.criterion import in_words
 from ..plant import StandardPlant, decouple
 from ..reduction import ReducedModel
+from ..rooms import versions
 from ..simulation import ErrorMap, ExposureErrors, Response, Verdict
 from ..store import written
 from ..synthesis import Controller
 from ..updating import Localisation, UpdateResult
-from ..versions import versions
 from ._axes import STYLES, bottom_only, decibel, finish, name_panel, panel_axes, readable
 from .bode import bode, singular_values
 from .errors import budget, error_map
@@ -106,17 +107,19 @@ def _value_lines(name: str, value: Any, design: Design, gallery: Gallery) -> str
     if isinstance(value, Response) and value.seed is not None and loop is not None:
         parts.append("<h4>Beside the model of the loop</h4>")
         parts.append(html_or_why(lambda: consistency(loop, value)._repr_html_()))
-    modes = _modes_of(value)
-    if modes is not None:
+    modes = value.modes() if isinstance(value, ReducedModel) else value
+    if isinstance(modes, Modes):
         parts.append(
             f'<div class="pictures">{moving_shapes(modes)}<div>{_modes_table(modes)}</div></div>'
         )
     drawn = [
-        html_or_why(lambda draw=draw, said=said: gallery.picture(draw, said))  # type: ignore[misc]
+        html_or_why(partial(gallery.picture, draw, said))
         for said, draw in _pictures(name, value, design)
     ]
     if isinstance(value, StandardPlant):
-        drawn.append(f"<div>{html_or_why(lambda: _ports_table(value))}{_assumptions(value)}</div>")
+        shown = html_or_why(lambda: value.check()._repr_html_())
+        shown = f"<details><summary>Standard assumptions</summary>{shown}</details>"
+        drawn.append(f"<div>{html_or_why(lambda: _ports_table(value))}{shown}</div>")
     if drawn:
         parts.append(f'<div class="pictures">{"".join(drawn)}</div>')
     tick("report")
@@ -126,43 +129,41 @@ def _value_lines(name: str, value: Any, design: Design, gallery: Gallery) -> str
 def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
     """Return captions and functions that draw a value."""
     if isinstance(value, Response):
-        return _of_run(name, value)
+        over: list[Picture] = [(f"{name}: errors over time", partial(response, value))]
+        forces = [n for n in value if n.endswith(":effort")]
+        if forces and any(n.endswith(":error") for n in value):
+            over.append((f"{name}: forces over time", partial(response, value, forces)))
+        return over
     if isinstance(value, StandardPlant) and value.is_assembled:
         said = "Sensors, actuators and POIs; arrows: along what they act and measure"
         return [
-            (said, lambda: placed(value)),
-            ("The plant, from forces along each axis to the POI", lambda: _axis_responses(value)),
+            (said, partial(placed, value)),
+            ("The plant, from forces along each axis to the POI", partial(_axis_responses, value)),
         ]
-    if isinstance(value, Placement):
-        plant = design.plant
-        if plant is None or not plant.is_assembled:
-            return []
-        own = plant
-        return [("The places that were chosen", lambda: placed(value.on(own)))]
+    plant = design.plant
+    if isinstance(value, Placement) and plant is not None and plant.is_assembled:
+        return [("The places that were chosen", lambda: placed(value.on(plant)))]
     if isinstance(value, Controller | StateSpace | Frf):
         system: Any = value.system if isinstance(value, Controller) else value
         if len(system.inputs) * len(system.outputs) <= _CHANNELS:
-            return [(f"Bode diagram of {name}", lambda: bode(system))]
+            return [(f"Bode diagram of {name}", partial(bode, system))]
         caption = f"Singular values of {name}, the area down to the smallest"
-        return [(caption, lambda: singular_values(system))]
+        return [(caption, partial(singular_values, system))]
     if isinstance(value, UpdateResult):
         few = len(value.parameters) <= _PARAMETERS
-        through: list[Picture] = [("Parameters through the update", lambda: parameters(value))]
-        return through * few + [("Residuals through the update", lambda: residual(value))]
+        through: list[Picture] = [("Parameters through the update", partial(parameters, value))]
+        return through * few + [("Residuals through the update", partial(residual, value))]
     simple: dict[type, tuple[str, Callable[[Any], Any]]] = {
         ErrorBudget: ("Error budget", budget),
         ErrorMap: ("Errors over the surface", error_map),
         LagReport: ("Error of the estimate by lag", lag_report),
-        Localisation: ("Where the model differs", lambda one: localisation(one)),
+        Localisation: ("Where the model differs", localisation),
         ParetoCurve: ("What each further device buys", pareto_curve),
         SensorMap: ("Where one more sensor helps", sensor_map),
         StabilisationDiagram: ("Stabilisation diagram", stabilisation),
     }
-    return [
-        (said, lambda draw=draw: draw(value))  # type: ignore[misc]
-        for kind, (said, draw) in simple.items()
-        if isinstance(value, kind)
-    ]
+    fit = (picture for kind, picture in simple.items() if isinstance(value, kind))
+    return [(said, partial(draw, value)) for said, draw in fit]
 
 
 def _axis_responses(plant: StandardPlant) -> None:
@@ -189,21 +190,6 @@ def _axis_responses(plant: StandardPlant) -> None:
     bottom_only(panels)
 
 
-def _of_run(name: str, run: Response) -> list[Picture]:
-    errors = [n for n in run if n.endswith(":error")]
-    efforts = [n for n in run if n.endswith(":effort")]
-    pictures: list[Picture] = [(f"{name}: errors over time", lambda: response(run))]
-    if errors and efforts:
-        pictures.append((f"{name}: forces over time", lambda: response(run, efforts)))
-    return pictures
-
-
-def _modes_of(value: Any) -> Modes | None:
-    if isinstance(value, Modes):
-        return value
-    return value.modes() if isinstance(value, ReducedModel) else None
-
-
 def _modes_table(modes: Modes) -> str:
     rows = []
     for k in range(min(modes.n_modes, 40)):
@@ -223,26 +209,14 @@ def _ports_table(plant: StandardPlant) -> str:
     for side, kind in kinds.items():
         for port in getattr(ports, side):
             at = getattr(port, "at", "")
-            where = ", ".join(f"{x:g}" for x in at) if _is_point(at) else str(at)
-            asd = getattr(port, "asd", 0.0)
-            density = with_unit(asd, _unit(plant, port.name, units.get(side, ""))) if asd else ""
+            point = isinstance(at, tuple | list | np.ndarray) and not isinstance(at[0], str)
+            where = ", ".join(f"{x:g}" for x in at) if point else str(at)
+            own = plant.units.get(port.name)
+            unit, asd = f"{own}/√Hz" if own else units.get(side, ""), getattr(port, "asd", 0.0)
+            density = with_unit(asd, unit) if asd else ""
             along = getattr(port, "direction", None) or " ".join(getattr(port, "axes", ()))
             rows.append([port.name, kind, where, str(along), density])
     return table(["channel", "kind", "place [m]", "along", "noise density"], rows)
-
-
-def _unit(plant: StandardPlant, name: str, otherwise: str) -> str:
-    own = plant.units.get(name)
-    return f"{own}/√Hz" if own else otherwise
-
-
-def _is_point(at: Any) -> bool:
-    return isinstance(at, tuple | list | np.ndarray) and len(at) == 3 and not isinstance(at[0], str)
-
-
-def _assumptions(plant: StandardPlant) -> str:
-    shown = html_or_why(lambda: plant.check()._repr_html_())
-    return f"<details><summary>Standard assumptions</summary>{shown}</details>"
 
 
 def certificates(design: Design) -> Chapter | None:
@@ -290,7 +264,11 @@ def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | N
     name, loop = next(iter(loops.items()))
     main = _main(loop, channel)
     compared = _loop_figures(loops, main)
-    found, why = _budget(loop, main)
+    found, why = None, ""
+    try:
+        found = loop.budget(main)
+    except FlexplantError as error:
+        why = f"No error budget: {error}"
     parts = [tiles([_error_tile(main, found), *_stability(loop), *_margins(compared.rows[name])])]
     for verdict in design.of(Verdict).values():
         said = "The specification is met."
@@ -317,7 +295,7 @@ def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | N
         f'<div class="pictures">{picture}<div>{found._repr_html_()}{motions}</div></div>'
     )
     others = [n for n in loop.plant.z if n != main and n.endswith(":error")]
-    drawn = "".join(html_or_why(lambda n=n: _other_budget(loop, n, gallery)) for n in others)  # type: ignore[misc]
+    drawn = "".join(html_or_why(partial(_other_budget, loop, n, gallery)) for n in others)
     if drawn:
         parts.append(f'<h3>Error budgets of the other axes</h3><div class="pictures">{drawn}</div>')
     return Chapter("Result", "".join(parts))
@@ -357,7 +335,7 @@ def loops_section(design: Design, gallery: Gallery, channel: str | None) -> Chap
         parts.append(f'<div class="pictures">{drawn}</div>')
     for name, loop in loops.items():
         parts += [f"<h3>{escape(name)}</h3>", loop._repr_html_()]
-        parts.append(html_or_why(lambda loop=loop: _margin_table(loop)))  # type: ignore[misc]
+        parts.append(html_or_why(partial(_margin_table, loop)))
     return Chapter("Loop", "".join(parts))
 
 
@@ -374,14 +352,6 @@ def html_or_why(make: Callable[[], str]) -> str:
         return make()
     except FlexplantError as error:
         return note(f"Not shown: {error}")
-
-
-def _budget(loop: ClosedLoop, channel: str) -> tuple[ErrorBudget | None, str]:
-    """Return the error budget, or why there is none."""
-    try:
-        return loop.budget(channel), ""
-    except FlexplantError as error:
-        return None, f"No error budget: {error}"
 
 
 def _error_tile(channel: str, found: ErrorBudget | None) -> Tile:
@@ -404,15 +374,10 @@ def _stability(loop: ClosedLoop) -> list[Tile]:
     left = loop.left_out
     if left is None:
         return [*found, ("with the modes left out", "not checked", "close_loop(larger=...)", "")]
-    figure = "stable" if left.is_stable else "UNSTABLE"
-    beside = one_line({stability_name(sampled): left.stability})
-    if left.modes:
-        beside = left.named_modes
-    kind = "good" if left.is_fine else "bad"
-    return [
-        *found,
-        (f"with the modes left out ({counted(left.states, 'state')})", figure, beside, kind),
-    ]
+    word, kind = "stable" if left.is_stable else "UNSTABLE", "good" if left.is_fine else "bad"
+    beside = left.named_modes if left.modes else one_line({stability_name(sampled): left.stability})
+    what = f"with the modes left out ({counted(left.states, 'state')})"
+    return [*found, (what, word, beside, kind)]
 
 
 def _margins(row: LoopFigures) -> list[Tile]:
@@ -550,16 +515,13 @@ def report(
         bar.advance()
         found += [loops_section(design, gallery, channel)]
         bar.advance(1 + len(design.of(ClosedLoop)))
-        found += room_sections(design, gallery)
-        found += [certificates(design), _origin({**noisy, **(seeds or {})})]
+        rows = [
+            [f"seed of {name}", short(seed)] for name, seed in {**noisy, **(seeds or {})}.items()
+        ]
+        rows += [list(pair) for pair in versions().items()]
+        origin = Chapter("Seeds and versions", table(["", ""], rows, words=True))
+        found += [*room_sections(design, gallery), certificates(design), origin]
     text = page(str(title), str(subtitle), [one for one in found if one is not None])
     with written(path) as file:
         file.write(text.encode("utf-8"))
     return Path(path)
-
-
-def _origin(seeds: Mapping[str, Any]) -> Chapter:
-    """Return the section of versions and seeds."""
-    rows = [[f"seed of {name}", short(seed)] for name, seed in seeds.items()]
-    rows += [list(pair) for pair in versions().items()]
-    return Chapter("Seeds and versions", table(["", ""], rows, words=True))
