@@ -48,8 +48,7 @@ def joined_parts(frfs: Mapping[str, Frf], signs: Mapping[str, float]) -> Measure
     n_freq = next(iter(frfs.values())).freq.size
     data = np.zeros((len(outputs), len(inputs), n_freq), dtype=np.complex128)
     variance = np.zeros(data.shape)
-    correlation = np.zeros((len(outputs), len(outputs), n_freq), dtype=np.complex128)
-    correlation[range(len(outputs)), range(len(outputs))] = 1.0
+    correlation = np.repeat(np.eye(len(outputs), dtype=np.complex128)[..., None], n_freq, axis=2)
     row = column = 0
     for name, frf in frfs.items():
         rows, columns = slice(row, row + len(frf.outputs)), slice(column, column + len(frf.inputs))
@@ -141,11 +140,7 @@ def joined_frfs(
     if variance is not None:
         done = "the joints take nearly all of a component's motion away"
         warn_of_errors(data, variance, first.freq, known=True, done=done)
-    units = {
-        f"{name}/{channel}": unit
-        for name, frf in frfs.items()
-        for channel, unit in frf.units.items()
-    }
+    units = {f"{name}{x}": unit for name, frf in prefixed.items() for x, unit in frf.units.items()}
     inputs, outputs = Y.inputs, Y.outputs
     return Frf(first.freq, data, inputs, outputs, first.quantity, variance=variance, units=units)
 

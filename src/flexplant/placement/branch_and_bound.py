@@ -53,7 +53,7 @@ class Exchange(Search):
         relaxed = problem.relaxed()
         chosen, history, evaluations = best_start(problem, self.starts, relaxed, work)
         value = min(steps[-1] for steps in history)
-        bound = relaxed[0] if relaxed is not None else problem.bound()
+        bound = relaxed[0] if relaxed else problem.bound()
         bound = min(bound, value) if np.isfinite(value) else -np.inf
         return Found(chosen, value, bound, evaluations, history)
 
@@ -316,9 +316,8 @@ class BranchAndBound(Search):
                 f"in value than the one found, but {100 * self.gap:.2g} % was wanted. Raise "
                 "branches, or accept a larger gap."
             )
-        return Found(
-            tree.chosen, tree.value, bound, evaluations + tree.evaluations, history, stopped
-        )
+        evaluations += tree.evaluations
+        return Found(tree.chosen, tree.value, bound, evaluations, history, stopped)
 
 
 class _Node(NamedTuple):

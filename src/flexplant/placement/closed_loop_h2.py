@@ -73,6 +73,13 @@ class MotionAndEffort(Criterion):
         """Return {z channel: factor}."""
         return factors_of(plant, self.poi, self.axes, every=True)
 
+    def _control(self, plant: StandardPlant) -> tuple[FloatArray, ...]:
+        """Return A, B, W, the rows of the POI, R, and S and F of the control Riccati equation."""
+        A, B, rows = plant.system.A, plant.B2, poi_rows(plant, self.factors(plant))
+        R = self.effort**2 * np.eye(B.shape[1])
+        found = control_dare(A, B, Q=rows.T @ rows, R=R)
+        return A, B, plant.process_noise, rows, R, found.P, found.gain
+
 
 def confirmed(cost: float, found: float) -> float:
     """Return the cost by Riccati equations, confirmed by that of the loop's covariance."""
@@ -121,14 +128,10 @@ class PoiLqr(MotionAndEffort):
         """
         self.check(plant, ())
         plant.check().require(("stabilisable",), "a stationary controller")
-        A, B = plant.system.A, plant.B2
-        rows = poi_rows(plant, self.factors(plant))
-        R = self.effort**2 * np.eye(B.shape[1])
-        solution = control_dare(A, B, Q=rows.T @ rows, R=R)
-        noise = plant.process_noise
-        cost = float(np.sum(solution.P * noise))
-        P = solve_stein(A - B @ solution.gain, noise)
-        seen = np.vstack([rows, self.effort * solution.gain])
+        A, B, noise, rows, _, S, F = self._control(plant)
+        cost = float(np.sum(S * noise))
+        P = solve_stein(A - B @ F, noise)
+        seen = np.vstack([rows, self.effort * F])
         found = float(np.einsum("ij,jk,ik->", seen, P, seen))
         return confirmed(cost, found)
 
@@ -145,11 +148,10 @@ class PoiLqr(MotionAndEffort):
         n = A.shape[0]
         # a plant made elsewhere holds its delay in its states
         whole, fraction = divmod(plant.delay if plant.is_assembled else 0.0, 1.0)
-        constant = 0.0
+        constant = float(np.sum((rows @ noise) ** 2))
         for _ in range(int(whole)):
-            constant += float(np.sum((rows @ noise) ** 2))
             noise = A @ noise
-        constant += float(np.sum((rows @ noise) ** 2))
+            constant += float(np.sum((rows @ noise) ** 2))
         if fraction:
             late = held_exactly(pushed(plant, candidates, rows), 1.0 / plant.dt, delay=fraction)
         else:
@@ -206,11 +208,7 @@ class ClosedLoopH2(MotionAndEffort):
         """
         self.check(plant, ())
         plant.check().require(("stabilisable", "detectable"), "a stationary controller")
-        rows = poi_rows(plant, self.factors(plant))
-        A, B, W = plant.system.A, plant.B2, plant.process_noise
-        R = self.effort**2 * np.eye(B.shape[1])
-        control = control_dare(A, B, Q=rows.T @ rows, R=R)
-        S, F = control.P, control.gain
+        A, B, W, rows, R, S, F = self._control(plant)
         estimator = design_kalman(plant, larger=plant)
         P, K = estimator.covariance, estimator.gain
         read = sensor_rows(plant)  # without references

@@ -80,13 +80,13 @@ class Branch:
 
     def halves(self, rows: FloatArray, weights: FloatArray) -> Iterator[Branch]:
         """Return the parts that arise when the most diverse group is cut in two."""
-        open_groups = [i for i, (group, count) in enumerate(self.groups) if count < group.size]
-        spread = [
-            _main_variance(rows[g], weights[g]) for g, _ in (self.groups[i] for i in open_groups)
-        ]
-        most = open_groups[int(np.argmax([size for size, _ in spread]))]
-        group, count = self.groups[most]
-        along = spread[open_groups.index(most)][1]
+        spread = {
+            i: _main_variance(rows[group], weights[group])
+            for i, (group, count) in enumerate(self.groups)
+            if count < group.size
+        }
+        most = max(spread, key=lambda i: spread[i][0])
+        (group, count), along = self.groups[most], spread[most][1]
         order = np.argsort(along, kind="stable")
         heaped = np.cumsum(weights[group][order])
         middle = int(np.searchsorted(heaped, 0.5 * heaped[-1])) + 1
@@ -367,15 +367,6 @@ class Quadratic(Value, Convex):
         """How many candidates there are."""
         return int(self.items.shape[0])
 
-    def relaxed(self, weights: FloatArray) -> tuple[float, FloatArray]:
-        """Return J and its gradient (N,) at weights of the candidates.
-
-        ``dX+ = M dX+ M' - X+ dG X+`` with ``M = (I - K g) A'``, so with the adjoint Stein
-        equation ``Y = M' Y M + S' S`` the gradient is ``-g_i' X+ Y X+ g_i``.
-        """
-        cost, _, _, adjoint, seen = self._stationary(weights)
-        return cost, -np.sum((seen @ adjoint) * seen, axis=1)
-
     def cost(self, weights: FloatArray) -> float:
         """Return J at weights (N,); infinite where it has none."""
         g = self._weighted(weights)
@@ -390,7 +381,8 @@ class Quadratic(Value, Convex):
         The information is the limit of iterates that are concave in w (a parallel sum is). Its
         derivative by w_i is ``(X+)^-1 D_i (X+)^-1`` with the Stein equation ``D_i = M D_i M' + X+
         g_i g_i' X+``, solved for all i by the eigenvectors of M, or one by one where it lacks some;
-        the adjoint equation confirms the slopes. Directions of no variance are left out: a
+        the adjoint equation ``Y = M' Y M + S' S``, by which J falls with w_i by
+        ``g_i' X+ Y X+ g_i``, confirms the slopes. Directions of no variance are left out: a
         compression of an inverse has an inverse that is concave as well.
         """
         cost, after, closed, adjoint, seen = self._stationary(weights)
@@ -442,16 +434,9 @@ def quadratic(
 ) -> Quadratic:
     """Return the problem in states in which X, with all candidates, has a unit diagonal."""
     X = _certain(A, H, items)
-    variance = np.maximum(X.diagonal(), 0.0)
-    s = np.sqrt(divisor(variance))
-    return Quadratic(
-        A * s[:, None] / s,
-        H / s / s[:, None],
-        S * s,
-        items * s,
-        np.zeros((items.shape[0], 0), dtype=np.int64) if owned is None else owned,
-        constant,
-    )
+    s = np.sqrt(divisor(X.diagonal()))
+    own = np.zeros((items.shape[0], 0), dtype=np.int64) if owned is None else owned
+    return Quadratic(A * s[:, None] / s, H / s / s[:, None], S * s, items * s, own, constant)
 
 
 def solved(A: FloatArray, H: FloatArray, g: FloatArray) -> FloatArray:
@@ -535,11 +520,8 @@ class WorstRow(Scorer):
 
     def bound(self, count: int, required: Sequence[int]) -> float:
         """Return the largest bound of any one term, or of their mean: the maximum is above both."""
-        k = len(self.constants)
-        parts = [
-            self.costs.replace(S=self.costs.S[[i]], constant=float(self.constants[i]))
-            for i in range(k)
-        ]
-        mean = float(np.mean(self.constants))
-        parts.append(self.costs.replace(S=self.costs.S / np.sqrt(k), constant=mean))
-        return max(part.bound(count, required) for part in parts)
+        S, constants = self.costs.S, self.constants
+        parts = [(S[[i]], constant) for i, constant in enumerate(constants.tolist())]
+        parts.append((S / np.sqrt(constants.size), float(np.mean(constants))))
+        costs = (self.costs.replace(S=rows, constant=constant) for rows, constant in parts)
+        return max(cost.bound(count, required) for cost in costs)

@@ -168,10 +168,8 @@ class KineticEnergy(ByShapes):
                 f"the model has {model.M.shape[0]} DOFs, the plant's {shapes.full.shape[0]}: pass "
                 "the one that the plant's modes are of."
             )
-        moving = shapes.phi[:, shapes.elastic] * (
-            shapes.rows @ (model.M @ shapes.full[:, shapes.elastic])
-        )
-        return SummedWorth(np.sum(moving, axis=1))
+        momentum = shapes.rows @ (model.M @ shapes.full[:, shapes.elastic])
+        return SummedWorth(np.sum(shapes.phi[:, shapes.elastic] * momentum, axis=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -321,12 +321,10 @@ def _with_past(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return a plant whose last states are its motions ``rows x`` some samples ago."""
     n, q = A.shape[0], rows.shape[0]
-    past = np.zeros((n + q * lag, n + q * lag))
-    past[:n, :n] = A
-    past[n : n + q, :n] = rows
-    past[n + q :, n:-q] = np.eye(q * (lag - 1))
-    last = np.zeros((q, n + q * lag))
-    last[:, -q:] = np.eye(q)
+    past = np.eye(n + q * lag, k=-q)
+    past[: n + q] = 0.0
+    past[: n + q, :n] = np.vstack([A, rows])
+    last = np.eye(q, n + q * lag, k=n + q * (lag - 1))
     more = ((0, 0), (0, q * lag))
     return past, np.pad(noise, more[::-1]), last, np.pad(items, more)
 

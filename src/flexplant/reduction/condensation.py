@@ -349,15 +349,14 @@ class CraigBampton(ReductionMethod):
         """Return the reduced model; `reduce` is the public way."""
         model, labels = fe_model(structure, self), tuple(self.boundary)
         part = DofPartition(model, labels)
-        T, count = part.static, 0
+        fixed = np.zeros((part.others.size, 0))
         if self.modes or self.below is not None:
             fixed = self._fixed(model, part)
-            count = fixed.shape[1]
-            T = np.hstack([T, part.whole(np.zeros((len(labels), count)), fixed)])
+        count = fixed.shape[1]
         names = [*labels, *(f"fixed mode {i}" for i in range(1, count + 1))]
         return projected_model(
             model,
-            T,
+            np.hstack([part.static, part.whole(np.zeros((len(labels), count)), fixed)]),
             dofs=model.dofs.select(labels),
             coordinates=names,
             method=f"{counted(count, 'fixed-interface mode')} (Craig-Bampton)",
@@ -372,11 +371,8 @@ class CraigBampton(ReductionMethod):
                 f"{counted(self.modes, 'fixed-interface mode')} of an interior of {rows.size} "
                 "DOFs: choose fewer."
             )
-        interior = FEModel(
-            block(model.M, rows, rows),
-            part.stiffness,
-            dofs=model.dofs.select([model.dofs.labels[i] for i in rows]),
-        )
+        dofs = model.dofs.select([model.dofs.labels[i] for i in rows])
+        interior = FEModel(block(model.M, rows, rows), part.stiffness, dofs=dofs)
         found = solve_modes(interior, count=self.modes or None, below=self.below)
         return np.real(found.phi)
 
@@ -440,8 +436,7 @@ class _FreeInterface(ReductionMethod):
         b, rows = len(labels), modes.dofs.indices(labels)
         phi, vectors = np.real(modes.phi), modes.vectors
         at = vectors[rows]
-        scaled, _ = unit_diagonal(at @ at.T)
-        values = la.eigvalsh(dense(scaled))
+        values = la.eigvalsh(dense(unit_diagonal(at @ at.T)[0]))
         if not values[0] > RANK * values[-1]:
             raise ModelError(
                 "the residual flexibility of the boundary is singular (condition "

@@ -72,8 +72,7 @@ class PivotedQr(SelectionCriterion):
             span = la.qr(required.T, mode="economic")[0]
             for _ in range(2):
                 pool = pool - (pool @ span.conj()) @ span.T
-        pivots = la.qr(pool.T, mode="r", pivoting=True)[1]
-        return [int(i) for i in pivots[:count]]
+        return [int(i) for i in la.qr(pool.T, mode="r", pivoting=True)[1][:count]]
 
     def values(self, rows: Rows) -> FloatArray:
         """Return the length of each row beyond the span of those before it."""

@@ -137,20 +137,16 @@ def _second_order(
     solve: Callable[[Any], Any], slope: Any, M: Any, B: FloatArray, count: int
 ) -> Any:
     """Return the tops of an orthonormal Krylov basis of the linearised problem (SOAR's space)."""
-    top = solve(B)
-    found, state = [top], np.vstack([top, np.zeros_like(top)])
-    basis = la.qr(state, mode="economic")[0]
-    m, n = B.shape[1], B.shape[0]
+    top, (n, m) = solve(B), B.shape
+    basis = la.qr(np.vstack([top, np.zeros_like(top)]), mode="economic")[0]
     for _ in range(count - 1):
         last = basis[:, -m:]
         top = -solve(slope @ last[:n] + M @ last[n:])
         state = np.vstack([top, last[:n]])
         for _ in range(2):
             state = state - basis @ (basis.conj().T @ state)
-        fresh = la.qr(state, mode="economic")[0]
-        basis = np.hstack([basis, fresh])
-        found.append(fresh[:n])
-    return np.hstack([basis[:n, :m], *found[1:]])
+        basis = np.hstack([basis, la.qr(state, mode="economic")[0]])
+    return basis[:n]
 
 
 def _factorised(matrix: Any, omega: float) -> Callable[[Any], Any]:

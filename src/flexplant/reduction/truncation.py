@@ -86,18 +86,15 @@ class ModalTruncation(ReductionMethod):
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the truncated model; `reduce` is the public way."""
+        numbers, model = self._numbers, structure
         static: Any = self.static_at
-        if isinstance(structure, Modes):
+        if isinstance(model, Modes):
             if self.damping is not None:
                 raise ModelError(
                     "these Modes have their damping: give damping= to solve_modes, or an FEModel."
                 )
             bound_of = (self.inputs, self.outputs) if self.inputs else None
-            return truncated(structure, self._numbers, static, bound_of, "modal truncation")
-        return self._from_model(structure, static)
-
-    def _from_model(self, model: FEModel, static: Any) -> ReducedModel:
-        numbers = self._numbers
+            return truncated(model, numbers, static, bound_of, "modal truncation")
         solved = solve_modes(model, damping=ModalDamping(0.0), count=max(numbers))
         law = self.damping
         if law is not None:
@@ -124,9 +121,8 @@ class ModalTruncation(ReductionMethod):
         into, out, force, seen = modal_channels(kept, self.inputs, self.outputs)
         if not isinstance(law, ModalDamping) or not isinstance(law.ratio, float) or not law.ratio:
             return None
-        pushed = places(self.inputs)
-        watched = places(self.outputs) or pushed
-        B = np.column_stack([model.dofs.row(place) for place in pushed])
+        B = np.column_stack([model.dofs.row(place) for place in places(self.inputs)])
+        watched = places(self.outputs) or places(self.inputs)
         C = np.array([model.dofs.row(place) for place in watched])
         flexible = static_response(model.M, model.K, model.rigid_body, np.hstack([B, C.T]))
         r, q = kept.n_rigid, B.shape[1]
@@ -140,9 +136,8 @@ class ModalTruncation(ReductionMethod):
         # of the lowest modes: none unseen is below the last, all are at most like one there
         lowest = self._numbers == tuple(range(1, kept.n_modes + 1))
         omega = kept.omega[-1] if lowest else 0.0
-        terms = [[both * omega**2, omega, law.ratio]] if omega else []
-        terms += vectors.tolist()
-        return ErrorBound(value, into, out, _RESIDUE, terms=np.array(terms) if omega else None)
+        terms = np.vstack([[both * omega**2, omega, law.ratio], vectors]) if omega else None
+        return ErrorBound(value, into, out, _RESIDUE, terms=terms)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -216,15 +211,14 @@ class ModalBalanced(ReductionMethod):
         ranking = rank_modes(modes, inputs=self.inputs, outputs=self.outputs)
         best = ranking.order[: self.count - modes.n_rigid].tolist()
         numbers = tuple(sorted([*range(1, modes.n_rigid + 1), *best]))
-        static: Any = self.static_at
         bound_of = (self.inputs, self.outputs)
-        return truncated(modes, numbers, static, bound_of, "modal Hankel values")
+        return truncated(modes, numbers, self.static_at, bound_of, "modal Hankel values")
 
 
 def truncated(
     modes: Modes,
     numbers: tuple[int, ...],
-    static: tuple[Place, ...],
+    static: Any,
     bound_of: tuple[Any, Any] | None,
     method: str,
 ) -> ReducedModel:
