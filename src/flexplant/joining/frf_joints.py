@@ -92,9 +92,9 @@ def _component_of(end: Any, parts: Sequence[Channels]) -> Channels:
 
 
 def _end(parts: Sequence[Channels], end: Any, side: str) -> JointEnd:
-    sides = [part.side(side) for part in parts]
-    size = np.ptp(np.vstack([part.dofs.xyz for part in sides]), axis=0).max(initial=0.0)
-    motions = [rigid_motions(part.dofs) for part in sides]
+    sides = {part.name: part.side(side).dofs for part in parts}
+    size = np.ptp(np.vstack([dofs.xyz for dofs in sides.values()]), axis=0).max(initial=0.0)
+    motions = [rigid_motions(dofs) for dofs in sides.values()]
     try:
         if isinstance(end, Patch):
             end = _measured_patch(end, _component_of(end, parts), side)
@@ -207,7 +207,6 @@ def independent(B: FloatArray, links: Sequence[FrfLink]) -> list[int]:
 class Side(NamedTuple):
     """The outputs, or the inputs, of a component that are DOFs."""
 
-    name: str
     dofs: DofSet
     channels: tuple[str, ...]
 
@@ -257,7 +256,7 @@ def _side(name: str, names: Sequence[str], dofs: DofSet | None, *, inside: bool)
     listed = sorted(set(owners))
     plain = DofSet(np.array(nodes, dtype=np.int64), tuple(directions), xyz)
     if listed in ([], [""]):
-        return Side(name, plain, tuple(channels))
+        return Side(plain, tuple(channels))
     if "" in listed:
         raise LabelError(
             f"some channels of {name!r} are of components ({', '.join(filter(None, listed))}), "
@@ -265,7 +264,7 @@ def _side(name: str, names: Sequence[str], dofs: DofSet | None, *, inside: bool)
         )
     numbers = [listed.index(component) for component in owners]
     found = plain.replace(components=tuple(listed), component_of=np.array(numbers, dtype=np.int64))
-    return Side(name, found, tuple(channels))
+    return Side(found, tuple(channels))
 
 
 def known_places(dofs: object, names: Mapping[str, object] | Sequence[str]) -> dict[str, DofSet]:

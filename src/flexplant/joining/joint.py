@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -285,33 +285,18 @@ _NO_ARM = 1e-9
 _SHORT_ARM, _NEIGHBOURS = 1e-4, 12
 
 
-class Jointed(Protocol):
-    """What has ends of joints: a component, or channels that were measured on it."""
-
-    @property
-    def name(self) -> str:
-        """What labels begin with."""
-        ...
-
-    @property
-    def dofs(self) -> DofSet:
-        """All that moves."""
-        ...
-
-
 class JointEnd:
-    """One end of a joint."""
+    """One end of a joint, on components by their DOFs: all that move, or those measured."""
 
     def __init__(
-        self, parts: Sequence[Jointed], end: Any, size: float, motions: Sequence[FloatArray]
+        self, parts: Mapping[str, DofSet], end: Any, size: float, motions: Sequence[FloatArray]
     ) -> None:
         self.text = repr(end) if isinstance(end, Patch) else str(end)
-        names = [part.name for part in parts]
         text = f"{end.component}/" if isinstance(end, Patch) else end
-        name, rest = split_end(text, names) if isinstance(text, str) else (end[0], "")
-        require_known("component", [name], names)
-        self.index, self._size = names.index(name), size
-        self._dofs, self._motions = parts[self.index].dofs, motions[self.index]
+        name, rest = split_end(text, list(parts)) if isinstance(text, str) else (end[0], "")
+        require_known("component", [name], parts)
+        self.index, self._size = list(parts).index(name), size
+        self._dofs, self._motions = parts[name], motions[self.index]
         self.label = ":" in rest
         if self.label:
             try:

@@ -57,9 +57,9 @@ class Link(NamedTuple):
 
 def links_of(joints: Any, parts: Sequence[Component]) -> list[Link]:
     """Return all axes of all joints."""
-    size = machine_size(parts)
+    size, dofs = machine_size(parts), {part.name: part.dofs for part in parts}
     motions = [rigid_motions(part.dofs) for part in parts]
-    return [link for one in joint_list(joints) for link in _links(one, parts, size, motions)]
+    return [link for one in joint_list(joints) for link in _links(one, dofs, size, motions)]
 
 
 def machine_size(parts: Sequence[Component]) -> float:
@@ -69,7 +69,7 @@ def machine_size(parts: Sequence[Component]) -> float:
 
 
 def _links(
-    joint: Joint, parts: Sequence[Component], size: float, motions: Sequence[FloatArray]
+    joint: Joint, parts: Mapping[str, DofSet], size: float, motions: Sequence[FloatArray]
 ) -> list[Link]:
     first = JointEnd(parts, joint.first, size, motions)
     second = None if joint.second is None else JointEnd(parts, joint.second, size, motions)

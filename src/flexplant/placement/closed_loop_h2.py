@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ..checks import FloatArray, checked, mapping, positive
 from ..errors import CertificateError, SolverError
 from ..estimation import design_kalman
+from ..estimation.estimator_channels import sensors
 from ..lti.discretisation import held_exactly
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import control_dare
@@ -34,7 +35,6 @@ from .poi_variance import (
     poi_rows,
     pushed,
     pushed_columns,
-    sensor_rows,
     structure_part,
     unit_of,
 )
@@ -211,7 +211,7 @@ class ClosedLoopH2(MotionAndEffort):
         A, B, W, rows, R, S, F = self._control(plant)
         estimator = design_kalman(plant, larger=plant)
         P, K = estimator.covariance, estimator.gain
-        read = sensor_rows(plant)  # without references
+        read = [plant.y.index(name) for name in sensors(plant)]  # without references
         C, noise = plant.C2[read], plant.sensor_noise[np.ix_(read, read)]
         V = F.T @ (R + B.T @ S @ B) @ F
         cost = float(np.sum(S * W) + np.sum(V * P))
@@ -229,12 +229,12 @@ class ClosedLoopH2(MotionAndEffort):
     def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
         """Raise AssumptionError when a rigid-body mode is missed or a candidate fits no filter."""
         super().check(plant, candidates)
-        sensors = [port for port in candidates if side_of(port) == "y"]
-        if candidates and not sensors:  # the plant's own are those of the loop
+        seeing = [port for port in candidates if side_of(port) == "y"]
+        if candidates and not seeing:  # the plant's own are those of the loop
             plant.check().require(("detectable",), "a stationary controller")
-        if candidates and len(sensors) == len(candidates):
+        if candidates and len(seeing) == len(candidates):
             plant.check().require(("stabilisable",), "a stationary controller")
-        PoiVariance(self.poi).check(plant, sensors)
+        PoiVariance(self.poi).check(plant, seeing)
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the cost as a function of the candidates alone; all else is computed once.
@@ -251,7 +251,7 @@ class ClosedLoopH2(MotionAndEffort):
         given = {side: [p for p in candidates if side_of(p) == side] for side in "yu"}
         fixed = {
             side: list(getattr(own, side)) if own else [PlantChannel(n, side) for n in names]
-            for side, names in (("y", [plant.y[i] for i in sensor_rows(plant)]), ("u", plant.u))
+            for side, names in (("y", sensors(plant)), ("u", plant.u))
         }
         problem = Separation(
             A,

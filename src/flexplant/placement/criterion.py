@@ -12,7 +12,6 @@ import numpy as np
 
 from ..checks import FloatArray, IntArray, Value, checked, function, short, with_unit
 from ..errors import FlexplantError, ModelError
-from ..estimation.estimator_channels import sensors
 from ..plant import StandardPlant
 from .candidates import Port, Side, sides_of, with_side
 
@@ -90,17 +89,6 @@ class OnPlant(Scorer):
     def whole(self) -> StandardPlant:
         """The plant with all candidates."""
         return with_side(self.plant, self.side, self.candidates)
-
-    @property
-    def rows_only(self) -> bool:
-        """Whether nothing but their own noise reaches the sensors at once.
-
-        A reference in y reaches itself at once: it is no sensor.
-        """
-        read = sensors(self.whole)
-        own = {f"{name}:noise" for name in read}
-        at_once = [name for name in self.whole.w if name not in own]
-        return not np.any(self.whole.system.select(read, at_once).D)
 
     def value(self, chosen: Sequence[int]) -> Any:
         """Return what the function gives on the plant with this choice."""
@@ -181,8 +169,7 @@ def as_criterion(given: Any, side: str = "") -> Criterion:
     if not callable(given) or isinstance(given, type):
         raise ModelError(
             "a criterion is a value such as PoiVariance(...) or placement.PoiLqr(...), or a "
-            "callable from "
-            f"plant to float, got {short(given)}. Pass one, or none for the usual."
+            f"callable from plant to float, got {short(given)}. Pass one, or none for the usual."
         )
     criterion = given if isinstance(given, Criterion) else _Function(given)
     for part in side:

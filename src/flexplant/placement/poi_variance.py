@@ -132,11 +132,6 @@ def measured_rows(plant: StandardPlant, candidates: Sequence[Port]) -> FloatArra
     return np.asarray(whole.C2[rows, : _own_states(plant)] / size[:, None])
 
 
-def sensor_rows(plant: StandardPlant) -> list[int]:
-    """Return which channels of y are sensors, not references."""
-    return [plant.y.index(name) for name in sensors(plant)]
-
-
 def pushed_columns(plant: StandardPlant, candidates: Sequence[Port]) -> FloatArray:
     """Return what a unit of each actuator, held over one sample, does to these states."""
     if not plant.is_assembled:
@@ -291,7 +286,9 @@ class PoiVariance(Criterion):
         larger = None if self._own else larger_plant(chosen.whole, self.larger)
         if larger is not None:
             return OnBoth(chosen, larger, self._value)
-        if not plain(plant, candidates) or not chosen.rows_only:
+        read, system = sensors(chosen.whole), chosen.whole.system  # a reference is no sensor
+        at_once = [name for name in chosen.whole.w if name.removesuffix(":noise") not in read]
+        if not plain(plant, candidates) or np.any(system.select(read, at_once).D):
             return chosen
         A, noise, rows = structure_part(plant, self._factors(plant))
         items = measured_rows(plant, candidates)

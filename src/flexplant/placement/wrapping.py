@@ -97,9 +97,8 @@ class LeftOutModes(Criterion):
         more = None if whole is None else shapes_of(whole, candidates)
         if more is None or more.omega.size <= kept.omega.size:
             raise AssumptionError(
-                "no modes left out of the plant are known: pass "
-                "placement.LeftOutModes(larger), the "
-                "structure with more modes."
+                "no modes left out of the plant are known: pass placement.LeftOutModes(larger), "
+                "the structure with more modes."
             )
         # modes are in order of their frequency: the plant has the first of them
         beyond = more.omega > 1.0001 * np.max(kept.omega)
@@ -116,9 +115,8 @@ class PenalisedScores(Scorer):
 
     def value(self, chosen: Sequence[int]) -> float:
         """Return it for one choice."""
-        return float(
-            _penalised_sum(self.base.value(chosen), self.penalty.value(chosen), self.weight)
-        )
+        base, penalty = self.base.value(chosen), self.penalty.value(chosen)
+        return float(_penalised_sum(base, penalty, self.weight))
 
     def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
         """Return it for several choices."""

@@ -83,9 +83,8 @@ def fe_model(structure: FEModel | Modes, method: object) -> FEModel:
     if isinstance(structure, FEModel):
         return structure
     raise ModelError(
-        f"{type(method).__name__} works on the matrices M and K, which "
-        f"{type(structure).__name__} do not hold: reduce(model, {type(method).__name__}(...)) "
-        "with the FEModel."
+        f"{type(method).__name__} works on the matrices M and K, which {type(structure).__name__} "
+        f"do not hold: reduce(model, {type(method).__name__}(...)) with the FEModel."
     )
 
 
