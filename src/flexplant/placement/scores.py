@@ -164,9 +164,7 @@ def score_actuators(
 
     Parameters
     ----------
-    plant : StandardPlant
-        Sampled, assembled from a structure.
-    layouts, candidates, constraints, executor, progress : optional
+    plant, layouts, candidates, constraints, executor, progress
         As for `score_sensors`, of `Actuator` values.
     criterion : PoiLqr or callable, optional
         From a plant to a float, smaller is better; `PoiLqr()` when not given.
@@ -406,12 +404,10 @@ def sensor_map(
 
     Parameters
     ----------
-    plant : StandardPlant
-        Sampled, assembled from a structure; its own sensors stay.
+    plant, criterion, executor, progress
+        As for `score_sensors`; the plant's own sensors stay.
     points : (n, 3) array [m]
         On the structure.
-    criterion : PoiVariance or callable, optional
-        From a plant to a float, smaller is better; `PoiVariance()` when not given.
     asd : float [m/sqrt(Hz), ...]
         Noise of the new sensor, as in `Sensor`.
     direction, quantity : str
@@ -419,8 +415,6 @@ def sensor_map(
     constraints : sequence of Constraint, optional
         As for `place_sensors`: points at which one more sensor breaks one are left out. A point on
         a POI is, unless OffPoi(-1) is among them.
-    executor, progress : optional
-        As for `score_sensors`.
 
     Returns
     -------

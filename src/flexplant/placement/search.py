@@ -124,16 +124,11 @@ def place_actuators(
 
     Parameters
     ----------
-    plant : StandardPlant
-        Sampled, assembled from a structure; its own actuators are not used.
-    candidates : sequence of Actuator
-        Each may be chosen once; a name stands for one of the plant's own.
-    count : int
-        How many are chosen, `required` included.
+    plant, candidates, count, required, constraints, method, executor, checkpoint, progress, rng
+        As for `place_sensors`, of `Actuator` values; OffPoi holds only where it is among the
+        constraints.
     criterion : PoiLqr or callable, optional
         From a plant to a float, smaller is better; `PoiLqr()` when not given.
-    required, constraints, method, executor, checkpoint, progress, rng : optional
-        As for `place_sensors`; OffPoi holds only where it is among the constraints.
 
     Returns
     -------
@@ -419,18 +414,12 @@ def pareto_curve(
 
     Parameters
     ----------
-    plant : StandardPlant
-        Sampled.
-    candidates : sequence of Sensor or of Actuator
+    plant, candidates, criterion, required, constraints, method, executor, progress, rng
         As for `place_sensors` or `place_actuators`.
     amounts : sequence of int or float
         Counts; budgets where there are costs. Those without any possible choice are left out.
-    criterion : Criterion or callable, optional
-        As for `place_sensors` or `place_actuators`.
     costs : mapping {str: float}, optional
         Cost of candidates by name, 1 of others: for each budget every count that fits is tried.
-    required, constraints, method, executor, progress, rng : optional
-        As for `place_sensors` or `place_actuators`.
 
     Returns
     -------

@@ -476,12 +476,10 @@ class AfterLoss(Wrapping):
 
     Parameters
     ----------
-    criterion : Criterion or callable
-        From plant to float.
+    criterion, measure
+        As for `OverMachines`, over the devices.
     of : {"sensors", "actuators"}
         Which devices may be lost.
-    measure : {"worst", "mean"}
-        Over the devices.
 
     Examples
     --------

@@ -157,10 +157,8 @@ class ModalBalanced(ReductionMethod):
     among : int, optional
         With an FEModel: how many of its lowest modes are used; None: all of a model that is
         not large.
-    static_at : place or sequence of places
-        Where the static compliance of what was left out is kept.
-    damping : ModalDamping or Rayleigh, optional
-        With an FEModel: of its modes.
+    static_at, damping
+        As for `ModalTruncation`.
 
     Notes
     -----
