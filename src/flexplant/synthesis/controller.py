@@ -182,11 +182,9 @@ def reached_norms(P: StandardPlant, loop: StateSpace, respond: Responder) -> dic
 
 def _grouped(names: Sequence[str], endings: Mapping[str, str], rest: str) -> dict[str, list[int]]:
     """Return the places of names by group, from their endings; empty groups left out."""
-    groups: dict[str, list[int]] = {rest: [], **{group: [] for group in endings}}
-    for i, name in enumerate(names):
-        own = next((group for group, end in endings.items() if name.endswith(end)), rest)
-        groups[own].append(i)
-    return {group: places for group, places in groups.items() if places}
+    own = [next((g for g, end in endings.items() if name.endswith(end)), rest) for name in names]
+    places = {group: [i for i, one in enumerate(own) if one == group] for group in (rest, *endings)}
+    return {group: found for group, found in places.items() if found}
 
 
 def swept_norm(loop: StateSpace, respond: Responder | None = None) -> float:
@@ -249,16 +247,13 @@ def with_left_out(
 
 def with_checks(answer: Controller, plant: StandardPlant, loop: ClosedLoop | None) -> Controller:
     """Return an answer with what its loop says of modes left out and of uncertain ones."""
-    left_out = None if loop is None else loop.left_out
-    tolerances = None if loop is None else loop.tolerances
+    left_out, tolerances = (None, None) if loop is None else (loop.left_out, loop.tolerances)
     certificate = dict(answer.certificate or {})
     for found in (left_out, tolerances):
         certificate |= {} if found is None else found.certificate
+    notes = answer.notes if left_out is not None else (*answer.notes, *unchecked(plant))
     return answer.replace(
-        certificate=certificate,
-        left_out=left_out,
-        tolerances=tolerances,
-        notes=answer.notes if left_out is not None else (*answer.notes, *unchecked(plant)),
+        certificate=certificate, left_out=left_out, tolerances=tolerances, notes=notes
     )
 
 

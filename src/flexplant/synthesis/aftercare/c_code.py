@@ -107,13 +107,9 @@ def write_c(
     if source.stem != prefix:
         source = source.with_name(f"{prefix}.c")
     program = c_program(
-        controller,
-        prefix,
-        limits=limits,
-        anti_windup=anti_windup,
-        schedule=schedule,
-        single=single,
-    )
+        controller, prefix,
+        limits=limits, anti_windup=anti_windup, schedule=schedule, single=single,
+    )  # fmt: skip
     header = source.with_suffix(".h")
     for file, text in ((header, program.header), (source, program.source)):
         with written(file) as stream:
@@ -308,17 +304,14 @@ def _applied_law(law: StateSpace, nu: int, outer: Sequence[str], L: FloatArray) 
             f"{law.outputs[i]!r} depends on the applied {law.outputs[j]!r} of the same sample, "
             "which is known after the command only. Let the block read it one sample late."
         )
-    Ba = law.B[:, ny:]
-    system = StateSpace(
-        law.A + Ba @ law.C[:nu],
-        law.B[:, :ny] + Ba @ law.D[:nu, :ny],
-        law.C,
-        law.D[:, :ny],
-        law.dt,
+    Ba, known = law.B[:, ny:], (*outer, *law.outputs)
+    system = law.replace(
+        A=law.A + Ba @ law.C[:nu],
+        B=law.B[:, :ny] + Ba @ law.D[:nu, :ny],
+        D=law.D[:, :ny],
         inputs=outer,
-        outputs=law.outputs,
-        units={key: unit for key, unit in law.units.items() if key in (*outer, *law.outputs)},
-        name=law.name,
+        units={key: unit for key, unit in law.units.items() if key in known},
+        blocks=None,
     )
     return _Law(system, nu, Ba + L)
 

@@ -348,34 +348,29 @@ class CText:
     @property
     def source(self) -> str:
         """The source file."""
-        form, functions = self.form, [self._outputs_of()]
-        if self.count > 1:
-            functions.append(self.filled(_PLACE))
-        if self.states:
-            functions.append(self._advance())
-        back = form.B.shape[-1] > self.m and self.states
+        functions = [self._outputs_of()]
+        functions += [self.filled(_PLACE)] if self.count > 1 else []
+        functions += [self._advance()] if self.states else []
+        back = self.form.B.shape[-1] > self.m and self.states
         clamp = _CLAMP if self.limits is not None else ""
         update = "    advance(self->x, in);\n" if self.states else "    (void)in;\n"
         update = self.filled(_MOVED) if self.moving else update
+        outputs = "        outputs_of(self->x, in, out, 0);\n"
         return self.filled(
             _SOURCE,
             tables=self._tables(),
             functions="\n".join(functions),
             start=self._start() if self.driven else "",
-            outputs_at=self.filled(_BETWEEN)
-            if self.count > 1
-            else "        outputs_of(self->x, in, out, 0);\n",
+            outputs_at=self.filled(_BETWEEN) if self.count > 1 else outputs,
             limit=self.filled(_LIMIT, clamp=clamp) if self.driven else "",
             update=update + (self.filled(_BACK) if back else ""),
         )
 
     def _tables(self) -> str:
         form, m = self.form, self.m
+        pairs = zip(("aa", "ab", "ba", "bb"), form.pairs.reshape(4, -1), strict=True)
         found = [
-            *(
-                self.table(name, form.pairs[i, j])
-                for name, i, j in (("aa", 0, 0), ("ab", 0, 1), ("ba", 1, 0), ("bb", 1, 1))
-            ),
+            *(self.table(name, entries) for name, entries in pairs),
             self.table("rest", form.rest.swapaxes(-1, -2)),
             self.table("B", form.B[..., :m].swapaxes(-1, -2)),
             self.table("back", form.B[..., m:].swapaxes(-1, -2)),
@@ -392,18 +387,16 @@ class CText:
         return "".join(found)
 
     def _outputs_of(self) -> str:
+        if not self.states:
+            return self.filled(_COMMAND, k="", sum="", seen="")
+        places = ["k", *(f"k + {i}" for i in range(1, LANES))]
         steps = "\n".join(
-            f"            s[{i}] += row[k{f' + {i}' if i else ''}] * x[k{f' + {i}' if i else ''}];"
-            for i in range(LANES)
+            f"            s[{i}] += row[{at}] * x[{at}];" for i, at in enumerate(places)
         )
-        added = " + ".join(f"(s[{i}] + s[{i + LANES // 2}])" for i in range(LANES // 2))
-        some = bool(self.states)
-        return self.filled(
-            _COMMAND,
-            k=", k" if some else "",
-            sum=self.filled(_SUM, steps=steps) if some else "",
-            seen=f"({added}) + " if some else "",
-        )
+        half = LANES // 2
+        added = " + ".join(f"(s[{i}] + s[{i + half}])" for i in range(half))
+        total = self.filled(_SUM, steps=steps)
+        return self.filled(_COMMAND, k=", k", sum=total, seen=f"({added}) + ")
 
     def _advance(self) -> str:
         if self.moving:
@@ -419,17 +412,16 @@ class CText:
         return self.filled(_ADVANCE, locals=values, pairs=pairs, rest=rest)
 
     def _start(self) -> str:
-        begin, table = "", "start[0]"
         if not self.states:
             return self.filled(_START, begin="    (void)in;\n", states="")
-        if self.count > 1:
-            table, half = "start[q]", self.number(0.5)
-            begin = self.filled(
-                "    {real} part;\n    int q = place_of(in[{at}], &part);\n"
-                "    q += part > {half} ? 1 : 0; /* the nearer place */\n",
-                half=half,
-            )
-        return self.filled(_START, begin=begin, states=self.filled(_STATES, table=table))
+        if self.count == 1:
+            return self.filled(_START, begin="", states=self.filled(_STATES, table="start[0]"))
+        begin = self.filled(
+            "    {real} part;\n    int q = place_of(in[{at}], &part);\n"
+            "    q += part > {half} ? 1 : 0; /* the nearer place */\n",
+            half=self.number(0.5),
+        )
+        return self.filled(_START, begin=begin, states=self.filled(_STATES, table="start[q]"))
 
 
 def _ascii(text: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -94,11 +95,10 @@ def two_state_form(
     """
     most, error = (_SINGLE if single else _DOUBLE), np.inf
     for form, sizes in _block_forms(K):
-        found = _arranged(form, sizes, driven, inputs)
-        found = _single_precision(found) if single else found
-        error = min(error, away := _difference(K, found))
-        if away <= most:
-            return found._replace(error=away)
+        found = _compared(K, _arranged(form, sizes, driven, inputs), single)
+        if found.error <= most:
+            return found
+        error = min(error, found.error)
     cure = (
         "Write it in double precision, or lower the rate."
         if single
@@ -120,13 +120,12 @@ def scheduled_form(
     """
     sizes = [state_scale(K.A, K.B, K.C) for K in laws]
     d = np.exp(np.mean(np.log(sizes), axis=0))
-    found, error = [], 0.0
+    found = []
     for K in laws:
         K = K.replace(A=K.A * d / d[:, None], B=K.B / d[:, None], C=K.C * d, blocks=None)
         own = _arranged(K, [K.n_states], [slice(driven)], None)
-        own = _single_precision(own) if single else own
-        error = max(error, _difference(K, own))
-        found.append(own)
+        found.append(_compared(K, own, single))
+    error = max(one.error for one in found)
     if error > (most := _SINGLE if single else _DOUBLE):
         raise CertificateError(
             f"{'single' if single else 'double'} precision moves the response at a place by "
@@ -180,36 +179,34 @@ def _arranged(
     K: StateSpace, sizes: list[int], driven: Sequence[slice], inputs: int | None
 ) -> TwoStateForm:
     """Return a block-diagonal system with its blocks side by side."""
-    starts = np.cumsum([0, *sizes])[:-1]
-    ones = [int(s) for s, size in zip(starts, sizes, strict=True) if size == 1]
-    twos = [(int(s), int(s) + 1) for s, size in zip(starts, sizes, strict=True) if size == 2]
-    many = [
-        int(s) + k for s, size in zip(starts, sizes, strict=True) if size > 2 for k in range(size)
-    ]
-    n = K.n_states  # stands for a state that does not exist
-    pairs = [*twos, *zip(ones[0::2], [*ones[1::2], n][: len(ones[0::2])], strict=True)]
+    ends, n = np.cumsum(sizes, dtype=int).tolist(), K.n_states
+    blocks = [range(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    ones = [k for block in blocks if len(block) == 1 for k in block]
+    pairs = [(block[0], block[1]) for block in blocks if len(block) == 2]
+    many = [k for block in blocks if len(block) > 2 for k in block]
+    pairs += zip_longest(ones[::2], ones[1::2], fillvalue=n)  # n: a state that does not exist
     pairs += [(n, n)] * (-len(pairs) % LANES)
     many += [n] * (-len(many) % LANES)
     order = np.array([i for i, _ in pairs] + [j for _, j in pairs] + many, dtype=int)
-    exists = order < n
-    place = np.where(exists, order, 0)
-    both = exists[:, None] & exists
-    change = K.A - np.eye(n) if n else np.zeros((1, 1))
-    full = np.where(both, change[np.ix_(place, place)], 0.0)
-    B = np.where(exists[:, None], K.B[place], 0.0) if n else np.zeros((0, len(K.inputs)))
-    C = np.where(exists, K.C[:, place], 0.0) if n else np.zeros((len(K.outputs), 0))
-    N = len(pairs)
+
+    def rows(matrix: FloatArray) -> FloatArray:
+        return np.asarray(np.pad(matrix, ((0, 1), (0, 0)))[order])
+
+    N, full = len(pairs), rows(rows(K.A - np.eye(n)).T).T
     entries = [[np.diag(full[i : i + N, j : j + N]) for j in (0, N)] for i in (0, N)]
     held = K.replace(B=K.B[:, :inputs], D=K.D[:, :inputs], inputs=K.inputs[:inputs], units={})
-    start = [np.where(exists[:, None], _at_rest(held, rows)[place], 0.0) for rows in driven if n]
-    return TwoStateForm(np.array(entries), full[2 * N :, 2 * N :], B, C, K.D, np.array(start), 0.0)
+    start = [rows(_at_rest(held, group)) for group in driven if n]
+    rest, C = full[2 * N :, 2 * N :], rows(K.C.T).T
+    return TwoStateForm(np.array(entries), rest, rows(K.B), C, K.D, np.array(start), 0.0)
 
 
-def _single_precision(form: TwoStateForm) -> TwoStateForm:
-    """Return a form with its numbers in single precision."""
-    parts = form._asdict().items()
-    single = {name: np.asarray(part, np.float32).astype(np.float64) for name, part in parts}
-    return form._replace(**single)  # type: ignore[arg-type]
+def _compared(K: StateSpace, form: TwoStateForm, single: bool) -> TwoStateForm:
+    """Return a form, in single precision if asked, with what its response differs by."""
+    if single:
+        parts = form._asdict().items()
+        less = {name: np.asarray(part, np.float32).astype(np.float64) for name, part in parts}
+        form = form._replace(**less)  # type: ignore[arg-type]
+    return form._replace(error=_difference(K, form))
 
 
 def _at_rest(K: StateSpace, driven: slice) -> FloatArray:

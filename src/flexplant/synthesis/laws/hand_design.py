@@ -62,8 +62,7 @@ class ShapedAxis(Value):
         if not isinstance(given, Iterable) or isinstance(given, str | Mapping):
             raise ModelError(f"elements are a list of Pid, Lead, Notch ..., got {short(given)}.")
         elements: list[SingleElement] = []
-        gain = number(self.gain, "gain")
-        on = [flag(one, "on") for one in self.on]
+        gain, on = number(self.gain, "gain"), [flag(one, "on") for one in self.on]
         for element in given:
             if isinstance(element, Law):  # its factors, each by itself
                 elements += element.factors
@@ -101,14 +100,12 @@ class ShapedAxis(Value):
     @property
     def law(self) -> Law:
         """The law of the elements that are on, continuous."""
-        rates = {element.own_rate for element in self.active} - {0.0}
-        return Law(self.active, self.gain, rate=max(rates, default=0.0))
+        rate = max((element.own_rate for element in self.active), default=0.0)
+        return Law(self.active, self.gain, rate=rate)
 
     def __repr__(self) -> str:
-        shown = [
-            f"{e!r}" if on else f"({e!r}, off)"
-            for e, on in zip(self.elements, self.on, strict=True)
-        ]
+        each = zip(self.elements, self.on, strict=True)
+        shown = [f"{e!r}" if on else f"({e!r}, off)" for e, on in each]
         forward = [f"{term} {gain:.4g}" for term, gain in self.forward.items()]
         more = f"; feedforward {', '.join(forward)}" if forward else ""
         return " * ".join([f"{self.gain:.5g}", *shown]) + more + ("" if self.closed else "; open")

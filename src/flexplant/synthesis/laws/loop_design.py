@@ -234,18 +234,13 @@ def made(
     inner = axes_controller(axes, laws)
     report = report_loops((axes.plant, inner), at="y", rigid=rigid, unstable=unstable)
     system = connected(axes, inner, references or {}).replace(name="loops")
+    if axes.given is None:
+        return DesignedLoops(system, laws, report)
     feedback = system.select(inputs=axes.after.inputs)  # references take no part in the loop
-    loop = None if axes.given is None else checked_loop(axes.given, [feedback], larger)
-    left_out = None if loop is None else loop.left_out
-    lacking = axes.given is not None and left_out is None
-    return DesignedLoops(
-        system,
-        laws,
-        report,
-        left_out,
-        unchecked(axes.given) if lacking and axes.given else (),
-        None if loop is None else loop.tolerances,
-    )
+    loop = checked_loop(axes.given, [feedback], larger)
+    left_out, tolerances = (None, None) if loop is None else (loop.left_out, loop.tolerances)
+    notes = () if left_out is not None else unchecked(axes.given)
+    return DesignedLoops(system, laws, report, left_out, notes, tolerances)
 
 
 def connected(axes: Axes, inner: StateSpace, references: Mapping[str, str]) -> StateSpace:

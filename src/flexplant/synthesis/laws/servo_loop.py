@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from ...checks import ComplexArray, FloatArray, frozen
-from ...errors import AssumptionError, FlexplantError, LabelError, counted
+from ...errors import AssumptionError, LabelError, counted
+from ...loop.blocks import as_block
 from ...loop.broken import inverted, scaled_size, sensitivity_size
 from ...lti.discretisation import held_exactly
 from ...lti.frequency_sweep import highest, resonance_grid
@@ -86,7 +87,7 @@ class ServoLoop:
             if peak <= TARGET and stable(axis):
                 break
             left = [f for f in self.resonant(axis).tolist() if f not in axis.notches][:_TRIED]
-            tried = [axis.with_notch(freq) for freq in left]
+            tried = [replace(axis, notches=(*axis.notches, freq)) for freq in left]
             if not tried:
                 break
             peaks = [self.peak(one)[0] for one in tried]
@@ -119,23 +120,22 @@ def servo_loop(
     """Return the loop of a plant with an observer, or with the POI itself as its estimate."""
     # decoupled, and with notches, by what is known to the design: a plant of fewer modes
     hats = tuple(poi.derived(axis, "hat") for axis in poi.axes)
-    poles = plant.system.poles()
-    if observer is not None:
-        poles = np.concatenate([poles, observer.poles()])
+    systems = (plant.system,) if observer is None else (plant.system, observer)
+    poles = np.concatenate([one.poles() for one in systems])
     grid = resonance_grid(poles, plant.dt, points=300)
     # half the rate itself, where a hold has no answer, is left out
     grid = grid[grid < 0.5 / plant.dt * (1.0 - 1e-6)]
     T_u = decoupling(known, poi)
-    if observer is None:
-        seen = [poi.channel(axis) for axis in poi.axes]
-        P = _response_stack(plant.system.select(seen, plant.u), grid)
-        return ServoLoop(grid, T_u @ P, None, elastic(known), plant)
-    read = [name for name in observer.inputs if name in plant.y]
-    given = [name for name in observer.inputs if name in plant.u]
-    estimate = T_u @ _response_stack(observer.select(hats, [*read, *given]), grid)
-    moved = estimate[:, :, : len(read)] @ _response_stack(plant.system.select(read, plant.u), grid)
+    read, given = [poi.channel(axis) for axis in poi.axes], []
+    E: Any = T_u
+    if observer is not None:
+        read, given = (
+            [name for name in observer.inputs if name in side] for side in (plant.y, plant.u)
+        )
+        E = T_u @ _response_stack(observer.select(hats, [*read, *given]), grid)
+    moved = E[..., : len(read)] @ _response_stack(plant.system.select(read, plant.u), grid)
     own = np.zeros_like(moved)
-    own[:, :, [plant.u.index(name) for name in given]] = estimate[:, :, len(read) :]
+    own[:, :, [plant.u.index(name) for name in given]] = E[..., len(read) :]
     return ServoLoop(grid, moved, own if given else None, elastic(known), plant)
 
 
@@ -166,17 +166,10 @@ def seeing(plant: StandardPlant, poi: Poi) -> StandardPlant:
 
 
 def observer_system(observer: Any, plant: StandardPlant, poi: Poi) -> StateSpace | None:
-    """Return the observer as a system of the plant's dt, checked to give the POI's estimates."""
+    """Return the observer as a block of the plant, checked to give the POI's estimates."""
     if observer is None:
         return None
-    inner = getattr(observer, "system", observer)
-    if not isinstance(inner, StateSpace):
-        if not hasattr(inner, "input_labels"):
-            raise LabelError(
-                f"observer must be an estimator or a StateSpace with named channels, got "
-                f"{type(observer).__name__}. Pass design_kalman(plant) or design_static(plant)."
-            )
-        inner = StateSpace.from_control(inner)
+    inner = as_block(observer, 1, plant.dt)
     missing = [h for h in (poi.derived(a, "hat") for a in poi.axes) if h not in inner.outputs]
     if missing:
         raise LabelError(
@@ -188,27 +181,19 @@ def observer_system(observer: Any, plant: StandardPlant, poi: Poi) -> StateSpace
         raise LabelError(
             f"the observer reads {', '.join(unknown)}, which the plant has neither in y nor in u."
         )
-    if inner.n_states and not np.isclose(inner.dt, plant.dt, rtol=SAME, atol=0.0):
-        raise FlexplantError(
-            f"the observer has dt {inner.dt:g} s, the plant {plant.dt:g} s: design both alike."
-        )
-    return inner if inner.dt == plant.dt else inner.replace(dt=plant.dt)
+    return inner
 
 
 def highest_bandwidth(freq: Sequence[float], holds: Callable[[float], bool]) -> float | None:
     """Return the largest frequency that holds: of a descending grid, then by bisection above."""
-    above: float | None = None
-    for one in freq:
-        if holds(one):
-            if above is None:
-                return one
-            low, high = one, above
-            for _ in range(6):
-                middle = float(np.sqrt(low * high))
-                low, high = (middle, high) if holds(middle) else (low, middle)
-            return low
-        above = one
-    return None
+    i = next((i for i, one in enumerate(freq) if holds(one)), None)
+    if not i:  # none, or the first
+        return None if i is None else freq[0]
+    low, high = freq[i], freq[i - 1]
+    for _ in range(6):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
 
 
 #: the lead's zero lies this factor below the bandwidth, its pole above: |S| of the rigid body
@@ -242,10 +227,6 @@ class Axis:
         shape = Law((pid, LowPass(self.rolloff), *notches), rate=self.rate, prewarped=False)
         at = abs(shape.at(np.array([self.bandwidth]))[0])
         return shape * float((2.0 * np.pi * self.bandwidth) ** 2 / at)
-
-    def with_notch(self, freq: float) -> Axis:
-        """Return the axis with one notch more [Hz]."""
-        return replace(self, notches=(*self.notches, freq))
 
 
 @lru_cache(maxsize=64)

@@ -104,8 +104,7 @@ class ScaledLoop:
         """Return the spectral abscissa [1], its gradient by [A, B; C, D], and the pole."""
         loop = self.closed(K)
         if loop is None:
-            rows, columns = self._out.shape[0], self._in.shape[0]
-            return np.inf, np.zeros((rows, columns)), complex(np.inf)
+            return np.inf, np.zeros((len(self._out), len(self._in))), complex(np.inf)
         found: Any = la.eig(loop.A, left=True, right=True)
         values, lefts, rights = found
         worst = int(np.argmax(values.real))
@@ -334,11 +333,11 @@ class _SmoothJudge(ScaledLoop, ABC):
 
     def _bent(self, K: Matrices, by: FloatArray) -> FloatArray:
         """Return the second derivatives, for parameters that the controller is linear in."""
-        rows = []
-        for move in by:
-            ends = [self._logarithm(K.moved(sign * _STEP * move), by)[1] for sign in (1.0, -1.0)]
-            rows.append((ends[0] - ends[1]) / (2.0 * _STEP))
-        H = np.array(rows)
+        up, down = (
+            np.array([self._logarithm(K.moved(step * move), by)[1] for move in by])
+            for step in (_STEP, -_STEP)
+        )
+        H = (up - down) / (2.0 * _STEP)
         return np.asarray(0.5 * (H + H.T))
 
 
@@ -363,11 +362,10 @@ class H2Judge(_SmoothJudge):
             return np.inf, np.zeros((loop.Bu.shape[1], loop.Cy.shape[0]))
         P, Q = solve_lyapunov(A, B @ B.T), solve_lyapunov(A.T, C.T @ C)
         norm = float(np.sqrt(max(np.sum((C @ P) * C), TINY)))
-        by_A, by_B, by_C = Q @ P / norm, Q @ B / norm, C @ P / norm
-        parts = (by_A, by_B, by_C, np.zeros_like(loop.D))
+        by_A, by_B, by_C, by_D = Q @ P / norm, Q @ B / norm, C @ P / norm, np.zeros_like(loop.D)
         if self.p.dt:
-            parts = (by_A[:n, :n], by_A[:n, n:], by_C[:, :n], by_C[:, n:])
-        return scale * norm, scale * loop.slope(*parts)
+            by_A, by_B, by_C, by_D = by_A[:n, :n], by_A[:n, n:], by_C[:, :n], by_C[:, n:]
+        return scale * norm, scale * loop.slope(by_A, by_B, by_C, by_D)
 
 
 class PeakJudge(_SmoothJudge):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -64,8 +63,7 @@ class Maximum(Protocol):
         """Return the functions of one place."""
 
 
-@dataclass(frozen=True)
-class Minimum:
+class Minimum(NamedTuple):
     """Where a minimisation ended."""
 
     x: FloatArray
@@ -237,11 +235,3 @@ def decrease_left(pieces: Pieces, radius: float) -> tuple[float, float]:
             slope = float(np.linalg.norm(weights @ pieces.gradient))
             gained = max(gained, -float(np.max(beside + pieces.gradient @ step)))
     return slope, gained
-
-
-def joined_pieces(parts: Sequence[Pieces]) -> Pieces:
-    """Return the pieces of several functions, such as the gains of several plants."""
-    every = parts[0]
-    for one in parts[1:]:
-        every = every.and_those(one)
-    return every

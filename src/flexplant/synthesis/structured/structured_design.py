@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -28,7 +28,7 @@ from ..controller import (
 from ..lmi.objectives import H2, Hinf
 from ..synthesis_plants import PlantRange, require_stabilisable
 from .judges import DECAY, GainJudge, Judge, LoopObjective, Matrices, ScaledLoop
-from .nonsmooth import Pieces, bfgs, decrease_left, joined_pieces, minimax
+from .nonsmooth import Pieces, bfgs, decrease_left, minimax
 from .structures import ControllerFamily, ControllerStructure, as_system
 
 #: steps for stability, from each start towards the least norm, and on from the best of them
@@ -178,25 +178,20 @@ def design_structured(
     closed = [lft(one.system, K) for one in plants]
     claim = _end_norm(found)
     each = [_verified_loop(*pair, objectives, claim) for pair in zip(plants, closed, strict=True)]
-    worst = int(np.argmax([one["norm"] for one in each]))
-    if not abs(each[worst]["norm"] - claim) <= _AGREEMENT * claim:
+    norms = [one["norm"] for one in each]
+    worst = int(np.argmax(norms))
+    if not abs(norms[worst] - claim) <= _AGREEMENT * claim:
         raise CertificateError(
-            f"the closed loop has the norm {each[worst]['norm']:.6g} on the plant as given, "
+            f"the closed loop has the norm {norms[worst]:.6g} on the plant as given, "
             f"{claim:.6g} in the scaled problem: it is too badly conditioned to trust. Bring "
             "the weights closer together."
         )
-    kind = _measure_word(objectives)
-    reached = {}
-    if kind == "H-infinity":
-        reached = reached_norms(plants[worst], closed[worst], responder(closed[worst]))
+    kind, loop = _measure_word(objectives), closed[worst]
+    plain = kind == "H-infinity"
+    reached = reached_norms(plants[worst], loop, responder(loop)) if plain else {}
     radius = _RADIUS * max(1.0, float(np.linalg.norm(found.x)))
     slope, decrease = decrease_left(search.pieces(found.x), radius)
-    certificate = dict(each[worst]) | {
-        "slope": slope,
-        "radius": radius,
-        "decrease left": decrease,
-    }
-    norms = [one["norm"] for one in each]
+    certificate = each[worst] | {"slope": slope, "radius": radius, "decrease left": decrease}
     if moving is not None:
         certificate |= moving.certified(
             lambda one: _verified_loop(one, lft(one.system, K), objectives, np.inf)["norm"], norms
@@ -209,7 +204,7 @@ def design_structured(
     answer = Controller(
         K,
         f"{kind} of structure {(structure if final is None else final)!r}",
-        gamma=each[worst]["norm"],
+        gamma=norms[worst],
         certificate=certificate,
         reached=reached,
         notes=notes,
@@ -257,8 +252,7 @@ def _objectives(given: Any) -> list[LoopObjective]:
         if isinstance(one, type) or not hasattr(one, "judges"):
             raise ModelError(
                 "objective must be synthesis.Hinf(...), synthesis.H2(...), "
-                "synthesis.PeakGain(...) or several of them, got "
-                f"{short(one)}."
+                f"synthesis.PeakGain(...) or several of them, got {short(one)}."
             )
         if len(every) > 1 and one.below is None:
             raise ModelError(
@@ -382,10 +376,8 @@ class _StructureSearch:
         # a little more for large parameters: ends infima that are only neared as gains grow
         if (K := self._controller(theta)) is None:
             return np.inf, (0, 0.0)
-        each = []
-        for judge, below in self.judged:
-            number, place = judge.value(K)
-            each.append((number / below, place))
+        values = [(judge.value(K), below) for judge, below in self.judged]
+        each = [(number / below, place) for (number, place), below in values]
         self._latest = theta, each
         worst = int(np.argmax([number for number, _ in each]))
         number, place = each[worst]
@@ -396,14 +388,9 @@ class _StructureSearch:
         if not np.array_equal(theta, self._latest[0]):
             self.value(theta)
         _, each = self._latest
-        most = max(gain for gain, _ in each)
-        return joined_pieces(
-            [
-                self._of_judge(theta, i, place, sweep=True)
-                for i, (gain, place) in enumerate(each)
-                if gain >= _PART * most
-            ]
-        )
+        least = _PART * max(gain for gain, _ in each)
+        near = [(i, place) for i, (gain, place) in enumerate(each) if gain >= least]
+        return reduce(Pieces.and_those, (self._of_judge(theta, *one, sweep=True) for one in near))
 
     def piece(self, theta: FloatArray, place: tuple[int, Any]) -> Pieces:
         """Return the numbers at the place of a peak elsewhere."""
