@@ -40,23 +40,20 @@ def write_c(
 ) -> tuple[Path, Path]:
     """Write a sampled controller as C99: one source file and its header, no allocation.
 
-    The states become blocks of two that lie side by side, so that a compiler computes several at a
-    time (at -O2 too); the response of these blocks is compared with the controller's. Numbers are
-    written with 17 digits (9 in single precision), which is exact.
-
-    The functions: `_reset`; `_start` with the commands that act now (bumpless: steady states that
-    give them, as far as the controller has such); `_output` and `_update`, or `_step`. A sample
-    with a value that is not finite holds the last outputs and raises a flag.
+    The states become blocks of two side by side, of which a compiler computes several at a time;
+    their response is compared with the controller's. Numbers have 17 digits (9 in single
+    precision), which is exact. The functions: `_reset`; `_start` with the commands that act now
+    (bumpless: steady states that give them, where the controller has such); `_output` and
+    `_update`, or `_step`. A value that is not finite holds the last outputs and raises a flag.
 
     Parameters
     ----------
     controller : StateSpace, Controller, ClosedLoop, ScheduledLoop, or {place: one of these}
-        Sampled. Of a ClosedLoop all blocks (observer, servo, feedforward) go to one file: in are
-        the channels of `plant.y`, out the driven actuators, then the monitored outputs. Inputs
-        that have the name of an output (observer, `anti_windup_form`) are fed what is applied,
-        in the file. A mapping is of controllers whose outputs alone differ (feedforward,
-        decoupling, gains after the states), interpolated linearly between places. Of a
-        ScheduledLoop all matrices are, as it does; its position is the last input.
+        Sampled. Of a ClosedLoop all blocks go to one file: in are the channels of `plant.y`, out
+        the driven actuators, then the monitored outputs. Inputs named like an output (observer,
+        `anti_windup_form`) are fed what is applied. A mapping is of controllers whose outputs
+        alone differ (feedforward, decoupling, gains after the states), linear between places; of
+        a ScheduledLoop all matrices are, its position the last input.
     path : path
         Of the source; the header stands beside it.
     name : str, optional

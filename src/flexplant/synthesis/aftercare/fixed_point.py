@@ -122,9 +122,9 @@ def fixed_point(
     """Return a loop's controller in fixed-point arithmetic, judged in its loop.
 
     Blocks of two states as in `write_c`: each row of A - I, B, C and D is rounded to integers of
-    `bits` with one power of two, states, inputs and outputs are integers of `state_bits` whose
-    powers of two follow from a run. The loop is closed again with the rounded coefficients, and
-    run in integers, without inputs, from some states: what does not come to rest is named.
+    `bits` with one power of two; states, inputs and outputs are integers of `state_bits`, scaled by
+    a run. The loop is closed with the rounded coefficients, and run in integers without inputs from
+    some states: what does not come to rest is named.
 
     Parameters
     ----------
@@ -137,8 +137,8 @@ def fixed_point(
     state_bits : int
         Word length of states, inputs and outputs.
     sections : int or sequence of int, optional
-        Blocks of two states: the controller is reduced to these. Of several numbers the one that
-        needs the fewest bits in all (sections times bits); as many as it has when not given.
+        Blocks of two states to which the controller is reduced; of several numbers the one with
+        the fewest bits in all (sections times bits). As many as it has when not given.
     headroom : float
         What words hold beyond the run's largest values, as a factor.
     loss : float

@@ -82,11 +82,7 @@ class TwoStateForm(NamedTuple):
 
 
 def two_state_form(
-    K: StateSpace,
-    *,
-    driven: Sequence[slice] = (),
-    inputs: int | None = None,
-    single: bool = False,
+    K: StateSpace, *, driven: Sequence[slice] = (), inputs: int | None = None, single: bool = False
 ) -> TwoStateForm:
     """Return a sampled system in blocks of two states, its response compared with the system's.
 
@@ -375,10 +371,8 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
         x' = (A - L C) x + (B - L D) y + L u_applied,    u = C x + D y
 
     Where u_applied = u it is the controller. Where actuators saturate, its states follow those of
-    a controller that commanded what was applied, with the poles of A - L C:
-
-    Hanus (`recovery` not given): ``L = B D^-1``, which makes ``A - L C`` the zeros of the
-    controller. Observer: L of a steady filter that settles within the recovery time.
+    a controller that commanded what was applied, with the poles of A - L C: ``L = B D^-1`` (Hanus)
+    makes these the zeros of the controller; with `recovery` L is that of a steady filter.
 
     Parameters
     ----------
@@ -390,8 +384,7 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
     Returns
     -------
     StateSpace
-        Inputs [y; u], outputs u: a block of `close_loop`, which feeds it what the actuators
-        apply; `simulate` needs no other anti_windup then.
+        [y; u] -> u: a block of `close_loop`, which feeds it what the actuators apply.
 
     Raises
     ------

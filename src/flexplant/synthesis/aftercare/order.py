@@ -88,15 +88,14 @@ def reduce_controller(
 
         W [dN; dM],   W = (M - P N)^-1 [P, -I]
 
-    Where that weighted error is below one the reduced loop is stable (small gain); in any case it
-    is closed again, on the plant as given, and refused when it is unstable or loses margin (of a
-    weighted plant: gamma) beyond `loss`.
+    Where that weighted error is below one the reduced loop is stable (small gain); it is closed
+    again, and refused when it is unstable or loses margin (of a weighted plant: gamma) beyond
+    `loss`.
 
     Parameters
     ----------
     plant : StandardPlant
-        What the controller was designed for, continuous or sampled like it; weighted ones keep
-        gamma.
+        What it was designed for, continuous or sampled like it; weighted ones keep gamma.
     controller : StateSpace or Controller
         From y to u; its integrators and unstable poles stay as they are.
     order : int, optional
@@ -104,8 +103,7 @@ def reduce_controller(
     loss : float
         Relative loss of the modulus margin, or growth of gamma, that is allowed.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes that the plant left out, as for `larger_plant`: the reduced loop is
-        checked there too.
+        A model with the modes left out, as for `larger_plant`: the loop is checked there too.
 
     Returns
     -------

@@ -399,18 +399,17 @@ class LawSearch:
     def failure(self) -> str:
         """Return why no law was found, in words."""
         axis = self.of.axis
-        if axis.free:
-            need = (
-                "a rigid body, its motion per force, at the lowest lines. Give rigid=0 when it is"
-            )
-            need += " on springs"
-        else:
-            need = f"a mass above its springs' mode, taken to be at {axis.suspension:.4g} Hz. Give"
-            need += " rigid= when the body is free"
+        need = (
+            "a rigid body, its motion per force, at the lowest lines. Give rigid=0 when it is on "
+            "springs"
+            if axis.free
+            else f"a mass above its springs' mode, taken to be at {axis.suspension:.4g} Hz. Give "
+            "rigid= when the body is free"
+        )
         low, top = self.of.lowest, self.of.highest
         reach = f"from {low:.3g} to {top:.3g} Hz" if top > low else f"above {low:.3g} Hz"
-        worst = int(np.argmax(axis.deviation / np.maximum(np.abs(axis.G), TINY)))
-        share = axis.deviation[worst] / max(abs(axis.G[worst]), TINY)
+        shares = axis.deviation / np.maximum(np.abs(axis.G), TINY)
+        worst, share = int(np.argmax(shares)), float(shares.max())
         poor = (
             f" The line at {axis.freq[worst]:.4g} Hz has an error of {100 * share:.0f} %: measure "
             "longer, or leave out the lines that say little."

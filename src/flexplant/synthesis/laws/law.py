@@ -42,11 +42,6 @@ class Section(NamedTuple):
         return np.asarray(((b2 * p + b1) * p + b0) / ((a2 * p + a1) * p + a0))
 
     @property
-    def order(self) -> int:
-        """The number of its states."""
-        return 2 if self.a[0] else 1 if self.a[1] else 0
-
-    @property
     def matrices(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """A, B, C and D of the continuous section."""
         (b2, b1, b0), (a2, a1, a0), w = self.b, self.a, self.omega
@@ -69,11 +64,7 @@ class BlockSection(NamedTuple):
     """A system of one channel in a law, continuous, where a `Section` has one transfer function."""
 
     own: StateSpace
-
-    @property
-    def centre(self) -> float:
-        """No frequency is kept beside the others."""
-        return 0.0
+    centre: float = 0.0
 
     def at(self, rate: float) -> BlockSection:
         """Return the same: nothing is prewarped."""
@@ -82,11 +73,6 @@ class BlockSection(NamedTuple):
     def gain(self, s: ComplexArray) -> ComplexArray:
         """Return the response at frequencies s = j omega [rad/s]."""
         return np.asarray(responder(self.own)(s.imag / (2.0 * np.pi))[0, 0])
-
-    @property
-    def order(self) -> int:
-        """The number of its states."""
-        return self.own.n_states
 
     @property
     def matrices(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -262,18 +248,10 @@ class Law(LawElement):
         a = 2.0 * self.rate
         parts = [section.matrices for section in self._sections]
         # sampled each on its own: states of one size
-        A, B, C, D = chained(self.gain, [trapezoidal(one, a) for one in parts] if a else parts)
-        sizes = [section.order for section in self._sections if section.order]
-        return StateSpace(
-            A,
-            B,
-            C,
-            D,
-            1.0 / self.rate if self.rate else 0.0,
-            inputs=["error"],
-            outputs=["command"],
-            blocks=sizes[::-1],
-        )
+        made = chained(self.gain, [trapezoidal(one, a) for one in parts] if a else parts)
+        sizes = [len(part[0]) for part in parts if len(part[0])]
+        dt = 1.0 / self.rate if self.rate else 0.0
+        return StateSpace(*made, dt, inputs=["error"], outputs=["command"], blocks=sizes[::-1])
 
     def response(self, freq: npt.ArrayLike) -> ComplexArray:
         """Return the response (n_freq,), in closed form.

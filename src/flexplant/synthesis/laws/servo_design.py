@@ -51,16 +51,14 @@ def design_servo(
 ) -> Controller:
     """Return a decoupled PID controller of the rigid-body motion at a POI.
 
-    Each axis of the POI is a double integrator of the acceleration a commanded there;
-    ``u = T_u a`` with T_u the least-force right inverse of the rigid-body gain. Each axis gets
-    ``a = k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s) (ref - hat)``, where F is a
-    second-order roll-off and the notches, and k makes the open loop of the rigid body cross 1 at
-    the bandwidth. On weak springs (`suspend`) it is the same controller, by the geometry of the
-    rigid body: its motions are ``1 / (s^2 + w_s^2)`` then, w_s the suspension's frequencies.
+    Each axis of the POI is a double integrator of the acceleration a commanded there (on weak
+    springs, `suspend`, ``1 / (s^2 + w_s^2)``); ``u = T_u a``, T_u the least-force right inverse of
+    the rigid-body gain. Each axis gets
+    ``a = k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s) (ref - hat)``, F a second-order
+    roll-off and the notches; with k the open loop of the rigid body crosses 1 at the bandwidth.
 
-    Then the loop that will run is certified: with the observer, the flexible modes and the delay,
-    and on the plant with the modes left out where they are known. `servo_bandwidth` gives the
-    largest bandwidth at which this loop holds 6 dB.
+    Certified is the loop that will run: with observer, flexible modes and delay, and with the modes
+    left out where they are known. `servo_bandwidth` gives the largest bandwidth that holds 6 dB.
 
     Parameters
     ----------
@@ -77,10 +75,9 @@ def design_servo(
     integrator : float [Hz], optional
         Corner of the integral action; a tenth of the bandwidth unless given.
     notches : sequence of float [Hz], optional
-        Frequencies of resonances to notch, each below half the rate: a sampled controller has no
-        notch above that, where the map would fold it to another frequency. Unless given they are
-        placed at the plant's modes, one by one, while |S| at u is above 6 dB (or the loop
-        unstable) and a notch lowers it; an empty sequence means none.
+        Frequencies of resonances to notch, each below half the rate. Unless given they are placed
+        at the plant's modes, one by one, while |S| at u is above 6 dB (or the loop unstable) and a
+        notch lowers it; an empty sequence means none.
     observer : KalmanEstimator, StaticEstimator or StateSpace, optional
         What will give the estimates `die:hat`, ...; unless given, the POI itself.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
@@ -90,11 +87,10 @@ def design_servo(
     Returns
     -------
     Controller
-        Inputs: the reference `die:ref` where there is one and the estimates `die:hat`,
-        `die:rx:hat`, ...; outputs: the actuators. The certificate holds the spectral radius and the
-        modulus margin of the sampled, delayed loop: of the rigid body alone, the worst of its
-        motions (on springs, without their damping), of the plant with the observer, and of that
-        with the modes left out; where |S| at u exceeds 6 dB, the largest bandwidth that holds it.
+        From the reference `die:ref` where there is one and the estimates `die:hat`, `die:rx:hat`,
+        ... to the actuators. The certificate holds spectral radius and modulus margin: of the worst
+        motion of the rigid body alone (on springs, without their damping), of the plant with the
+        observer, and with the modes left out; where |S| at u exceeds 6 dB, the largest bandwidth.
 
     Raises
     ------
@@ -113,8 +109,8 @@ def design_servo(
     Warns
     -----
     FlexplantWarning
-        When the loop on the POI itself is unstable, or the modes left out make the loop unstable or
-        bring |S| at u above 8 dB.
+        When the loop on the POI itself is unstable, or the modes left out make it unstable or bring
+        |S| at u above 8 dB.
 
     Examples
     --------
@@ -189,12 +185,11 @@ def servo_bandwidth(
 ) -> float:
     """Return the largest bandwidth [Hz] at which `design_servo` keeps |S| at u below a peak.
 
-    Plant and observer are swept once over a grid through their resonances; each bandwidth then
-    costs the closed form of the axis and small inverses, all frequencies at once. The loop is
-    broken at the plant's input, where `modulus_margin` breaks it: what the observer reads of u
-    stays closed. What holds there is accepted when it is stable by its eigenvalues and holds the
-    peak by `modulus_margin`, with the modes left out too where they are known. Bandwidths are tried
-    in steps of 9 %, from the top down, then between the first that holds and the one above it.
+    Plant and observer are swept once over a grid through their resonances. The loop is broken at
+    the plant's input, as by `modulus_margin`: what the observer reads of u stays closed. What holds
+    there is accepted when its eigenvalues are stable and `modulus_margin` holds the peak, with the
+    modes left out too where they are known. Bandwidths are tried in steps of 9 %, from the top
+    down, then between the first that holds and the one above it.
 
     Parameters
     ----------

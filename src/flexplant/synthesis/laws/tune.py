@@ -21,14 +21,7 @@ from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant, larger_plant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from .axis_law import (
-    AxisLaw,
-    LawSearch,
-    MeasuredAxis,
-    are_stable,
-    linear_step,
-    near_lowest,
-)
+from .axis_law import AxisLaw, LawSearch, MeasuredAxis, are_stable, linear_step, near_lowest
 from .law import Law, decoupled, tustin_s
 from .loop_design import Axes, DesignedLoops, axes_of, made
 from .servo_loop import TARGET
@@ -54,13 +47,12 @@ def tune_loops(
 ) -> DesignedLoops:
     """Return the laws of highest bandwidth that keep |S| below a peak, all axes together.
 
-    Give a plant or a measured FRF: ``design = fx.tune_loops(frf, rate=10e3)``. `design.laws`
-    holds a law of each axis (PID, low-pass and notches), `design.report` its margins,
-    `design.system` is what `close_loop` takes and `write_c` exports. With several axes
-    ``before=`` and ``after=`` decouple them, as `decouple` finds. Lines that do not resolve a
-    resonance, and their variance, are on the safe side: the loop gain is kept small there. The
-    best of many starts is returned, without proof that no other law does better, and with a
-    warning where the peak is not kept. How: `algorithms`.
+    Of a plant or a measured FRF: ``design = fx.tune_loops(frf, rate=10e3)``. `design.laws` holds a
+    law of each axis (PID, low-pass and notches), `design.report` its margins, `design.system` is
+    what `close_loop` takes and `write_c` exports. ``before=`` and ``after=`` decouple several axes,
+    as `decouple` finds. Where lines do not resolve a resonance, or have variance, the loop gain is
+    kept small. The best of many starts is returned, without proof that no other law does better,
+    and with a warning where the peak is not kept. How: `algorithms`.
 
     Parameters
     ----------
@@ -69,13 +61,12 @@ def tune_loops(
     peak : float
         Bound on |S|, at u, at y and of each axis; 2 is a modulus margin of 6 dB.
     rigid : int, optional
-        Rigid-body modes that the axes show; unless given as many as axes, of a model those that it
-        has. 0 on springs whose modes lie within the lines.
+        Rigid-body modes; unless given as many as axes, of a model those that it has. 0 on springs
+        whose modes lie within the lines.
     notches : int
         At most so many for each axis; one has to raise the bandwidth by 2 %.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes left out, as for `larger_plant`, of a StandardPlant: the peak holds
-        there too. Unless given, with those that the plant's reduced model still has.
+        Of a StandardPlant, as for `design_servo`: the peak holds there too.
     progress : bool, optional
         A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
 

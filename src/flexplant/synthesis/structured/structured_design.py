@@ -16,7 +16,7 @@ from ...lti.preparation import Prepared, prepared
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
-from ...plant import StandardPlant, standard_plant
+from ...plant import StandardPlant
 from ...tolerances import SAME
 from ..controller import (
     Controller,
@@ -26,7 +26,7 @@ from ..controller import (
     with_left_out,
 )
 from ..lmi.objectives import H2, Hinf
-from ..synthesis_plants import PlantRange, require_stabilisable
+from ..synthesis_plants import PlantRange, posed, require_reach
 from .judges import DECAY, GainJudge, Judge, LoopObjective, Matrices, ScaledLoop
 from .nonsmooth import Pieces, bfgs, decrease_left, minimax
 from .structures import ControllerFamily, ControllerStructure, as_system
@@ -79,24 +79,24 @@ def design_structured(
     """Return the controller of a structure with the least norm found from w to z.
 
     From several starts the spectral abscissa of the closed loop is lowered until it is stable, then
-    the norm, the largest over all plants (of several objectives the largest in multiples of their
-    `below`). H-infinity: at the minimum several peaks are equally high: each step
-    takes the gains at all high frequencies together, with their gradients
-    (``d|T| = Re u* dT v``, u and v the singular vectors there) and second derivatives. The best
-    ends are continued. The problem is not convex: another start may do better.
+    the norm, the largest over all plants (of several objectives in multiples of their `below`).
+    At a minimum of the H-infinity norm several peaks are equally high: each step takes the gains
+    at all high frequencies together, with their gradients (``d|T| = Re u* dT v``, u and v the
+    singular vectors there) and second derivatives. The best ends are continued. The problem is not
+    convex: another start may do better.
 
     Parameters
     ----------
     plant : StandardPlant, sequence of StandardPlant, or mapping {position: StandardPlant}
-        Continuous or sampled; one controller for several plants with the same u, y and rate. By
-        position: the plant of a moving stage, the controller then judged half way between these
-        positions too (rows and columns of the plant linear there). A labelled StateSpace serves.
+        Continuous or sampled; one controller for several plants with the same u, y and rate, by
+        position judged half way between them too (the plant linear there). A labelled StateSpace
+        serves.
     structure : FixedOrder, TunedLaws, ObserverGains or Parametrised
         What the controller looks like, and where the search begins.
     objective : Hinf, H2, PeakGain, or sequence of these
-        What is minimised; several each with `below`, the one that is farthest from it counts.
-        Anything with the methods of `LoopObjective` serves. H2 of a continuous plant is finite for
-        controllers without feedthrough where D12 and D21 are: ``FixedOrder(n, direct=False)``.
+        What is minimised; of several, each with `below`, the one farthest above it. Anything with
+        the methods of `LoopObjective` serves. H2 of a continuous plant is finite for controllers
+        without feedthrough where D12 and D21 are: ``FixedOrder(n, direct=False)``.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
     starts : int
@@ -113,13 +113,12 @@ def design_structured(
     Returns
     -------
     Controller
-        `structure` is the one given with the numbers found, of `TunedLaws` the laws; a further
-        design can begin there. `gamma` is the largest verified norm (over `below`), `tried` holds
-        what each start reached. The certificate holds the norm of each plant, what each objective
-        is, by position the worst of these, between them too, and of the local minimum
-        `slope`, the norm of the smallest convex combination of the gradients (of log gamma, by the
-        parameters), and `decrease left`, what a step of the length `radius` would still lower gamma
-        by to first order, relative to it.
+        `structure` is the one given with the numbers found: a further design can begin there.
+        `gamma` is the largest verified norm (over `below`), `tried` what each start reached. The
+        certificate holds the norm of each plant, each objective, by position the worst, between
+        them too, and of the local minimum `slope`, the norm of the smallest convex combination of
+        the gradients (of log gamma, by the parameters), and `decrease left`, by which part a step
+        of the length `radius` would still lower gamma, to first order.
 
     Raises
     ------
@@ -161,8 +160,8 @@ def design_structured(
     starts, random = whole(starts, "starts", maximum=MOST), generator(rng)
     evaluations = whole(evaluations, "evaluations")
     problems = [prepared(one.system, one.u, one.y) for one in plants]
-    for one, problem in zip(plants, problems, strict=True):
-        require_stabilisable(one, problem, "structured synthesis")
+    for problem in problems:
+        require_reach(problem)
     family = structure.family(plants[0], problems[0])
     objectives = _objectives(objective)
     if not plants[0].dt:
@@ -217,20 +216,11 @@ def design_structured(
 def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> list[StandardPlant]:
     """Return the plants, all with the same channels and rate."""
     many = given if isinstance(given, list | tuple) else [given]
-    named = u is not None or y is not None
-    plants = [
-        StandardPlant.from_statespace(one, u=u, y=y) if named else standard_plant(one)
-        for one in many
-    ]
+    plants = [posed(one, u, y, "structured synthesis") for one in many]
     if not plants:
         raise ModelError("plant is an empty list: pass at least one plant.")
     first = plants[0]
     for i, one in enumerate(plants, 1):
-        if not (one.w and one.z and one.u and one.y):
-            raise ModelError(
-                f"synthesis needs channels w, z, u and y, got {one!r}. Name those of a StateSpace "
-                "by u= and y=."
-            )
         if (one.u, one.y) != (first.u, first.y) or not np.isclose(
             one.dt, first.dt, rtol=SAME, atol=0.0
         ):

@@ -309,11 +309,7 @@ class Parametrised:
     """
 
     def __init__(
-        self,
-        make: Callable[[FloatArray], StateSpace],
-        start: npt.ArrayLike,
-        *,
-        spread: float = 0.3,
+        self, make: Callable[[FloatArray], StateSpace], start: npt.ArrayLike, *, spread: float = 0.3
     ) -> None:
         function(make, "make", "Pass one of the parameters, which returns a StateSpace.")
         self.make, self.start = make, real_array(start, "start", (None,))
