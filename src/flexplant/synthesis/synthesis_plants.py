@@ -145,15 +145,12 @@ _HINT = "Pass {0.0: plant, 0.1: other}, the same model with its ports at each po
 def sorted_places(given: Any, name: str, least: int = 2) -> tuple[FloatArray, list[Any]]:
     """Return positions in rising order, and what is at each."""
     entries = mapping(given, name, _HINT, least=least)
-    pairs = sorted(((number(x, "a position"), one) for x, one in entries.items()), key=_position)
+    each = ((number(x, "a position"), one) for x, one in entries.items())
+    pairs = sorted(each, key=lambda pair: pair[0])
     places = np.array([x for x, _ in pairs])
     if np.any(np.diff(places) <= 0.0):
         raise ModelError(f"positions of {name} must differ, got {places.tolist()}. {_HINT}")
     return places, [one for _, one in pairs]
-
-
-def _position(pair: tuple[float, Any]) -> float:
-    return pair[0]
 
 
 def system_at(systems: Sequence[StateSpace], places: FloatArray, x: float) -> StateSpace:

@@ -192,7 +192,9 @@ def fixed_point(
     best: tuple[int, int, _WordForm, StateSpace, LoopFacts] | None = None
     for count in counts:
         try:
-            own = _fewer_sections(closed, K, count, allowed)
+            own = K
+            if count is not None and 2 * whole(count, "sections") < K.n_states:
+                own = reduce_controller(closed.plant, K, order=2 * count, loss=allowed).system
         except FlexplantError as error:
             tried[f"{count} sections"] = str(error)
             continue
@@ -221,7 +223,14 @@ def fixed_point(
     was = {f"{name} before": value for name, value in before.certificate.items()}
     held = np.exp2([*words.D.of, *words.D.to]).tolist()
     ranges = dict(zip((*system.inputs, *system.outputs), held, strict=True))
-    _require_rest(cycles, ranges, room, wide)
+    large = [one for one in cycles if room * one.amplitude > _NO_REST * ranges[one.channel]]
+    if large:
+        named = ", ".join(f"{one.channel} {one.amplitude:.3g} (SI)" for one in large)
+        raise CertificateError(
+            f"with words of {wide} bits the loop does not come to rest: limit cycles of {named} "
+            f"are more than {_NO_REST:g} of what the run has. Allow more state_bits, or a smaller "
+            "headroom."
+        )
     return FixedPointController(
         system,
         length,
@@ -234,20 +243,6 @@ def fixed_point(
     )
 
 
-def _require_rest(
-    cycles: tuple[LimitCycle, ...], ranges: Mapping[str, float], headroom: float, wide: int
-) -> None:
-    """Raise where the loop does not come to rest beside what the run has."""
-    large = [one for one in cycles if headroom * one.amplitude > _NO_REST * ranges[one.channel]]
-    if large:
-        named = ", ".join(f"{one.channel} {one.amplitude:.3g} (SI)" for one in large)
-        raise CertificateError(
-            f"with words of {wide} bits the loop does not come to rest: limit cycles of {named} "
-            f"are more than {_NO_REST:g} of what the run has. Allow more state_bits, or a smaller "
-            "headroom."
-        )
-
-
 def _run_channel(run: Any, name: str) -> FloatArray:
     try:
         values = np.asarray(run[name], dtype=np.float64)
@@ -256,13 +251,6 @@ def _run_channel(run: Any, name: str) -> FloatArray:
             f"run has no channel {name!r}, which the controller reads: pass simulate(loop, ...)."
         ) from error
     return np.asarray(values.reshape(-1, values.shape[-1])[0])
-
-
-def _fewer_sections(loop: ClosedLoop, K: StateSpace, count: Any, loss: float) -> StateSpace:
-    """Return the controller of so many sections."""
-    if count is None or 2 * whole(count, "sections") >= K.n_states:
-        return K
-    return reduce_controller(loop.plant, K, order=2 * count, loss=loss).system
 
 
 def _replayed_powers(form: TwoStateForm, inputs: FloatArray, headroom: float) -> list[Integers]:
@@ -376,7 +364,7 @@ def _limit_cycles(
     decays = np.log(_REST * 2.0**words.wide)
     samples = int(np.clip(2.0 * decays / max(-np.log(radius), TINY), _SHORTEST, _LONGEST))
     names = (*K.inputs, *driven)
-    powers = dict(zip(names, [*words.D.of.tolist(), *words.D.to.tolist()], strict=True))
+    powers = [*words.D.of.tolist(), *words.D.to.tolist()]
     x = np.zeros((g.n_states, _STARTS))
     most = _PART * 2.0 ** (words.wide - 1)
     state = np.rint(most * rng.uniform(-1.0, 1.0, (len(words.A.to), _STARTS))).astype(np.int64)
@@ -398,7 +386,7 @@ def _limit_cycles(
     for i, name in enumerate(names):
         run = last[:, i, np.argmax(np.abs(last[:, i]).max(axis=0))]
         amplitude = float(np.abs(run).max())
-        if amplitude > left * 2.0 ** powers[name]:
+        if amplitude > left * 2.0 ** powers[i]:
             found.append(LimitCycle(name, _line(run, K.dt), amplitude))
     return tuple(found), left
 

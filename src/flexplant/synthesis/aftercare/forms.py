@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
-from ...checks import ComplexArray, FloatArray, IntArray, positive
+from ...checks import ComplexArray, FloatArray, positive
 from ...errors import AssumptionError, CertificateError, ModelError
 from ...lti.equations import state_scale
 from ...lti.frequency import frequency_response
@@ -148,9 +148,10 @@ def _block_forms(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
     A = K.A * d / d[:, None]
     T, Z = la.schur(A)
     real, imag = la.lapack.dtrsen(np.zeros(len(T)), T, Z, job="N")[2:4]
-    values = real + 1j * imag  # in the order of T
+    folded = real + 1j * np.abs(imag)  # in the order of T; conjugates stay together
     for near in _NEAR:
-        owner = _cluster_numbers(values, near)
+        close = np.abs(folded[:, None] - folded) <= near
+        owner = csgraph.connected_components(close, directed=False)[1]
         sizes = np.bincount(owner).tolist()
         bases = [
             la.lapack.dtrsen(owner == k, T, Z, job="N")[1][:, :size] for k, size in enumerate(sizes)
@@ -162,13 +163,6 @@ def _block_forms(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
         new = np.where(kept, np.linalg.solve(V, A @ V), 0.0)
         B, C = np.linalg.solve(V, K.B / d[:, None]), (K.C * d) @ V
         yield K.replace(A=new, B=B, C=C, blocks=None), sizes
-
-
-def _cluster_numbers(values: ComplexArray, near: float) -> IntArray:
-    """Return the group of each pole: those within a distance of each other, and conjugates."""
-    folded = values.real + 1j * np.abs(values.imag)
-    near_others = np.abs(folded[:, None] - folded) <= near
-    return np.asarray(csgraph.connected_components(near_others, directed=False)[1], dtype=np.int64)
 
 
 def _arranged(

@@ -236,7 +236,7 @@ class LoopDesign(Value):
         given = axes or {}
         require_known("axis", given, parts.names)
         if rigid is None:
-            rigid = _free_axes(parts) if isinstance(parts.plant, Frf) else 0
+            rigid = _free_axes(parts.plant) if isinstance(parts.plant, Frf) else 0
         shaped = {name: given.get(name, ShapedAxis()) for name in parts.names}
         first = repr(getattr(plant, "nominal", plant)).splitlines()[0].strip("<>")
         return cls(
@@ -397,15 +397,12 @@ def _at_plant(given: Any, side: str, names: tuple[str, ...], prefix: str) -> tup
     return tuple(f"{prefix}{i}" for i in range(1, count + 1))
 
 
-def _free_axes(axes: Axes) -> int:
+def _free_axes(frf: Frf) -> int:
     """Return how many axes of a measured plant fall with slope 2 at their lowest lines."""
     from ...lti.measured_lines import low_slope
 
-    frf = axes.plant
-    if frf.freq.size < 5:
-        return 0
-    each = [low_slope(frf.freq, frf.data[i : i + 1, i : i + 1]) for i in range(len(axes.names))]
-    return sum(slope > 1.0 for slope in each)
+    axes = range(len(frf.outputs) if frf.freq.size >= 5 else 0)
+    return sum(low_slope(frf.freq, frf.data[i : i + 1, i : i + 1]) > 1.0 for i in axes)
 
 
 def _digest(plant: Any) -> str:

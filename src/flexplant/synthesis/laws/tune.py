@@ -99,9 +99,11 @@ def tune_loops(
     """
     peak = between(peak, "peak", 1.0, float("inf"), "No loop keeps |S| below 1: try 2.")
     axes = axes_of(plant, before, after, rate, delay, hold)
-    measured = isinstance(axes.plant, Frf)
-    if rigid is None:
-        rigid = len(axes.names) if measured else _free_modes(axes.plant)
+    if rigid is None and isinstance(axes.plant, Frf):
+        rigid = len(axes.names)
+    elif rigid is None:  # a rigid-body mode has two poles at zero frequency
+        distance = np.abs(axes.plant.poles() - (1.0 if axes.rate else 0.0))
+        rigid = int(np.count_nonzero(distance <= _ZERO * np.max(distance, initial=0.0))) // 2
     rigid = whole(rigid, "rigid", minimum=0)
     most = whole(notches, "notches", minimum=0)
     plants = _joint_plants(plant, axes, rigid, larger, {"rate": rate, "delay": delay, "hold": hold})
@@ -146,12 +148,6 @@ def _joint_plants(
         kind = " with the modes left out"
         found.append(JointPlant(G.select(y, u), *static, axes.names, rigid, kind))
     return found
-
-
-def _free_modes(plant: StateSpace) -> int:
-    """Return the number of rigid-body modes: half the poles at zero frequency."""
-    distance = np.abs(plant.poles() - (1.0 if plant.dt else 0.0))
-    return int(np.count_nonzero(distance <= _ZERO * np.max(distance, initial=0.0))) // 2
 
 
 def _axes_response(plant: JointPlant, axes: Axes) -> Frf:

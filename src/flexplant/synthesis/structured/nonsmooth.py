@@ -188,16 +188,13 @@ class _Model:
         """Return the step, the weights of the pieces, and by how much the largest decreases."""
         weights = self.weights
         for _ in range(2):  # the weights of the first give the Hessian of the second
-            values, vectors = la.eigh(self._hessian(weights))
+            active = np.flatnonzero(weights > _SHARE).tolist()
+            values, vectors = la.eigh(sum(weights[i] * self.pieces.hessian(i) for i in active))
             self.size = float(np.abs(values).max())
             root = np.sqrt(np.abs(values) + mu)
             weights, y = downhill(self.pieces.gradient @ vectors / root, self.beside)
             step = vectors @ (y / root)
         return step, weights, -float(np.max(self.beside + self.pieces.gradient @ step))
-
-    def _hessian(self, weights: FloatArray) -> FloatArray:
-        active = np.flatnonzero(weights > _SHARE).tolist()
-        return np.asarray(sum(weights[i] * self.pieces.hessian(i) for i in active))
 
 
 def downhill(gradients: FloatArray, beside: FloatArray) -> tuple[FloatArray, FloatArray]:

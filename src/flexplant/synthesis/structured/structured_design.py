@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial, reduce
+from functools import reduce
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -166,9 +166,18 @@ def design_structured(
     objectives = _objectives(objective)
     if not plants[0].dt:
         _require_no_feedthrough(family, plants[0], objectives)
-    search = _StructureSearch(
-        family, problems, evaluations, partial(_judges, objectives, plants, problems)
-    )
+    kind = _measure_word(objectives)
+    plain = kind == "H-infinity"
+
+    def judging(order: int) -> _Judged:
+        return [
+            (judge, one.below or 1.0)
+            for plant in plants
+            for one in objectives
+            for judge in one.judges(plant, order)
+        ]
+
+    search = _StructureSearch(family, problems, evaluations, None if plain else judging)
     with Progress(starts + _CONTINUED, "starts of the search", progress=progress) as bar:
         found = search.best(starts, random, bar)
     final = family.structure(found.x)
@@ -185,8 +194,7 @@ def design_structured(
             f"{claim:.6g} in the scaled problem: it is too badly conditioned to trust. Bring "
             "the weights closer together."
         )
-    kind, loop = _measure_word(objectives), closed[worst]
-    plain = kind == "H-infinity"
+    loop = closed[worst]
     reached = reached_norms(plants[worst], loop, responder(loop)) if plain else {}
     radius = _RADIUS * max(1.0, float(np.linalg.norm(found.x)))
     slope, decrease = decrease_left(search.pieces(found.x), radius)
@@ -262,23 +270,6 @@ def _measure_word(objectives: Sequence[LoopObjective]) -> str:
     if isinstance(one, Hinf) and one.w is None and one.z is None and one.below is None:
         return "H-infinity"
     return repr(one)
-
-
-def _judges(
-    objectives: Sequence[LoopObjective],
-    plants: Sequence[StandardPlant],
-    problems: Sequence[Prepared],
-    order: int,
-) -> _Judged:
-    """Return the judges of all plants."""
-    if _measure_word(objectives) == "H-infinity":  # the problems are ready
-        return [(GainJudge(problem, order), 1.0) for problem in problems]
-    return [
-        (judge, one.below or 1.0)
-        for plant in plants
-        for one in objectives
-        for judge in one.judges(plant, order)
-    ]
 
 
 def _require_no_feedthrough(

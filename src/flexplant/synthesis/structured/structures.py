@@ -144,7 +144,13 @@ class FixedOrder(Value):
                 f"pattern must have shape ({nu}, {ny}) of (u, y), got {pattern.shape}."
             )
         entries = _Entries(self.order, pattern, prepared, nests=self.start is None)
-        known = self.start if self.start is not None else _reduced_controller(plant, self.order)
+        known = self.start
+        if known is None and self.order:
+            with attempted("a start from the reduced controller of full order"):
+                full = design_hinf(plant).system
+                known = (
+                    balanced(full, order=self.order).system if full.n_states > self.order else None
+                )
         if known is None:
             return entries
         if known.n_states != self.order or known.D.shape != (nu, ny):
@@ -154,16 +160,6 @@ class FixedOrder(Value):
         K = _continuous_matrices(known, plant.dt)
         entries.first = (K.joined / entries.scale)[entries.free]
         return entries
-
-
-def _reduced_controller(plant: StandardPlant, order: int) -> StateSpace | None:
-    """Return the controller of full order, reduced; None where that is not possible."""
-    if not order:
-        return None
-    with attempted("a start from the reduced controller of full order"):
-        full = design_hinf(plant).system
-        return balanced(full, order=order).system if full.n_states > order else None
-    return None
 
 
 class _Entries(ControllerFamily):
