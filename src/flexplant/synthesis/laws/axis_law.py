@@ -28,6 +28,19 @@ _DEPTH, _WIDTH = (0.01, 1.0), (0.02, 1.0)
 _BEYOND = 0.1
 #: how far a notch below the bandwidth may lie from a mode, as a factor
 _BESIDE = 1.3
+#: depth and width of a notch from which a better one is sought, gain in bandwidth that it has to
+#: bring; closest points, highest modes and multiples of the bandwidth where it is tried
+_SLIGHT, _WORTH, _TRIED, _ABOVE = (0.7, 0.3), 1.02, 2, (1.3, 1.8, 2.7)
+#: linear steps, of trials and of what is kept; how many are kept
+_FEW, _MANY, _KEPT = 10, 60, 3
+#: radii [e-folds], penalty on what is violated, step of differences
+_RADIUS, _SMALLEST, _PENALTY, _DIFFERENCE = 0.25, 5e-4, 20.0, 1e-6
+#: minima of the distance that count in a step, at most and as far above the least
+_POINTS, _REACH = 40, 0.4
+#: distance to the critical point that steps keep beyond what is needed, to end with no less
+_SPARE = 5e-4
+#: error of a line that is named when nothing is found
+_POOR = 0.2
 
 
 @dataclass(frozen=True)
@@ -42,6 +55,7 @@ class AxisLaw:
 
     axis: MeasuredAxis
     peak: float
+    notches: int
 
     @property
     def lowest(self) -> float:
@@ -146,6 +160,119 @@ class AxisLaw:
     def s(self) -> ComplexArray:
         """The s of each point, by Tustin's rule where the law is sampled."""
         return tustin_s(self.axis.points[0], self.axis.rate)
+
+    def best(self) -> FloatArray:
+        """Return the law of the highest bandwidth."""
+        given = starts(self)
+        rough = [one for start in given if (one := self.raised(start, _FEW)) is not None]
+        if not rough:
+            raise SolverError(self.failure())
+        rough.sort(key=_first, reverse=True)
+        best = max((self._finished(one) for one in rough[:_KEPT]), key=_first)
+        full = 4 + 3 * self.notches
+        while best.size < full and (more := self._with_notch(best)) is not None:
+            best = more
+        return self._without_idle(best)
+
+    def _finished(self, numbers: FloatArray) -> FloatArray:
+        found = self.raised(numbers)
+        return numbers if found is None else found
+
+    def raised(self, numbers: FloatArray, steps: int = _MANY) -> FloatArray | None:
+        """Return what steps from some numbers lead to; None when that does not hold the peak."""
+        # linear programs within a radius, with an exact penalty [Fletcher1987]_, chapter 14
+        x, radius, best = numbers, _RADIUS, None
+        if not self.axis.is_stable(self.law(x)):
+            return None
+        room = self._spare(x)
+        for _ in range(steps):
+            step, expected = self._step(x, room, radius)
+            if radius < _SMALLEST or expected < _SMALLEST:
+                break
+            trial = self._spare(x + step)
+            gained = step[0] + _PENALTY * (min(trial.min(), 0.0) - min(room.min(), 0.0))
+            if gained > 0.1 * expected and self.axis.is_stable(self.law(x + step)):
+                x, room = x + step, trial
+                radius *= 2.0 if gained > 0.7 * expected and radius < _RADIUS else 1.0
+                if room.min() >= -_SPARE and (best is None or x[0] > best[0]):
+                    best = x
+            else:
+                radius *= 0.4
+        if best is None or best[0] <= np.log(self.lowest):
+            return None
+        return best if self.room(best).min() >= 0.0 else None
+
+    def _spare(self, numbers: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
+        """Return the room beyond a little that steps may violate."""
+        return self.room(numbers, rows) - _SPARE
+
+    def _step(self, x: FloatArray, room: FloatArray, radius: float) -> tuple[FloatArray, float]:
+        """Return the step of the linear program, and the gain that it predicts."""
+        rows = _critical_points(room)
+        slopes, (low, high, limits, most) = self._slopes(x, room, rows), self.limits(x)
+        bounds = (low - x, high - x, limits, np.maximum(most - limits @ x, 0.0))
+        step, gain = linear_step(slopes, room[rows], bounds, radius, aim=[0], penalty=_PENALTY)
+        return step, gain - _PENALTY * float(min(room.min(), 0.0))
+
+    def _slopes(self, x: FloatArray, room: FloatArray, rows: IntArray) -> FloatArray:
+        """Return the derivatives of some of the room by the numbers, by differences."""
+        found = np.zeros((rows.size, x.size))
+        for k in range(x.size):
+            step = np.zeros(x.size)
+            step[k] = _DIFFERENCE
+            found[:, k] = (self._spare(x + step, rows) - room[rows]) / _DIFFERENCE
+        return found
+
+    def _with_notch(self, numbers: FloatArray) -> FloatArray | None:
+        """Return the law with the notch that raises the bandwidth most; None when none is worth it.
+
+        At the points closest to the critical point, at modes and above the bandwidth.
+        """
+        axis = self.axis
+        close = axis.points[0][lowest_of(self.room(numbers))[:_TRIED]]
+        above = np.exp(numbers[0]) * np.array(_ABOVE)
+        trials = [
+            self.raised(np.append(numbers, np.log([f, *_SLIGHT])), _FEW)
+            for f in np.concatenate([close, axis.resonances[:_TRIED], above]).tolist()
+            if axis.freq[0] < f < axis.ceiling
+        ]
+        best = max((one for one in trials if one is not None), key=_first, default=numbers)
+        return self._finished(best) if best[0] > numbers[0] + np.log(_WORTH) else None
+
+    def _without_idle(self, numbers: FloatArray) -> FloatArray:
+        """Return the law without notches that bring little."""
+        for i in reversed(range(4, numbers.size, 3)):
+            less = self.raised(np.delete(numbers, slice(i, i + 3)), _FEW)
+            if less is not None and less[0] + np.log(_WORTH) > numbers[0]:
+                numbers = less
+        return numbers
+
+    def failure(self) -> str:
+        """Return why no law was found, in words."""
+        axis = self.axis
+        need = (
+            "a rigid body, its motion per force, at the lowest lines. Give rigid=0 when it is on "
+            "springs"
+            if axis.free
+            else f"a mass above its springs' mode, taken to be at {axis.suspension:.4g} Hz. Give "
+            "rigid= when the body is free"
+        )
+        low, top = self.lowest, self.highest
+        reach = f"from {low:.3g} to {top:.3g} Hz" if top > low else f"above {low:.3g} Hz"
+        shares = axis.deviation / np.maximum(np.abs(axis.G), TINY)
+        worst, share = int(np.argmax(shares)), float(shares.max())
+        poor = (
+            f" The line at {axis.freq[worst]:.4g} Hz has an error of {100 * share:.0f} %: measure "
+            "longer, or leave out the lines that say little."
+            if share > _POOR
+            else ""
+        )
+        decibel = 20.0 * np.log10(self.peak)
+        return (
+            f"axis {axis.name!r}: no bandwidth {reach} is stable with |S| below {decibel:.2g} dB. "
+            f"The axis has to be {need}; raise the rate, lower "
+            f"the delay, or measure at lower frequencies.{poor}"
+        )
 
 
 #: standard deviations of a line within which the response is taken to lie
@@ -285,145 +412,6 @@ def _scatter(freq: FloatArray, G: ComplexArray) -> FloatArray:
     return np.asarray(np.sqrt(median[places]) * np.abs(G))
 
 
-#: depth and width of a notch from which a better one is sought, gain in bandwidth that it has to
-#: bring; closest points, highest modes and multiples of the bandwidth where it is tried
-_SLIGHT, _WORTH, _TRIED, _ABOVE = (0.7, 0.3), 1.02, 2, (1.3, 1.8, 2.7)
-#: linear steps, of trials and of what is kept; how many are kept
-_FEW, _MANY, _KEPT = 10, 60, 3
-#: radii [e-folds], penalty on what is violated, step of differences
-_RADIUS, _SMALLEST, _PENALTY, _DIFFERENCE = 0.25, 5e-4, 20.0, 1e-6
-#: minima of the distance that count in a step, at most and as far above the least
-_POINTS, _REACH = 40, 0.4
-#: distance to the critical point that steps keep beyond what is needed, to end with no less
-_SPARE = 5e-4
-#: error of a line that is named when nothing is found
-_POOR = 0.2
-
-
-@dataclass(frozen=True)
-class LawSearch:
-    """The search for the law of one axis with the highest bandwidth that holds |S|.
-
-    Laws are the logarithms of their numbers, the bandwidth the first.
-    """
-
-    of: AxisLaw
-    notches: int
-
-    def best(self) -> FloatArray:
-        """Return the law of the highest bandwidth."""
-        given = starts(self.of, self.notches)
-        rough = [one for start in given if (one := self.raised(start, _FEW)) is not None]
-        if not rough:
-            raise SolverError(self.failure())
-        rough.sort(key=_first, reverse=True)
-        best = max((self._finished(one) for one in rough[:_KEPT]), key=_first)
-        full = 4 + 3 * self.notches
-        while best.size < full and (more := self._with_notch(best)) is not None:
-            best = more
-        return self._without_idle(best)
-
-    def _finished(self, numbers: FloatArray) -> FloatArray:
-        found = self.raised(numbers)
-        return numbers if found is None else found
-
-    def raised(self, numbers: FloatArray, steps: int = _MANY) -> FloatArray | None:
-        """Return what steps from some numbers lead to; None when that does not hold the peak."""
-        # linear programs within a radius, with an exact penalty [Fletcher1987]_, chapter 14
-        x, radius, best = numbers, _RADIUS, None
-        if not self.of.axis.is_stable(self.of.law(x)):
-            return None
-        room = self._spare(x)
-        for _ in range(steps):
-            step, expected = self._step(x, room, radius)
-            if radius < _SMALLEST or expected < _SMALLEST:
-                break
-            trial = self._spare(x + step)
-            gained = step[0] + _PENALTY * (min(trial.min(), 0.0) - min(room.min(), 0.0))
-            if gained > 0.1 * expected and self.of.axis.is_stable(self.of.law(x + step)):
-                x, room = x + step, trial
-                radius *= 2.0 if gained > 0.7 * expected and radius < _RADIUS else 1.0
-                if room.min() >= -_SPARE and (best is None or x[0] > best[0]):
-                    best = x
-            else:
-                radius *= 0.4
-        if best is None or best[0] <= np.log(self.of.lowest):
-            return None
-        return best if self.of.room(best).min() >= 0.0 else None
-
-    def _spare(self, numbers: FloatArray, rows: IntArray | slice = slice(None)) -> FloatArray:
-        """Return the room beyond a little that steps may violate."""
-        return self.of.room(numbers, rows) - _SPARE
-
-    def _step(self, x: FloatArray, room: FloatArray, radius: float) -> tuple[FloatArray, float]:
-        """Return the step of the linear program, and the gain that it predicts."""
-        rows = _critical_points(room)
-        slopes, (low, high, limits, most) = self._slopes(x, room, rows), self.of.limits(x)
-        bounds = (low - x, high - x, limits, np.maximum(most - limits @ x, 0.0))
-        step, gain = linear_step(slopes, room[rows], bounds, radius, aim=[0], penalty=_PENALTY)
-        return step, gain - _PENALTY * float(min(room.min(), 0.0))
-
-    def _slopes(self, x: FloatArray, room: FloatArray, rows: IntArray) -> FloatArray:
-        """Return the derivatives of some of the room by the numbers, by differences."""
-        found = np.zeros((rows.size, x.size))
-        for k in range(x.size):
-            step = np.zeros(x.size)
-            step[k] = _DIFFERENCE
-            found[:, k] = (self._spare(x + step, rows) - room[rows]) / _DIFFERENCE
-        return found
-
-    def _with_notch(self, numbers: FloatArray) -> FloatArray | None:
-        """Return the law with the notch that raises the bandwidth most; None when none is worth it.
-
-        At the points closest to the critical point, at modes and above the bandwidth.
-        """
-        axis = self.of.axis
-        close = axis.points[0][lowest_of(self.of.room(numbers))[:_TRIED]]
-        above = np.exp(numbers[0]) * np.array(_ABOVE)
-        trials = [
-            self.raised(np.append(numbers, np.log([f, *_SLIGHT])), _FEW)
-            for f in np.concatenate([close, axis.resonances[:_TRIED], above]).tolist()
-            if axis.freq[0] < f < axis.ceiling
-        ]
-        best = max((one for one in trials if one is not None), key=_first, default=numbers)
-        return self._finished(best) if best[0] > numbers[0] + np.log(_WORTH) else None
-
-    def _without_idle(self, numbers: FloatArray) -> FloatArray:
-        """Return the law without notches that bring little."""
-        for i in reversed(range(4, numbers.size, 3)):
-            less = self.raised(np.delete(numbers, slice(i, i + 3)), _FEW)
-            if less is not None and less[0] + np.log(_WORTH) > numbers[0]:
-                numbers = less
-        return numbers
-
-    def failure(self) -> str:
-        """Return why no law was found, in words."""
-        axis = self.of.axis
-        need = (
-            "a rigid body, its motion per force, at the lowest lines. Give rigid=0 when it is on "
-            "springs"
-            if axis.free
-            else f"a mass above its springs' mode, taken to be at {axis.suspension:.4g} Hz. Give "
-            "rigid= when the body is free"
-        )
-        low, top = self.of.lowest, self.of.highest
-        reach = f"from {low:.3g} to {top:.3g} Hz" if top > low else f"above {low:.3g} Hz"
-        shares = axis.deviation / np.maximum(np.abs(axis.G), TINY)
-        worst, share = int(np.argmax(shares)), float(shares.max())
-        poor = (
-            f" The line at {axis.freq[worst]:.4g} Hz has an error of {100 * share:.0f} %: measure "
-            "longer, or leave out the lines that say little."
-            if share > _POOR
-            else ""
-        )
-        decibel = 20.0 * np.log10(self.of.peak)
-        return (
-            f"axis {axis.name!r}: no bandwidth {reach} is stable with |S| below {decibel:.2g} dB. "
-            f"The axis has to be {need}; raise the rate, lower "
-            f"the delay, or measure at lower frequencies.{poor}"
-        )
-
-
 def linear_step(
     slopes: FloatArray,
     room: FloatArray,
@@ -495,12 +483,12 @@ _STARTS, _EACH, _APART = 12, 3, 0.25
 _LACK, _LATER = 0.25, 4.0
 
 
-def starts(of: AxisLaw, notches: int) -> list[FloatArray]:
+def starts(of: AxisLaw) -> list[FloatArray]:
     """Return numbers near the highest bandwidths, with and without notches at the modes."""
     if not of.lowest < of.highest:
         return []
     rows = _axis_points(of)
-    sets = _sets(of, notches)
+    sets = _sets(of)
     found: list[list[tuple[float, FloatArray]]] = [[] for _ in sets]
     for w in np.geomspace(of.highest, of.lowest, _TRIALS).tolist():
         for own, (score, numbers) in zip(found, _best_starts(of, w, sets, rows), strict=True):
@@ -512,9 +500,9 @@ def starts(of: AxisLaw, notches: int) -> list[FloatArray]:
     return [numbers for _, numbers in best[:_STARTS]]
 
 
-def _sets(of: AxisLaw, notches: int) -> list[FloatArray]:
+def _sets(of: AxisLaw) -> list[FloatArray]:
     """Return the logarithms of the numbers of the notches that are tried together."""
-    modes = of.axis.resonances[: min(_MODES, notches)].tolist()
+    modes = of.axis.resonances[: min(_MODES, of.notches)].tolist()
     each = [
         [(), *((f * up, d, z) for up, d, z in _NOTCHES if f * up < of.axis.ceiling)] for f in modes
     ]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import Value, flag, instance, number, positive, real_array, short, whole
+from ...checks import Value, checked, flag, instance, number, positive, real_array, short, whole
 from ...errors import AssumptionError, LabelError, ModelError, ShapeError, require_known
 from ...fingerprint import fingerprint
 from ...loop.blocks import DERIVATIVES
@@ -50,19 +50,20 @@ class ShapedAxis(Value):
     """
 
     elements: tuple[SingleElement, ...] = ()
-    gain: float = 1.0
+    gain: float = field(default=1.0, metadata=checked(number))
     on: tuple[bool, ...] = ()
     feedforward: tuple[float, ...] = ()
-    closed: bool = True
+    closed: bool = field(default=True, metadata=checked(flag))
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         given: Any = self.elements
         if isinstance(given, LawElement):
             given = (given,)
         if not isinstance(given, Iterable) or isinstance(given, str | Mapping):
             raise ModelError(f"elements are a list of Pid, Lead, Notch ..., got {short(given)}.")
         elements: list[SingleElement] = []
-        gain, on = number(self.gain, "gain"), [flag(one, "on") for one in self.on]
+        gain, on = self.gain, [flag(one, "on") for one in self.on]
         for element in given:
             if isinstance(element, Law):  # its factors, each by itself
                 elements += element.factors
@@ -79,13 +80,8 @@ class ShapedAxis(Value):
             raise ShapeError(f"feedforward has up to {len(TERMS)} gains ({', '.join(TERMS)}).")
         while forward and not forward[-1]:
             forward = forward[:-1]
-        self._set(
-            elements=tuple(elements),
-            gain=gain,
-            on=tuple(on or [True] * len(elements)),
-            feedforward=forward,
-            closed=flag(self.closed, "closed"),
-        )
+        on = on or [True] * len(elements)
+        self._set(elements=tuple(elements), gain=gain, on=tuple(on), feedforward=forward)
 
     @property
     def active(self) -> tuple[SingleElement, ...]:
@@ -156,16 +152,17 @@ class LoopDesign(Value):
     axes: Mapping[str, ShapedAxis]
     before: Any = None
     after: Any = None
-    rate: float = 0.0
-    delay: float = 0.0
-    hold: bool = True
-    rigid: int = 0
-    unstable: int = 0
+    rate: float = field(default=0.0, metadata=checked(positive, zero=True))
+    delay: float = field(default=0.0, metadata=checked(positive, zero=True))
+    hold: bool = field(default=True, metadata=checked(flag))
+    rigid: int = field(default=0, metadata=checked(whole, minimum=0))
+    unstable: int = field(default=0, metadata=checked(whole, minimum=0))
     references: Mapping[str, str] = field(default_factory=dict)
     made_on: str = ""
     fingerprint: str = ""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         axes: Any = self.axes
         if not isinstance(axes, Mapping) or not axes:
             raise ModelError(f"axes is a mapping {{axis: ShapedAxis}}, got {short(axes)}.")
@@ -186,17 +183,8 @@ class LoopDesign(Value):
                 f"and before= starts from {len(before.inputs)}. Name the axes like the motions."
             )
         require_known("axis", self.references, names)
-        self._set(
-            axes=found,
-            before=before.replace(dt=0.0),
-            after=after.replace(dt=0.0),
-            rate=positive(self.rate, "rate", zero=True),
-            delay=positive(self.delay, "delay", zero=True),
-            hold=flag(self.hold, "hold"),
-            rigid=whole(self.rigid, "rigid", minimum=0),
-            unstable=whole(self.unstable, "unstable", minimum=0),
-            references=dict(self.references),
-        )
+        before, after = before.replace(dt=0.0), after.replace(dt=0.0)
+        self._set(axes=found, before=before, after=after, references=dict(self.references))
 
     @classmethod
     def on(

@@ -21,7 +21,7 @@ from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import Progress, one_thread
 from ...plant import StandardPlant, larger_plant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from .axis_law import AxisLaw, LawSearch, MeasuredAxis, are_stable, linear_step, near_lowest
+from .axis_law import AxisLaw, MeasuredAxis, are_stable, linear_step, near_lowest
 from .law import Law, decoupled, tustin_s
 from .loop_design import Axes, DesignedLoops, axes_of, made
 from .servo_loop import TARGET
@@ -112,8 +112,8 @@ def tune_loops(
         for i, name in enumerate(axes.names):
             variance = None if frf.variance is None else frf.variance[i, i]
             one = MeasuredAxis(name, frf.freq, frf.data[i, i], axes.rate, rigid > 0, variance)
-            of.append(AxisLaw(one, float(peak)))
-            alone.append(LawSearch(of[i], most).best())
+            of.append(AxisLaw(one, float(peak), most))
+            alone.append(of[i].best())
             bar.advance()
     found = JointSearch(of, plants, float(peak), alone).best()
     design = made(axes, dict(zip(axes.names, found.laws, strict=True)), rigid, 0, None, larger)
