@@ -319,24 +319,16 @@ def _root_product(poles: ComplexArray, zeros: ComplexArray, back: ComplexArray) 
     """Return ``prod (z - zeros) / prod (z - poles)`` at 1/z - 1 = back."""
     z = 1.0 / (1.0 + back)
     rise = -back * z  # z - 1
-    found = np.ones(z.size, dtype=np.complex128)
-    for root in zeros:
-        found *= rise + (1.0 - root)
-    for root in poles:
-        found /= rise + (1.0 - root)
-    return found
+    above, below = (np.prod(rise + (1.0 - roots[:, None]), axis=0) for roots in (zeros, poles))
+    return np.asarray(above / below)
 
 
 def _sections_response(sections: FloatArray, back: ComplexArray) -> ComplexArray:
     """Return the response of sections: in powers of 1/z - 1, small where coefficients cancel."""
-    found = np.ones(back.size, dtype=np.complex128)
-    for row in sections:
-        above, below = (
-            (c0 + c1 + c2) + (c1 + 2.0 * c2) * back + c2 * back**2
-            for c0, c1, c2 in (row[:3], row[3:])
-        )
-        found *= above / below
-    return found
+    c = sections.reshape(-1, 2, 3, 1)
+    c0, c1, c2 = c[:, :, 0], c[:, :, 1], c[:, :, 2]
+    each = (c0 + c1 + c2) + (c1 + 2.0 * c2) * back + c2 * back**2
+    return np.asarray(np.prod(each[:, 0] / each[:, 1], axis=0))
 
 
 def _cause(exact: float, poles: ComplexArray, dt: float) -> str:
