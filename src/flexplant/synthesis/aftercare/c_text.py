@@ -296,23 +296,23 @@ class CText:
         single: bool,
     ) -> None:
         self.system, self.form, self.single, self.limits = K, form, single, limits
-        states, self.m, self.p = form.B.shape[-2], len(K.inputs), len(K.outputs)
+        self.states, self.m, self.p = form.B.shape[-2], len(K.inputs), len(K.outputs)
+        self.driven, self.places, self.count = driven, places, max(places.size, 1)
         #: whether A and B follow the place too
         self.moving = form.rest.ndim == 3
-        self.states, self.places, self.count = states, places, max(places.size, 1)
+        rest, precision = form.rest.shape[-1], "single" if single else "double"
         error = f"blocks within {form.error:.1e} of the largest gain of each channel"
-        kept = f"in {'single' if single else 'double'} precision, {error}"
         self.fields: dict[str, Any] = {
             "title": _ascii(K.name or name), "name": name, "guard": name.upper(), "dt": K.dt,
-            "n": K.n_states, "what": f"{counted(K.n_states, 'state')} {kept}",
-            "m": self.m, "p": self.p, "room": max(states, 1), "driven": driven,
+            "n": K.n_states,
+            "what": f"{counted(K.n_states, 'state')} in {precision} precision, {error}",
+            "m": self.m, "p": self.p, "room": max(self.states, 1), "driven": driven,
             "u_room": max(driven, 1), "inputs": _ascii(", ".join(K.inputs)),
             "outputs": _ascii(", ".join(K.outputs)), "real": "float" if single else "double",
             "zero": self.number(0.0), "one": self.number(1.0), "N": form.lanes,
-            "pairs": form.lanes, "rest": form.rest.shape[-1], "R": form.rest.shape[-1],
-            "before": 2 * form.lanes, "lanes": LANES, "at": at, "last": self.count - 2,
+            "pairs": form.lanes, "rest": rest, "R": rest, "before": 2 * form.lanes,
+            "lanes": LANES, "at": at, "last": self.count - 2,
         }  # fmt: skip
-        self.driven = driven
 
     def number(self, value: float) -> str:
         """Return a literal: exact, of the type that is computed in."""

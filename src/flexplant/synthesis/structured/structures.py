@@ -198,14 +198,11 @@ class _Entries(ControllerFamily):
 
     def _grown(self, lower: FloatArray) -> FloatArray:
         """Return the parameters of a controller of one state fewer, and a state to begin with."""
-        k = self.order
-        entries = np.zeros(self.scale.shape)
-        others = np.delete(np.arange(k + len(self.names[1])), k - 1)
-        columns = np.delete(np.arange(k + len(self.names[0])), k - 1)
-        inner = np.zeros((others.size, columns.size))
-        inner[self.free[np.ix_(others, columns)]] = lower
-        entries[np.ix_(others, columns)] = inner
-        rng = np.random.default_rng(k)
+        k, rng = self.order, np.random.default_rng(self.order)
+        kept = np.delete(np.delete(self.free, k - 1, axis=0), k - 1, axis=1)
+        inner = np.zeros(kept.shape)
+        inner[kept] = lower
+        entries = np.insert(np.insert(inner, k - 1, 0.0, axis=0), k - 1, 0.0, axis=1)
         entries[k - 1, k:] = _COUPLING * rng.standard_normal(len(self.names[0]))
         entries[k:, k - 1] = _COUPLING * rng.standard_normal(len(self.names[1]))
         entries[k - 1, k - 1] = -1.0
