@@ -22,12 +22,12 @@ from ..checks import (
     real_array,
     sizes_of,
 )
-from ..errors import LabelError, SolverError, counted, unknown_label, warn
+from ..errors import SolverError, counted, unknown_label, warn
 from ..lti.discretisation import Recursion
 from ..lti.equations import scale_of
 from ..lti.lyapunov import solve_stein
 from ..parallel import one_thread
-from .estimator_channels import estimates, recorded
+from .estimator_channels import ChannelError, estimates, recorded
 from .filter_model import FEW_DIGITS, FilterModel, Sight, Steady, innovation_root
 from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother
 from .passage import (
@@ -181,13 +181,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
         sensor = channel.removesuffix(":innovation") if isinstance(channel, str) else channel
         if sensor != channel and sensor in self.sensors:
             return 1, list(self.sensors).index(sensor)
-        raise EstimateChannelError(str(unknown_label("channel", channel, list(self))))
-
-
-class EstimateChannelError(LabelError, KeyError):
-    """An estimate has no such channel; a KeyError too, as of any Mapping."""
-
-    __str__ = Exception.__str__
+        raise ChannelError(str(unknown_label("channel", channel, list(self))))
 
 
 #: difference of a gain from the one of P, times a deviation of the innovations, in deviations of

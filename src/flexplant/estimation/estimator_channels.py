@@ -16,6 +16,12 @@ from ..plant import StandardPlant, standard_plant
 DERIVED = (":error", ":effort")
 
 
+class ChannelError(LabelError, KeyError):
+    """A record or an estimate has no such channel; a KeyError too, as of any Mapping."""
+
+    __str__ = Exception.__str__
+
+
 def checked_plant(given: StandardPlant | System) -> StandardPlant:
     """Return a StandardPlant that has something to estimate and to measure."""
     plant = standard_plant(given)

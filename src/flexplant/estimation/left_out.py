@@ -118,7 +118,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     read = plant.reading_gain[np.ix_(
         [plant.y.index(name) for name in sensors(plant)], [y.index(port.name) for port in ports.y]
     )]  # fmt: skip
-    quiet = _quiet(with_flexibility(plant, flexibility), plant, stand_ins)
+    quiet = _quiet(with_flexibility(plant, flexibility), plant, plant.n_rigid + stand_ins)
     return LeftOut(
         others + big.n_rigid + 1,
         read @ covariance[nz:, nz:] @ read.T,
@@ -214,7 +214,11 @@ def _motion_covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> Float
         )
     omega = np.asarray(1j * np.repeat(blocks.omega[chosen], 2), dtype=np.complex128)
     drive = blocks.push[chosen].reshape(poles.size, -1)
-    density = [_root_asd(port, omega) for port in ports.forces]  # of actuators: their input noise
+    # the root of the two-sided density at each mode's frequency; of actuators their input noise
+    density = [
+        port.asd / np.sqrt(2.0) * np.abs(_siso_response(port.filter, omega))
+        for port in ports.forces
+    ]
     drive = drive * np.array(density).reshape(-1, poles.size).T
     see = blocks.see[:, chosen].reshape(-1, poles.size).copy()
     turn = np.where(poles.imag >= 0, omega, -omega)
@@ -225,29 +229,19 @@ def _motion_covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> Float
     return np.asarray(np.real(see @ X @ see.conj().T))
 
 
-def _root_asd(port: Any, omega: ComplexArray) -> FloatArray:
-    """Return the root of a disturbance's two-sided density at frequencies."""
-    asd = port.asd
-    shape = port.filter
-    if shape is None:
-        return np.full(omega.size, asd / np.sqrt(2.0))
-    return np.asarray(asd / np.sqrt(2.0) * np.abs(_siso_response(shape, omega)))
-
-
 def _siso_response(part: StateSpace | None, at: ComplexArray) -> ComplexArray:
     if part is None:
         return np.ones(at.size, dtype=np.complex128)
     return np.array([part.evaluated(s)[0, 0] for s in at])
 
 
-def _quiet(fresh: StandardPlant, plant: StandardPlant, stand_ins: IntArray) -> StandardPlant:
-    """Return the new plant with the old one's noise, less that on shapes that stand in for modes.
+def _quiet(fresh: StandardPlant, plant: StandardPlant, modes: IntArray) -> StandardPlant:
+    """Return the new plant with the old one's noise, less that on some modes (from 0).
 
-    What the modes left out do is in the noise of the sensors already.
+    Shapes that stand in for modes left out have none: it is in the noise of the sensors already.
     """
     factor = np.array(plant.noise_factor)
-    elastic = plant.modal_states[2 * plant.n_rigid :].reshape(-1, 2)
-    factor[elastic[stand_ins].reshape(-1)] = 0.0
+    factor[plant.modal_states.reshape(-1, 2)[modes].reshape(-1)] = 0.0
     return fresh.replace(origin=fresh.assembled.replace(noise_factor=factor))
 
 
@@ -372,10 +366,8 @@ def unresolved_share(
     coarse = modes[nodes[modes - 1] < NODES] - 1
     if not coarse.size:
         return 0.0
-    factor = np.array(larger.noise_factor)
-    factor[larger.modal_states.reshape(-1, 2)[coarse].reshape(-1)] = 0.0
-    still = larger.replace(origin=larger.assembled.replace(noise_factor=factor))
-    rest = error_variances(read_alike(plant, still), observer).values
+    still = read_alike(plant, _quiet(larger, larger, coarse))
+    rest = error_variances(still, observer).values
     shares = 1.0 - rest / divisor(variances)
     share = float(np.max(shares))
     if share > WARNED:

@@ -207,7 +207,7 @@ def _unbiased(model: FilterModel, d: InputEntry, found: Invertibility) -> _Input
         for _ in range(_STEPS):
             found_gains = gains(model, d, P)
             last, P = P, found_gains.covariance(model)
-            if _relative_gap(last, P) < _SETTLED:
+            if np.max(np.abs(last - P).diagonal() / divisor(P.diagonal())) < _SETTLED:
                 break
     except SolverError as error:
         raise AssumptionError(
@@ -225,11 +225,6 @@ def _initial_covariance(m: FilterModel, d: InputEntry, late: bool) -> FloatArray
     size = _LARGE * np.sum((left @ spread) * left, axis=1)
     G, H = d.G * size, d.H * size
     return solve_dare(m.A, m.C2, Q=m.Q + G @ d.G.T, R=m.R + H @ d.H.T, S=m.S + G @ d.H.T).P
-
-
-def _relative_gap(one: FloatArray, two: FloatArray) -> float:
-    size = divisor(two.diagonal())
-    return float(np.max(np.abs(one - two).diagonal() / size))
 
 
 class _InputGains(NamedTuple):
@@ -261,8 +256,7 @@ def _direct_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
     # noise that reaches state and sensors together: what the innovation shows of it beside d
     K = m.A @ L_x + d.G @ M + weigh(m.S, spread) @ rest
     L = m.C1 @ L_x + d.at_pois @ M
-    bias = max(_max_abs(M @ d.H - np.eye(len(M))), _max_abs((K @ d.H - d.G) / _column_sizes(d.G)))
-    return _InputGains(K, L, m.A - K @ m.C2, m.driven(K), False, bias)
+    return _InputGains(K, L, m.A - K @ m.C2, m.driven(K), False, _bias(M, d.H, K, d.G))
 
 
 def _late_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
@@ -273,9 +267,8 @@ def _late_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
     L_x = plain + (d.G - plain @ F) @ M
     still = np.eye(len(P)) - L_x @ m.C2
     L = m.C1 @ L_x + d.at_pois @ M
-    bias = max(_max_abs(M @ F - np.eye(len(M))), _max_abs((L_x @ F - d.G) / _column_sizes(d.G)))
     driven = still @ m.Q @ still.T + L_x @ m.R @ L_x.T
-    return _InputGains(m.A @ L_x, L, still @ m.A, driven, True, bias)
+    return _InputGains(m.A @ L_x, L, still @ m.A, driven, True, _bias(M, F, L_x, d.G))
 
 
 def _augmented(
@@ -358,12 +351,10 @@ def _weighted_inverse(F: FloatArray, spread: FloatArray) -> FloatArray:
     return np.asarray(inverse / columns[:, None])
 
 
-def _column_sizes(G: FloatArray) -> FloatArray:
-    return np.asarray(np.maximum(np.abs(G).max(axis=0), TINY))
-
-
-def _max_abs(matrix: FloatArray) -> float:
-    return float(np.max(np.abs(matrix), initial=0.0))
+def _bias(M: FloatArray, F: FloatArray, L: FloatArray, G: FloatArray) -> float:
+    """Return the largest entry of ``M F - I``, and of ``L F - G`` beside the columns of G."""
+    off = M @ F - np.eye(len(M)), (L @ F - G) / np.maximum(np.abs(G).max(axis=0), TINY)
+    return max(float(np.max(np.abs(part), initial=0.0)) for part in off)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -12,7 +12,7 @@ from ..checks import FloatArray, Value, instance, name_list, positive, real_arra
 from ..errors import LabelError, ModelError, ShapeError, counted, require_known
 from ..loop import ClosedLoop, close_loop
 from ..plant import Poi, Ports
-from .response import Numbers, Response, moving_moments, signal_unit
+from .response import Numbers, Response, as_numbers, moving_moments, signal_unit
 from .simulate import Signal, simulate
 
 #: share of the windows in the third column of the table: three standard deviations of a Gaussian
@@ -117,18 +117,14 @@ def exposure_errors(
     >>> round(float(found["die:error"].ma) * 1e9, 6)
     2.0
     """
-    _check_run(run)
+    instance(run, Response, "run", "Pass what simulate returned.")
     names = error_channels(run) if channels is None else name_list(channels, "channels")
     if not names:
         raise ModelError("the run has no error of a POI: name the channels, channels=['y1'].")
     parts = _exposure_slices(run, start, exposures)
     shortest = min(part.stop - part.start for part in parts)
-    count = shortest if window is None else round(positive(window, "window") / run.dt)
-    if not 1 <= count <= shortest:
-        raise ModelError(
-            f"a window of {count} samples does not fit an exposure of {shortest} samples of "
-            f"{run.dt:g} s: choose a shorter window, or a longer exposure."
-        )
+    where = f"an exposure of {shortest} samples of {run.dt:g} s"
+    count = shortest if window is None else _fitting(window, run.dt, shortest, where)
     values = np.zeros((len(names), 4))
     for i, name in enumerate(names):
         both = [_windows(run[name][..., part], count, window is None) for part in parts]
@@ -185,22 +181,17 @@ def settling_time(
     >>> round(float(fx.simulation.settling_time(run, "die:error", ma=1e-8, window=0.01)), 2)
     0.23
     """
-    _check_run(run)
+    instance(run, Response, "run", "Pass what simulate returned.")
     limit = positive(ma, "ma"), np.inf if msd is None else positive(msd, "msd")
     part = _exposure_slices(run, after, None)[0]
-    count = round(positive(window, "window") / run.dt)
-    if not 1 <= count <= part.stop - part.start:
-        raise ModelError(
-            f"a window of {count} samples does not fit the {part.stop - part.start} samples after "
-            f"{after:g} s: choose a shorter window, or a longer run."
-        )
+    most = part.stop - part.start
+    count = _fitting(window, run.dt, most, f"the {most} samples after {after:g} s")
     average, deviation = _windows(run[channel][..., part], count, False)
     outside = (np.abs(average) > limit[0]) | (deviation > limit[1])
     late = outside.shape[-1] - np.argmax(outside[..., ::-1], axis=-1)
     steps = np.where(np.any(outside, axis=-1), late, 0).astype(np.float64)
     steps[steps == outside.shape[-1]] = np.inf
-    found = steps * run.dt
-    return float(found) if np.ndim(found) == 0 else np.asarray(found)
+    return as_numbers(steps * run.dt)
 
 
 def error_channels(run: Response) -> tuple[str, ...]:
@@ -226,8 +217,15 @@ def _poi_of(channel: str) -> str:
     return place if axis in _AXES and place else channel.removesuffix(":error")
 
 
-def _check_run(run: object) -> None:
-    instance(run, Response, "run", "Pass what simulate returned.")
+def _fitting(window: float, dt: float, most: int, where: str) -> int:
+    """Return the samples of a window, which must be at most so many."""
+    count = round(positive(window, "window") / dt)
+    if not 1 <= count <= most:
+        raise ModelError(
+            f"a window of {count} samples does not fit {where}: choose a shorter window, or a "
+            "longer run."
+        )
+    return count
 
 
 def _exposure_slices(run: Response, start: Any, exposures: Any) -> list[slice]:

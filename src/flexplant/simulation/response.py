@@ -19,7 +19,8 @@ from ..checks import (
     positive,
     real_array,
 )
-from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
+from ..errors import ModelError, ShapeError, counted, unknown_label
+from ..estimation.estimator_channels import ChannelError
 from ..loop import Spectrum
 from ..tolerances import TYPED
 
@@ -124,7 +125,7 @@ class Response(Value, Mapping[str, FloatArray]):
         """
         signal = self._from(channel, start)
         unit = signal_unit(signal)
-        return _as_numbers(unit * np.sqrt(np.mean((signal / unit) ** 2, axis=-1)))
+        return as_numbers(unit * np.sqrt(np.mean((signal / unit) ** 2, axis=-1)))
 
     def rms_interval(
         self, channel: str, *, start: float = 0.0, level: float = 0.95
@@ -153,7 +154,7 @@ class Response(Value, Mapping[str, FloatArray]):
 
     def peak(self, channel: str, *, start: float = 0.0) -> Numbers:
         """Return the largest magnitude of a channel from `start` on, one for each run."""
-        return _as_numbers(np.max(np.abs(self._from(channel, start)), axis=-1))
+        return as_numbers(np.max(np.abs(self._from(channel, start)), axis=-1))
 
     def psd(self, channel: str, *, start: float = 0.0, segment: float | None = None) -> Spectrum:
         """Return the one-sided power spectral density of a channel, over all runs.
@@ -254,13 +255,8 @@ class Response(Value, Mapping[str, FloatArray]):
         return count
 
 
-class ChannelError(LabelError, KeyError):
-    """A response has no such channel; a KeyError too, as of any Mapping."""
-
-    __str__ = Exception.__str__
-
-
-def _as_numbers(values: FloatArray) -> Numbers:
+def as_numbers(values: FloatArray) -> Numbers:
+    """Return a number, or an array of one for each run."""
     return float(values) if np.ndim(values) == 0 else values
 
 
