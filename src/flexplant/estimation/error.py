@@ -23,6 +23,7 @@ from ..checks import (
     instance,
     members,
     short,
+    sizes_of,
 )
 from ..errors import (
     AssumptionError,
@@ -398,6 +399,12 @@ class PoiFilter(Value):
         """The sensors, in the order of the columns of the gains."""
         return sensors(self.plant)
 
+    @property
+    def rms_text(self) -> str:
+        """The predicted rms errors in words."""
+        rms = {name: self.rms(name) for name in poi_channels(self.plant)}
+        return sizes_of(rms, self.plant.units)
+
     def rms(self, channel: str, *, on: StandardPlant | ClosedLoop | System | None = None) -> float:
         """Return the rms of the estimation error at the sample instants.
 
@@ -542,20 +549,12 @@ def errors_on_machines(
     first = next(iter(given.values())).plant
     name = poi_channels(first)[row_of(poi_channels(first), channel)]
     nominal = [_rms(one, one.plant, name, blocks) for one in given.values()]
-    values = []
-    for one in given.values():
-        row = []
-        for machine in listed:
-            try:
-                row.append(_rms(one, machine, name, blocks))
-            except AssumptionError:
-                if not blocks:
-                    raise
-                row.append(np.inf)
-        values.append(row)
-    return MachineTable(
-        name, tuple(given), np.array(nominal), np.array(values), first.units.get(name, "")
-    )
+    values = np.full((len(given), len(listed)), np.inf)
+    for row, one in zip(values, given.values(), strict=True):
+        for i, machine in enumerate(listed):
+            with suppress(*([AssumptionError] if blocks else [])):  # an unstable loop
+                row[i] = _rms(one, machine, name, blocks)
+    return MachineTable(name, tuple(given), np.array(nominal), values, first.units.get(name, ""))
 
 
 def _rms(estimator: Any, machine: StandardPlant, channel: str, blocks: Sequence[Any]) -> float:

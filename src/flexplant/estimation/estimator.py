@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, positive, real_array, short, sizes_of
+from ..checks import FloatArray, positive, real_array, short
 from ..errors import LabelError, ModelError, ShapeError, counted, require_known
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
@@ -75,8 +75,6 @@ class KalmanEstimator(PoiFilter):
     left_out: LeftOut | None = None
 
     def __repr__(self) -> str:
-        channels = poi_channels(self.plant)
-        rms = sizes_of({name: self.rms(name) for name in channels}, self.plant.units)
         count = self.certificate.left_out
         beyond = (
             "modes left out are not known: truncation is not in these numbers"
@@ -97,7 +95,7 @@ class KalmanEstimator(PoiFilter):
             f"<KalmanEstimator: {counted(self.system.n_states, 'state')}, "
             f"{counted(len(self.sensors), 'sensor')}, "
             f"spectral radius {self.certificate.spectral_radius:.6f}\n"
-            f"  rms error {rms} ({beyond})>"
+            f"  rms error {self.rms_text} ({beyond})>"
         )
 
     @cached_property

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..certificates import Certificate
-from ..checks import FloatArray, between, members, sizes_of, whole
+from ..checks import FloatArray, between, members, whole
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError, counted
 from ..lti.equations import powers, scale_of, stein_sum, sylvester
 from ..lti.lyapunov import solve_stein
@@ -21,7 +21,7 @@ from ..parallel import Progress, one_thread, tick
 from ..plant import StandardPlant, UncertainPlant
 from ..tolerances import TINY
 from .error import PoiFilter, error_variances, moving_parts
-from .estimator_channels import poi_channels, same_pois
+from .estimator_channels import same_pois
 from .filter_model import (
     FilterModel,
     error_system,
@@ -136,11 +136,10 @@ class RobustFilter(PoiFilter):
     certificate: HinfFilterCertificate | MinimaxCertificate
 
     def __repr__(self) -> str:
-        rms = sizes_of({n: self.rms(n) for n in poi_channels(self.plant)}, self.plant.units)
         return (
             f"<RobustFilter: {counted(self.system.n_states, 'state')}, "
             f"{counted(len(self.sensors), 'sensor')};\n"
-            f"  rms error on its own plant {rms};\n  {self.certificate!r}>"
+            f"  rms error on its own plant {self.rms_text};\n  {self.certificate!r}>"
         )
 
 

@@ -80,12 +80,9 @@ class RmsAlong(Value):
         self._set(time=time, rms=rms, names=names, units=dict(self.units))
 
     def __repr__(self) -> str:
-        largest = {
-            name: float(self.rms[i].max())
-            for i, name in enumerate(self.names)
-            if name.endswith(":error")
-        }
-        shown = sizes_of(largest or {self.names[0]: float(self.rms[0].max())}, self.units)
+        largest = dict(zip(self.names, self.rms.max(axis=1).tolist(), strict=True))
+        errors = {name: size for name, size in largest.items() if name.endswith(":error")}
+        shown = sizes_of(errors or {self.names[0]: largest[self.names[0]]}, self.units)
         return f"<RmsAlong: {self.time.size} samples; largest {shown}>"
 
     def __getitem__(self, name: str) -> FloatArray:
@@ -237,9 +234,8 @@ class FiltersAlong(Value):
         self._set(names=names, time=time, units=dict(self.units), **own)
 
     def __repr__(self) -> str:
-        lines = [
-            f"<FiltersAlong: {counted(self.time.size, 'sample')}; rms error, steady gains more"
-        ]
+        count = counted(self.time.size, "sample")
+        lines = [f"<FiltersAlong: {count}; rms error, steady gains more"]
         for i, name in enumerate(self.names):
             unit = self.units.get(name)
             exact, *others = (float(np.sqrt(np.mean(getattr(self, g)[i] ** 2))) for g in GAINS)
@@ -275,13 +271,8 @@ def filters_along(
     ----------
     plant : StandardPlant
         Sampled, with ports that move.
-    moving : mapping {position: path}
-        As for `simulate`.
-    duration : float [s]
-        Of the trajectory.
-    repeats : bool
-        Whether the trajectory repeats for ever (a periodic Riccati equation). Else the machine has
-        stood at the beginning for a long time.
+    moving, duration, repeats
+        As for `rms_along`; what repeats has a periodic Riccati equation.
     positions : int
         Places along the trajectory whose steady gains are scheduled.
 

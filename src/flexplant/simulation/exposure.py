@@ -331,18 +331,14 @@ def error_map(
         Around a sampled plant that was assembled from a structure.
     points : (p, 3) array [m]
         The places.
-    duration : float [s]
-        Of the run.
+    duration, noise, rng
+        As for `simulate`.
     reference : signal, optional
         As for `simulate`; along `axis`. Rest when not given.
     axis : str
         x, y, z, rx, ry or rz: the direction of the error.
     window, start, exposures
         As for `exposure_errors`.
-    noise : bool
-        Whether the white noises act.
-    rng : int, SeedSequence, Generator or None
-        Seed of the noises.
 
     Returns
     -------
@@ -367,24 +363,18 @@ def error_map(
     >>> fx.simulation.error_map(loop, points, duration=0.1, axis="x", rng=1).ma.shape
     (2,)
     """
-    given: object = loop
-    instance(given, ClosedLoop, "loop", "Use close_loop(plant, ...).")
+    instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
     places = real_array(points, "points", (None, 3))
     ports = loop.plant.assembled.ports
     names = [f"map|{i}" for i in range(1, len(places) + 1)]
     pois = [Poi(name, at=tuple(p), axes=(axis,)) for name, p in zip(names, places, strict=True)]
     wide = loop.plant.with_ports(ports.replace(z=[*ports.z, *pois]))
-    followed = "" if reference is None else _map_reference(ports, axis)
-    run = simulate(
-        close_loop(wide, *loop.blocks, idle=loop.idle),
-        duration=duration,
-        reference={followed: reference} if followed and reference is not None else None,
-        noise=noise,
-        rng=rng,
-    )
-    target = run[followed] if followed else np.zeros(run.time.size)
-    shown = [pois[i].channel(axis) for i in range(len(pois))]
-    data = target - np.array([run[name] for name in shown])
+    given = {} if reference is None else {_map_reference(ports, axis): reference}
+    closed = close_loop(wide, *loop.blocks, idle=loop.idle)
+    run = simulate(closed, duration=duration, reference=given, noise=noise, rng=rng)
+    target = [run[followed] for followed in given] or [np.zeros(run.time.size)]
+    shown = [poi.channel(axis) for poi in pois]
+    data = target[0] - np.array([run[name] for name in shown])
     errors = run.replace(data=data, names=shown, units={})
     found = exposure_errors(errors, shown, window=window, start=start, exposures=exposures)
     unit = wide.units.get(shown[0], "")

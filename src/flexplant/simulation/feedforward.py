@@ -424,8 +424,7 @@ def inverse_forces(
     """
     instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
     plant, poi, axis, name = tracked(loop.plant, reference)
-    given: object = move
-    instance(given, SetPoint, "move", "Use setpoint(...) or scan(...).")
+    instance(move, SetPoint, "move", "Use setpoint(...) or scan(...).")
     if not plant.dt:
         raise ModelError("the inverse is of a sampled loop: use plant.discretized(rate, delay=).")
     steps = round(positive(duration, "duration") / plant.dt)
@@ -498,8 +497,8 @@ def _feedback(loop: ClosedLoop, force: FloatArray, move: SetPoint, name: str) ->
     names = [force_name(u) for u in plant.u]
     alone = close_loop(plant, known_forces(plant))
     given = {one: force[:, i] for i, one in enumerate(names)}
-    run = simulate(alone, reference={**given, name: move}, duration=len(force) * plant.dt,
-                   noise=False)  # fmt: skip
+    duration = len(force) * plant.dt
+    run = simulate(alone, reference={**given, name: move}, duration=duration, noise=False)
     # a loop that passes forces on already would count them twice
     passed = {name for block in loop.blocks for name in block.inputs}
     more = () if passed.issuperset(names) else (known_forces(plant),)

@@ -241,18 +241,9 @@ class MachinePipeline(Value):
             loop = self._loop(machine, plant, blocks, many)
             run = simulate(loop, duration=self.duration, reference=self.reference, rng=of_run)
             check = self.specification
-            report = MachineReport(
-                row={},
-                measured=measured,
-                places=places,
-                fit=fit,
-                observer=observer,
-                blocks=blocks,
-                left_out=left_out,
-                loop=loop,
-                run=run,
-                verdict=None if check is None else check.check(loop, run),
-            )
+            verdict = None if check is None else check.check(loop, run)
+            stages = measured, fit, observer, blocks, left_out, loop, run, verdict, places
+            report = MachineReport({}, *stages)
             row = self._row(report)
         row["warnings"] = len(said)
         return report.replace(row=row, warned=tuple(str(one.message) for one in said))

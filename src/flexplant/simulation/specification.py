@@ -16,6 +16,8 @@ from .response import Response
 
 #: limits that need a run, in the order of the table
 _OF_RUNS = ("ma", "msd", "rms", "peak", "settling", "effort")
+#: those of the loop itself
+_OF_LOOPS = ("noise", "bandwidth", "modulus_margin")
 
 
 def _efforts(value: Any, name: str) -> float | dict[str, float]:
@@ -160,12 +162,7 @@ class Specification(Value):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        limits = {
-            name: v
-            for name, v in self._fields().items()
-            if name not in ("channel", "window", "start")
-        }
-        if all(limit is None for limit in limits.values()):
+        if all(getattr(self, name) is None for name in (*_OF_RUNS, *_OF_LOOPS)):
             raise ModelError("a specification needs at least one limit: Specification(ma=5e-9).")
         if self.settling is not None and self.ma is None:
             raise ModelError("settling is the time to reach ma (and msd): give ma as well.")
@@ -178,8 +175,7 @@ class Specification(Value):
         All runs of the run count; `exposures` (k, 2) [s] are as for `exposure_errors`, all after
         `start` (and `settling`) when not given. Limits on errors and efforts need a run.
         """
-        given: object = loop
-        instance(given, ClosedLoop, "loop", "Use close_loop(plant, ...).")
+        instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
         needed = [name for name in _OF_RUNS if getattr(self, name) is not None]
         if needed and not isinstance(run, Response):
             raise ModelError(
