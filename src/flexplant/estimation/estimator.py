@@ -394,22 +394,19 @@ def twin_class() -> Any:
     from filterpy.kalman import KalmanFilter
 
     class Twin(KalmanFilter):  # type: ignore[misc]
-        def update(self, z: Any, R: Any = None, H: Any = None) -> None:
-            super().update(None if z is None else _column(z, self.dim_z, "y"), R, H)
+        def update(self, z: Any, *more: Any, **given: Any) -> None:
+            super().update(None if z is None else _column(z, self.dim_z, "y"), *more, **given)
 
-        def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
-            super().predict(_command(u, self.dim_u), B, F, Q)
+        def predict(self, u: Any = None, *more: Any, **given: Any) -> None:
+            super().predict(_command(u, self.dim_u), *more, **given)
 
-        def predict_steadystate(self, u: Any = None, B: Any = None) -> None:
-            super().predict_steadystate(_command(u, self.dim_u), B)
+        def predict_steadystate(self, u: Any = None, *more: Any, **given: Any) -> None:
+            super().predict_steadystate(_command(u, self.dim_u), *more, **given)
 
         def get_prediction(
-            self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None
+            self, u: Any = None, *more: Any, **given: Any
         ) -> tuple[FloatArray, FloatArray]:
-            # 1.4 takes u alone, so that what is not given is not passed on
-            given = {"B": B, "F": F, "Q": Q}
-            others = {name: value for name, value in given.items() if value is not None}
-            x, P = super().get_prediction(_command(u, self.dim_u), **others)
+            x, P = super().get_prediction(_command(u, self.dim_u), *more, **given)
             return x, P
 
         def rts_smoother(

@@ -110,13 +110,12 @@ def _firsts(channels: Sequence[str]) -> dict[str, int]:
 class Recorded(NamedTuple):
     """A record: time (N,), and measurements y with NaN where missing beside commands u.
 
-    `both` is [y u] (N, ny + nu), `complete` says that no sample is missing.
+    `both` is [y u] (N, ny + nu).
     """
 
     time: FloatArray
     both: FloatArray
     ny: int
-    complete: bool
 
     @property
     def y(self) -> FloatArray:
@@ -157,8 +156,7 @@ def recorded(records: Any, model: Any) -> Recorded:
     both, ny = np.stack(parts, axis=1), len(model.sensors)
     if not len(both):
         raise ShapeError("the record holds no samples: there is nothing to estimate from.")
-    complete = bool(np.all(np.isfinite(both)))
-    return Recorded(_time(records, known, len(both), model.dt), both, ny, complete)
+    return Recorded(_time(records, known, len(both), model.dt), both, ny)
 
 
 def _run_values(values: Any, name: str, *, missing: bool) -> FloatArray:

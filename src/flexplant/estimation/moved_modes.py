@@ -98,10 +98,11 @@ class MovedModes(Value):
     def frequency(self) -> dict[int, tuple[float, float]]:
         """Relative change of each mode's frequency, and its standard deviation."""
         change = np.abs(self.poles / self.expected) - 1.0
-        deviation = np.sqrt(np.diag(self.covariance))[: len(self.modes)]
-        return {
-            n: (float(c), float(d)) for n, c, d in zip(self.modes, change, deviation, strict=True)
-        }
+        return self._with(change, np.sqrt(np.diag(self.covariance))[: len(self.modes)])
+
+    def _with(self, sizes: FloatArray, deviations: FloatArray) -> dict[int, tuple[float, float]]:
+        both = zip(sizes.tolist(), deviations.tolist(), strict=True)
+        return dict(zip(self.modes, both, strict=True))
 
     @property
     def damping(self) -> dict[int, tuple[float, float]]:
@@ -110,9 +111,7 @@ class MovedModes(Value):
         turned = np.hstack([-np.eye(m), np.eye(m)])
         deviation = np.sqrt(np.diag(turned @ self.covariance @ turned.T))
         zeta = -self.poles.real / np.abs(self.poles)
-        return {
-            n: (float(z), float(z * d)) for n, z, d in zip(self.modes, zeta, deviation, strict=True)
-        }
+        return self._with(zeta, zeta * deviation)
 
     @property
     def texts(self) -> list[str]:

@@ -68,11 +68,8 @@ class Walk:
         self.s, self.gate = s, gate
         self.steady, self.model, self.sight = steady, steady.model, sight
         self.predict, self.keep = predict, keep
-        both = record.both
-        self.there = np.ones(record.y.shape, dtype=bool)
-        if not record.complete:
-            self.there, both = np.asarray(np.isfinite(record.y)), both.copy()
-            both[:, : record.ny][~self.there] = 0.0
+        both = np.nan_to_num(record.both)
+        self.there: BoolArray = np.isfinite(record.y)
         self.gated = np.zeros(record.y.shape if gate < np.inf else (0, record.ny), dtype=bool)
         self.whole = np.asarray(np.all(self.there, axis=1))
         self.gaps = np.flatnonzero(~self.whole)

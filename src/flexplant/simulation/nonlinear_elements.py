@@ -55,7 +55,7 @@ class Saturation(Value):
     Raises
     ------
     ModelError
-        When a limit is not positive, or `least` is.
+        When a limit is not positive, or `least` is; so for the numbers of all other elements.
 
     Examples
     --------
@@ -93,11 +93,6 @@ class Quantiser(Value):
     ----------
     step : float [unit of the channel]
         The least significant bit.
-
-    Raises
-    ------
-    ModelError
-        When it is not positive.
 
     Examples
     --------
@@ -153,11 +148,6 @@ class Hysteresis(Value):
     width : float [unit of the channel]
         Half the width of the loop.
 
-    Raises
-    ------
-    ModelError
-        When it is not positive.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -187,11 +177,6 @@ class Dropout(Value):
     ----------
     share : float
         Of the samples, each by itself; the first one comes.
-
-    Raises
-    ------
-    ModelError
-        When it is not between 0 and 1.
 
     Examples
     --------
@@ -233,11 +218,6 @@ class Friction(Value):
     reads : str
         The channel of y that measures the motion x at the place, without its noise.
 
-    Raises
-    ------
-    ModelError
-        When a number is not positive.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -274,11 +254,6 @@ class Jitter(Value):
     ----------
     spread : float [s]
         The largest one; less than the time between two samples of the controller.
-
-    Raises
-    ------
-    ModelError
-        When it is not positive.
 
     Examples
     --------

@@ -175,6 +175,12 @@ _SHOWN = 3
 #: what stands for a missing number, truth or text, and what each is called
 _MISSING: dict[type, Any] = {float: np.nan, bool: False, str: ""}
 _CALLED = {float: "number", bool: "truth", str: "text"}
+#: what becomes each of these, a truth before a number
+_PLAIN: dict[type, Any] = {
+    bool: bool | np.bool_,
+    str: str,
+    float: int | float | np.integer | np.floating,
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -272,22 +278,18 @@ def _row_misfit(row: Mapping[str, Any], kinds: Mapping[str, type]) -> str:
 def checked_row(row: Any) -> dict[str, Any]:
     """Return what a pipeline returned as plain numbers, truths and texts."""
     instance(row, Mapping, "what the pipeline returns", "Return {column: number, truth or text}.")
-    plain: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     for name, value in row.items():
         if not isinstance(name, str) or name == "failed":
             raise ModelError(f"{name!r} cannot be the name of a column. Use another text.")
-        if isinstance(value, bool | np.bool_):
-            plain[name] = bool(value)
-        elif isinstance(value, str):
-            plain[name] = str(value)
-        elif isinstance(value, int | float | np.integer | np.floating):
-            plain[name] = float(value)
-        else:
+        kind = next((plain for plain, given in _PLAIN.items() if isinstance(value, given)), None)
+        if kind is None:
             raise ModelError(
                 f"column {name!r} holds {short(value)}: a table has one number, truth or text for "
                 "each machine. Return several columns, or save arrays to files of your own."
             )
-    return plain
+        found[name] = kind(value)
+    return found
 
 
 Estimator = KalmanEstimator | StaticEstimator
