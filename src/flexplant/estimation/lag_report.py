@@ -194,11 +194,6 @@ class FixedLag(Value):
     samples : int
         The lag, at least 1. At the end of a record what there is.
 
-    Raises
-    ------
-    ModelError
-        When it is no whole number from 1.
-
     References
     ----------
     [AndersonMoore1979]_, chapter 7.

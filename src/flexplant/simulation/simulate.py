@@ -327,7 +327,7 @@ def _known_inputs(
         )
     given = np.zeros((1, time.size, len(plant.w)))
     for kind, known, signals in (
-        ("reference", both, {**reference, **_derivatives(reference, both, own)}),
+        ("reference", both, {**reference, **_derivatives(reference, both, own, time)}),
         ("disturbance", others, disturbance or {}),
     ):
         for name, signal in signals.items():
@@ -340,7 +340,7 @@ def _known_inputs(
 
 
 def _derivatives(
-    reference: Mapping[str, Signal], both: Sequence[str], own: Sequence[str]
+    reference: Mapping[str, Signal], both: Sequence[str], own: Sequence[str], time: FloatArray
 ) -> dict[str, Signal]:
     """Return the derivatives of set-points that blocks read and that are not given themselves."""
     found: dict[str, Signal] = {}
@@ -360,12 +360,8 @@ def _derivatives(
                 f"{kind} is impulses. Give the set-point a bound on {kind}, or use "
                 "feedforward.up_to of a lower derivative."
             )
-        found[name] = _of(move, kind)
+        found[name] = getattr(move.at(time), kind)
     return found
-
-
-def _of(move: SetPoint, kind: str) -> Callable[[FloatArray], FloatArray]:
-    return lambda time: np.asarray(getattr(move.at(time), kind))
 
 
 def _signal_samples(signal: Any, name: str, time: FloatArray, runs: int) -> FloatArray:
@@ -431,12 +427,12 @@ def _generators(seed: np.random.SeedSequence, numbers: Iterable[int]) -> list[np
 def _start(loop: ClosedLoop, start: npt.ArrayLike | None) -> FloatArray:
     plant = loop.plant.system.n_states
     total = plant + loop.controller.n_states
-    state = np.zeros(total)
-    if start is not None:
-        values = real_array(start, "start")
-        size = plant if values.shape == (plant,) else total
-        state[:size] = real_array(values, "start (plant, or plant and controller)", (size,))
-    return state
+    if start is None:
+        return np.zeros(total)
+    values = real_array(start, "start")
+    size = plant if values.shape == (plant,) else total
+    values = real_array(values, "start (plant, or plant and controller)", (size,))
+    return np.pad(values, (0, total - size))
 
 
 #: a density over frequency [Hz]: a function, or frequencies and densities

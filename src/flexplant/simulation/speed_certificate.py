@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from math import comb
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as la
@@ -383,11 +385,10 @@ def _interval(
 ) -> float | None:
     """Halve an interval between nodes until each part is shown, or one is not at a point of it."""
     P0, S = line
-    start, step = ends[0], speed * motion.h
-    open_parts = [(*ends, 0)]
+    step, open_parts = speed * motion.h, [(*ends, 0)]
     while open_parts:
         low, high, depth = open_parts.pop()
-        parts = [P0 + (p - start) * S for p in (low, high)]
+        parts = [P0 + (p - ends[0]) * S for p in (low, high)]
         near = low - step < ends[0] or high + step > ends[1]
         moves = [step * own for own in ([S, *reach] if near else [S])]
         if _inequality_holds(motion, (low, high), parts, moves, speed):
@@ -423,7 +424,7 @@ def _inequality_holds(
     Between rest and full speed A and P+ are linear in the speed, and ``A' P+ A`` lies below the
     same combination of its four corners: each of A at rest and at speed, with each P+.
     """
-    matrices = {s: _Quadratic(motion, ends, s * speed) for s in (-1.0, 0.0, 1.0)}
+    matrices = {s: _Quadratic.of(motion, ends, s * speed) for s in (-1.0, 0.0, 1.0)}
     error = max(one.error(P) for one in matrices.values())
     if not error < 1.0:
         return False
@@ -438,32 +439,35 @@ def _inequality_holds(
     )
 
 
-class _Quadratic:
-    """A over a part of the range, as a quadratic through its ends and its middle."""
+class _Quadratic(NamedTuple):
+    """A over a part of the range through its ends and middle, in Bernstein's basis.
 
-    def __init__(self, motion: _Motion, ends: tuple[float, float], speed: float) -> None:
+    And how far it is off at both quarters.
+    """
+
+    bernstein: list[FloatArray]
+    off: list[FloatArray]
+
+    @classmethod
+    def of(cls, motion: _Motion, ends: tuple[float, float], speed: float) -> _Quadratic:
+        """Return A over a part of the range for a speed."""
         low, high = ends
-        at = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
-        values = [motion.A(p, speed) for p in (low + (high - low) * at).tolist()]
-        first, self.second, middle, self.fourth, last = values
-        #: coefficients in Bernstein's basis
-        self.bernstein = [first, 2.0 * middle - 0.5 * (first + last), last]
-
-    def at(self, t: float) -> FloatArray:
-        """Return its value at t from 0 to 1."""
-        a, b, c = self.bernstein
-        return np.asarray((1 - t) ** 2 * a + 2 * t * (1 - t) * b + t * t * c)
+        at = low + (high - low) * np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+        first, second, middle, fourth, last = (motion.A(p, speed) for p in at.tolist())
+        a, b, c = first, 2.0 * middle - 0.5 * (first + last), last
+        exact = ((0.25, second), (0.75, fourth))
+        off = [A - ((1 - t) ** 2 * a + 2 * t * (1 - t) * b + t * t * c) for t, A in exact]
+        return cls([a, b, c], off)
 
     def error(self, P: list[FloatArray]) -> float:
         """Return the bound of its error, in the norm of P at the two ends."""
-        largest = 0.0
-        for own in P:
-            R = np.linalg.cholesky(own).T
-            for t, exact in ((0.25, self.second), (0.75, self.fourth)):
-                off = R @ (exact - self.at(t))
-                largest = max(largest, float(np.linalg.norm(la.solve_triangular(R.T, off.T,
-                    lower=True), 2)))  # fmt: skip
-        return _SAFE * largest
+        roots = [np.linalg.cholesky(own) for own in P]
+        sizes = [
+            np.linalg.norm(la.solve_triangular(L, (L.T @ one).T, lower=True), 2)
+            for L in roots
+            for one in self.off
+        ]
+        return _SAFE * float(max(sizes))
 
 
 def _coefficients(
@@ -478,11 +482,8 @@ def _coefficients(
     for k in range(n + 1):
         own = ((n - k) * P[0] + k * P[1]) / n
         total = np.zeros_like(own)
-        for a in range(3):
-            for b in range(3):
-                c = k - a - b
-                if c not in (0, 1):
-                    continue
+        for a, b in product(range(3), repeat=2):
+            if (c := k - a - b) in (0, 1):
                 weight = comb(2, a) * comb(2, b) / comb(n, k)
                 total += weight * (A.bernstein[a].T @ (P[c] + move) @ A.bernstein[b])
         yield left * own - right * total

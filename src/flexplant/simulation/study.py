@@ -322,17 +322,13 @@ class EstimatorComparison(Value):
         return found
 
     def __repr__(self) -> str:
-        turning = self.channel.rpartition(":")[2].startswith("r")
-        unit = "nrad" if turning else "nm"
+        unit = "nrad" if self.channel.rpartition(":")[2].startswith("r") else "nm"
         width = max(map(len, self.names)) + 2
         lines = [f"rms error of the estimate of {self.channel} [{unit}]"]
         lines.append(f"{'':{width}s}{'predicted':>10s}{'measured':>10s}  {self.level:.0%} interval")
-        for name, (predicted, measured, low, high) in zip(
-            self.names, 1e9 * self.errors, strict=True
-        ):
-            lines.append(
-                f"{name:{width}s}{predicted:10.3f}{measured:10.3f}  {low:.3f} to {high:.3f}"
-            )
+        for name, (*both, low, high) in zip(self.names, 1e9 * self.errors, strict=True):
+            cells = "".join(f"{value:10.3f}" for value in both)
+            lines.append(f"{name:{width}s}{cells}  {low:.3f} to {high:.3f}")
         return "\n".join(lines)
 
 
