@@ -34,7 +34,6 @@ from .passage import (
     SETTLED,
     KnownParameters,
     Moment,
-    Passage,
     Start,
     Walk,
     stationary_start,
@@ -268,7 +267,7 @@ def in_unit_states(
 _TOGETHER = 2048
 
 
-def smoothed(passage: Passage, sight: Sight) -> tuple[FloatArray, FloatArray]:
+def smoothed(passage: Walk, sight: Sight) -> tuple[FloatArray, FloatArray]:
     """Return estimates and variances (N, nz) from all measurements of a record.
 
     The adjoint form of Bryson and Frazier, which inverts no covariance of a state::
@@ -310,7 +309,7 @@ def smoothed(passage: Passage, sight: Sight) -> tuple[FloatArray, FloatArray]:
 
 
 def _backward(
-    passage: Passage,
+    passage: Walk,
     sight: Sight,
     span: tuple[int, int],
     r: FloatArray,
@@ -359,7 +358,7 @@ def _adjoint_pass(
     return [part if fixed else here.applied(part) for part in parts], r
 
 
-def lagged(passage: Passage, sight: Sight, lag: int) -> tuple[FloatArray, FloatArray]:
+def lagged(passage: Walk, sight: Sight, lag: int) -> tuple[FloatArray, FloatArray]:
     """Return estimates and variances (N, nz) from the measurements up to `lag` samples later.
 
     ``hat[k|k+l] = hat[k|k] + sum_j T[k] F[k+1]' ... F[k+j-1]' C2' S^-1 e[k+j]``, j = 1 ... l. Where
@@ -410,7 +409,7 @@ def _information(steady: Steady, lag: int) -> FloatArray:
 
 
 def _smooth_transient(
-    passage: Passage,
+    passage: Walk,
     sight: Sight,
     ks: IntArray,
     lag: int,
@@ -462,7 +461,7 @@ def _smooth_transient(
             variance[k] += found.added(seen[i])
 
 
-def _last_found(passage: Passage, k: int) -> KnownParameters | None:
+def _last_found(passage: Walk, k: int) -> KnownParameters | None:
     """Return what is known of delta at a sample."""
     moment = passage.moments.get(k)
     return passage.found if moment is None or moment.found is None else moment.found

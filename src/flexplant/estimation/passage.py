@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -34,25 +35,13 @@ class Moment(NamedTuple):
     found: KnownParameters | None
 
 
-class Passage(NamedTuple):
-    """What a filter made of a record."""
-
-    steady: Steady
-    hat: FloatArray  # (N, nz)
-    variance: FloatArray  # (N, nz)
-    white: FloatArray  # (N, ny), whitened innovations for delta = 0, zeros where missing
-    innovations: FloatArray  # (N, ny), NaN where missing or nothing is known yet
-    deviation: FloatArray  # (N, ny), of the innovations
-    whitened: FloatArray  # (N, ny), NaN where missing
-    moments: dict[int, Moment]
-    stretches: list[tuple[int, int, bool]]  # (first, last + 1, stationary)
-    found: KnownParameters | None
-    state: FloatArray  # (n,), x[N|N-1]
-    gated: BoolArray  # (N, ny), samples that the gate made missing
-
-
 class Walk:
-    """The filter on one record; its arrays are filled sample by sample."""
+    """The filter on one record; its arrays are filled sample by sample.
+
+    `hat` and `variance` (N, nz) are of the estimates, `white` (N, ny) whitened innovations for
+    delta = 0, zeros where missing. `innovations`, their `deviation` and `whitened` (N, ny) are NaN
+    where a sample is missing, or nothing predicts it yet.
+    """
 
     def __init__(
         self,
@@ -81,10 +70,11 @@ class Walk:
         self.moments: dict[int, Moment] = {}
         self.found: KnownParameters | None = None
 
-    def done(self, start: Start | FloatArray) -> Passage:
+    def done(self, start: Start | FloatArray) -> Walk:
         """Filter from a start to the end of the record."""
         N, whole = self.y.shape[0], self.whole
-        stretches: list[tuple[int, int, bool]] = []
+        #: first sample, last + 1, and whether the gain was stationary
+        self.stretches: list[tuple[int, int, bool]] = []
         if isinstance(start, Start):
             x, P, Z = np.zeros(start.P.shape[0]), start.P, start.Z
             k, settled = 0, False
@@ -98,7 +88,7 @@ class Walk:
                 k, x = self._screened(first, self._until(k), x)
                 P = self.steady.P
                 if k > first:
-                    stretches.append((first, k, True))
+                    self.stretches.append((first, k, True))
                 continue
             settled = False
             while k < N and not settled:
@@ -113,13 +103,11 @@ class Walk:
                         x = x + Z @ found.value if found else x
                         Z = Z[:, :0]
                         k, x, P, settled = self._fading(k, self._until(k), x, Y)
-            stretches.append((first, k, False))
+            self.stretches.append((first, k, False))
         if Z.shape[1] and self.found is not None:
             x = x + Z @ self.found.value
-        return Passage(
-            self.steady, self.hat, self.variance, self.white, self.innovations, self.deviation,
-            self.whitened, self.moments, stretches, self.found, x, self.gated,
-        )  # fmt: skip
+        self.state = x  # x[N|N-1]
+        return self
 
     def _until(self, k: int) -> int:
         """Return the first sample from k on in which one is missing, or the end."""
@@ -264,11 +252,13 @@ class Walk:
             at = slice(k, min(k + length, until))
             count, first = at.stop - k, x
             x = self._steadily(at.start, at.stop, x)
-            moved = faded(self.steady.F, Y, count)
+            # F^k Y for k = 0 .. count
+            moved = np.array([*accumulate(range(count), lambda Z, _: self.steady.F @ Z, initial=Y)])
             C = m.C2 @ moved[:-1]
-            found = accumulate(g.W @ C, self.whitened[at])
+            found = shown_so_far(g.W @ C, self.whitened[at])
             before, after = found.value[:-1], found.value[1:]
-            enter = eta_effect(self.steady, self.sight.part(at), moved[:-1], predict=self.predict)
+            here, into = self.sight.part(at), self.steady.entering(g, predict=self.predict)
+            enter = (here.c[:, :, : x.size] - here.c @ into @ m.C2) @ moved[:-1]
             value, covariance = (before, found.covariance[:-1])
             if not self.predict:
                 value, covariance = after, found.covariance[1:]
@@ -374,16 +364,7 @@ def lasting_part(weight: FloatArray, Y: FloatArray) -> FloatArray:
     return np.asarray(Y @ mix[:, ~gone])
 
 
-def faded(F: FloatArray, Y: FloatArray, samples: int) -> FloatArray:
-    """Return ``F^k Y`` for k = 0 .. samples (samples + 1, n, r)."""
-    moved = np.empty((samples + 1, *Y.shape))
-    moved[0] = Y
-    for k in range(samples):
-        np.matmul(F, moved[k], out=moved[k + 1])
-    return moved
-
-
-def accumulate(rows: FloatArray, white: FloatArray) -> ShownSoFar:
+def shown_so_far(rows: FloatArray, white: FloatArray) -> ShownSoFar:
     """Return what whitened innovations ``white = rows eta + noise`` (k, ny) show of eta."""
     count, _, r = rows.shape
     information, values = np.zeros((count + 1, r, r)), np.zeros((count + 1, r))
@@ -393,14 +374,6 @@ def accumulate(rows: FloatArray, white: FloatArray) -> ShownSoFar:
     covariance = np.linalg.inv(np.cumsum(information, axis=0))
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
     return ShownSoFar(np.einsum("krs,ks->kr", covariance, np.cumsum(values, axis=0)), covariance)
-
-
-def eta_effect(steady: Steady, here: Sight, moved: FloatArray, *, predict: bool) -> FloatArray:
-    """Return how eta enters the estimates (k, nz, r)."""
-    n = moved.shape[1]
-    enter = steady.entering(steady.gains, predict=predict)
-    rows = here.c[:, :, :n] - here.c @ enter @ steady.model.C2
-    return np.asarray(rows @ moved)
 
 
 #: a direction counts as found from this part of the best known one's information (root)
