@@ -202,10 +202,10 @@ class Examined(NamedTuple):
     tried: FloatArray
     reach: float
 
-
-def examined(tried: list[float], whole: StandardPlant | None) -> Examined:
-    """Return the peaks examined; modes left out that are known may make others near kept modes."""
-    return Examined(np.array(tried), _NEAR if whole is None else _DRIFTED)
+    @classmethod
+    def of(cls, tried: list[float], whole: StandardPlant | None) -> Examined:
+        """Return the peaks; modes left out that are known may make others near kept modes."""
+        return cls(np.array(tried), _NEAR if whole is None else _DRIFTED)
 
 
 def peak_verdicts(

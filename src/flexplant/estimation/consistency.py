@@ -18,7 +18,6 @@ from .causes import (
     Examined,
     LikelyCause,
     Outliers,
-    examined,
     folded,
     known_verdict,
     left_modes,
@@ -258,11 +257,11 @@ def consistency(
     whole = _larger_plant(observer, larger)
     if said or whole is not None:
         rest = _tested(observer, white, normal, whole, alpha, u)
-    verdicts = _verdicts(observer, rest, whole, estimate.sensors, examined([], whole))
+    verdicts = _verdicts(observer, rest, whole, estimate.sensors, Examined.of([], whole))
     said += [one for one in verdicts if not said or one.cause != "none"]
     moved, changes = None, [one.change for one in verdicts if one.change is not None]
     if changes and known:
-        before = examined([one.freq for one in rest.peaks], whole)
+        before = Examined.of([one.freq for one in rest.peaks], whole)
         moved, left = _moved_modes(observer, estimate, changes, single, alpha, before)
         said += left
     gated = int(estimate.gated.sum())

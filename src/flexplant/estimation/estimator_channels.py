@@ -30,15 +30,6 @@ def checked_plant(given: StandardPlant | System) -> StandardPlant:
             f"the plant is {plant.alteration}: an estimator is of physical channels. Use "
             "plant.unweighted."
         )
-    _check_reading(plant)
-    for side, names in (("POI in z", poi_channels(plant)), ("sensor in y", sensors(plant))):
-        if not names:
-            raise AssumptionError(f"the plant has no {side}: there is nothing to estimate with.")
-    return plant
-
-
-def _check_reading(plant: StandardPlant) -> None:
-    """Raise ModelError unless y is a static combination of sensors alone."""
     plain = plant.unweighted
     mixed = [plain.y.index(name) for name in plain.y if name in plain.w]
     rows = [plant.y.index(name) for name in sensors(plant)]
@@ -47,6 +38,10 @@ def _check_reading(plant: StandardPlant) -> None:
             "the block that the plant is read through mixes references with sensors: a reference "
             "would look like a motion. Estimate from the sensors, on plant.unweighted."
         )
+    for side, names in (("POI in z", poi_channels(plant)), ("sensor in y", sensors(plant))):
+        if not names:
+            raise AssumptionError(f"the plant has no {side}: there is nothing to estimate with.")
+    return plant
 
 
 def read_alike(plant: StandardPlant, other: StandardPlant) -> StandardPlant:

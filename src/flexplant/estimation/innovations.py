@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -239,22 +239,19 @@ def density_of(
     p = len(observer.sensors)
     process = np.empty((freq.size, p, p), dtype=np.complex128)
     sensors = np.empty_like(process)
-    for at in _slices(freq.size):
+    for start in range(0, freq.size, _PIECE):
+        at = slice(start, start + _PIECE)
         V = whitening(observer, freq[at]) if white is None else white[at]
         if plant is None:
-            sensors[at] = _squared(V @ np.linalg.cholesky(observer.model.R))
+            sensors[at] = squared(V @ np.linalg.cholesky(observer.model.R))
             process[at] = np.eye(p) - sensors[at]
             continue
         rows = [plant.y.index(name) for name in observer.sensors]
         g = plant.system
         C = g.C[g.output_index(observer.sensors)]
-        Y = (
-            seen_from_states(g.A, C, freq[at], g.blocks) @ plant.noise_factor
-            + plant.noise_direct[rows]
-        )
-        process[at] = _squared(V @ Y)
-        own = plant.sensor_noise_factor[rows]
-        sensors[at] = _squared(V @ own)
+        Y = seen_from_states(g.A, C, freq[at], g.blocks) @ plant.noise_factor
+        process[at] = squared(V @ (Y + plant.noise_direct[rows]))
+        sensors[at] = squared(V @ plant.sensor_noise_factor[rows])
     return InnovationParts(process, sensors)
 
 
@@ -279,14 +276,9 @@ def expected(observer: KalmanEstimator, plant: StandardPlant, samples: int) -> I
 
 
 def _cholesky(observer: KalmanEstimator) -> FloatArray:
-    S = observer.model.innovation(observer.predicted_covariance)
-    return innovation_root(S)
+    return innovation_root(observer.model.innovation(observer.predicted_covariance))
 
 
-def _squared(part: ComplexArray) -> ComplexArray:
+def squared(part: ComplexArray) -> ComplexArray:
+    """Return ``T T*`` of matrices T (m, p, r)."""
     return np.asarray(part @ np.conj(np.swapaxes(part, 1, 2)))
-
-
-def _slices(count: int) -> Iterator[slice]:
-    for start in range(0, count, _PIECE):
-        yield slice(start, start + _PIECE)

@@ -20,7 +20,7 @@ from .consistency import consistency
 from .estimate import Estimate
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike, sensors
-from .innovations import seen_from_states
+from .innovations import seen_from_states, squared
 from .kalman import design_kalman
 
 #: designs of the filter whose innovations are used, and the change of all ratios that ends them
@@ -266,7 +266,7 @@ def _level_spectrum(
         to = seen_from_states(closed, m.C2 * d / size[:, None], freq[piece])  # C (z I - A_c)^-1
         for i, one in enumerate(sources):
             T = to @ ((one.G - K @ one.H) / d[:, None]) + one.H / size[:, None]
-            parts[i, piece] = T @ np.conj(np.swapaxes(T, 1, 2))
+            parts[i, piece] = squared(T)
     return _LevelSpectrum(X[:, :, None] * X.conj()[:, None, :], parts)
 
 

@@ -347,21 +347,19 @@ class MachinePipeline(Value):
         row: dict[str, Any] = {one.name: 0.0 for one in self.candidates}
         row |= {one.name: float(p) for one, p in zip(fit.unknowns, fit.values, strict=True)}
         row["modes measured"] = len(found.measured)
-        row["p value"] = fit.p_value if fit.p_value is not None else float("nan")
+        row["p value"] = np.nan if fit.p_value is None else fit.p_value
         poi, axis = self.ports.followed[0]
         row["estimate rms"] = found.observer.rms(poi.channel(axis))
-        row["margin expected"] = (
-            float("nan") if found.left_out is None else found.left_out.modulus_margin
-        )
+        row["margin expected"] = np.nan if found.left_out is None else found.left_out.modulus_margin
         row["stable"] = loop.is_stable
         row["spectral radius"] = loop.spectral_radius
         row["modulus margin"] = loop.modulus_margin
         try:
             row["bandwidth"] = bandwidth(loop)
         except AssumptionError:  # not stable, or |S| is nowhere below 0 dB
-            row["bandwidth"] = float("nan")
+            row["bandwidth"] = np.nan
         steady = float(np.max(found.run.rms(self.error, start=0.5 * self.duration)))
-        row["error rms"] = steady if loop.is_stable else float("nan")
+        row["error rms"] = steady if loop.is_stable else np.nan
         if found.verdict is not None:
             row |= {n: found.verdict[n] for n in found.verdict.names if n not in row}
             row["passed"] = found.verdict.passed
@@ -417,6 +415,10 @@ class MachineReport(Value):
         return consistency(self.observer, self.run)
 
     def __repr__(self) -> str:
+        numbers = [
+            f"{name}: {value:.5g}" if isinstance(value, float) else f"{name}: {value}"
+            for name, value in self.row.items()
+        ]
         sections: dict[str, Sequence[Any]] = {
             "Measured": [self.measured],
             "Localised": [self.places],
@@ -427,7 +429,7 @@ class MachineReport(Value):
             "Loop that was run": [self.loop],
             "The run beside the model": [self._judged()],
             "Specification": [self.verdict],
-            "In numbers": [f"{name}: {_short_number(value)}" for name, value in self.row.items()],
+            "In numbers": numbers,
             "Warnings": self.warned,
         }
         lines = []
@@ -448,7 +450,3 @@ class MachineReport(Value):
         """Write the text to a file, at once or not at all; `save` keeps the values themselves."""
         with written(path) as file:
             file.write(f"{self!r}\n".encode())
-
-
-def _short_number(value: Any) -> str:
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
