@@ -45,7 +45,7 @@ def test_steps_of_several_channels():
     assert ax.figure.axes[3].get_xlabel() == "time [ms]"
     with pytest.raises(LabelError, match="f9"):
         fx.plot.step(g, inputs="f9")
-    with pytest.raises(ModelError, match="one axes holds one"):
+    with pytest.raises(ModelError, match="takes 1 axes, for one channel"):
         fx.plot.step(g, ax=plt.subplots()[1])
     for wrong in ("a", {}):
         with pytest.raises(ModelError):

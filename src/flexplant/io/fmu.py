@@ -291,7 +291,7 @@ def interface(K: StateSpace, name: str, version: str) -> str:
     """Return the source of the functions of one version, all that the specification lists."""
     prefix, listed = ("fmi3", _THREE) if version == "3.0" else ("fmi2", _TWO)
     common = _COMMON.format(name=name, dt=K.dt, m=len(K.inputs), p=len(K.outputs))
-    return common + "\n".join(_function(line, prefix) for line in listed.strip().splitlines())
+    return common + "\n".join(_function(line, prefix) for line in listed.splitlines() if line)
 
 
 def _function(line: str, prefix: str) -> str:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.collections import PolyCollection
@@ -505,13 +506,41 @@ def _response_to_draw(one: Any, freq: FloatArray | None) -> Frf:
         ) from error
 
 
-def require_channels(rows: int, columns: int) -> None:
-    """Raise ModelError where no channel is chosen."""
-    if not rows * columns:
+#: channels for which a grid of panels can still be read
+_MOST = 36
+
+
+def channel_axes(
+    ax: Any, rows: int, columns: int, ratios: Sequence[int], height: float
+) -> npt.NDArray[Any]:
+    """Return the axes of channels, so many below each other for each as there are heights.
+
+    They are those given for one channel, or new ones.
+    """
+    channels, each = rows * columns, len(ratios)
+    if not channels:
         raise ModelError(
             f"{rows} outputs and {columns} inputs are no channel to draw. Choose some: outputs=, "
             "inputs=; all without."
         )
+    given = np.ravel(np.asarray(ax, dtype=object))
+    if ax is not None and (given.size != each or channels != 1):
+        raise ModelError(
+            f"ax= takes {each} axes, for one channel; got {given.size} axes and {channels} "
+            "channels. Leave ax out for a grid, or choose one: outputs=, inputs=."
+        )
+    if channels > _MOST:
+        raise ModelError(
+            f"{rows} outputs and {columns} inputs are {channels} channels, more than can be read "
+            f"({_MOST}). Choose some: outputs=, inputs=."
+        )
+    if ax is not None:
+        return given.reshape(each, 1)
+    drawn: npt.NDArray[Any] = plt.subplots(
+        each * rows, columns, sharex=True, squeeze=False, layout="constrained",
+        figsize=(max(7.0, 4.0 * columns), height), height_ratios=[*ratios] * rows,
+    )[1]  # fmt: skip
+    return drawn
 
 
 def decibel(values: ComplexArray | FloatArray) -> FloatArray:

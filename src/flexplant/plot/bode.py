@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
@@ -18,6 +17,7 @@ from ._axes import (
     STYLES,
     Curve,
     axes,
+    channel_axes,
     curves,
     decibel,
     finish,
@@ -25,14 +25,10 @@ from ._axes import (
     legend,
     panel_axes,
     readable,
-    require_channels,
     role_of,
     shared_reference,
     singular,
 )
-
-#: channels for which a grid of diagrams can still be read
-_MOST = 36
 
 
 def bode(
@@ -85,7 +81,7 @@ def bode(
     first = drawn[0].response
     rows = list(first.outputs) if outputs is None else list(name_list(outputs, "outputs"))
     columns = list(first.inputs) if inputs is None else list(name_list(inputs, "inputs"))
-    panels = _panels(ax, len(rows), len(columns))
+    panels = channel_axes(ax, len(rows), len(columns), (2, 1), 5.0 * len(rows))
     for i, output in enumerate(rows):
         for j, name in enumerate(columns):
             pair = panels[2 * i, j], panels[2 * i + 1, j]
@@ -101,27 +97,6 @@ def bode(
         legend(panels[0, -1], given=ax is not None or panels.size > 2)
     shown: Axes = panels[0, 0]
     return shown
-
-
-def _panels(ax: Sequence[Axes] | None, rows: int, columns: int) -> Any:
-    require_channels(rows, columns)
-    if rows * columns > _MOST:
-        raise ModelError(
-            f"{rows} outputs and {columns} inputs are {rows * columns} channels, more than can be "
-            f"read ({_MOST}). Choose some: outputs=, inputs=."
-        )
-    if ax is None:
-        return plt.subplots(
-            2 * rows, columns, sharex=True, squeeze=False, layout="constrained",
-            figsize=(max(7.0, 4.0 * columns), 5.0 * rows), height_ratios=[2, 1] * rows,
-        )[1]  # fmt: skip
-    given = np.ravel(np.asarray(ax, dtype=object))
-    if given.size != 2 or rows * columns != 1:
-        raise ModelError(
-            f"ax= takes two axes, for the magnitude and phase of one channel; got {given.size} "
-            f"axes and {rows * columns} channels. Leave ax out for a grid."
-        )
-    return given.reshape(2, 1)
 
 
 def _draw_channel(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
@@ -24,6 +23,7 @@ from ._axes import (
     GREY,
     apart,
     bottom_only,
+    channel_axes,
     finish,
     labelled,
     legend,
@@ -31,7 +31,6 @@ from ._axes import (
     named,
     panel_axes,
     quantity_of,
-    require_channels,
     shown_in,
     styles,
 )
@@ -182,8 +181,6 @@ def _draw_panel(
     finish(ax, x=named("time", time), y=named(quantity, shown), given=given)
 
 
-#: channels for which a grid of panels can still be read
-_MOST = 36
 #: a pole is shown until it has decayed to 1 %, or for so many periods
 _DECAY, _PERIODS = 4.6, 20.0
 #: samples of a picture at least and at most, and in a period of the fastest pole
@@ -244,7 +241,7 @@ def step(
     end = (
         max(map(_duration, found.values())) if duration is None else positive(duration, "duration")
     )
-    panels = _response_axes(ax, len(rows), len(columns))
+    panels = channel_axes(ax, len(rows), len(columns), (1,), max(3.6, 2.4 * len(rows)))
     for (label, g), look in zip(found.items(), styles(found), strict=True):
         time, data = _step_responses(g.select(rows, columns), end)
         for i, output in enumerate(rows):
@@ -266,22 +263,6 @@ def _set_points(found: Any) -> tuple[list[str], list[str]] | None:
         return None
     owners = {name.rpartition(":")[0] for name in refs}
     return [name for name in found.plant.z if name.rpartition(":")[0] in owners], refs
-
-
-def _response_axes(ax: Axes | None, rows: int, columns: int) -> Any:
-    require_channels(rows, columns)
-    if rows * columns > _MOST or (ax is not None and rows * columns > 1):
-        raise ModelError(
-            f"{rows} outputs and {columns} inputs are {rows * columns} channels: "
-            f"{'one axes holds one' if ax is not None else f'{_MOST} can be read'}. Choose some: "
-            "outputs=, inputs=."
-        )
-    if ax is not None:
-        return np.array([[ax]], dtype=object)
-    size = (max(7.0, 4.0 * columns), max(3.6, 2.4 * rows))
-    return plt.subplots(
-        rows, columns, sharex=True, squeeze=False, layout="constrained", figsize=size
-    )[1]
 
 
 def _draw_step(

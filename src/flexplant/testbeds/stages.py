@@ -206,16 +206,8 @@ def magnet_stage(
     ----------
     size : (float, float, float) [m]
         Sides of the block along x, y and z, where it is thin.
-    damping : float
-        Modal damping ratio of the elastic modes, their mean.
-    added_mass : float [kg]
-        The hidden mass.
-    rate : float [Hz]
-        Sampling rate of its controller.
-    delay : float [samples], optional
-        From measurement to actuation; 1.3 when not given.
-    individual : int
-        Which machine: its scatter, its magnets and its second mass.
+    damping, added_mass, rate, delay, individual
+        As for `wafer_stage`; the magnets are those of the individual, too.
 
     Returns
     -------

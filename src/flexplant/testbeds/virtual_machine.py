@@ -154,15 +154,7 @@ class WaferStage(Value):
         )
 
     def loop(self, ports: Ports, *blocks: Any) -> ClosedLoop:
-        """Return the machine's own closed loop, for its margins.
-
-        Parameters
-        ----------
-        ports : Ports
-            Its channels.
-        *blocks : StateSpace, KalmanEstimator or Controller
-            What is to run on it.
-        """
+        """Return the machine's own closed loop, for its margins; ports and blocks as for `run`."""
         return close_loop(self._plant(ports), *blocks)
 
     def scheduled(self, ports: Ports, schedule: ScheduledLoop) -> ScheduledLoop:
