@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray, between, positive, real_array
+from ...checks import between, positive, real_array
 from ...errors import AssumptionError, LabelError, ModelError, SolverError, counted, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
@@ -277,9 +277,21 @@ class ServoTask:
 
     @cached_property
     def controller(self) -> Callable[[Axis], StateSpace]:
-        """The function of an axis that gives [ref, hats] -> u: errors, axes and decoupling."""
+        """The function of an axis that gives [refs, hats] -> u: its law for each, decoupled."""
+        hats = tuple(self.poi.derived(name, "hat") for name in self.poi.axes)
+        refs = (self.poi.derived(name, "ref") for name in self.poi.axes)
+        read = {hat: ref for hat, ref in zip(hats, refs, strict=True) if ref in self.plant.y}
         T_u = decoupling(self.plant, self.poi)
-        return cache(lambda axis: _servo_law(self.plant, self.poi, axis, T_u))
+        before = StateSpace([], [], [], T_u, inputs=hats, outputs=self.plant.u)
+        after = StateSpace([], [], [], np.eye(len(hats)), inputs=hats, outputs=hats)
+        axes = Axes(None, before, after, self.rate)
+
+        def found(axis: Axis) -> StateSpace:
+            inner = axes_controller(axes, dict.fromkeys(hats, axis.law))
+            system = connected(axes, inner, read).select(inputs=[*read.values(), *hats])
+            return system.replace(name="servo", units=self.plant.units)
+
+        return cache(found)
 
     @cached_property
     def closed(self) -> Callable[[Axis], ClosedLoop]:
@@ -424,22 +436,3 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
             f"moves, such as poi={ports.z[0].name!r}."
         )
     return ports.poi(name if name is not None else ports.z[0].name)
-
-
-def _servo_law(plant: StandardPlant, poi: Poi, axis: Axis, T_u: FloatArray) -> StateSpace:
-    """Return [refs, hats] -> u: the law of each axis of the POI, decoupled by T_u."""
-    hats = tuple(poi.derived(name, "hat") for name in poi.axes)
-    references = {
-        hat: ref
-        for hat, name in zip(hats, poi.axes, strict=True)
-        if (ref := poi.derived(name, "ref")) in plant.y
-    }
-    axes = Axes(
-        None,
-        StateSpace([], [], [], T_u, inputs=hats, outputs=plant.u),
-        StateSpace([], [], [], np.eye(len(hats)), inputs=hats, outputs=hats),
-        axis.rate,
-    )
-    inner = axes_controller(axes, dict.fromkeys(hats, axis.law))
-    found = connected(axes, inner, references).select(inputs=[*references.values(), *hats])
-    return found.replace(name="servo", units=plant.units)
