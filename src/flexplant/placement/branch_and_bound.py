@@ -15,7 +15,7 @@ from ..checks import FloatArray, between, checked, function, whole
 from ..errors import ModelError, warn
 from ..parallel import Progress, expect
 from ..work import Work
-from .convex import Below, Branch, Convex, Groups, Quadratic
+from .convex import Below, Branch, Convex, Groups, Quadratic, chosen_rows
 from .problem import ADVICE, Found, Problem, Search, layouts_of
 
 #: from so many trials on a lower bound shows first which of them could be better
@@ -128,8 +128,7 @@ class _Run:
         scorer = self.problem.layouts.scorer
         if len(trials) >= _MANY and np.isfinite(value) and isinstance(scorer, Quadratic):
             if self.tangent is None or self.tangent[0] != tuple(chosen):
-                weights = np.zeros(self.problem.total)
-                weights[list(chosen)] = 1.0
+                weights = chosen_rows([chosen], self.problem.total)[0]
                 self.tangent = tuple(chosen), scorer.inner_tangent(self.problem.root, weights)
             if self.tangent[1] is not None:
                 low = self.tangent[1].values(trials)

@@ -22,7 +22,7 @@ from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
 from ..synthesis import design_hinf
 from .candidates import PlantChannel, Port, side_of
-from .convex import Quadratic, measured, quadratic
+from .convex import Quadratic, chosen_rows, measured, quadratic
 from .criterion import AGREEMENT, Criterion, Scorer
 from .poi_variance import (
     Named,
@@ -304,8 +304,7 @@ class Separation(Scorer):
 
     def _sides(self, chosen: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Return numbers of the sensors among the sensors, and of actuators, of a choice."""
-        kept = np.zeros(self.measuring.size, dtype=bool)
-        kept[list(chosen)] = True
+        kept = chosen_rows([chosen], self.measuring.size)[0] > 0
         both = (np.flatnonzero(kept[own]) for own in (self.measuring, ~self.measuring))
         seeing, pushing = (tuple(part.tolist()) for part in both)
         return seeing, pushing

@@ -27,7 +27,7 @@ from ..errors import LabelError, ModelError
 from ..structure import Disc
 from ..tolerances import TINY
 from .candidates import Places, Zone
-from .convex import Branch
+from .convex import Branch, chosen_rows
 
 #: what rounding may have added to a sum
 _SLACK = 1e-9
@@ -56,10 +56,8 @@ class LinearRows:
     @classmethod
     def equal(cls, pairs: Sequence[tuple[int, int]], total: int) -> LinearRows:
         """Return rows by which both or none of each pair are chosen."""
-        rows = np.zeros((len(pairs), total))
-        for row, (i, j) in zip(rows, pairs, strict=True):
-            row[i] += 1.0
-            row[j] -= 1.0
+        first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        rows = np.eye(total)[first] - np.eye(total)[second]
         return cls(rows, np.zeros(len(rows)), np.zeros(len(rows)))
 
     @classmethod
@@ -77,10 +75,7 @@ class LinearRows:
 
     def hold(self, sets: Sequence[Sequence[int]]) -> npt.NDArray[np.bool_]:
         """Return which of some choices (m,) satisfy every row."""
-        x = np.zeros((len(sets), self.A.shape[1]))
-        for row, chosen in zip(x, sets, strict=True):
-            row[list(chosen)] = 1.0
-        sums = x @ self.A.T
+        sums = chosen_rows(sets, self.A.shape[1]) @ self.A.T
         within = (sums >= self.lower - self._slack) & (sums <= self.upper + self._slack)
         return np.asarray(np.all(within, axis=1))
 
@@ -493,9 +488,7 @@ class MinimumDistance(Constraint):
         """Return x_i + x_j <= 1 for each pair that is too close."""
         close = places.distances(places.points) < self.distance - places.same
         first, second = np.nonzero(np.triu(close, 1))
-        pairs = np.zeros((first.size, places.total))
-        line = np.arange(first.size)
-        pairs[line, first] = pairs[line, second] = 1.0
+        pairs = np.eye(places.total)[first] + np.eye(places.total)[second]
         return LinearRows(pairs, np.zeros(first.size), np.ones(first.size))
 
 

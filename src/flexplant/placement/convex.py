@@ -98,6 +98,14 @@ class Branch:
             yield Branch(rest + tuple((g, c) for g, c in counts if c))
 
 
+def chosen_rows(sets: Sequence[Sequence[int]], total: int) -> FloatArray:
+    """Return a row (m, N) for each choice: 1 for its candidates, 0 for the others."""
+    rows = np.zeros((len(sets), total))
+    for row, chosen in zip(rows, sets, strict=True):
+        row[list(chosen)] = 1.0
+    return rows
+
+
 def _main_variance(rows: FloatArray, weights: FloatArray) -> tuple[float, FloatArray]:
     """Return the weighted variance of rows, and each row's place along its main direction."""
     # those of weight zero are to be cut as well
@@ -187,9 +195,7 @@ class Tangent(Below):
 
     def values(self, sets: Sequence[Sequence[int]]) -> FloatArray:
         """Return numbers (m,) below the cost of each choice."""
-        weights = np.zeros((len(sets), self.at.size))
-        for row, chosen in zip(weights, sets, strict=True):
-            row[list(chosen)] = 1.0
+        weights = chosen_rows(sets, self.at.size)
         try:
             solved = np.linalg.solve(self._information(weights), self.face)
         except np.linalg.LinAlgError:

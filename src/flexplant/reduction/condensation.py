@@ -40,8 +40,7 @@ def _loose(model: FEModel, kept: IntArray) -> str:
     rigid = model.rigid_body / np.linalg.norm(model.rigid_body, axis=0)
     largest = float(np.linalg.norm(rigid[kept], axis=1).max(initial=0.0))
     _, sizes, turned = la.svd(rigid[kept])
-    held = np.zeros(rigid.shape[1])
-    held[: sizes.size] = sizes
+    held = np.pad(sizes, (0, rigid.shape[1] - sizes.size))
     left = rigid @ turned[held < SAME * max(largest, held.max(initial=0.0))].T
     # the displacements that move most, one after the other; rotations where there are no others
     names = model.dofs.labels
@@ -74,13 +73,11 @@ class DofPartition:
     """Kept rows, the others, and the static shapes ``-Kss^-1 Ksm`` between them."""
 
     def __init__(self, model: FEModel, labels: tuple[str, ...]) -> None:
-        n = model.n_dof
         self.kept: IntArray = model.dofs.indices(labels)
-        others = np.ones(n, dtype=bool)
-        others[self.kept] = False
-        self.others: IntArray = np.flatnonzero(others)
+        self.others = np.delete(np.arange(model.n_dof), self.kept)
         if not self.others.size:
-            raise ShapeError(f"all {counted(n, 'DOF')} would be kept: nothing is left to condense.")
+            every = counted(model.n_dof, "DOF")
+            raise ShapeError(f"all {every} would be kept: nothing is left to condense.")
         rigid = model.rigid_body
         if rigid.shape[1]:
             # held at the kept DOFs, no rigid-body motion may be left
@@ -89,8 +86,7 @@ class DofPartition:
                 raise ModelError(_loose(model, self.kept))
         self.stiffness = block(model.K, self.others, self.others)
         self.solver = Solver(self.stiffness, _SINGULAR)
-        coupling: Any = block(model.K, self.others, self.kept)
-        loads = coupling.toarray() if hasattr(coupling, "toarray") else np.asarray(coupling)
+        loads = dense(block(model.K, self.others, self.kept))
         self.static = self.whole(np.eye(self.kept.size), -self.solver.solve(loads))
 
     def whole(self, kept: FloatArray, others: FloatArray) -> FloatArray:
