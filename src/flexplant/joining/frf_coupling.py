@@ -349,19 +349,26 @@ def _coupled_response(
     inverse = (turned / values[:, None]) @ back / below[:, :, None] / above[:, None, :]
     forces = inverse @ gap
     found = lines - load @ forces
-    if more is None:  # what opens is what springs and dampers give way
-        left = np.abs(B_out @ found - Z.T[:, :, None] * forces)
-        most = np.abs(B_out) @ (np.abs(lines) + np.abs(load) @ np.abs(forces))
-        if not np.all(left <= _GAP * most):
-            raise CertificateError(
-                f"the coupled responses leave a gap of {float((left / most).max()):.2g} in a joint "
-                f"(limit {_GAP:g}): the interface is too badly conditioned. Join fewer channels."
-            )
+    if more is None:
+        _check_gap(B_out, lines, load, found, forces, Z)
     motions = load[:, rows] @ inverse
     left_of = np.eye(len(outputs))[rows] - motions @ B_out
     right_of = np.eye(len(inputs))[:, columns] - B_in.T @ forces[:, :, columns]
     error = variance_of(size_of_error, parts.correlation, left_of, right_of)
     return np.moveaxis(found, 0, 2)[np.ix_(rows, columns)], error
+
+
+def _check_gap(
+    B_out: FloatArray, lines: Any, load: Any, found: Any, forces: Any, Z: ComplexArray
+) -> None:
+    """Refuse joints that stay open: what opens is what springs and dampers give way."""
+    left = np.abs(B_out @ found - Z.T[:, :, None] * forces)
+    most = np.abs(B_out) @ (np.abs(lines) + np.abs(load) @ np.abs(forces))
+    if not np.all(left <= _GAP * most):
+        raise CertificateError(
+            f"the coupled responses leave a gap of {float((left / most).max()):.2g} in a joint "
+            f"(limit {_GAP:g}): the interface is too badly conditioned. Join fewer channels."
+        )
 
 
 def _shared_rows(Y: MeasuredParts, known: Mapping[str, Frf]) -> tuple[FloatArray, FloatArray]:
