@@ -32,7 +32,6 @@ from .filter_model import FEW_DIGITS, FilterModel, Sight, Steady, innovation_roo
 from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother
 from .passage import (
     SETTLED,
-    KnownParameters,
     Moment,
     Start,
     Walk,
@@ -431,18 +430,16 @@ def _smooth_transient(
         passage.moments[k].T if k in passage.moments else sight.part(slice(k, k + 1)).c[0] @ onward
         for k in ks.tolist()
     ])  # fmt: skip
-    founds = [_last_found(passage, min(k + lag, N - 1)) for k in ks.tolist()]
     count = max(one.shown.shape[1] for one in listed)
     shown = np.array([
         one.shown if one.shown.shape[1] else np.zeros((one.shown.shape[0], count)) for one in listed
     ])  # fmt: skip
     seen = np.zeros((ks.size, w.shape[1], count))
-    for i, k in enumerate(ks.tolist()):
-        moment = passage.moments.get(k)
-        if moment is not None:
-            hat[k], variance[k] = moment.hat, moment.variance
-            if moment.found is not None:
-                seen[i] = moment.seen
+    known = [(i, k, passage.moments[k]) for i, k in enumerate(ks.tolist()) if k in passage.moments]
+    for i, k, moment in known:
+        hat[k], variance[k] = moment.hat, moment.variance
+        if moment.found is not None:
+            seen[i] = moment.seen
     for age in range(1, lag + 1):
         inside = ks + age < N
         here, at = ks[inside], (ks + age)[inside] - span.start
@@ -452,16 +449,10 @@ def _smooth_transient(
         variance[here] -= np.sum(white**2, axis=2)
         seen[inside] -= white @ shown[at]
         w[inside] = w[inside] @ model.A.T - rows @ K[at].transpose(0, 2, 1)
-    for i, k in enumerate(ks.tolist()):
-        moment = passage.moments.get(k)
-        if moment is not None and moment.found is not None:
-            found = founds[i]
+    for i, k, moment in known:
+        if moment.found is not None:
+            later = passage.moments.get(min(k + lag, N - 1))
+            found = passage.found if later is None or later.found is None else later.found
             assert found is not None  # noqa: S101
             hat[k] += seen[i] @ found.value
             variance[k] += found.added(seen[i])
-
-
-def _last_found(passage: Walk, k: int) -> KnownParameters | None:
-    """Return what is known of delta at a sample."""
-    moment = passage.moments.get(k)
-    return passage.found if moment is None or moment.found is None else moment.found

@@ -463,10 +463,8 @@ def estimate_along(
 
     Raises
     ------
-    LabelError
-        When a sensor, command or position is unknown.
-    ModelError, ShapeError
-        As `filters_along`; when records differ in length.
+    LabelError, ModelError, ShapeError
+        As `filters_along`; when a record is missing or has another length.
 
     Examples
     --------

@@ -439,9 +439,7 @@ def scan(
         At constant velocity before the exposure.
     start : float [m]
         Position before the scan. The exposure begins later: see ``at(exposures)``.
-    rest : float [s]
-        Time at rest before the scan begins.
-    rate : float, optional [Hz]
+    rest, rate
         As for `setpoint`.
 
     Returns
