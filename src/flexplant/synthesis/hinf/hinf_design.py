@@ -189,8 +189,6 @@ class Evened(NamedTuple):
 
     channels: tuple[ModeChannel, ...]
     first: float
-    #: what `Riccati` finds with them, where that is known
-    found: SolvedController | None = None
 
 
 def tolerant(
@@ -202,7 +200,7 @@ def tolerant(
 ) -> Controller:
     """Return the verified controller of a plant with channels for its modes."""
     channels = given.channels
-    answer = _design_one(with_mode_channels(plant, channels), method, progress, given.found)
+    answer = _design_one(with_mode_channels(plant, channels), method, progress)
     scales = {one.mode: one.D for one in channels}
     stated = [one.replace(D=scales[one.mode]) for one in mode_channels(plant, uncertain)]
     share = tolerated(stated, with_mode_channels(plant, stated), answer.system)
@@ -229,21 +227,12 @@ def evened(
     # only the scales hang on it: where it fails, the design itself says all
     with attempted("evening out the scales of modes"):
         opened = with_mode_channels(plant, channels)
-        loop, found = _solved(opened, method or Riccati(progress=progress))
+        loop, found = solved(opened, method or Riccati(progress=progress))
         channels, first = rebalanced(channels, opened, loop), found.gamma
     return Evened(channels, first)
 
 
-def tolerant_system(
-    plant: StandardPlant, uncertain: UncertainPlant[Any], damped_below: float
-) -> tuple[StateSpace, Evened]:
-    """Return the controller that `tolerant` verifies, by itself, and what led to it."""
-    given = evened(plant, uncertain, progress=False, damped_below=damped_below)
-    system, found = _solved(with_mode_channels(plant, given.channels), Riccati(progress=False))
-    return system, given._replace(found=found)
-
-
-def _solved(plant: StandardPlant, method: SynthesisMethod) -> tuple[StateSpace, SolvedController]:
+def solved(plant: StandardPlant, method: SynthesisMethod) -> tuple[StateSpace, SolvedController]:
     """Return the controller that a method finds, not verified, and what it says of it."""
     problem = prepared(plant.system, plant.u, plant.y)
     found = method.solve(problem)
@@ -251,23 +240,20 @@ def _solved(plant: StandardPlant, method: SynthesisMethod) -> tuple[StateSpace, 
 
 
 def _design_one(
-    plant: StandardPlant,
-    method: SynthesisMethod | None,
-    progress: bool | None,
-    known: SolvedController | None = None,
+    plant: StandardPlant, method: SynthesisMethod | None, progress: bool | None
 ) -> Controller:
-    """Return the verified controller of a plant, where `known` from what `Riccati` finds."""
+    """Return the verified controller of a plant."""
     problem = prepared(plant.system, plant.u, plant.y)
     try:
         require_reach(problem)
         if plant.is_assembled:  # whatever a method makes of it: this motion would drift
             require_shown(problem)
         if method is None:
-            answer = best_answer(plant, problem, progress, known)
+            answer = best_answer(plant, problem, progress)
         else:
             if progress is not None and isinstance(method, (Riccati, Lmi)):
                 method = method.replace(progress=progress)
-            answer = _certified_answer(plant, problem, method, known or method.solve(problem))
+            answer = _certified_answer(plant, problem, method, method.solve(problem))
             lower = max(answer.lower, pointwise_bound(problem))
             answer = answer._replace(lower=raised_bound(problem, answer.gamma, lower))
         _require_known(plant, problem, answer)
@@ -295,17 +281,7 @@ def _require_known(plant: StandardPlant, problem: Prepared, answer: Answer) -> N
             f"a controller with gamma {answer.gamma:.4g} was found, the lower bound is "
             f"{answer.lower:.4g}, and both hang on rounding."
         )
-    change = _moved_by_rounding(plant.system, answer)
-    if change > _SENSITIVE:
-        raise SolverError(
-            f"a controller with gamma {answer.gamma:.4g} was found, but one rounding of each entry "
-            f"of A, B and C changes it by {100 * change:.2g} %."
-        )
-
-
-def _moved_by_rounding(P: StateSpace, answer: Answer) -> float:
-    """Return by how much the loop's norm changes, relative, with the last digits of the plant."""
-    rng, change = np.random.default_rng(0), 0.0
+    P, rng, change = plant.system, np.random.default_rng(0), 0.0
     for _ in range(_DRAWS):
         moved = {
             name: part * (1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], size=part.shape))
@@ -313,7 +289,11 @@ def _moved_by_rounding(P: StateSpace, answer: Answer) -> float:
         }
         gain = hinf_norm(lft(P.replace(**moved, blocks=None), answer.controller.system))
         change = max(change, abs(gain / answer.gamma - 1.0) if answer.gamma else 0.0)
-    return change
+    if change > _SENSITIVE:
+        raise SolverError(
+            f"a controller with gamma {answer.gamma:.4g} was found, but one rounding of each entry "
+            f"of A, B and C changes it by {100 * change:.2g} %."
+        )
 
 
 def _blamed(problem: Prepared, error: FlexplantError) -> FlexplantError:
@@ -347,16 +327,8 @@ class Answer(NamedTuple):
         return self.gamma <= _CLOSE * self.lower
 
 
-def best_answer(
-    plant: StandardPlant,
-    problem: Prepared,
-    progress: bool | None,
-    known: SolvedController | None = None,
-) -> Answer:
-    """Return the answer of `Riccati`, or where it is not close to its bound the better of two.
-
-    `known`: what the former is known to find.
-    """
+def best_answer(plant: StandardPlant, problem: Prepared, progress: bool | None) -> Answer:
+    """Return the answer of `Riccati`, or where it is not close to its bound the better of two."""
     answers: list[Answer] = []
     #: answers whose loop may be stable with a larger norm than the method claims
     broken: list[tuple[SynthesisMethod, SolvedController]] = []
@@ -365,9 +337,9 @@ def best_answer(
     lower = pointwise_bound(problem)
     for name, regularised in (("Riccati()", None), ("Riccati(regularised=True)", True)):
         method = Riccati(regularised=regularised, progress=progress)
-        tried[name], found, known = np.inf, known, None
+        tried[name], found = np.inf, None
         try:
-            found = found or method.solve(problem)
+            found = method.solve(problem)
             one = _certified_answer(plant, problem, method, found)
         except FlexplantError as error:
             if found is None and isinstance(error, InfeasibleError) and not answers:

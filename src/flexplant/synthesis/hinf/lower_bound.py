@@ -85,10 +85,8 @@ def _bound_at_zeros(
     found = 0.0
     for s in zeros:
         pencil = np.block([[A - s * np.eye(n), B2], [C, D12]])
-        columns = np.linalg.norm(pencil, axis=0)
-        pencil = pencil / np.where(columns > 0, columns, 1.0)
-        rows = np.linalg.norm(pencil, axis=1)
-        rows = np.where(rows > 0, rows, 1.0)
+        pencil = pencil / divisor(np.linalg.norm(pencil, axis=0))
+        rows = divisor(np.linalg.norm(pencil, axis=1))
         left, values, _ = np.linalg.svd(pencil / rows[:, None])
         rank = int(np.count_nonzero(values > _LOST))
         null = (left[:, rank:] / rows[:, None]).conj().T

@@ -126,7 +126,9 @@ def mode_channels(
     w, u = np.array(forces).T
     low = [one.theta / (dt or 1.0) < 2.0 * np.pi * damped_below for one in found]
     found = [
-        _damped(one) if below and force > _PUSHED * u.max() else one
+        one.replace(v=one.v * max(_DAMPED / one.share, 1.0), c=0.0)
+        if below and force > _PUSHED * u.max()
+        else one
         for one, below, force in zip(found, low, u, strict=True)
     ]
     if not np.any(w):
@@ -142,11 +144,6 @@ def mode_channels(
         for one, force, some in zip(found, size, moved, strict=True)
         if some
     )
-
-
-def _damped(one: ModeChannel) -> ModeChannel:
-    """Return a channel of a complex delta of 1 % or more."""
-    return one.replace(v=one.v * max(_DAMPED / one.share, 1.0), c=0.0)
 
 
 def _moved_by_force(pair: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:

@@ -125,14 +125,10 @@ def shape_loop(
 
     Raises
     ------
-    AssumptionError
-        When an undamped or unstable mode is not reached or seen, or hidden by the shaping.
+    AssumptionError, CertificateError, ModelError, ShapeError, LabelError
+        As for `design_ncf`; names too.
     SolverError
         When no gain brings the crossover to the bandwidth.
-    CertificateError
-        When the closed loop misses the norm that was claimed.
-    ModelError, ShapeError, LabelError
-        When plant, transformations, model and names do not go together.
 
     Warns
     -----

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -28,8 +28,9 @@ from ...plant.larger_plant import damped_less, draws_with_left_out
 from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import Controller, with_left_out
-from .hinf_design import evened, tolerant, tolerant_system
+from .hinf_design import Evened, evened, solved, tolerant
 from .hinf_riccati import Riccati
+from .mode_channels import with_mode_channels
 
 #: |S| crosses 1 at about two thirds of the bandwidth of these weights, which bound the efforts
 _CROSSES = 2.0 / 3.0
@@ -198,18 +199,17 @@ class _StageTask:
     ) -> _StageTry | None:
         """Return a controller, from the other methods where the first finds none."""
         known = self.uncertain
+        given = evened(weighted, known, progress=False, damped_below=damped_below)
         with attempted(
             f"one Riccati method for {bandwidth:.4g} Hz",
             (SolverError, InfeasibleError, CertificateError),
         ):
-            system, given = tolerant_system(weighted, known, damped_below)
-            return _StageTry(
-                bandwidth, system, partial(tolerant, weighted, given, known, Riccati())
-            )
+            opened = with_mode_channels(weighted, given.channels)
+            system, _ = solved(opened, Riccati(progress=False))
+            return _StageTry(bandwidth, weighted, given, system)
         try:
-            given = evened(weighted, known, damped_below=damped_below)
             found = tolerant(weighted, given, known)
-            return _StageTry(bandwidth, found.system, lambda: found)
+            return _StageTry(bandwidth, weighted, given, found.system, found)
         except (AssumptionError, ModelError):
             raise
         except FlexplantError as error:
@@ -295,10 +295,18 @@ class _StageTask:
                 "on machines drawn. Measure their poles, lower margin=, or move the actuators."
                 + (f" ({causes})" if causes else "")
             )
-        found = self.best.verified()
+        best, found, drawn = self.best, self.best.found, self.best.drawn
+        if found is None:
+            try:
+                found = tolerant(best.weighted, best.given, self.uncertain, Riccati())
+            except CertificateError:  # rounding: what takes its place must hold as well
+                found = tolerant(best.weighted, best.given, self.uncertain)
+                margin, drawn = self._judged(found.system)
+                if margin < self.margin or drawn < _KEPT * self.margin:
+                    raise
         certificate = dict(found.certificate or {}) | {
-            f"least modulus margin of {_DRAWS} machines drawn": self.best.drawn,
-            "weights for Hz": self.best.bandwidth,
+            f"least modulus margin of {_DRAWS} machines drawn": drawn,
+            "weights for Hz": best.bandwidth,
         }
         return found.replace(
             system=self._block(found.system),
@@ -313,8 +321,11 @@ class _StageTry(NamedTuple):
     """The controller for the weights of a bandwidth [Hz], and the machines' least margin."""
 
     bandwidth: float
+    weighted: StandardPlant
+    given: Evened
     system: StateSpace
-    verified: Callable[[], Controller]
+    #: what was verified of it, where other methods than `Riccati` found it
+    found: Controller | None = None
     drawn: float = 0.0
 
 

@@ -24,7 +24,7 @@ from ..hinf.mode_channels import mode_channels, tolerated, with_mode_channels
 from .lower import Destabilising, destabilising, power_iteration, smallest_with_block
 from .mu import INTERVALS, Cover, Covered, sought
 from .uncertain_loop import UncertainLoop, uncertain_loop
-from .uncertainty_blocks import Perturbation, block_places, matrix_of
+from .uncertainty_blocks import Perturbation, block_places, matrix_of, perturbed
 
 #: mu below this is not resolved
 _RESOLVED = 0.05
@@ -373,10 +373,8 @@ def worst_case_gain(
         When the nominal loop is not stable, or machines of the uncertainty may be unstable.
     CertificateError
         When the machine found has a larger gain than was proven possible.
-    ModelError, LabelError
-        When `uncertain` is no uncertain plant, or channels are missing or unknown.
-    SolverError
-        When intervals do not cover the frequency axis.
+    ModelError, LabelError, SolverError
+        As for `robust_stability`; where channels are missing or unknown.
 
     References
     ----------
@@ -495,9 +493,5 @@ def _corner_gain(
 
 def _perturbed_gain(gains: ComplexArray, where: list[Any], one: Perturbation) -> float:
     """Return the largest gain over a band of the loop with a perturbation."""
-    performance = where[-1]
-    delta = matrix_of(one, where[:-1])
-    w, z = performance.w.start, performance.z.start
-    inner = np.eye(z) - gains[:, :z, :w] @ delta
-    through = gains[:, z:, :w] @ delta @ np.linalg.solve(inner, gains[:, :z, w:])
-    return float(np.linalg.norm(gains[:, z:, w:] + through, 2, axis=(1, 2)).max())
+    closed = perturbed(gains, matrix_of(one, where[:-1]))
+    return float(np.linalg.norm(closed, 2, axis=(1, 2)).max())

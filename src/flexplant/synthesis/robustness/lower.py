@@ -20,6 +20,7 @@ from .uncertainty_blocks import (
     RepeatedScalar,
     block_places,
     matrix_of,
+    perturbed,
     realised_delta,
 )
 
@@ -201,17 +202,11 @@ def smallest_with_block(
     With the reals closed at t q, the block needs ``t sigma_max(F(M, t q)) = 1``: its own worst is
     known. The reals are moved one after the other to an end of their interval.
     """
-    w, z = where[-1].w.start, where[-1].z.start
     repeats = [p.block.w for p in where[:-1]]
     sizes = least * np.geomspace(1.0, 100.0, 60)
 
     def closed(q: FloatArray, t: FloatArray) -> ComplexArray:
-        delta = np.repeat(q, repeats)
-        scaled = t[:, None, None] * (M[:z, :w] * delta)
-        inner = np.linalg.solve(
-            np.eye(z) - scaled, np.broadcast_to(M[:z, w:], (t.size, z, M.shape[1] - w))
-        )
-        return np.asarray(M[z:, w:] + (t[:, None, None] * (M[z:, :w] * delta)) @ inner)
+        return perturbed(M, t[:, None, None] * np.diag(np.repeat(q, repeats)))
 
     def first(q: FloatArray) -> float:
         over = sizes * np.linalg.norm(closed(q, sizes), 2, axis=(1, 2)) >= 1.0

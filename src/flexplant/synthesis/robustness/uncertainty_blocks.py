@@ -283,6 +283,14 @@ def matrix_of(found: Perturbation, where: Sequence[Place]) -> ComplexArray:
     return total
 
 
+def perturbed(M: ComplexArray, delta: ComplexArray | FloatArray) -> ComplexArray:
+    """Return responses (..., z, w) with a Delta on their first channels closed, of each as well."""
+    w, z = delta.shape[-2:]
+    through = M[..., z:, :w] @ delta
+    inner = np.eye(z) - M[..., :z, :w] @ delta
+    return np.asarray(M[..., z:, w:] + through @ np.linalg.solve(inner, M[..., :z, w:]))
+
+
 def realised_delta(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
     """Return a real, stable system Delta(s) of norm one with the perturbation at its frequency.
 
