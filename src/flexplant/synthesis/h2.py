@@ -37,9 +37,8 @@ def design_h2(
     """Return the controller ``u = K y`` of least H2 norm from w to z: the rms of z for white w.
 
     With X and Y of the Riccati equations of control and of estimation, F and L their gains and
-    ``R = D12' D12`` (sampled: ``+ B2' X B2``), the least norm is, continuous and sampled::
+    ``R = D12' D12`` (sampled: ``+ B2' X B2``), the least norm is, with L0 = 0 where continuous::
 
-        |Tzw|^2 = trace(B1' X B1) + trace(R F Y F')
         |Tzw|^2 = trace(B1' X B1 + D11' D11) + trace(R (F Y F' - L0 S L0')),
                   S = D21 D21' + C2 Y C2',  L0 = (F Y C2' + F0 D21') S^-1
 
@@ -51,7 +50,7 @@ def design_h2(
     plant : StandardPlant
         Continuous or sampled. A labelled StateSpace (ours or python-control's) serves too.
     u, y, larger
-        As for `design_hinf`.
+        As for `design_hinf`, with its warning of modes left out.
 
     Returns
     -------
@@ -65,19 +64,13 @@ def design_h2(
     AssumptionError
         When w reaches z at once in a continuous plant (infinite norm), or an undamped mode is
         not seen, reached, costly or excited.
-    InfeasibleError
-        When the norm falls to zero with what is added to a singular problem.
-    SolverError
-        When no stabilising controller was found.
+    InfeasibleError, SolverError
+        When the norm falls to zero with what is added to a singular problem, or no stabilising
+        controller was found.
     CertificateError
         When the closed loop is not stable or its norm is not that of the formula.
     ModelError
         When the plant is of another type, or `larger` does not go with it.
-
-    Warns
-    -----
-    FlexplantWarning
-        When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
 
     Notes
     -----

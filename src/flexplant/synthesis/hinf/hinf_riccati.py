@@ -226,10 +226,8 @@ def _open_size(problem: Prepared) -> float:
 def _direct_bound(problem: Prepared) -> float:
     """Return the bound that the feedthrough alone puts on gamma (Glover and Doyle, (i))."""
     D, m2, p2 = problem.D11, problem.B2.shape[1], problem.C2.shape[0]
-    rows, columns = D.shape[0] - m2, D.shape[1] - p2
-    parts = (D[:rows], D[:, :columns])
-    sizes = [float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts]
-    return max(sizes)
+    parts = (D[: D.shape[0] - m2], D[:, : D.shape[1] - p2])
+    return max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts)
 
 
 def _bound_at(problem: Prepared, omega: float) -> float:

@@ -53,10 +53,6 @@ class ModeChannel(Value):
     D: float
     share: float
 
-    def of_size(self, times: float) -> ModeChannel:
-        """Return the channel of a larger or smaller uncertainty."""
-        return self.replace(share=times * self.share, v=times * self.v, c=times * self.c)
-
     def parts(self, dt: float) -> tuple[FloatArray, FloatArray, float, float, float, float]:
         """Return the input column (2,), output row (2,), and (a, b, c, d) of the all-pass."""
         size = 1.0 / np.hypot(1.0, self.c)

@@ -65,8 +65,8 @@ def design_ncf(
         ``k (1 + w / (10 s))``, w = 2 pi bandwidth, with gain 1 at the bandwidth.
     back_off : float
         Relative distance from gamma_min, at which K_s is singular.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes left out, for the check of a StandardPlant as for `larger_plant`.
+    larger
+        Of a StandardPlant, as for `design_hinf`.
 
     Returns
     -------

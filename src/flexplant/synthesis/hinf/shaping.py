@@ -112,8 +112,8 @@ def shape_loop(
         all axes, ``cog:z:ref`` and so on, unless given.
     back_off : float
         Relative distance from the smallest gamma, with one degree of freedom.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes left out, for the check of a StandardPlant as for `larger_plant`.
+    larger
+        Of a StandardPlant, as for `design_hinf`.
 
     Returns
     -------

@@ -454,8 +454,7 @@ class Lmi(Value):
     max_states : int
         Larger problems are refused.
     progress : bool, optional
-        True shows a bar of these programs at once, False never; None after two seconds on a
-        terminal.
+        A bar of these programs, as for `Riccati`.
 
     Raises
     ------

@@ -68,8 +68,8 @@ def design_lmi(
         more where no controller keeps the bounds there: the certificate says how much.
     max_states : int
         Larger problems are refused: the time grows with the sixth power.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes that the plant left out, as for `larger_plant`.
+    larger
+        As for `design_hinf`, with its warning of modes left out.
 
     Returns
     -------
@@ -91,11 +91,6 @@ def design_lmi(
         When specifications do not fit the plant.
     SolverError
         When the solver stops early, or no controller satisfies what the LMIs claim.
-
-    Warns
-    -----
-    FlexplantWarning
-        When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
 
     References
     ----------

@@ -108,7 +108,7 @@ def design_mu(
     order : int
         Most states of D for each Delta and side.
     larger, progress
-        As for `design_hinf`.
+        As for `design_hinf`, with its warning of modes left out.
 
     Returns
     -------
@@ -122,11 +122,6 @@ def design_mu(
         When no step gives a controller; see `design_hinf`.
     ModelError, LabelError
         When `uncertain` is no uncertain plant, or channels are missing or unknown.
-
-    Warns
-    -----
-    FlexplantWarning
-        When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
 
     References
     ----------
@@ -187,13 +182,17 @@ def _filter_steps(
     for number in range(most + 1):
         try:
             K = _scaled_controller(plant, scales, method, nominal=not number)
-            step = _robust_step(uncertain, number, K, w, z)
+            loop = uncertain_loop(uncertain, [K], w=w, z=z)
+            # mu of robust performance, real Deltas real
+            blocks = [*loop.blocks, loop.performance]
+            found = Cover(loop.system, blocks, heights=loop.heights, accuracy=0.02).run()
         except (AssumptionError, SolverError):
             if number:
                 raise
             continue
-        yield step
-        scales = _scales_of(plant, step.after, order)
+        mu, freq = float(np.sqrt(found.level)), float(loop.freq(found.omega))
+        yield _DkStep(number, mu, K, loop, freq)
+        scales = _scales_of(plant, loop, order)
 
 
 #: filters on each output and on each input of the uncertainty's channels
@@ -222,16 +221,6 @@ def _scaled_controller(
     standard = StandardPlant.from_statespace(scaled, u=own.u, y=own.y)
     K = design_hinf(standard, method).system
     return tustin(K, 1.0 / plant.dt) if plant.dt else K
-
-
-def _robust_step(
-    uncertain: UncertainPlant[Any], number: int, K: StateSpace, w: Any, z: Any
-) -> _DkStep:
-    """Return mu of robust performance of a controller, real Deltas real."""
-    loop = uncertain_loop(uncertain, [K], w=w, z=z)
-    blocks = [*loop.blocks, loop.performance]
-    found = Cover(loop.system, blocks, heights=loop.heights, accuracy=0.02).run()
-    return _DkStep(number, float(np.sqrt(found.level)), K, loop, float(loop.freq(found.omega)))
 
 
 def _scales_of(plant: UncertainLoop, loop: UncertainLoop, order: int) -> _DFilters:
@@ -373,7 +362,9 @@ def _dk_iteration(
     method: SynthesisMethod | None,
 ) -> _DkStep:
     """Return the controller for Deltas and weights over a level, its mu, and channels for it."""
-    sized = [one.of_size(1.0 / level) for one in channels]
+    sized = [
+        one.replace(share=one.share / level, v=one.v / level, c=one.c / level) for one in channels
+    ]
     plant = with_mode_channels(weighted, sized)
     g = plant.system
     scale = np.ones(len(g.outputs))

@@ -188,9 +188,11 @@ def open_plant(
     inputs = [*g.inputs[:n_real], *(f"{name}:neglected:w" for name in ends), *into, *plant.u]
     outputs = [*g.outputs[:n_real], *z_names, *out, *plant.y]
     before, behind = _checked_weights(before, plant.dt), _checked_weights(behind, plant.dt)
-    system = _with_weights(
-        g.select(outputs, inputs), *(_bilinear_images(one, plant.dt) for one in (before, behind))
+    images = (
+        {n: bilinear(W, 1.0 / plant.dt) if plant.dt and W.n_states else W for n, W in side.items()}
+        for side in (before, behind)
     )
+    system = _with_weights(g.select(outputs, inputs), *images)
     return UncertainLoop(
         uncertain, channels, system, tuple(listed), part, tuple(z_names), before, behind
     )
@@ -247,14 +249,6 @@ def _checked_weights(given: Mapping[str, Any], dt: float) -> dict[str, StateSpac
             )
         found[name] = at_rate(one, name, dt)
     return found
-
-
-def _bilinear_images(weights: Mapping[str, StateSpace], dt: float) -> dict[str, StateSpace]:
-    """Return the bilinear images of sampled weights."""
-    return {
-        name: bilinear(one, 1.0 / dt) if dt and one.n_states else one
-        for name, one in weights.items()
-    }
 
 
 def _with_weights(
