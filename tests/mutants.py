@@ -24,7 +24,7 @@ SOURCE = TOP / "src" / "flexplant"
 
 #: module, right text, wrong text
 LINES = [
-    ("structure/units.py", "self.mass / self.time)", "self.mass)"),
+    ("structure/units.py", "self.mass / self.time, ", "self.mass, "),
     ("lti/lyapunov.py", "if not residual <= TOLERANCE:", "if False:"),
     ("lti/equations.py", "for term in (moved, bent, Q))) <= _OFF:", "for term in (Q,))) >= 0:"),
     ("lti/peaks.py", " + radius**3 * model.rest(centre, radius, 2)", ""),

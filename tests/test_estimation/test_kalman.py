@@ -21,7 +21,8 @@ from flexplant.errors import (
 from flexplant.estimation import Filter, Smoother, check_gain, design_kalman, kalman
 from flexplant.estimation.filter_model import noise_root
 from flexplant.lti import StateSpace
-from flexplant.lti.square_roots import difference_of, riccati_root
+from flexplant.lti.lyapunov import difference_of
+from flexplant.lti.riccati import riccati_root
 from flexplant.modes import solve_modes
 from flexplant.placement import score_sensors
 from flexplant.plant import (

@@ -7,7 +7,7 @@ import scipy.sparse as sp
 import oracles_structure as oracle
 from flexplant.errors import LabelError, ModelError, ShapeError, SolverError
 from flexplant.labels import DofSet
-from flexplant.modes import solve, solve_modes
+from flexplant.modes import solve, solve_modes, statics
 from flexplant.modes import sparse_modes as counted
 from flexplant.modes.solve import rigid_residual
 from flexplant.structure import FEModel, ModalDamping, Rayleigh, Spring
@@ -121,7 +121,8 @@ def test_complex_modes_fulfil_the_quadratic_problem(plate):
 @pytest.mark.parametrize("elements", [(12, 12), (14, 9)])
 def test_sparse_and_dense_routes_agree(elements, monkeypatch):
     model = make_plate(elements=elements)
-    monkeypatch.setattr(solve, "DENSE_LIMIT", 100)
+    for module in (solve, statics):
+        monkeypatch.setattr(module, "DENSE_LIMIT", 100)
     monkeypatch.setattr(solve, "_DENSE_MANY", 100)
     sparse = solve_modes(model, count=24)
     assert sparse.certificate["counted"] == sparse.certificate["found"] >= 24
@@ -130,7 +131,8 @@ def test_sparse_and_dense_routes_agree(elements, monkeypatch):
     assert few.n_modes == np.count_nonzero(sparse.freq <= 2000)
     again = solve_modes(model, count=24)
     assert np.array_equal(again.phi, sparse.phi)
-    monkeypatch.setattr(solve, "DENSE_LIMIT", 3000)
+    for module in (solve, statics):
+        monkeypatch.setattr(module, "DENSE_LIMIT", 3000)
     dense = solve_modes(model, count=24)
     np.testing.assert_allclose(sparse.omega[3:], dense.omega[3:], rtol=1e-8)
     assert np.array_equal(sparse.omega[:3], np.zeros(3))

@@ -16,13 +16,15 @@ def test_every_kind_of_entry_is_converted_by_its_own_factor():
     # a steel cantilever in N and mm: 12 E I / L^3, 6 E I / L^2, 4 E I / L; in SI by hand
     K = np.array([[12.0, 6000.0], [6000.0, 4.0e6]])  # N/mm, N/rad, N mm/rad
     np.testing.assert_allclose(
-        system.stiffness_matrix(K, DOFS), [[12e3, 6000.0], [6000.0, 4.0e3]], rtol=1e-15
+        system.matrices({"K": K}, DOFS)["K"], [[12e3, 6000.0], [6000.0, 4.0e3]], rtol=1e-15
     )
     M = np.array([[2e-3, 0.5], [0.5, 300.0]])  # t, t mm, t mm^2
-    np.testing.assert_allclose(system.mass_matrix(M, DOFS), [[2.0, 0.5], [0.5, 0.3]], rtol=1e-15)
+    np.testing.assert_allclose(
+        system.matrices({"M": M}, DOFS)["M"], [[2.0, 0.5], [0.5, 0.3]], rtol=1e-15
+    )
     D = np.array([[1.0, 1.0], [1.0, 1.0]])  # N s/mm, N s, N mm s
     np.testing.assert_allclose(
-        system.damping_matrix(D, DOFS), [[1e3, 1.0], [1.0, 1e-3]], rtol=1e-15
+        system.matrices({"D": D}, DOFS)["D"], [[1e3, 1.0], [1.0, 1e-3]], rtol=1e-15
     )
     np.testing.assert_array_equal(system.placed(DOFS).xyz, [[1.0, 0, 0], [1.0, 0, 0]])
 
@@ -50,21 +52,21 @@ def test_frequencies_change_with_the_unit_of_time_only():
     square = np.linalg.eigvals(np.linalg.solve(M, K)).real
     for names, time in ((("mm", "t", "s"), 1.0), (("in", "lb", "ms"), 1e-3)):
         system = units(*names)
-        mass = system.mass_matrix(M, DOFS)
-        stiff = np.linalg.solve(mass, system.stiffness_matrix(K, DOFS))
+        mass = system.matrices({"M": M}, DOFS)["M"]
+        stiff = np.linalg.solve(mass, system.matrices({"K": K}, DOFS)["K"])
         np.testing.assert_allclose(np.linalg.eigvals(stiff).real * time**2, square, rtol=1e-12)
-        decay = np.linalg.solve(mass, system.damping_matrix(K, DOFS))
+        decay = np.linalg.solve(mass, system.matrices({"D": K}, DOFS)["D"])
         np.testing.assert_allclose(np.linalg.eigvals(decay).real * time, square, rtol=1e-12)
 
 
 def test_a_sparse_matrix_stays_sparse_and_symmetric_to_the_bit():
     given = sp.random_array((2, 2), density=1.0, rng=np.random.default_rng(0))
     given = sp.csc_array(given + given.T)
-    scaled = units("in", "lb").stiffness_matrix(given, DOFS)
+    scaled = units("in", "lb").matrices({"K": given}, DOFS)["K"]
     assert sp.issparse(scaled)
     assert abs(scaled - scaled.T).max() == 0
     np.testing.assert_allclose(
-        scaled.toarray(), units("in", "lb").stiffness_matrix(given.toarray(), DOFS), rtol=1e-15
+        scaled.toarray(), units("in", "lb").matrices({"K": given.toarray()}, DOFS)["K"], rtol=1e-15
     )
 
 

@@ -11,8 +11,7 @@ import numpy as np
 from ..certificates import Certificate
 from ..checks import FloatArray, IntArray, Value, real_array
 from ..errors import AssumptionError, CertificateError, ModelError, ShapeError, SolverError
-from ..lti.lyapunov import solve_stein
-from ..lti.square_roots import difference_of, square_root
+from ..lti.lyapunov import difference_of, solve_stein, square_root
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..tolerances import SAME

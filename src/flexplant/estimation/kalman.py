@@ -9,8 +9,8 @@ import numpy as np
 
 from ..checks import FloatArray
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
-from ..lti.riccati import solve_dare
-from ..lti.square_roots import dual_variances, riccati_root
+from ..lti.lyapunov import dual_variances
+from ..lti.riccati import riccati_root, solve_dare
 from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant

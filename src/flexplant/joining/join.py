@@ -480,7 +480,7 @@ def compliances(
     if rows.size > _MOST or part.model.n_unstable:
         return np.full(len(axes), np.nan), np.full(len(axes), np.nan)
     model, loads = part.model, dense(part.T[rows].T)
-    C = loads.T @ static_response(model.M, model.K, model.rigid_body, loads)
+    C = loads.T @ static_response(model, loads)
     C = 0.5 * (C + C.T)
     W, A = W[list(axes)], A[:, list(axes)]
     mean = np.diag(W @ C @ W.T)

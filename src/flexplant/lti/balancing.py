@@ -117,10 +117,14 @@ def balanced(
     g = as_statespace(sys)
     if (order is None) == (tol is None):
         raise ModelError("balanced needs either order= (states) or tol= (relative error bound).")
+    weighted = input_weight is not None or output_weight is not None
     before, after = _as_weight(input_weight, g, "input"), _as_weight(output_weight, g, "output")
     split = split_stable(g)
     stable = split.stable
-    Lp, Lq = _controllability(stable, before), _observability(stable, after)
+    # series puts the states of its second system first
+    Lp = compressed(controllability_factor(series(before, stable))[: stable.n_states])
+    seen = observability_factor(series(stable, after))
+    Lq = compressed(seen[len(seen) - stable.n_states :])
     left, values, right = np.linalg.svd(Lq.T @ Lp)
     rank = int(np.sum(values > RANK * values[0])) if values.size and values[0] > 0 else 0
     n_kept = split.rest.n_states
@@ -133,8 +137,7 @@ def balanced(
             f"the weighted reduction to {counted(r, 'stable state')} is {problem.reason}: with "
             "weights on both sides stability is not guaranteed. Take another order or one weight."
         )
-    error, freq = _error_norm(stable, reduced, before, after)
-    weighted = before is not None or after is not None
+    error, freq = peak_gain(series(series(before, parallel(stable, -reduced)), after))
     bound = float("nan") if weighted else 2.0 * float(np.sum(values[r:]))
     return BalancedReduction(_rejoined(g, split, reduced), values, bound, error, freq, n_kept)
 
@@ -177,12 +180,10 @@ def _rejoined(g: StateSpace, split: Split, reduced: StateSpace) -> StateSpace:
     return both.replace(states=[*names, *kept], name=g.name)
 
 
-def _as_weight(weight: System | None, g: StateSpace, side: str) -> StateSpace | None:
-    """Return a weight with its channels named so that it fits, or None."""
-    if weight is None:
-        return None
-    w = as_statespace(weight)
+def _as_weight(weight: System | None, g: StateSpace, side: str) -> StateSpace:
+    """Return a weight, ones where there is none."""
     ours = g.inputs if side == "input" else g.outputs
+    w = as_statespace(np.eye(len(ours)) if weight is None else weight)
     theirs = w.outputs if side == "input" else w.inputs
     if len(theirs) != len(ours):
         raise ModelError(
@@ -194,28 +195,6 @@ def _as_weight(weight: System | None, g: StateSpace, side: str) -> StateSpace | 
     if (problem := obstacle(w)) is not None:
         raise ModelError(f"the {side} weight is {problem.reason}: weights must be stable.")
     return w.replace(dt=g.dt)
-
-
-def _controllability(g: StateSpace, before: StateSpace | None) -> FloatArray:
-    # series puts the states of g first
-    joined = g if before is None else series(before, g)
-    return compressed(controllability_factor(joined)[: g.n_states])
-
-
-def _observability(g: StateSpace, after: StateSpace | None) -> FloatArray:
-    joined = g if after is None else series(g, after)
-    return compressed(observability_factor(joined)[joined.n_states - g.n_states :])
-
-
-def _error_norm(
-    g: StateSpace, reduced: StateSpace, before: StateSpace | None, after: StateSpace | None
-) -> tuple[float, float]:
-    difference = parallel(g, reduced.replace(C=-reduced.C, D=-reduced.D))
-    if before is not None:
-        difference = series(before, difference)
-    if after is not None:
-        difference = series(difference, after)
-    return peak_gain(difference)
 
 
 def hankel_values(sys: System) -> FloatArray:
@@ -265,30 +244,17 @@ def hankel_values(sys: System) -> FloatArray:
 def hankel_norm(sys: System) -> float:
     """Return the Hankel norm: the largest gain from past inputs to future outputs.
 
+    The largest of the `hankel_values`; infinite when the system is not strictly stable.
+
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
         Continuous or sampled; the feedthrough does not matter.
 
-    Returns
-    -------
-    float
-        The largest Hankel singular value; infinite when the system is not strictly stable.
-
     Raises
     ------
     ModelError
         When `sys` is no system.
-
-    References
-    ----------
-    [Glover1984]_.
-
-    Examples
-    --------
-    >>> from flexplant.lti import StateSpace
-    >>> print(f"{hankel_norm(StateSpace([[-1.0]], [[2.0]], [[3.0]], [[0.0]])):.3f}")
-    3.000
     """
     g = as_statespace(sys)
     if obstacle(g) is not None:

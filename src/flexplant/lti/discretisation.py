@@ -13,7 +13,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, IntArray, between, positive
 from ..errors import ModelError, warn
 from ..tolerances import TINY, divisor
-from .joining import Matrices
+from .joining import bilinear_matrices, trapezoidal
 from .lyapunov import compressed
 from .statespace import StateSpace, System, as_statespace
 
@@ -311,16 +311,6 @@ def _has_pole_at(place: float, A: FloatArray) -> bool:
     return bool(np.min(distance, initial=np.inf) <= _SAME * abs(place))
 
 
-def trapezoidal(matrices: Matrices, a: float) -> Matrices:
-    """Return A, B, C, D with ``s = a (z - 1) / (z + 1)``; no pole lies at a."""
-    A, B, C, D = matrices
-    inverse = np.linalg.inv(a * np.eye(len(A)) - A)
-    # x is replaced by the trapezoidal state, scaled so that B and C keep their sizes
-    root = np.sqrt(2.0 * a)
-    plus = a * np.eye(len(A)) + A
-    return plus @ inverse, root * inverse @ B, root * C @ inverse, D + C @ inverse @ B
-
-
 def image_freq(omega: Any, dt: float) -> Any:
     """Return the frequencies [Hz] that those of the bilinear image [rad/s] stand for."""
     return np.arctan(0.5 * dt * omega) / (np.pi * dt) if dt else omega / (2.0 * np.pi)
@@ -335,14 +325,6 @@ def bilinear(sys: System, rate: float) -> StateSpace:
         raise ModelError(f"{g!r} has a pole at z = -1, which the bilinear map sends to infinity.")
     A, B, C, D = bilinear_matrices((g.A, g.B, g.C, g.D), a)
     return g.replace(A=A, B=B, C=C, D=D, dt=0.0, blocks=None)
-
-
-def bilinear_matrices(matrices: Matrices, a: float) -> Matrices:
-    """Return A, B, C, D with ``z = (a + s) / (a - s)``; no pole lies at -1."""
-    A, B, C, D = matrices
-    eye, root = np.eye(len(A)), np.sqrt(2.0 * a)
-    inverse = np.linalg.inv(eye + A)
-    return a * inverse @ (A - eye), root * inverse @ B, root * C @ inverse, D - C @ inverse @ B
 
 
 #: times half the rate: where even the lowest mode lies above this, the rate is in another unit

@@ -9,9 +9,6 @@ from ..checks import ComplexArray, FloatArray, real_array
 from ..errors import ModelError, SolverError
 from ..tolerances import SPLIT, divisor
 
-#: size of B and C beside A: enough to hold the states of a chain together
-BORDER = 1.0
-
 
 def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     """Return d (n,), powers of two, for states ``x = d x_scaled``: ``A d / d[:, None]`` is even.
@@ -21,8 +18,8 @@ def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     got units of 1e26 beside 1e-34), which costs B and C all their digits.
     """
     drive, sight = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
-    # borders whose size beside the balanced A is moderate, whatever the units of A, inputs, outputs
-    size = BORDER * (float(np.linalg.norm(balanced_matrix(A))) or 1.0)
+    # borders as large as the balanced A, whatever the units of A, inputs, outputs
+    size = float(np.linalg.norm(balanced_matrix(A))) or 1.0
     return bordered_scale(
         A,
         drive * (size / (float(np.linalg.norm(drive)) or 1.0)),

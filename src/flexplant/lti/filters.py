@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import between, positive, real_array, whole
+from ..checks import between, number, positive, whole
 from ..errors import ModelError
 from ..tolerances import SAME
 from .interconnection import series
@@ -75,12 +75,9 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     matched at one frequency. Notches keep their frequency and depth exactly, which Tustin only
     does at one.
 
-    Of one input and one output alone, as in MATLAB's c2d: the zeros of several channels are
-    properties of all of them together (with their directions), and no state space with mapped
-    poles and mapped transmission zeros keeps the gains of the single entries; entry by entry, the
-    poles would be there once for each entry. Sampling the residues of a modal form is impulse
-    invariance, another method, which aliases. A filter with a section for each channel is sampled
-    section by section: ``append(*(matched(f, rate) for f in sections))``.
+    Of one input and one output alone, as in MATLAB's c2d: zeros of several channels belong to all
+    of them together. A filter with a section for each channel is sampled section by section:
+    ``append(*(matched(f, rate) for f in sections))``.
 
     Parameters
     ----------
@@ -173,10 +170,6 @@ def second_order(b2: float, b1: float, b0: float, omega: float, zeta: float) -> 
     )
 
 
-def _checked_gain(gain: float) -> float:
-    return float(real_array(gain, "gain", ()))
-
-
 def lowpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     """Return a low-pass filter, Butterworth for order 2.
 
@@ -205,39 +198,25 @@ def lowpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     >>> round(abs(fx.lowpass(100.0)(2j * 3.141592653589793 * 100.0)), 4)
     0.7071
     """
-    return _butterworth(freq, order, 0.0, _checked_gain(gain))
+    return _butterworth(freq, order, 0.0, number(gain, "gain"))
 
 
 def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     """Return a high-pass filter, Butterworth for order 2.
 
+    ``gain (s/w) / (s/w + 1)`` or ``gain p^2 / (p^2 + sqrt(2) p + 1)``, p = s / w.
+
     Parameters
     ----------
-    freq : float [Hz]
-        Corner frequency.
-    order : {1, 2}
-        Slope at low frequencies.
-    gain : float
-        At high frequencies.
-
-    Returns
-    -------
-    StateSpace
-        ``gain (s/w) / (s/w + 1)`` or ``gain p^2 / (p^2 + sqrt(2) p + 1)``, p = s / w.
+    freq, order, gain
+        As for `lowpass`: order is the slope at low frequencies, gain that at high ones.
 
     Raises
     ------
     ModelError
-        When freq is not positive, gain not a number, or the order neither 1 nor 2.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> high = fx.lti.highpass(10.0)
-    >>> round(abs(high(2j * np.pi * 10.0)), 4), round(abs(high(0.0)), 4)
-    (0.7071, 0.0)
+        As for `lowpass`.
     """
-    return _butterworth(freq, order, _checked_gain(gain), 0.0)
+    return _butterworth(freq, order, number(gain, "gain"), 0.0)
 
 
 def _butterworth(freq: float, order: int, high: float, low: float) -> StateSpace:
@@ -311,7 +290,7 @@ def leadlag(zero: float, pole: float, *, gain: float = 1.0) -> StateSpace:
     >>> round(float(np.angle(lead(2j * np.pi * 30.0), deg=True)), 1)
     53.1
     """
-    ratio, gain = positive(pole, "pole") / positive(zero, "zero"), _checked_gain(gain)
+    ratio, gain = positive(pole, "pole") / positive(zero, "zero"), number(gain, "gain")
     return first_order(gain * ratio, gain, 2.0 * np.pi * pole)
 
 

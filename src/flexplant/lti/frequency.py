@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,22 +34,11 @@ from .frequency_sweep import sampled_freq as sampled_freq
 from .joining import chosen_pair, rows_of, short_list
 from .measured_lines import checked_correlation, checked_overlap, checked_window, line_correlation
 from .responses import responses
-from .statespace import System, as_statespace
+from .statespace import StateSpace, System, as_statespace
 
 #: multiplications below which a response takes no time
 _LONG = 1e9
 _NUMBERS = (int, float, complex, np.number)
-
-
-class Operand(NamedTuple):
-    """A response on the lines of another one, with what is known of its channels and errors."""
-
-    data: ComplexArray
-    variance: FloatArray | None
-    inputs: Sequence[str]
-    outputs: Sequence[str]
-    units: dict[str, str]
-    quantity: str | None
 
 
 def _reciprocal(frf: Any) -> Any:
@@ -69,19 +58,17 @@ def _reciprocal(frf: Any) -> Any:
     return _computed(frf, inverse, variance, inputs=frf.outputs, outputs=frf.inputs, quantity=None)
 
 
-def _operand(given: Any, frf: Any) -> Operand:
+def _operand(given: Any, frf: Any) -> Any:
     """Return a response, or that of a system, on the lines of an Frf."""
     if not isinstance(given, Frf):
-        g = as_statespace(given)
-        return Operand(responses(g, frf.freq), None, g.inputs, g.outputs, dict(g.units), None)
-    own: Any = given
-    if own.freq.shape != frf.freq.shape or not np.allclose(own.freq, frf.freq, rtol=SAME, atol=0.0):
+        return _of_system(as_statespace(given), frf.freq)
+    lines: FloatArray = given.freq
+    if lines.shape != frf.freq.shape or not np.allclose(lines, frf.freq, rtol=SAME, atol=0.0):
         raise ShapeError(
             f"responses are combined line by line, but one has {_line_range(frf)} and the other "
-            f"{_line_range(own)}. Compute or measure both at the same frequencies."
+            f"{_line_range(given)}. Compute or measure both at the same frequencies."
         )
-    parts = (own.data, own.variance, own.inputs, own.outputs, own.channel_units, own.quantity)
-    return Operand(*parts)
+    return given
 
 
 def _multiple(frf: Any, factor: complex) -> Any:
@@ -91,7 +78,7 @@ def _multiple(frf: Any, factor: complex) -> Any:
     return frf.replace(data=factor * frf.data, variance=variance)
 
 
-def _matrix_product(frf: Any, one: Operand, two: Operand) -> Any:
+def _matrix_product(one: Any, two: Any) -> Any:
     """Return the product of two matrices of responses, line by line."""
     if len(one.inputs) != len(two.outputs):
         raise ShapeError(
@@ -106,10 +93,10 @@ def _matrix_product(frf: Any, one: Operand, two: Operand) -> Any:
     variance = _optional_sum(
         product(one.variance, np.abs(two.data) ** 2), product(np.abs(one.data) ** 2, two.variance)
     )
-    units = {name: two.units[name] for name in two.inputs if name in two.units}
-    units |= {name: one.units[name] for name in one.outputs if name in one.units}
+    units = {name: unit for name, unit in two.channel_units.items() if name in two.inputs}
+    units |= {name: unit for name, unit in one.channel_units.items() if name in one.outputs}
     return _computed(
-        frf, product(one.data, two.data), variance,
+        one, product(one.data, two.data), variance,
         inputs=two.inputs, outputs=one.outputs, units=units, quantity=None,
     )  # fmt: skip
 
@@ -124,7 +111,7 @@ def _optional_sum(a: FloatArray | None, b: FloatArray | None) -> FloatArray | No
     return b if a is None else a if b is None else a + b
 
 
-def _sides(one: Operand) -> str:
+def _sides(one: Any) -> str:
     return f"{short_list(one.inputs)} -> {short_list(one.outputs)}"
 
 
@@ -279,11 +266,10 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         )
 
     def __repr__(self) -> str:
-        sides = f"{short_list(self.inputs)} -> {short_list(self.outputs)}"
         span = f"{self.freq[0]:.4g} .. {self.freq[-1]:.4g} Hz" if self.freq.size else ""
         units = {self.unit(*channel) for channel in self}
         unit = units.pop() if len(units) == 1 else None
-        sides += f" [{unit}]" if unit is not None else ""
+        sides = _sides(self) + (f" [{unit}]" if unit is not None else "")
         return f"<{type(self).__name__}: {sides}, {self.freq.size} frequencies {span}>"
 
     def __getitem__(self, key: tuple[str, str]) -> ComplexArray:
@@ -313,7 +299,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
 
     def __add__(self, other: Any) -> Any:
         """Return the sum of two responses between the same channels."""
-        one, two = _operand(self, self), _operand(other, self)
+        one, two = self, _operand(other, self)
         if (tuple(one.inputs), tuple(one.outputs)) != (tuple(two.inputs), tuple(two.outputs)):
             raise LabelError(
                 f"a sum needs the same channels, got {_sides(one)} and {_sides(two)}. Select or "
@@ -337,13 +323,13 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         """Return ``G1 G2``, the second one's outputs driving this one's inputs; or a multiple."""
         if isinstance(other, _NUMBERS):
             return _multiple(self, complex(other))
-        return _matrix_product(self, _operand(self, self), _operand(other, self))
+        return _matrix_product(self, _operand(other, self))
 
     def __rmul__(self, other: Any) -> Any:
         """Return a multiple, or the product of a system before this one."""
         if isinstance(other, _NUMBERS):
             return _multiple(self, complex(other))
-        return _matrix_product(self, _operand(other, self), _operand(self, self))
+        return _matrix_product(_operand(other, self), self)
 
     def __truediv__(self, other: Any) -> Any:
         """Return the responses divided by a number, or by a response of one channel."""
@@ -546,8 +532,13 @@ def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
     advice = "Fewer lines or states take less."
     with Progress(0, "frequency response", advice=advice) if long else nullcontext():
         expect(work)
-        data = responses(g, freq)
+        return _of_system(g, freq)
+
+
+def _of_system(g: StateSpace, freq: FloatArray) -> Frf:
+    """Return the response of a system at frequencies that are known to suit it."""
     # the checks of Frf hold already: its copy and its look at every entry cost twice the response
+    data = responses(g, freq)
     for array in (freq, data):
         array.flags.writeable = False
     fields = {"freq": freq, "data": data, "inputs": tuple(g.inputs), "outputs": tuple(g.outputs)}

@@ -66,6 +66,24 @@ def cascaded(first: Matrices, second: Matrices) -> Matrices:
     return A, np.vstack([B2 @ D1, B1]), np.hstack([C2, D2 @ C1]), D2 @ D1
 
 
+def trapezoidal(matrices: Matrices, a: float) -> Matrices:
+    """Return A, B, C, D with ``s = a (z - 1) / (z + 1)``; no pole lies at a."""
+    A, B, C, D = matrices
+    inverse = np.linalg.inv(a * np.eye(len(A)) - A)
+    # x is replaced by the trapezoidal state, scaled so that B and C keep their sizes
+    root = np.sqrt(2.0 * a)
+    plus = a * np.eye(len(A)) + A
+    return plus @ inverse, root * inverse @ B, root * C @ inverse, D + C @ inverse @ B
+
+
+def bilinear_matrices(matrices: Matrices, a: float) -> Matrices:
+    """Return A, B, C, D with ``z = (a + s) / (a - s)``; no pole lies at -1."""
+    A, B, C, D = matrices
+    eye, root = np.eye(len(A)), np.sqrt(2.0 * a)
+    inverse = np.linalg.inv(eye + A)
+    return a * inverse @ (A - eye), root * inverse @ B, root * C @ inverse, D - C @ inverse @ B
+
+
 def in_parallel(g1: Any, g2: Any) -> dict[str, Any]:
     """Return the fields of ``g1 + g2``: same channels, outputs added."""
     if g1.inputs != g2.inputs or g1.outputs != g2.outputs:
@@ -170,6 +188,19 @@ def is_block_diagonal(g: Any) -> bool:
         return False
     owner = np.repeat(np.arange(len(g.blocks)), g.blocks)
     return not np.any(g.A[owner[:, None] != owner[None, :]])
+
+
+def diagonal_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[FloatArray, IntArray]:
+    """Return 1 x 1 and 2 x 2 diagonal blocks as (b, 2, 2), and the states of each (b, 2; -1: none).
+
+    What a block of one state does not have is zero.
+    """
+    sizes = np.asarray(blocks)
+    starts = np.cumsum(sizes) - sizes
+    slots = np.stack([starts, np.where(sizes == 2, starts + 1, -1)], axis=1)
+    real = slots >= 0
+    pairs = A[slots[:, :, None], slots[:, None, :]] * (real[:, :, None] & real[:, None, :])
+    return pairs, slots
 
 
 def checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:

@@ -1,6 +1,8 @@
-"""Stein and Lyapunov equations, and the Gramians that follow from them."""
+"""Stein and Lyapunov equations, and the Gramians that follow from them, also by their factors."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.linalg as la
@@ -8,7 +10,9 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, real_array
 from ..errors import SolverError
 from ..parallel import one_thread
+from ..tolerances import divisor
 from .equations import (
+    DOUBLINGS,
     accumulated,
     even_scale,
     lyapunov,
@@ -20,7 +24,7 @@ from .equations import (
     symmetric,
     symmetrised,
 )
-from .joining import is_block_diagonal
+from .joining import bilinear_matrices, diagonal_blocks, is_block_diagonal
 from .statespace import StateSpace, System, as_statespace
 
 
@@ -159,30 +163,17 @@ def controllability_gramian(sys: System) -> FloatArray:
 def observability_gramian(sys: System) -> FloatArray:
     """Return Q (n, n): ``A' Q + Q A + C' C = 0``, or ``Q = A' Q A + C' C`` when sampled.
 
+    The dual of `controllability_gramian`.
+
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
         Strictly stable.
 
-    Returns
-    -------
-    (n, n) array
-        Symmetric.
-
     Raises
     ------
     SolverError
         When the system is not strictly stable.
-
-    References
-    ----------
-    [ZhouDoyleGlover1996]_, section 3.8.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.lti.observability_gramian(fx.lti.tf([1.0], [1.0, 1.0])).round(9)
-    array([[0.5]])
     """
     g = as_statespace(sys)
     return _gramian(g, g.A.T, g.C.T)
@@ -196,21 +187,17 @@ def _gramian(g: StateSpace, A: FloatArray, B: FloatArray) -> FloatArray:
             "unstable modes out, or close a loop first."
         )
     if is_block_diagonal(g):
-        return _modal_gramian(A, B, g.blocks, bool(g.dt))
+        return _modal_gramian(A, B, g.blocks or (), bool(g.dt))
     return solve_stein(A, B @ B.T) if g.dt else solve_lyapunov(A, B @ B.T)
 
 
 def _modal_gramian(
-    A: FloatArray, B: FloatArray, blocks: tuple[int, ...] | object, discrete: bool
+    A: FloatArray, B: FloatArray, blocks: Sequence[int], discrete: bool
 ) -> FloatArray:
     """Solve block by block: ``A_i X_ij + X_ij A_j' + B_i B_j' = 0``, all pairs (i, j) at once."""
     # 1 x 1 blocks are padded to 2 x 2 with a decoupled stable state that nothing drives
-    sizes = np.asarray(blocks)
-    starts = np.cumsum(sizes) - sizes
-    b = sizes.size
-    slots = np.stack([starts, np.where(sizes == 2, starts + 1, -1)], axis=1)  # (b, 2)
-    real = slots >= 0
-    pairs = A[slots[:, :, None], slots[:, None, :]] * (real[:, :, None] & real[:, None, :])
+    pairs, slots = diagonal_blocks(A, blocks)
+    real, b = slots >= 0, len(slots)
     pairs[~real[:, 1], 1, 1] = 0.0 if discrete else -1.0
     drive = (B[slots] * real[:, :, None]).reshape(2 * b, -1)
     W = drive @ drive.T
@@ -272,30 +259,30 @@ def _check(residual: float, equation: str) -> None:
 
 def controllability_factor(g: StateSpace) -> FloatArray:
     """Return L (n, n) with ``P = L L'``, the controllability Gramian of a stable system."""
-    d = state_scale(g.A, g.B, g.C)
-    return d[:, None] * _hammarling(*_bilinear(g.A * d / d[:, None], g.B / d[:, None], g.dt))
+    return _factor(g.A, g.B, g.C, g.dt)
 
 
 def observability_factor(g: StateSpace) -> FloatArray:
     """Return L (n, n) with ``Q = L L'``, the observability Gramian of a stable system."""
-    d = state_scale(g.A, g.B, g.C)
-    scaled = (g.A * d / d[:, None]).T
-    return _hammarling(*_bilinear(scaled, (g.C * d).T, g.dt)) / d[:, None]
+    return _factor(g.A.T, g.C.T, g.B.T, g.dt)
+
+
+def _factor(A: FloatArray, B: FloatArray, C: FloatArray, dt: float) -> FloatArray:
+    d = state_scale(A, B, C)
+    A, B = A * d / d[:, None], B / d[:, None]
+    if dt:  # ``P = A P A' + B B'`` is that of the bilinear image
+        A, B, *_ = bilinear_matrices((A, B, A[:0], B[:0]), 1.0)
+    return d[:, None] * _hammarling(A, B)
 
 
 def compressed(L: FloatArray) -> FloatArray:
     """Return a factor with the same ``L L'`` and no more columns than rows."""
-    if L.shape[1] <= L.shape[0]:
-        return L
+    return triangular(L) if L.shape[1] > L.shape[0] else L
+
+
+def triangular(L: FloatArray) -> FloatArray:
+    """Return a lower triangular T with ``T T' = L L'``: exact for each row, whatever its size."""
     return np.asarray(la.qr(L.T, mode="r")[0][: L.shape[0]].T)
-
-
-def _bilinear(A: FloatArray, B: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Map ``P = A P A' + B B'`` to a Lyapunov equation with the same P (bilinear map)."""
-    if not dt:
-        return A, B
-    inverse = np.linalg.inv(A + np.eye(A.shape[0]))
-    return inverse @ (A - np.eye(A.shape[0])), np.sqrt(2.0) * inverse @ B
 
 
 def _hammarling(A: FloatArray, B: FloatArray) -> FloatArray:
@@ -335,3 +322,49 @@ def _hammarling(A: FloatArray, B: FloatArray) -> FloatArray:
         R[:k] -= a * np.outer(u, v.conj())
     L = Z @ U
     return compressed(np.hstack([L.real, L.imag]))
+
+
+#: relative, of a standard deviation: the terms that follow add the square of this to a variance
+_LAST_ROOT = 1e-9
+
+
+def square_root(X: FloatArray) -> FloatArray:
+    """Return L with ``L L' = X``, which is positive semidefinite apart from rounding.
+
+    By its eigenvectors, each row scaled to unit size before.
+    """
+    size = divisor(np.sqrt(np.maximum(X.diagonal(), 0.0)))
+    values, vectors = np.linalg.eigh(symmetrised(X) / size / size[:, None])
+    return np.asarray(size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def stein_root(F: FloatArray, G: FloatArray) -> FloatArray:
+    """Return L with ``L L'`` the sum of ``F^k G G' F'^k``, k = 0, 1, ..., by doubling."""
+    L = G
+    for _ in range(DOUBLINGS):
+        more = F @ L
+        L = triangular(np.hstack([L, more]))
+        if not np.isfinite(L).all():
+            break
+        if np.all(np.linalg.norm(more, axis=1) <= _LAST_ROOT * np.linalg.norm(L, axis=1)):
+            return L
+        F = F @ F
+    raise SolverError("the sum of squares does not end: the filter is not strictly stable.")
+
+
+def dual_variances(F: FloatArray, G: FloatArray, rows: FloatArray, size: FloatArray) -> FloatArray:
+    """Return the variances of ``c x`` for rows c, ``x+ = F x + G e``, as sums of ``(c F^k G)^2``.
+
+    `size` (n,) are standard deviations of the states: their units.
+    """
+    size = divisor(size)
+    F, G = F * size / size[:, None], G / size[:, None]
+    return np.array([float(np.sum((stein_root(F.T, c[:, None]).T @ G) ** 2)) for c in rows * size])
+
+
+def difference_of(claim: FloatArray, truth: FloatArray) -> float:
+    """Return the largest relative difference of variances; without end where one is negative."""
+    if not np.all(claim >= 0) or not np.all(truth >= 0):
+        return np.inf
+    return float(np.max(np.abs(claim - truth) / divisor(truth), initial=0.0))

@@ -11,9 +11,9 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray
 from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
-from .discretisation import bilinear_matrices
 from .equations import balanced_matrix, even_scale, state_scale
 from .frequency_sweep import SOUGHT, highest, largest_gains, resonance_grid
+from .joining import bilinear_matrices
 from .lyapunov import controllability_gramian, observability_gramian
 from .peaks import Residues, proved_peak, residues
 from .responses import points, responder

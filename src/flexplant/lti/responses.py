@@ -13,7 +13,7 @@ from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..parallel import one_thread
 from .equations import scaled_schur, state_scale
-from .joining import pair_eigenvalues
+from .joining import diagonal_blocks, is_block_diagonal, pair_eigenvalues
 from .statespace import StateSpace
 
 #: so many complex numbers are less than 128 kB
@@ -126,12 +126,8 @@ def _solver(g: Part) -> tuple[Solver, int, int]:
 
 def _diagonal_blocks(g: StateSpace | Part) -> tuple[FloatArray, IntArray, FloatArray]:
     """Return the diagonal blocks as (b, 2, 2), the states of each (b, 2; -1 none), and the rest."""
-    sizes = np.asarray(g.blocks)
-    starts = np.cumsum(sizes) - sizes
-    slots = np.stack([starts, np.where(sizes == 2, starts + 1, -1)], axis=1)
-    real = slots >= 0
-    pairs = g.A[slots[:, :, None], slots[:, None, :]] * (real[:, :, None] & real[:, None, :])
-    coupling = g.A.copy()
+    pairs, slots = diagonal_blocks(g.A, g.blocks or ())
+    real, coupling = slots >= 0, g.A.copy()
     for i in (0, 1):
         for j in (0, 1):
             both = real[:, i] & real[:, j]
@@ -154,10 +150,9 @@ class ModalPairs(NamedTuple):
 
 def modal_pairs(g: StateSpace) -> ModalPairs | None:
     """Return the blocks of a block-diagonal A, None for another."""
-    if g.blocks is None or not set(g.blocks) <= {1, 2}:
+    if not is_block_diagonal(g):
         return None
-    pairs, slots, coupling = _diagonal_blocks(g)
-    return None if np.any(coupling) else _modal_pairs(g, pairs, slots)
+    return _modal_pairs(g, *diagonal_blocks(g.A, g.blocks or ()))
 
 
 def _modal_pairs(g: StateSpace | Part, pairs: FloatArray, slots: IntArray) -> ModalPairs:
@@ -265,19 +260,13 @@ def _reachable(A: FloatArray, B: FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray(now)
 
 
-def _closed_form(
-    g: Part, pairs: FloatArray, real: npt.NDArray[np.bool_]
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, ComplexArray, ComplexArray]:
-    a, b, c, d = (pairs[:, i, j].copy() for i in (0, 1) for j in (0, 1))
-    # a 1 x 1 block gets a partner that nothing drives, with a pole at no frequency of interest
-    d[~real[:, 1]] = 0.0 if g.dt else -1.0
-    return a, b, c, d, *pair_eigenvalues(a, b, c, d)
-
-
 def _substitution(g: Part, pairs: FloatArray, slots: IntArray, coupling: FloatArray) -> Solver:
     """Block upper triangular A: all blocks of one level (no coupling among them) at once."""
     real = slots >= 0
-    a, b, c, d, first, second = _closed_form(g, pairs, real)
+    a, b, c, d = (pairs[:, i, j].copy() for i in (0, 1) for j in (0, 1))
+    # a 1 x 1 block gets a partner that nothing drives, with a pole at no frequency of interest
+    d[~real[:, 1]] = 0.0 if g.dt else -1.0
+    first, second = pair_eigenvalues(a, b, c, d)
     n, m = g.B.shape
     owner = np.empty(n, dtype=np.int64)
     for i in (0, 1):

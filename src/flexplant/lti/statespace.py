@@ -233,10 +233,7 @@ class StateSpace(Value):
             return self.replace(D=self.D + self._direct(other))
         return StateSpace(**in_parallel(self, as_statespace(other)))
 
-    def __radd__(self, other: Any) -> StateSpace:
-        """Return `self + other`: ``1 + L``."""
-        found: StateSpace = self + other
-        return found
+    __radd__ = __add__
 
     def __rsub__(self, other: Any) -> StateSpace:
         """Return `-self + other`: ``1 - S``."""
@@ -474,11 +471,7 @@ def direct_gain(D: Any, B: Any, C: Any) -> FloatArray:
 
 
 def foreign_fields(sys: Any) -> dict[str, Any]:
-    """Return the fields of a `StateSpace` that a system of python-control or SciPy has.
-
-    A transfer function becomes sections in series (`tf_fields`), each channel of a matrix with
-    states of its own: `minimal` removes what they share.
-    """
+    """Return the fields of a `StateSpace` that a system of python-control or SciPy has."""
     dt = _sampling_time(sys)
     if all(hasattr(sys, part) for part in ("A", "B", "C", "D")):
         fields = {part: getattr(sys, part) for part in ("A", "B", "C", "D")}

@@ -288,9 +288,7 @@ def static_shapes(
                 return factor.solve(balanced)
             square = 2 * float(unstable_stiffness(model.K, model.body_motions)[0])
             return np.asarray(la.solve(dense(model.K) - square * dense(model.M), balanced))
-        if factor is None:
-            return static_response(model.M, model.K, model.rigid_body, forces)
-        return factor.static(forces)
+        return static_response(model, forces)
 
     found = static(loads)
     shapes = [found] if loads.shape[1] > _MANY else [found, static(np.asarray(model.M @ found))]

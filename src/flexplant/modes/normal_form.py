@@ -195,14 +195,12 @@ def modal(real: RealForm, *, lowest: int | None = None) -> NormalForm:
         shapes = np.repeat(real.phi[:, r:][:, ~swings], 2, axis=1)[:, order]
         poles = np.concatenate([zero, poles[:lowest]])
         return NormalForm(poles, real.phi[:, some], r, decaying, still[order], shapes)
-    found = complex_modes(omega, real.C[r:, r:], lowest=lowest)
-    return NormalForm(
-        np.concatenate([zero, found.poles]),
-        np.hstack([real.phi[:, :r], real.phi[:, r:] @ found.mix]),
-        r,
-        found.decaying,
-        found.overdamped,
-        real.phi[:, r:] @ found.overdamped_mix,
+    found = _complex_modes(omega, real.C[r:, r:], lowest=lowest)
+    return found.replace(
+        poles=np.concatenate([zero, found.poles]),
+        phi=np.hstack([real.phi[:, :r], real.phi[:, r:] @ found.phi]),
+        n_rigid=r,
+        overdamped_phi=real.phi[:, r:] @ found.overdamped_phi,
     )
 
 
@@ -297,16 +295,6 @@ _MIXED = 1e-2
 PLANT = "assemble_plant(model, ports) takes such damping as it is, in dense form."
 
 
-class ComplexModes(NamedTuple):
-    """Solutions of ``(lambda^2 + lambda C + Omega^2) x = 0``."""
-
-    poles: ComplexArray
-    mix: ComplexArray
-    decaying: FloatArray
-    overdamped: FloatArray
-    overdamped_mix: FloatArray
-
-
 def check_oscillating(oscillates: FloatArray | np.ndarray, omega: FloatArray) -> None:
     """Raise ModelError when one of some modes does not oscillate."""
     if not np.all(oscillates):
@@ -318,7 +306,7 @@ def check_oscillating(oscillates: FloatArray | np.ndarray, omega: FloatArray) ->
         )
 
 
-def complex_modes(omega: FloatArray, C: FloatArray, *, lowest: int | None) -> ComplexModes:
+def _complex_modes(omega: FloatArray, C: FloatArray, *, lowest: int | None) -> NormalForm:
     """Return the complex modes of ``p'' + C p' + Omega^2 p = 0``."""
     k, u = omega.size, int(np.count_nonzero(omega < 0))
     values, vectors = _eigen(omega, C, low=lowest is not None)
@@ -355,7 +343,7 @@ def complex_modes(omega: FloatArray, C: FloatArray, *, lowest: int | None) -> Co
     decaying, slow = poles[u : 2 * u].real, vectors[k:, still].real
     poles = np.concatenate([poles[:u], poles[2 * u :]])
     slow = slow / np.linalg.norm(slow, axis=0)
-    return ComplexModes(poles, mix, decaying, values[still].real, slow)
+    return NormalForm(poles, mix, 0, decaying, values[still].real, slow)
 
 
 def _kinds(values: ComplexArray) -> tuple[IntArray, IntArray, IntArray]:

@@ -25,6 +25,7 @@ from .normal_form import PROPORTIONAL, NormalForm, check_drag, normal_form
 from .sparse_modes import counted_modes
 from .statics import (
     attachment_vectors,
+    is_large,
     labels_of,
     modes_below,
     places,
@@ -135,11 +136,11 @@ def solve_modes(
         )
     names = labels_of(at, model.dofs)
     # complex modes of a large model are found in a basis of more undamped ones
-    perhaps = damping is None and model.D is not None and _is_large(model)
+    perhaps = damping is None and model.D is not None and is_large(model)
     more = wider(kept, top, model.n_dof) if perhaps and not is_rayleigh(model) else (kept, top)
     with Progress(None, STEPS, progress=progress, advice="Fewer modes (count=, below=) take less."):
         # one factor for the modes and for the attachment vectors, while it is held here
-        factored = stiffness_factor(model, factor) if at and _is_large(model) else None
+        factored = stiffness_factor(model, factor) if at and is_large(model) else None
         omega, phi, certificate = _undamped(model, *more, factor)
     orthonormality, residual, rounding = check_modes(model, omega, phi)
     certificate["orthonormality"] = orthonormality
@@ -258,7 +259,7 @@ def _undamped(
     rigid = model.rigid_body
     n, r = rigid.shape
     certificate: dict[str, float] = {}
-    if np.isfinite(top) and DENSE_LIMIT < n <= _DENSE_MANY and _is_large(model):
+    if np.isfinite(top) and DENSE_LIMIT < n <= _DENSE_MANY and is_large(model):
         # how many there are decides whether a dense solution is faster
         count = min(count, max(modes_below(model, top), r))
     small = n <= DENSE_LIMIT or (n <= _DENSE_MANY and _MANY * count > n)
@@ -282,10 +283,6 @@ def _undamped(
     for at in column_groups(omega.size):
         shapes[:, r + at.start : r + at.stop] = signed(phi[:, at])
     return np.concatenate([np.zeros(r), omega]), shapes, certificate
-
-
-def _is_large(model: FEModel) -> bool:
-    return model.n_dof > DENSE_LIMIT and sp.issparse(model.K) and sp.issparse(model.M)
 
 
 def _is_proportional(model: FEModel, omega: FloatArray, phi: FloatArray) -> bool:
@@ -315,7 +312,7 @@ def _complex_modes(
             "the model's D is not proportional: its modes are complex and take no attachment "
             "vectors. Pass damping=ModalDamping(...) in place of D, or leave out compliance_at."
         )
-    if _is_large(model):
+    if is_large(model):
         return damped_modes(model, phi, count, top, factor)
     form = normal_form(
         model.M,

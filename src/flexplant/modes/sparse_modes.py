@@ -62,19 +62,13 @@ _PARTS = (1.0, *[0.03] * 5)
 _JUDGED = 8
 
 
+@one_thread()
 def counted_modes(
     model: FEModel, count: int, top: float = np.inf, method: Pardiso | Cholmod | None = None
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     """Return the lowest elastic modes with omega^2 up to `top`, and what was counted."""
     # Lanczos finds them, a Sturm count in a gap above says how many; missing ones are sought
     # beside
-    with one_thread():
-        return _modes_counted(model, count, top, method)
-
-
-def _modes_counted(
-    model: FEModel, count: int, top: float, method: Pardiso | Cholmod | None
-) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     n, r = model.rigid_body.shape
     new = search_factor
     factor: StiffnessFactor | CountingFactor | None = None

@@ -13,9 +13,9 @@ import scipy.sparse as sp
 from ..checks import FloatArray, Matrix, short
 from ..errors import ModelError, SolverError, attempted, counted
 from ..labels import DofSet, Place
-from ..sparse.factor import DENSE_LIMIT, MultifrontalCholesky, dense, diagonal, same_pattern
+from ..sparse.factor import DENSE_LIMIT, MultifrontalFactor, dense, diagonal, same_pattern
 from ..sparse.lanczos import rounding_of
-from ..sparse.lowest import SignedFactor, multifrontal_inertia, signed_factor
+from ..sparse.lowest import multifrontal_inertia, signed_factor
 from ..sparse.ordering import Dissection, dissect
 from ..sparse.other_factors import Cholmod, CholmodCholesky, Pardiso, PardisoCholesky
 from ..structure import FEModel
@@ -57,8 +57,8 @@ class StiffnessFactor:
         shifted = _shift_matrix(self.K, self.M, self.sigma)
         self.dissection = dissection_of(model)
         try:
-            self._cholesky: MultifrontalCholesky | PardisoCholesky | CholmodCholesky = (
-                MultifrontalCholesky(shifted, self.dissection, single=single)
+            self._cholesky: MultifrontalFactor | PardisoCholesky | CholmodCholesky = (
+                MultifrontalFactor(shifted, self.dissection, single=single)
                 if method is None
                 else method.factored(shifted)
             )
@@ -131,7 +131,7 @@ class CountingFactor:
 
     single = True
 
-    def __init__(self, signed: SignedFactor, sigma: float) -> None:
+    def __init__(self, signed: MultifrontalFactor, sigma: float) -> None:
         self._signed, self.sigma, self.below = signed, sigma, signed.negative
 
     def solve(self, force: FloatArray) -> FloatArray:
@@ -158,10 +158,15 @@ def stiffness_factor(model: FEModel, method: Pardiso | Cholmod | None = None) ->
     return factor
 
 
+def is_large(model: Any) -> bool:
+    """Return whether a model is sparse, and factored as such."""
+    large: bool = model.M.shape[0] > DENSE_LIMIT
+    return large and sp.issparse(model.K) and sp.issparse(model.M)
+
+
 def held_factor(model: FEModel) -> StiffnessFactor | None:
     """Return the factor of a large sparse model, in use as long as it is held; else None."""
-    large = model.n_dof > DENSE_LIMIT and sp.issparse(model.K) and sp.issparse(model.M)
-    return stiffness_factor(model) if large else None
+    return stiffness_factor(model) if is_large(model) else None
 
 
 def search_factor(model: FEModel, method: Pardiso | Cholmod | None = None) -> StiffnessFactor:
@@ -248,12 +253,9 @@ def attachment_vectors(
     under it: inertia relief), less the part that the modes give; then made M-orthogonal to the
     modes, mass-normalised, and diagonal in K among each other.
     """
-    M, K, rigid = model.M, model.K, model.rigid_body
+    M, K = model.M, model.K
     loads = np.column_stack([model.dofs.row(place) for place in at])
-    if sp.issparse(K) and sp.issparse(M) and model.n_dof > DENSE_LIMIT:
-        response = stiffness_factor(model).static(loads)
-    else:
-        response = static_response(M, K, rigid, loads)
+    response = static_response(model, loads)
     whole = np.sum(loads * response, axis=0)
     for _ in range(2):
         response = response - phi @ (phi.T @ np.asarray(M @ response))
@@ -281,12 +283,16 @@ def attachment_vectors(
     return signed(vectors), np.sqrt(squares)
 
 
-def static_response(M: Matrix, K: Matrix, rigid: FloatArray, loads: FloatArray) -> FloatArray:
+def static_response(model: Any, loads: FloatArray) -> FloatArray:
     """Return the elastic static response (n, m) to loads, M-orthogonal to the rigid-body motions.
 
-    ``K u = f - M R R^T f``: the load less the inertia of the rigid-body acceleration it causes,
-    held at the r DOFs that distinguish rigid-body motions best; in balance these carry no force.
+    ``K u = f - M R R^T f``: the load less the inertia of the rigid-body acceleration it causes. Of
+    a large model by its factor; else held at the r DOFs that distinguish rigid-body motions best,
+    which in balance carry no force. A model is anything with M, K and rigid_body.
     """
+    if is_large(model):
+        return stiffness_factor(model).static(loads)
+    M, rigid = model.M, model.rigid_body
     balanced = loads - np.asarray(M @ (rigid @ (rigid.T @ loads)))
     n, r = rigid.shape
     held = np.zeros(n, dtype=bool)
@@ -295,26 +301,18 @@ def static_response(M: Matrix, K: Matrix, rigid: FloatArray, loads: FloatArray) 
         weighted = np.sqrt(diagonal(M))[:, None] * rigid
         held[la.qr(weighted.T, mode="economic", pivoting=True)[2][:r]] = True
     free = np.flatnonzero(~held)
+    stiffness = dense(model.K)[np.ix_(free, free)]
+    size = np.sqrt(np.diag(stiffness))[:, None]
+    try:
+        factor = la.cho_factor(stiffness / size / size.T)
+    except la.LinAlgError as error:
+        raise ModelError(
+            f"K is singular beyond the {counted(r, 'rigid-body motion')} of the geometry (a "
+            "mechanism, a DOF without stiffness, or wrong coordinates): there is no static "
+            "response."
+        ) from error
     response = np.zeros_like(balanced)
-    if sp.issparse(K) and n > DENSE_LIMIT:
-        sparse: Any = K
-        part_of_K = sparse[free][:, free]
-        solve = MultifrontalCholesky(part_of_K).solve
-        part = solve(balanced[free])
-        part = part + solve(balanced[free] - part_of_K @ part)
-    else:
-        stiffness = dense(K)[np.ix_(free, free)]
-        size = np.sqrt(np.diag(stiffness))[:, None]
-        try:
-            factor = la.cho_factor(stiffness / size / size.T)
-        except la.LinAlgError as error:
-            raise ModelError(
-                f"K is singular beyond the {counted(r, 'rigid-body motion')} of the geometry (a "
-                "mechanism, a DOF without stiffness, or wrong coordinates): there is no static "
-                "response."
-            ) from error
-        part = np.asarray(la.cho_solve(factor, balanced[free] / size) / size)
-    response[free] = part
+    response[free] = la.cho_solve(factor, balanced[free] / size) / size
     for _ in range(2):
         response = response - rigid @ (rigid.T @ np.asarray(M @ response))
     return np.asarray(response, dtype=np.float64)

@@ -15,9 +15,8 @@ from ..errors import CertificateError, SolverError
 from ..estimation import design_kalman
 from ..estimation.estimator_channels import sensors
 from ..lti.discretisation import held_exactly
-from ..lti.lyapunov import solve_stein
+from ..lti.lyapunov import solve_stein, square_root
 from ..lti.riccati import control_dare
-from ..lti.square_roots import square_root
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
 from ..synthesis import design_hinf

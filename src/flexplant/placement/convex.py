@@ -16,8 +16,8 @@ import scipy.linalg as la
 from ..checks import FloatArray, IntArray, Value
 from ..errors import SolverError, attempted
 from ..lti.equations import doubled, doubled_riccati, relative
-from ..lti.riccati import control_dare
-from ..lti.square_roots import riccati_root, square_root
+from ..lti.lyapunov import square_root
+from ..lti.riccati import control_dare, riccati_root
 from ..tolerances import SETTLED, TINY, divisor
 from .criterion import Scorer
 

@@ -291,7 +291,7 @@ def static_error(whole: FloatArray, reduced: Reduced, Br: FloatArray, Cr: FloatA
     """Return errors (p, q) of the elastic compliance `whole`, of the size of its channels."""
     q = Br.shape[1]
     watched = np.hstack([Br, Cr.T])
-    found = watched.T @ static_response(reduced.M, reduced.K, reduced.rigid_body, watched)
+    found = watched.T @ static_response(reduced, watched)
     size = np.sqrt(np.abs(np.diag(whole)))
     return np.asarray(np.abs(found - whole)[q:, :q] / np.outer(size[q:], size[:q]))
 

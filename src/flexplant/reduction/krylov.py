@@ -15,7 +15,7 @@ from ..checks import FloatArray, checked, real_array, whole
 from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..modes.modes import Modes
-from ..modes.statics import labels_of, places, static_response, stiffness_factor
+from ..modes.statics import held_factor, labels_of, places, static_response
 from ..sparse.factor import DENSE_LIMIT, dense, dynamic_lu
 from ..structure import FEModel
 from ..tolerances import RANK, TINY
@@ -114,10 +114,9 @@ def _real_moments(model: FEModel, B: FloatArray, omega: float, count: int, D: An
     M, K = model.M, model.K
     if omega > 0:
         solve: Any = _factorised(K - omega**2 * M, omega)
-    elif sp.issparse(K) and sp.issparse(M) and model.n_dof > DENSE_LIMIT:
-        solve = stiffness_factor(model).static
     else:
-        solve = partial(static_response, M, K, model.rigid_body)
+        held = held_factor(model)  # one for all moments
+        solve = partial(static_response, model) if held is None else held.static
     if D is not None:
         return np.asarray(_second_order(solve, D, M, B, count))
     block = _normed(model, solve(B))

@@ -18,7 +18,7 @@ from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..modes.statics import places
 from ..parallel import Progress
-from ..sparse.factor import DENSE_LIMIT, MultifrontalCholesky, dense, unit_diagonal
+from ..sparse.factor import DENSE_LIMIT, MultifrontalFactor, dense, unit_diagonal
 from ..structure import Damping, FEModel
 from ..structure.definite import elastic_modes, refuse_unstable
 from ..tolerances import RANK, TINY
@@ -41,7 +41,7 @@ class Solver:
         self._once: Callable[[FloatArray], Any]
         try:
             if sp.issparse(matrix) and matrix.shape[0] > DENSE_LIMIT:
-                factor = MultifrontalCholesky(matrix)
+                factor = MultifrontalFactor(matrix)
                 self._once = lambda loads: factor.solve(np.ascontiguousarray(loads))
                 return
             scaled, size = unit_diagonal(dense(matrix))

@@ -124,7 +124,7 @@ class ModalTruncation(ReductionMethod):
         B = np.column_stack([model.dofs.row(place) for place in places(self.inputs)])
         watched = places(self.outputs) or places(self.inputs)
         C = np.array([model.dofs.row(place) for place in watched])
-        flexible = static_response(model.M, model.K, model.rigid_body, np.hstack([B, C.T]))
+        flexible = static_response(model, np.hstack([B, C.T]))
         r, q = kept.n_rigid, B.shape[1]
         square = kept.omega[r:, None] ** 2
         left = np.sum(B * flexible[:, :q]) - np.sum(force[r:] ** 2 / square)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -164,7 +165,7 @@ def is_positive_definite(
         if n > _BOUND_LIMIT and lowest_eigenvalue_bound(shifted) > 0:
             return True
         try:
-            MultifrontalCholesky(shifted, dissect(shifted, nodes, xyz), keep=False)
+            MultifrontalFactor(shifted, dissect(shifted, nodes, xyz), keep=False)
         except SolverError:
             return False
         return True
@@ -219,8 +220,12 @@ _SLICE = 600
 _INVERTED = 128
 
 
-class MultifrontalCholesky:
-    """``A = L L^T`` of a sparse symmetric positive definite matrix [DuffReid1983]_."""
+class MultifrontalFactor:
+    """``A = L D L^T`` of a sparse symmetric matrix, D of +1 and -1 [DuffReid1983]_.
+
+    Cholesky (D = I) unless `signed`, for matrices that need not be definite: pivots are not moved
+    between fronts then, and what the factor leaves shows whether that was stable.
+    """
 
     def __init__(
         self,
@@ -229,102 +234,205 @@ class MultifrontalCholesky:
         *,
         keep: bool = True,
         single: bool = False,
+        signed: bool = False,
     ) -> None:
-        lower = sp.csc_array(matrix)
-        # in single precision the range of numbers is small
-        self._single = single
-        self._scale = float(np.abs(lower.data).max(initial=0.0)) if single else 1.0
-        if single:
-            lower = in_single(lower, self._scale)
-        potrf, trtri, self._trsm, syrk = _kernels(lower.dtype)
+        lower, self._scale = sp.csc_array(matrix), 0.0
+        if single:  # where the range of numbers is small
+            self._scale = float(np.abs(lower.data).max(initial=0.0)) or 1.0
+            lower = _in_single(lower, self._scale)
         self.dissection = dissect(lower) if dissection is None else dissection
-        self._blocks: list[tuple[FloatArray | None, FloatArray]] = []
+        self._blocks: list[tuple[Pivots | None, FloatArray]] = []
+        #: negative eigenvalues of ``L D L^T``
+        self.negative = 0
         with one_thread():
-            for front, pivots, below, rest in assembled_fronts(lower, self.dissection):
-                _, info = potrf(pivots, lower=1, overwrite_a=1, clean=0)
-                if info:
-                    raise SolverError(
-                        "a sparse Cholesky factorisation met a pivot that is not positive: the "
-                        "matrix is indefinite or singular. Look for a sign, or for DOFs without "
-                        "stiffness or mass."
-                    )
-                if front.rows.size:
-                    below = self._trsm(
-                        1.0, pivots, below, side=1, lower=1, trans_a=1, overwrite_b=1
-                    )
-                    syrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
+            for _, pivots, below in eliminated(lower, self.dissection, signed=signed):
+                self.negative += pivots.negative
                 if keep:
-                    self._blocks.append(_stored(pivots, below, trtri))
+                    self._blocks.append(_stored(pivots, below))
 
     @property
     def n_entries(self) -> int:
         """Stored entries of the factor."""
-        return sum(below.size + (0 if top is None else top.size) for top, below in self._blocks)
+        return sum(below.size + (p.size**2 if p else 0) for p, below in self._blocks)
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return ``A^-1 right`` for (n,) or (n, m) right-hand sides, blocked."""
-        order = self.dissection.order
+        """Return ``(L D L^T)^-1 right`` for (n,) or (n, m) right-hand sides, blocked."""
+        order, fronts = self.dissection.order, self.dissection.fronts
         # rows in C order: one right-hand side after the other in each, for BLAS 3 on the fronts
         x = np.ascontiguousarray(right.reshape(order.size, -1)[order], dtype=np.float64)
         scale = None
-        if self._single:
+        if self._scale:
             largest = np.abs(x).max(axis=0, initial=np.finfo(np.float64).tiny)
             x, scale = (x / largest).astype(np.float32), self._scale / largest
-        fronts = self.dissection.fronts
         with one_thread():
             for front, (pivots, below) in zip(fronts, self._blocks, strict=True):
-                first, last, rows = front.first, front.last, front.rows
-                part = x[first:last]
+                part = x[front.first : front.last]
                 if pivots is None:
                     moved = below @ part
-                    x[first:last] = moved[: last - first]
-                    if rows.size:
-                        x[rows] -= moved[last - first :]
-                    continue
-                self._trsm(1.0, pivots, part.T, side=1, lower=1, trans_a=1, overwrite_b=1)
-                if rows.size:
-                    x[rows] -= below @ part
+                    part[:] = moved[: len(part)]
+                    x[front.rows] -= moved[len(part) :]
+                else:
+                    part[:] = pivots.signed(pivots.after(part.T).T)
+                    x[front.rows] -= below @ part
             for front, (pivots, below) in zip(fronts[::-1], self._blocks[::-1], strict=True):
-                first, last, rows = front.first, front.last, front.rows
-                part = x[first:last]
+                part = x[front.first : front.last]
                 if pivots is None:
-                    size = last - first
-                    moved = below[:size].T @ part
-                    if rows.size:
-                        moved -= below[size:].T @ x[rows]
-                    x[first:last] = moved
-                    continue
-                if rows.size:
-                    part -= below.T @ x[rows]
-                self._trsm(1.0, pivots, part.T, side=1, lower=1, overwrite_b=1)
+                    own, below = below[: len(part)], below[len(part) :]
+                    part[:] = own.T @ part - below.T @ x[front.rows]
+                else:
+                    part -= pivots.signed(below.T @ x[front.rows])
+                    part[:] = pivots.before(part.T).T
         answer = np.empty(x.shape)
         answer[order] = x if scale is None else x / scale
         return answer.reshape(right.shape)
 
 
-def in_single(matrix: Any, scale: float) -> Any:
+def _in_single(matrix: Any, scale: float) -> Any:
     """Return a sparse matrix over `scale` in single precision."""
     data = np.empty(matrix.data.shape, np.float32)
     np.divide(matrix.data, scale, out=data, casting="same_kind")
     return sp.csc_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
-def _kernels(dtype: Any) -> tuple[Any, Any, Any, Any]:
-    """Return LAPACK's potrf and trtri, and BLAS's trsm and syrk, of a precision."""
-    of_lapack: Any = lapack.get_lapack_funcs(("potrf", "trtri"), dtype=dtype)
-    of_blas: Any = blas.get_blas_funcs(("trsm", "syrk"), dtype=dtype)
-    return *of_lapack, *of_blas
+@cache
+def _kernels(kind: str) -> dict[str, Any]:
+    """Return what the fronts need of LAPACK and BLAS in a precision."""
+    names = ("potrf", "trtri", "sytrf", "sytrf_lwork", "syconv")
+    found: Any = lapack.get_lapack_funcs(names, dtype=kind)
+    more: Any = blas.get_blas_funcs(("trsm", "syrk"), dtype=kind)
+    return dict(zip((*names, "trsm", "syrk"), (*found, *more), strict=True))
 
 
-def _stored(
-    pivots: FloatArray, below: FloatArray, trtri: Any
-) -> tuple[FloatArray | None, FloatArray]:
+def _stored(pivots: Pivots, below: FloatArray) -> tuple[Pivots | None, FloatArray]:
     """Return a front as it is kept: small ones as ``[L^-1; B L^-1]``, for one product per solve."""
-    if pivots.shape[0] > _INVERTED:
+    if pivots.size > _INVERTED or isinstance(pivots, _SignedPivots):
         return pivots, below
-    inverse, _ = trtri(pivots, lower=1, overwrite_c=1)
-    inverse = np.tril(inverse)
+    inverse = pivots.inverse()
     return None, np.vstack([inverse, below @ inverse])
+
+
+def eliminated(
+    lower: Any, dissection: Dissection, *, signed: bool
+) -> Iterator[tuple[Front, Pivots, FloatArray]]:
+    """Yield each front with its factored pivots ``G diag(s) G^T``, and what is below by ``G^-T``.
+
+    Cholesky where the pivot block is positive definite; where it is not, Bunch-Kaufman when signed.
+    """
+    potrf, syrk = (_kernels(lower.dtype.char)[name] for name in ("potrf", "syrk"))
+    for front, block, below, rest in assembled_fronts(lower, dissection):
+        kept = block.copy(order="F") if signed else block
+        _, info = potrf(block, lower=1, overwrite_a=1, clean=0)
+        if info and not signed:
+            raise SolverError(
+                "a sparse Cholesky factorisation met a pivot that is not positive: the matrix is "
+                "indefinite or singular. Look for a sign, or for DOFs without stiffness or mass."
+            )
+        pivots = _SignedPivots(kept) if info else Pivots(block)
+        del kept
+        if front.rows.size:
+            below = pivots.after(below)
+            syrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
+            if pivots.negative:
+                # the few with a negative sign are added, not taken away
+                few = np.asfortranarray(below[:, pivots.signs < 0])
+                syrk(2.0, few, beta=1.0, c=rest, lower=1, overwrite_c=1)
+        yield front, pivots, below
+
+
+class Pivots:
+    """``A = G G^T`` of a positive definite block, by its Cholesky factor."""
+
+    #: s of +1 and -1 in ``G diag(s) G^T``; none where all are +1
+    signs: Any = None
+    #: how many are -1
+    negative = 0
+
+    def __init__(self, factor: FloatArray) -> None:
+        self._factor, self.size = factor, len(factor)
+
+    def after(self, rows: FloatArray) -> FloatArray:
+        """Return ``rows G^-T``; rows in Fortran's order are overwritten."""
+        return self._solved(rows, trans_a=1)
+
+    def before(self, rows: FloatArray) -> FloatArray:
+        """Return ``rows G^-1``; rows in Fortran's order are overwritten."""
+        return self._solved(rows)
+
+    def signed(self, part: FloatArray) -> FloatArray:
+        """Return ``diag(s) part``."""
+        return part if self.signs is None else np.asarray(self.signs[:, None] * part)
+
+    def inverse(self) -> FloatArray:
+        """Return ``G^-1``, in the place of G."""
+        found, _ = _kernels(self._factor.dtype.char)["trtri"](self._factor, lower=1, overwrite_c=1)
+        return np.tril(found)
+
+    def _solved(self, rows: FloatArray, **options: int) -> FloatArray:
+        trsm = _kernels(self._factor.dtype.char)["trsm"]
+        return np.asarray(trsm(1.0, self._factor, rows, side=1, lower=1, overwrite_b=1, **options))
+
+
+class _SignedPivots(Pivots):
+    """``A = G diag(s) G^T`` of an indefinite block, s of +1 and -1 (Bunch-Kaufman).
+
+    The lower triangle of A is overwritten.
+    """
+
+    def __init__(self, block: FloatArray) -> None:
+        of = _kernels(block.dtype.char)
+        work, _ = of["sytrf_lwork"](block.shape[0], lower=1)
+        block, exchanges, _ = of["sytrf"](block, lower=1, lwork=int(work), overwrite_a=1)
+        factor, off, _ = of["syconv"](block, exchanges, lower=1, overwrite_a=1)
+        self._order = _exchanged(exchanges)
+        main = np.diag(factor).copy()
+        # 2 x 2 pivots by a rotation each
+        self._one = one = np.flatnonzero(off)
+        self._two = two = one + 1
+        pivots = np.array([[main[one], off[one]], [off[one], main[two]]]).transpose(2, 0, 1)
+        values, self._turn = np.linalg.eigh(pivots)
+        main[one], main[two] = values.T
+        if np.any(main == 0):
+            raise SolverError(
+                "a count of eigenvalues by L D L^T met a zero pivot: the shift hits an eigenvalue. "
+                "Count at another frequency."
+            )
+        self._size = np.sqrt(np.abs(main))
+        super().__init__(factor)
+        self.signs, self.negative = np.sign(main), int(np.count_nonzero(main < 0))
+
+    def after(self, rows: FloatArray) -> FloatArray:
+        """Return ``rows G^-T``."""
+        rows = rows.T[self._order].T
+        if rows.size:
+            rows = self._solved(rows, trans_a=1, diag=1)
+        self._rotate(rows.T, self._turn)
+        return rows / self._size
+
+    def before(self, rows: FloatArray) -> FloatArray:
+        """Return ``rows G^-1``."""
+        rows = rows / self._size
+        self._rotate(rows.T, self._turn.transpose(0, 2, 1))
+        found = np.empty_like(rows)
+        found[:, self._order] = self._solved(rows, diag=1)
+        return found
+
+    def _rotate(self, part: FloatArray, turn: FloatArray) -> None:
+        one, two = self._one, self._two
+        part[one], part[two] = (
+            turn[:, 0, j, None] * part[one] + turn[:, 1, j, None] * part[two] for j in (0, 1)
+        )
+
+
+def _exchanged(exchanges: IntArray) -> IntArray:
+    """Return the order of the rows after LAPACK's exchanges by Bunch-Kaufman, lower triangle."""
+    order = np.arange(exchanges.size)
+    k = 0
+    while k < order.size:
+        pair = exchanges[k] < 0
+        last, other = k + int(pair), abs(int(exchanges[k])) - 1
+        order[[last, other]] = order[[other, last]]
+        k = last + 1
+    return order
 
 
 def assembled_fronts(

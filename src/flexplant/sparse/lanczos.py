@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..checks import FloatArray, Matrix, Rng
+from ..checks import FloatArray, IntArray, Matrix, Rng
 from ..errors import SolverError, counted
 from ..parallel import tick
 from ..tolerances import ROUNDING, divisor
@@ -234,7 +234,8 @@ class BlockLanczos:
         check_at = self.steps
         for _ in range(_RESTARTS * _STEPS):
             if self._m + self._r >= n or not self._next.shape[1]:
-                return self._ritz(count)
+                theta, mix, _ = self._pairs()
+                return theta[:count], self._shapes(mix[:, :count])
             self._step()
             full = self._r + self._m + 2 * self._next.shape[1] > self._capacity
             if self.steps < check_at and not full:
@@ -250,14 +251,15 @@ class BlockLanczos:
             required = np.full(count, tolerance)
             required[shapes:] = max(tolerance, VALUE)
             strict = np.minimum(required, tolerance) if limited else required
-            left = _unfinished(theta[:wanted], error, strict)
+            left = _unconverged(theta[:wanted], error, strict).size
             if theta.size >= wanted and not left and needed is not None:
                 shapes = wanted if limited else shapes
                 close = np.flatnonzero(error[:shapes] > _SURE * theta[:shapes])
                 strict[close] = np.minimum(tolerance, needed(self._shapes(mix[:, close])))
-                left, needed = _unfinished(theta[:wanted], error, strict), None
+                left, needed = _unconverged(theta[:wanted], error, strict).size, None
             if left:
-                held = _converged(theta[:wanted], error, np.full(wanted, _SURE))
+                late = _unconverged(theta[:wanted], error, np.full(wanted, _SURE))
+                held = int(late[0]) if late.size else min(wanted, theta.size)
                 if _most_copies(theta[:held]) >= self._block:
                     wanted, left = held, 0
             done = theta.size >= wanted and not left
@@ -278,11 +280,6 @@ class BlockLanczos:
 
     def _random(self, columns: int) -> FloatArray:
         return self._rng.standard_normal((self._V.shape[1], columns))
-
-    def _ritz(self, count: int) -> tuple[FloatArray, FloatArray]:
-        theta, mix = la.eigh(self._T)
-        theta, mix = theta[::-1][:count], mix[:, ::-1][:, :count]
-        return theta, self._shapes(mix)
 
     def _shapes(self, mix: FloatArray) -> FloatArray:
         return self._V[self._r : self._r + self._m].T @ mix
@@ -398,20 +395,10 @@ def iterated(
         phi[:, at] = moved
 
 
-def _unfinished(theta: FloatArray, error: FloatArray, required: FloatArray) -> int:
-    """Return how many Ritz pairs have not reached their tolerance."""
-    return int(np.count_nonzero(_unconverged(theta, error, required)))
-
-
-def _converged(theta: FloatArray, error: FloatArray, required: FloatArray) -> int:
-    """Return how many Ritz pairs precede the first that has not reached its tolerance."""
-    late = _unconverged(theta, error, required)
-    return int(np.argmax(late)) if np.any(late) else theta.size
-
-
-def _unconverged(theta: FloatArray, error: FloatArray, required: FloatArray) -> np.ndarray:
+def _unconverged(theta: FloatArray, error: FloatArray, required: FloatArray) -> IntArray:
+    """Return which Ritz pairs have not reached their tolerance."""
     limit = np.maximum(required[: theta.size] * theta, REACHED * theta[0])
-    return np.asarray(error[: theta.size] > limit)
+    return np.flatnonzero(error[: theta.size] > limit)
 
 
 def _most_copies(theta: FloatArray) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -10,24 +10,22 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
-from scipy.linalg import blas, lapack
 
 from ..checks import FloatArray, IntArray
 from ..errors import SolverError, attempted
 from ..parallel import one_thread
 from .factor import (
     DENSE_LIMIT,
-    MultifrontalCholesky,
-    assembled_fronts,
+    MultifrontalFactor,
     by_rows,
     dense,
     diagonal,
-    in_single,
+    eliminated,
     negative_pivots,
     symmetric_lu,
 )
 from .lanczos import VALUE, BlockLanczos, beyond, iterated, rayleigh_ritz
-from .ordering import Dissection, Front, dissect
+from .ordering import Dissection, dissect
 
 #: rounding let pass in the energies that accompany a count
 _ENERGY = 1e-4
@@ -61,9 +59,9 @@ def multifrontal_inertia(
     energy = np.zeros(3)
     negative = 0
     with one_thread():
-        for front, pivots, below in _eliminated(lower, chosen):
+        for front, pivots, below in eliminated(lower, chosen, signed=True):
             y = pivots.after(b[front.first : front.last].T).T
-            moved = pivots.signs[:, None] * y
+            moved = pivots.signed(y)
             energy += np.sum(y * moved, axis=0)
             b[front.rows] -= below @ moved
             negative += pivots.negative
@@ -76,178 +74,33 @@ def multifrontal_inertia(
     return negative
 
 
-def signed_factor(matrix: Any, dissection: Dissection) -> SignedFactor | None:
+def signed_factor(matrix: Any, dissection: Dissection) -> MultifrontalFactor | None:
     """Return a factor in single precision that counts; None where rounding may change a sign."""
     with attempted("a factor in single precision", SolverError):
-        factor = SignedFactor(matrix, dissection)
-        return factor if factor.error_radius(matrix) < _RADIUS else None
+        factor = MultifrontalFactor(matrix, dissection, single=True, signed=True)
+        return factor if _error_radius(factor, matrix) < _RADIUS else None
     return None
 
 
-class SignedFactor:
-    """``A = L D L^T`` of a sparse symmetric matrix in single precision, D of +1 and -1.
+def _error_radius(factor: MultifrontalFactor, matrix: Any) -> float:
+    """Return a bound of the spectral radius of ``G = I - (L D L^T)^-1 A``, wrong once in 1e12.
 
-    Pivots are not moved between fronts: `error_radius` shows whether that was stable.
+    With ``L D L^T = A + E`` the matrices ``A + t E``, t from 0 to 1, are regular when it is
+    below 1: no eigenvalue changes its sign, and A has the inertia of D. ``G^k`` stretches some
+    direction v most; of Gaussian x nearly all have ``|v^T x| > 0.1``, and then
+    ``rho^k <= ||G^k|| <= ||G^k x|| / |v^T x|``.
     """
-
-    def __init__(self, matrix: Any, dissection: Dissection) -> None:
-        self._order = dissection.order
-        self._scale = float(np.abs(matrix.data).max(initial=0.0)) or 1.0
-        lower = in_single(matrix, self._scale)
-        with one_thread():
-            self._blocks = list(_eliminated(lower, dissection))
-
-    @property
-    def negative(self) -> int:
-        """Negative eigenvalues of ``L D L^T``."""
-        return sum(pivots.negative for _, pivots, _ in self._blocks)
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Return ``(L D L^T)^-1 right`` for (n, m) right-hand sides, to single precision."""
-        largest = np.abs(right).max(axis=0, initial=np.finfo(np.float64).tiny)
-        x: Any = np.ascontiguousarray(right[self._order] / largest, dtype=np.float32)
-        with one_thread():
-            for front, pivots, below in self._blocks:
-                part = pivots.signs[:, None] * pivots.after(x[front.first : front.last].T).T
-                x[front.first : front.last] = part
-                x[front.rows] -= below @ part
-            for front, pivots, below in self._blocks[::-1]:
-                part = x[front.first : front.last]
-                part -= pivots.signs[:, None] * (below.T @ x[front.rows])
-                x[front.first : front.last] = pivots.before(part.T).T
-        answer = np.empty(right.shape)
-        answer[self._order] = x
-        answer *= largest / self._scale
-        return answer
-
-    def error_radius(self, matrix: Any) -> float:
-        """Return a bound of the spectral radius of ``G = I - (L D L^T)^-1 A``, wrong once in 1e12.
-
-        With ``L D L^T = A + E`` the matrices ``A + t E``, t from 0 to 1, are regular when it is
-        below 1: no eigenvalue changes its sign, and A has the inertia of D. ``G^k`` stretches some
-        direction v most; of Gaussian x nearly all have ``|v^T x| > 0.1``, and then
-        ``rho^k <= ||G^k|| <= ||G^k x|| / |v^T x|``.
-        """
-        A = by_rows(matrix)
-        x = np.random.default_rng(0).standard_normal((A.shape[0], _VECTORS))
-        size, bound = np.inf, np.inf
-        for k in range(1, _POWER + 1):
-            before = size
-            x -= self.solve(A @ x)
-            size = float(np.linalg.norm(x, axis=0).max())
-            bound = min(bound, (size / _MISSED) ** (1 / k))
-            if bound < _RADIUS or (k > 2 and size > _RADIUS * before):
-                break
-        return bound
-
-
-def _eliminated(lower: Any, dissection: Dissection) -> Iterator[tuple[Front, _Pivots, FloatArray]]:
-    """Yield each front with its factored pivots ``G diag(s) G^T``, and what is below by ``G^-T``.
-
-    Cholesky where the pivot block is positive definite, Bunch-Kaufman where it is not.
-    """
-    of_lapack: Any = lapack.get_lapack_funcs(("potrf",), dtype=lower.dtype)
-    of_blas: Any = blas.get_blas_funcs(("syrk",), dtype=lower.dtype)
-    (potrf,), (syrk,) = of_lapack, of_blas
-    for front, block, below, rest in assembled_fronts(lower, dissection):
-        kept = block.copy(order="F")
-        _, info = potrf(block, lower=1, overwrite_a=1, clean=0)
-        pivots = _SignedPivots(kept) if info else _Pivots(block, np.ones(len(block), block.dtype))
-        del kept
-        if front.rows.size:
-            below = pivots.after(below)
-            syrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
-            if pivots.negative:
-                # the few with a negative sign are added, not taken away
-                few = np.asfortranarray(below[:, pivots.signs < 0])
-                syrk(2.0, few, beta=1.0, c=rest, lower=1, overwrite_c=1)
-        yield front, pivots, below
-
-
-class _Pivots:
-    """``A = G G^T`` of a positive definite block, by its Cholesky factor."""
-
-    def __init__(self, factor: FloatArray, signs: FloatArray) -> None:
-        self._factor, self.signs = factor, signs
-        self.negative = int(np.count_nonzero(signs < 0))
-        trsm: Any = blas.get_blas_funcs(("trsm",), dtype=factor.dtype)
-        (self._trsm,) = trsm
-
-    def after(self, rows: FloatArray) -> FloatArray:
-        """Return ``rows G^-T``; rows in Fortran's order are overwritten."""
-        return self._solved(rows, trans_a=1)
-
-    def before(self, rows: FloatArray) -> FloatArray:
-        """Return ``rows G^-1``; rows in Fortran's order are overwritten."""
-        return self._solved(rows)
-
-    def _solved(self, rows: FloatArray, **options: int) -> FloatArray:
-        solved = self._trsm(1.0, self._factor, rows, side=1, lower=1, overwrite_b=1, **options)
-        return np.asarray(solved)
-
-
-class _SignedPivots(_Pivots):
-    """``A = G diag(s) G^T`` of an indefinite block, s of +1 and -1 (Bunch-Kaufman).
-
-    The lower triangle of A is overwritten.
-    """
-
-    def __init__(self, block: FloatArray) -> None:
-        names = ("sytrf", "sytrf_lwork", "syconv")
-        of_lapack: Any = lapack.get_lapack_funcs(names, dtype=block.dtype)
-        sytrf, sytrf_lwork, syconv = of_lapack
-        work, _ = sytrf_lwork(block.shape[0], lower=1)
-        block, exchanges, _ = sytrf(block, lower=1, lwork=int(work), overwrite_a=1)
-        factor, off, _ = syconv(block, exchanges, lower=1, overwrite_a=1)
-        self._order = _exchanged(exchanges)
-        main = np.diag(factor).copy()
-        # 2 x 2 pivots by a rotation each
-        self._one = one = np.flatnonzero(off)
-        self._two = two = one + 1
-        pivots = np.array([[main[one], off[one]], [off[one], main[two]]]).transpose(2, 0, 1)
-        values, self._turn = np.linalg.eigh(pivots)
-        main[one], main[two] = values.T
-        if np.any(main == 0):
-            raise SolverError(
-                "a count of eigenvalues by L D L^T met a zero pivot: the shift hits an eigenvalue. "
-                "Count at another frequency."
-            )
-        self._size = np.sqrt(np.abs(main))
-        super().__init__(factor, np.sign(main))
-
-    def after(self, rows: FloatArray) -> FloatArray:
-        """Return ``rows G^-T``."""
-        rows = rows.T[self._order].T
-        if rows.size:
-            rows = self._solved(rows, trans_a=1, diag=1)
-        self._rotate(rows.T, self._turn)
-        return rows / self._size
-
-    def before(self, rows: FloatArray) -> FloatArray:
-        """Return ``rows G^-1``."""
-        rows = rows / self._size
-        self._rotate(rows.T, self._turn.transpose(0, 2, 1))
-        found = np.empty_like(rows)
-        found[:, self._order] = self._solved(rows, diag=1)
-        return found
-
-    def _rotate(self, part: FloatArray, turn: FloatArray) -> None:
-        one, two = self._one, self._two
-        part[one], part[two] = (
-            turn[:, 0, j, None] * part[one] + turn[:, 1, j, None] * part[two] for j in (0, 1)
-        )
-
-
-def _exchanged(exchanges: IntArray) -> IntArray:
-    """Return the order of the rows after LAPACK's exchanges by Bunch-Kaufman, lower triangle."""
-    order = np.arange(exchanges.size)
-    k = 0
-    while k < order.size:
-        pair = exchanges[k] < 0
-        last, other = k + int(pair), abs(int(exchanges[k])) - 1
-        order[[last, other]] = order[[other, last]]
-        k = last + 1
-    return order
+    A = by_rows(matrix)
+    x = np.random.default_rng(0).standard_normal((A.shape[0], _VECTORS))
+    size, bound = np.inf, np.inf
+    for k in range(1, _POWER + 1):
+        before = size
+        x -= factor.solve(A @ x)
+        size = float(np.linalg.norm(x, axis=0).max())
+        bound = min(bound, (size / _MISSED) ** (1 / k))
+        if bound < _RADIUS or (k > 2 and size > _RADIUS * before):
+            break
+    return bound
 
 
 #: up to this many DOFs dense LAPACK finds every eigenvalue
@@ -337,7 +190,7 @@ def _most_negative(
     for _ in range(30):
         try:
             if order is not None:
-                MultifrontalCholesky(K + shift * M, order, keep=False)
+                MultifrontalFactor(K + shift * M, order, keep=False)
             else:
                 la.cholesky(dense(K + shift * M), check_finite=False)
         except (SolverError, la.LinAlgError):
@@ -372,7 +225,7 @@ def _inverse_iteration(
         best = np.argsort(-np.abs(mu))[: count + r]
         return rayleigh_ritz(K, M, beyond(M, known, shapes[:, best]))
     factor = _factorise(K + shift * M, order)
-    if not isinstance(factor, MultifrontalCholesky):
+    if not isinstance(factor, MultifrontalFactor):
         return rayleigh_ritz(K, M, beyond(M, known, _both_ways(K, M, shift, count + r, factor)))
     values, shapes = np.zeros(0), np.zeros((n, 0))
     while shapes.shape[1] < count:
@@ -421,7 +274,7 @@ def _factorise(matrix: Any, order: Dissection | None) -> Any:
     """Return a factorisation with a method solve; by fronts where K + s M is definite and large."""
     if order is not None:
         with attempted("a multifrontal Cholesky factor", SolverError):
-            return MultifrontalCholesky(matrix, order)
+            return MultifrontalFactor(matrix, order)
     return symmetric_lu(matrix)
 
 

@@ -268,12 +268,7 @@ class FEMatrices(Value):
         (12000.0, 2.0, 0.5)
         """
         system, dofs = units(length, mass, time), self._named_dofs
-        return self.replace(
-            K=system.stiffness_matrix(self.K, dofs),
-            M=None if self.M is None else system.mass_matrix(self.M, dofs),
-            D=None if self.D is None else system.damping_matrix(self.D, dofs),
-            dofs=system.placed(dofs),
-        )
+        return self.replace(**system.matrices(self._matrices, dofs), dofs=system.placed(dofs))
 
     def rotated(self, rotations: Any) -> FEMatrices:
         """Return the matrices in global directions, from nodes with local coordinate systems.

@@ -377,13 +377,11 @@ class FEModel(Placed, Value):
         >>> si.M[0, 0], si.K[0, 0], si.dofs.xyz[1, 0]
         (np.float64(1.0), np.float64(5000.0), np.float64(0.25))
         """
-        unit = units(length, mass, time)
-        load = self.held_inertia
+        unit, load = units(length, mass, time), self.held_inertia
+        given = {"M": self.M, "K": self.K} | ({} if self.D is None else {"D": self.D})
         return self._with(
             held_inertia=None if load is None else frozen(unit.ground_load(load, self.dofs)),
-            M=frozen(unit.mass_matrix(self.M, self.dofs)),
-            K=frozen(unit.stiffness_matrix(self.K, self.dofs)),
-            D=None if self.D is None else frozen(unit.damping_matrix(self.D, self.dofs)),
+            **{name: frozen(A) for name, A in unit.matrices(given, self.dofs).items()},
             dofs=unit.placed(self.dofs),
         )
 

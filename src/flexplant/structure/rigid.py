@@ -300,7 +300,7 @@ def _free_motions(M: Matrix, K: Matrix, motions: FloatArray, far: float) -> Floa
         return basis
     nearly = motions @ (near / scale[:, None])
     # those without a large force at any DOF: nothing grounds them
-    nearly = nearly[:, _largest_parts(K, size_of_K, nearly) < _EVERYWHERE]
+    nearly = nearly[:, force_parts(K, nearly) < _EVERYWHERE]
     return _null_vectors(M, K, size_of_K, motions, basis, nearly) if nearly.shape[1] else basis
 
 
@@ -324,14 +324,9 @@ def force_free(M: Matrix, K: Matrix, motions: FloatArray) -> bool:
 def force_parts(K: Matrix, motions: FloatArray) -> FloatArray:
     """Return the largest force of each motion (r,), of the largest that its parts make anywhere."""
     rows = by_rows(K)
-    return _largest_parts(rows, Absolute(rows), motions)
-
-
-def _largest_parts(K: Matrix, size_of_K: Absolute, motions: FloatArray) -> FloatArray:
-    entries: Any = K.diagonal()
-    weight = 1 / np.sqrt(divisor(entries))[:, None]
-    force = np.abs(weight * np.asarray(K @ motions)).max(axis=0)
-    most = (weight * (size_of_K @ np.abs(motions))).max(axis=0)
+    weight = 1 / np.sqrt(divisor(diagonal(K)))[:, None]
+    force = np.abs(weight * np.asarray(rows @ motions)).max(axis=0)
+    most = (weight * (Absolute(rows) @ np.abs(motions))).max(axis=0)
     return np.asarray(force / divisor(most))
 
 

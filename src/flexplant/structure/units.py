@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -40,8 +40,6 @@ MASSES: Mapping[str, float] = {
 }
 TIMES: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
-AnyMatrix = TypeVar("AnyMatrix")
-
 
 @dataclass(frozen=True)
 class Units:
@@ -59,17 +57,10 @@ class Units:
         """One unit of force [N]."""
         return self.mass * self.length / self.time**2
 
-    def mass_matrix(self, M: AnyMatrix, dofs: DofSet) -> AnyMatrix:
-        """Return a mass matrix (n, n) in kg, kg m, kg m^2."""
-        return self._scaled(M, dofs, self.mass)
-
-    def damping_matrix(self, D: AnyMatrix, dofs: DofSet) -> AnyMatrix:
-        """Return a damping matrix (n, n) in N s/m, N s, N m s."""
-        return self._scaled(D, dofs, self.mass / self.time)
-
-    def stiffness_matrix(self, K: AnyMatrix, dofs: DofSet) -> AnyMatrix:
-        """Return a stiffness matrix (n, n) in N/m, N, N m."""
-        return self._scaled(K, dofs, self.mass / self.time**2)
+    def matrices(self, given: Mapping[str, Any], dofs: DofSet) -> dict[str, Any]:
+        """Return those of M (n, n), D and K that are given, in kg, N s/m, N/m times m or m^2."""
+        factors = {"M": self.mass, "D": self.mass / self.time, "K": self.mass / self.time**2}
+        return {name: self._scaled(A, dofs, factors[name]) for name, A in given.items()}
 
     def ground_load(self, load: FloatArray, dofs: DofSet) -> FloatArray:
         """Return loads (n, 6) of the six rigid-body accelerations in kg, kg m, kg m^2."""
@@ -92,21 +83,17 @@ class Units:
             )
         return dofs.replace(xyz=self.length * dofs.xyz)
 
-    def _scaled(self, matrix: AnyMatrix, dofs: DofSet, factor: float) -> AnyMatrix:
+    def _scaled(self, given: Any, dofs: DofSet, factor: float) -> Any:
         # rows are forces, or moments for rotations; columns displacements, or rotations: each
         # rotation brings one length more, and work is the same for all
         unit: Any = self.length / self.of_dofs(dofs)
-        given: Any = matrix
-        scaled: Any
-        if sp.issparse(matrix):
-            # entry by entry, so that a symmetric matrix stays so to the last bit
-            listed: Any = given.tocoo()
-            weight = unit[listed.row] * unit[listed.col] * factor
-            scaled = sp.csc_array((listed.data * weight, (listed.row, listed.col)), listed.shape)
-        else:
-            scaled = np.asarray(given) * (np.outer(unit, unit) * factor)
-        result: AnyMatrix = scaled
-        return result
+        dense = not sp.issparse(given)
+        if dense:
+            return np.asarray(given) * (np.outer(unit, unit) * factor)
+        # entry by entry, so that a symmetric matrix stays so to the last bit
+        listed = given.tocoo()
+        weight = unit[listed.row] * unit[listed.col] * factor
+        return sp.csc_array((listed.data * weight, (listed.row, listed.col)), listed.shape)
 
 
 def units(length: Any = "m", mass: Any = "kg", time: Any = "s") -> Units:

@@ -13,9 +13,8 @@ import numpy.typing as npt
 
 from ...checks import ComplexArray, FloatArray, Value, flag, instance, positive, real_array, short
 from ...errors import ModelError
-from ...lti.discretisation import trapezoidal
 from ...lti.frequency import sampled_freq
-from ...lti.joining import Matrices, block_matrix, cascaded
+from ...lti.joining import Matrices, block_matrix, cascaded, trapezoidal
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace
 
