@@ -46,10 +46,9 @@ class BrokenLoop:
 
     def respond(self, freq: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Return K (n_freq, nu, ny) and P (n_freq, ny, nu)."""
-        K, P = self.controller(freq), self.plant(freq)
-        return np.ascontiguousarray(K.transpose(2, 0, 1)), np.ascontiguousarray(
-            P.transpose(2, 0, 1)
-        )
+        both = self.controller(freq), self.plant(freq)
+        K, P = (np.ascontiguousarray(part.transpose(2, 0, 1)) for part in both)
+        return K, P
 
     def gain(self, freq: FloatArray, at: Side = "u") -> ComplexArray:
         """Return K P (broken at u) or P K (at y), frequency first."""
@@ -100,18 +99,14 @@ class BrokenLoop:
         return cache(self._worst)
 
     def _worst(self, at: Side, scaled: bool) -> tuple[float, float]:
-        def find(freq: FloatArray) -> FloatArray:
-            return self.size(freq, at, scaled)
+        def size(freq: FloatArray) -> FloatArray:  # a bound of it where it is not high
+            gain = self.gain(freq, at)
+            return scaled_size(inverted(gain)) if scaled else sensitivity_size(gain)
 
         if self.measured is not None:
-            return highest(find, self.followed, 0)
+            return highest(size, self.followed, 0)
         grid = resonance_grid(self.poles(), self.dt, points=_POINTS, around=SOUGHT)
-        return highest(find, grid, 6)
-
-    def size(self, freq: FloatArray, at: Side, scaled: bool) -> FloatArray:
-        """Return the size of S at frequencies [Hz], a bound of it where it is not high."""
-        gain = self.gain(freq, at)
-        return scaled_size(inverted(gain)) if scaled else sensitivity_size(gain)
+        return highest(size, grid, 6)
 
     def margin(self, at: Side = "u", scaled: bool | None = None) -> float:
         """Return ``1 / max_f |S|``; 0 when unstable."""

@@ -92,14 +92,9 @@ def in_axes(
             variance = aliased if held else variance[..., : freq.size]
     units = {**chosen.channel_units, **first.units, **last.units}
     return Frf(
-        freq,
-        data,
-        first.inputs,
-        last.outputs,
-        quantity=frf.quantity,
-        variance=variance,
-        units=units,
-    )
+        freq, data, first.inputs, last.outputs,
+        quantity=frf.quantity, variance=variance, units=units,
+    )  # fmt: skip
 
 
 def line_variance(frf: Frf) -> FloatArray | None:
@@ -148,10 +143,9 @@ def _aliased(lines: FloatArray, variance: FloatArray, freq: FloatArray, rate: fl
     """Return the variance of `_sampled_response`: aliases add theirs."""
     total = np.zeros((*variance.shape[:2], freq.size))
     for moved in _alias_frequencies(lines, freq, rate):
-        at = np.abs(moved)
-        hold = np.sinc(moved / rate) ** 2
         for i, j in np.ndindex(variance.shape[:2]):
-            total[i, j] += hold * np.interp(at, lines, variance[i, j], left=0.0, right=0.0)
+            at = np.interp(np.abs(moved), lines, variance[i, j], left=0.0, right=0.0)
+            total[i, j] += np.sinc(moved / rate) ** 2 * at
     return total
 
 
@@ -243,12 +237,11 @@ def nyquist_count(
         (hidden.undecided, "lies a mode that is unstable in the loop if it is a little narrower"),
     ):
         if open_.any():
-            worst = int(np.argmax(open_))
+            low, high = lines[int(np.argmax(open_)) :][:2]
             return NyquistCount(
                 None,
-                f"between the lines at {lines[worst]:.4g} and {lines[worst + 1]:.4g} Hz {what}: "
-                "measure with a finer resolution there, or give the loop less gain at that "
-                "resonance",
+                f"between the lines at {low:.4g} and {high:.4g} Hz {what}: measure with a finer "
+                "resolution there, or give the loop less gain at that resonance",
             )
     grows = -float(np.polyfit(np.log(freq[:3]), np.log(np.abs(F[:3])), 1)[0])
     if abs(grows - at_zero) > _SLOPE:
@@ -277,12 +270,8 @@ def nyquist_count(
             "and the unstable poles that the plant has",
         )
     widest = int(np.argmax(hidden.width))
-    return NyquistCount(
-        round(count),
-        "",
-        float(hidden.width[widest]),
-        float(0.5 * np.sum(lines[widest : widest + 2])),
-    )
+    near = float(0.5 * np.sum(lines[widest : widest + 2]))
+    return NyquistCount(round(count), "", float(hidden.width[widest]), near)
 
 
 def _continued(

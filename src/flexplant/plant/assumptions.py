@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 import scipy.linalg as la
@@ -16,6 +17,10 @@ from ..tolerances import SAME, TINY
 from .partition import Partition
 from .reach_and_sight import Assumption, full_ranks, no_zeros, reach_and_sight, response_at
 from .realisation import natural
+
+#: tests of a plant, in the order in which they matter
+_Tests: TypeAlias = Callable[[Partition], list[Assumption]]
+_TESTS: tuple[_Tests, ...] = (reach_and_sight, full_ranks, no_zeros)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -36,22 +41,17 @@ class AssumptionReport(Value):
 
     plant: Partition
 
-    @cached_property
+    @property
     def assumptions(self) -> tuple[Assumption, ...]:
         """All assumptions, in the order in which they matter."""
-        return (*self._modal, *self._ranks, *self._zeros)
+        return tuple(item for tests in _TESTS for item in self._found(tests))
 
-    @cached_property
-    def _modal(self) -> tuple[Assumption, ...]:
-        return tuple(reach_and_sight(self.plant))
-
-    @cached_property
-    def _ranks(self) -> tuple[Assumption, ...]:
-        return tuple(full_ranks(self.plant))
-
-    @cached_property
-    def _zeros(self) -> tuple[Assumption, ...]:
-        return tuple(no_zeros(self.plant))
+    def _found(self, tests: _Tests) -> list[Assumption]:
+        """Return the findings of some tests, which are done once."""
+        known: dict[_Tests, list[Assumption]] = self.__dict__.setdefault("_known", {})
+        if tests not in known:
+            known[tests] = tests(self.plant)
+        return known[tests]
 
     @cached_property
     def modes(self) -> tuple[ModeVisibility, ...]:
@@ -64,11 +64,10 @@ class AssumptionReport(Value):
         return all(item.holds for item in self.assumptions)
 
     def __getitem__(self, key: str) -> Assumption:
-        for group in ("_modal", "_ranks", "_zeros"):
-            for item in getattr(self, group):
+        for tests in _TESTS:
+            for item in self._found(tests):
                 if item.key == key:
-                    found: Assumption = item
-                    return found
+                    return item
         raise unknown_label("assumption", key, [item.key for item in self.assumptions])
 
     def __repr__(self) -> str:
@@ -93,21 +92,11 @@ class AssumptionReport(Value):
     def require(self, keys: tuple[str, ...], purpose: str) -> None:
         """Raise AssumptionError unless the assumptions of these keys hold.
 
-        Parameters
-        ----------
-        keys : sequence of str
-            What the design needs; a key that does not apply to this plant holds.
-        purpose : str
-            What it is needed for, for the message.
-
-        Raises
-        ------
-        AssumptionError
-            When one fails; the message says what to change, and holds the report.
+        A key that does not apply to this plant holds. The message says for what `purpose` they are
+        needed and what to change, and holds the report.
         """
-        known = (*self._modal, *self._ranks)
-        if {"P12", "P21"} & set(keys):
-            known = self.assumptions
+        needed = _TESTS if {"P12", "P21"} & set(keys) else _TESTS[:2]
+        known = tuple(item for tests in needed for item in self._found(tests))
         failed = [item for item in known if item.key in keys and not item.holds]
         if failed:
             said = " ".join(f"{item.finding} {item.remedy}" for item in failed)
@@ -218,7 +207,8 @@ def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
     pairs = plant.modal_blocks[n_rigid:count]
     omega = np.sqrt(np.abs(np.linalg.det(pairs)))
     zeta = -0.5 * np.trace(pairs, axis1=1, axis2=2) / omega
-    swinging = _undamped_pairs(pairs)
+    swinging = pairs.copy()
+    swinging[pairs[:, 0, 0] == 0.0, 1, 1] = 0.0  # damping is no part of the shape of a real mode
     # filters of ports act at the pole; one that does not swing stands for its frequency
     wanted = omega * (-zeta + 1j * np.sqrt(np.maximum(1.0 - zeta**2, 0.0)))
     wanted = np.where(zeta < 1.0, wanted, 1j * omega)
@@ -248,35 +238,22 @@ def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
             seen = [response_at(block, z) @ m for z, m in zip(points, motions, strict=True)]
             motions = np.array(seen).reshape(omega.size, len(names))
         sides[side] = names, np.abs(motions)
+    shares: dict[str, FloatArray] = {}
+    best: dict[str, list[str]] = {}
+    for side, (own, gains) in sides.items():
+        if own and omega.size:
+            each = gains / np.maximum(gains.max(axis=0), TINY)
+            shares[side], best[side] = each.max(axis=1), [own[i] for i in each.argmax(axis=1)]
     return tuple(
-        _visibility(n_rigid + 1 + k, float(omega[k]), float(zeta[k]), k, sides)
+        ModeVisibility(
+            n_rigid + 1 + k,
+            float(omega[k] / (2 * np.pi)),
+            float(zeta[k]),
+            {side: float(each[k]) for side, each in shares.items()},
+            {side: each[k] for side, each in best.items()},
+        )
         for k in range(omega.size)
     )
-
-
-def _undamped_pairs(pairs: FloatArray) -> FloatArray:
-    """Return the pairs, those of real modes without their damping: it is no part of the shape."""
-    real = pairs[:, 0, 0] == 0.0
-    swinging = pairs.copy()
-    swinging[real, 1, 1] = 0.0
-    return swinging
-
-
-def _visibility(
-    number: int,
-    omega: float,
-    zeta: float,
-    k: int,
-    sides: dict[str, tuple[Sequence[str], FloatArray]],
-) -> ModeVisibility:
-    shares, channels = {}, {}
-    for side, (names, gains) in sides.items():
-        if not names:
-            continue
-        share = gains[k] / np.maximum(gains.max(axis=0), TINY)
-        best = int(np.argmax(share))
-        shares[side], channels[side] = float(share[best]), names[best]
-    return ModeVisibility(number, omega / (2 * np.pi), zeta, shares, channels)
 
 
 def _vectors(A: FloatArray, poles: ComplexArray, first: int) -> tuple[ComplexArray, ComplexArray]:
@@ -293,14 +270,11 @@ def _vectors(A: FloatArray, poles: ComplexArray, first: int) -> tuple[ComplexArr
         lefts = la.inv(rights).conj().T
         i = int(np.argmin(np.abs(values - pole)))
         left[own, k], right[own, k] = lefts[:, i], rights[:, i]
-    rest = np.arange(first + 2 * count, n)
-    if rest.size and np.any(A[: rest[0], rest]):
-        for k, pole in enumerate(poles.tolist()):
-            shifted = pole * np.eye(rest.size) - A[np.ix_(rest, rest)]
-            into = left[: rest[0], k].conj() @ A[: rest[0], rest]
-            left[rest, k] = np.linalg.solve(shifted.T, into).conj()
-    if rest.size and np.any(A[rest, : rest[0]]):
-        for k, pole in enumerate(poles.tolist()):
-            shifted = pole * np.eye(rest.size) - A[np.ix_(rest, rest)]
-            right[rest, k] = np.linalg.solve(shifted, A[rest, : rest[0]] @ right[: rest[0], k])
+    m = first + 2 * count
+    for k, pole in enumerate(poles.tolist() if n > m else ()):
+        shifted = pole * np.eye(n - m) - A[m:, m:]
+        if np.any(A[:m, m:]):
+            left[m:, k] = np.linalg.solve(shifted.T, left[:m, k].conj() @ A[:m, m:]).conj()
+        if np.any(A[m:, :m]):
+            right[m:, k] = np.linalg.solve(shifted, A[m:, :m] @ right[:m, k])
     return left, right

@@ -38,8 +38,7 @@ def with_ports_of(own: Assembled, ports: Ports) -> Assembled | None:
     # None for ports that are others or in another order, or whose noise the states hold mixed
     if not _among(ports, own.ports):
         return None
-    kept = [poi.channel(axis) for poi in ports.z for axis in poi.axes]
-    outputs = [*kept, *(sensor.name for sensor in ports.y)]
+    outputs = ports.motions
     inputs = [*(port.name for port in ports.forces), *ports.input_noises]
     if not inputs or not outputs:
         return None
@@ -109,31 +108,27 @@ P = TypeVar("P", bound=Partition)
 def wired(cls: type[P], origin: Assembled) -> P:
     """Return the plant of an origin: what is static is added to its physical system."""
     physical, ports = origin.physical, origin.ports
-    pois = [poi.channel(axis) for poi in ports.z for axis in poi.axes]
-    sensors, actuators = [s.name for s in ports.y], [a.name for a in ports.u]
-    noises = [f"{s.name}:noise" for s in ports.y if s.asd > 0]
-    refs = [poi.derived(axis, "ref") for poi, axis in ports.followed]
+    actuators = [a.name for a in ports.u]
+    noises = {f"{s.name}:noise": s.asd for s in ports.y if s.asd > 0}
+    refs, errors = (
+        [poi.derived(axis, kind) for poi, axis in ports.followed] for kind in ("ref", "error")
+    )
     w = [*(d.name for d in ports.w), *ports.input_noises, *noises, *refs]
-    errors = [poi.derived(axis, "error") for poi, axis in ports.followed]
+    pois = ports.motions[: len(ports.motions) - len(ports.y)]
     z = [*pois, *errors, *(f"{name}:effort" for name in actuators)]
-    y = [*sensors, *refs]
+    y = [*(s.name for s in ports.y), *refs]
     inputs, outputs = [*w, *actuators], [*z, *y]
     motions = physical.output_index([poi.channel(axis) for poi, axis in ports.followed])
-    through = {(name.removesuffix(":noise"), name): 1.0 for name in noises}
-    through |= {
-        pair: 1.0
-        for ref, error in zip(refs, errors, strict=True)
-        for pair in ((error, ref), (ref, ref))
-    }
-    through |= {(f"{name}:effort", name): 1.0 for name in actuators}
+    pairs = [(name.removesuffix(":noise"), name) for name in noises]
+    pairs += [*zip(errors, refs, strict=True), *zip(refs, refs, strict=True)]
+    pairs += [(f"{name}:effort", name) for name in actuators]
     shown = physical.replace(
         C=np.vstack([physical.C, -physical.C[motions]]),
         D=np.vstack([physical.D, -physical.D[motions]]),
         outputs=[*physical.outputs, *errors],
     )
-    system = among(shown, inputs, outputs, through).replace(units=ports.units)
-    asd = {d.name: d.asd for d in ports.w if d.asd > 0} | ports.input_noises
-    asd |= {f"{s.name}:noise": s.asd for s in ports.y if s.asd > 0}
+    system = among(shown, inputs, outputs, dict.fromkeys(pairs, 1.0)).replace(units=ports.units)
+    asd = {d.name: d.asd for d in ports.w if d.asd > 0} | ports.input_noises | noises
     return cls(system, tuple(w), tuple(actuators), tuple(z), tuple(y), asd, origin)
 
 
@@ -176,12 +171,8 @@ def sampled(plant: P, rate: float, delay: float) -> P:
         factor = np.vstack([white, np.zeros((lines, white.shape[1]))])
     sizes = np.array([plant.asd[name] for name in held]) * np.sqrt(0.5 * rate)
     factor = np.hstack([factor, physical.B[:, physical.input_index(held)] * sizes])
-    return wired(
-        type(plant),
-        origin.replace(
-            physical=physical, noise_factor=factor, delay=float(delay), continuous=plant
-        ),
-    )
+    known = {"noise_factor": factor, "delay": float(delay), "continuous": plant}
+    return wired(type(plant), origin.replace(physical=physical, **known))
 
 
 def _has_other_states(origin: Assembled) -> bool:
@@ -284,11 +275,8 @@ def rebuilt(
     if ports is None and realisation is not None and _moves_alike(own, realisation):
         fresh = wired(type(plant), _with_modes(plant.continuous.assembled, realisation))
     else:
-        fresh = continuous_plant(
-            type(plant),
-            own.realisation if realisation is None else realisation,
-            own.ports if ports is None else ports,
-        )
+        modes = own.realisation if realisation is None else realisation
+        fresh = continuous_plant(type(plant), modes, own.ports if ports is None else ports)
     return sampled_like(plant, fresh)
 
 
@@ -327,11 +315,11 @@ def weighted(plant: P, z: Any, w: Any) -> P:
     if not keep_z or not keep_w:
         raise ModelError("all of z or w was left out: keep at least one channel of each.")
     inner = plant.system.select([*keep_z, *plant.y], [*keep_w, *plant.u])
-    before = append(
-        *(_weight(plant, w.get(name, 1.0), name) for name in keep_w), _identity(plant, plant.u)
-    )
-    after = append(
-        *(_weight(plant, z.get(name, 1.0), name) for name in keep_z), _identity(plant, plant.y)
+    before, after = (
+        append(
+            *(_weight(plant, side.get(name, 1.0), name) for name in kept), _identity(plant, rest)
+        )
+        for side, kept, rest in ((w, keep_w, plant.u), (z, keep_z, plant.y))
     )
     system = series(series(before, inner), after)
     step = tuple(z.items()), tuple(w.items())
@@ -358,7 +346,8 @@ def _mapping(weights: Any, side: str) -> dict[str, Any]:
 def measured_through(plant: P, block: System) -> P:
     """Return the plant with y read through a block."""
     g = as_statespace(block)
-    inner = plant.system.select([*plant.z, *(plant.y[i] for i in _positions_of(plant, g))])
+    require_known("channel of y", g.inputs, plant.y)
+    inner = plant.system.select([*plant.z, *g.inputs])
     block = g if g.n_states else g.replace(dt=plant.dt)
     after = append(_identity(plant, plant.z), block)
     if plant.origin.reading is not None:
@@ -378,11 +367,6 @@ def altered_like(plant: P, plain: P) -> P:
         else:
             plain = weighted(plain, *map(dict, step))
     return plain
-
-
-def _positions_of(plant: Partition, g: StateSpace) -> list[int]:
-    require_known("channel of y", g.inputs, plant.y)
-    return [plant.y.index(name) for name in g.inputs]
 
 
 def _weight(plant: Partition, weight: Any, name: str) -> StateSpace:

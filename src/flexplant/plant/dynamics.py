@@ -38,7 +38,7 @@ def port_rows(realisation: ModalRealisation, ports: Ports) -> PortRows:
             f"a model needs inputs (w or u) and outputs (z or y), got {ports!r}. Add ports."
         )
     pois = [(poi, axis) for poi in ports.z for axis in poi.axes]
-    outputs = [*(poi.channel(axis) for poi, axis in pois), *(sensor.name for sensor in sensors)]
+    outputs = ports.motions
     added = [[outputs.index(port.added_to) if port.added_to else -1] for port in forces]
     return PortRows(
         [port.name for port in forces],

@@ -46,11 +46,9 @@ def larger_plant(
 
     Raises
     ------
-    ModelError
-        When the plant has no ports to assemble a structure with, or the larger plant has another
-        sampling time or delay.
-    LabelError
-        When the larger plant has other channels.
+    LabelError, ModelError
+        When the larger plant has other channels; another sampling time or delay, or the plant no
+        ports to assemble a structure with.
 
     Examples
     --------
@@ -68,11 +66,8 @@ def larger_plant(
         if not isinstance(model, ReducedModel) or model.truncated is None:
             return None
         larger = model
-    found = (
-        _matched(plain, standard_plant(larger))
-        if is_plant(larger)
-        else with_modes_of(plain, larger)
-    )
+    other = is_plant(larger)
+    found = _matched(plain, standard_plant(larger)) if other else with_modes_of(plain, larger)
     if plain.is_assembled and found.is_assembled:
         _warn_of_another_body(plain, found)
     return found
@@ -95,9 +90,8 @@ def _warn_of_another_body(own: StandardPlant, larger: StandardPlant) -> None:
 
 def _rigid_gains(plant: StandardPlant) -> FloatArray:
     """Return the acceleration (p, m) of what is seen, per force, by the modes at 0 Hz."""
-    ports = plant.assembled.ports
-    seen = [poi.channel(axis) for poi in ports.z for axis in poi.axes] + [s.name for s in ports.y]
-    return rigid_gain(plant, rigid_modes(plant.assembled.realisation, None), seen, plant.u)
+    motions = rigid_modes(plant.assembled.realisation, None)
+    return rigid_gain(plant, motions, plant.assembled.ports.motions, plant.u)
 
 
 def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:

@@ -363,6 +363,12 @@ class Ports(Value):
         return (*self.forces, *self.y)
 
     @property
+    def motions(self) -> list[str]:
+        """The outputs of the physical system: axes of POIs, then sensors."""
+        pois = [poi.channel(axis) for poi in self.z for axis in poi.axes]
+        return [*pois, *(sensor.name for sensor in self.y)]
+
+    @property
     def units(self) -> dict[str, str]:
         """The SI units of all channels that have one, and of what is derived from them.
 

@@ -235,10 +235,9 @@ def decouple(plant: Partition, *, axes: Sequence[str] | None = None) -> Decoupli
     AssumptionError
         When the actuators or sensors do not reach or see an axis apart from the others; when no
         axes are given and they have part in one that the model's shapes do not make.
-    LabelError
-        When an axis is not one of the structure's.
-    ModelError
-        When the plant was not assembled from a structure, or it is held.
+    LabelError, ModelError
+        When an axis is not one of the structure's; when the plant was not assembled from a
+        structure, or it is held.
 
     References
     ----------
@@ -253,16 +252,16 @@ def decouple(plant: Partition, *, axes: Sequence[str] | None = None) -> Decoupli
     plant = Partition.of(plant)
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     body = rigid_body_of(realisation)
+    sensors = [s for s in ports.y if s.order == 0]
+    seen = [s.static_row(realisation) for s in sensors]
+    pushed = [port.static_push(realisation) for port in ports.u]
     if axes is None:
-        rows = [s.static_row(realisation) for s in ports.y if s.order == 0]
-        rows += [port.static_push(realisation) for port in ports.u]
-        refuse_lost(body, realisation, rows, np.inf, "; or name the axes that count, axes=[...]")
+        do = "; or name the axes that count, axes=[...]"
+        refuse_lost(body, realisation, [*seen, *pushed], np.inf, do)
     wanted = body.axes if axes is None else name_list(axes, "axes")
     require_known("rigid-body axis", wanted, body.axes)
     pick = np.eye(len(body.axes))[[body.axes.index(axis) for axis in wanted]]
-    sensors = [s for s in ports.y if s.order == 0]
-    see = rigid_parts([s.static_row(realisation) for s in sensors], body.motions)
-    push = rigid_parts([port.static_push(realisation) for port in ports.u], body.motions).T
+    see, push = rigid_parts(seen, body.motions), rigid_parts(pushed, body.motions).T
     # in these units rotations and translations move the structure alike
     length = np.asarray(1.0 / np.linalg.norm(body.motions, axis=0))
     T_y = _left_inverse(see, length, pick)
@@ -322,13 +321,5 @@ def _gain_system(
             _, axis, *kind = channel.split(":")
             units[channel] = _UNITS[axis.startswith("r")][kind[0] if kind else ""]
     return StateSpace(
-        [],
-        [],
-        [],
-        gain,
-        plant.dt,
-        inputs=inputs,
-        outputs=outputs,
-        name="decoupling",
-        units=units,
-    )
+        [], [], [], gain, plant.dt, inputs=inputs, outputs=outputs, name="decoupling", units=units
+    )  # fmt: skip
