@@ -263,9 +263,7 @@ class ClosedLoop(Value):
     @cached_property
     def completed(self) -> ClosedLoop | None:
         """The same controller closed around the plant with the modes left out; None: not known."""
-        if self.larger is None:
-            return None
-        return self.around(self.larger)
+        return None if self.larger is None else self.around(self.larger)
 
     @cached_property
     def left_out(self) -> SpillOver | None:
@@ -274,17 +272,15 @@ class ClosedLoop(Value):
         if whole is None:
             return None
         stability = whole.spectral_radius if self.plant.dt else whole.spectral_abscissa
-        margin, without, peak = whole.modulus_margin, self.modulus_margin, float("nan")
+        margin, without, peak = whole.modulus_margin, self.modulus_margin, None
+        if whole.is_stable:
+            peak = whole.broken.worst("u", bool(whole.broken.mixed("u")))[1]
         found: tuple[tuple[int, ...], tuple[float, ...]] = (), ()
         states = whole.plant.system.states
-        if not whole.is_stable:
-            found = growing_modes(whole.monitored, states)
-        else:
-            peak = whole.broken.worst("u", bool(whole.broken.mixed("u")))[1]
-            if high(margin, without):
-                found = growing_modes(whole.monitored, states, near=peak)
-        sampled = bool(self.plant.dt)
-        return SpillOver(stability, sampled, margin, without, peak, len(states), *found)
+        if peak is None or high(margin, without):
+            found = growing_modes(whole.monitored, states, near=peak)
+        at, sampled = float("nan") if peak is None else peak, bool(self.plant.dt)
+        return SpillOver(stability, sampled, margin, without, at, len(states), *found)
 
     @cached_property
     def modulus_margin(self) -> float:

@@ -227,15 +227,13 @@ def broken_margins(parts: BrokenLoop, at: Literal["u", "y"]) -> tuple[LoopMargin
     names = parts.u if at == "u" else parts.y
 
     def one(i: int) -> LoopMargins:
-        exact = None
-        if parts.measured is None:
+        def exact(freq: FloatArray) -> ComplexArray:
+            return np.asarray(1.0 - 1.0 / inverted(parts.gain(freq, at))[:, i, i])
 
-            def exact(freq: FloatArray) -> ComplexArray:
-                return np.asarray(1.0 - 1.0 / inverted(parts.gain(freq, at))[:, i, i])
+        L, between = 1.0 - 1.0 / S[:, i, i], exact if parts.measured is None else None
+        return loop_margins(names[i], grid, L, between, sampled=bool(parts.dt))
 
-        return loop_margins(names[i], grid, 1.0 - 1.0 / S[:, i, i], exact, sampled=bool(parts.dt))
-
-    return tuple(one(i) for i in range(len(names)))
+    return tuple(map(one, range(len(names))))
 
 
 def broken_count(parts: BrokenLoop, rigid: int, unstable: int) -> NyquistCount:
@@ -548,18 +546,13 @@ def _figures(
     pair: tuple[str, ...],
 ) -> LoopFigures:
     decay = loop.spectral_radius if loop.plant.dt else loop.spectral_abscissa
-    nan = float("nan")
-    if curve is None:
-        margin = loop.modulus_margin if loop.is_stable else 0.0
-        return LoopFigures(loop.is_stable, decay, nan, nan, nan, nan, low_freq, margin)
-    top = int(np.argmax(curve[1]))
-    low = nan
-    if np.isfinite(low_freq):
-        low = float(abs(loop.gain(*pair)(np.array([low_freq]))[0, 0, 0]))
-    return LoopFigures(
-        True, decay, reached, float(curve[1][top]), float(curve[0][top]), low, low_freq,
-        loop.modulus_margin,
-    )  # fmt: skip
+    peak = freq = low = float("nan")
+    if curve is not None:
+        freq, peak = (float(part[np.argmax(curve[1])]) for part in curve)
+        if np.isfinite(low_freq):
+            low = float(abs(loop.gain(*pair)(np.array([low_freq]))[0, 0, 0]))
+    margin = loop.modulus_margin
+    return LoopFigures(loop.is_stable, decay, reached, peak, freq, low, low_freq, margin)
 
 
 def _cells(row: LoopFigures) -> tuple[str, ...]:

@@ -200,15 +200,14 @@ def taken_apart(loop: Loop) -> BrokenLoop:
 
 def _fed_back(gain: Any) -> tuple[Any, StateSpace]:
     """Return a loop gain as a plant, and the negative unity feedback that closes it."""
-    if isinstance(gain, Frf) or hasattr(gain, "frdata"):
-        gain = gain if isinstance(gain, Frf) else Frf.from_control(gain)
-    elif hasattr(gain, "system") or not hasattr(gain, "dt"):
+    if hasattr(gain, "frdata"):  # python-control's
+        gain = Frf.from_control(gain)
+    elif hasattr(gain, "system") or not (isinstance(gain, Frf) or hasattr(gain, "dt")):
         raise ModelError(
             "need a ClosedLoop, (plant, controller) or a loop gain L of negative feedback, got "
             f"{short(gain)}. Type close_loop(plant, controller) or (plant, controller)."
         )
-    else:
-        gain = as_statespace(gain)
+    gain = gain if isinstance(gain, Frf) else as_statespace(gain)
     outputs, inputs = tuple(gain.outputs), tuple(gain.inputs)
     if len(outputs) != len(inputs):
         raise ModelError(
@@ -222,17 +221,12 @@ def _fed_back(gain: Any) -> tuple[Any, StateSpace]:
 def _modelled(
     plant: StateSpace, controller: StateSpace, poles: Callable[[], ComplexArray]
 ) -> BrokenLoop:
-    dt = plant.dt or controller.dt
-    if (
-        plant.n_states
-        and controller.n_states
-        and not np.isclose(plant.dt, controller.dt, rtol=SAME)
-    ):
+    dt, both = plant.dt or controller.dt, plant.n_states and controller.n_states
+    if both and not np.isclose(plant.dt, controller.dt, rtol=SAME):
         raise ModelError(
             f"plant and controller have dt {plant.dt:g} and {controller.dt:g} s: discretise one."
         )
     plant, controller = plant.replace(dt=dt), controller.replace(dt=dt)
-
     return BrokenLoop(
         tuple(plant.inputs), tuple(plant.outputs), remembered(responder(controller)),
         responder(plant), poles, dt,
@@ -280,16 +274,13 @@ def _measured_loop(plant: Frf, controller: StateSpace, quantities: dict[str, str
         raise unknown_label("measured input", controller.outputs[0], plant.inputs, "the Frf")
     controller = controller.select(driven)
     P = plant.select(controller.inputs, driven).data
+    lines = np.array(plant.freq)
     return BrokenLoop(
-        tuple(driven),
-        tuple(controller.inputs),
+        tuple(driven), tuple(controller.inputs),
         lambda freq: frequency_response(controller, freq).data,
-        lambda freq: on_lines(np.asarray(plant.freq), P, freq),
-        controller.poles,
-        controller.dt,
-        np.array(plant.freq),
-        {**controller.units, **plant.channel_units},
-    )
+        lambda freq: on_lines(lines, P, freq),
+        controller.poles, controller.dt, lines, {**controller.units, **plant.channel_units},
+    )  # fmt: skip
 
 
 def _loop_and_grid(loop: Loop, freq: npt.ArrayLike | None) -> tuple[BrokenLoop, FloatArray]:
@@ -394,8 +385,7 @@ def broken_bandwidth(parts: BrokenLoop) -> float:
             "bandwidth. Stabilise it first: see loop.spectral_radius and loop.modulus_margin."
         )
     grid = parts.grid
-    loop_low = parts.gain(grid[:1])[0]
-    vectors, gains, _ = np.linalg.svd(loop_low)
+    vectors, gains, _ = np.linalg.svd(parts.gain(grid[:1])[0])
     # axes without an actuator: their gain is rounding of the others
     acting = np.asarray(vectors[:, gains >= 1e-6 * gains[0]], dtype=np.complex128)
     values = _sensitivity_along(acting, parts, grid)

@@ -41,7 +41,7 @@ class AssumptionReport(Value):
 
     plant: Partition
 
-    @property
+    @cached_property
     def assumptions(self) -> tuple[Assumption, ...]:
         """All assumptions, in the order in which they matter."""
         return tuple(item for tests in _TESTS for item in self._found(tests))

@@ -168,12 +168,12 @@ def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> Along:
         for i, point in enumerate(points):
             there = _elsewhere(plant, poi.name, point).system
             C[i], D[i] = there.C[at], there.D[at]
-        return Along(poi.name, points, tuple(shown), C, D, np.zeros((points.shape[0], 0, 1)))
-    for k, axis in enumerate(poi.axes):
-        rows = realisation.model.rows(points, axis)
-        C[:, k, plant.modal_states] = realisation.motion(rows, 0)
-    for k, axis in enumerate(tracked, len(channels)):
-        C[:, k] = -C[:, list(poi.axes).index(axis)]
+    else:
+        for k, axis in enumerate(poi.axes):
+            rows = realisation.model.rows(points, axis)
+            C[:, k, plant.modal_states] = realisation.motion(rows, 0)
+        for k, axis in enumerate(tracked, len(channels)):
+            C[:, k] = -C[:, list(poi.axes).index(axis)]
     return Along(poi.name, points, tuple(shown), C, D, np.zeros((points.shape[0], 0, 1)))
 
 
@@ -329,17 +329,11 @@ def position_map(plant: Any, judge: Any, points: Any) -> PositionMap:
         rows.append((_misses(own, there), sees, pushes, list(_figures_at(judges, there))))
     shape = tuple(values.size for values in grid.values())
     decoupling, seen, reached, judged = (
-        np.array(part, dtype=float) for part in zip(*rows, strict=True)
+        np.array(part, dtype=float).reshape(*shape, len(part[0]))
+        for part in zip(*rows, strict=True)
     )
-    judged = judged.reshape(*shape, len(judges))
-    return PositionMap(
-        grid,
-        decoupling.reshape(*shape, 2),
-        seen.reshape(*shape, len(modes)),
-        reached.reshape(*shape, len(modes)),
-        modes,
-        {name: judged[..., i] for i, name in enumerate(judges)},
-    )
+    figures = {name: judged[..., i] for i, name in enumerate(judges)}
+    return PositionMap(grid, decoupling, seen, reached, modes, figures)
 
 
 def _named_judges(judge: Any) -> dict[str, Callable[[Any], float]]:

@@ -67,11 +67,9 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
             more = len(texts) - _SHOWN
             text = "; ".join(texts[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
             found.append(Assumption(case.key, False, f"{text} {listed}.", case.remedy))
-        else:
-            text = f"{' and '.join(words)}, by {counted(len(case.names), 'channel')}."
-            found.append(
-                Assumption(case.key, True, text if words else "every mode decays by itself.")
-            )
+            continue
+        text = f"{' and '.join(words)}, by {counted(len(case.names), 'channel')}."
+        found.append(Assumption(case.key, True, text if words else "every mode decays by itself."))
     return found
 
 
@@ -183,12 +181,6 @@ def _sample(value: complex, rate: float) -> complex:
     return complex(np.exp(value / rate)) if rate else value
 
 
-def _hold_gain(value: complex, rate: float) -> float:
-    """Return what is left of an input that is held for a sample, ``|exp(a) - 1| / |a|``."""
-    a = value / rate if rate else 0.0
-    return abs(np.expm1(a) / a) if a else 1.0
-
-
 def _lacks(plant: Partition, group: list[_Pole], case: _Case, rate: float) -> list[str]:
     """Return, in words, what the channels of a case have no part in at poles that look alike."""
     g = plant.system
@@ -205,7 +197,9 @@ def _lacks(plant: Partition, group: list[_Pole], case: _Case, rate: float) -> li
             seen = _modal_rows(g.C[g.output_index(case.block.inputs)], basis)
             parts.append(_modal_rows(response_at(case.block, _sample(pole.value, rate)), seen))
         elif case.pushes:
-            size = _hold_gain(pole.value, rate) if case.held else 1.0
+            # what is left of an input that is held for a sample, |exp(a) - 1| / |a|
+            a = pole.value / rate if rate and case.held else 0.0
+            size = abs(np.expm1(a) / a) if a else 1.0
             part = _modal_rows(g.B[:, g.input_index(case.names)].T, basis)
             parts.append(part * (size if size > _ALIKE else 0.0))
         else:
@@ -352,13 +346,11 @@ def no_zeros(plant: Partition) -> list[Assumption]:
         if key != "P12":
             g = StateSpace(g.A.T, g.C.T, g.B.T, g.D.T, g.dt)
         zeros = axis_zeros(g)
-        if zeros.size:
-            listed = ", ".join(dict.fromkeys(_frequency(plant, zero) for zero in zeros[:3]))
-            text = f"{fro} -> {to} has an invariant zero on the stability limit at {listed}."
-            found.append(Assumption(key, False, text, remedy))
-        else:
-            text = f"{fro} -> {to} has no invariant zero on the stability limit."
-            found.append(Assumption(key, True, text))
+        listed = ", ".join(dict.fromkeys(_frequency(plant, zero) for zero in zeros[:3]))
+        where = f"an invariant zero on the stability limit at {listed}"
+        text = where if zeros.size else "no invariant zero on the stability limit"
+        said = f"{fro} -> {to} has {text}."
+        found.append(Assumption(key, not zeros.size, said, remedy if zeros.size else ""))
     return found
 
 
@@ -371,7 +363,9 @@ def evened(g: StateSpace) -> StateSpace:
 def _frequency(plant: Partition, zero: complex) -> str:
     """Return a zero on the stability limit as a frequency, with the mode it belongs to."""
     omega = abs(np.log(zero)) / plant.dt if plant.dt else abs(zero)
-    if omega < SPLIT * _top_omega(plant):
+    poles = plant.system.poles()
+    top = np.pi / plant.dt if plant.dt else np.max(np.abs(poles), initial=TINY)
+    if omega < SPLIT * top:
         return "zero frequency (a rigid-body motion or an integrator)"
     text = f"{omega / (2 * np.pi):.4g} Hz"
     own = np.sqrt(np.abs(np.linalg.det(plant.modal_blocks)))
@@ -380,12 +374,6 @@ def _frequency(plant: Partition, zero: complex) -> str:
         if abs(own[nearest] - omega) < 1e-4 * omega:
             return f"{text} (mode {nearest + 1})"
     return text
-
-
-def _top_omega(plant: Partition) -> float:
-    if plant.dt:
-        return float(np.pi / plant.dt)
-    return float(np.max(np.abs(plant.system.poles()), initial=TINY))
 
 
 @dataclass(frozen=True, eq=False)

@@ -287,13 +287,11 @@ def _complex(
     driven = -1j * phi[:, start:] * (size / swing)
     inputs = np.stack([driven.real, -driven.imag], axis=2)
     outputs = np.stack([phi[:, start:].real, phi[:, start:].imag], axis=2) / size[:, None]
-    found = ModalRealisation(
-        model,
-        np.concatenate([real.pairs[:start], pairs]),
-        np.hstack([real.inputs[:, : 2 * start], inputs.reshape(n, -1)]),
-        np.hstack([real.outputs[:, : 2 * start], outputs.reshape(n, -1)]),
-        _state_names(omega.size, omega.size),
-        rigid,
+    found = real.replace(
+        pairs=np.concatenate([real.pairs[:start], pairs]),
+        inputs=np.hstack([real.inputs[:, : 2 * start], inputs.reshape(n, -1)]),
+        outputs=np.hstack([real.outputs[:, : 2 * start], outputs.reshape(n, -1)]),
+        names=_state_names(omega.size, omega.size),
     )
     return _with_two_shapes(found, omega, zeta, phi, slice(rigid, start))
 

@@ -38,13 +38,6 @@ class Late(NamedTuple):
         return self.whole + (self.fraction > 0)
 
 
-class Sampled(NamedTuple):
-    """A sampled system, and the factor of the noise that disturbances add to its states."""
-
-    system: StateSpace
-    noise_factor: FloatArray
-
-
 def sampled_physical(
     g: StateSpace,
     rate: float,
@@ -54,8 +47,10 @@ def sampled_physical(
     late_inputs: Mapping[str, float],
     late_outputs: Mapping[str, float],
     asd: FloatArray,
-) -> Sampled:
+) -> tuple[StateSpace, FloatArray]:
     """Return the zero-order-hold equivalent of a physical system with delays per channel.
+
+    And the factor (n, r) of the noise that disturbances add to its states.
 
     ``x(k h + t) = E(t) x[k] + N(t) u[k - m] + O(t) u[k - m - 1]``: an input that is (m h + f) late
     is the new sample for the last t - f and the old one before that. A late output is the motion
@@ -102,7 +97,7 @@ def sampled_physical(
     if g.blocks is not None:
         blocks = [*[1] * first, *g.blocks, *[1] * (layout.size - first - n)]
     system = g.replace(A=A, B=B, C=C, D=D, dt=h, states=layout.names, blocks=blocks)
-    return Sampled(system, _sampled_noise(g, Flow(g.A, head, pairs), asd, h, layout, outputs))
+    return system, _sampled_noise(g, Flow(g.A, head, pairs), asd, h, layout, outputs)
 
 
 class _Layout:
@@ -226,11 +221,8 @@ class Flow:
     def __init__(self, A: FloatArray, head: int, pairs: FloatArray) -> None:
         b, n = pairs.shape[0], A.shape[0]
         self.A, self.pairs, self.n = A, pairs, n
-        self.head, self.modes, self.tail = (
-            slice(0, head),
-            slice(head, head + 2 * b),
-            slice(head + 2 * b, n),
-        )
+        ends = (0, head, head + 2 * b, n)
+        self.head, self.modes, self.tail = (slice(*two) for two in pairwise(ends))
         h, t = head, n - head - 2 * b
         self.h, self.t, self.b = h, t, b
         # coupling no larger than the rates: large units would make expm square too often
@@ -241,23 +233,20 @@ class Flow:
             float(np.abs(A[self.head, self.tail]).max(initial=0.0)) * self.up,
             rate,
         )
+        self.size = np.repeat([self.up, 1.0, 1.0 / self.down], np.diff(ends))
+        self.whole = whole = self.size[:, None] * A / self.size
         self.direct = np.zeros((h + t, h + t))
         self.direct[:h, :h], self.direct[h:, h:] = A[self.head, self.head], A[self.tail, self.tail]
-        self.direct[:h, h:] = A[self.head, self.tail] * (self.up * self.down)
+        self.direct[:h, h:] = whole[self.head, self.tail]
         self.small = np.zeros((b, h + 2 + t, h + 2 + t))
         self.small[:, :h, :h] = A[self.head, self.head]
         self.small[:, h + 2 :, h + 2 :] = A[self.tail, self.tail]
         self.small[:, h : h + 2, h : h + 2] = pairs
-        seen = A[self.head, self.modes].reshape(h, b, 2).transpose(1, 0, 2)
-        driven = A[self.modes, self.tail].reshape(b, 2, t)
-        self.small[:, :h, h : h + 2] = seen * self.up
-        self.small[:, h : h + 2, h + 2 :] = driven * self.down
+        seen = whole[self.head, self.modes].reshape(h, b, 2)
+        self.small[:, :h, h : h + 2] = seen.transpose(1, 0, 2)
+        self.small[:, h : h + 2, h + 2 :] = whole[self.modes, self.tail].reshape(b, 2, t)
         #: modes that see each other: no sum over pairs, the exponential of the whole
         self.coupled = np.count_nonzero(A[self.modes, self.modes]) > np.count_nonzero(pairs)
-        size = np.ones(n)
-        size[self.head], size[self.tail] = self.up, 1.0 / self.down
-        self.size = size
-        self.whole = size[:, None] * A / size
         self.rate = float(np.linalg.norm(self.whole, 1)) if n else 0.0
         if self.coupled:
             self.reached = acting(A != 0)

@@ -70,13 +70,7 @@ class Position(Value):
         self._set(start=self.within(start))
 
     def within(self, value: Any) -> float:
-        """Return a value of it as a float.
-
-        Raises
-        ------
-        ModelError
-            When it lies outside the range.
-        """
+        """Return a value of it as a float; ModelError when it lies outside the range."""
         found = number(value, f"position {self.name!r}")
         low, high = self.range
         spare = _BEYOND * (high - low)
@@ -271,22 +265,19 @@ def port_at(port: Any, values: Mapping[str, float]) -> Any:
 def require_positions(ports: Sequence[Any], positions: Sequence[Position]) -> None:
     """Refuse ports that move with a position that nobody named, or by a table too short for it."""
     known = {one.name: one for one in positions}
-    for port in ports:
-        moves = getattr(port, "moves", None)
-        if moves is None:
-            continue
-        for name in moves.names:
-            if name not in known:
-                raise LabelError(
-                    f"{port.name!r} moves with {name!r}, which is none of the positions "
-                    f"({', '.join(known) or 'there are none'}). Name it and its range: "
-                    f"Ports(..., positions=[fx.plant.Position({name!r}, range=(-0.1, 0.1))])."
-                )
-        for name in moves.names:
-            if isinstance(moves.along, PlaceTable) and not moves.along.covers(known[name]):
-                low, high = known[name].range
-                raise ModelError(
-                    f"the PlaceTable of {port.name!r} does not span position {name!r} from "
-                    f"{low:g} to {high:g}: nothing is known of its place beyond. Measure on, or "
-                    "narrow the range."
-                )
+    moving = [port for port in ports if getattr(port, "moves", None) is not None]
+    followed = [(port, name) for port in moving for name in port.moves.names]
+    for port, name in followed:
+        if name not in known:
+            raise LabelError(
+                f"{port.name!r} moves with {name!r}, which is none of the positions "
+                f"({', '.join(known) or 'there are none'}). Name it and its range: "
+                f"Ports(..., positions=[fx.plant.Position({name!r}, range=(-0.1, 0.1))])."
+            )
+        along = port.moves.along
+        if isinstance(along, PlaceTable) and not along.covers(known[name]):
+            low, high = known[name].range
+            raise ModelError(
+                f"the PlaceTable of {port.name!r} does not span position {name!r} from {low:g} to "
+                f"{high:g}: nothing is known of its place beyond. Measure on, or narrow the range."
+            )

@@ -82,10 +82,8 @@ class NeglectedModes(Value):
     def __repr__(self) -> str:
         return (
             f"<NeglectedModes: {counted(len(self.inputs), 'input')} -> "
-            f"{counted(len(self.outputs), 'output')}, "
-            f"{counted(self.weights.n_states, 'state')}, bounded {self.tightest:.3g}, median "
-            "looseness "
-            f"{self.looseness:.3g}>"
+            f"{counted(len(self.outputs), 'output')}, {counted(self.weights.n_states, 'state')}, "
+            f"bounded {self.tightest:.3g}, median looseness {self.looseness:.3g}>"
         )
 
 
@@ -172,15 +170,8 @@ def _bounding(pair: Pair, follow: int) -> NeglectedModes:
     order = np.argsort(1.0 / found)
     half = np.searchsorted(np.cumsum(spacing[order]), 0.5 * spacing.sum())
     looseness = float(1.0 / found[order][half])
-    return NeglectedModes(
-        weights,
-        scales,
-        tuple(pair[0].inputs),
-        tuple(pair[0].outputs),
-        mirrored,
-        tightest,
-        looseness,
-    )
+    inputs, outputs = tuple(pair[0].inputs), tuple(pair[0].outputs)
+    return NeglectedModes(weights, scales, inputs, outputs, mirrored, tightest, looseness)
 
 
 def with_neglected(system: StateSpace, neglected: NeglectedModes, deltas: int) -> StateSpace:
