@@ -277,18 +277,12 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
     correlation = shared / (size[:, None] * size[None])
     rows = np.arange(data.shape[1])
     correlation[rows, rows] = 1.0
-    return Frf(
-        first.freq,
-        mean,
-        freedom=_freedom(correlation, size, count - 1, data.shape[2]),
-        inputs=first.inputs,
-        outputs=first.outputs,
-        quantity=first.quantity,
+    return first.replace(
+        data=mean,
+        coherence=None,
         variance=variance,
         correlation=correlation,
-        resolution=first.resolution,
-        window=first.window,
-        overlap=first.overlap,
+        freedom=_freedom(correlation, size, count - 1, data.shape[2]),
     )
 
 
@@ -343,16 +337,12 @@ def stacked_runs(runs: tuple[Frf, ...]) -> Frf:
         correlation = np.zeros((n * len(runs), n * len(runs), first.freq.size), complex)
         for k, block in enumerate(blocks):
             correlation[k * n : (k + 1) * n, k * n : (k + 1) * n] = block
-    return Frf(
-        first.freq,
-        np.concatenate([run.data for run in runs]),
-        variance=np.concatenate(variances) if len(variances) == len(runs) else None,
+    known = len(variances) == len(runs)
+    return first.replace(
+        data=np.concatenate([run.data for run in runs]),
+        coherence=None,
+        variance=np.concatenate(variances) if known else None,
         correlation=correlation,
+        freedom=first.freedom if known else None,
         outputs=[f"{name} of run {k + 1}" for k in range(len(runs)) for name in first.outputs],
-        inputs=first.inputs,
-        quantity=first.quantity,
-        freedom=first.freedom if len(variances) == len(runs) else None,
-        window=first.window,
-        resolution=first.resolution,
-        overlap=first.overlap,
     )

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray
-from ..tolerances import RANK, TINY
-from .refine import Fit, Lines
+from ..tolerances import TINY
+from .refine import Fit, scaled_inverse
 
 #: MAC from which two shapes are one: they differ by less than what a neighbour's tail makes
 ALIKE = 0.9
@@ -60,17 +59,18 @@ def outputs_disagree(fit: Fit, least: float = np.inf) -> bool:
     return alone < min(least, free + noise) and alone * NOISE < fit.cost
 
 
-def coherence(lines: Lines, model: ComplexArray, pole: complex) -> float:
+def coherence(fit: Fit, pole: complex) -> float:
     r"""Return by how much more a misfit near a pole lowers the cost by chance than noise does.
 
     The mean of :math:`|e|^2/\sigma^2` there, times :math:`1 + 2 \sum_k \rho_k` of the correlation
     of e over neighbouring lines up to the first that is noise: misfit that is smooth over so many
     lines counts as one error, not as many.
     """
+    lines = fit.lines
     spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
     reach = max(NEAR * spacing, WIDE * abs(pole.real))
     near = np.abs(2 * np.pi * lines.freq - pole.imag) <= reach
-    error = (lines.data - model)[..., near] * lines.weight[..., near]
+    error = (lines.data - fit.model)[..., near] * lines.weight[..., near]
     power = float(np.sum(np.abs(error) ** 2))
     count = error.shape[-1]
     if power <= 0 or count < 4:
@@ -110,7 +110,7 @@ def twin_poles(fit: Fit) -> tuple[int, int] | None:
                 continue
             single = fit.participation.shape[0] == 1
             if (single and (same or not fit.lines.known)) or (
-                (same or single) and coherence(fit.lines, fit.model, fit.poles[k]) > NOISE
+                (same or single) and coherence(fit, fit.poles[k]) > NOISE
             ):
                 return int(j), int(k)
     return None
@@ -146,13 +146,13 @@ class Disagreement:
         return np.asarray(formal + self.correlation * np.outer(rest, rest))
 
 
-def disagreement(lines: Lines, fit: Fit, least: float, excess: float) -> Disagreement | None:
+def disagreement(fit: Fit, least: float, excess: float) -> Disagreement | None:
     """Return by how much the outputs of a fit differ, and the mean of their own poles.
 
     None where poles of their own lower the cost by less than `least`, or do not explain nearly all
     of the cost's `excess` over that of noise: something else is wrong then.
     """
-    if len(lines.parts) == 1:
+    if len(fit.lines.parts) == 1:
         return None
     own = fit.own
     if fit.cost - own_cost(fit) < max(least, MOSTLY * excess):
@@ -186,9 +186,7 @@ def _parted(fit: Fit) -> list[Fit]:
 def _variance(one: Fit) -> FloatArray:
     """Return the variances (2 m,) of a fit's poles, its participation held."""
     N = one.gradient()[0][: 2 * one.m, : 2 * one.m]
-    size = np.sqrt(np.maximum(np.diag(N), TINY))
-    inverse = la.pinvh(N / np.outer(size, size), rtol=RANK)
-    return np.asarray(one.lines.inflation * np.diag(inverse) / size**2)
+    return np.asarray(one.lines.inflation * np.diag(scaled_inverse(N)))
 
 
 def _strayed(fit: Fit, own: list[Fit]) -> tuple[FloatArray, FloatArray]:

@@ -11,7 +11,6 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray
 from ..errors import SolverError, attempted, warn
-from ..tolerances import RANK
 from .model_error import coherence, own_cost, twin_poles
 from .refine import Fit, Lines, pivoted, refined
 
@@ -25,14 +24,15 @@ def supported(lines: Lines, poles: ComplexArray, part: ComplexArray) -> Fit:
     """Leave out, one by one, poles that noise alone may explain; SolverError when none is left."""
     least = pole_price(lines)
     fit = pivoted(lines, poles, part)
-    costs = _Costs(fit)
     kept = list(range(poles.size))
+    now = fit.cost_of(kept)
     while len(kept) > 1:
-        unit = max(1.0, costs.of(kept) / freedom(lines, len(kept)))
-        losses = [costs.of([k for k in kept if k != out]) - costs.of(kept) for out in kept]
-        if min(losses) > least * unit:
+        allowed = least * max(1.0, now / lines.freedom(len(kept)))
+        costs = [fit.cost_of([k for k in kept if k != out]) for out in kept]
+        if min(costs) - now > allowed:
             break
-        kept.pop(int(np.argmin(losses)))
+        kept.pop(int(np.argmin(costs)))
+        now = min(costs)
     kept = [k for k in kept if len(kept) == 1 or _seen(lines, poles, part, kept, k)]
     if not kept:
         raise SolverError(
@@ -92,37 +92,6 @@ def pole_price(lines: Lines) -> float:
     return price(lines, 2 * (n_out + n_in), CHANCE / n_freq)
 
 
-class _Costs:
-    """Cost of the fit with some of the poles, from one set of normal equations per output."""
-
-    def __init__(self, fit: Fit) -> None:
-        self.m = fit.m
-        self.parts = fit.linear
-        self.known: dict[tuple[int, ...], float] = {}
-
-    def of(self, kept: list[int]) -> float:
-        """Return the cost with the poles at these places only."""
-        key = tuple(kept)
-        if key not in self.known:
-            both = np.array([*kept, *(k + self.m for k in kept)])
-            total = 0.0
-            for N, g, square in self.parts:
-                x = la.lstsq(N[np.ix_(both, both)], g[both], cond=RANK)[0]
-                total += square - float(g[both] @ x)
-            self.known[key] = total
-        return self.known[key]
-
-
-def freedom(lines: Lines, m: int) -> float:
-    """Return the expected cost of a fit with m poles: real data less real parameters.
-
-    Where errors of lines are correlated each parameter fits `inflation` times as much of them.
-    """
-    n_out, n_in, _ = lines.data.shape
-    used = n_out * n_in * (lines.lower + lines.upper) + 2 * m * (n_out + n_in)
-    return float(max(1.0, 2 * lines.data.size - lines.inflation * used))
-
-
 #: half the distance at which a pole is taken apart, in parts of its damping
 APART = 0.5
 #: numbers of residual terms of modes above the band: as few, and where these leave more than noise
@@ -153,12 +122,12 @@ class Trial(NamedTuple):
 #: the rivals of each place at which something may be changed, the best ones first
 Proposals: TypeAlias = Iterable[list[Trial]]
 #: what proposes one kind of change
-Kind: TypeAlias = Callable[[Lines, Fit], Proposals]
+Kind: TypeAlias = Callable[[Fit], Proposals]
 
 
 def improved(
-    lines: Lines, fit: Fit, kinds: Sequence[tuple[Kind, int]], *, steps: int, rough: bool = False
-) -> tuple[Lines, Fit]:
+    fit: Fit, kinds: Sequence[tuple[Kind, int]], *, steps: int, rough: bool = False
+) -> Fit:
     """Return the fit with the changes that lower its cost by more than noise does.
 
     Each kind proposes changes, until none of them is accepted or so many are: refined, it lowers
@@ -168,51 +137,50 @@ def improved(
     """
     for propose, most in kinds:
         for _ in range(most):
-            if rough and exact(lines, fit.model):
-                return lines, fit
-            trials = (one for rivals in propose(lines, fit) for one in rivals[:RIVALS])
-            more = next(filter(None, (_accepted(lines, fit, one, steps) for one in trials)), None)
+            if rough and _is_exact(fit):
+                return fit
+            trials = (one for rivals in propose(fit) for one in rivals[:RIVALS])
+            more = next(filter(None, (_accepted(fit, one, steps) for one in trials)), None)
             if more is None:
                 break
-            lines, fit = more
-    return lines, fit
+            fit = more
+    return fit
 
 
-def _accepted(lines: Lines, fit: Fit, trial: Trial, steps: int) -> tuple[Lines, Fit] | None:
+def _accepted(fit: Fit, trial: Trial, steps: int) -> Fit | None:
     """Return the refined fit of a trial where it is better by more than noise makes it."""
-    if trial.gain < min(trial.least, BEFORE * trial.least):
-        return None
-    more_poles = trial.poles.size > fit.poles.size
-    if more_poles and trial.poles.size > lines.most:
+    more_poles = trial.poles.size > fit.m
+    if trial.gain < min(trial.least, BEFORE * trial.least) or (
+        more_poles and trial.poles.size > fit.lines.most
+    ):
         return None
     below = fit.cost - trial.least
-    start = trial.poles, trial.participation
     more = None
     with attempted(f"a fit with {trial.poles.size} poles", SolverError):
-        more = refined(trial.lines, *start, steps=steps, strict=more_poles, below=below)
+        more = refined(*trial[:3], steps=steps, strict=more_poles, below=below)
     if more is None:
         return None
     zeta, before = (-each.poles.real / np.abs(each.poles) for each in (more, fit))
     if more.cost >= below or zeta.max() >= max(BROADEST, BROADER * before.max(initial=0.0)):
         return None
     if more_poles and not (
-        corroborated(lines, fit.model, more.model)
+        corroborated(fit.lines, fit.model, more.model)
         and newest_pole(fit, more) not in (twin_poles(more) or ())
-        and shared(lines, fit, more, trial.least)
+        and shared(fit, more, trial.least)
     ):
         return None
-    return trial.lines, more
+    return more
 
 
-def shared(lines: Lines, fit: Fit, more: Fit, least: float) -> bool:
+def shared(fit: Fit, more: Fit, least: float) -> bool:
     """Return whether the outputs share what a pole more explains, beyond what else they are off by.
 
     The pole is to lower the cost by what it must, or by the `coherence` of what is left near it;
     and where outputs do not agree on the poles, also that of fits with poles of their own at each
     output, which have no need of a pole for the sake of these differences.
     """
-    new = newest_pole(fit, more)
-    least = max(least, pole_price(lines) * coherence(lines, more.model, more.poles[new]))
+    lines, new = fit.lines, newest_pole(fit, more)
+    least = max(least, pole_price(lines) * coherence(more, more.poles[new]))
     if fit.cost - more.cost < least:
         return False
     if len(lines.parts) == 1:
@@ -220,8 +188,7 @@ def shared(lines: Lines, fit: Fit, more: Fit, least: float) -> bool:
     if "own" not in vars(fit) and _proven(fit, more, least):
         return True
     apart = own_cost(fit)
-    agreed = fit.cost - apart < own_price(lines, fit)
-    return agreed or apart - own_cost(more) > least
+    return fit.cost - apart < own_price(fit) or apart - own_cost(more) > least
 
 
 def _proven(fit: Fit, more: Fit, least: float) -> bool:
@@ -248,73 +215,68 @@ def newest_pole(fit: Fit, more: Fit) -> int:
     return int(np.argmax(away))
 
 
-def own_price(lines: Lines, fit: Fit) -> float:
+def own_price(fit: Fit) -> float:
     """Return by how much poles of their own at each output must lower the cost."""
-    count = 2 * fit.poles.size * (len(lines.parts) - 1)
-    return unit(lines, fit) * price(lines, max(1, count), ALARM)
+    count = 2 * fit.m * (len(fit.lines.parts) - 1)
+    return max(1.0, fit.misfit) * price(fit.lines, max(1, count), ALARM)
 
 
-def unit(lines: Lines, fit: Fit) -> float:
-    """Return the misfit, 1 at least, by which an estimated variance is off everywhere."""
-    return max(1.0, fit.cost / freedom(lines, fit.poles.size))
-
-
-def unwindowed(lines: Lines, fit: Fit) -> Proposals:
+def unwindowed(fit: Fit) -> Proposals:
     """Propose lines that are not seen through the window of segments.
 
     H1 of an input that is white over a few lines is what the window makes of the response; H2, Hv
     and bursts that end within a segment are not.
     """
-    if lines.segment is not None:
-        plain = replace(lines, segment=None)
+    if fit.lines.segment is not None:
+        plain = replace(fit.lines, segment=None)
         yield [Trial(plain, fit.poles, fit.participation, np.inf, 0.0)]
 
 
-def dropped(lines: Lines, fit: Fit) -> Proposals:
+def dropped(fit: Fit) -> Proposals:
     """Propose the poles that are modes and that noise alone does not explain."""
     light = np.flatnonzero(-fit.poles.real < BROADEST * np.abs(fit.poles))
-    less = supported(lines, fit.poles[light], fit.participation[:, light])
+    less = supported(fit.lines, fit.poles[light], fit.participation[:, light])
     if less.m < fit.m:
-        yield [Trial(lines, less.poles, less.participation, np.inf, -np.inf)]
+        yield [Trial(fit.lines, less.poles, less.participation, np.inf, -np.inf)]
 
 
-def merged(lines: Lines, fit: Fit) -> Proposals:
+def merged(fit: Fit) -> Proposals:
     """Propose the fit without the weaker one of two poles of one resonance."""
     pair = twin_poles(fit)
     if pair is not None:
-        rest = np.delete(np.arange(fit.poles.size), pair[1])
-        yield [Trial(lines, fit.poles[rest], fit.participation[:, rest], np.inf, -np.inf)]
+        yield [Trial(fit.lines, *fit.rest(pair[1]), np.inf, -np.inf)]
 
 
-def _refit_terms(lines: Lines, fit: Fit, upper: int, chance: float) -> Trial:
+def _refit_terms(fit: Fit, upper: int, chance: float) -> Trial:
     """Return the fit with another number of residual terms of modes above the band."""
-    other, count = replace(lines, upper=upper), upper - lines.upper
-    channels = lines.data.shape[0] * lines.data.shape[1]
+    lines, count = fit.lines, upper - fit.lines.upper
+    other = replace(lines, upper=upper)
     gain = fit.cost - Fit(other, fit.poles, fit.participation).cost
-    least = np.sign(count) * unit(lines, fit) * price(lines, channels * abs(count), chance)
+    channels = lines.data.shape[0] * lines.data.shape[1]
+    least = np.sign(count) * max(1.0, fit.misfit) * price(lines, channels * abs(count), chance)
     return Trial(other, fit.poles, fit.participation, gain, least)
 
 
-def fewer_terms(lines: Lines, fit: Fit) -> Proposals:
+def fewer_terms(fit: Fit) -> Proposals:
     """Propose the fewest residual terms that the data let pass."""
-    trials = (_refit_terms(lines, fit, upper, FEW) for upper in UPPER if upper < lines.upper)
+    trials = (_refit_terms(fit, upper, FEW) for upper in UPPER if upper < fit.lines.upper)
     yield [trial for trial in trials if trial.gain > trial.least]
 
 
-def more_terms(lines: Lines, fit: Fit) -> Proposals:
+def more_terms(fit: Fit) -> Proposals:
     """Propose more residual terms where the data require them.
 
     Sampling folds modes of more than half the rate into the band, weak and broad ones. What a few
     terms leave of them is too little to be seen and enough to bias, and terms cost next to nothing
     in a wide band: so as many as the lines afford.
     """
-    count = lines.freq.size
-    afforded = [u for u in MORE if u > lines.upper and count >= 8 * (u + lines.lower)]
-    trials = (_refit_terms(lines, fit, upper, CHANCE) for upper in afforded)
+    lines = fit.lines
+    afforded = [u for u in MORE if u > lines.upper and lines.freq.size >= 8 * (u + lines.lower)]
+    trials = (_refit_terms(fit, upper, CHANCE) for upper in afforded)
     yield [trial for trial in trials if trial.gain > trial.least]
 
 
-def split_proposals(lines: Lines, fit: Fit) -> Proposals:
+def split_proposals(fit: Fit) -> Proposals:
     r"""Propose to take those poles apart that are two.
 
     A pole of two modes, repeated or so close that one pole passes for both, requires residues
@@ -323,10 +285,14 @@ def split_proposals(lines: Lines, fit: Fit) -> Proposals:
     .. math:: \frac{\psi l^T}{s-\lambda} \to \frac{\psi l^T + \psi' l_\perp^T}{s-\lambda}
         \quad\text{or}\quad \frac{\psi l^T}{s-\lambda-\delta} + \frac{\psi' l^T}{s-\lambda+\delta}
     """
-    least = pole_price(lines) * unit(lines, fit)
-    pairs = [pair for k in range(fit.poles.size) for pair in _pairs(fit, k)]
-    trials = [Trial(lines, *one, fit.cost - Fit(lines, *one).cost, least) for one in pairs]
-    yield sorted(trials, key=lambda trial: -trial.gain)
+    pairs = (pair for k in range(fit.m) for pair in _pairs(fit, k))
+    yield sorted((_more_poles(fit, *pair) for pair in pairs), key=lambda trial: -trial.gain)
+
+
+def _more_poles(fit: Fit, poles: ComplexArray, part: ComplexArray) -> Trial:
+    """Return the trial of a fit with a pole more."""
+    least = pole_price(fit.lines) * max(1.0, fit.misfit)
+    return Trial(fit.lines, poles, part, fit.cost - Fit(fit.lines, poles, part).cost, least)
 
 
 def _pairs(fit: Fit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
@@ -344,40 +310,35 @@ def _pairs(fit: Fit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
     return pairs
 
 
-def relocated(lines: Lines, fit: Fit) -> Proposals:
+def relocated(fit: Fit) -> Proposals:
     """Propose other places for weak poles, within seven half-widths.
 
     Noise gives the likelihood of a mode that is hardly seen several peaks; the fit climbs the one
     that it is started at.
     """
     for k, pole in enumerate(fit.poles):
-        rest = np.delete(fit.poles, k)
-        if not rest.size or -pole.real > 0.05 * abs(pole):
+        if fit.m == 1 or -pole.real > 0.05 * abs(pole):
             continue
-        without = Fit(lines, rest, np.delete(fit.participation, k, axis=1)).cost
-        if without - fit.cost > WEAK * pole_price(lines):
+        if Fit(fit.lines, *fit.rest(k)).cost - fit.cost > WEAK * pole_price(fit.lines):
             continue
         trials = []
         for shift in np.arange(-7.0, 7.1, 0.7):
             poles = fit.poles.copy()
             poles[k] = pole + 1j * shift * abs(pole.real)
-            gain = fit.cost - Fit(lines, poles, fit.participation).cost
-            trials.append((gain, abs(shift), poles))
-        best = sorted(trials, key=lambda trial: -trial[0])[:RIVALS]
+            trials.append((Fit(fit.lines, poles, fit.participation).cost, abs(shift), poles))
+        best = sorted(trials, key=lambda trial: trial[0])[:RIVALS]
         # refined, it is to lower the cost: where it begins it does so seldom
         yield [
-            Trial(lines, poles, fit.participation, np.inf, GAIN)
+            Trial(fit.lines, poles, fit.participation, np.inf, GAIN)
             for _, shift, poles in best
             if shift >= 1.0
         ]
 
 
-def missed_poles(lines: Lines, fit: Fit) -> Proposals:
+def missed_poles(fit: Fit) -> Proposals:
     """Propose a pole at the highest peaks of what is left, single lines apart."""
-    least = pole_price(lines) * unit(lines, fit)
-    for peak in [peak for peak in unexplained(lines, fit) if not peak.isolated][:TRIED]:
-        poles, part, cost = candidate(lines, fit.model, fit.poles, fit.participation, peak)
-        yield [Trial(lines, poles, part, fit.cost - cost, least)]
+    for peak in [peak for peak in unexplained(fit) if not peak.isolated][:TRIED]:
+        yield [_more_poles(fit, *_with_pole(fit, peak))]
 
 
 #: lengths [lines] of the stretches that are examined
@@ -406,33 +367,35 @@ class Peak:
     isolated: bool = False  # one or two lines, and noise alone around them
 
 
-def residual_peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
-    r"""Return the stretches whose residual is more than noise, the highest first.
+def unexplained(fit: Fit) -> list[Peak]:
+    r"""Return the stretches whose residual is more than noise, each once, the highest first.
 
     Over L lines of c channels the sum of :math:`2 |e|^2/\sigma^2` is chi-square with 2 c L degrees
     of freedom. Its middle and spread are also taken from all stretches (median, median absolute
     deviation): an estimated variance is off everywhere, a missed pole is off in one place.
     """
+    lines, model = fit.lines, fit.model
+    if _is_exact(fit):
+        return []
     error = np.abs(lines.data - model) ** 2 * lines.weight**2
-    channels = lines.data.shape[0] * lines.data.shape[1]
     power = error.sum(axis=(0, 1))
-    found: list[Peak] = []
-    if exact(lines, model):
-        return found
     noiseless = not lines.known and _is_smooth(lines, model)
     measured = np.sum(np.abs(lines.data * lines.weight) ** 2, axis=(0, 1))
+    step = float(lines.freq[1] - lines.freq[0])
+    found: list[Peak] = []
     for length in STRETCHES:
         if 4 * length > power.size:
             break
-        total = np.convolve(power, np.ones(length), mode="valid")
+        ones = np.ones(length)
+        total = np.convolve(power, ones, mode="valid")
         middle = float(np.median(total))
         spread = 1.4826 * float(np.median(np.abs(total - middle)))
-        freedom = 2.0 * channels * length * (1.0 - used)
-        spread = max(spread, middle / freedom * np.sqrt(2.0 * freedom * lines.inflation))
+        free = lines.freedom(fit.m) / power.size * length
+        spread = max(spread, middle / free * np.sqrt(2.0 * free * lines.inflation))
         # chi-square leans to the right, its cube root does not (Wilson and Hilferty, 1931)
         height = 3.0 * middle / spread * (np.cbrt(total / middle) - 1.0)
         if noiseless:
-            share = total / np.convolve(measured, np.ones(length), mode="valid")
+            share = total / np.convolve(measured, ones, mode="valid")
             height = np.where(share > SHARE**2, height, 0.0)
         for _ in range(PLACES):
             best = int(np.argmax(height))
@@ -440,17 +403,18 @@ def residual_peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]
             if highest <= LIMIT:
                 break
             height[max(0, best - 2 * length) : best + 2 * length + 1] = 0.0
-            seen = lines.freq[best : best + length]
-            weight = power[best : best + length]
-            step = float(lines.freq[1] - lines.freq[0])
-            middle_freq = float(seen @ weight / weight.sum())
+            seen = slice(best, best + length)
+            freq, weight = lines.freq[seen], power[seen]
             alone = _isolated(power, best, length, middle, spread)
-            if alone:
-                if not _surpassing(lines, model, slice(best, best + length)):
-                    continue
-                middle_freq = float(seen[np.argmax(weight)])
-            found.append(Peak(middle_freq, step * length, highest, alone))
-    return sorted(found, key=lambda peak: -peak.height)
+            if alone and not _surpassing(lines, model, seen):
+                continue
+            place = freq[np.argmax(weight)] if alone else freq @ weight / weight.sum()
+            found.append(Peak(float(place), step * length, highest, alone))
+    kept: list[Peak] = []
+    for peak in sorted(found, key=lambda peak: -peak.height):
+        if all(abs(peak.freq - other.freq) > max(peak.width, other.width) for other in kept):
+            kept.append(peak)
+    return kept
 
 
 def _isolated(power: FloatArray, first: int, length: int, middle: float, spread: float) -> bool:
@@ -481,9 +445,10 @@ def _surpassing(lines: Lines, model: ComplexArray, where: slice) -> bool:
     return bool(-nu * np.log1p(x / nu) < np.log(CHANCE / lines.data.size))
 
 
-def exact(lines: Lines, model: ComplexArray) -> bool:
+def _is_exact(fit: Fit) -> bool:
     """Whether a fit leaves rounding only."""
-    return bool(la.norm(lines.data - model) < ROUNDING * la.norm(lines.data))
+    data = fit.lines.data
+    return bool(la.norm(data - fit.model) < ROUNDING * la.norm(data))
 
 
 def _is_smooth(lines: Lines, model: ComplexArray) -> bool:
@@ -496,43 +461,28 @@ def _is_smooth(lines: Lines, model: ComplexArray) -> bool:
     return bool(np.median(near / np.convolve(power[1:], window, mode="valid")) > 0.5)
 
 
-def candidate(
-    lines: Lines, model: ComplexArray, poles: ComplexArray, part: ComplexArray, peak: Peak
-) -> tuple[ComplexArray, ComplexArray, float]:
-    """Return poles and participation with the one added that explains a peak best, and the cost.
+def _with_pole(fit: Fit, peak: Peak) -> tuple[ComplexArray, ComplexArray]:
+    """Return poles and participation with the one added that explains a peak best.
 
     Frequencies across the peak and some damping ratios are tried; the participation is the
     leading right singular vector of what the trial pole has in common with the residual.
     """
-    error = (lines.data - model) * lines.weight**2
-    best: tuple[float, ComplexArray, ComplexArray] | None = None
+    lines = fit.lines
+    error = (lines.data - fit.model) * lines.weight**2
+    best, pole, part = -1.0, 0j, fit.participation
     # dampings that a resolved peak can have
     own = np.clip(peak.width / (2 * peak.freq) * np.array([0.3, 1.0]), 1e-5, 0.15)
     for zeta in np.unique([*DAMPING, *own.tolist()]):
         for shift in (-0.5, -0.2, 0.0, 0.2, 0.5):
             omega = 2 * np.pi * (peak.freq + shift * peak.width)
-            pole = omega * (-zeta + 1j * np.sqrt(1 - zeta**2))
-            term = 1.0 / (2j * np.pi * lines.freq - pole)
-            common = error @ term.conj()
+            place = omega * (-zeta + 1j * np.sqrt(1 - zeta**2))
+            term = 1.0 / (2j * np.pi * lines.freq - place)
             gain = np.sum(lines.weight**2 * np.abs(term) ** 2, axis=2)
-            sizes, right = la.svd(common / np.sqrt(gain))[1:]
-            score = float(sizes[0])
-            if best is None or score > best[0]:
-                best = score, np.array([pole]), right[0][:, None]
-    assert best is not None  # noqa: S101 - trials were made
-    more = np.concatenate([poles, best[1]])
-    parts = np.concatenate([part, best[2].astype(np.complex128)], axis=1)
-    return more, parts, Fit(lines, more, parts).cost
-
-
-def unexplained(lines: Lines, fit: Fit) -> list[Peak]:
-    """Return the peaks of what a fit leaves, each once, the highest first."""
-    used = 1.0 - freedom(lines, fit.poles.size) / (2 * fit.model.size)
-    kept: list[Peak] = []
-    for peak in residual_peaks(lines, fit.model, used):
-        if all(abs(peak.freq - other.freq) > max(peak.width, other.width) for other in kept):
-            kept.append(peak)
-    return kept
+            sizes, right = la.svd(error @ term.conj() / np.sqrt(gain))[1:]
+            if sizes[0] > best:
+                best, pole, part = float(sizes[0]), place, right[0][:, None]
+    parts = np.hstack([fit.participation, part.astype(np.complex128)])
+    return np.append(fit.poles, pole), parts
 
 
 def warned(left: list[Peak], apart: tuple[float, str, str] | None) -> None:

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, IntArray
@@ -74,6 +73,15 @@ class Lines:
     def parts(self) -> tuple[IntArray, ...]:
         """The rows that may have poles of their own: those of a set-up together, else each."""
         return self.setups or tuple(np.arange(len(self.data))[:, None])
+
+    def freedom(self, m: int) -> float:
+        """Return the expected cost of a fit with m poles: real data less real parameters.
+
+        Where errors of lines are correlated each parameter fits `inflation` times as much of them.
+        """
+        n_out, n_in, _ = self.data.shape
+        used = n_out * n_in * (self.lower + self.upper) + 2 * m * (n_out + n_in)
+        return float(max(1.0, 2 * self.data.size - self.inflation * used))
 
     def of_rows(self, rows: IntArray) -> Lines:
         """Return the lines of some outputs."""
@@ -190,6 +198,12 @@ def refined(
     return now
 
 
+def scaled_inverse(N: FloatArray) -> FloatArray:
+    """Return the inverse of a normal matrix, that of what is not determined zero."""
+    size = np.sqrt(np.maximum(np.diag(N), TINY))
+    return np.asarray(la.pinvh(N / np.outer(size, size), rtol=RANK) / np.outer(size, size))
+
+
 def pivoted(lines: Lines, poles: ComplexArray, participation: ComplexArray) -> Fit:
     """Return the fit whose largest entry of each column of the participation is 1, and held."""
     pivots = np.argmax(np.abs(participation), axis=0)
@@ -219,8 +233,8 @@ class Fit:
         lines.work.add(lines.data.size * (2 * m) ** 2)
         self.lines, self.poles, self.participation, self.m = lines, poles, participation, m
         self.pivots: IntArray = np.zeros(m, dtype=int) if pivots is None else pivots
-        self.plus, self.slope = seen_terms(poles, s, lines.hold, lines.segment)
-        self.minus, self.slope_minus = seen_terms(poles.conj(), s, lines.hold, lines.segment)
+        self.plus, self.slope = pole_terms(poles, s, lines.hold, lines.segment)
+        self.minus, self.slope_minus = pole_terms(poles.conj(), s, lines.hold, lines.segment)
         self.shapes = np.zeros((n_out, m), dtype=np.complex128)
         self.triangles: list[tuple[FloatArray, FloatArray]] = []
         #: per output the basis of the shapes' columns, free of residual terms, and the error
@@ -245,8 +259,25 @@ class Fit:
             columns = _off(Q, _real_and_imag(both * w[:, None, :]))
             yield columns.swapaxes(0, 1).reshape(2 * self.m, w.shape[0] * columns.shape[2]).T
 
+    @property
+    def misfit(self) -> float:
+        """The cost by that of noise of the stated variance."""
+        return self.cost / self.lines.freedom(self.m)
+
+    def rest(self, place: int) -> tuple[ComplexArray, ComplexArray]:
+        """Return poles and participation without those at a place."""
+        return np.delete(self.poles, place), np.delete(self.participation, place, axis=1)
+
+    def cost_of(self, kept: list[int]) -> float:
+        """Return the cost with the poles at some places only, from the normal equations."""
+        both, total = np.array([*kept, *(k + self.m for k in kept)]), 0.0
+        for N, g, square in self._normal:
+            x = la.lstsq(N[np.ix_(both, both)], g[both], cond=RANK)[0]
+            total += square - float(g[both] @ x)
+        return total
+
     @cached_property
-    def linear(self) -> list[tuple[FloatArray, FloatArray, float]]:
+    def _normal(self) -> list[tuple[FloatArray, FloatArray, float]]:
         """Per output the normal equations of its shapes, and the power they are to explain."""
         found = []
         for right, (Q, _), (R, size) in zip(
@@ -324,8 +355,8 @@ class Fit:
             )
         return found
 
-    def _jacobian(self, o: int) -> tuple[FloatArray, FloatArray]:
-        """Return J (n_in 2 n_freq, n_parameters) of an output, and what the shapes take of it.
+    def _jacobian(self, o: int) -> FloatArray:
+        """Return J (n_in 2 n_freq, n_parameters) of an output.
 
         ``J = D - Q Q^T D`` with how the rows of each input move, D, and the basis Q of the shapes.
         """
@@ -336,9 +367,7 @@ class Fit:
         for own, D, (mine, at) in zip(J, moving, self._places, strict=True):
             own[:, at] = D[mine].T
         J = J.reshape(Q.shape[0], -1)
-        common = Q.T @ J
-        J -= Q @ common
-        return J, common
+        return np.asarray(J - Q @ (Q.T @ J))
 
     def gradient(self) -> tuple[FloatArray, FloatArray]:
         """Return J^T J and J^T e of the nonlinear parameters, all outputs together."""
@@ -372,7 +401,7 @@ class Fit:
                 common[:, at] += (D @ basis).T[:, mine]
             left -= common.T @ common
             if np.any(np.diag(left) < OWN_SQUARE * np.diag(whole)):
-                J = self._jacobian(o)[0]
+                J = self._jacobian(o)
                 left = J.T @ J
             N += left
             taken.append(common)
@@ -382,7 +411,7 @@ class Fit:
         """Yield J (n_in, n_freq, n_parameters) per output."""
         n_in, n_freq = self.lines.data.shape[1:]
         for o in range(len(self.bases)):
-            split = self._jacobian(o)[0].reshape(n_in, 2, n_freq, -1)
+            split = self._jacobian(o).reshape(n_in, 2, n_freq, -1)
             yield split[:, 0] + 1j * split[:, 1]
 
     def maps(self) -> list[tuple[FloatArray, ComplexArray]]:
@@ -485,72 +514,33 @@ def hann_ratio(gap: ComplexArray, segment: float) -> tuple[ComplexArray, Complex
     """
     T, turn = segment, 2j * np.pi
     x = gap * T
-    middle, (low, d_low), (high, d_high) = (
-        _ramp(x),
-        *(_smooth_step(x + side) for side in (-turn, turn)),
-    )
-    left, right = _ramp(x - turn), _ramp(x + turn)
-    g = (4.0 * middle[0] + left[0] + right[0]) / 6.0 + (low - high) / (2.0 * turn)
-    slope = (4.0 * middle[1] + left[1] + right[1]) / 6.0 + (d_low - d_high) / (2.0 * turn)
+    _, middle = _lag_terms(x)
+    low, left = _lag_terms(x - turn)
+    high, right = _lag_terms(x + turn)
+    g, slope = (4.0 * middle + left + right) / 6.0 + (low - high) / (2.0 * turn)
     return np.asarray(x * g), np.asarray(T * (g + x * slope))
 
 
-def _smooth_step(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return ``mu = (1 - exp(-x)) / x`` and its derivative."""
+def _lag_terms(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """Return ``mu = (1 - exp(-x)) / x`` and ``kappa = (1 - mu) / x``, each with its derivative."""
     near = np.abs(x) < SERIES
     far: ComplexArray = np.where(near, 1.0 + 0j, x)
     decay = np.exp(-far)
-    value = (1.0 - decay) / far
-    slope = (decay * (1.0 + far) - 1.0) / far**2
-    return _with_series(x, near, value, slope, 1)
-
-
-def _ramp(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return ``kappa = (x - 1 + exp(-x)) / x^2`` and its derivative."""
-    near = np.abs(x) < SERIES
-    far: ComplexArray = np.where(near, 1.0 + 0j, x)
-    decay = np.exp(-far)
-    value = (far - 1.0 + decay) / far**2
-    slope = ((1.0 - decay) / far - 2.0 * value) / far
-    return _with_series(x, near, value, slope, 2)
-
-
-def _with_series(
-    x: ComplexArray,
-    near: npt.NDArray[np.bool_],
-    value: ComplexArray,
-    slope: ComplexArray,
-    first: int,
-) -> tuple[ComplexArray, ComplexArray]:
-    """Return value and slope, near zero by the series ``sum (-x)^n / (n + first)!``."""
+    mu = (1.0 - decay) / far
+    kappa = (1.0 - mu) / far
+    found = np.array([[mu, (decay - mu) / far], [kappa, (mu - 2.0 * kappa) / far]])
     if np.any(near):
-        z = x[near]
-        factorial, power, total, change = 1.0, np.ones_like(z), 0.0 * z, 0.0 * z
-        for k in range(2, first + 1):
-            factorial *= k
-        for n in range(TERMS):
-            total = total + power / factorial
-            factorial *= n + 1 + first
-            change = change - (n + 1) * power / factorial
-            power = -power * z
-        value, slope = value.copy(), slope.copy()
-        value[near], slope[near] = total, change
-    return value, slope
-
-
-def seen_terms(
-    poles: ComplexArray, s: ComplexArray, hold: float | None, segment: float | None
-) -> tuple[ComplexArray, ComplexArray]:
-    """Return `pole_terms` as lines of Hann-windowed segments [s] show them; None: as they are."""
-    value, slope = pole_terms(poles, s, hold)
-    if segment is None:
-        return value, slope
-    ratio, change = hann_ratio(s[None, :] - poles[:, None], segment)
-    return value * ratio, slope * ratio - value * change
+        # kappa = sum (-x)^n / (n + 2)!
+        z, n = x[near], np.arange(TERMS)
+        inverse = 1.0 / np.cumprod(np.arange(1.0, TERMS + 3))[1:]
+        powers = (-z[:, None]) ** n
+        value, slope = powers @ inverse[:-1], -powers @ ((n + 1) * inverse[1:])
+        found[:, :, near] = [[1.0 - z * value, -value - z * slope], [value, slope]]
+    return found[0], found[1]
 
 
 def pole_terms(
-    poles: ComplexArray, s: ComplexArray, hold: float | None
+    poles: ComplexArray, s: ComplexArray, hold: float | None, segment: float | None = None
 ) -> tuple[ComplexArray, ComplexArray]:
     r"""Return ``1/(s - lambda)`` (n_poles, n_freq) and its derivative with respect to lambda.
 
@@ -559,18 +549,23 @@ def pole_terms(
     .. math:: \frac{e^{\lambda T} - 1}{\lambda}\,\frac{1}{z - e^{\lambda T}}, \quad z = e^{sT},
 
     which has the same pole on the axis of s and tends to 1/(s - lambda) with T
-    ([PintelonSchoukens2012]_, section 6.2).
+    ([PintelonSchoukens2012]_, section 6.2). `segment`: as lines of Hann-windowed segments [s] show
+    them.
     """
     gap = s[None, :] - poles[:, None]
-    if hold is None:
-        return 1.0 / gap, 1.0 / gap**2
-    T = 1.0 / hold
-    turn = np.exp(poles * T)[:, None]
-    # 1 - exp(-gap T) loses digits near the pole unless computed by expm1
-    distance = turn * np.expm1(gap * T)
-    gain = (np.expm1(poles * T) / poles)[:, None]
-    slope = (turn * T - gain) / poles[:, None]
-    return gain / distance, slope / distance + gain * T * turn / distance**2
+    value, slope = 1.0 / gap, 1.0 / gap**2
+    if hold is not None:
+        T = 1.0 / hold
+        turn = np.exp(poles * T)[:, None]
+        # 1 - exp(-gap T) loses digits near the pole unless computed by expm1
+        distance = turn * np.expm1(gap * T)
+        gain = (np.expm1(poles * T) / poles)[:, None]
+        change = (turn * T - gain) / poles[:, None]
+        value, slope = gain / distance, change / distance + gain * T * turn / distance**2
+    if segment is not None:
+        ratio, change = hann_ratio(gap, segment)
+        value, slope = value * ratio, slope * ratio - value * change
+    return value, slope
 
 
 def residual_terms(

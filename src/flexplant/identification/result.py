@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError, SolverError, warn
@@ -17,14 +16,12 @@ from .diagram import StabilisationDiagram
 from .line_weights import PreparedLines, Rejected
 from .measured import MeasuredModes
 from .model_error import Disagreement
-from .pole_test import freedom
-from .refine import Fit, Lines, axis, free_inputs, residual_terms, seen_terms
+from .refine import Fit, axis, free_inputs, pole_terms, residual_terms, scaled_inverse
 
 
 def answer(
     frf: Frf,
     ready: PreparedLines,
-    lines: Lines,
     fit: Fit,
     reported: IntArray,
     labels: Mapping[str, str],
@@ -34,7 +31,7 @@ def answer(
     apart: Disagreement | None,
 ) -> IdentifiedModes:
     """Return the identified modes of a fit, sorted, those that are reported."""
-    misfit = fit.cost / freedom(lines, fit.poles.size)
+    lines, misfit = fit.lines, fit.misfit
     formal, spread = _covariances(fit, ready)
     covariance, spread = formal * max(1.0, misfit), spread * max(1.0, misfit)
     if apart is not None:
@@ -45,12 +42,11 @@ def answer(
     outputs = tuple(labels.get(name, name) for name in frf.outputs)
     inputs = tuple(labels.get(name, name) for name in frf.inputs)
     shared = [(outputs.index(dof), i) for i, dof in enumerate(inputs) if dof in outputs]
-    raw, unscaled = shapes, part
-    shapes, part, normalised = _scaled_shapes(fit.poles, shapes, part, shared if labels else [])
+    normalised = bool(labels and shared)
+    shapes, part, T = _scaled_shapes(fit.poles, shapes, part, shared if normalised else [])
     if ready.swapped:
         turned = np.roll(np.arange(spread.shape[1]), -len(fit.shapes))
         spread = spread[:, turned][:, :, turned]
-    T = _scale_errors((raw, unscaled), (shapes, part), shared if normalised else [])
     spread = T @ spread @ T.conj().transpose(0, 2, 1)
     order = np.argsort(np.abs(fit.poles), kind="stable")
     seen = np.isin(order, reported)
@@ -93,12 +89,12 @@ def _covariances(fit: Fit, ready: PreparedLines) -> tuple[FloatArray, ComplexArr
     """
     N, maps = fit.gradient()[0], fit.maps()
     m, n_out, n_in = fit.poles.size, len(maps), fit.participation.shape[0]
-    size = np.sqrt(np.maximum(np.diag(N), TINY))
     # participation of repeated poles is known up to a rotation only: it gets no variance
-    inverse = la.pinvh(N / np.outer(size, size), rtol=1e-13) / np.outer(size, size)
+    inverse = scaled_inverse(N)
     slopes = np.array([slope for slope, _ in maps]).reshape(n_out, 2, m, -1)
     direct = [own for _, own in maps]
-    common, mixed = inverse, np.zeros((n_out, inverse.shape[0], 2 * m))
+    common = inverse
+    mixed: FloatArray = np.zeros((n_out, len(inverse), 2 * m))
     held = np.zeros((n_out, n_out, 2 * m, 2 * m))
     if ready.independent:
         for a, own in enumerate(direct):
@@ -139,36 +135,37 @@ def _free_entries(fit: Fit) -> FloatArray:
     return found
 
 
-def _scale_errors(
-    raw: tuple[ComplexArray, ComplexArray],
-    scaled: tuple[ComplexArray, ComplexArray],
-    shared: list[tuple[int, int]],
-) -> ComplexArray:
-    r"""Return T (m, n_out + n_in, n_out + n_in) from errors of raw channels to those scaled.
+def _scaled_shapes(
+    poles: ComplexArray, psi: ComplexArray, part: ComplexArray, shared: list[tuple[int, int]]
+) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+    r"""Return shapes mass-normalised by shared DOFs, or with a largest entry of 1; participation.
 
-    With ``phi = f psi`` and ``p = l / f``: ``d phi = f d psi + phi df/f`` and
-    ``d p = d l / f - p df/f``. Of `shared` channels s, ``f^2 ~ psi_s^H l_s / |psi_s|^2`` and l_s is
-    a multiple r of psi_s but for noise, so that ``2 df/f = psi_s^H (d l_s / r - d psi_s) /
-    |psi_s|^2``; else ``f = 1 / psi_max``.
+    And T (m, n_out + n_in, n_out + n_in) from errors of the raw channels to those scaled. With
+    ``phi = f psi``, ``p = l / f``: ``d phi = f d psi + phi df/f`` and ``d p = d l / f - p df/f``.
+    Of `shared` channels s, ``f^2 ~ psi_s^H l_s / |psi_s|^2`` and l_s is a multiple r of psi_s but
+    for noise, so that ``2 df/f = psi_s^H (d l_s / r - d psi_s) / |psi_s|^2``; else
+    ``f = 1 / psi_max``.
     """
-    psi, part = raw
     n_out, m = psi.shape
     large, columns = np.argmax(np.abs(psi), axis=0), np.arange(m)
-    factor = scaled[0][large, columns] / psi[large, columns]
     g = np.zeros((m, n_out + part.shape[0]), dtype=np.complex128)
     if shared:
         rows, places = (list(side) for side in zip(*shared, strict=True))
         driven = psi[rows].conj() / np.sum(np.abs(psi[rows]) ** 2, axis=0)
         ratio = np.sum(driven * part[places], axis=0)
+        factor = np.sqrt(2j * poles.imag * ratio)
+        factor = factor * np.where((factor * psi[large, columns]).real < 0, -1.0, 1.0)
         for row, place, weight in zip(rows, places, driven, strict=True):
             g[:, row] -= 0.5 * weight
             g[:, n_out + place] += 0.5 * weight / ratio
     else:
-        g[columns, large] = -1.0 / psi[large, columns]
-    T = np.concatenate([scaled[0], -scaled[1]]).T[:, :, None] * g[:, None, :]
+        factor = 1.0 / psi[large, columns]
+        g[columns, large] = -factor
+    phi, driving = psi * factor, part / factor
+    T = np.concatenate([phi, -driving]).T[:, :, None] * g[:, None, :]
     diagonal = np.arange(g.shape[1])
     T[:, diagonal, diagonal] += np.where(diagonal < n_out, factor[:, None], 1 / factor[:, None])
-    return np.asarray(T)
+    return phi, driving, np.asarray(T)
 
 
 def _inner_product(left: ComplexArray, right: ComplexArray | None) -> Any:
@@ -176,23 +173,6 @@ def _inner_product(left: ComplexArray, right: ComplexArray | None) -> Any:
     if right is None:
         return 0.0
     return (left.reshape(-1, left.shape[2]).conj().T @ right.reshape(-1, right.shape[2])).real
-
-
-def _scaled_shapes(
-    poles: ComplexArray, shapes: ComplexArray, part: ComplexArray, shared: list[tuple[int, int]]
-) -> tuple[ComplexArray, ComplexArray, bool]:
-    """Return shapes mass-normalised by shared DOFs, or with a largest entry of 1."""
-    columns = np.arange(poles.size)
-    if shared:
-        rows, places = (list(side) for side in zip(*shared, strict=True))
-        driven = shapes[rows]
-        ratio = np.sum(driven.conj() * part[places], axis=0) / np.sum(np.abs(driven) ** 2, axis=0)
-        factor = np.sqrt(2j * poles.imag * ratio)
-        large = np.argmax(np.abs(shapes), axis=0)
-        factor = factor * np.where((factor * shapes[large, columns]).real < 0, -1.0, 1.0)
-    else:
-        factor = 1.0 / shapes[np.argmax(np.abs(shapes), axis=0), columns]
-    return shapes * factor, part / factor, bool(shared)
 
 
 #: width 2 zeta f of a resonance in lines below which leakage may keep poles from being stable
@@ -416,8 +396,8 @@ class IdentifiedModes(MeasuredModes):
         shapes = np.concatenate([self.shapes, shapes], axis=1)
         participation = np.concatenate([self.participation, participation], axis=1)
         segment = self.segment if as_measured else None
-        plus, _ = seen_terms(poles, s, self.hold, segment)
-        minus, _ = seen_terms(poles.conj(), s, self.hold, segment)
+        plus, _ = pole_terms(poles, s, self.hold, segment)
+        minus, _ = pole_terms(poles.conj(), s, self.hold, segment)
         data = np.einsum("ok,ik,kf->oif", shapes, participation, plus)
         data += np.einsum("ok,ik,kf->oif", shapes.conj(), participation.conj(), minus)
         upper = self.terms.shape[2] - self.lower

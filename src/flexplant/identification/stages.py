@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray
+from ..checks import ComplexArray, IntArray
 from ..errors import ModelError, ShapeError, SolverError, attempted, counted, warn
 from ..lti.frequency import Frf
 from ..parallel import Progress, expect
-from ..tolerances import RANK, TINY
+from ..tolerances import TINY
 from .diagram import (
     PoleSelection,
     StabilisationDiagram,
@@ -35,7 +34,6 @@ from .model_error import (
 from .pole_test import (
     dropped,
     fewer_terms,
-    freedom,
     improved,
     merged,
     missed_poles,
@@ -47,11 +45,10 @@ from .pole_test import (
     split_proposals,
     supported,
     unexplained,
-    unit,
     unwindowed,
     warned,
 )
-from .refine import Exhausted, Fit, Lines, Products, pivoted, refined
+from .refine import Exhausted, Fit, Lines, Products, pivoted, refined, scaled_inverse
 from .result import IdentifiedModes, answer, hann_segment, leakage_warned
 
 #: half-widths beside a pole within which another one may stand for the same resonance
@@ -59,12 +56,7 @@ BESIDE = 3.0
 
 
 def gated(
-    lines: Lines,
-    fit: Fit,
-    fitted: Callable[[ComplexArray, ComplexArray], Fit],
-    *,
-    alone: bool,
-    compare: bool,
+    fit: Fit, steps: int, *, alone: bool, compare: bool
 ) -> tuple[Fit, IntArray, tuple[Rejected, ...]]:
     """Return the fit without poles that are none, the places of those reported, and the others.
 
@@ -73,25 +65,26 @@ def gated(
     chosen by hand are not merged (`alone`: none were).
     """
     listed: list[Rejected] = []
-    while True:
-        found = _needless(lines, fit, fitted, alone, compare)
-        if found is None:
-            break
+    while (found := _needless(fit, steps, alone, compare)) is not None:
         place, reason = found
         listed.append(rejection(fit, place, reason))
-        if fit.poles.size == 1:
+        if fit.m == 1:
             raise SolverError(
                 f"no pole is left: {listed[-1][0]:.5g} Hz is {reason}. Widen the band, measure "
                 "longer, or average more."
             )
-        rest = np.delete(np.arange(fit.poles.size), place)
-        fit = fitted(fit.poles[rest], fit.participation[:, rest])
-    reasons = [_rejection(lines, pole) for pole in fit.poles]
+        fit = _without(fit, place, steps)
+    reasons = [_rejection(fit.lines, pole) for pole in fit.poles]
     listed += [rejection(fit, k, why) for k, why in enumerate(reasons) if why]
     kept = np.array([k for k, why in enumerate(reasons) if why is None], dtype=np.int64)
     if not kept.size:
         raise _none_left(listed)
     return fit, kept, tuple(sorted(listed))
+
+
+def _without(fit: Fit, place: int, steps: int) -> Fit:
+    """Return the fit without one of its poles."""
+    return refined(fit.lines, *fit.rest(place), steps=steps, strict=False)
 
 
 def steady(
@@ -138,52 +131,36 @@ def rejection(fit: Fit, k: int, reason: str) -> Rejected:
     return abs(pole) / (2 * np.pi), -pole.real / abs(pole), reason
 
 
-def _needless(
-    lines: Lines,
-    fit: Fit,
-    fitted: Callable[[ComplexArray, ComplexArray], Fit],
-    alone: bool,
-    compare: bool,
-) -> tuple[int, str] | None:
+def _needless(fit: Fit, steps: int, alone: bool, compare: bool) -> tuple[int, str] | None:
     """Return a pole that is to be left out, and why."""
-    size, std = np.abs(fit.poles), _deviations(lines, fit)
+    size, worse = np.abs(fit.poles), max(1.0, fit.misfit) * fit.lines.inflation
+    variance = np.diag(scaled_inverse(fit.gradient()[0]))[: 2 * fit.m] * worse
+    std = np.sqrt(variance).reshape(2, -1)
     unknown = np.maximum(std[1] / size, std[0] / np.maximum(-fit.poles.real, TINY))
-    inside = [k for k in range(size.size) if _rejection(lines, fit.poles[k]) is None]
+    inside = [k for k in range(size.size) if _rejection(fit.lines, fit.poles[k]) is None]
     worst = max(inside, key=lambda k: float(unknown[k]), default=None)
     if worst is not None and unknown[worst] >= 1.0:
         return worst, "without information: its deviation of frequency or damping exceeds it"
     if not alone:
         return None
+
+    def is_shared(place: int) -> bool:
+        # true where there is no fit without it
+        with attempted("a fit without one of its poles", SolverError):
+            least = pole_price(fit.lines) * max(1.0, fit.misfit)
+            return shared(_without(fit, place, steps), fit, least)
+        return True
+
     found = twin_poles(fit)
     if found is not None:
         other, place = found
         alike = column_mac(fit.shapes, other, place) > ALIKE
-        if not compare or alike or not _is_shared(lines, fit, fitted, place):
+        if not compare or alike or not is_shared(place):
             return place, f"a twin of the pole at {size[other] / (2 * np.pi):.5g} Hz"
     for place in lesser(fit, fit.shapes) if compare else []:
-        if not _is_shared(lines, fit, fitted, place):
-            return place, f"not shared by the {lines.side}: it stands for what they differ by"
+        if not is_shared(place):
+            return place, f"not shared by the {fit.lines.side}: it stands for what they differ by"
     return None
-
-
-def _is_shared(
-    lines: Lines, fit: Fit, fitted: Callable[[ComplexArray, ComplexArray], Fit], place: int
-) -> bool:
-    """Return whether the outputs share a pole of the fit, true where there is no fit without it."""
-    rest = np.delete(np.arange(fit.poles.size), place)
-    with attempted("a fit without one of its poles", SolverError):
-        less = fitted(fit.poles[rest], fit.participation[:, rest])
-        return shared(lines, less, fit, pole_price(lines) * unit(lines, fit))
-    return True
-
-
-def _deviations(lines: Lines, fit: Fit) -> FloatArray:
-    """Return the deviations (2, m) of Re and Im of the poles, misfit included."""
-    N, _ = fit.gradient()
-    size = np.sqrt(np.maximum(np.diag(N), TINY))
-    inverse = la.pinvh(N / np.outer(size, size), rtol=RANK)
-    variance = np.diag(inverse) / size**2 * unit(lines, fit) * lines.inflation
-    return np.asarray(np.sqrt(variance[: 2 * fit.poles.size]).reshape(2, -1))
 
 
 def lesser(fit: Fit, vectors: ComplexArray, alike: float = 0.0) -> list[int]:
@@ -434,32 +411,28 @@ def _answered(
     # poles that outputs are to share are known where a refinement, or own fits, were made
     compare = settled or differ
 
-    def again(poles: ComplexArray, part: ComplexArray) -> Fit:
-        count = task.steps if settled else QUICK * int(compare)
-        return refined(lines, poles, part, steps=count, strict=False)
-
-    fit, reported, rejected = gated(lines, now.fit, again, alone=begin.alone, compare=compare)
+    count = task.steps if settled else QUICK * int(compare)
+    fit, reported, rejected = gated(now.fit, count, alone=begin.alone, compare=compare)
     apart = None
     if settled:
         fit = refined(lines, fit.poles, fit.participation, steps=task.steps, fine=True)
     if compare:
-        excess = fit.cost - freedom(lines, fit.poles.size)
-        apart = disagreement(lines, fit, own_price(lines, fit), excess)
+        excess = fit.cost - lines.freedom(fit.m)
+        apart = disagreement(fit, own_price(fit), excess)
         if apart is not None:
             reported, others = steady(fit, reported, apart)
             fit = Fit(lines, apart.poles, fit.participation, fit.pivots)
             rejected += others
     # a first answer may leave some misfit, but not so much that deviations are twice as large
-    misfit = fit.cost / freedom(lines, fit.poles.size)
-    if compare or task.budget.done > BUDGET or (begin.alone and misfit > LARGE):
+    if compare or task.budget.done > BUDGET or (begin.alone and fit.misfit > LARGE):
         odd = None if apart is None else (apart.size, lines.side, _odd(task.frf, lines, apart))
-        warned(unexplained(lines, fit), odd)
+        warned(unexplained(fit), odd)
     if task.side == RUNS:
         ready = ready.over_runs(task.runs)
         lines = replace(lines, data=ready.data, weight=ready.weight, setups=())
         fit = Fit(lines, fit.poles, fit.participation, fit.pivots)
     found = answer(
-        *(task.frf, ready, lines, fit, reported, task.labels, begin.diagram),
+        *(task.frf, ready, fit, reported, task.labels, begin.diagram),
         *(tuple(sorted(weaker + rejected + ready.mains)), reason, apart),
     )
     if begin.at_peaks:
@@ -505,7 +478,7 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
     fit = Fit(lines, none[0], none)
     ends = 2 * np.pi * np.array([lines.freq[FLANK], lines.freq[-1 - FLANK]])
     for _ in range(MOST):
-        trials = [one for rivals in missed_poles(lines, fit) for one in rivals]
+        trials = [one for rivals in missed_poles(fit) for one in rivals]
         trials = [
             one
             for one in trials
@@ -521,9 +494,7 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
 
 def _may_disagree(fit: Fit) -> bool:
     """Return whether references may disagree: more than noise is left, or poles stand beside."""
-    return len(fit.participation) > 1 and bool(
-        lesser(fit, fit.shapes, ALIKE) or fit.cost > NOISE * freedom(fit.lines, fit.m)
-    )
+    return len(fit.participation) > 1 and bool(lesser(fit, fit.shapes, ALIKE) or fit.misfit > NOISE)
 
 
 def _first_fit(
@@ -566,13 +537,13 @@ def _likeliest_fit(task: Task, first: _Stage, alone: bool, bar: Progress) -> _St
         fit = refined(
             lines, start.poles, start.participation, steps=steps, strict=not alone, first=start
         )
-        lines, fit = improved(lines, fit, reducing, steps=steps)
+        fit = improved(fit, reducing, steps=steps)
         bar.advance()
         if alone:
-            lines, fit = improved(lines, fit, growing, steps=steps, rough=True)
+            fit = improved(fit, growing, steps=steps, rough=True)
             bar.advance()
         poles, part = fit.poles, fit.participation
         if not ready.known:
-            share = 1.0 - freedom(lines, poles.size) / (2 * fit.model.size)
+            share = 1.0 - fit.lines.freedom(fit.m) / (2 * fit.model.size)
             ready = ready.from_residuals(ready.data - fit.model, share)
     return _Stage(ready, fit)
