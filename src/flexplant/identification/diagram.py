@@ -218,21 +218,24 @@ class StabilisationDiagram(Value):
 
 
 def built_diagram(
-    results: Sequence[OrderPoles], band: FloatArray, tolerances: tuple[float, float, float]
+    results: Sequence[OrderPoles],
+    band: FloatArray,
+    tolerances: tuple[float, float, float],
+    *,
+    first: int = 0,
 ) -> StabilisationDiagram:
-    """Return the diagram of results by ascending order: flags and tracks."""
+    """Return the diagram of results by ascending order: flags and tracks, numbered from `first`."""
     flags: list[IntArray] = []
     tracks: list[IntArray] = []
-    count = 0
     for before, result in zip([None, *results], results, strict=False):
         flag = np.zeros(result.poles.size, dtype=np.int64)
         track = np.full(result.poles.size, -1, dtype=np.int64)
         if before is not None and before.poles.size and result.poles.size:
             old, flag = _continued_poles(before, result, tolerances)
             track = np.where(old >= 0, tracks[-1][old], -1)
-        fresh = track < 0
-        track[fresh] = count + np.arange(fresh.sum())
-        count += int(fresh.sum())
+        fresh = np.flatnonzero(track < 0)
+        track[fresh] = first + np.arange(fresh.size)
+        first += fresh.size
         flags.append(flag)
         tracks.append(track)
     return StabilisationDiagram(
@@ -472,14 +475,15 @@ def diagram_of(
 ) -> StabilisationDiagram:
     """Return the diagrams of all parts as one; a track belongs where its median lies."""
     low, high = float(ready.freq[0]), float(ready.freq[-1])
-    edge = MARGIN * (high - low)
+    edge, band, first = MARGIN * (high - low), np.array([low, high]), 0
     found = []
     for window in windows(ready):
         freq = ready.freq[window.seen]
         moments = _moments_in(ready, window, orders[-1])
         inside = partial(_in_band, band=(float(freq[0]), float(freq[-1])), max_zeta=max_zeta)
         results = [moments.solve(order, inside) for order in orders]
-        diagram = built_diagram(results, np.array([low, high]), tolerances)
+        diagram = built_diagram(results, band, tolerances, first=first)
+        first += len(diagram)
         ends = (
             low - edge if window.first == 0 else ready.freq[window.first],
             high + edge if window.last == ready.freq.size else ready.freq[window.last],
@@ -489,17 +493,12 @@ def diagram_of(
             mine = diagram.tracks == track
             keep[mine] = ends[0] <= np.median(diagram.freq[mine]) < ends[1]
         found.append((diagram, keep))
-    offsets = np.cumsum([0] + [int(d.tracks.max(initial=-1)) + 1 for d, _ in found])
-    tracks = [d.tracks[k] + o for (d, k), o in zip(found, offsets[:-1], strict=True)]
-    return StabilisationDiagram(
-        np.concatenate([d.orders[k] for d, k in found]),
-        np.concatenate([d.poles[k] for d, k in found]),
-        np.concatenate([d.flags[k] for d, k in found]),
-        np.concatenate(tracks),
-        shapes=np.concatenate([d.shapes[:, k] for d, k in found], axis=1),
-        participation=np.concatenate([d.participation[:, k] for d, k in found], axis=1),
-        band=np.array([low, high]),
-    )
+    names = ("orders", "poles", "flags", "tracks", "shapes", "participation")
+    parts: dict[str, Any] = {
+        name: np.concatenate([getattr(one, name)[..., keep] for one, keep in found], axis=-1)
+        for name in names
+    }
+    return StabilisationDiagram(**parts, band=band)
 
 
 def weighted_by_remainder(ready: PreparedLines, order: int) -> PreparedLines:

@@ -22,7 +22,6 @@ from .diagram import (
 )
 from .frf_estimation import repetitions, stacked_runs
 from .line_weights import prepared_lines
-from .pole_test import UPPER
 from .result import IdentifiedModes, of_segments
 from .stages import MOST_POLES, RUNS, Task, identified
 
@@ -221,17 +220,17 @@ def identify_modes(
                 )
             if start is not None:
                 instance(start, PoleSelection, "start", "Pass diagram.select(freq=[...]).")
-            side, together = _sides(setups, runs)
+            side, together = _checked_sides(setups, runs)
+            most_terms = upper
+            if upper is not None:
+                most_terms = whole(upper, "upper", minimum=0, maximum=MOST_TERMS)
             task = Task(
                 frf=runs[0],
                 runs=len(runs),
                 lower=whole(lower, "lower", minimum=0, maximum=MOST_TERMS),
-                upper=None
-                if upper is None
-                else whole(upper, "upper", minimum=0, maximum=MOST_TERMS),
-                terms=UPPER[-1],
+                upper=most_terms,
                 hold=rate,
-                labels=checked_channels(dofs, runs[0]),
+                labels=_checked_channels(dofs, runs[0]),
                 side=side,
                 together=together,
                 refine=refine,
@@ -244,18 +243,7 @@ def identify_modes(
             raise of_segments(runs[0], error) from None
 
 
-def _sides(setups: Any, runs: Sequence[Frf]) -> tuple[str, tuple[IntArray, ...]]:
-    """Return what may have poles of its own where that was said, and which rows go together."""
-    side, together = checked_setups(setups, runs[0])
-    if len(runs) == 1:
-        return side, together
-    if side:
-        raise ModelError("setups= are those of one measurement, got several: give one of them.")
-    count = len(runs) * len(runs[0].outputs)
-    return RUNS, tuple(np.split(np.arange(count), len(runs)))
-
-
-def checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
+def _checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
     """Return {channel: DOF label}, checked."""
     if dofs is None:
         return {}
@@ -264,14 +252,19 @@ def checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
     return {str(name): str(label) for name, label in dofs.items()}
 
 
-def checked_setups(setups: Any, frf: Frf) -> tuple[str, tuple[IntArray, ...]]:
-    """Return "outputs", "inputs" or "" of none, and which of them each set-up measured."""
+def _checked_sides(setups: Any, runs: Sequence[Frf]) -> tuple[str, tuple[IntArray, ...]]:
+    """Return what may have poles of its own where that was said, and which rows go together."""
+    frf, count = runs[0], len(runs)
     if setups is None:
-        return "", ()
+        if count == 1:
+            return "", ()
+        return RUNS, tuple(np.split(np.arange(count * len(frf.outputs)), count))
     listed = [[str(name) for name in one] for one in setups if several(one)]
     flat = sorted(name for one in listed for name in one)
     for side, names in (("outputs", frf.outputs), ("inputs", frf.inputs)):
         if flat == sorted(names) and len(listed) > 1 and all(listed):
+            if count > 1:
+                raise ModelError("setups= are those of one measurement, got several: give one.")
             return side, tuple(np.array([names.index(name) for name in one]) for one in listed)
     raise LabelError(
         f"setups are two lists or more that hold each of the outputs {short(list(frf.outputs))}, "

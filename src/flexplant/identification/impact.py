@@ -262,7 +262,10 @@ def impact_frf(
         require_known("quantity", [quantity], ["displacement", "velocity", "acceleration"])
     between(level, "level", 0.0, 1.0, "A twentieth is usual: 0.05.")
     length = round(positive(segment, "segment") * data.rate)
-    tau = segment / WINDOWS if decay is None else _time_constant(decay)
+    tau = segment / WINDOWS
+    if decay is not None:
+        endless = isinstance(decay, float) and decay == float("inf")
+        tau = decay if endless else positive(decay, "decay")
     n_time = data.u.shape[2]
     if not 8 <= length <= n_time:
         raise ModelError(
@@ -288,7 +291,14 @@ def impact_frf(
             own = f[e, i, part] * _force_window(length, *at) * window
             forces[i].append(np.fft.rfft(own))
             motions[i].append(np.fft.rfft(y[e, :, part] * window, axis=1))
-    _require_blows(data.inputs, forces, refused)
+    for name, own_forces in zip(data.inputs, forces, strict=True):
+        if not own_forces:
+            why = "; ".join(repr(blow) for blow in refused if blow.input == name)
+            raise ModelError(
+                f"{name} has no blow that can be used ({why or 'no pulse in its record'}): "
+                "shorten segment= where blows follow too soon, check level= and the ranges, or "
+                "measure again."
+            )
     inner = slice(1, (length + 1) // 2)
     F = [np.array(part)[:, inner] for part in forces]
     Y = [np.array(part)[:, :, inner] for part in motions]
@@ -376,17 +386,6 @@ def _blows(
         yield blow, i, start, (before, end - begin)
 
 
-def _require_blows(inputs: tuple[str, ...], forces: list[Any], refused: list[Blow]) -> None:
-    for name, found in zip(inputs, forces, strict=True):
-        if not found:
-            why = "; ".join(repr(blow) for blow in refused if blow.input == name)
-            raise ModelError(
-                f"{name} has no blow that can be used ({why or 'no pulse in its record'}): "
-                "shorten segment= where blows follow too soon, check level= and the ranges, or "
-                "measure again."
-            )
-
-
 def _pulses(force: FloatArray, level: float, largest: float) -> list[tuple[int, int]]:
     """Return where pulses begin and end; those nearer than the width of one are one pulse."""
     size = float(np.abs(force).max())
@@ -457,14 +456,6 @@ def _flat_runs(extreme: Any, steps: FloatArray, steep: float) -> Any:
 def _dependence(damped: float) -> float:
     """Return x coth(x) of T/tau; 1 without a window."""
     return damped / float(np.tanh(damped)) if damped else 1.0
-
-
-def _time_constant(decay: Any) -> float:
-    return (
-        float("inf")
-        if isinstance(decay, float) and decay == float("inf")
-        else positive(decay, "decay")
-    )
 
 
 def _full_scale(limits: Any, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> dict[str, float]:

@@ -110,7 +110,7 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
     if periodic:
         y, u = (_each_period(side, samples)[..., keep] for side in (data.y, data.u))
         left = y - np.einsum("oif,eipf->eopf", frf.data, u)
-        transient_warned(transient(frf.freq, left, y, discard=method.discard), method.discard)
+        transient_warned(frf.freq, left, y, method.discard)
     return frf
 
 
@@ -415,20 +415,8 @@ def _differences(x: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(1.0 - 2.0 * product / np.maximum(both, TINY), 0.0))
 
 
-@dataclass(frozen=True)
-class Transient:
-    """A decay seen in periods: where [Hz], its share left after a period, and what cures it."""
-
-    freq: float
-    decay: float
-    bias: float  # of the mean period, in standard deviations of its noise
-    more: int  # periods to discard beyond those discarded
-
-
-def transient(
-    freq: FloatArray, e: ComplexArray, Y: ComplexArray, *, discard: int
-) -> Transient | None:
-    r"""Return the slowest decay of what periods leave, where it biases their mean.
+def transient_warned(freq: FloatArray, e: ComplexArray, Y: ComplexArray, discard: int) -> None:
+    r"""Warn of the slowest decay of what periods leave, where it biases their mean.
 
     At line k period p is ``S_k + tau_k z^p`` with ``z = exp(lambda T)``, the same for all lines,
     outputs and experiments that a mode reaches. Over a grid of z the energy that this explains
@@ -442,11 +430,11 @@ def transient(
     e = e[:, :, first : first + MOST]
     count = e.shape[2]
     if count < 3 or (count < 4 and not discard):
-        return None
+        return
     e = e - e.mean(axis=2, keepdims=True)
     noise = np.median(np.mean(np.abs(e) ** 2, axis=(0, 2)), axis=-1)
     if not np.all(noise > 0):
-        return None
+        return
     e = e / np.sqrt(noise)[:, None, None]
     seen = np.sum(np.abs(Y[:, :, 0]) ** 2 / noise[:, None], axis=(0, 1))
     shared = np.einsum("eapf,ebpf->ab", e, e.conj())
@@ -460,7 +448,7 @@ def transient(
     centred = powers - powers.mean(axis=1, keepdims=True)
     size = np.sum(np.abs(centred) ** 2, axis=1)
     pattern = np.einsum("zp,zq->zpq", centred.conj(), centred).reshape(z.size, -1)
-    found: Transient | None = None
+    worst = (0, 0, 0.0, 0.0)  # periods more to discard, the line, what is left after one, the bias
     for length in STRETCHES:
         if length > freq.size:
             break
@@ -487,19 +475,14 @@ def transient(
         ):
             decay = float(np.abs(z[best[k]]))
             more = int(np.ceil(np.log(10.0 * bias[k]) / (-2.0 * np.log(decay))))
-            if found is None or more > found.more:
-                found = Transient(float(freq[k]), decay, float(np.sqrt(bias[k])), more)
-    return found
-
-
-def transient_warned(found: Transient | None, discard: int) -> None:
-    """Warn of a transient that has not died away in the periods kept."""
-    if found is None:
-        return
-    warn(
-        f"a transient has not died away in the periods kept: near {found.freq:.4g} Hz "
-        f"{found.decay:.0%} of it is left after a period, and biases the FRF by {found.bias:.2g} "
-        "standard deviations of its noise; damping and the number of modes would be wrong. "
-        f"Measure {found.more} periods more and discard {discard + found.more}, "
-        f"discard={discard + found.more}, or shake so long before recording."
-    )
+            if more > worst[0]:
+                worst = (more, int(k), decay, float(np.sqrt(bias[k])))
+    more, line, decay, off = worst
+    if more:
+        warn(
+            f"a transient has not died away in the periods kept: near {freq[line]:.4g} Hz "
+            f"{decay:.0%} of it is left after a period, and biases the FRF by {off:.2g} "
+            "standard deviations of its noise; damping and the number of modes would be wrong. "
+            f"Measure {more} periods more and discard {discard + more}, "
+            f"discard={discard + more}, or shake so long before recording."
+        )

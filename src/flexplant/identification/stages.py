@@ -32,6 +32,7 @@ from .model_error import (
     twin_poles,
 )
 from .pole_test import (
+    UPPER,
     dropped,
     fewer_terms,
     improved,
@@ -236,8 +237,6 @@ class Task:
     #: residual terms of modes below the band; of modes above, None where the data choose
     lower: int
     upper: int | None
-    #: those of modes above that a fit has at first
-    terms: int
     hold: float | None
     labels: Mapping[str, str]
     #: what may have poles of its own (outputs, inputs, runs), empty where the data are to say it,
@@ -254,7 +253,7 @@ class Task:
         rows = RUNS if self.side == RUNS and ready.side == "outputs" else ready.side
         return Lines(
             *(ready.freq, ready.data, ready.weight, self.lower),
-            *(self.terms if self.upper is None else self.upper, self.hold, ready.known),
+            *(UPPER[-1] if self.upper is None else self.upper, self.hold, ready.known),
             inflation=ready.inflation,
             variance_freedom=self.frf.freedom,
             segment=hann_segment(self.frf),

@@ -266,11 +266,14 @@ class MeasuredPlaces:
         S = np.zeros((r, r))
         for (i, j), value in zip(pairs, found.tolist(), strict=True):
             S[i, j] = S[j, i] = value
-        return U @ _noisy_cholesky(
-            S,
-            "the term in 1/s^2 of the measurement is no rigid-body motion of positive mass. Pass "
-            "rigid=False for a held structure; begin the band of a free one lower.",
-        )
+        values, vectors = la.eigh(S)
+        if not values.size or values[-1] <= 0 or values[0] < -NEGATIVE * values[-1]:
+            raise ModelError(
+                "the term in 1/s^2 of the measurement is no rigid-body motion of positive mass. "
+                "Pass rigid=False for a held structure; begin the band of a free one lower."
+            )
+        keep = values > NOISE * values[-1]
+        return np.asarray(U @ (vectors[:, keep] * np.sqrt(values[keep])))
 
     def residual(self, G: FloatArray, fast: float) -> FloatArray:
         """Return residual vectors (places, m), mass-normalised at their frequency [rad/s]."""
@@ -290,15 +293,6 @@ def _imaginary(shapes: ComplexArray) -> FloatArray:
     """Return the relative size (m,) of the shapes' imaginary parts."""
     size = np.linalg.norm(shapes, axis=0)
     return np.asarray(np.linalg.norm(shapes.imag, axis=0) / divisor(size))
-
-
-def _noisy_cholesky(S: FloatArray, trouble: str) -> FloatArray:
-    """Return L with ``S = L L^T`` but for noise."""
-    values, vectors = la.eigh(S)
-    if not values.size or values[-1] <= 0 or values[0] < -NEGATIVE * values[-1]:
-        raise ModelError(trouble)
-    keep = values > NOISE * values[-1]
-    return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
 
 
 def _expanded(over: Modes, rows: Any, columns: list[FloatArray]) -> tuple[list[FloatArray], float]:

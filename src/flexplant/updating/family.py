@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
 
 from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
@@ -263,12 +264,6 @@ class Family:
             self._weight = la.cholesky(self.M[np.ix_(self.massive, self.massive)])
         return np.asarray(self._weight @ X[self.massive], dtype=np.complex128)
 
-    def derivatives(self, eigen: Eigen, columns: Sequence[int]) -> ComplexArray:
-        """Return y^H (lambda^2 dM + lambda dD + dK) x for all pairs of `columns`, (q, m, m)."""
-        X, poles = eigen.X[:, columns], eigen.poles[columns]
-        moved = self.moved(X, (poles**2, poles, np.ones_like(poles)))
-        return np.asarray(eigen.Y[:, columns].conj().T @ moved, dtype=np.complex128)
-
     def sensitivity(self, eigen: Eigen, columns: Sequence[int]) -> ComplexArray:
         """Return d lambda / d p (m, q) of distinct modes, each by its own vectors."""
         X, poles = eigen.X[:, columns], eigen.poles[columns]
@@ -278,7 +273,9 @@ class Family:
 
     def group_derivative(self, eigen: Eigen, columns: Sequence[int]) -> ComplexArray:
         """Return G (q, s, s): exactly repeated modes move by the eigenvalues of sum dp_b G_b."""
-        change = self.derivatives(eigen, columns)
+        X, poles = eigen.X[:, columns], eigen.poles[columns]
+        moved = self.moved(X, (poles**2, poles, np.ones_like(poles)))
+        change = eigen.Y[:, columns].conj().T @ moved
         return np.asarray(-np.linalg.solve(eigen.scale(columns), change), dtype=np.complex128)
 
     def strength(self, omega: float) -> FloatArray:
@@ -555,25 +552,15 @@ def measured_pairs(
 
 def _match_cluster(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:
     """Return the new modes of a cluster in the order of its old ones."""
-    s = old.size
-    new = np.sort(new)
-    linked = shapes[np.ix_(old, new)] > FOREIGN
-    if linked.all() or (linked.diagonal().all() and np.count_nonzero(linked) == s):
-        return new
-    # what a mode reaches through shapes in common: a few rounds of union
-    reach = linked @ linked.T | np.eye(s, dtype=bool)
-    for _ in range(int(s).bit_length()):
-        reach = reach @ reach
-    sides, seen = [], np.zeros(s, dtype=bool)
-    for i in range(s):
-        if not seen[i]:
-            seen |= reach[i]
-            sides.append((np.flatnonzero(reach[i]), np.flatnonzero(linked[reach[i]].any(axis=0))))
-    if sum(b.size for _, b in sides) != s:
-        return new
-    if any(a.size != b.size for a, b in sides):
-        return new
+    s, new = old.size, np.sort(new)
+    linked = np.zeros((2 * s, 2 * s), dtype=bool)
+    linked[:s, s:] = shapes[np.ix_(old, new)] > FOREIGN
+    # what modes reach through shapes in common
+    count, side = connected_components(linked, directed=False)
     found = new.copy()
-    for a, b in sides:
+    for k in range(count):
+        a, b = np.flatnonzero(side[:s] == k), np.flatnonzero(side[s:] == k)
+        if a.size != b.size:
+            return new
         found[a] = new[b]
     return found
