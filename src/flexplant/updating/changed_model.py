@@ -71,11 +71,7 @@ def applied(model: Any, parameters: Sequence[Parameter], p: FloatArray) -> Any:
 def _changed_structure(
     model: FEModel, parameters: Sequence[Parameter], p: FloatArray, std: FloatArray | None
 ) -> FEModel:
-    total: dict[str, Matrix | None] = dict.fromkeys("MDK")
-    for parameter, value in zip(parameters, p.tolist(), strict=True):
-        for name, part in zip("MDK", parameter.change(model, value), strict=True):
-            total[name] = matrix_sum(total[name], part)
-    changes = {name: matrix_sum(getattr(model, name), change) for name, change in total.items()}
+    changes = _changes(model, parameters, p)
     try:
         changed: FEModel = _replaced(model, changes, parameters, p, std)
     except ModelError:
@@ -84,6 +80,17 @@ def _changed_structure(
             raise
         return found
     return changed
+
+
+def _changes(
+    model: FEModel, parameters: Sequence[Parameter], p: FloatArray
+) -> dict[str, Matrix | None]:
+    """Return M, D and K with the parameters at `p`."""
+    found: dict[str, Matrix | None] = {name: getattr(model, name) for name in "MDK"}
+    for parameter, value in zip(parameters, p.tolist(), strict=True):
+        for name, part in zip("MDK", parameter.change(model, value), strict=True):
+            found[name] = matrix_sum(found[name], part)
+    return found
 
 
 def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
@@ -264,7 +271,8 @@ class FullBasis:
 
     def _basis(self, p: FloatArray) -> FloatArray:
         """Return the M-orthonormal basis (n, k) at `p`, rigid-body motions of the model first."""
-        changed = self._changed(p)
+        parts = _changes(self.full, self.parameters, p)
+        changed = self.full.replace(M=parts["M"], K=parts["K"], D=None)
         phi, static = self._modes(changed), static_shapes(changed, self.loads)
         M: Any = self.full.M
         V = np.array(self.full.rigid_body)
@@ -283,13 +291,6 @@ class FullBasis:
         if omega.size < n and omega[-1] < top:
             _, phi = _lowest_modes(model, n, top)
         return phi
-
-    def _changed(self, p: FloatArray) -> FEModel:
-        changes: dict[str, Any] = {"M": self.full.M, "K": self.full.K}
-        for q, value in zip(self.parameters, p.tolist(), strict=True):
-            dM, _, dK = q.change(self.full, value)
-            changes = {"M": matrix_sum(changes["M"], dM), "K": matrix_sum(changes["K"], dK)}
-        return self.full.replace(**changes, D=None)
 
 
 def _lowest_modes(model: FEModel, count: int, top: float = np.inf) -> tuple[FloatArray, FloatArray]:

@@ -224,14 +224,10 @@ def identifiability(
 
     Parameters
     ----------
-    model : ReducedModel or FEModel
-        The model.
-    parameters : sequence of q Parameter
-        Unknowns.
+    model, parameters, start
+        As for `update`.
     residuals : sequence of Residual
         Data; the values are not used, only what they would depend on (and their noise).
-    start : (q,) array, optional
-        Where; as in `update`.
 
     Returns
     -------

@@ -86,7 +86,11 @@ def frac(H: Any, G: Any) -> FloatArray:
     >>> fx.updating.frac([[[1.0, 2.0j]]], [[[2.0, 4.0j]]]).round(6)  # scale does not count
     array([[1.]])
     """
-    a, b = _checked_responses(H, G)
+    a, b = complex_array(H, "H"), complex_array(G, "G")
+    if a.shape != b.shape or a.ndim < 1:
+        raise ShapeError(
+            f"H has shape {a.shape} and G {b.shape}: choose the same channels and lines."
+        )
     product = np.abs(np.sum(a.conj() * b, axis=-1)) ** 2
     size = np.sum(np.abs(a) ** 2, axis=-1) * np.sum(np.abs(b) ** 2, axis=-1)
     if np.any(size == 0):
@@ -130,8 +134,8 @@ def fdac(H: Any, G: Any) -> FloatArray:
         raise ShapeError(f"H has channels {a.shape[:-1]} and G {b.shape[:-1]}: choose the same.")
     a, b = a.reshape(-1, a.shape[-1]), b.reshape(-1, b.shape[-1])
     size = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
-    if not np.all(np.isfinite(size)) or np.any(size == 0):
-        raise ModelError("a line is zero or not finite at all channels: leave it out.")
+    if np.any(size == 0):
+        raise ModelError("a line is zero at all channels: leave it out.")
     return np.asarray(np.real(a.conj().T @ b) / size, dtype=np.float64)
 
 
@@ -210,16 +214,15 @@ def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
     >>> fx.updating.correlate(drawing, [poles]).freq_error.round(4)
     array([0.0201])
     """
-    listed = checked_residuals(residuals)
-    objective = Objective(model, [], listed)
+    objective = Objective(model, [], checked_residuals(residuals))
     point = objective.begin(np.zeros(0))
     poles: ComplexArray = np.zeros(0, complex)
     found = poles
     modes: tuple[int, ...] = ()
     shapes = responses = spectrum = np.zeros((0, 0))
     alike: tuple[tuple[int, ...], ...] = ()
-    for residual, bound in zip(listed, objective.bounds, strict=True):
-        tied: Any = bound
+    tied: Any
+    for residual, tied in zip(objective.residuals, objective.bounds, strict=True):
         measured = getattr(residual, "measured", None)
         if isinstance(measured, MeasuredModes):
             modes, poles = measured.modes or (), measured.poles
@@ -230,9 +233,8 @@ def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
                 shapes = mac(residual.shapes, seen[:, columns])
                 alike = _alike(seen, point, columns)
         if isinstance(residual, FrfResidual):
-            H = tied.responses(point)
-            responses = frac(np.moveaxis(tied.data, 0, 2), np.moveaxis(H, 0, 2))
-            spectrum = fdac(np.moveaxis(tied.data, 0, 2), np.moveaxis(H, 0, 2))
+            both = [np.moveaxis(H, 0, 2) for H in (tied.data, tied.responses(point))]
+            responses, spectrum = frac(*both), fdac(*both)
     return Correlation(
         modes=modes,
         freq_error=np.abs(found) / np.abs(poles) - 1,
@@ -260,17 +262,6 @@ def _nonzero_shapes(value: Any, name: str) -> ComplexArray:
     if np.any(np.all(array == 0, axis=0)):
         raise ModelError(f"{name} holds a zero shape: its MAC is not defined.")
     return array
-
-
-def _checked_responses(H: Any, G: Any) -> tuple[ComplexArray, ComplexArray]:
-    a, b = complex_array(H, "H"), complex_array(G, "G")
-    if a.shape != b.shape or a.ndim < 1:
-        raise ShapeError(
-            f"H has shape {a.shape} and G {b.shape}: choose the same channels and lines."
-        )
-    if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
-        raise ModelError("responses have NaN or infinite entries: leave those lines out.")
-    return a, b
 
 
 #: part of the rms of unused data that a helpful update leaves where the noise is not known
@@ -341,17 +332,11 @@ def validate(
 
     Parameters
     ----------
-    model : ReducedModel or FEModel
-        The model.
-    parameters : sequence of Parameter
-        Unknowns.
-    residuals : sequence of Residual
-        To fit. `Eigenvalues.select`, `ModeShapes.select` and `FrfResidual.select` take parts, as
-        does `split`.
-    unused : sequence of Residual
-        To judge by.
-    method, start, starts, rng, prior
-        Of `update`.
+    model, parameters, method, start, starts, rng, prior
+        As for `update`.
+    residuals, unused : sequences of Residual
+        To fit, and to judge by. `Eigenvalues.select`, `ModeShapes.select` and
+        `FrfResidual.select` take parts, as does `split`.
 
     Returns
     -------
@@ -360,9 +345,7 @@ def validate(
     Raises
     ------
     FlexplantError
-        As `update`.
-    ModelError
-        When unused data were fitted.
+        As `update`; ModelError when unused data were fitted.
 
     Examples
     --------
@@ -382,7 +365,10 @@ def validate(
     fit = update(model, listed, given, method=method, **options)
     begin = np.asarray(fit.history.parameters[0], dtype=np.float64)
     before, _ = _misfit(model, listed, given, begin, fit, spread=False)
-    fitted = np.array([before[0], _per_freedom(fit, before)])
+    # per degree of freedom where the noise is known
+    known = fit.chi2 is not None and fit.dof > 0
+    after = np.sqrt((fit.chi2 or 0.0) / fit.dof) if known else before[1]
+    fitted = np.array([before[0], after])
     both, chance_of = _misfit(model, listed, kept, begin, fit, spread=True)
     return Validation(
         fit=fit,
@@ -419,10 +405,9 @@ def split(residual: Any, *, share: float = 0.5, rng: Rng = 0) -> tuple[Any, Any]
     >>> len(fitted.measured.poles), len(unused.measured.poles)
     (1, 1)
     """
-    measured = getattr(residual, "measured", None)
     parts = getattr(residual, "lines", None)
     if parts is None:
-        parts = getattr(measured, "modes", None)
+        parts = getattr(getattr(residual, "measured", None), "modes", None)
     if not isinstance(residual, Residual) or parts is None:
         raise ModelError(
             f"split takes modes or lines apart, got {type(residual).__name__}. Pass Eigenvalues, "
@@ -437,12 +422,6 @@ def split(residual: Any, *, share: float = 0.5, rng: Rng = 0) -> tuple[Any, Any]
     chosen: Any = residual
     first, rest = np.sort(items[order[:count]]), np.sort(items[order[count:]])
     return chosen.select(first.tolist()), chosen.select(rest.tolist())
-
-
-def _per_freedom(fit: UpdateResult, rms: FloatArray) -> float:
-    """Return the rms of fitted data, per degree of freedom where the noise is known."""
-    known = fit.chi2 is not None and fit.dof > 0
-    return float(np.sqrt((fit.chi2 or 0.0) / fit.dof)) if known else float(rms[1])
 
 
 def _misfit(
