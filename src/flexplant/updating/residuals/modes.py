@@ -47,8 +47,41 @@ def growth(omega: FloatArray, measured: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (1.0 + omega / np.mean(measured)))
 
 
+class _ModalResidual(Residual):
+    """A residual of measured modes."""
+
+    measured: MeasuredModes
+
+    def _checked_numbers(self) -> tuple[int, ...]:
+        hint = "Pass MeasuredModes(poles, modes=[...])."
+        instance(self.measured, MeasuredModes, "measured", hint)
+        if self.measured.modes is None:
+            raise LabelError(
+                f"{type(self).__name__} needs mode numbers, which {self.measured!r} has not: "
+                "which mode of the model each pole belongs to is not known. Give modes=[...], "
+                "counted from 1 with the rigid-body modes."
+            )
+        return self.measured.modes
+
+    def _chosen(self, modes: Sequence[int]) -> tuple[MeasuredModes, list[int]]:
+        """Return the measured modes of some numbers, and their positions."""
+        known = self.measured.modes or ()
+        if not isinstance(modes, Iterable) or isinstance(modes, str):
+            raise LabelError(
+                f"modes must be a list of numbers, got {short(modes)}. Pass [6, 7], say."
+            )
+        wanted = [whole(n, "a mode") for n in modes]
+        missing = [n for n in wanted if n not in known]
+        if missing or not wanted:
+            raise LabelError(
+                f"modes {missing or '[]'} were not measured; measured are {list(known)}."
+            )
+        columns = [known.index(n) for n in wanted]
+        return self.measured.select(columns), columns
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Eigenvalues(Residual):
+class Eigenvalues(_ModalResidual):
     """Residuals of complex eigenvalues, ``lambda_exp - lambda_num``, weighted by W.
 
     The paper, eqs. (10) and (12): ``e = d lambda^H W d lambda`` with W real, positive and
@@ -87,15 +120,7 @@ class Eigenvalues(Residual):
     clusters: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
-        instance(
-            self.measured, MeasuredModes, "measured", "Pass MeasuredModes(poles, modes=[...])."
-        )
-        if self.measured.modes is None:
-            raise LabelError(
-                f"{self.measured!r} has no mode numbers: which mode of the model each pole "
-                "belongs to is not known. Give modes=[...], counted from 1 with the rigid-body "
-                "modes."
-            )
+        self._checked_numbers()
         if self.weights is not None:
             why = "W of (12) is positive definite: leave a pole out of the measurement instead."
             shape = (len(self.measured),)
@@ -104,13 +129,8 @@ class Eigenvalues(Residual):
 
     def __repr__(self) -> str:
         numbers = ", ".join(str(number) for number in self.measured.modes or ())
-        kind = (
-            "given"
-            if self.weights is not None
-            else "equal"
-            if self.measured.covariance is None
-            else "1/variance"
-        )
+        known = "equal" if self.measured.covariance is None else "1/variance"
+        kind = known if self.weights is None else "given"
         return f"<Eigenvalues: modes {numbers}, weights {kind}>"
 
     @property
@@ -132,7 +152,7 @@ class Eigenvalues(Residual):
         LabelError
             When a mode was not measured.
         """
-        chosen, columns = chosen_modes(self.measured, modes)
+        chosen, columns = self._chosen(modes)
         weights = None if self.weights is None else self.weights[columns]
         return self.replace(measured=chosen, weights=weights)
 
@@ -151,8 +171,9 @@ class BoundEigenvalues(Bound):
         close = clusters(measured.poles, residual.clusters) if residual.clusters else []
         self.clusters = [group.tolist() for group in close]
         alone = [[i] for i in range(m) if not any(i in group for group in self.clusters)]
-        self.mean = np.zeros((len(alone) + len(self.clusters), m))
-        for row, group in zip(self.mean, [*alone, *self.clusters], strict=True):
+        self._members = [*alone, *self.clusters]
+        self.mean = np.zeros((len(self._members), m))
+        for row, group in zip(self.mean, self._members, strict=True):
             row[group] = 1 / len(group)
         self.target = measured.poles
         self.noisy = residual.weights is None and measured.covariance is not None
@@ -166,7 +187,6 @@ class BoundEigenvalues(Bound):
             self.noise = self.white @ measured.covariance @ self.white.T
         self.size = np.abs(self.white) @ np.tile(np.abs(self.target), 2)
         self.name = f"modes {', '.join(map(str, self.numbers))}"
-        self._members = [*alone, *self.clusters]
 
     def kinds(self) -> list[Kind]:
         """Return relative errors of frequency (at constant zeta) and of damping.
@@ -212,7 +232,7 @@ class BoundEigenvalues(Bound):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ModeShapes(Residual):
+class ModeShapes(_ModalResidual):
     """Residuals of measured mode shapes psi at some places, scale and phase removed.
 
     ``r = (I - P) psi``, P the projector on the model's shape there: what no complex factor of the
@@ -264,23 +284,18 @@ class ModeShapes(Residual):
     assign: bool = field(default=True, kw_only=True)
 
     def __post_init__(self) -> None:
-        name = type(self).__name__
-        instance(
-            self.measured, MeasuredModes, "measured", "Pass MeasuredModes(poles, modes=[...])."
-        )
-        if self.measured.modes is None:
-            raise LabelError(f"{name} needs mode numbers: MeasuredModes(poles, modes=[...]).")
+        numbers = self._checked_numbers()
         require_known("direction", [self.direction], DIRECTIONS)
-        at, given = _measured_shapes(self, name)
+        at, given = _measured_shapes(self)
         shape = (len(at), len(self.measured))
         real = real_array(np.real(given), "shapes", shape)
         imag = real_array(np.imag(given), "the imaginary part of shapes", shape)
         if len(at) < 2:
-            raise ShapeError(f"{name} needs two places at least: the scale of one is not known.")
+            raise ShapeError("shapes need two places at least: the scale of one is not known.")
         shapes: Any = real + 1j * imag if np.iscomplexobj(given) else real
         empty = np.flatnonzero(np.all(shapes == 0, axis=0))
         if empty.size:
-            raise ModelError(f"the shape of mode {self.measured.modes[empty[0]]} is zero.")
+            raise ModelError(f"the shape of mode {numbers[empty[0]]} is zero.")
         std = self.std
         if std is not None:
             std = np.broadcast_to(real_array(std, "std"), shape).copy() if np.ndim(std) < 2 else std
@@ -304,14 +319,8 @@ class ModeShapes(Residual):
         )
 
     def select(self, modes: Sequence[int]) -> ModeShapes:
-        """Return the residual of some of its modes, by number.
-
-        Raises
-        ------
-        LabelError
-            When a mode was not measured.
-        """
-        chosen, columns = chosen_modes(self.measured, modes)
+        """Return the residual of some of its modes; see `Eigenvalues.select`."""
+        chosen, columns = self._chosen(modes)
         std = None if self.std is None else self.std[:, columns]
         covariance = None if self.covariance is None else self.covariance[columns]
         shapes = np.asarray(self.shapes)[:, columns]
@@ -340,7 +349,7 @@ class BoundShapes(Bound):
         own = measured.modes or ()
         near = [group.tolist() for group in clusters(measured.poles, CLUSTER)]
         alone = [i for i in range(len(own)) if not any(i in group for group in near)]
-        self.own = self.numbers = own
+        self.numbers = own
         self.noisy = residual.std is not None or residual.covariance is not None
         self.rows = place_rows(family, list(residual.at or ()), residual.direction)
         self.poles = measured.poles
@@ -362,7 +371,7 @@ class BoundShapes(Bound):
 
     def row_name(self, row: int) -> str:
         """Return the mode of a row."""
-        return f"the shape of mode {self.own[self._order[row // self._rows_each]]}"
+        return f"the shape of mode {self.numbers[self._order[row // self._rows_each]]}"
 
     def assigned(self, point: Point) -> Point:
         """Return the point with modes relabelled by the measured shapes."""
@@ -374,10 +383,10 @@ class BoundShapes(Bound):
         )
         labels = point.labels.copy()
         for i, column in enumerate(columns.tolist()):
-            here = np.flatnonzero(labels == self.own[i])
+            here = np.flatnonzero(labels == self.numbers[i])
             if here.size and here[0] != column:
                 labels[here[0]], labels[column] = labels[column], labels[here[0]]
-            labels[column] = self.own[i]
+            labels[column] = self.numbers[i]
         changed = Point(point.family, point.p, point.eigen, labels)
         changed.turned = point.turned
         return changed
@@ -426,35 +435,20 @@ def _conjugated(X: Any) -> Any:
     return X.conj().transpose(0, 2, 1)
 
 
-def chosen_modes(measured: MeasuredModes, modes: Sequence[int]) -> tuple[MeasuredModes, list[int]]:
-    """Return the measured modes of some numbers, and their positions."""
-    known = measured.modes or ()
-    if not isinstance(modes, Iterable) or isinstance(modes, str):
-        raise LabelError(f"modes must be a list of numbers, got {short(modes)}. Pass [6, 7], say.")
-    wanted = [whole(n, "a mode") for n in modes]
-    missing = [n for n in wanted if n not in known]
-    if missing or not wanted:
-        raise LabelError(f"modes {missing or '[]'} were not measured; measured are {list(known)}.")
-    columns = [known.index(n) for n in wanted]
-    return measured.select(columns), columns
-
-
-def _measured_shapes(residual: ModeShapes, name: str) -> tuple[list[Place], Any]:
+def _measured_shapes(residual: ModeShapes) -> tuple[list[Place], Any]:
     """Return the places and the shapes there, from the measured modes where none are given."""
-    measured, at = residual.measured, residual.at
-    if residual.shapes is not None:
-        if at is None or isinstance(at, Mapping):
-            raise ShapeError(f"{name} needs at= with shapes=. Pass the place of each row.")
-        return _checked_places(at, residual.direction), residual.shapes
-    if measured.shapes is None:
+    measured, at, name = residual.measured, residual.at, type(residual).__name__
+    shapes = measured.shapes if residual.shapes is None else residual.shapes
+    if shapes is None:
         raise ShapeError(
             f"{measured!r} holds no shapes: give them, {name}(measured, shapes, at), or identify "
             "them."
         )
-    labels = measured.dofs or ()
-    if at is None or isinstance(at, Mapping):
-        return list(channel_places(labels, at)), measured.shapes
-    return _checked_places(at, residual.direction), measured.shapes
+    if at is not None and not isinstance(at, Mapping):
+        return _checked_places(at, residual.direction), shapes
+    if residual.shapes is not None:
+        raise ShapeError(f"{name} needs at= with shapes=. Pass the place of each row.")
+    return list(channel_places(measured.dofs or (), at)), shapes
 
 
 def _checked_places(at: Any, direction: str) -> list[Place]:
