@@ -357,12 +357,7 @@ def _averaged(
 
 
 def _blows(
-    data: Records,
-    f: FloatArray,
-    e: int,
-    level: float,
-    length: int,
-    full: Mapping[str, float],
+    data: Records, f: FloatArray, e: int, level: float, length: int, full: Mapping[str, float]
 ) -> Iterator[tuple[Blow, int, int, tuple[int, int]]]:
     """Yield the blows of experiment e: input, where the segment begins, samples before, width."""
     largest = float(np.abs(f).max())

@@ -194,12 +194,7 @@ def _hankel(y: FloatArray, count: int) -> FloatArray:
 
 
 def _order_poles(
-    U: FloatArray,
-    sizes: FloatArray,
-    n: int,
-    order: int,
-    step: float,
-    band: tuple[float, float],
+    U: FloatArray, sizes: FloatArray, n: int, order: int, step: float, band: tuple[float, float]
 ) -> OrderPoles:
     """Return the poles of one order inside the band."""
     O = U[:, :order] * np.sqrt(sizes[:order])  # noqa: E741 - the observability matrix

@@ -398,12 +398,7 @@ def _second(task: Task, first: _Stage, alone: bool, bar: Progress) -> tuple[_Sta
 
 
 def _answered(
-    task: Task,
-    now: _Stage,
-    begin: _Begin,
-    weaker: tuple[Rejected, ...],
-    reason: str,
-    differ: bool,
+    task: Task, now: _Stage, begin: _Begin, weaker: tuple[Rejected, ...], reason: str, differ: bool
 ) -> IdentifiedModes:
     """Return the modes of a fit that pass the gate; `reason`: why it was not refined."""
     ready, lines, settled = now.ready, now.lines, not reason

@@ -28,11 +28,7 @@ NEAREST, FARTHEST = 1.03, 10.0
 
 
 def structural_modes(
-    measured: IdentifiedModes,
-    dofs: DofSet,
-    *,
-    over: Modes | None = None,
-    rigid: bool = True,
+    measured: IdentifiedModes, dofs: DofSet, *, over: Modes | None = None, rigid: bool = True
 ) -> Modes:
     r"""Return identified modes as those of a structure, for `assemble_plant`.
 

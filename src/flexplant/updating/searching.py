@@ -180,12 +180,7 @@ class _Tried:
 
 
 def from_one_start(
-    objective: Objective,
-    begin: FloatArray,
-    search: Search,
-    rng: Rng,
-    *,
-    given: bool,
+    objective: Objective, begin: FloatArray, search: Search, rng: Rng, *, given: bool
 ) -> tuple[SearchEnd, list[FloatArray], list[Reached]]:
     """Return the best end, the objective being there, all starts that were tried and their ends.
 

@@ -213,10 +213,7 @@ def update(
 
 
 def _ends_warned(
-    objective: Objective,
-    best: SearchEnd,
-    estimates: list[FloatArray],
-    lost: FlexplantError | None,
+    objective: Objective, best: SearchEnd, estimates: list[FloatArray], lost: FlexplantError | None
 ) -> None:
     """Warn of rounds that have not settled, of a start that leads nowhere, of a search cut short.
 
