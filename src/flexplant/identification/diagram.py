@@ -149,10 +149,8 @@ class StabilisationDiagram(Value):
 
         Raises
         ------
-        ModelError
-            When presence is out of range.
-        SolverError
-            When no pole stays.
+        ModelError, SolverError
+            When presence is out of range, or no pole stays.
         """
         presence = between(presence, "presence", 0.0, 1.0, "Try 0.5.", ends="]")
         known = np.unique(self.orders)

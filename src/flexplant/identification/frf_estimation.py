@@ -124,9 +124,9 @@ def estimate_frf(
     inputs and H1 is biased towards ``-1/K``. References r that are not correlated with the noise
     give the process sensitivity PS = S_yr S_rr^-1 and the sensitivity S = S_ur S_rr^-1, and the
     plant is their quotient (the three-point method): r is an excitation added to the commands, or
-    set-points, one for each input. The estimate of periodic signals averages the noise away first,
-    and with as many experiments as inputs it is that quotient with and without r. Take as inputs
-    what acts on the machine: the commands and the excitation added to them.
+    set-points, one for each input. Periodic signals average the noise away first, with as many
+    experiments as inputs with and without r. Inputs are what acts on the machine: the commands and
+    the excitation added to them.
 
     Parameters
     ----------
@@ -154,14 +154,13 @@ def estimate_frf(
     Warns
     -----
     FlexplantWarning
-        When an output keeps one value for longer than quantisation explains: a drop-out. When,
-        without a reference, the machine seems to respond before its inputs act: noise returns
-        through a controller, and the estimate is biased (set-points as the only excitation bias
-        it without that sign: pass reference= in closed loop always); with one, at lines where the
-        inputs are mostly noise. When averages of segments
-        are taken of inputs that repeat (`Periodic`) or are pulses (`impact_frf`). With
-        `Periodic`: when the inputs do not repeat after the stated period (it or the rate is
-        wrong), or when a transient has not died away, with the periods to discard.
+        When an output keeps one value for longer than quantisation explains: a drop-out. Without a
+        reference, when the machine seems to respond before its inputs act: noise returns through a
+        controller, and biases the estimate (set-points as the only excitation bias it without that
+        sign: pass reference= in closed loop always); with one, at lines where the inputs are mostly
+        noise. When averages of segments are taken of inputs that repeat (`Periodic`) or are pulses
+        (`impact_frf`). With `Periodic`: when the inputs do not repeat after the stated period, or a
+        transient has not died away, with the periods to discard.
 
     Raises
     ------
@@ -221,13 +220,10 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
     The correlation of the errors of two outputs is pooled over the inputs. How well the variance
     is known (`freedom`) follows from R, the inputs and how many outputs err independently.
 
-    Runs with other phases of the excitation make quantisation without dither, and whatever else
-    is the same in every run, appear as noise: with the same signal in every run the spread does
-    not contain it, and the variance is 28 to 300 times too small. Give `multisine` another `rng`
-    for each run.
-
-    A machine that drifts between runs is seen in their mean as broader resonances, off by more than
-    its deviations: give `identify_modes` the runs themselves then.
+    Give `multisine` another `rng` for each run: what is the same in every run, quantisation without
+    dither with the same signal, is not in the spread, and the variance 28 to 300 times too small.
+    Of a machine that drifts between runs give `identify_modes` the runs themselves: their mean
+    shows broader resonances, off by more than its deviations.
 
     Parameters
     ----------
@@ -242,10 +238,9 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
 
     Raises
     ------
-    ShapeError
-        When they have different channels or frequencies.
-    ModelError
-        When there are fewer than two, they differ in quantity or do not differ at all.
+    ShapeError, ModelError
+        When there are fewer than two, they have different channels, frequencies or quantities, or
+        do not differ at all.
 
     References
     ----------

@@ -116,24 +116,23 @@ def identify_modes(
 ) -> IdentifiedModes:
     """Return poles, mode shapes and their covariance from measured FRFs.
 
-    Give the FRF and the band that holds the modes: ``found = fx.identify_modes(frf, band=(50.0,
-    800.0), dofs={"y1": "41:z"})``. `found.freq` [Hz], `found.zeta` and `found.shapes` are the
-    answer, `found.rejected` says which poles were left out and why, and `fx.plot.identified`
-    draws it beside the measurement. ``fx.Eigenvalues(fx.numbered(found, drawing))`` is what
-    `update` takes. Modes outside the band are accounted for. Poles come from a stabilisation
-    diagram and a maximum likelihood fit, without choices to make; `start=` takes poles picked by
-    eye (`fx.plot.PolePicker`), `refine=False` takes a second. What the fit does not explain is
-    warned of, with its frequency. How it works: `algorithms`.
+    ``found = fx.identify_modes(frf, band=(50.0, 800.0), dofs={"y1": "41:z"})``: `found.freq` [Hz],
+    `found.zeta` and `found.shapes` are the answer, `found.rejected` says which poles were left out
+    and why, and `fx.plot.identified` draws it beside the measurement.
+    ``fx.Eigenvalues(fx.numbered(found, drawing))`` is what `update` takes. Poles come from a
+    stabilisation diagram and a maximum likelihood fit, without choices to make; `start=` takes
+    poles picked by eye (`fx.plot.PolePicker`). Modes outside the band are accounted for; what the
+    fit does not explain is warned of, with its frequency. How it works: `algorithms`.
 
     Parameters
     ----------
     frf : Frf, or list of Frf
         Measured, or runs of the same channels between which the machine may have drifted (a mean of
-        these shows broader resonances, and hides it): poles are then means over the runs, and their
-        deviations come from how these differ.
-        With a variance, errors are weighted by it and the covariance follows from it
-        (and from the correlation between outputs, and between lines by the window, where known);
-        without, both come from what the fit leaves, averaged over 41 lines.
+        these shows broader resonances, and hides it): poles are then means over the runs, with
+        deviations from how these differ.
+        With a variance, errors are weighted by it and the covariance follows from it (and from the
+        correlation between outputs, and between lines by the window, where known); without, both
+        come from what the fit leaves, averaged over 41 lines.
     band : (low, high) [Hz], optional
         What to fit and report; all by default.
     orders : iterable of int, optional
@@ -146,9 +145,9 @@ def identify_modes(
         Number of those of modes above; when not given 3, and up to 25 where the data require them:
         with too few the poles are biased by a standard deviation before the misfit shows it.
     hold : float [Hz], optional
-        Rate of the zero-order hold between the inputs and the machine, where the FRF is that of
-        a sampled plant. Modes above half the rate are seen folded, as broad ones, where no
-        filter keeps them out: a pole of several per cent of damping may be one of these.
+        Rate of the zero-order hold between the inputs and the machine, where the FRF is that of a
+        sampled plant. Modes above half the rate are then seen folded, as broad ones of several per
+        cent of damping, where no filter keeps them out.
     dofs : mapping {channel: DOF label}, optional
         Where outputs and inputs are; shapes are labelled by it, and mass-normalised where an
         input and an output share a DOF.
@@ -158,8 +157,8 @@ def identify_modes(
     refine : bool, optional
         Whether to fit by maximum likelihood; when not given, where that is cheap (values of the FRF
         times (poles times references) squared up to 5e7 at each step, 5e10 in all) and worth it:
-        not where poles of each output's own leave noise alone and shared ones far more, as outputs
-        that disagree do. False takes about a second.
+        not where outputs disagree, which poles of their own explain and shared ones do not. False
+        takes about a second.
     most : int
         Poles that the fit may have, the strongest; others of the diagram are in `rejected`.
     max_iterations : int

@@ -137,10 +137,9 @@ class ImpactTest(Value):
 
         Raises
         ------
-        ModelError
-            When the window's damping was taken out of them before.
-        SolverError
-            When no pole has damping beyond that of the window, and its deviation.
+        ModelError, SolverError
+            When the window's damping was taken out of them before, or no pole has damping beyond
+            it, and its deviation.
         """
         instance(found, IdentifiedModes, "found", "Pass identify_modes(test.frf).")
         if not np.isfinite(self.decay):

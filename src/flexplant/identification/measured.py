@@ -195,10 +195,8 @@ class MeasuredModes(Value):
 
         Raises
         ------
-        LabelError
-            When there is no such pole, or it is given twice.
-        ModelError
-            When a place is no whole number.
+        LabelError, ModelError
+            When a place is no whole number, there is no such pole, or it is given twice.
         """
         if not several(poles):
             raise LabelError(f"select takes a list of places of the poles, got {short(poles)}.")

@@ -59,7 +59,8 @@ def identify_output_only(
     each pole, to first order in the errors of H, made larger by (b - 1)/(b - 3) of b blocks: errors
     over estimated deviations are of Student's distribution, and their squares then 1 in the mean.
     Poles whose frequency varies by more than 2 %, or whose damping by more than 60 %, are noise and
-    left out.
+    left out. A rotating part or a mains hum appears as a mode of next to no damping, excitation
+    that is not white as modes of its own.
 
     Parameters
     ----------
@@ -87,15 +88,9 @@ def identify_output_only(
 
     Raises
     ------
-    ModelError, ShapeError
-        When an argument is out of range, or the record is too short.
-    SolverError
-        When no pole stays over the orders and over the record.
-
-    Notes
-    -----
-    A rotating part or a mains hum appears as a mode of next to no damping; excitation that is not
-    white appears as modes of its own.
+    ModelError, ShapeError, SolverError
+        When an argument is out of range, the record is too short, or no pole stays over the orders
+        and over the record.
 
     References
     ----------

@@ -74,11 +74,9 @@ def structural_modes(
 
     Raises
     ------
-    ModelError
-        When the scale of shapes is not known, the term in 1/s^2 is no inertia, or `over` has more
-        modes than places.
-    LabelError
-        When a channel is not one of `dofs`.
+    ModelError, LabelError
+        When the scale of shapes is not known, the term in 1/s^2 is no inertia, `over` has more
+        modes than places, or a channel is not one of `dofs`.
 
     References
     ----------
@@ -339,11 +337,7 @@ def shape_deviations(
 
     Parameters
     ----------
-    measured : IdentifiedModes
-        As given to `structural_modes`.
-    dofs : DofSet
-        As given to `structural_modes`.
-    over : Modes, optional
+    measured, dofs, over
         As given to `structural_modes`.
     count : int
         Directions of each mode; noise that each sensor has for itself needs as many as there are

@@ -75,13 +75,7 @@ class _GivenParameter(Parameter):
         return part if isinstance(part, tuple) else () if part is None else (part,)
 
     def terms(self, model: FEModel | ReducedModel) -> list[Derivatives]:
-        """Return the matrices of all powers in the model's DOFs.
-
-        Raises
-        ------
-        ShapeError
-            When the matrices belong neither to the model nor to its full structure.
-        """
+        """Return the matrices of all powers in the model's DOFs, of which they have to be."""
         project = partial(_projected_matrix, model=model, name=self.name)
         powers = zip_longest(*(self._powers(label) for label in PARTS))
         return [(project(M), project(D), project(K)) for M, D, K in powers]
@@ -145,23 +139,19 @@ class MatrixParameter(_GivenParameter):
 
         Parameters
         ----------
-        name : str
-            For results.
+        name, unit, bounds, prior
+            As of the class; bounds and prior of p, the change.
         build : callable
             From the value to an FEModel; the same DOFs at every value.
         value : float
             Of the model that is updated.
         step : float, optional
             Of the difference; 1e-3 of the value when not given.
-        unit, bounds, prior
-            As of the class; bounds and prior of p, the change.
 
         Raises
         ------
-        ModelError
-            When the step is not positive or the matrices do not change.
-        ShapeError
-            When the DOFs change.
+        ModelError, ShapeError
+            When the step is not positive, the matrices do not change, or the DOFs do.
         """
         function(build, "build", MAKES)
         middle = float(real_array(value, "value", ()))
@@ -201,11 +191,6 @@ class MatrixParameter(_GivenParameter):
             Of the model that is updated; an array has the shape of the regions.
         bounds, prior : optional
             Of each relative change, as for `AddedMass`.
-
-        Returns
-        -------
-        list of MatrixParameter
-            In the order of the regions.
 
         Raises
         ------
@@ -293,13 +278,7 @@ class ModeDamping(Parameter):
         return f"<ModeDamping: {self.name}>"
 
     def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
-        """Return (None, dD, None).
-
-        Raises
-        ------
-        LabelError
-            When the model has no such elastic mode.
-        """
+        """Return (None, dD, None); LabelError of a mode that the model has not."""
         rigid = np.asarray(model.rigid_body, dtype=np.float64)
         k, r = rigid.shape
         if not r < self.mode <= k:
@@ -460,26 +439,18 @@ class PolynomialParameter(_GivenParameter):
 
         Parameters
         ----------
-        name : str
-            For results.
-        build : callable
-            From the value to an FEModel; the same DOFs at every value.
-        value : float
-            Of the model that is updated.
+        name, build, value, unit, bounds, prior
+            As for `MatrixParameter.from_difference`.
         degree : int, optional
             Highest power. None: the first of 3, 6 and 12 that is good enough.
         width : float, optional
             Of the interval on either side of the value; a fifth of it when not given.
-        unit, bounds, prior
-            As of the class; bounds and prior of p, the change.
 
         Raises
         ------
-        ModelError
+        ModelError, ShapeError
             When the polynomials miss the matrices by more than 1e-6 of their change between the
-            points, or nothing changes.
-        ShapeError
-            When the DOFs change.
+            points, nothing changes, or the DOFs do.
         """
         function(build, "build", MAKES)
         middle = float(real_array(value, "value", ()))

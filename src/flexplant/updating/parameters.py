@@ -42,13 +42,7 @@ class Parameter(Value):
 
     @abstractmethod
     def matrices(self, model: FEModel | ReducedModel) -> Derivatives:
-        """Return the derivatives (dM, dD, dK) of the model's matrices, None where zero.
-
-        Raises
-        ------
-        LabelError
-            When the model has no such place.
-        """
+        """Return the derivatives (dM, dD, dK) of the model's matrices, None where zero."""
 
     def terms(self, model: FEModel | ReducedModel) -> list[Derivatives]:
         """Return the matrices M_j of ``M(p) = M + sum_j g_j(p) M_j``, and of D and K."""
@@ -181,11 +175,8 @@ class AddedDamping(PointParameter):
 
     Parameters
     ----------
-    at : str, (3,) array [m] or mapping
-        DOF label, point (interpolated between nodes) or {label: weight}; a mapping
-        {a: 1, b: -1} is a damper between two DOFs.
-    direction, name, to, bounds, prior : optional
-        As for `AddedMass`.
+    at, direction, name, to, bounds, prior
+        As for `AddedMass`; {a: 1, b: -1} is a damper between two DOFs.
 
     Examples
     --------
@@ -207,11 +198,8 @@ class AddedStiffness(PointParameter):
 
     Parameters
     ----------
-    at : str, (3,) array [m] or mapping
-        DOF label, point (interpolated between nodes) or {label: weight}; a mapping
-        {a: 1, b: -1} is a spring between two DOFs.
-    direction, name, to, bounds, prior : optional
-        As for `AddedMass`.
+    at, direction, name, to, bounds, prior
+        As for `AddedMass`; {a: 1, b: -1} is a spring between two DOFs.
 
     Examples
     --------

@@ -100,11 +100,10 @@ def eigenvalue_sensitivities(
 
     Raises
     ------
-    LabelError
-        When a mode number or a place is unknown, or names are doubled.
-    ModelError
-        When the matrices are indefinite at `values`, or several parameters split repeated modes
-        along different vectors, so that no derivatives to them all exist.
+    LabelError, ModelError
+        When a mode number or a place is unknown, names are doubled, the matrices are indefinite at
+        `values`, or several parameters split repeated modes along different vectors, so that no
+        derivatives to them all exist.
 
     References
     ----------

@@ -48,14 +48,12 @@ def update(
 ) -> UpdateResult:
     """Find the parameters with which the model reproduces the measurement.
 
-    Give the model, what may differ and what was measured: ``fit = fx.update(drawing,
-    [fx.AddedMass("3:x")], [fx.Eigenvalues(found)])``. `fit.values`, `fit.std` and
-    `fit.parameters` are the answer, `fit.model` the updated model for `assemble_plant`,
-    `fit.applied_to(full)` the full one, and `fx.plot.update` draws all of it. Start with poles
-    (`Eigenvalues`), then add `ModeShapes` or `FrfResidual`. Parameters with bounds or a prior
-    keep to them; which ones the data determine, `identifiability` says, and where to look first,
-    `localise`. Modes are followed by number and shape, so they may swap order. How it works:
-    `algorithms`.
+    ``fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(found)])``: `fit.values`,
+    `fit.std` and `fit.parameters` are the answer, `fit.model` the updated model for
+    `assemble_plant`, `fit.applied_to(full)` the full one, and `fx.plot.update` draws all of it.
+    Start with poles (`Eigenvalues`), then add `ModeShapes` or `FrfResidual`. Which parameters the
+    data determine, `identifiability` says, and where to look first, `localise`. Modes are followed
+    by number and shape, so they may swap order. How it works: `algorithms`.
 
     Parameters
     ----------
@@ -63,43 +61,39 @@ def update(
         The model. An FEModel of more than 300 DOFs is updated in a basis of its modes that is made
         anew at the estimate until that moves no more; one of more than 20 000 should be reduced.
     parameters : sequence of q Parameter
-        `AddedMass`, `AddedDamping`, `AddedStiffness`, `ModeDamping`, `MatrixParameter`.
+        `AddedMass`, `AddedDamping`, `AddedStiffness`, `ModeDamping`, `MatrixParameter`, with what
+        is known of them, bounds and priors.
     residuals : sequence of Residual
         What to fit: `Eigenvalues`, `ModeShapes`, `FrfResidual`, `Antiresonances`,
         `StaticCompliance`, mixed freely.
     method : UpdateMethod, optional
-        `GaussNewton`, `TrustRegion`, `Tikhonov` or `Lasso`. None: as said above, the trust region
-        going on where Gauss-Newton leads nowhere.
+        `GaussNewton`, `TrustRegion`, `Tikhonov` or `Lasso`. None: the trust region, for poles alone
+        without bounds and priors only where Gauss-Newton leads nowhere.
     start : (q,) array [kg, N s/m, N/m], optional
-        Values to begin with. When not given zeros, or the means of priors, inside the bounds; then
-        complex responses are fitted by the logarithm of their magnitude first, all entries about
-        equally weighted, and poles before shapes, since these converge from farther away. Four
-        other starts are always tried, two with a model of more than 100 DOFs, since a minimum does
-        not show that there is another; print(fit) names those of similar chi-square. The first of
-        them is the default where a start was given, the others are near the better of the two.
-        Where no start leads to an end, responses alone are fitted and a tenth of their power is
-        left, or several parameters to poles alone and a pole is 0.1 % off, which noise does not
-        explain, up to 20 (or 4) are tried (`UpdateResult.starts`).
+        Values to begin with. None: zeros, or the means of priors, inside the bounds; then responses
+        are fitted by the logarithm of their magnitude first, all entries about equally weighted,
+        and poles before shapes, since these converge from farther away. Four other starts are
+        always tried (two with more than 100 DOFs), the default the first of them, since a minimum
+        does not show that there is another; print(fit) names those of similar chi-square. Up to 20
+        (or 4) are tried where none leads to an end, or noise does not explain that responses leave
+        a tenth of their power or that a pole is 0.1 % off (`UpdateResult.starts`).
     starts : int or (s, q) array, optional
         Search from these starts alone, or from so many that are drawn between the bounds (or from
         the priors), and keep the best; `start` is one of them. 1: from `start` alone.
     rng : int, SeedSequence or Generator
         For drawn starts.
     prior : bool
-        Whether priors take part. A parameter with two finite bounds and no prior has one from
-        them: zero (or the bound nearest to it) most probable, the farther bound three standard
-        deviations away.
+        Whether priors take part. Two finite bounds without a prior make one: zero (or the bound
+        nearest to it) most probable, the farther bound three standard deviations away.
     max_iterations : int, optional
         Most steps from one start; 20 for Gauss-Newton, 200 for the others when not given.
     tolerance : float
-        Done when a full step, or the residual, changes no eigenvalue by more than this,
-        relatively.
+        Done when a full step, or the residual, changes no eigenvalue by more than this, relatively.
     full : FEModel, optional
         That the reduced model was made from. The reduction makes an error that can be larger than
-        the noise and that chi-square does not always show; with the full model it is taken out by
-        defect correction: solve the full model at the estimate, add the difference of its residuals
-        from those of the reduced one, fit again. Damping is that of the full model's D; where it
-        has none, that of the reduced model.
+        the noise, which chi-square does not always show; it is taken out by defect correction:
+        solve the full model at the estimate, add the difference of its residuals from those of the
+        reduced one, fit again. Damping is that of the full model's D, else of the reduced model.
     rounds : int
         Of defect correction, at most; fewer where one moves the estimate by less than 0.01
         standard deviations.
@@ -114,13 +108,13 @@ def update(
     Warns
     -----
     FlexplantWarning
-        When the tolerance was not met; when no end is found from the `start` that was given, but
-        from another; when the noise is known and the fit leaves more than noise
-        does in one of 10 000 cases: parameters, and for each kind of residual the standard
-        deviation of what the model cannot explain, are then estimated together
-        (`UpdateResult.discrepancy`; with responses the covariance is widened instead, by chi-square
-        over its degrees of freedom, and no +- is printed); when the last round of defect correction
-        still moved the estimate by more than half a standard deviation.
+        When the tolerance was not met; when an end is found, but not from the `start` that was
+        given; when the last round of defect correction still moved the estimate by more than half
+        a standard deviation; when the fit leaves more than known noise does in one of 10 000 cases:
+        parameters, and for each kind of residual the standard deviation of what the model cannot
+        explain, are then estimated together (`UpdateResult.discrepancy`; with responses the
+        covariance is widened instead, by chi-square over its degrees of freedom, and no +- is
+        printed).
 
     Raises
     ------

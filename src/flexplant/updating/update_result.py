@@ -52,12 +52,10 @@ class History(Value):
 
     Examples
     --------
-    >>> import flexplant as fx
-    >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
-    >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))
-    >>> history = fx.update(drawing, [fx.AddedMass("3:x")], [poles]).history
-    >>> bool(abs(history.error[-1]) < abs(history.error[0]))
-    True
+    >>> import numpy as np
+    >>> steps, poles = np.array([[0.0], [0.2]]), np.array([[600j], [580j]])
+    >>> History(steps, poles, error=np.array([4.0, 0.1]), fraction=np.array([0.0, 1.0]))
+    <History: 1 step (0 shortened), error 4 -> 0.1>
     """
 
     parameters: FloatArray
@@ -151,10 +149,9 @@ class UpdateResult(Value):
     covariance : (q, q) array or None
         Of the estimate. With measured covariances C: ``G C G^T`` of the linear estimator
         ``G = (J^T W J)^-1 J^T W`` with J = [Re S; Im S], whatever the weights. Without:
-        ``s^2 (J^T W J)^-1`` with the residual variance ``s^2 = e / (2 m - q)``, so weights are
-        relative; it then holds the model's own error too. None when neither is known (no
-        covariance and 2 m = q). Where `chi2` is more than noise (`p_value` below 1e-4) C holds
-        the discrepancy too, or with responses is widened by ``chi2 / dof``.
+        ``s^2 (J^T W J)^-1`` with the residual variance ``s^2 = e / (2 m - q)``, which holds the
+        model's own error too; None when 2 m = q. Where `chi2` is more than noise (`p_value` below
+        1e-4) C holds the discrepancy too, or with responses is widened by ``chi2 / dof``.
     correlation : (q, q) array
         The correlation of the estimate for errors of covariance W^-1 (of `covariance` where
         there is one).
@@ -295,21 +292,12 @@ class UpdateResult(Value):
         return "\n".join([head, *lines]) + ">"
 
     def interval(self, level: float = 0.95) -> FloatArray:
-        """Return confidence (credible) intervals (q, 2) of the parameters.
+        """Return confidence (credible) intervals (q, 2) of the parameters, of a level in 0 .. 1.
 
         Of the normal distribution; of Student's where the discrepancy was estimated, with the
         degrees of freedom that the data alone give the kind that has fewest of them: an error of
-        all modes together takes one, since no mode shows it.
-
-        Parameters
-        ----------
-        level : float
-            Between 0 and 1.
-
-        Raises
-        ------
-        ModelError
-            When the covariance is not known, or the level is no probability.
+        all modes together takes one, since no mode shows it. ModelError where the covariance is
+        not known.
         """
         share = between(level, "level", 0.0, 1.0, "Choose 0.95, say.")
         half = self._quantile(share) * self._known_std()
@@ -338,14 +326,9 @@ class UpdateResult(Value):
         return [wider * deviation for deviation in std.tolist()]
 
     def sample(self, count: int, *, rng: Rng = 0) -> FloatArray:
-        """Return draws (count, q) from Laplace's approximation of the posterior.
+        """Return draws (count, q), normal with `values` and `covariance` (Laplace's posterior).
 
-        Normal with mean `values` and `covariance`.
-
-        Raises
-        ------
-        ModelError
-            When the covariance is not known, or the count is no whole number from 1.
+        ModelError where the covariance is not known.
         """
         std = self._known_std()
         white = generator(rng).standard_normal(
@@ -374,20 +357,14 @@ class UpdateResult(Value):
         Parameters
         ----------
         model : FEModel or ReducedModel
-            Its DOFs contain the places of the parameters. A sparse model stays sparse.
-
-        Returns
-        -------
-        FEModel or ReducedModel
-            Of the kind given.
+            Its DOFs contain the places of the parameters. One of its kind is returned; a sparse
+            model stays sparse.
 
         Raises
         ------
-        ModelError
-            When it is no model, or the parameters make its matrices indefinite.
-        LabelError, ShapeError
-            When it lacks the place of a parameter, or matrices of a parameter belong to
-            another number of DOFs.
+        ModelError, LabelError, ShapeError
+            When it is no model, its matrices become indefinite, it lacks the place of a parameter,
+            or matrices of a parameter belong to another number of DOFs.
         """
         if not hasattr(model, "rigid_body") or not hasattr(model, "dofs"):
             raise ModelError(
@@ -402,17 +379,12 @@ class UpdateResult(Value):
         """Return the updated model with the measured poles of some modes; see `ReducedModel`.
 
         The parameters explain shapes, POIs and modes that were not measured; what is measured of
-        a mode is put in as it is.
+        a mode is put in as it is. ModelError of an FEModel: calibrate its `modes()`.
 
         Parameters
         ----------
         measured : MeasuredModes
             With mode numbers.
-
-        Raises
-        ------
-        ModelError
-            When the model is an FEModel: calibrate its `modes()`.
         """
         if not hasattr(self.model, "calibrated"):
             raise ModelError(
@@ -448,10 +420,6 @@ class UpdateResult(Value):
         mesh : MeshError, optional
             Of ``modes.mesh_error(finer)``; 1.5 times of it count for modes that were not measured.
 
-        Returns
-        -------
-        ModalUncertainty
-
         Raises
         ------
         ModelError, LabelError
@@ -474,11 +442,6 @@ class UpdateResult(Value):
         count : int, optional
             How many, rigid-body modes included. None: all; of an FEModel of more than 1500 DOFs
             there must be a count.
-
-        Returns
-        -------
-        Modes
-            Over `model.full_dofs`.
 
         Raises
         ------

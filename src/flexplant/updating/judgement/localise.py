@@ -41,11 +41,10 @@ def localise(
 
     Arguments are as for `update`: ``found = fx.localise(drawing, candidates, residuals)``, with a
     candidate for every place, ``[fx.AddedMass(at) for at in drawing.dofs.labels]`` say.
-    `found.chosen` names up to `most` of them, `found.ranking` all by what each explains alone,
-    `found.alike` those that the sensors cannot distinguish: pass the candidates of these names to
-    `update`. Where nothing is wrong it names none. What is wrong everywhere (Young's modulus,
-    damping) goes into `nuisance`. To find what stands out, give more data than `most` unknowns.
-    How it works: `algorithms`.
+    `found.chosen` names up to `most` of them, none where nothing is wrong; `found.ranking` all by
+    what each explains alone, `found.alike` those that the sensors cannot distinguish: pass these
+    to `update`. What is wrong everywhere (Young's modulus, damping) goes into `nuisance`. How it
+    works: `algorithms`.
 
     Parameters
     ----------
@@ -69,12 +68,11 @@ def localise(
     Returns
     -------
     Localisation
-        Its repr says when the chosen subset leaves more than noise (`p_value`).
 
     Warns
     -----
     FlexplantWarning
-        When the chosen subset leaves more than noise does in one of 10 000 cases.
+        When the chosen subset leaves more than noise does in one of 10 000 cases (`p_value`).
 
     Raises
     ------

@@ -100,10 +100,8 @@ class Eigenvalues(_ModalResidual):
 
     Raises
     ------
-    ModelError, ShapeError
-        When weights are not positive numbers, one for each pole.
-    LabelError
-        When the poles have no mode numbers.
+    ModelError, ShapeError, LabelError
+        When weights are not positive, one for each pole, or the poles have no mode numbers.
 
     References
     ----------
@@ -145,13 +143,7 @@ class Eigenvalues(_ModalResidual):
         return np.asarray(1 / (variance[:m] + variance[m:]), dtype=np.float64)
 
     def select(self, modes: Sequence[int]) -> Eigenvalues:
-        """Return the residual of some of its modes, by number.
-
-        Raises
-        ------
-        LabelError
-            When a mode was not measured.
-        """
+        """Return the residual of some of its modes, by number; they must have been measured."""
         chosen, columns = self._chosen(modes)
         weights = None if self.weights is None else self.weights[columns]
         return self.replace(measured=chosen, weights=weights)
