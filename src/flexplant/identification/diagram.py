@@ -404,8 +404,8 @@ POLES = 100
 
 def affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
     """Return the orders, by default as many as the lines afford; ModelError for too high ones."""
-    parts = windows(ready)
-    fewest = min(window.seen.stop - window.seen.start for window in parts)
+    parts = _windows(ready)
+    fewest = min(seen.stop - seen.start for _, seen in parts)
     if orders is None:
         # four orders at least are compared, which twenty lines afford
         references = ready.data.shape[1]
@@ -439,17 +439,8 @@ LINES, OVERLAP = 400, 0.25
 MARGIN = 0.04
 
 
-@dataclass(frozen=True, eq=False)
-class Window:
-    """A part of the band: its own lines first..last, and those used."""
-
-    first: int
-    last: int
-    seen: slice
-
-
-def windows(ready: PreparedLines) -> list[Window]:
-    """Return parts of about 400 lines, cut where the responses are weakest."""
+def _windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
+    """Return the lines of parts of about 400, cut where responses are weakest, and those used."""
     import scipy.ndimage as ndi
 
     n_freq = ready.freq.size
@@ -464,7 +455,8 @@ def windows(ready: PreparedLines) -> list[Window]:
     parts = []
     for first, last in pairwise(cuts):
         beyond = round(OVERLAP * (last - first))
-        parts.append(Window(first, last, slice(max(0, first - beyond), min(n_freq, last + beyond))))
+        seen = slice(max(0, first - beyond), min(n_freq, last + beyond))
+        parts.append((slice(first, last), seen))
     return parts
 
 
@@ -475,16 +467,16 @@ def diagram_of(
     low, high = float(ready.freq[0]), float(ready.freq[-1])
     edge, band, first = MARGIN * (high - low), np.array([low, high]), 0
     found = []
-    for window in windows(ready):
-        freq = ready.freq[window.seen]
-        moments = _moments_in(ready, window, orders[-1])
+    for own, seen in _windows(ready):
+        freq = ready.freq[seen]
+        moments = _moments_in(ready, seen, orders[-1])
         inside = partial(_in_band, band=(float(freq[0]), float(freq[-1])), max_zeta=max_zeta)
         results = [moments.solve(order, inside) for order in orders]
         diagram = built_diagram(results, band, tolerances, first=first)
         first += len(diagram)
         ends = (
-            low - edge if window.first == 0 else ready.freq[window.first],
-            high + edge if window.last == ready.freq.size else ready.freq[window.last],
+            low - edge if own.start == 0 else ready.freq[own.start],
+            high + edge if own.stop == ready.freq.size else ready.freq[own.stop],
         )
         keep = np.zeros(len(diagram), dtype=bool)
         for track in np.unique(diagram.tracks):
@@ -505,18 +497,16 @@ def weighted_by_remainder(ready: PreparedLines, order: int) -> PreparedLines:
     n_out, n_in, n_freq = ready.data.shape
     for _ in range(2):
         error: FloatArray = np.zeros(ready.data.shape)
-        parts = windows(now)
-        for window in parts:
-            own = slice(window.first, window.last)
-            fitted: ComplexArray = _moments_in(now, window, order).response(order, now.freq[own])
+        parts = _windows(now)
+        for own, seen in parts:
+            fitted: ComplexArray = _moments_in(now, seen, order).response(order, now.freq[own])
             error[:, :, own] = np.abs(now.data[:, :, own] - fitted) ** 2
         share = (order + 1) * len(parts) / n_freq * (1 + n_in / n_out)
         now = now.from_errors(error, min(0.5, share))
     return now
 
 
-def _moments_in(ready: PreparedLines, window: Window, order: int) -> Moments:
-    seen = window.seen
+def _moments_in(ready: PreparedLines, seen: slice, order: int) -> Moments:
     return Moments(ready.freq[seen], ready.data[:, :, seen], ready.line_weight[:, seen], order)
 
 

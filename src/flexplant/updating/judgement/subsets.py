@@ -47,6 +47,8 @@ class SubsetFit(NamedTuple):
     error: float
     #: the same in units of the noise and its correlation, None where that is not known
     chi2: float | None
+    #: the extended BIC, ``chi^2 + k ln n + 2 ln C(c, k)``
+    score: float
 
 
 class Subsets:
@@ -81,15 +83,14 @@ class Subsets:
             self.start = self.start.copy()
             self.start[self.beside] = self.ways[()][-1]
         else:
-            self.done[()], self.ends[()] = _subset_fit(whole, self.start[:0], point), point
+            self.done[()], self.ends[()] = self._left(whole, self.start[:0], point, ()), point
 
     def fit(self, subset: Subset) -> SubsetFit | None:
         """Return the fit of a subset, None when it cannot be fitted."""
         if subset not in self.done:
             try:
-                found = self._fitted(subset)
-                self.done[subset] = found
-                self.least = min(self.least, self._criterion(found, len(subset)))
+                self.done[subset] = found = self._fitted(subset)
+                self.least = min(self.least, found.score)
             except (ModelError, SolverError):
                 self.done[subset] = None
         return self.done[subset]
@@ -104,7 +105,8 @@ class Subsets:
         found = TrustRegion().search(objective, end, most=50, tolerance=CHOSEN)
         self.ways[subset] = [*self.ways[subset], *found.trail.p[1:]]
         point = objective.at(found.p)
-        self.done[subset], self.ends[subset] = _subset_fit(objective, found.p, point), point
+        self.done[subset] = self._left(objective, found.p, point, subset)
+        self.ends[subset] = point
 
     def worst(self, subset: Subset) -> str:
         """Return the residuals that the fit of a subset explains least, in words."""
@@ -113,14 +115,20 @@ class Subsets:
         return worst(objective, self._end_of(objective, range(len(picked)), subset))
 
     def score(self, subset: Subset) -> float:
-        """Return the extended BIC, ``chi^2 + k ln n + 2 ln C(c, k)``; infinite without a fit."""
+        """Return the extended BIC of a subset, infinite without a fit."""
         found = self.fit(subset)
-        return np.inf if found is None else self._criterion(found, len(subset))
+        return np.inf if found is None else found.score
 
-    def _criterion(self, found: SubsetFit, k: int) -> float:
-        c, known = self.count, found.chi2 is not None
-        misfit = found.error if found.chi2 is None else found.chi2
-        return bic(misfit, self.rows, k + len(self.beside), known) + 2 * log(comb(c, k))
+    def _left(
+        self, objective: Objective, values: FloatArray, point: Point, subset: Subset
+    ) -> SubsetFit:
+        """Return what the model at a point leaves; `values`: of the parameters that were fitted."""
+        r, k = objective.values(point), len(subset)
+        error = float(r @ r)
+        chi2, _ = chi_square(objective, point, np.full(point.p.size, bool(values.size)))
+        misfit = error if chi2 is None else chi2
+        score = bic(misfit, self.rows, k + len(self.beside), chi2 is not None)
+        return SubsetFit(values, error, chi2, score + 2 * log(comb(self.count, k)))
 
     def chi2(self, subset: Subset) -> tuple[float | None, int]:
         """Return what a subset leaves (None where the noise is not known) and its freedom."""
@@ -134,7 +142,7 @@ class Subsets:
         A set with more candidates beside those of the best names no other place.
         """
         other = [
-            (self._criterion(found, len(one)), one)
+            (found.score, one)
             for one, found in self.done.items()
             if found is not None and not set(best) <= set(one)
         ]
@@ -288,16 +296,15 @@ class Subsets:
             r = exact.values(point)
             off = float(np.sum((r - few.values(made)) ** 2))
             close = off <= max(FAITHFUL**2 * float(r @ r), NEGLIGIBLE**2 * self.error_without)
-            left = _subset_fit(exact, found.p, point)
+            left = self._left(exact, found.p, point, subset)
             # what is not physical leaves less than what is: of interest if it is the best
-            worse = self._criterion(left, len(subset)) > self.least
-            if close and (worse or is_physical(exact.family, found.p)):
+            if close and (left.score > self.least or is_physical(exact.family, found.p)):
                 self.ways[subset], self.ends[subset] = way, point
                 return left
         found, way = self._searched(exact, subset)
         point = exact.at(found.p)
         self.ways[subset], self.ends[subset] = way, point
-        return _subset_fit(exact, found.p, point)
+        return self._left(exact, found.p, point, subset)
 
     def _searched(self, objective: Objective, subset: Subset) -> tuple[SearchEnd, list[FloatArray]]:
         """Return the end of the search for a subset's values, and the points on the way there."""
@@ -353,13 +360,6 @@ class Subsets:
     def _error(self, subset: Subset) -> float:
         found = self.done.get(subset)
         return np.inf if found is None else found.error
-
-
-def _subset_fit(objective: Objective, values: FloatArray, point: Point) -> SubsetFit:
-    """Return what the model at a point leaves; `values` are those parameters that were fitted."""
-    r = objective.values(point)
-    chi2, _ = chi_square(objective, point, np.full(point.p.size, bool(values.size)))
-    return SubsetFit(values, float(r @ r), chi2)
 
 
 def _beside(J: FloatArray, beside: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray]:
