@@ -470,7 +470,7 @@ def diagram_of(
     for own, seen in _windows(ready):
         freq = ready.freq[seen]
         moments = _moments_in(ready, seen, orders[-1])
-        inside = partial(_in_band, band=(float(freq[0]), float(freq[-1])), max_zeta=max_zeta)
+        inside = partial(_in_band, low=freq[0], high=freq[-1], max_zeta=max_zeta)
         results = [moments.solve(order, inside) for order in orders]
         diagram = built_diagram(results, band, tolerances, first=first)
         first += len(diagram)
@@ -510,10 +510,9 @@ def _moments_in(ready: PreparedLines, seen: slice, order: int) -> Moments:
     return Moments(ready.freq[seen], ready.data[:, :, seen], ready.line_weight[:, seen], order)
 
 
-def _in_band(poles: ComplexArray, band: tuple[float, float], max_zeta: float) -> BoolArray:
+def _in_band(poles: ComplexArray, *, low: float, high: float, max_zeta: float) -> BoolArray:
     """Return which poles count in a part of the band."""
     freq = np.abs(poles) / (2 * np.pi)
-    zeta = -poles.real / np.abs(poles)
-    edge = MARGIN * (band[1] - band[0])
-    keep = (freq > max(band[0] - edge, 0.5 * band[0])) & (freq < band[1] + edge)
+    zeta, edge = -poles.real / np.abs(poles), MARGIN * (high - low)
+    keep = (freq > max(low - edge, 0.5 * low)) & (freq < high + edge)
     return np.asarray(keep & (zeta > 0) & (zeta < max_zeta) & (poles.imag > 0))

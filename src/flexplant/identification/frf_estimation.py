@@ -44,6 +44,8 @@ def feedback_warned(frf: Frf) -> None:
     and compared with what the variance makes there. Hann-windowed segments only: others fold
     what rings on at the end of a segment to these times.
     """
+    import scipy.ndimage as ndi
+
     n = frf.freq.size
     if frf.window != "hann" or frf.variance is None or frf.resolution is None or n < 4 * STRETCH:
         return
@@ -65,7 +67,10 @@ def feedback_warned(frf: Frf) -> None:
     spread = np.abs(np.fft.fft(window) / size) ** 2
     both = np.concatenate([power, power[..., -2:0:-1]], axis=-1)
     noise = np.fft.irfft(np.fft.rfft(both) * np.fft.rfft(spread), size)[..., : n + 2]
-    seen, noise, whole = (_moving_mean(x) for x in (seen, noise, np.abs(spectrum) ** 2))
+    seen, noise, whole = (
+        ndi.uniform_filter1d(power, STRETCH, axis=-1, mode="nearest")
+        for power in (seen, noise, np.abs(spectrum) ** 2)
+    )
     ratio = seen / np.maximum(noise, TINY)
     share = np.sqrt(seen / np.maximum(whole, TINY))
     score: Any = np.where((ratio > SEEN) & (share > LEAST), ratio, 0.0)[..., 1:-1]
@@ -89,12 +94,6 @@ def _taper(x: FloatArray) -> FloatArray:
 
     both = kaiser(2049, 12.0)
     return np.asarray(np.interp(x, np.linspace(0.0, 1.0, 1025), both[1024:]))
-
-
-def _moving_mean(power: FloatArray) -> FloatArray:
-    import scipy.ndimage as ndi
-
-    return np.asarray(ndi.uniform_filter1d(power, STRETCH, axis=-1, mode="nearest"))
 
 
 Signals: TypeAlias = npt.ArrayLike | Mapping[str, Any]

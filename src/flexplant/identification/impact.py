@@ -281,13 +281,16 @@ def impact_frf(
     forces: list[list[ComplexArray]] = [[] for _ in data.inputs]
     motions: list[list[ComplexArray]] = [[] for _ in data.inputs]
     for e in range(f.shape[0]):
-        for blow, i, start, at in _blows(data, f, e, level, length, full):
+        for blow, i, start, (before, width) in _blows(data, f, e, level, length, full):
             if blow.reason:
                 refused.append(blow)
                 continue
             used.append(blow)
             part = slice(start, start + length)
-            own = f[e, i, part] * _force_window(length, *at) * window
+            # 1 until a pulse's width after it, then half a cosine to zero over another width
+            time = np.arange(length) - (before + 2 * width)
+            force_window = 0.5 + 0.5 * np.cos(np.pi * np.clip(time / max(width, 1), 0.0, 1.0))
+            own = f[e, i, part] * force_window * window
             forces[i].append(np.fft.rfft(own))
             motions[i].append(np.fft.rfft(y[e, :, part] * window, axis=1))
     for name, own_forces in zip(data.inputs, forces, strict=True):
@@ -408,13 +411,6 @@ def _unusable(begins: list[int], k: int, start: int, length: int, n_time: int, r
     if start + length > n_time:
         return f"the record ends {(n_time - begins[k]) / rate:.3g} s after it"
     return ""
-
-
-def _force_window(length: int, before: int, width: int) -> FloatArray:
-    """Return 1 until a pulse's width after it, then half a cosine to zero over another width."""
-    time = np.arange(length) - (before + 2 * width)
-    fall = np.clip(time / max(width, 1), 0.0, 1.0)
-    return np.asarray(0.5 + 0.5 * np.cos(np.pi * fall))
 
 
 def _limited(

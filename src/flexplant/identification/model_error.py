@@ -159,7 +159,11 @@ def disagreement(fit: Fit, least: float, excess: float) -> Disagreement | None:
         return None
     places = np.array([np.concatenate([one.poles.real, one.poles.imag]) for one in own])
     # an output that hardly sees a mode may have its own pole anywhere: known no better than there
-    seen, alone = (np.array([_variance(one) for one in fits]) for fits in (_parted(fit), own))
+    parted = [
+        Fit(fit.lines.of_rows(rows), fit.poles, fit.participation, fit.pivots)
+        for rows in fit.lines.parts
+    ]
+    seen, alone = (np.array([_variance(one) for one in fits]) for fits in (parted, own))
     elsewhere, broad = (np.tile(squares, 2) for squares in _strayed(fit, own))
     variance = np.maximum(seen, alone) + elsewhere
     # the spread is that of all outputs, broad poles too: it shows which poles are not shared
@@ -175,12 +179,6 @@ def disagreement(fit: Fit, least: float, excess: float) -> Disagreement | None:
     worst = int(np.argmax(np.abs(off)))
     odd = (worst, float(off[worst])) if abs(off[worst]) > ODD * size else None
     return Disagreement(size, poles, spread, deviation, weighted.T @ weighted, odd)
-
-
-def _parted(fit: Fit) -> list[Fit]:
-    """Return the fits of each output, or set-up, at the shared poles."""
-    each = (fit.lines.of_rows(rows) for rows in fit.lines.parts)
-    return [Fit(lines, fit.poles, fit.participation, fit.pivots) for lines in each]
 
 
 def _variance(one: Fit) -> FloatArray:

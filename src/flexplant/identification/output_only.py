@@ -134,7 +134,10 @@ def identify_output_only(
         inside = (low, high)
         results = [_order_poles(U, sizes, y.shape[1], order, step, inside) for order in listed]
         chosen = built_diagram(results, np.array(inside), TOLERANCES).automatic().poles
-        bases = [_leave_one_out(mean, one, parts) for one in each]
+        bases = []
+        for one in each:
+            tick(PARTS)
+            bases.append(la.svd((parts * mean - one) / (parts - 1)))
         best: tuple[OrderPoles, FloatArray, Any] | None = None
         for result in results:
             found = _those(result, chosen)
@@ -168,12 +171,6 @@ def _record_pieces(y: FloatArray, parts: int) -> list[FloatArray]:
     share = max(1, round(parts / y.shape[0]))
     pieces = [piece for record in y for piece in np.array_split(record, share, axis=1)]
     return [piece - piece.mean(axis=1, keepdims=True) for piece in pieces]
-
-
-def _leave_one_out(mean: FloatArray, one: FloatArray, parts: int) -> Any:
-    """Return the singular value decomposition of the mean without one of the parts."""
-    tick(PARTS)
-    return la.svd((parts * mean - one) / (parts - 1))
 
 
 def _hankel(y: FloatArray, count: int) -> FloatArray:

@@ -89,7 +89,8 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
     lines = np.arange(1, (samples + 1) // 2)
     freq = lines / method.period
     X = U if data.r is None else line_spectra(data.r, samples, periods)
-    keep = _excited(X)
+    singular = np.linalg.svd(_mean_spectra(X), compute_uv=False)[:, -1]
+    keep = singular > EXCITED * singular.max(initial=0.0)
     if method.band is not None:
         keep &= (freq >= method.band[0]) & (freq <= method.band[1])
     if not np.any(keep):
@@ -185,11 +186,6 @@ def _each_period(signals: FloatArray, samples: int) -> ComplexArray:
 def _mean_spectra(spectra: ComplexArray) -> ComplexArray:
     """Return those of the mean period (lines, n_channel, n_exp)."""
     return np.asarray(spectra[:, :, 0].transpose(2, 1, 0))
-
-
-def _excited(spectra: ComplexArray) -> Any:
-    singular = np.linalg.svd(_mean_spectra(spectra), compute_uv=False)[:, -1]
-    return singular > EXCITED * singular.max(initial=0.0)
 
 
 def _noise_spectrum(

@@ -108,7 +108,12 @@ def _covariances(fit: Fit, ready: PreparedLines) -> tuple[FloatArray, ComplexArr
                 common = common + _inner_product(gains[a], ready.spread(a, b, gains[b]))
                 mixed[b] += _inner_product(gains[a], other)
                 held[a, b] = _inner_product(direct[a], other)
-    slopes = np.concatenate([slopes, _free_entries(fit)])
+    # derivatives of Re and Im of the participation, whose free entries are parameters themselves
+    entries = np.zeros((n_in, 2, m, 2 * m * n_in))
+    place = 2 * m * (1 + np.arange(n_in - 1)[:, None]) + np.arange(m)
+    free = free_inputs(fit.pivots, n_in)
+    entries[free, 0, np.arange(m), place] = entries[free, 1, np.arange(m), place + m] = 1.0
+    slopes = np.concatenate([slopes, entries])
     mixed = mixed.reshape(n_out, -1, 2, m)
     held = held.reshape(n_out, n_out, 2, m, 2, m)
     found = np.zeros((m, n_out + n_in, n_out + n_in), dtype=np.complex128)
@@ -123,16 +128,6 @@ def _covariances(fit: Fit, ready: PreparedLines) -> tuple[FloatArray, ComplexArr
     chosen = common[: 2 * m, : 2 * m]
     both: ComplexArray = found + found.conj().transpose(0, 2, 1)
     return (chosen + chosen.T) / 2, both / 2
-
-
-def _free_entries(fit: Fit) -> FloatArray:
-    """Return the derivatives (n_in, 2, m, n_parameters) of Re and Im of the participation."""
-    n_in, m = fit.participation.shape
-    found = np.zeros((n_in, 2, m, 2 * m * n_in))
-    place = 2 * m * (1 + np.arange(n_in - 1)[:, None]) + np.arange(m)
-    free = free_inputs(fit.pivots, n_in)
-    found[free, 0, np.arange(m), place] = found[free, 1, np.arange(m), place + m] = 1.0
-    return found
 
 
 def _scaled_shapes(

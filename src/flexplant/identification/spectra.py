@@ -360,18 +360,14 @@ def signals(value: Any, side: str, prefix: str) -> tuple[FloatArray, tuple[str, 
         )
     if not names:
         cure = f"{side}.T" if np.ndim(value) == 2 else f"np.swapaxes({side}, 1, 2)"
-        _require_time_last(array, side, cure)
+        channels, samples = array.shape[1:]
+        if channels > samples:
+            raise ShapeError(
+                f"{side} have {channels} channels of {samples} samples each: their axes are "
+                f"swapped, time is the last one here. Pass {cure}; in a mapping, each name has its "
+                "own record."
+            )
     return array, signal_names(names, array.shape[1], prefix, side)
-
-
-def _require_time_last(array: FloatArray, side: str, cure: str) -> None:
-    """Refuse records of more channels than samples: their axes are swapped."""
-    channels, samples = array.shape[1:]
-    if channels > samples:
-        raise ShapeError(
-            f"{side} have {channels} channels of {samples} samples each: their axes are swapped, "
-            f"time is the last one here. Pass {cure}; in a mapping, each name has its own record."
-        )
 
 
 #: samples of one value, beyond what quantisation makes, that are no measurement

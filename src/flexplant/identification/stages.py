@@ -294,10 +294,16 @@ def identified(
     progress: bool | None,
 ) -> IdentifiedModes:
     """Return the modes of prepared lines; `start`: poles chosen by hand."""
+    references = ready.data.shape[1]
+    if start is not None and start.participation.shape[0] != references:
+        raise ShapeError(
+            f"start was chosen with {counted(start.participation.shape[0], 'reference')}, this FRF "
+            f"has {references}: make the diagram from the same channels."
+        )
     listed = affordable(orders, ready)
     if not ready.known:
         ready = weighted_by_remainder(ready, listed[-1])
-    begin = _begin(task, ready, listed) if start is None else _by_hand(ready, start)
+    begin = _Begin(start) if start is not None else _begin(task, ready, listed)
     refine = False if begin.at_peaks else task.refine
     work = ready.data.size * (len(begin.poles) * ready.data.shape[1]) ** 2
     costly = work > CHEAP
@@ -327,16 +333,6 @@ def identified(
         bar.advance(STAGES - bar.done)
     leakage_warned(task.frf, found)
     return found
-
-
-def _by_hand(ready: PreparedLines, start: PoleSelection) -> _Begin:
-    """Return poles that were chosen by hand."""
-    if start.participation.shape[0] != ready.data.shape[1]:
-        raise ShapeError(
-            f"start was chosen with {counted(start.participation.shape[0], 'reference')}, this FRF "
-            f"has {ready.data.shape[1]}: make the diagram from the same channels."
-        )
-    return _Begin(start)
 
 
 def _begin(task: Task, ready: PreparedLines, orders: list[int]) -> _Begin:

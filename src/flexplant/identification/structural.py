@@ -108,7 +108,10 @@ def structural_modes(
     columns = [body, shapes.real, np.hstack([beside.shapes.real, residual])]
     place = dofs
     if over is not None:
-        columns, certificate["expansion"] = _expanded(over, rows, columns)
+        E = expansion(over, rows)
+        left = np.linalg.norm(columns[1] - E[rows] @ columns[1], axis=0)
+        certificate["expansion"] = float(np.max(left / np.linalg.norm(columns[1], axis=0)))
+        columns = [E @ one for one in columns]
     else:
         place = dofs.select(labels)
         if dofs.interpolation is not None:
@@ -287,14 +290,6 @@ def _imaginary(shapes: ComplexArray) -> FloatArray:
     """Return the relative size (m,) of the shapes' imaginary parts."""
     size = np.linalg.norm(shapes, axis=0)
     return np.asarray(np.linalg.norm(shapes.imag, axis=0) / divisor(size))
-
-
-def _expanded(over: Modes, rows: Any, columns: list[FloatArray]) -> tuple[list[FloatArray], float]:
-    """Return shapes over all DOFs of a model, and the part of elastic ones it does not make."""
-    E = expansion(over, rows)
-    left = columns[1] - E[rows] @ columns[1]
-    part = np.linalg.norm(left, axis=0) / np.linalg.norm(columns[1], axis=0)
-    return [E @ one for one in columns], float(np.max(part))
 
 
 def expansion(over: Modes, rows: Any) -> FloatArray:

@@ -278,8 +278,8 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
     # attachment vectors stand for modes left out: no machine has their frequencies
     m = len(found.modes) - getattr(fit.model, "n_vectors", 0)
     found = found.replace(modes=found.modes[:m], poles=found.poles[:m], S=found.S[:m])
-    known = range(found.modes[0], found.modes[-1] + 1)
-    places, poles = measured_poles(measured, known)
+    elastic = range(found.modes[0], found.modes[-1] + 1)
+    places, poles = measured_poles(measured, elastic)
     places = places + 1 - found.modes[0]
     own = found.poles[places]
     both = np.r_[places, m + places]
@@ -288,7 +288,11 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
     said = np.r_[np.full(ratio.size, True), ratio > ZETA]
     gap = np.r_[np.log(np.abs(poles / own)), np.log(np.where(ratio > ZETA, ratio, 1.0))]
     # the damping of a model or a measurement without any says nothing
-    noise = np.where(np.outer(said, said), _noise(measured, poles), np.eye(said.size) * _SILENT**2)
+    known = np.eye(said.size) * _EXACT**2
+    if measured.covariance is not None:
+        G = _relative_changes(poles, np.hstack([np.eye(poles.size), 1j * np.eye(poles.size)]))
+        known += G @ measured.covariance @ G.T
+    noise = np.where(np.outer(said, said), known, np.eye(said.size) * _SILENT**2)
     grown = growth(np.abs(found.poles), np.abs(poles))
     mean, covariance, dof = _conditioned(S, both, gap, noise, np.r_[grown, np.ones(m)], fit)
     model = found.poles.copy()
@@ -302,8 +306,9 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
     share = np.expm1(np.abs(mean) + width * np.sqrt(np.diag(covariance)))
     if mesh is not None:
         for mode, error in zip(mesh.modes.tolist(), mesh.error.tolist(), strict=True):
-            if mode in known and mode - known[0] not in places:
-                share[mode - known[0]] = max(share[mode - known[0]], _MESH * abs(error))
+            place = mode - elastic[0]
+            if mode in elastic and place not in places:
+                share[place] = max(share[place], _MESH * abs(error))
     share[both] = np.maximum(share[both], np.repeat(_DRIFT, places.size))
     return ModalUncertainty(found.modes, share, covariance, model)
 
@@ -347,16 +352,6 @@ def _conditioned(
 
 def _damping(poles: ComplexArray) -> FloatArray:
     return np.asarray(-poles.real / np.abs(poles))
-
-
-def _noise(measured: Any, poles: ComplexArray) -> FloatArray:
-    """Return the covariance of relative errors of frequencies and damping of measured poles."""
-    m = poles.size
-    exact = np.eye(2 * m) * _EXACT**2
-    if measured.covariance is None:
-        return exact
-    G = _relative_changes(poles, np.hstack([np.eye(m), 1j * np.eye(m)]))
-    return np.asarray(G @ measured.covariance @ G.T + exact)
 
 
 def _relative_changes(poles: ComplexArray, changes: ComplexArray) -> FloatArray:

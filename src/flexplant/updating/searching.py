@@ -229,7 +229,7 @@ def _other_starts(
     """Return starts around the first of some where the modes can be numbered, and its `led`."""
     for middle, led in middles:
         with attempted("starts around another", (ModelError, LabelError)):
-            return scattered(objective, middle, count, rng), led
+            return _scattered(objective, middle, count, rng), led
     return [], False
 
 
@@ -347,27 +347,23 @@ def summary(
     found = [end for end in ends if isinstance(end, SearchEnd) and end.converged]
     minima: list[SearchEnd] = []
     for end in sorted(found, key=lambda one: one.cost):
-        if not any(same_minimum(objective, point, end, other) for other in (best, *minima)):
+        if not any(_same_minimum(objective, point, end, other) for other in (best, *minima)):
             minima.append(end)
     above = _above(objective, best, minima)
     return Starts(
         np.array(begins),
         np.array([end.p if isinstance(end, SearchEnd) else nan for end in ends]),
         np.array([end.cost if isinstance(end, SearchEnd) else np.inf for end in ends]),
-        tuple(_ending(end) for end in ends),
+        tuple(
+            "; then ".join(end.tried) or end.reason if isinstance(end, SearchEnd) else str(end)
+            for end in ends
+        ),
         np.array([end.p for end in minima]).reshape(-1, best.p.size),
         above,
     )
 
 
-def _ending(end: Reached) -> str:
-    """Return how a search ended, in words."""
-    if not isinstance(end, SearchEnd):
-        return str(end)
-    return "; then ".join(end.tried) or end.reason
-
-
-def same_minimum(objective: Objective, point: Point, a: SearchEnd, b: SearchEnd) -> bool:
+def _same_minimum(objective: Objective, point: Point, a: SearchEnd, b: SearchEnd) -> bool:
     """Return whether two ends are one minimum: their difference changes what is fitted by nothing.
 
     By less than a standard deviation where the noise is known, and relatively.
@@ -399,7 +395,7 @@ def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> Fl
     return np.asarray(np.where(np.abs(above) < SAME_COST * least, 0.0, above), dtype=np.float64)
 
 
-def scattered(objective: Objective, middle: FloatArray, count: int, rng: Rng) -> list[FloatArray]:
+def _scattered(objective: Objective, middle: FloatArray, count: int, rng: Rng) -> list[FloatArray]:
     """Return starts around one, as far as each parameter moves eigenvalues by 10 %.
 
     Sizes are drawn evenly over decades; masses, springs and dampers are added, not taken away.
@@ -427,11 +423,8 @@ def _random_starts(objective: Objective, count: int, rng: Rng) -> FloatArray:
     low = np.where(objective.has_prior, objective.prior_mean - 2 * objective.prior_std, -np.inf)
     high = np.where(objective.has_prior, objective.prior_mean + 2 * objective.prior_std, np.inf)
     low, high = np.maximum(low, objective.lower), np.minimum(high, objective.upper)
-    open_ = [
-        p.name
-        for p, width in zip(objective.parameters, high - low, strict=True)
-        if not np.isfinite(width)
-    ]
+    widths = zip(objective.parameters, high - low, strict=True)
+    open_ = [p.name for p, width in widths if not np.isfinite(width)]
     if open_:
         raise ModelError(
             f"starts of {', '.join(open_)} cannot be drawn: give them bounds= or prior=, or "

@@ -241,9 +241,11 @@ def _result(
 ) -> UpdateResult:
     """Return what the best search found and how well it is known."""
     point = objective.at(best.p)
-    at_bound = _at_bound(
-        objective, best.p, unit_changes(objective, objective.slopes(point, prior=False))
-    )
+    low, high, p = objective.lower, objective.upper, best.p
+    unit = unit_changes(objective, objective.slopes(point, prior=False))
+    near = AT_BOUND * np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(p), unit))
+    names = np.array([q.name for q in objective.parameters], dtype=object)
+    at_bound = tuple(names[(p - low <= near) | (high - p <= near)].tolist())
     fitted = np.array([q.name not in at_bound for q in objective.parameters])
     if method.penalised:
         fitted &= best.p != begin
@@ -291,15 +293,6 @@ def _complaint(fit: UpdateResult, named: str) -> str:
         "Something else differs between model and machine, or the noise is understated; "
         f"localise(model, candidates, residuals) searches for the place. {tried}{kept}"
     )
-
-
-def _at_bound(objective: Objective, p: FloatArray, unit: FloatArray) -> tuple[str, ...]:
-    """Return the names of the parameters at one of their bounds; `unit` counts as one change."""
-    low, high = objective.lower, objective.upper
-    width = high - low
-    near = AT_BOUND * np.where(np.isfinite(width), width, np.maximum(np.abs(p), unit))
-    at = (p - low <= near) | (high - p <= near)
-    return tuple(q.name for q, there in zip(objective.parameters, at, strict=True) if there)
 
 
 #: standard deviations by which a round moves the estimate that need no further round

@@ -111,7 +111,12 @@ def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, F
     spare = r.size - q
     found: FloatArray | None = None
     if objective.noise_known:
-        found = unit = half @ _noise_in(objective, point, U) @ half.T
+        # N, the covariance of the rows; those of priors have unit variance
+        total = U.T @ U
+        for bound, rows in objective.rows(point):
+            if bound.noise is not None:
+                total += U[rows].T @ (bound.noise @ U[rows] - U[rows])
+        found = unit = half @ total @ half.T
     elif spare > 0:
         found = unit * float(r @ r) / spare
     std = np.sqrt(np.diag(unit))
@@ -120,15 +125,6 @@ def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, F
     np.fill_diagonal(correlation, 1.0)
     regular = s.size == q and bool(s[-1] > SINGULAR * s[0])
     return (found if regular else None), correlation
-
-
-def _noise_in(objective: Objective, point: Point, U: FloatArray) -> FloatArray:
-    """Return ``U^T N U``, N the covariance of the rows (those of priors have unit variance)."""
-    total = U.T @ U
-    for bound, rows in objective.rows(point):
-        if bound.noise is not None:
-            total += U[rows].T @ (bound.noise @ U[rows] - U[rows])
-    return np.asarray(total, dtype=np.float64)
 
 
 #: correlations beyond this are listed

@@ -201,7 +201,11 @@ class _BoundFrf(Bound):
         """Return H and what its slopes are made from."""
         if self._last is None or self._last[0] is not point:
             if self.hold is None:
-                X, Y = motions(point, self.omega, self.B, self.C)
+                # Z^-1 B and Z^-T C^T at all lines; Z is symmetric
+                M, D, K = point.matrices
+                w, loads = self.omega[:, None, None], np.hstack([self.B, self.C.T])
+                solved: Any = np.linalg.solve(K - w**2 * M + 1j * w * D, loads[None] + 0j)
+                X, Y = np.split(solved, [self.B.shape[1]], axis=2)
                 H = np.matmul(self.C, X) * self.factor[:, None, None]
                 self._last = (point, H, (X, Y))
             else:
@@ -220,39 +224,22 @@ class _BoundFrf(Bound):
 
     def slopes(self, point: Point) -> FloatArray:
         H, made = self._solved(point)
+        q = point.p.size
         if self.hold is None:
-            dH = response_slopes(point, self.omega, *made) * self.factor[:, None, None]
+            # -Y^T (dK + i omega dD - omega^2 dM) X
+            X, Y = made
+            lines, k, n_in = X.shape
+            s = np.repeat(1j * self.omega, n_in)
+            flat = np.moveaxis(X, 0, 1).reshape(k, lines * n_in)
+            moved = point.family.moved(flat, (s**2, s, np.ones_like(s)))
+            moved = moved.reshape(q, k, lines, n_in).transpose(0, 2, 1, 3)
+            dH = -np.matmul(Y.transpose(0, 2, 1), moved) * self.factor[:, None, None]
         else:
             held, z, X = made
             dH = held.slopes(z, X)
-        q = point.p.size
         if self.magnitude:
             return np.asarray(-(np.real(dH / H) / self.sigma).reshape(q, -1).T)
         return split_parts(-(dH / self.sigma).reshape(q, -1).T)
-
-
-def motions(
-    point: Point, omega: FloatArray, B: FloatArray, C: FloatArray
-) -> tuple[ComplexArray, ComplexArray]:
-    """Return ``Z^-1 B`` and ``Z^-T C^T`` (l, k, ...) at all lines; Z is symmetric."""
-    M, D, K = point.matrices
-    w = omega[:, None, None]
-    loads = np.hstack([B, C.T])
-    solved: Any = np.linalg.solve(K - w**2 * M + 1j * w * D, loads[None] + 0j)
-    return solved[:, :, : B.shape[1]], solved[:, :, B.shape[1] :]
-
-
-def response_slopes(
-    point: Point, omega: FloatArray, X: ComplexArray, Y: ComplexArray
-) -> ComplexArray:
-    """Return dH / dp (q, l, o, i) = -Y^T (dK + i omega dD - omega^2 dM) X."""
-    family, q = point.family, point.p.size
-    lines, k, n_in = X.shape
-    flat = np.moveaxis(X, 0, 1).reshape(k, lines * n_in)
-    s = np.repeat(1j * omega, n_in)
-    moved = family.moved(flat, (s**2, s, np.ones_like(s))).reshape(q, k, lines, n_in)
-    slopes: ComplexArray = -np.matmul(Y.transpose(0, 2, 1), moved.transpose(0, 2, 1, 3))
-    return slopes
 
 
 def _fair(frf: Frf) -> FloatArray | None:

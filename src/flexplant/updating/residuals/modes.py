@@ -437,17 +437,13 @@ def _measured_shapes(residual: ModeShapes) -> tuple[list[Place], Any]:
             "them."
         )
     if at is not None and not isinstance(at, Mapping):
-        return _checked_places(at, residual.direction), shapes
+        listed = [at] if isinstance(at, str) else at
+        hint = "Give a place for each row."
+        instance(listed, Sequence | np.ndarray, "at", hint, ShapeError)
+        return [named_place(place, residual.direction)[0] for place in listed], shapes
     if residual.shapes is not None:
         raise ShapeError(f"{name} needs at= with shapes=. Pass the place of each row.")
     return list(channel_places(measured.dofs or (), at)), shapes
-
-
-def _checked_places(at: Any, direction: str) -> list[Place]:
-    if isinstance(at, str):
-        return [at]
-    instance(at, Sequence | np.ndarray, "at", "Give a place for each row.", ShapeError)
-    return [named_place(place, direction)[0] for place in at]
 
 
 def _hermitian_stack(value: Any, size: tuple[int, int]) -> Any:

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ...checks import FloatArray, between
+from ...checks import FloatArray, between, checked
 from ...errors import ModelError, SolverError, counted
 from ..family import Point
 from .objective import Objective, SearchEnd, Trail, UpdateMethod
@@ -49,7 +49,11 @@ class GaussNewton(UpdateMethod):
     True
     """
 
-    truncate: float = field(default=0.0, kw_only=True)
+    truncate: float = field(
+        default=0.0,
+        kw_only=True,
+        metadata=checked(between, low=0.0, high=1.0, hint="Choose 1e-3, say.", ends="["),
+    )
 
     #: how often a step that harms is halved
     halvings: ClassVar[int] = 30
@@ -57,19 +61,10 @@ class GaussNewton(UpdateMethod):
     keeps_bounds = False
     weighs_poles = True
 
-    def __post_init__(self) -> None:
-        why = "Choose 1e-3, say."
-        self._set(truncate=between(self.truncate, "truncate", 0.0, 1.0, why, ends="["))
-
     @property
     def penalised(self) -> bool:
         """Whether directions are left out, in which the answer stays at the start."""
         return self.truncate > 0
-
-    @property
-    def least_squares(self) -> bool:
-        """Whether all directions are searched."""
-        return not self.truncate
 
     def search(
         self,

@@ -289,7 +289,7 @@ class UpdateMethod(Value):
     @property
     def least_squares(self) -> bool:
         """Whether the answer is that of least squares: no penalty, no robust loss, all data."""
-        return True
+        return not self.penalised
 
     @property
     def penalised(self) -> bool:

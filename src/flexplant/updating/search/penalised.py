@@ -60,11 +60,6 @@ class Tikhonov(PenalisedMethod):
     array([0.058, 0.058])
     """
 
-    @property
-    def least_squares(self) -> bool:
-        """Whether there is no penalty."""
-        return False
-
     def search(
         self,
         objective: Objective,
