@@ -230,11 +230,6 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
         Of the same channels, frequencies and quantity, with independent noise; four or more
         for weights that are worth something.
 
-    Returns
-    -------
-    Frf
-        What `identify_modes` weights by.
-
     Raises
     ------
     ShapeError, ModelError

@@ -45,11 +45,9 @@ def stabilisation_diagram(
 
     Parameters
     ----------
-    frf : Frf
-        Measured; weighted by its variance where it has one. Velocity and acceleration are
-        integrated; no quantity is taken for displacement.
-    band : (low, high) [Hz], optional
-        The frequencies used; all by default.
+    frf, band
+        As for `identify_modes`. Velocity and acceleration are integrated; no quantity is taken for
+        displacement.
     orders : iterable of int, optional
         Model orders; each has order * min(n_in, n_out) poles. By default 2 to 40, or to a quarter
         of the lines, or to 100 poles; every other one where many references make each costly.

@@ -222,7 +222,7 @@ def impact_frf(
         Share of the largest force of a record above which a pulse begins, between 0 and 1.
     limits : mapping {channel: value}, optional
         Full scale of channels: a blow that reaches it is refused. Channels that stay at their
-        extreme value after a steep rise are found without.
+        extreme value after a steep rise are found without; outputs that keep one are warned of.
     quantity : {"displacement", "velocity", "acceleration"}, optional
         What the responses are.
 
@@ -230,11 +230,6 @@ def impact_frf(
     -------
     ImpactTest
         With the FRF, its coherence, variance and correlation, and the blows used and refused.
-
-    Warns
-    -----
-    FlexplantWarning
-        When an output keeps one value for long.
 
     Raises
     ------

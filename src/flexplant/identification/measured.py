@@ -52,13 +52,10 @@ class MeasuredModes(Value):
 
     Raises
     ------
-    ShapeError
-        When lengths differ, or only one of shapes and dofs is given.
-    ModelError
-        When poles are not finite, real (overdamped or rigid) or unstable, a shape is zero or not
-        finite, or the covariance is not positive definite.
-    LabelError
-        When mode numbers are not whole numbers from 1, or numbers or labels appear twice.
+    ShapeError, ModelError, LabelError
+        When lengths differ, or only one of shapes and dofs is given; poles are not finite, real
+        (overdamped or rigid) or unstable, a shape is zero or not finite, or the covariance is not
+        positive definite; mode numbers are not whole from 1, or numbers or labels appear twice.
 
     Examples
     --------
@@ -362,10 +359,9 @@ def numbered(
 
     Raises
     ------
-    ModelError
-        When a pole has no partner (all of them, when `partial`), or an argument is out of range.
-    LabelError
-        When a shape's row is not known to the model.
+    ModelError, LabelError
+        When a pole has no partner (all of them, when `partial`), an argument is out of range, or a
+        shape's row is not known to the model.
 
     References
     ----------

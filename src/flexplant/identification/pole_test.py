@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
@@ -185,28 +185,8 @@ def shared(fit: Fit, more: Fit, least: float) -> bool:
         return False
     if len(lines.parts) == 1:
         return True
-    if "own" not in vars(fit) and _proven(fit, more, least):
-        return True
     apart = own_cost(fit)
     return fit.cost - apart < own_price(fit) or apart - own_cost(more) > least
-
-
-def _proven(fit: Fit, more: Fit, least: float) -> bool:
-    """Return whether a few outputs, with poles of their own, prove the pole more already."""
-    found: list[Any] = []
-    gain = 0.0
-    for o, own in enumerate(more.own):
-        size = len(found)
-        with attempted(f"a fit of {fit.lines.side} {o + 1} alone", SolverError):
-            rows = fit.lines.parts[o]
-            found.append(fit.of_rows(rows, below=own.cost + least - gain))
-        if len(found) == size:
-            return True
-        gain += found[-1].cost - own.cost
-        if gain > least:
-            return True
-    vars(fit)["own"] = found
-    return False
 
 
 def newest_pole(fit: Fit, more: Fit) -> int:

@@ -64,13 +64,9 @@ def structural_modes(
     Modes
         Rigid-body modes first. `certificate` says how large the imaginary parts left out are
         ("imaginary") and, with `over`, what part of a measured shape the model's modes do not make
-        ("expansion"). ``plant.uncertain(numbered(measured, modes))`` gives the covariance of the
-        poles to the plant, with ``shapes=shape_deviations(measured, dofs)`` that of shapes too.
-
-    Warns
-    -----
-    FlexplantWarning
-        When one of these is above a tenth.
+        ("expansion"); above a tenth both are warned of.
+        ``plant.uncertain(numbered(measured, modes))`` gives the covariance of the poles to the
+        plant, with ``shapes=shape_deviations(measured, dofs)`` that of shapes too.
 
     Raises
     ------

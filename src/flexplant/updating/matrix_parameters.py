@@ -369,22 +369,12 @@ class PolynomialParameter(_GivenParameter):
 
     Parameters
     ----------
-    name : str
-        For results.
     dM, dD, dK : sequences of (k, k) or (n, n) arrays or sparse matrices
-        M_1, M_2, ...; D_1, ...; K_1, ...: symmetric, of the model's own DOFs or of the full
-        structure's. None stands for zero.
-    unit : str
-        Of p.
-    bounds, prior : optional
-        As for `AddedMass`.
+        M_1, M_2, ...; D_1, ...; K_1, ...: as those of `MatrixParameter`; None stands for zero.
+    name, unit, bounds, prior
+        As for `MatrixParameter`, as are errors.
     missed : float
         Part of the largest change of a matrix that the polynomials were seen to miss.
-
-    Raises
-    ------
-    ModelError, ShapeError, LabelError
-        When no matrix is given, or one is not square, finite and symmetric, or the name is empty.
 
     Examples
     --------

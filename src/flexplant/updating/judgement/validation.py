@@ -109,10 +109,6 @@ def fdac(H: Any, G: Any) -> FloatArray:
     H, G : (..., n_freq), (..., n_freq') complex arrays
         Measured and computed responses of the same channels.
 
-    Returns
-    -------
-    (n_freq, n_freq') array
-
     Raises
     ------
     ShapeError, ModelError

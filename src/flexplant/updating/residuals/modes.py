@@ -500,11 +500,6 @@ class ShapeCorrelation(ModeShapes):
     std, covariance : optional
         As in `ModeShapes`: weighs the entries in the MAC; the residuals have no known noise.
 
-    Raises
-    ------
-    ModelError, ShapeError, LabelError
-        As `ModeShapes`.
-
     Examples
     --------
     >>> import flexplant as fx

@@ -203,10 +203,8 @@ class StaticCompliance(_PointResidual):
     ----------
     value : float [m/N]
         Measured.
-    output, input : place
-        Where the motion and the force are.
-    direction : str
-        At points.
+    output, input, direction
+        Where the motion and the force are, as for `Antiresonances`.
     std : float [m/N], optional
         Standard deviation. None: not known; the residual is relative to `value`.
 
