@@ -103,14 +103,13 @@ def steady(
     ])  # fmt: skip
     differs = beside & (1.96 * apart.spread[:m] > damping)
     unknown = apart.deviation[:m] >= -apart.poles.real
-    side, listed = fit.lines.side, []
-    for k in reported[(differs | unknown)[reported]]:
-        reason = (
-            f"not shared by the {side}: its damping differs by as much as it is"
-            if differs[k]
-            else f"without information: over the {side} the deviation of its damping exceeds it"
-        )
-        listed.append(rejection(fit, int(k), reason))
+    side = fit.lines.side
+    reasons = (
+        f"without information: over the {side} the deviation of its damping exceeds it",
+        f"not shared by the {side}: its damping differs by as much as it is",
+    )
+    lost = reported[(differs | unknown)[reported]]
+    listed = [rejection(fit, int(k), reasons[int(differs[k])]) for k in lost]
     kept = reported[~(differs | unknown)[reported]]
     if not kept.size:
         raise _none_left(listed)

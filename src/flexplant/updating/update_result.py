@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -257,13 +258,13 @@ class UpdateResult(Value):
         )
 
     def __repr__(self) -> str:
+        def said(values: Sequence[str]) -> list[str]:
+            named = zip(self.parameters[:5], values, self.units, strict=False)
+            return [f"{name} = {value} {unit}".rstrip() for name, value, unit in named]
+
         deviations = self._printed_deviations()
-        lines = [
-            f"  {name} = {with_deviation(value, deviation)} {unit}".rstrip()
-            for name, value, deviation, unit in zip(
-                self.parameters[:5], self.values.tolist(), deviations, self.units, strict=False
-            )
-        ]
+        values = list(map(with_deviation, self.values.tolist(), deviations))
+        lines = [f"  {line}" for line in said(values)]
         if len(self.parameters) > 5:
             lines.append(f"  ... and {len(self.parameters) - 5} more")
         if self.at_bound:
@@ -272,21 +273,15 @@ class UpdateResult(Value):
             lines.append(f"  negative: {', '.join(self.negative_masses[:5])}")
         rivals = [] if self.starts is None else self.starts.rivals
         for p, more in rivals[:2]:
-            other = ", ".join(
-                f"{name} = {value:.4g} {unit}".rstrip()
-                for name, value, unit in zip(
-                    self.parameters[:5], p.tolist(), self.units, strict=False
-                )
-            )
-            sign = "-" if more < 0 else "+"
+            other, sign = ", ".join(said([f"{v:.4g}" for v in p])), "-" if more < 0 else "+"
             lines.append(f"  ANOTHER MINIMUM, chi2 {sign} {abs(more):.3g}: {other}")
         if self.discrepancy:
             off = f"{self.discrepancy_text} (relative)"
             lines.append(f"  off by, beside noise: {off}; the +- count it")
         elif is_bad(self.p_value):
             lines.append("  no +-: what is left is no noise, and coherent")
-        said = "converged" if self.converged else "NOT CONVERGED"
-        head = f"<UpdateResult: {said} in {counted(len(self.history), 'step')} ({self.reason})"
+        ended = "converged" if self.converged else "NOT CONVERGED"
+        head = f"<UpdateResult: {ended} in {counted(len(self.history), 'step')} ({self.reason})"
         if self.p_value is not None:
             head += f", chi2 {self.chi2:.4g} for {self.dof} dof"
         return "\n".join([head, *lines]) + ">"

@@ -272,13 +272,9 @@ def identifiability(
     std = np.where(lost | ~seen, np.inf, np.sqrt(np.diag(unit)) / np.where(seen, length, 1.0))
     size = np.where(lost, 1.0, np.sqrt(np.maximum(np.diag(unit), TINY)))
     correlation = np.where(np.outer(~lost, ~lost), unit / np.outer(size, size), np.eye(lost.size))
-    mixed = []
-    for vector in Vt[~clear]:
-        group = tuple(
-            n for n, part, ok in zip(names, vector, seen, strict=True) if ok and abs(part) > 0.1
-        )
-        if len(group) > 1:
-            mixed.append(group)
+    parts = np.array(names, dtype=object)
+    groups = [tuple(parts[seen & (np.abs(vector) > 0.1)].tolist()) for vector in Vt[~clear]]
+    mixed = [group for group in groups if len(group) > 1]
     unseen = tuple(n for n, ok in zip(names, seen, strict=True) if not ok)
     poor = list(dict.fromkeys([*unseen, *(n for group in mixed for n in group)]))
     # combinations of the parameters themselves that change no residual

@@ -29,11 +29,11 @@ class Defect(NamedTuple):
     slopes: FloatArray
 
 
-class Penalty(NamedTuple):
-    """Residuals ``weight (p - start)`` beside those of the data."""
+class Drawn(NamedTuple):
+    """Residuals ``weight (p - middle)`` beside those of the data: a prior, or a penalty."""
 
-    start: FloatArray
-    weight: FloatArray
+    middle: FloatArray
+    weight: FloatArray  # (m, q)
 
 
 class Objective:
@@ -67,6 +67,11 @@ class Objective:
         self.prior_mean = np.array([0.0 if known is None else known[0] for known in priors])
         self.prior_std = np.array([1.0 if known is None else known[1] for known in priors])
         self.uses_prior = bool(prior and self.noisy and self.has_prior.any())
+        #: to what the answer is drawn: the priors, and what a search may add
+        self.drawn: list[Drawn] = []
+        if self.uses_prior:
+            pull = -np.diag(1 / self.prior_std)[self.has_prior]
+            self.drawn.append(Drawn(self.prior_mean, pull))
         limits = [getattr(q, "bounds", None) or (-np.inf, np.inf) for q in parameters]
         self.lower = np.array([low for low, _ in limits], dtype=np.float64)
         self.upper = np.array([high for _, high in limits], dtype=np.float64)
@@ -79,8 +84,6 @@ class Objective:
         self.path: list[FloatArray] = []
         #: what is added to the residuals, to first order about the parameters it was found at
         self.defect: Defect | None = None
-        #: what a search may add to draw the answer to its start
-        self.penalty: Penalty | None = None
 
     @property
     def default_start(self) -> FloatArray:
@@ -147,11 +150,8 @@ class Objective:
         if self.defect is not None:
             moved = self.defect.slopes @ (point.p - self.defect.p)
             rows = [np.concatenate(rows) + self.defect.values + moved]
-        if prior and self.uses_prior:
-            gap = (self.prior_mean - point.p) / self.prior_std
-            rows.append(gap[self.has_prior])
-        if prior and self.penalty is not None:
-            rows.append(self.penalty.weight * (point.p - self.penalty.start))
+        if prior:
+            rows += [one.weight @ (point.p - one.middle) for one in self.drawn]
         return np.concatenate(rows)
 
     def slopes(self, point: Point, *, prior: bool = True) -> FloatArray:
@@ -159,10 +159,8 @@ class Objective:
         rows = [bound.slopes(point) for bound in self.bounds]
         if self.defect is not None:
             rows = [np.vstack(rows) + self.defect.slopes]
-        if prior and self.uses_prior:
-            rows.append(-np.diag(1 / self.prior_std)[self.has_prior])
-        if prior and self.penalty is not None:
-            rows.append(np.diag(self.penalty.weight))
+        if prior:
+            rows += [one.weight for one in self.drawn]
         return np.vstack(rows)
 
     def size(self, point: Point) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from ...checks import FloatArray, checked, positive
 from ...errors import ModelError, SolverError
 from ...tolerances import ROUNDING, TINY
-from .objective import Objective, Penalty, SearchEnd, Trail, UpdateMethod, unit_changes
+from .objective import Drawn, Objective, SearchEnd, Trail, UpdateMethod, unit_changes
 from .trust_region import TrustRegion
 
 #: weights tried for an L-curve, or on a path of sparse changes
@@ -73,11 +73,11 @@ class Tikhonov(PenalisedMethod):
         unit = unit_changes(objective, J)
 
         def solved(size: float, begin: FloatArray) -> SearchEnd:
-            objective.penalty = Penalty(start, size / unit)
+            objective.drawn.append(Drawn(start, np.diag(size / unit)))
             try:
                 return TrustRegion().search(objective, begin, most=most, tolerance=tolerance)
             finally:
-                objective.penalty = None
+                objective.drawn.pop()
 
         if self.weight is not None:
             return solved(self.weight, start)
