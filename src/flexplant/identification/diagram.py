@@ -287,6 +287,11 @@ class OrderPoles:
     shapes: ComplexArray
     participation: ComplexArray
 
+    def select(self, places: IntArray) -> OrderPoles:
+        """Return some of them."""
+        parts = (self.poles, self.shapes, self.participation)
+        return OrderPoles(self.order, *(part[..., places] for part in parts))
+
 
 class Moments:
     r"""The normal equations of all model orders of a right matrix fraction.

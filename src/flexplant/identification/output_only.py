@@ -207,13 +207,7 @@ def _those(result: OrderPoles, chosen: ComplexArray) -> OrderPoles:
     """Return those poles of an order that are near chosen ones, one for each."""
     moved = np.abs(chosen[:, None] - result.poles) / np.abs(chosen)[:, None]
     near = np.unique([int(np.argmin(row)) for row in moved if row.size and row.min() < SAME])
-    picked = near.astype(np.int64)
-    return OrderPoles(
-        result.order,
-        result.poles[picked],
-        result.shapes[:, picked],
-        result.participation[:, picked],
-    )
+    return result.select(near.astype(np.int64))
 
 
 def _jackknife(found: OrderPoles, again: list[OrderPoles]) -> tuple[FloatArray, Any]:

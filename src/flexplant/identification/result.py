@@ -299,16 +299,6 @@ class IdentifiedModes(MeasuredModes):
         Which of them disagree, "outputs", "inputs" or "runs", empty where none do.
     undamped : float [rad/s]
         What was taken out of the damping: that of an exponential window.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> import numpy as np
-    >>> freq = np.arange(10.0, 40.0, 0.1)
-    >>> H = 1 / (20.0**2 - freq**2 + 0.4j * freq)
-    >>> found = fx.identify_modes(fx.Frf(freq, H[None, None]))
-    >>> found.freq.round(3), found.zeta.round(4)
-    (array([20.]), array([0.01]))
     """
 
     participation: ComplexArray = field(kw_only=True)

@@ -138,8 +138,8 @@ def update(
     >>> heavier = fx.chain(masses=[1.0, 1.0, 1.2], stiffnesses=[4e5, 4e5])
     >>> measured = fx.MeasuredModes(poles=fx.solve_modes(heavier, count=3).poles[1:], modes=[2, 3])
     >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
-    >>> fit.values.round(6), fit.converged
-    (array([0.2]), True)
+    >>> fit.parameters, fit.units, fit.values.round(6), fit.converged
+    (('mass at 3:x',), ('kg',), array([0.2]), True)
     """
     listed = checked_parameters(parameters)
     given = checked_residuals(residuals)

@@ -185,17 +185,6 @@ class UpdateResult(Value):
     discrepancy : sequence of Discrepancy
         What the model is off by in each kind of residual, beside noise; empty where noise explains
         what is left.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
-    >>> measured = fx.MeasuredModes(poles=[615.0j], modes=[2])
-    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
-    >>> fit.parameters, fit.units, fit.values.round(4)
-    (('mass at 3:x',), ('kg',), array([0.1186]))
-    >>> fit.model.M[2, 2].round(4)
-    np.float64(1.1186)
     """
 
     parameters: tuple[str, ...]
