@@ -36,13 +36,11 @@ def feedback_warned(frf: Frf) -> None:
 
     .. math:: S_{yu} S_{uu}^{-1} = \frac{G S_{rr} - K^* S_{vv}}{S_{rr} + |K|^2 S_{vv}}
 
-    whose K^* acts before its input: an impulse response at negative times, which no machine has
-    ([PintelonSchoukens2012]_, section 2.6.4).
-    Noise that returns through a set-point's controller alone, ``u = K (r - y)``, biases by 1/K,
-    which is causal: no record of u and y shows that. The response is taken from lines with s^2
-    and a taper, so that neither rigid-body modes nor the end of the band spread over all lags,
-    and compared with what the variance makes there. Hann-windowed segments only: others fold
-    what rings on at the end of a segment to these times.
+    whose K^* acts before its input: an impulse response at negative times
+    ([PintelonSchoukens2012]_, section 2.6.4). Noise through a set-point's controller alone, ``u = K
+    (r - y)``, biases by 1/K, which is causal and not seen. Lines are taken with s^2 and a taper, so
+    that neither rigid-body modes nor the end of the band spread over all lags; of Hann-windowed
+    segments only: others fold what rings on at the end of a segment to these times.
     """
     import scipy.ndimage as ndi
 

@@ -203,9 +203,9 @@ def _disturbed(data: ComplexArray, d: FloatArray, chance: float, tapered: bool) 
     r"""Return which of some lines hold a disturbance of the frequency in their middle.
 
     The lines aside are fitted by :math:`(1 + g d) H = a + b d + c d^2 + r/d`, d the distance in
-    lines, g that of a resonance nearby: one of half-width w in the middle has the height
-    :math:`|r|/w` there, a disturbance has no r. Through a Hann window it has side lobes, of
-    :math:`1/(\pi d^3)` of its height.
+    lines, g of a resonance nearby: one of half-width w in the middle has the height :math:`|r|/w`,
+    a disturbance no r; through a Hann window it has side lobes of :math:`1/(\pi d^3)` of its
+    height.
     """
     middle = d.size // 2
     near = np.abs(np.arange(d.size) - middle) <= SPREAD

@@ -43,10 +43,8 @@ def own_cost(fit: Fit) -> float:
 def outputs_disagree(fit: Fit, least: float = np.inf) -> bool:
     """Return whether poles of each output's own leave noise alone, shared ones far more.
 
-    And less than another fit, of more poles, does (`least`).
-
-    No pole that outputs share explains what is left then, and where the shared poles are is known
-    by how the outputs differ, not by the misfit that a refinement lowers.
+    And less than another fit, of more poles, does (`least`). Where the shared poles are is known
+    then by how the outputs differ, not by the misfit that a refinement lowers.
     """
     lines, (n_out, m) = fit.lines, fit.shapes.shape
     parts = len(lines.parts)
@@ -63,8 +61,7 @@ def coherence(fit: Fit, pole: complex) -> float:
     r"""Return by how much more a misfit near a pole lowers the cost by chance than noise does.
 
     The mean of :math:`|e|^2/\sigma^2` there, times :math:`1 + 2 \sum_k \rho_k` of the correlation
-    of e over neighbouring lines up to the first that is noise: misfit that is smooth over so many
-    lines counts as one error, not as many.
+    of e over neighbouring lines: misfit that is smooth over some of them counts as one error.
     """
     lines = fit.lines
     spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
@@ -94,9 +91,8 @@ def strength(fit: Fit) -> FloatArray:
 def twin_poles(fit: Fit) -> tuple[int, int] | None:
     """Return two poles within a bandwidth with the same shape and participation, the weak one last.
 
-    One resonance that is no straight circle (leakage, an amplitude that matters) becomes such a
-    pair. With one input any two shapes pass for it: two modes are proven there by several inputs,
-    or by leaving nothing but noise of a known variance.
+    One resonance that is no straight circle (leakage, amplitude) looks so; with one input two modes
+    do too, unless they leave nothing but noise of a known variance.
     """
     height = strength(fit)
     for k in np.argsort(height):

@@ -57,9 +57,8 @@ def _seen(lines: Lines, poles: ComplexArray, part: ComplexArray, kept: list[int]
 def corroborated(lines: Lines, less: ComplexArray, more: ComplexArray) -> bool:
     """Return whether other lines than the two that gain most bear a pole out.
 
-    A disturbance of one frequency, or a variance that came out too small there, is explained by a
-    pole of next to no damping that changes other lines by chance only: by a chi-square of four
-    degrees, of the pole and its size.
+    By a chi-square of four degrees, the pole and its size: a disturbance of one frequency, or a
+    variance that is too small there, changes other lines by chance only.
     """
     before, after = (
         np.sum(np.abs((lines.data - model) * lines.weight) ** 2, axis=(0, 1))
@@ -73,8 +72,7 @@ def corroborated(lines: Lines, less: ComplexArray, more: ComplexArray) -> bool:
 def price(lines: Lines, count: int, chance: float) -> float:
     """Return by how much noise lowers the cost with so many numbers more: a chi-square quantile.
 
-    Where errors of neighbouring lines are correlated, noise that changes little over a few lines
-    has `inflation` times the power of independent errors.
+    Errors that neighbouring lines share have `inflation` times the power of independent ones.
     """
     from scipy.special import chdtri
 
@@ -84,9 +82,8 @@ def price(lines: Lines, count: int, chance: float) -> float:
 def pole_price(lines: Lines) -> float:
     """Return by how much a pole must lower the cost, wherever in the band it is.
 
-    Its pole, shape and participation are 2 (n_out + n_in) numbers. A pole kept in vain costs
-    little; one left out biases its neighbours by up to the root of this amount. A pole that is
-    split off another one is no cheaper: the fit takes it where noise suits it.
+    Its pole, shape and participation are 2 (n_out + n_in) numbers. One kept in vain costs little;
+    one left out biases its neighbours by up to the root of this.
     """
     n_out, n_in, n_freq = lines.data.shape
     return price(lines, 2 * (n_out + n_in), CHANCE / n_freq)
@@ -130,10 +127,9 @@ def improved(
 ) -> Fit:
     """Return the fit with the changes that lower its cost by more than noise does.
 
-    Each kind proposes changes, until none of them is accepted or so many are: refined, it lowers
-    the cost by what it must, without a pole becoming broader than a mode (it would replace
-    something else), and a pole more is borne out by several lines. `rough`: a fit that leaves
-    nothing but rounding is changed no more.
+    Each kind proposes changes, until none is accepted or so many are: refined, it lowers the cost
+    by what it must, no pole becomes broader than a mode, and a pole more is borne out by several
+    lines. `rough`: a fit that leaves nothing but rounding is changed no more.
     """
     for propose, most in kinds:
         for _ in range(most):
@@ -175,9 +171,8 @@ def _accepted(fit: Fit, trial: Trial, steps: int) -> Fit | None:
 def shared(fit: Fit, more: Fit, least: float) -> bool:
     """Return whether the outputs share what a pole more explains, beyond what else they are off by.
 
-    The pole is to lower the cost by what it must, or by the `coherence` of what is left near it;
-    and where outputs do not agree on the poles, also that of fits with poles of their own at each
-    output, which have no need of a pole for the sake of these differences.
+    It is to lower the cost by what it must, or by the `coherence` of what is left near it; where
+    outputs do not agree on the poles, also that of fits with poles of their own at each.
     """
     lines, new = fit.lines, newest_pole(fit, more)
     least = max(least, pole_price(lines) * coherence(more, more.poles[new]))
@@ -204,8 +199,7 @@ def own_price(fit: Fit) -> float:
 def unwindowed(fit: Fit) -> Proposals:
     """Propose lines that are not seen through the window of segments.
 
-    H1 of an input that is white over a few lines is what the window makes of the response; H2, Hv
-    and bursts that end within a segment are not.
+    H2, Hv and bursts that end within a segment are not, H1 of an input that is white nearby is.
     """
     if fit.lines.segment is not None:
         plain = replace(fit.lines, segment=None)
@@ -244,11 +238,9 @@ def fewer_terms(fit: Fit) -> Proposals:
 
 
 def more_terms(fit: Fit) -> Proposals:
-    """Propose more residual terms where the data require them.
+    """Propose more residual terms where the data require them, as many as the lines afford.
 
-    Sampling folds modes of more than half the rate into the band, weak and broad ones. What a few
-    terms leave of them is too little to be seen and enough to bias, and terms cost next to nothing
-    in a wide band: so as many as the lines afford.
+    Folded modes are weak and broad: what few terms leave of them is not seen, but biases.
     """
     lines = fit.lines
     afforded = [u for u in MORE if u > lines.upper and lines.freq.size >= 8 * (u + lines.lower)]
@@ -293,8 +285,7 @@ def _pairs(fit: Fit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
 def relocated(fit: Fit) -> Proposals:
     """Propose other places for weak poles, within seven half-widths.
 
-    Noise gives the likelihood of a mode that is hardly seen several peaks; the fit climbs the one
-    that it is started at.
+    The likelihood of a mode that is hardly seen has several peaks; a fit climbs the nearest.
     """
     for k, pole in enumerate(fit.poles):
         if fit.m == 1 or -pole.real > 0.05 * abs(pole):
@@ -400,8 +391,7 @@ def unexplained(fit: Fit) -> list[Peak]:
 def _isolated(power: FloatArray, first: int, length: int, middle: float, spread: float) -> bool:
     """Return whether a peak is one or two lines and nothing around them.
 
-    A disturbance of one frequency, a variance that came out too small there, or a mode narrower
-    than the lines are apart; one that they resolve is seen at the neighbours too.
+    A disturbance, or a mode narrower than the lines are apart; others show at the neighbours too.
     """
     aside = max(0, (AROUND - length + 1) // 2)
     near = np.sort(power[max(0, first - aside) : first + length + aside])[:-2]
@@ -444,8 +434,8 @@ def _is_smooth(lines: Lines, model: ComplexArray) -> bool:
 def _with_pole(fit: Fit, peak: Peak) -> tuple[ComplexArray, ComplexArray]:
     """Return poles and participation with the one added that explains a peak best.
 
-    Frequencies across the peak and some damping ratios are tried; the participation is the
-    leading right singular vector of what the trial pole has in common with the residual.
+    Of frequencies across the peak and some damping ratios; the participation is the leading right
+    singular vector of what the pole has in common with the residual.
     """
     lines = fit.lines
     error = (lines.data - fit.model) * lines.weight**2

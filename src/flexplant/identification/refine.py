@@ -340,8 +340,7 @@ class Fit:
     def _places(self) -> list[tuple[Any, Any]]:
         """Per input which of the 4 m columns of its rows are parameters, and which ones.
 
-        Parameters are Re and Im of the poles, then those entries of the participation, input by
-        input, that are free: the pivot of each column is not.
+        Re and Im of the poles, then the participation, input by input, without the pivots.
         """
         m, k = self.m, np.arange(self.m)
         found = []
@@ -468,9 +467,8 @@ OWN_PART, FAR_APART, OWN_SQUARE = 1e-4, 0.1, 1e-6
 def _orthonormal(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return Q and R of columns of length one, whose memory runs along the columns.
 
-    Long columns are orthonormalised by the triangle of their products, twice where they are not
-    far apart: as exact as `_qr` where no column is nearly a combination of the others, and many
-    times as fast.
+    By the triangle of their products, twice where they are not far apart: many times as fast as
+    `_qr`, and as exact where no column is nearly a combination of the others.
     """
     rows, whole = columns.T, np.eye(columns.shape[1])
     for _ in range(2):

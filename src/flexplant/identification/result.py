@@ -188,12 +188,10 @@ def hann_segment(frf: Frf) -> float | None:
 def leakage_warned(frf: Frf, found: IdentifiedModes) -> None:
     r"""Warn of resonances that windowed segments widen by more than their deviation.
 
-    Segments without a taper see responses to inputs t before with the share 1 - t/T of their
-    length T, which shifts a pole by about -1/T: of its width of n lines, ``1/(pi n)``. Tapered
-    ones leave about ``0.15 n^-1.25`` ([BendatPiersol2010]_, section 11.6; random excitation). What
-    leaks is not coherent: no more than ``1 - gamma^2`` at the resonance, nothing where all of a
-    response lies within its segment. Where the window is fitted through, nothing is left but below
-    half a line.
+    Segments of length T without a taper shift a pole by about -1/T: of its width of n lines,
+    ``1/(pi n)``; tapered ones leave about ``0.15 n^-1.25`` ([BendatPiersol2010]_, section 11.6;
+    random excitation). What leaks is not coherent: no more than ``1 - gamma^2`` at the resonance.
+    Where the window is fitted through, nothing is left but below half a line.
     """
     if frf.window is None or frf.resolution is None:
         return

@@ -62,8 +62,8 @@ def gated(
     """Return the fit without poles that are none, the places of those reported, and the others.
 
     Twins, and poles that nothing is known of, are left out of the fit, one by one; what lies at the
-    edge of the band or is mains remains in the fit, which explains it, and is not reported. Poles
-    chosen by hand are not merged (`alone`: none were).
+    edge of the band or is mains remains in it, not reported. Poles chosen by hand (not `alone`) are
+    not merged.
     """
     listed: list[Rejected] = []
     while (found := _needless(fit, steps, alone, compare)) is not None:
@@ -93,8 +93,8 @@ def steady(
 ) -> tuple[IntArray, tuple[Rejected, ...]]:
     """Return which poles outputs (or inputs) that disagree share, and the others.
 
-    One beside another, whose damping at one of them is not known from zero (95 %), stands for what
-    the outputs differ by; of one whose mean damping is known no better, nothing is known.
+    One beside another, whose damping at one output is not known from zero (95 %), stands for what
+    they differ by; of one whose mean damping is known no better, nothing is known.
     """
     damping, m = -fit.poles.real, fit.m
     beside = np.array([
@@ -177,9 +177,8 @@ def lesser(fit: Fit, vectors: ComplexArray, alike: float = 0.0) -> list[int]:
 def single(lines: Lines, fit: Fit, vectors: ComplexArray, steps: int) -> Fit:
     """Return the fit of lines, of one pole a resonance, whose participation are these vectors.
 
-    Outputs that disagree give each resonance several poles of one participation; references do of
-    one shape, which is the participation once inputs and outputs are exchanged. It is held: poles
-    that the rows do not share would bend it.
+    Rows that disagree give each resonance several poles of one participation (or, exchanged,
+    shape). It is held: poles that the rows do not share would bend it.
     """
     keep = np.delete(np.arange(fit.m), lesser(fit, vectors, ALIKE))
     start = pivoted(lines, fit.poles[keep], vectors[:, keep])
@@ -443,8 +442,7 @@ def _odd(frf: Frf, lines: Lines, apart: Disagreement) -> str:
 def _highest_pole(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection | None:
     """Return the diagram's pole nearest the largest response, None where nothing stands out.
 
-    In a band little wider than its resonance, whose lines afford few orders, poles of outputs that
-    disagree are not the same from one order to the next.
+    In a narrow band, which affords few orders, outputs that disagree have no stable poles.
     """
     power = np.sum(np.abs(lines.data * lines.weight) ** 2, axis=(0, 1))
     inner = slice(FLANK, -FLANK)
@@ -459,8 +457,7 @@ def _highest_pole(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection 
 def _at_peaks(lines: Lines) -> PoleSelection | None:
     """Return poles at the peaks of a response that no stable poles explain, as a grid finds them.
 
-    A response whose phase rises through a resonance (a transient that is not decayed, a record of
-    one run) has no pole that is stable there, and its peak is one all the same.
+    Where the phase rises through a resonance (a transient, a record of one run) none is stable.
     """
     spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
     none = np.zeros((lines.data.shape[1], 0), dtype=np.complex128)

@@ -35,10 +35,9 @@ def changed_model(
     family: Family | None = None,
     std: FloatArray | None = None,
 ) -> Any:
-    """Return the model with the parameters at `p`; a sparse FEModel stays sparse.
+    """Return the model with the parameters at `p`, a reduced one with the rigid-body basis left.
 
-    A reduced model has the rigid-body basis that is left; `family`: of the same parameters; `std`:
-    their standard deviations, for an error.
+    `family`: of the same parameters; `std`: their standard deviations, for an error.
     """
     if isinstance(model, FEModel):
         return _changed_structure(model, parameters, p, std)
@@ -96,8 +95,7 @@ def _changes(
 def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
     """Return the model when its D fails for nothing but a slight negative drag of rigid motion.
 
-    A drag d below 1e-4 of the first elastic frequency is left out wherever it is (`normal_form`):
-    its sign does not matter. ``D + d M`` must be positive semi-definite.
+    Its sign does not matter below 1e-4 of the first elastic frequency (`normal_form`).
     """
     D = changes["D"]
     if D is None or not model.rigid_body.shape[1]:

@@ -144,9 +144,8 @@ def weigh_discrepancy(
 ) -> tuple[SearchEnd, tuple[Discrepancy, ...]]:
     """Return the end of a search with the discrepancy as part of the noise, and the discrepancy.
 
-    In turn: the variances at the estimate, the estimate with these variances. The objective then
-    weighs by them. None where the kind of a residual has no discrepancy (responses: an error of a
-    model is no noise from line to line).
+    In turn: the variances at the estimate, the estimate with these. None with responses, where an
+    error of a model is no noise from line to line.
     """
     rows = objective.rows(objective.at(end.p))
     kinds = [bound.kinds() for bound, _ in rows]

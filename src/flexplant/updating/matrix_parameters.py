@@ -492,8 +492,7 @@ def _interpolated(
 ) -> tuple[dict[str, list[Matrix | None]], dict[str, tuple[float, float]]]:
     """Return the matrices of all powers, and what they miss at most and where, of M, D and K.
 
-    `points` holds the models at the middle and where the polynomials are checked; those at the
-    nodes join them.
+    `points` holds the models made so far, by place; those at the nodes join them.
     """
     nodes = np.cos(np.pi * (np.arange(powers + 1) + 0.5) / (powers + 1)).tolist()
     for x in nodes:

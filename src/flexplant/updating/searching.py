@@ -43,9 +43,8 @@ ENOUGH = 1e-3
 def _led(search: Search, objective: Objective, begin: FloatArray) -> SearchEnd:
     """Return the end of a search from `begin` that goes through easier problems first.
 
-    Complex responses have a minimum wherever a peak of the model lies between two measured ones;
-    the logarithm of their magnitude, all entries weighted equally, hardly any. Shapes turn when
-    modes are near each other, so poles come first.
+    Responses have a minimum wherever a peak of the model lies between two measured ones; the
+    logarithm of their magnitude hardly any. Shapes turn when modes are near: poles come first.
     """
     easier = _easier(objective.residuals)
     if easier is None:
@@ -184,10 +183,8 @@ def from_one_start(
 ) -> tuple[SearchEnd, list[FloatArray], list[Reached]]:
     """Return the best end, the objective being there, all starts that were tried and their ends.
 
-    A few other starts are always tried: a minimum does not show that there is another. The default
-    is the first of them where a start was given. There are more where no start leads to an end, or
-    the best one explains nothing of responses (a peak of the model lies on a wrong measured one),
-    or is far from poles alone (modes may have been paired wrongly).
+    A few others are always tried, the default first where a start was given; more where none leads
+    to an end, or the best leaves what noise does not (a peak on a wrong one, a wrong pairing).
     """
     if given:
         # a start that is no model is a mistake of the call
@@ -376,8 +373,7 @@ def _same_minimum(objective: Objective, point: Point, a: SearchEnd, b: SearchEnd
 def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> FloatArray:
     """Return by how much -2 ln of the likelihood is larger at other minima.
 
-    The difference of chi-square, or ``n ln(e/e_least)`` where the noise is not known or is not all
-    that is left.
+    The difference of chi-square, or ``n ln(e/e_least)`` where noise is not all that is left.
     """
     if not minima:
         return np.zeros(0)

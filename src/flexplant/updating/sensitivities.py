@@ -221,10 +221,9 @@ class PoleRows:
 def split_point(point: Point, data: PoleRows) -> Point:
     """Return the point with exactly repeated modes turned to the split of the next step.
 
-    How repeated modes split depends on the step, and the step on how they split: try both
-    directions of every parameter, and keep the step that fits best by the split it causes itself.
-    Their numbers rise with the frequencies they move to: which of equal modes came first is a
-    matter of rounding.
+    How they split depends on the step, and the step on how they split: of both directions of every
+    parameter, the step that fits best by the split it causes itself. Their numbers rise with the
+    frequencies they move to.
     """
     groups = repeated_groups(point.eigen.poles)
     if not groups:

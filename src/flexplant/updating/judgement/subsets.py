@@ -54,8 +54,8 @@ class SubsetFit(NamedTuple):
 class Subsets:
     """Fits of subsets of the candidates, the nuisance beside them, each done once.
 
-    Where modes alone are compared and the changes are of low rank, each is fitted in few
-    `coordinates`; in all of them where these differ, or by `polish`.
+    Of modes alone and changes of low rank in few `coordinates`, where these suffice, until
+    `polish`.
     """
 
     def __init__(self, whole: Objective, residuals: Any, count: int) -> None:
@@ -413,9 +413,8 @@ def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | N
     r"""Return B (k, k') of few coordinates for modes up to `top` [rad/s], None if not worth it.
 
     The modes up to 1.5 `top`; and of those beyond, what a load b moves of them at three
-    frequencies, :math:`b_i/(\omega_i^2 - \sigma)`. That is rational interpolation over the band
-    of how they follow it; eigenvalues have its error squared. Columns are orthonormal, and
-    diagonal in K.
+    frequencies, :math:`b_i/(\omega_i^2 - \sigma)`: eigenvalues have the error of this rational
+    interpolation squared. Columns are orthonormal, and diagonal in K.
     """
     squares = np.diag(family.K)
     low = squares <= (BEYOND * top) ** 2

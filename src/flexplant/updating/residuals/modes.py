@@ -39,10 +39,9 @@ ZETA = 1e-6
 def growth(omega: FloatArray, measured: FloatArray) -> FloatArray:
     """Return by how much more than the usual the frequencies (m,) of a model are off.
 
-    What a model leaves out (shear, rotary inertia, what lies between the nodes of a mesh) costs a
-    share that grows with the square of the wavenumber, of plates and beams with omega; what is
-    wrong everywhere (material, thickness) a constant one. Both are alike at the middle of the
-    measured frequencies.
+    What it leaves out (shear, rotary inertia, what lies between nodes) costs a share that grows
+    with omega, of plates and beams; what is wrong everywhere (material, thickness) a constant one.
+    Both are alike at the middle of the measured frequencies.
     """
     return np.asarray(0.5 * (1.0 + omega / np.mean(measured)))
 

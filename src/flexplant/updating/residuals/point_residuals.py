@@ -289,8 +289,7 @@ class Held:
     """``x[k+1] = A x[k] + Gamma_1 u[k-n] + Gamma_0 u[k-n-1]`` of ``M q'' + D q' + K q = B u``.
 
     All from one exponential of ``S = [0 s 0; -M^-1 K/s  -M^-1 D  M^-1 B; 0 0 0]``, with the states
-    (s q, q', u) of one size, and its Frechet derivatives: exact with rigid-body modes, real poles
-    and repeated ones, where sums over modes are not.
+    (s q, q', u) of one size, and its Frechet derivatives: exact with real and repeated poles too.
     """
 
     def __init__(

@@ -189,8 +189,7 @@ class Quick(GaussNewton):
 class Secured(UpdateMethod):
     """The paper's (13) and (14); from a start where they lead nowhere, a trust region.
 
-    Both lower the same error (12). The end of the trust region is settled by the paper's steps,
-    which say so where its S is singular.
+    Its end is settled by the paper's steps, which say so where their S is singular.
     """
 
     keeps_bounds = False
