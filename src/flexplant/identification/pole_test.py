@@ -25,7 +25,7 @@ def supported(lines: Lines, poles: ComplexArray, part: ComplexArray) -> Fit:
     least = pole_price(lines)
     fit = pivoted(lines, poles, part)
     kept = list(range(poles.size))
-    now = fit.cost_of(kept)
+    now = fit.cost_of(kept) if kept else 0.0
     while len(kept) > 1:
         allowed = least * max(1.0, now / lines.freedom(len(kept)))
         costs = [fit.cost_of([k for k in kept if k != out]) for out in kept]
