@@ -35,7 +35,7 @@ from flexplant.updating import (
     update,
     validate,
 )
-from flexplant.updating.search.trust_region import _data_loss
+from flexplant.updating.search.least_squares import _data_loss
 
 LINKS = [(0, None, 90), (0, 1, 110), (1, 2, 70), (2, 3, 130), (3, None, 60)]
 MASSES = [1, 2, 1.5, 1.2]

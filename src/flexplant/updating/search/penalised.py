@@ -10,8 +10,8 @@ import numpy as np
 from ...checks import FloatArray, checked, positive
 from ...errors import ModelError, SolverError
 from ...tolerances import ROUNDING, TINY
+from .least_squares import TrustRegion
 from .objective import Drawn, Objective, SearchEnd, Trail, UpdateMethod, unit_changes
-from .trust_region import TrustRegion
 
 #: weights tried for an L-curve, or on a path of sparse changes
 PATH = 13
