@@ -415,19 +415,14 @@ def _sort_families(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -
         first = pairs[free[0]] - 1
         family = [i for i in free if omega[pairs[i] - 1] <= omega[first] * (1.0 + FAMILY)]
         free = free[len(family) :]
-        numbers = _free_numbers([pairs[i] for i in family], omega, set(pairs.values()))
+        taken, numbers = set(pairs.values()), []
+        for number in [pairs[i] for i in family]:
+            # the lowest free one of the modes of its frequency
+            taken.discard(number)
+            equal = np.flatnonzero(np.abs(omega / omega[number - 1] - 1.0) <= EQUAL) + 1
+            numbers.append(next(int(n) for n in equal if n not in taken))
+            taken.add(numbers[-1])
         pairs.update(zip(sorted(family, key=lambda i: float(freq[i])), numbers, strict=True))
-
-
-def _free_numbers(numbers: list[int], omega: FloatArray, taken: set[int]) -> list[int]:
-    """Return rising numbers, each the lowest free one of the modes of its frequency."""
-    lowest = []
-    for number in numbers:
-        taken.discard(number)
-        equal = np.flatnonzero(np.abs(omega / omega[number - 1] - 1.0) <= EQUAL) + 1
-        lowest.append(next(int(n) for n in equal if n not in taken))
-        taken.add(lowest[-1])
-    return lowest
 
 
 def _likeness(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -> FloatArray:

@@ -128,7 +128,10 @@ def identify_output_only(
             "give fewer blocks= or lags=."
         )
     with Progress(2 * parts, PARTS, progress=progress):
-        each = np.array([_hankel(block, count) for block in _record_pieces(y, parts)])
+        share = max(1, round(parts / y.shape[0]))
+        pieces = [piece for record in y for piece in np.array_split(record, share, axis=1)]
+        means = (piece - piece.mean(axis=1, keepdims=True) for piece in pieces)
+        each = np.array([_hankel(block, count) for block in means])
         mean = each.mean(axis=0)
         U, sizes, _ = la.svd(mean)
         inside = (low, high)
@@ -164,13 +167,6 @@ def identify_output_only(
     shapes = found.shapes[:, kept]
     shapes = shapes / shapes[np.argmax(np.abs(shapes), axis=0), np.arange(kept.size)]
     return MeasuredModes(found.poles[kept], covariance=covariance, shapes=shapes, dofs=names)
-
-
-def _record_pieces(y: FloatArray, parts: int) -> list[FloatArray]:
-    """Return about `parts` pieces (n_channel, n_time) of the records."""
-    share = max(1, round(parts / y.shape[0]))
-    pieces = [piece for record in y for piece in np.array_split(record, share, axis=1)]
-    return [piece - piece.mean(axis=1, keepdims=True) for piece in pieces]
 
 
 def _hankel(y: FloatArray, count: int) -> FloatArray:

@@ -136,6 +136,7 @@ def frf_of_periods(
     G = G.transpose(0, 2, 1)
     variance: FloatArray | None = None
     correlation: ComplexArray | None = None
+    coherence: FloatArray | None = None
     left, freedom = _noise_spectrum(Y, U, G, periods)
     if freedom > 0:
         # the excitation's part of the inputs: U X^H (X X^H)^-1 X U^H
@@ -144,13 +145,19 @@ def frf_of_periods(
         power = np.mean(np.abs(Y[:, :, 0]) ** 2, axis=(0, 2))
         if not np.all(np.einsum("foo->fo", left).real > ROUNDING * power):
             variance = correlation = None  # no noise at all: nothing to weight by
+        else:
+            # the share of the outputs' power in a period that is not noise
+            noise = np.einsum("foo->of", left).real
+            whole = np.mean(np.abs(y) ** 2, axis=2).T + (periods - 1) * noise
+            share = np.clip(1.0 - periods * noise / np.maximum(whole, TINY), 0.0, 1.0)
+            coherence = np.repeat(share[:, None, :], n_in, axis=1)
     return Frf(
         freq,
         G.transpose(1, 2, 0),
         inputs=inputs,
         outputs=outputs,
         quantity=quantity,
-        coherence=_coherence(y, left, periods, n_in) if variance is not None else None,
+        coherence=coherence,
         variance=variance,
         correlation=correlation,
         freedom=None if variance is None else float(freedom),
@@ -199,14 +206,6 @@ def _noise_spectrum(
         weight, freedom = np.ones(1), n_exp - n_in
     left = np.einsum("p,eapf,ebpf->fab", weight, e, e.conj(), optimize=True)
     return np.asarray(left / max(freedom, 1)), freedom
-
-
-def _coherence(y: ComplexArray, left: ComplexArray, periods: int, n_in: int) -> FloatArray:
-    """Return the share of the outputs' power in a period that is not noise."""
-    noise = np.einsum("foo->of", left).real
-    power = np.mean(np.abs(y) ** 2, axis=2).T + (periods - 1) * noise
-    coherence = np.clip(1.0 - periods * noise / np.maximum(power, TINY), 0.0, 1.0)
-    return np.repeat(coherence[:, None, :], n_in, axis=1)
 
 
 def multisine(

@@ -372,7 +372,10 @@ def _by_rows(task: Task, now: _Stage, alone: bool, judged: bool) -> tuple[_Stage
         fit = less if outputs_disagree(less, fit.cost) else fit
     differ = judged and outputs_disagree(fit)
     asked = task.side not in ("", lines.side)
-    if asked or (not task.side and judged and not differ and _may_disagree(fit)):
+    # more than noise is left, or poles stand beside each other
+    odd = fit.misfit > NOISE or bool(lesser(fit, fit.shapes, ALIKE))
+    open_ = not task.side and judged and not differ and len(fit.participation) > 1
+    if asked or (open_ and odd):
         other = single(task.lines(ready.turned), fit, fit.shapes, QUICK)
         differ = judged and outputs_disagree(other, np.inf if asked else fit.cost)
         if differ or asked:
@@ -476,11 +479,6 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
             break
         fit = Fit(lines, best.poles, best.participation)
     return PoleSelection(fit.poles, fit.participation) if fit.poles.size else None
-
-
-def _may_disagree(fit: Fit) -> bool:
-    """Return whether references may disagree: more than noise is left, or poles stand beside."""
-    return len(fit.participation) > 1 and bool(lesser(fit, fit.shapes, ALIKE) or fit.misfit > NOISE)
 
 
 def _first_fit(

@@ -114,7 +114,17 @@ def structural_modes(
             # between the places that were measured only
             margin = float(getattr(dofs.interpolation, "margin", 0.0))
             place = interpolated(place, margin=margin)
-    _warn(certificate)
+    if imaginary > COMPLEX:
+        warn(
+            f"a measured shape has an imaginary part of {imaginary:.0%}: the modes of this "
+            "structure are real, so that it is left out. Measure longer, or look for two modes that "
+            "were taken for one."
+        )
+    if certificate.get("expansion", 0.0) > MISSED:
+        warn(
+            f"{certificate['expansion']:.0%} of a measured shape is none of the model's modes: "
+            "the expansion is that far off at least. Give more of its modes, or update it first."
+        )
     body, phi, vectors = columns
     m = residual.shape[1]
     near = beside.poles
@@ -299,20 +309,6 @@ def expansion(over: Modes, rows: Any) -> FloatArray:
             "model: expand over fewer, solve_modes(model, count=...), or measure at more places."
         )
     return np.asarray(np.linalg.lstsq(seen.T, Phi.T)[0].T)
-
-
-def _warn(certificate: dict[str, float]) -> None:
-    if certificate["imaginary"] > COMPLEX:
-        warn(
-            f"a measured shape has an imaginary part of {certificate['imaginary']:.0%}: the modes "
-            "of this structure are real, so that it is left out. Measure longer, or look for two "
-            "modes that were taken for one."
-        )
-    if certificate.get("expansion", 0.0) > MISSED:
-        warn(
-            f"{certificate['expansion']:.0%} of a measured shape is none of the model's modes: "
-            "the expansion is that far off at least. Give more of its modes, or update it first."
-        )
 
 
 def shape_deviations(

@@ -40,7 +40,14 @@ def changed_model(
     `family`: of the same parameters; `std`: their standard deviations, for an error.
     """
     if isinstance(model, FEModel):
-        return _changed_structure(model, parameters, p, std)
+        total = _changes(model, parameters, p)
+        try:
+            return _replaced(model, total, parameters, p, std)
+        except ModelError:
+            found = _with_drag(model, total)
+            if found is None:
+                raise
+            return found
     family = Family(model, parameters) if family is None else family
     changes: dict[str, Any] = {
         name: matrix_sum(getattr(model, name), change if np.any(change) else None)
@@ -65,20 +72,6 @@ def applied(model: Any, parameters: Sequence[Parameter], p: FloatArray) -> Any:
             "model that has its damping, model.with_damping(ModalDamping(0.01)), say."
         )
     return changed_model(model, parameters, p)
-
-
-def _changed_structure(
-    model: FEModel, parameters: Sequence[Parameter], p: FloatArray, std: FloatArray | None
-) -> FEModel:
-    changes = _changes(model, parameters, p)
-    try:
-        changed: FEModel = _replaced(model, changes, parameters, p, std)
-    except ModelError:
-        found = _with_drag(model, changes)
-        if found is None:
-            raise
-        return found
-    return changed
 
 
 def _changes(

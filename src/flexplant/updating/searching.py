@@ -263,16 +263,12 @@ def _graded_end(objective: Objective, end: SearchEnd, *, named: bool) -> _Graded
     chi2, dof = chi_square(objective, point, np.ones(end.p.size, dtype=bool))
     explained = end.converged and chi2 is not None and not is_bad(chance(chi2, dof))
     improvable = not explained and dof > 0 and _improvable(objective, end, point)
-    return _GradedEnd(end, named, improvable, explained and _is_possible(objective, end.p))
-
-
-def _is_possible(objective: Objective, p: FloatArray) -> bool:
-    """Return whether the model with the parameters at `p` is one."""
-    try:
-        changed_model(objective.family.model, objective.parameters, p, objective.family)
-    except ModelError:
-        return False
-    return True
+    likely = False
+    with attempted("the model at an end", ModelError):
+        if explained:
+            changed_model(objective.family.model, objective.parameters, end.p, objective.family)
+            likely = True
+    return _GradedEnd(end, named, improvable, likely)
 
 
 def _reached(search: Callable[..., SearchEnd], *given: Any) -> Reached:
