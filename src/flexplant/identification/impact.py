@@ -90,8 +90,6 @@ class ImpactTest(Value):
     >>> response = np.convolve(force, ring)[:6000]
     >>> response += 1e-4 * np.random.default_rng(1).normal(size=6000)
     >>> test = fx.identification.impact_frf(force, response, 1e3, segment=2.0)
-    >>> print(test)
-    <ImpactTest: 2 blows used, 0 refused, segments of 2 s, window of 0.5 s>
     >>> seen = fx.identify_modes(test.frf, band=(20.0, 60.0))
     >>> -seen.poles.real.round(1), -test.corrected(seen).poles.real.round(1)
     (array([4.]), array([2.]))
@@ -201,9 +199,8 @@ def impact_frf(
     Blows are the pulses of the force in long records. Each has a segment of its own, in which the
     force beside the pulse is set to zero (the force window) and force and responses are multiplied
     by ``exp(-t/decay)``, which moves all poles by -1/decay (`ImpactTest.corrected` takes it out).
-    What rings on at the end of a segment, and into the next one, changes residues and no pole.
-    Left out are blows with another one in their segment, clipped ones, and those cut off by the
-    end of the record.
+    What rings on at its end changes residues and no pole. Left out are blows with another one in
+    their segment, clipped ones, and those cut off by the end of the record.
 
     Parameters
     ----------

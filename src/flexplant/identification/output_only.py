@@ -53,11 +53,9 @@ def identify_output_only(
     so that the leading singular vectors of H give O up to its basis, its shift A, and
     :math:`\lambda = rate\,\ln \mu(A)`. Poles that stay over the orders are chosen, at the lowest
     order that has most of them: more states add noise. White noise of the sensors is in
-    :math:`R_0` only, which is not used.
-
-    The record is cut into blocks; H without each of them (a jackknife) gives the covariance of
-    each pole, to first order in the errors of H, made larger by (b - 1)/(b - 3) of b blocks: errors
-    over estimated deviations are of Student's distribution, and their squares then 1 in the mean.
+    :math:`R_0` only, which is not used. H without each of some blocks of the record (a jackknife)
+    gives the covariance of each pole, made larger by (b - 1)/(b - 3) of b blocks: squares of errors
+    over deviations, of Student's distribution, are then 1 in the mean.
     Poles whose frequency varies by more than 2 %, or whose damping by more than 60 %, are noise and
     left out. A rotating part or a mains hum appears as a mode of next to no damping, excitation
     that is not white as modes of its own.

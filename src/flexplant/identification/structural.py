@@ -117,8 +117,8 @@ def structural_modes(
     if imaginary > COMPLEX:
         warn(
             f"a measured shape has an imaginary part of {imaginary:.0%}: the modes of this "
-            "structure are real, so that it is left out. Measure longer, or look for two modes that "
-            "were taken for one."
+            "structure are real, so that it is left out. Measure longer, or look for two modes "
+            "that were taken for one."
         )
     if certificate.get("expansion", 0.0) > MISSED:
         warn(

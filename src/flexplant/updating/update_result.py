@@ -96,13 +96,9 @@ class Starts(Value):
 
     Examples
     --------
-    >>> import flexplant as fx
-    >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
-    >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))
-    >>> mass = [fx.AddedMass("3:x", bounds=(0.0, 1.0))]
-    >>> fit = fx.update(drawing, mass, [poles], starts=3)
-    >>> fit.starts.end.round(4).ravel()
-    array([0.1186, 0.1186, 0.1186])
+    >>> import numpy as np
+    >>> Starts(np.zeros((2, 1)), np.array([[0.1], [np.nan]]), cost=np.array([1.0, np.inf]))
+    <Starts: 1 of 2 at the least cost 1, 1 failed>
     """
 
     begin: FloatArray

@@ -88,8 +88,7 @@ def sample_posterior(
 ) -> Posterior:
     """Draw from the posterior ``exp(-1/2 |r(p)|^2)`` (with priors, inside bounds).
 
-    An ensemble of walkers with stretch moves: no tuning, and scale does not matter. They begin
-    spread by Laplace's approximation about the fit.
+    An ensemble of walkers with stretch moves, no tuning, spread by Laplace's approximation first.
 
     Parameters
     ----------

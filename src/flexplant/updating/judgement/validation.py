@@ -107,7 +107,7 @@ def fdac(H: Any, G: Any) -> FloatArray:
     Parameters
     ----------
     H, G : (..., n_freq), (..., n_freq') complex arrays
-        Measured and computed responses of the same channels.
+        Measured and computed, of the same channels.
 
     Raises
     ------

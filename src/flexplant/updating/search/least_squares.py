@@ -242,8 +242,7 @@ class GaussNewton(UpdateMethod):
     >>> import flexplant as fx
     >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
     >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))
-    >>> method = fx.updating.GaussNewton()
-    >>> fx.update(drawing, [fx.AddedMass("3:x")], [poles], method=method).converged
+    >>> fx.update(drawing, [fx.AddedMass("3:x")], [poles], method=GaussNewton()).converged
     True
     """
 
