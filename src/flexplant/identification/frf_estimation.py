@@ -8,8 +8,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import ComplexArray, FloatArray, members, positive
-from ..errors import ModelError, ShapeError, require_known, warn
+from ..checks import ComplexArray, FloatArray, members
+from ..errors import ModelError, ShapeError, warn
 from ..lti.frequency import Frf
 from ..tolerances import TINY
 from .periodic import Periodic, averages_advised, periodic_frf
@@ -187,9 +187,7 @@ def estimate_frf(
     >>> [f"{np.mean(frf.data.real):.1f}" for frf in frfs]
     ['1.6', '2.0']
     """
-    data = records(inputs, outputs, reference, positive(rate, "rate"))
-    if quantity is not None:
-        require_known("quantity", [quantity], ["displacement", "velocity", "acceleration"])
+    data = records(inputs, outputs, reference, rate, quantity)
     dropouts_warned(data)
     method = H1Estimator() if method is None else method
     if isinstance(method, Periodic):

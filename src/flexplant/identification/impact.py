@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray, IntArray, Value, between, instance, positive
-from ..errors import ModelError, ShapeError, SolverError, counted, require_known, unknown_label
+from ..errors import ModelError, ShapeError, SolverError, counted, unknown_label
 from ..lti.frequency import Frf
 from ..tolerances import TINY
 from .line_weights import mains_multiple
@@ -248,21 +248,13 @@ def impact_frf(
     >>> [blow.time for blow in test.used], [blow.reason for blow in test.refused]
     ([0.1, 1.0], ['another blow follows after 0.04 s', 'a blow came 0.04 s before'])
     """
-    data = records(force, response, None, positive(rate, "rate"))
-    if quantity is not None:
-        require_known("quantity", [quantity], ["displacement", "velocity", "acceleration"])
+    data = records(force, response, None, rate, quantity)
     between(level, "level", 0.0, 1.0, "A twentieth is usual: 0.05.")
-    length = round(positive(segment, "segment") * data.rate)
+    length = data.samples(positive(segment, "segment"))
     tau = segment / WINDOWS
     if decay is not None:
         endless = isinstance(decay, float) and decay == float("inf")
         tau = decay if endless else positive(decay, "decay")
-    n_time = data.u.shape[2]
-    if not 8 <= length <= n_time:
-        raise ModelError(
-            f"a segment of {length} samples in a record of {n_time}: choose segment= between "
-            f"{8 / data.rate:g} and {n_time / data.rate:g} s."
-        )
     full = _full_scale(limits, data.inputs, data.outputs)
     dropouts_warned(data)
     f = data.u - np.median(data.u, axis=2, keepdims=True)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..checks import ComplexArray, FloatArray, Value, positive, real_array, signal_names
-from ..errors import ModelError, ShapeError, warn
-from ..lti.frequency import Frf
+from ..errors import ModelError, ShapeError, require_known, warn
+from ..lti.frequency import ORDERS, Frf
 from ..lti.measured_lines import checked_overlap, checked_window
 from ..tolerances import ROUNDING, TINY
 
@@ -121,13 +121,7 @@ def averages(data: Records, method: SpectralMethod) -> Averages:
     """Return Welch averages over segments and experiments; zero frequency is left out."""
     from scipy.signal import get_window
 
-    n_time = data.u.shape[2]
-    length = n_time // 8 if method.segment is None else round(method.segment * data.rate)
-    if not 8 <= length <= n_time:
-        raise ModelError(
-            f"a segment of {length} samples in a record of {n_time}: choose segment= between "
-            f"{8 / data.rate:g} and {n_time / data.rate:g} s."
-        )
+    n_time, length = data.u.shape[2], data.samples(method.segment)
     window = np.asarray(get_window(method.window, length), dtype=np.float64)
     hop = max(1, round(length * (1.0 - method.overlap)))
     starts = range(0, n_time - length + 1, hop)
@@ -311,9 +305,23 @@ class Records:
     outputs: tuple[str, ...]
     rate: float
 
+    def samples(self, segment: float | None) -> int:
+        """Return the length of a segment [s] in samples, an eighth of the record by default."""
+        n_time = self.u.shape[2]
+        length = n_time // 8 if segment is None else round(segment * self.rate)
+        if not 8 <= length <= n_time:
+            raise ModelError(
+                f"a segment of {length} samples in a record of {n_time}: choose segment= between "
+                f"{8 / self.rate:g} and {n_time / self.rate:g} s."
+            )
+        return length
 
-def records(inputs: Any, outputs: Any, reference: Any, rate: float) -> Records:
-    """Return records of arrays or mappings by name."""
+
+def records(inputs: Any, outputs: Any, reference: Any, rate: Any, quantity: Any) -> Records:
+    """Return records of arrays or mappings by name; the quantity of the outputs is checked too."""
+    rate = positive(rate, "rate")
+    if quantity is not None:
+        require_known("quantity", [quantity], ORDERS)
     u, in_names = signals(inputs, "inputs", "u")
     y, out_names = signals(outputs, "outputs", "y")
     sides = {"outputs": y}

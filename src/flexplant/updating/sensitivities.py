@@ -171,10 +171,10 @@ def mode_columns(modes: Any, eigen: Eigen) -> list[int]:
 def checked_parameters(parameters: Any) -> tuple[Parameter, ...]:
     """Return the parameters as a tuple, checked."""
     listed = tuple(parameters) if isinstance(parameters, Sequence) else (parameters,)
-    for parameter in listed:
-        instance(parameter, Parameter, "a parameter", "Pass [AddedMass('41:z')], say.")
     if not listed:
         raise ModelError("parameters is empty: there is nothing to update.")
+    for parameter in listed:
+        instance(parameter, Parameter, "a parameter", "Pass [AddedMass('41:z')], say.")
     names = [parameter.name for parameter in listed]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
