@@ -344,15 +344,14 @@ def shape_deviations(
     --------
     >>> import flexplant as fx
     >>> import numpy as np
-    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5], ground=[1e5, 0.0])
-    >>> modes = fx.solve_modes(model, count=2, damping=fx.ModalDamping(0.01))
-    >>> sensors = [fx.Sensor(f"y{i}", at=f"{i}:x") for i in (1, 2)]
-    >>> plant = fx.assemble_plant(modes, fx.Ports(u=[fx.Actuator("u1", at="1:x")], y=sensors))
-    >>> frf = fx.frequency_response(plant.Gyu, np.linspace(10.0, 250.0, 400))
-    >>> noisy = frf.replace(variance=np.full(frf.data.shape, 1e-16))
-    >>> measured = fx.identify_modes(noisy, dofs={"y1": "1:x", "y2": "2:x", "u1": "1:x"})
+    >>> freq = np.linspace(10.0, 250.0, 400)
+    >>> model = fx.chain(masses=[1.0], stiffnesses=[], ground=4e5)
+    >>> s = 2j * np.pi * freq
+    >>> H = 1 / (s**2 + 12.0 * s + 4e5)
+    >>> frf = fx.Frf(freq, H[None, None], ["u1"], ["y1"], variance=1e-16 * np.ones((1, 1, 400)))
+    >>> measured = fx.identify_modes(frf, dofs={"y1": "1:x", "u1": "1:x"})
     >>> fx.identification.shape_deviations(measured, model.dofs, count=1).shape
-    (2, 2, 1)
+    (1, 1, 1)
     """
     at, dofs, rows = measured_places(measured, dofs, over)
     kept = whole(count, "count")

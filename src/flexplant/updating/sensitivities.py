@@ -85,10 +85,8 @@ def eigenvalue_sensitivities(
 
     Parameters
     ----------
-    model : ReducedModel or FEModel
-        The model; an FEModel is treated densely.
-    parameters : sequence of q Parameter
-        To which the derivatives are taken.
+    model, parameters
+        As for `update`; an FEModel is treated densely.
     modes : sequence of int, optional
         Numbers from 1, rigid-body modes included; all elastic modes when not given.
     values : (q,) array, optional

@@ -191,7 +191,7 @@ def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
     model : ReducedModel or FEModel
         Before or after an update (`UpdateResult.model`).
     residuals : sequence of Residual
-        The measurements: poles, shapes and responses are compared; of several kinds the last.
+        Poles, shapes and responses are compared; of several of a kind the last.
 
     Returns
     -------

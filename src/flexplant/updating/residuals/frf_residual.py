@@ -40,10 +40,9 @@ class FrfResidual(Residual):
         Responses of outputs to inputs [quantity / N]; `measured.quantity` says displacement
         (also when None), velocity or acceleration.
     variance : float or array that spreads to (n_out, n_in, n_freq), optional
-        ``E|noise|^2`` of each entry; that of the Frf when not given, times ``nu / (nu - 1)``
-        where it was estimated with `freedom` nu, so that chi-square has its mean; the correlation
-        of lines follows from the Frf's window. Where neither is known,
-        entries count by their size, each divided by the rms of its channel pair.
+        ``E|noise|^2`` of each entry; that of the Frf when not given, times ``nu / (nu - 1)`` where
+        it was estimated with `freedom` nu; the correlation of lines follows from the Frf's window.
+        Where neither is known, each entry is divided by the rms of its channel pair.
     lines : sequence of int or (n_freq,) bool array, optional
         Frequency lines to use. None: those where the median over the channels of
         ``|H|^2 / variance`` is above 9 (all without a variance), and none at 0 Hz.
@@ -55,8 +54,7 @@ class FrfResidual(Residual):
         Compare ln |H| instead of H: forgiving of phase errors, convergent from farther away.
     hold : float, optional [Hz]
         Rate of the zero-order hold between the inputs and the machine, where the response is that
-        of the sampled machine (modes above half the rate then fold into the band, as in the
-        measurement). None: a response of continuous signals.
+        of the sampled machine (modes above half the rate then fold into the band).
     delay : float [samples]
         From the command to the held force, of any fraction, where the measurement contains it.
 

@@ -248,9 +248,8 @@ class ModeShapes(_ModalResidual):
         Standard deviation of the entries (of a complex one: ``E|n|^2 = std^2``), in their own
         scale. None: all equal, not known.
     covariance : (modes, m, m) array, optional
-        ``E[n n^H]`` of each shape instead of `std`, real or Hermitian; what it says of the scale
-        is not used, so it may be singular there (a shape whose largest entry was set to 1). That of
-        `measured`, where its shapes are taken and it has one (`shape_covariance`).
+        ``E[n n^H]`` of each shape instead of `std`, real or Hermitian; its scale is not used, and
+        may be singular. That of `measured` (`shape_covariance`), where its shapes are taken.
     assign : bool
         Whether modes are assigned by MAC with the measured shapes; False: by continuation.
 
