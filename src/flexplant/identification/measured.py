@@ -297,16 +297,11 @@ def _checked_shapes(
         return None, None
     if shapes is None or dofs is None or isinstance(dofs, str):
         raise ShapeError("shapes= and the list dofs= of their rows' labels belong together.")
-    array = np.array(shapes, dtype=np.complex128)
     labels = tuple(str(label) for label in dofs)
-    if array.shape != (len(labels), poles.size) or not labels:
-        raise ShapeError(
-            f"shapes must have shape ({len(labels)}, {poles.size}) for {len(labels)} DOFs and "
-            f"{poles.size} poles, got {array.shape}."
-        )
+    array = complex_array(shapes, "shapes", (len(labels), poles.size))
     check_names(labels, "dofs")
-    if not np.all(np.isfinite(array)) or not np.all(np.any(array, axis=0)):
-        raise ModelError("every mode shape must be finite and not zero everywhere.")
+    if not np.all(np.any(array, axis=0)):
+        raise ModelError("every mode shape must not be zero everywhere.")
     return np.where(poles.imag < 0, array.conj(), array), labels
 
 

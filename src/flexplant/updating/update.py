@@ -143,10 +143,8 @@ def update(
     """
     listed = checked_parameters(parameters)
     given = checked_residuals(residuals)
-    if method is not None:
-        instance(
-            method, UpdateMethod, "method", "Pass updating.GaussNewton() or updating.TrustRegion()."
-        )
+    hint = "Pass updating.GaussNewton() or updating.TrustRegion()."
+    instance(method, UpdateMethod | None, "method", hint)
     if max_iterations is not None:
         whole(max_iterations, "max_iterations")
     tolerance = positive(tolerance, "tolerance")
@@ -213,10 +211,8 @@ def _ends_warned(
 
     `estimates`: the first and that of each round; `lost`: why the start given has no end.
     """
-    if (
-        len(estimates) > 1
-        and (still := normalised_step(objective, best.p, estimates[-2])) > UNSETTLED
-    ):
+    still = normalised_step(objective, best.p, estimates[-2]) if len(estimates) > 1 else 0.0
+    if still > UNSETTLED:
         warn(
             f"defect correction has not settled: round {len(estimates) - 1} still moved the "
             f"estimate by {still:.2g} standard deviations. Give more rounds=, or a reduced model "
@@ -273,9 +269,8 @@ def _result(
 
 def _complaint(fit: UpdateResult, named: str) -> str:
     """Return what is wrong with a fit that leaves more than noise; `named`: its worst residuals."""
-    negative = ""
-    if fit.negative_masses:
-        negative = f"{', '.join(fit.negative_masses)} came out negative. "
+    masses = fit.negative_masses
+    negative = f"{', '.join(masses)} came out negative. " if masses else ""
     tried = f"{counted(len(fit.starts or ()), 'start')} tried. "
     kept = (
         f"The covariance is widened by {(fit.chi2 or 0.0) / max(fit.dof, 1):.3g} and holds for "
