@@ -216,7 +216,7 @@ def test_a_peak_whose_phase_rises_is_found_all_the_same(band):
 def test_a_refinement_that_takes_too_much_leaves_the_first_answer(monkeypatch):
     frf, _ = roving(0.0, 1, step=0.3)
     first = identify_modes(frf, refine=False)
-    monkeypatch.setattr("flexplant.identification.stages.BUDGET", 1e6)
+    monkeypatch.setattr("flexplant.identification.identification_stages.BUDGET", 1e6)
     found = identify_modes(frf)
     assert "after 1e+06 operations" in repr(found)
     np.testing.assert_allclose(found.poles, first.poles, rtol=1e-6)  # of one step and of two
@@ -362,7 +362,7 @@ def test_default_orders_are_those_that_the_lines_afford():
 
 @pytest.mark.slow
 def test_a_costly_refinement_is_said_and_the_first_answer_is_near_it(monkeypatch, capsys):
-    monkeypatch.setattr("flexplant.identification.stages.CHEAP", 10.0)
+    monkeypatch.setattr("flexplant.identification.identification_stages.CHEAP", 10.0)
     frf, truth = roving(0.0, 1)
     first = identify_modes(frf)
     assert not first.refined

@@ -21,9 +21,9 @@ from .diagram import (
     weighted_by_remainder,
 )
 from .frf_estimation import repetitions, stacked_runs
+from .identification_stages import MOST_POLES, RUNS, Task, identified
 from .line_weights import prepared_lines
 from .result import IdentifiedModes, of_segments
-from .stages import MOST_POLES, RUNS, Task, identified
 
 #: most residual terms on one side of the band: powers of a frequency beyond tell no more apart in
 #: double precision

@@ -52,9 +52,9 @@ from .parameters import AddedMass as AddedMass
 from .parameters import AddedStiffness as AddedStiffness
 from .parameters import Parameter as Parameter
 from .residuals.frf_residual import FrfResidual as FrfResidual
-from .residuals.modes import Eigenvalues as Eigenvalues
-from .residuals.modes import ModeShapes as ModeShapes
-from .residuals.modes import ShapeCorrelation as ShapeCorrelation
+from .residuals.modal_residuals import Eigenvalues as Eigenvalues
+from .residuals.modal_residuals import ModeShapes as ModeShapes
+from .residuals.modal_residuals import ShapeCorrelation as ShapeCorrelation
 from .residuals.point_residuals import Antiresonances as Antiresonances
 from .residuals.point_residuals import StaticCompliance as StaticCompliance
 from .residuals.residual import Residual as Residual

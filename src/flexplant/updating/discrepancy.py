@@ -14,10 +14,10 @@ from ..errors import ModelError, counted
 from ..modes.modes import MeshError, measured_poles
 from ..tolerances import divisor
 from .family import Point
-from .residuals.modes import USUAL, ZETA, Eigenvalues, growth
+from .residuals.modal_residuals import USUAL, ZETA, Eigenvalues, growth
 from .residuals.residual import Bound, Kind
 from .search import Objective, SearchEnd
-from .search.objective import Search
+from .search.objective import SearchPlan
 from .sensitivities import eigenvalue_sensitivities
 
 #: degrees of freedom that the usual discrepancy of a kind counts: two measured modes outweigh it,
@@ -140,7 +140,7 @@ class _Weighed(Bound):
 
 
 def weigh_discrepancy(
-    objective: Objective, search: Search, end: SearchEnd
+    objective: Objective, search: SearchPlan, end: SearchEnd
 ) -> tuple[SearchEnd, tuple[Discrepancy, ...]]:
     """Return the end of a search with the discrepancy as part of the noise, and the discrepancy.
 

@@ -24,10 +24,10 @@ from .family import Point
 from .judgement.goodness import chance, chi_square, is_bad
 from .parameters import PointParameter
 from .residuals.frf_residual import FrfResidual
-from .residuals.modes import Eigenvalues, ModeShapes
+from .residuals.modal_residuals import Eigenvalues, ModeShapes
 from .residuals.residual import Residual
 from .search import Objective, SearchEnd, TrustRegion
-from .search.objective import Search, Trail
+from .search.objective import SearchPlan, Trail
 from .sensitivities import checked_values
 from .update_result import Starts
 
@@ -40,7 +40,7 @@ EVEN = 0.1
 ENOUGH = 1e-3
 
 
-def _led(search: Search, objective: Objective, begin: FloatArray) -> SearchEnd:
+def _led(search: SearchPlan, objective: Objective, begin: FloatArray) -> SearchEnd:
     """Return the end of a search from `begin` that goes through easier problems first.
 
     Responses have a minimum wherever a peak of the model lies between two measured ones; the
@@ -57,7 +57,7 @@ def _led(search: Search, objective: Objective, begin: FloatArray) -> SearchEnd:
         family=objective.family,
     )
     objective.path = []
-    near = Search(TrustRegion(), search.most, max(search.tolerance, ENOUGH))
+    near = SearchPlan(TrustRegion(), search.most, max(search.tolerance, ENOUGH))
     before = None
     with attempted("poles first, before shapes and responses"):
         points = near.begun(stage, begin).trail.p
@@ -131,7 +131,7 @@ class _GradedEnd(NamedTuple):
 class _Tried:
     """Searches from one start after the other; the objective is where the last one left it."""
 
-    def __init__(self, objective: Objective, search: Search) -> None:
+    def __init__(self, objective: Objective, search: SearchPlan) -> None:
         self.objective = objective
         self.search = search
         self.begins: list[FloatArray] = []
@@ -147,11 +147,11 @@ class _Tried:
             search = search._replace(tolerance=max(search.tolerance, NEARLY))
         sound = best is not None and not best.improvable
         glance = search._replace(most=GLANCE) if sound and search.most is None else search
-        end = _reached(_led if led else Search.begun, glance, self.objective, begin)
+        end = _reached(_led if led else SearchPlan.begun, glance, self.objective, begin)
         if glance is not search and best is not None and isinstance(end, SearchEnd):
             near = end.cost < WORTH * best.end.cost
             if near and not end.converged:
-                end = _reached(Search.resumed, search, self.objective, end)
+                end = _reached(SearchPlan.resumed, search, self.objective, end)
         self.begins.append(begin)
         self.ends.append(end)
         if isinstance(end, SearchEnd):
@@ -179,7 +179,7 @@ class _Tried:
 
 
 def from_one_start(
-    objective: Objective, begin: FloatArray, search: Search, rng: Rng, *, given: bool
+    objective: Objective, begin: FloatArray, search: SearchPlan, rng: Rng, *, given: bool
 ) -> tuple[SearchEnd, list[FloatArray], list[Reached]]:
     """Return the best end, the objective being there, all starts that were tried and their ends.
 
@@ -213,7 +213,7 @@ def from_one_start(
         raise none_found(objective, tried.begins, tried.ends)
     end = best.end
     if end is not tried.ends[0]:
-        settled = _reached(Search.resumed, search, objective, end)
+        settled = _reached(SearchPlan.resumed, search, objective, end)
         end = settled if isinstance(settled, SearchEnd) else end
     objective.path = []
     objective.follow(end.trail.p)
@@ -294,10 +294,10 @@ def _improvable(objective: Objective, end: SearchEnd, point: Point) -> bool:
 
 
 def from_starts(
-    objective: Objective, begins: list[FloatArray], search: Search
+    objective: Objective, begins: list[FloatArray], search: SearchPlan
 ) -> tuple[SearchEnd, list[Reached]]:
     """Return the best end, the objective being there, and what every start led to."""
-    ends = [_reached(Search.begun, search, objective, one) for one in begins]
+    ends = [_reached(SearchPlan.begun, search, objective, one) for one in begins]
     reached = [found for found in ends if isinstance(found, SearchEnd)]
     if not reached:
         raise none_found(objective, begins, ends)

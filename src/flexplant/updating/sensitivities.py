@@ -14,7 +14,7 @@ from ..errors import LabelError, ModelError, ShapeError, counted
 from ..tolerances import divisor
 from .family import Eigen, Family, Point, repeated_groups
 from .parameters import Parameter
-from .residuals.modes import BoundEigenvalues
+from .residuals.modal_residuals import BoundEigenvalues
 
 #: what turns exactly repeated modes to the vectors in which a change of parameters splits them; and
 #: the derivatives (q,) along these, by the modes' columns

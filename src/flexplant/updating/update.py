@@ -16,10 +16,10 @@ from .changed_model import MOST_ROUNDS, FullBasis, changed_model, is_large
 from .discrepancy import weigh_discrepancy
 from .judgement.goodness import chi_square, covariance, is_bad, worst
 from .parameters import Parameter
-from .residuals.modes import Eigenvalues
+from .residuals.modal_residuals import Eigenvalues
 from .residuals.residual import Residual
 from .search import Objective, SearchEnd, Secured, TrustRegion, UpdateMethod, checked_residuals
-from .search.objective import ITERATIONS, Defect, Search, unit_changes
+from .search.objective import ITERATIONS, Defect, SearchPlan, unit_changes
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
 from .sensitivities import checked_parameters, checked_values
 from .update_result import History, UpdateResult
@@ -163,7 +163,7 @@ def update(
         )
     if plain and method.weighs_poles:
         given = tuple(r.replace(weights=r.W) for r in given if isinstance(r, Eigenvalues))
-    search = Search(method, max_iterations, tolerance)
+    search = SearchPlan(method, max_iterations, tolerance)
     basis, used = None, model
     if full is not None:
         basis = FullBasis(full, listed, given, model)
@@ -295,7 +295,7 @@ STILL = 1e-2
 
 
 def corrected(
-    objective: Objective, basis: FullBasis, search: Search, end: SearchEnd, rounds: int
+    objective: Objective, basis: FullBasis, search: SearchPlan, end: SearchEnd, rounds: int
 ) -> tuple[SearchEnd, list[FloatArray]]:
     """Return the end of the last round, the objective being there, and the estimates on the way.
 

@@ -27,7 +27,7 @@ from .changed_model import applied
 from .discrepancy import USUAL_DOF, Discrepancy, ModalUncertainty, modal_uncertainty
 from .judgement.goodness import chance, is_bad
 from .parameters import AddedMass, Parameter
-from .residuals.modes import Eigenvalues
+from .residuals.modal_residuals import Eigenvalues
 from .residuals.residual import Residual
 
 #: share of machines that two printed deviations hold

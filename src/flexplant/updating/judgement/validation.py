@@ -17,7 +17,7 @@ from ...sparse.factor import dense
 from ..family import Point
 from ..parameters import Parameter
 from ..residuals.frf_residual import FrfResidual
-from ..residuals.modes import ModeShapes
+from ..residuals.modal_residuals import ModeShapes
 from ..residuals.residual import Residual
 from ..search import Objective, checked_residuals
 from ..search.objective import UpdateMethod, compared_modes

@@ -15,7 +15,7 @@ from ...parallel import tick
 from ...tolerances import divisor
 from ..family import Family, Point, first_point
 from ..parameters import Parameter
-from ..residuals.modes import BoundEigenvalues
+from ..residuals.modal_residuals import BoundEigenvalues
 from ..residuals.residual import Bound, Residual
 from ..sensitivities import PoleRows, mode_columns, split_point
 
@@ -29,7 +29,7 @@ class Defect(NamedTuple):
     slopes: FloatArray
 
 
-class Drawn(NamedTuple):
+class PriorRows(NamedTuple):
     """Residuals ``weight (p - middle)`` beside those of the data: a prior, or a penalty."""
 
     middle: FloatArray
@@ -68,10 +68,10 @@ class Objective:
         self.prior_std = np.array([1.0 if known is None else known[1] for known in priors])
         self.uses_prior = bool(prior and self.noisy and self.has_prior.any())
         #: to what the answer is drawn: the priors, and what a search may add
-        self.drawn: list[Drawn] = []
+        self.drawn: list[PriorRows] = []
         if self.uses_prior:
             pull = -np.diag(1 / self.prior_std)[self.has_prior]
-            self.drawn.append(Drawn(self.prior_mean, pull))
+            self.drawn.append(PriorRows(self.prior_mean, pull))
         limits = [getattr(q, "bounds", None) or (-np.inf, np.inf) for q in parameters]
         self.lower = np.array([low for low, _ in limits], dtype=np.float64)
         self.upper = np.array([high for _, high in limits], dtype=np.float64)
@@ -323,7 +323,7 @@ class UpdateMethod(Value):
         """
 
 
-class Search(NamedTuple):
+class SearchPlan(NamedTuple):
     """A method, and how far it goes: most steps (None: its own) and relative tolerance."""
 
     method: UpdateMethod

@@ -11,7 +11,7 @@ from ...checks import FloatArray, checked, positive
 from ...errors import ModelError, SolverError
 from ...tolerances import ROUNDING, TINY
 from .least_squares import TrustRegion
-from .objective import Drawn, Objective, SearchEnd, Trail, UpdateMethod, unit_changes
+from .objective import Objective, PriorRows, SearchEnd, Trail, UpdateMethod, unit_changes
 
 #: weights tried for an L-curve, or on a path of sparse changes
 PATH = 13
@@ -73,7 +73,7 @@ class Tikhonov(PenalisedMethod):
         unit = unit_changes(objective, J)
 
         def solved(size: float, begin: FloatArray) -> SearchEnd:
-            objective.drawn.append(Drawn(start, np.diag(size / unit)))
+            objective.drawn.append(PriorRows(start, np.diag(size / unit)))
             try:
                 return TrustRegion().search(objective, begin, most=most, tolerance=tolerance)
             finally:
