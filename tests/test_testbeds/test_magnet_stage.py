@@ -10,7 +10,7 @@ import flexplant as fx
 from flexplant.errors import LabelError, ModelError
 from flexplant.plant import suspend
 from flexplant.testbeds.ritz import ritz_block
-from flexplant.testbeds.stages import BLOCK, PULL
+from flexplant.testbeds.virtual_stages import BLOCK, PULL
 
 RATE = 10e3
 AXES = ("x", "y", "z", "rx", "ry", "rz")

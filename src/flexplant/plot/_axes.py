@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.collections import PolyCollection
@@ -81,10 +80,7 @@ def three_axes(
 ) -> Sequence[Axes]:
     """Return the three axes given, or those of a new figure."""
     if ax is None:
-        drawn: list[Axes] = list(
-            plt.subplots(rows, columns, layout="constrained", **options)[1].ravel()
-        )
-        return drawn
+        return list(plt.subplots(rows, columns, layout="constrained", **options)[1].ravel())
     if np.size(np.asarray(ax, dtype=object)) != 3:
         raise ModelError("ax= takes three axes. Leave it out for a new figure.")
     return ax
@@ -510,9 +506,7 @@ def _response_to_draw(one: Any, freq: FloatArray | None) -> Frf:
 _MOST = 36
 
 
-def channel_axes(
-    ax: Any, rows: int, columns: int, ratios: Sequence[int], height: float
-) -> npt.NDArray[Any]:
+def channel_axes(ax: Any, rows: int, columns: int, ratios: Sequence[int], height: float) -> Any:
     """Return the axes of channels, so many below each other for each as there are heights.
 
     They are those given for one channel, or new ones.
@@ -536,11 +530,10 @@ def channel_axes(
         )
     if ax is not None:
         return given.reshape(each, 1)
-    drawn: npt.NDArray[Any] = plt.subplots(
+    return plt.subplots(
         each * rows, columns, sharex=True, squeeze=False, layout="constrained",
         figsize=(max(7.0, 4.0 * columns), height), height_ratios=[*ratios] * rows,
     )[1]  # fmt: skip
-    return drawn
 
 
 def decibel(values: ComplexArray | FloatArray) -> FloatArray:

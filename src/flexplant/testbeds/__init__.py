@@ -22,9 +22,9 @@ A machine of one's own has the same two methods, ``loop(ports, *blocks)`` and ``
 """
 
 from ..rooms import public_names as _public_names
-from .stages import magnet_stage as magnet_stage
-from .stages import three_masses as three_masses
-from .stages import wafer_stage as wafer_stage
 from .virtual_machine import WaferStage as WaferStage
+from .virtual_stages import magnet_stage as magnet_stage
+from .virtual_stages import three_masses as three_masses
+from .virtual_stages import wafer_stage as wafer_stage
 
 __dir__ = _public_names(__name__)
