@@ -79,7 +79,7 @@ def test_a_map_is_the_run_of_a_poi_at_each_point():
     assert "9 points along z, windows of 5 ms" in repr(found)
     ax = fx.plot.error_map(found, what="msd")
     assert "MSD of the error along z" in ax.figure.axes[1].get_ylabel()
-    with pytest.raises(ModelError, match="'ma' or 'msd'"):
+    with pytest.raises(ModelError, match="'ma', 'msd'"):
         fx.plot.error_map(found, what="rms")
 
 
