@@ -375,6 +375,24 @@ def test_a_controller_that_follows_its_machine_on_a_path(tmp_path):
         write_c(schedule, tmp_path / "limited.c", limits=2.0)
 
 
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_every_state_of_a_schedule_follows_the_place(order):
+    """Also where there are so few that one system's would be a pair."""
+    from flexplant.lti.responses import responses
+    from flexplant.synthesis.aftercare.forms import TwoStateForm, scheduled_form
+
+    A = np.array([[0.9, 0.1, 0.0], [-0.1, 0.9, 0.1], [0.0, 0.0, 0.5]])[:order, :order]
+    B, C = np.array([[1.0], [0.5], [0.2]])[:order], np.array([[1.0, 0.2, 0.7]])[:, :order]
+    laws = [StateSpace(k * A, B, C, [[0.1]], 1e-3) for k in (1.0, 0.8)]
+    form, freq = scheduled_form(laws, driven=1), np.array([1.0, 30.0, 300.0])
+    for q, K in enumerate(laws):
+        rows = slice(q, q + 1)
+        one = TwoStateForm(
+            form.pairs, form.rest[q], form.B[q], form.C[rows], form.D[rows], form.start, 0.0
+        )
+        np.testing.assert_allclose(one.response(freq, 1e-3), responses(K, freq), rtol=1e-12)
+
+
 def test_refusals_of_the_c_export(tmp_path):
     slow = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01, inputs=["s"], outputs=["f"])
     reads = StateSpace([[0.5]], [[1.0, 0.0]], [[1.0]], [[0.0, 1.0]], 0.01,

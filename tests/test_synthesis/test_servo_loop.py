@@ -217,6 +217,11 @@ def test_refusals():
     other = kalman.system.renamed(inputs={"y1": "q1"})
     with pytest.raises(LabelError, match="reads q1"):
         design_servo(plant, bandwidth=50.0, observer=other)
+    with pytest.raises(ModelError, match="the observer is a str, not a system"):
+        design_servo(plant, bandwidth=50.0, observer="kalman")
+    slower = kalman.system.replace(dt=2.0 * plant.dt)
+    with pytest.raises(ModelError, match=r"the observer <.*> has dt .* s, the plant"):
+        design_servo(plant, bandwidth=50.0, observer=slower)
     with pytest.raises(ModelError, match="peak must be above 1"):
         servo_bandwidth(plant, peak=1.0)
     with pytest.raises(SolverError, match=r"no bandwidth from .* rigid body by itself does not"):

@@ -27,6 +27,7 @@ from flexplant.synthesis import (
 )
 from flexplant.synthesis.structured.nonsmooth import Pieces, bfgs, decrease_left, downhill, minimax
 from flexplant.synthesis.structured.structured_design import _StructureSearch
+from flexplant.synthesis.structured.structures import ControllerFamily
 from stages import ports, sampled
 
 
@@ -96,6 +97,19 @@ STRUCTURES = {
     "observer, sampled": (machine, ObserverGains()),
     "parametrised": (machine, Parametrised(scaled, [1.0])),
 }
+
+
+def test_gains_of_an_observer_have_derivatives_without_differences():
+    """They are those of the controller, also with feedthrough of the plant from u to y."""
+    rng = np.random.default_rng(1)
+    A, B, C, D = (rng.standard_normal(shape) for shape in ((5, 5), (5, 5), (4, 5), (4, 5)))
+    plant = named(A, B, C, np.where([[0], [0], [1], [1]], D, 0.0), 3, 2)
+    family = ObserverGains().family(plant, prepared(plant.system, plant.u, plant.y))
+    theta = family.first + 0.1 * rng.standard_normal(family.first.size)
+    exact = family.jacobian(theta)
+    by_differences = ControllerFamily(family.matrices, family.first, 0.1).jacobian(theta)
+    np.testing.assert_allclose(exact, by_differences, rtol=0, atol=1e-9 * np.abs(exact).max())
+    assert not np.any(exact[:, 5:, 5:])  # no feedthrough, not even in rounding
 
 
 @pytest.mark.slow

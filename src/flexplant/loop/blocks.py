@@ -105,20 +105,20 @@ def commands(
     return found
 
 
-def as_block(block: Any, place: int, dt: float) -> StateSpace:
-    """Return a block as a StateSpace of the plant's dt."""
+def as_block(block: Any, name: str, dt: float) -> StateSpace:
+    """Return a block as a StateSpace of the plant's dt; messages call it by a name."""
     inner = getattr(block, "system", block)
     if isinstance(block, StandardPlant) or not (
         isinstance(inner, StateSpace) or hasattr(inner, "input_labels")
     ):
         raise ModelError(
-            f"block {place} is a {type(block).__name__}, not a system with named channels. Pass a "
+            f"{name} is a {type(block).__name__}, not a system with named channels. Pass a "
             "StateSpace with inputs= and outputs=, or a value with such a .system."
         )
     sys = inner if isinstance(inner, StateSpace) else StateSpace.from_control(inner)
     if sys.n_states and not np.isclose(sys.dt, dt, rtol=SAME, atol=0.0):
         raise ModelError(
-            f"block {place} {sys!r} has dt {sys.dt:g} s, the plant {dt:g} s (0 is continuous). "
+            f"{name} {sys!r} has dt {sys.dt:g} s, the plant {dt:g} s (0 is continuous). "
             "Design it on plant.discretized(rate), or discretise it at the plant's rate."
         )
     return sys if sys.dt == dt else sys.replace(dt=dt)

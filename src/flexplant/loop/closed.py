@@ -501,7 +501,7 @@ def close_loop(
     (True, -10.0)
     """
     plant = standard_plant(plant)
-    systems = tuple(as_block(block, i, plant.dt) for i, block in enumerate(blocks, 1))
+    systems = tuple(as_block(block, f"block {i}", plant.dt) for i, block in enumerate(blocks, 1))
     if not systems:
         raise ModelError(
             "close_loop needs at least one block that drives an actuator: pass a StateSpace, "

@@ -363,8 +363,7 @@ def evened(g: StateSpace) -> StateSpace:
 def _frequency(plant: Partition, zero: complex) -> str:
     """Return a zero on the stability limit as a frequency, with the mode it belongs to."""
     omega = abs(np.log(zero)) / plant.dt if plant.dt else abs(zero)
-    poles = plant.system.poles()
-    top = np.pi / plant.dt if plant.dt else np.max(np.abs(poles), initial=TINY)
+    top = np.pi / plant.dt if plant.dt else np.abs(plant.system.poles()).max(initial=TINY)
     if omega < SPLIT * top:
         return "zero frequency (a rigid-body motion or an integrator)"
     text = f"{omega / (2 * np.pi):.4g} Hz"

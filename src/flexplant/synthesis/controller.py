@@ -133,14 +133,17 @@ AGREEMENT = 1e-3
 _AROUND = (0.0, *np.geomspace(0.05, 20.0, 24).tolist())
 
 
-def required_stability(loop: StateSpace) -> float:
+#: what may be wrong where a controller, given or found, does not stabilise its loop
+_SIGN = "Is the sign of the feedback u = K y right, and is it the plant that it was made for?"
+
+
+def required_stability(loop: StateSpace, cause: str = _SIGN) -> float:
     """Return the spectral abscissa or radius of a closed loop that has to be stable."""
     least = stability(loop.poles(), loop.dt)
     if not least < (1.0 if loop.dt else 0.0):
         raise CertificateError(
             f"the closed loop is not stable ({stability_name(loop.dt)} {least:.6g}): the "
-            "controller is refused. "
-            "Is the sign of the feedback u = K y right, and is it the plant that it was made for?"
+            f"controller is refused. {cause}"
         )
     return least
 

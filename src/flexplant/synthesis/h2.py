@@ -157,15 +157,20 @@ def _solve_regular(p: Prepared) -> SolvedController:
     return SolvedController(A, p.B2 @ L0 - L, F - L0 @ p.C2, L0, cost, cost, residual)
 
 
+#: why a loop that solves its Riccati equations is not stable in rounding
+_UNDAMPED = (
+    "The plant is too badly conditioned, or a mode that neither z nor w contains stays undamped: "
+    "weight its motion and disturb it."
+)
+
+
 def _certified(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:
     """Return what was verified of lft(P, K): its H2 norm by both Gramians, and its stability."""
     loop = lft(P, K)
-    least, norm = required_stability(loop), h2_norm(loop)
+    least, norm = required_stability(loop, _UNDAMPED), h2_norm(loop)
     if not np.isfinite(norm):
         raise CertificateError(
-            "the H2 norm of the closed loop is infinite: the controller is refused. The plant is "
-            "too badly conditioned, or a mode that neither z nor w contains stays undamped: weight "
-            "its motion and disturb it."
+            f"the H2 norm of the closed loop is infinite: the controller is refused. {_UNDAMPED}"
         )
     if not abs(norm - claim) <= AGREEMENT * norm:
         raise CertificateError(

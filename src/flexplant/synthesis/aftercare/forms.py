@@ -119,7 +119,7 @@ def scheduled_form(
     found = []
     for K in laws:
         K = K.replace(A=K.A * d / d[:, None], B=K.B / d[:, None], C=K.C * d, blocks=None)
-        own = _arranged(K, [K.n_states], [slice(driven)], None)
+        own = _arranged(K, [K.n_states], [slice(driven)], None, paired=0)  # A follows the place
         found.append(_compared(K, own, single))
     error = max(one.error for one in found)
     if error > (most := _SINGLE if single else _DOUBLE):
@@ -166,14 +166,15 @@ def _block_forms(K: StateSpace) -> Iterator[tuple[StateSpace, list[int]]]:
 
 
 def _arranged(
-    K: StateSpace, sizes: list[int], driven: Sequence[slice], inputs: int | None
+    K: StateSpace, sizes: list[int], driven: Sequence[slice], inputs: int | None, paired: int = 2
 ) -> TwoStateForm:
-    """Return a block-diagonal system with its blocks side by side."""
+    """Return a block-diagonal system with its blocks side by side, those of few states paired."""
     ends, n = np.cumsum(sizes, dtype=int).tolist(), K.n_states
     blocks = [range(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    many = [k for block in blocks if len(block) > paired for k in block]
+    blocks = [block for block in blocks if len(block) <= paired]
     ones = [k for block in blocks if len(block) == 1 for k in block]
     pairs = [(block[0], block[1]) for block in blocks if len(block) == 2]
-    many = [k for block in blocks if len(block) > 2 for k in block]
     pairs += zip_longest(ones[::2], ones[1::2], fillvalue=n)  # n: a state that does not exist
     pairs += [(n, n)] * (-len(pairs) % LANES)
     many += [n] * (-len(many) % LANES)

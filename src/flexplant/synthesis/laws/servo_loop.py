@@ -169,7 +169,7 @@ def observer_system(observer: Any, plant: StandardPlant, poi: Poi) -> StateSpace
     """Return the observer as a block of the plant, checked to give the POI's estimates."""
     if observer is None:
         return None
-    inner = as_block(observer, 1, plant.dt)
+    inner = as_block(observer, "the observer", plant.dt)
     missing = [h for h in (poi.derived(a, "hat") for a in poi.axes) if h not in inner.outputs]
     if missing:
         raise LabelError(

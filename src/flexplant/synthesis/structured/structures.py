@@ -61,15 +61,19 @@ class ControllerFamily:
         spread: float,
         structure: Callable[[FloatArray], Value | None] = lambda _: None,
         allows: Callable[[FloatArray], bool] = lambda _: True,
+        slopes: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
         self.matrices, self.first, self.spread = matrices, first, spread
         self.structure, self.allows, self.order = structure, allows, matrices(first).A.shape[0]
+        self._slopes = slopes
 
     def jacobian(self, theta: FloatArray) -> FloatArray:
         """Return the derivatives (n, rows, columns) of [A, B; C, D] by the parameters.
 
-        By differences, exact for polynomials up to the fourth power.
+        Those of `slopes`; without them by differences, exact up to the fourth power.
         """
+        if self._slopes is not None:
+            return self._slopes(theta)
         return np.array(
             [
                 sum(weight * self.matrices(theta + step * one).joined for step, weight in _STEPS)
@@ -259,8 +263,11 @@ class ObserverGains(Value):
         first = -control_care(p.A, p.B2, Q=np.eye(n), R=np.eye(len(p.u))).gain
         gain = -solve_care(p.A, p.C2, Q=np.eye(n), R=np.eye(len(p.y))).gain
 
+        def gains(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+            return theta[: first.size].reshape(-1, n), theta[first.size :].reshape(n, -1)
+
         def matrices(theta: FloatArray) -> Matrices:
-            F, L = theta[: first.size].reshape(-1, n), theta[first.size :].reshape(n, -1)
+            F, L = gains(theta)
             return Matrices(
                 p.speed * (p.A + p.B2 @ F + L @ (p.C2 + p.D22 @ F)),
                 -root * L @ p.y_scale,
@@ -268,8 +275,16 @@ class ObserverGains(Value):
                 np.zeros((len(p.u), len(p.y))),
             )
 
+        def slopes(theta: FloatArray) -> FloatArray:  # a gain moves one column, or one row
+            F, L = gains(theta)
+            into = np.vstack([p.speed * (p.B2 + L @ p.D22), root * p.u_scale])
+            out = np.hstack([p.speed * (p.C2 + p.D22 @ F), -root * p.y_scale])
+            by_F = np.einsum("ri,jc->ijrc", into, np.eye(n, out.shape[1]))
+            by_L = np.einsum("ri,jc->ijrc", np.eye(len(into), n), out)
+            return np.concatenate([by.reshape(-1, *by.shape[2:]) for by in (by_F, by_L)])
+
         start = np.concatenate([first.ravel(), gain.ravel()])
-        return ControllerFamily(matrices, start, 0.1, lambda _: self)
+        return ControllerFamily(matrices, start, 0.1, lambda _: self, slopes=slopes)
 
 
 class Parametrised:
