@@ -90,6 +90,28 @@ def test_a_value_of_delta_is_the_plant_with_that_shape():
     assert len(plant.uncertain(measured, shapes=silent).deltas) == 4
 
 
+def test_gains_and_a_delay_go_beside_shapes():
+    """Together they are the plant assembled anew, channels in the order gains, modes, shapes."""
+    rng = np.random.default_rng(3)
+    phi = rng.normal(size=(3, 3))
+    plant = assemble_plant(three_modes(phi), PORTS)
+    poles = np.array([complex(*_upper(plant, k)) for k in (2, 3)])
+    measured = MeasuredModes(poles, modes=(2, 3), covariance=np.full(2, 0.25))
+    shapes = 0.05 * rng.normal(size=(2, 3, 1))
+    gain = dict.fromkeys((plant.u[0], "y1", "y3"), 0.1)
+    uncertain = plant.uncertain(measured, shapes=shapes, gain=gain)
+    values = {delta.name: rng.uniform(-1, 1) for delta in uncertain.deltas}
+    by_channels = closed(uncertain, values)
+    exact = frequency_response(uncertain.lft(values).system, FREQ).data
+    found = frequency_response(by_channels, FREQ).data
+    size = np.maximum(np.abs(exact).max(axis=2, keepdims=True), 1e-300)
+    assert np.abs((found - exact) / size).max() < 1e-9
+    owners = list(dict.fromkeys(uncertain.channels.values()))
+    assert [name for name in owners if name.endswith("gain")] == owners[:3]
+    late = plant.discretized(2e3, delay=1).uncertain(measured, shapes=shapes, delay=0.5)
+    assert [delta.kind for delta in late.deltas].count("delay") == 1
+
+
 def _upper(plant, number):
     pole = max(np.linalg.eigvals(plant.modal_blocks[number - 1]), key=lambda value: value.imag)
     return pole.real, pole.imag

@@ -141,15 +141,15 @@ def _by_modes(
         system = _opened(base, system, found)
         do = "Give the sensor a `row` and a quantity."
         _require_exact(base, system, own, "the modes", do)
-    if gains:
-        system, _ = with_gain_channels(base, system, gains)
-        _require_exact(base, system, [*own, *gains], "the gains", "Leave gain= out.")
     if shapes:
         found = {delta: _shape_channels(base, delta, matrix) for delta in shapes}
         system = _opened(base, system, found)
-        every = [*deltas, *shapes]
-        _require_exact(base, system, every, "the shapes of modes", "Leave shapes= out.")
+        own += shapes
+        _require_exact(base, system, own, "the shapes of modes", "Leave shapes= out.")
         covariance = la.block_diag(covariance, np.eye(len(shapes)) / deviations**2)
+    if gains:  # last: they scale what all others do
+        system, _ = with_gain_channels(base, system, gains)
+        _require_exact(base, system, [*own, *gains], "the gains", "Leave gain= out.")
     return _with_bound(plant, system, neglected, (*deltas, *shapes), covariance, deviations)
 
 
