@@ -140,35 +140,40 @@ def _matrix(
         raise _outside(
             words.path, f"byte {place[bad]}", name, int(row[bad] - 1 + length[bad]), shape
         )
-    if dense:
-        parts = zip(length.tolist(), place.tolist(), strict=True)
-        data = np.concatenate(
-            [np.zeros(0, value), *(np.frombuffer(words.content, value, n, at) for n, at in parts)]
-        )
+    target: Any = np.complex128 if kind > 2 else np.float64
+    if dense:  # each string where it is in the file, without a copy
+        each = zip(length.tolist(), place.tolist(), strict=True)
+        numbers = [np.frombuffer(words.content, value, n, at) for n, at in each]
     else:
         inside = np.arange(int(length.sum())) - np.repeat(np.cumsum(length) - length, length)
-        data = _gather(words.content, np.repeat(place, length) + inside * per, per).view(value)
-    target = np.complex128 if kind > 2 else np.float64
-    return _placed((column, row, length), data.astype(target), shape, sparse=not dense)
+        at = np.repeat(place, length) + inside * per
+        numbers = [_gather(words.content, at, per).view(value)]
+    return _placed((column, row, length), numbers, shape, target, sparse=not dense)
 
 
 def _placed(
-    strings: tuple[Any, Any, Any], numbers: Any, shape: tuple[int, int], *, sparse: bool
+    strings: tuple[Any, Any, Any],
+    numbers: list[Any],
+    shape: tuple[int, int],
+    target: Any,
+    *,
+    sparse: bool,
 ) -> Any:
     """Return the matrix of strings of numbers: each its column and first row (from 1), its length.
 
-    Sparse too where it would be too large for the numbers that the file holds of it.
+    The numbers stand one behind the other, an array for each string of a dense matrix. It is sparse
+    too where it would be too large for the numbers that the file holds of it.
     """
     column, row, count = strings
-    if not sparse and shape[0] * shape[1] <= max(_SMALL, _TIMES * numbers.size):
-        dense, ends = np.zeros(shape, dtype=numbers.dtype, order="F"), np.cumsum(count)
-        listed = zip(*(part.tolist() for part in (column, row, count, ends)), strict=True)
-        for j, i, length, end in listed:
-            dense[i - 1 : i - 1 + length, j - 1] = numbers[end - length : end]
+    if not sparse and shape[0] * shape[1] <= max(_SMALL, _TIMES * int(count.sum())):
+        dense = np.zeros(shape, dtype=target, order="F")
+        for j, i, part in zip(column.tolist(), row.tolist(), numbers, strict=True):
+            dense[i - 1 : i - 1 + part.size, j - 1] = part
         return dense
     inside = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
     at = np.repeat(row - 1, count) + inside, np.repeat(column - 1, count)
-    return sp.csc_array(sp.coo_array((numbers, at), shape=shape))
+    data = np.concatenate([np.zeros(0, target), *numbers])
+    return sp.csc_array(sp.coo_array((data, at), shape=shape))
 
 
 def _strings(words: _Words, first: Any, end: Any, big: bool, per: int, name: str) -> Any:
@@ -380,7 +385,9 @@ class _Reader:
         column, row, count = np.array(self.strings, dtype=np.int64).reshape(-1, 3).T
         if (last := int(np.max(row + count - 1, initial=0))) > shape[0]:
             raise _outside(self.path, f"before line {self.at + 1}", name, last, shape)
-        return _placed((column, row, count), numbers, shape, sparse=sparse)
+        ends = zip(count.tolist(), np.cumsum(count).tolist(), strict=True)
+        parts = [numbers] if sparse else [numbers[end - n : end] for n, end in ends]
+        return _placed((column, row, count), parts, shape, numbers.dtype, sparse=sparse)
 
 
 #: entries that are kept dense however few of them the file holds
