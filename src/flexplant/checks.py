@@ -192,7 +192,7 @@ def in_unit(size: float, unit: str | None) -> tuple[float, str]:
     """Return the factor and the unit with its SI prefix that bring a size to 1 .. 1000."""
     base, per = (unit[1:], 1e-3) if unit and unit.startswith("kg") else (unit or "", 1.0)
     head = _PREFIXED.match(base)
-    if head is None or not size:
+    if head is None or not size or not np.isfinite(size):
         return 1.0, unit or ""
     power = int(head[2] or 1)
     known = ((factor**power, prefix) for factor, prefix in _PREFIXES)

@@ -204,6 +204,8 @@ def test_refusals(plate):
         model.row("99:z")
     with pytest.raises(ShapeError):
         model.expand(np.ones(23))
+    with pytest.raises(ModelError, match="different lengths"):
+        model.expand([1.0, [2.0]])
     with pytest.raises(ShapeError):
         model.replace(M=np.eye(3))
     with pytest.raises(ModelError, match="positive definite"):

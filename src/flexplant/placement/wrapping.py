@@ -424,7 +424,7 @@ class OverPositions(Several):
                     f"even all of them miss {counted(missed, 'rigid-body mode')}. Add others, or "
                     "narrow the positions."
                 )
-        super().check(plant, candidates)
+            Wrapping.check(self, there, ports)
 
     def plants(
         self, plant: StandardPlant, candidates: Sequence[Port]

@@ -130,7 +130,7 @@ def projected_model(
     load = scale[:, None] * (T.T @ np.asarray(model.M @ full))
     rigid = scale[:, None] * la.solve(dense(scaled), load, assume_a="pos")
     missed = float(np.abs(T @ rigid - full).max(initial=0.0))
-    if missed > _RIGID_TOLERANCE * np.abs(full).max(initial=0.0):
+    if not missed <= _RIGID_TOLERANCE * np.abs(full).max(initial=0.0):
         raise ModelError(
             f"{method} does not hold the rigid-body motions of the structure (misses "
             f"{missed / np.abs(full).max():.2g} of them): its poles at 0 would be lost. "

@@ -168,7 +168,8 @@ class ReducedModel(Value):
 
     def expand(self, q: FloatArray | ComplexArray) -> FloatArray | ComplexArray:
         """Return the motion ``T q`` of all n DOFs, of motions (k,) or (k, m), complex or not."""
-        shape = (self.n_dof,) if np.ndim(q) == 1 else (self.n_dof, None)
+        listed = complex_array(q, "q") if isinstance(q, list | tuple) else q
+        shape = (self.n_dof,) if np.ndim(listed) == 1 else (self.n_dof, None)
         check: Any = complex_array if np.iscomplexobj(q) else real_array
         moved: FloatArray | ComplexArray = self.T @ check(q, "q", shape)
         return moved
