@@ -79,6 +79,7 @@ def test_the_same_thing_looks_the_same_everywhere():
         (0.02, "1/s", (1.0, "1/s")),
         (0.0, "m", (1.0, "m")),
         (3.0, None, (1.0, "")),
+        (np.nan, "m", (1.0, "m")),
     ],
 )
 def test_prefixes(size, unit, shown):
