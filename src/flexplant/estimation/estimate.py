@@ -227,12 +227,12 @@ def estimated(
     return Estimate(
         record.time,
         estimates(model.channels),
-        hat.T,
-        np.sqrt(np.maximum(variance, 0.0)).T,
+        _across(hat),
+        _across(np.sqrt(np.maximum(variance, 0.0))),
         model.sensors,
-        passage.innovations.T,
-        passage.deviation.T,
-        passage.whitened.T,
+        _across(passage.innovations),
+        _across(passage.deviation),
+        _across(passage.whitened),
         lag,
         passage.state * d,
         known_units(units, estimates(model.channels))
@@ -241,6 +241,15 @@ def estimated(
         passage.gated.T,
         record.both,
     )
+
+
+def _across(columns: FloatArray) -> FloatArray:
+    """Return the transpose as a read-only array of its own, which a value takes without a copy."""
+    rows = columns.base
+    if rows is None or rows.strides != columns.strides[::-1]:
+        rows = np.array(columns.T, order="C")
+    rows.flags.writeable = False
+    return rows
 
 
 def in_unit_states(

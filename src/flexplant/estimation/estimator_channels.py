@@ -123,6 +123,10 @@ class Recorded(NamedTuple):
         return self.both[:, self.ny :]
 
 
+#: samples that are copied together
+_PIECE = 2048
+
+
 def recorded(records: Any, model: Any) -> Recorded:
     """Return the sensors and commands of a filter's model from what was recorded."""
     if not hasattr(records, "keys") or not hasattr(records, "__getitem__"):
@@ -148,10 +152,15 @@ def recorded(records: Any, model: Any) -> Recorded:
             f"channels of one record have one length, got {short(sizes)}. Cut them to the same "
             "samples, or fill what is missing of a sensor with NaN."
         )
-    both, ny = np.stack(parts, axis=1), len(model.sensors)
-    if not len(both):
+    count, ny = parts[0].size, len(model.sensors)
+    if not count:
         raise ShapeError("the record holds no samples: there is nothing to estimate from.")
-    return Recorded(_time(records, known, len(both), model.dt), both, ny)
+    both = np.empty((count, len(parts)))
+    for first in range(0, count, _PIECE):  # a piece of all columns stays in the cache
+        piece = slice(first, first + _PIECE)
+        for i, part in enumerate(parts):
+            both[piece, i] = part[piece]
+    return Recorded(_time(records, known, count, model.dt), both, ny)
 
 
 def _run_values(values: Any, name: str, *, missing: bool) -> FloatArray:

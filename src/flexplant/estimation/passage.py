@@ -57,16 +57,19 @@ class Walk:
         self.s, self.gate = s, gate
         self.steady, self.model, self.sight = steady, steady.model, sight
         self.predict, self.keep = predict, keep
-        both = np.nan_to_num(record.both)
-        self.there: BoolArray = np.isfinite(record.y)
+        both, self.there = record.both, np.asarray(np.isfinite(record.y))
+        if not self.there.all():
+            both = both.copy()
+            both[:, : record.ny][~self.there] = 0.0
         self.gated = np.zeros(record.y.shape if gate < np.inf else (0, record.ny), dtype=bool)
         self.whole = np.asarray(np.all(self.there, axis=1))
         self.gaps = np.flatnonzero(~self.whole)
         self.both, self.y, self.u = both, both[:, : record.ny], record.u
         (N, ny), nz = record.y.shape, sight.c.shape[1]
-        self.hat, self.variance = np.empty((2, N, nz))
+        # channel by channel in memory: so the estimate takes them, without a copy
+        self.hat, self.variance = (np.empty((nz, N)).T for _ in range(2))
         self.white = np.zeros((N, ny) if keep else (0, ny))
-        self.innovations, self.deviation, self.whitened = np.empty((3, N, ny))
+        self.innovations, self.deviation, self.whitened = (np.empty((ny, N)).T for _ in range(3))
         self.moments: dict[int, Moment] = {}
         self.found: KnownParameters | None = None
 

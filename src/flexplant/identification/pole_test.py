@@ -180,8 +180,31 @@ def shared(fit: Fit, more: Fit, least: float) -> bool:
         return False
     if len(lines.parts) == 1:
         return True
+    if "own" not in vars(fit) and _proven(fit, more, least):
+        return True
     apart = own_cost(fit)
     return fit.cost - apart < own_price(fit) or apart - own_cost(more) > least
+
+
+def _proven(fit: Fit, more: Fit, least: float) -> bool:
+    """Return whether a few outputs, with poles of their own, prove the pole more already.
+
+    Most poles are: fits of the other outputs, which take most of the time, are not made then.
+    """
+    found: list[Fit] = []
+    gain = 0.0
+    for rows, own in zip(fit.lines.parts, more.own, strict=True):
+        alone = None
+        with attempted(f"a fit of {fit.lines.side} {len(found) + 1} alone", SolverError):
+            alone = fit.of_rows(rows, below=own.cost + least - gain)
+        if alone is None:
+            return True
+        found.append(alone)
+        gain += alone.cost - own.cost
+        if gain > least:
+            return True
+    vars(fit)["own"] = found  # all of them were made, as `Fit.own` does
+    return False
 
 
 def newest_pole(fit: Fit, more: Fit) -> int:

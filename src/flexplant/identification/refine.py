@@ -292,12 +292,13 @@ class Fit:
         """The fits of each output, or set-up, alone."""
         return [self.of_rows(rows) for rows in self.lines.parts]
 
-    def of_rows(self, rows: IntArray) -> Fit:
+    def of_rows(self, rows: IntArray, below: float = np.inf) -> Fit:
         """Return the fit of some outputs alone: poles of their own, the participation of all."""
         return refined(
             *(self.lines.of_rows(rows), self.poles, self.participation),
             steps=OWN,
             strict=False,
+            below=below,
             poles_only=True,
         )
 
