@@ -78,11 +78,12 @@ def _changes(
     model: FEModel, parameters: Sequence[Parameter], p: FloatArray
 ) -> dict[str, Matrix | None]:
     """Return M, D and K with the parameters at `p`."""
-    found: dict[str, Matrix | None] = {name: getattr(model, name) for name in "MDK"}
+    # changes of a few places each first: the model's own matrices are large
+    total: dict[str, Matrix | None] = dict.fromkeys("MDK")
     for parameter, value in zip(parameters, p.tolist(), strict=True):
         for name, part in zip("MDK", parameter.change(model, value), strict=True):
-            found[name] = matrix_sum(found[name], part)
-    return found
+            total[name] = matrix_sum(total[name], part)
+    return {name: matrix_sum(getattr(model, name), part) for name, part in total.items()}
 
 
 def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
