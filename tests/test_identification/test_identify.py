@@ -20,7 +20,13 @@ from flexplant.identification import (
     stabilisation_diagram,
 )
 from flexplant.identification.line_weights import prepared_lines
-from flexplant.identification.pole_test import improved, missed_poles, split_proposals, unexplained
+from flexplant.identification.pole_test import (
+    improved,
+    missed_poles,
+    shared,
+    split_proposals,
+    unexplained,
+)
 from flexplant.identification.refine import LEAST, Fit, Lines, refined
 from flexplant.lti import Frf
 from flexplant.store import load
@@ -202,6 +208,19 @@ def test_a_pair_is_taken_apart_with_one_input():
     apart = improved(merged, [(split_proposals, 6)], steps=150)
     assert apart.poles.size == 3
     assert np.abs(np.sort_complex(apart.poles.imag + 0j) / truth.imag - 1).max() < 1e-3
+
+
+def test_a_few_outputs_prove_a_pole_that_all_share():
+    """The fits of the other outputs alone, which take most of the time, are not made then."""
+    truth = pole([47.5, 80.0, 112.0], [0.004, 0.004, 0.01])
+    frf = measured(truth, PHI[:, :3], n_in=1, level=1e-3)
+    lines = Lines(frf.freq, frf.data, np.sqrt(2.0 / frf.variance), 2, 3, None)
+    ones = np.ones((1, 3), dtype=complex)
+    less, more = (refined(lines, truth[:m], ones[:, :m], steps=150) for m in (2, 3))
+    assert len(lines.parts) > 1
+    assert shared(less, more, 50.0)
+    assert "own" not in vars(less)  # which would be the fits of all outputs
+    assert not shared(less, more, 2.0 * (less.cost - more.cost))
 
 
 @pytest.mark.slow
