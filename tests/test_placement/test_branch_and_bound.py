@@ -121,7 +121,7 @@ def test_optima_are_proven_and_no_bound_is_above_any_truth(case, side):
     low, weights = scorer.relaxation(whole)
     assert low <= values[best] * (1 + 1e-7)
     # the weights are the least relaxed cost, apart from one in a hundred
-    relaxed = scorer.relaxed(0.999 * weights + 0.001 * whole.centre(len(candidates)))[0]
+    relaxed = scorer.cost(0.999 * weights + 0.001 * whole.centre(len(candidates)))
     assert low <= relaxed <= 1.02 * low
     # every tangent, wherever it touches, is below every truth; every branch below those it holds
     for at in (whole.centre(len(candidates)), 0.9 * weights + 0.1 * whole.centre(len(candidates))):

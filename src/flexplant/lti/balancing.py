@@ -255,6 +255,12 @@ def hankel_norm(sys: System) -> float:
     ------
     ModelError
         When `sys` is no system.
+
+    Examples
+    --------
+    >>> from flexplant.lti import StateSpace
+    >>> print(f"{hankel_norm(StateSpace([[-1.0]], [[2.0]], [[3.0]], [[0.0]])):.3f}")
+    3.000
     """
     g = as_statespace(sys)
     if obstacle(g) is not None:

@@ -215,6 +215,13 @@ def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     ------
     ModelError
         As for `lowpass`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> high = fx.lti.highpass(10.0)
+    >>> round(abs(high(2j * np.pi * 10.0)), 4), round(abs(high(0.0)), 4)
+    (0.7071, 0.0)
     """
     return _butterworth(freq, order, number(gain, "gain"), 0.0)
 

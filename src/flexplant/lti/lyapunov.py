@@ -174,6 +174,12 @@ def observability_gramian(sys: System) -> FloatArray:
     ------
     SolverError
         When the system is not strictly stable.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.lti.observability_gramian(fx.lti.tf([1.0], [1.0, 1.0])).round(9)
+    array([[0.5]])
     """
     g = as_statespace(sys)
     return _gramian(g, g.A.T, g.C.T)

@@ -218,6 +218,12 @@ def control_care(
     ------
     ShapeError, ModelError, SolverError
         As `solve_dare`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.lti.control_care([[0.0]], [[1.0]], Q=[[4.0]], R=[[1.0]]).P.round(9)
+    array([[2.]])
     """
     return _dual(solve_care, A, B, Q=Q, R=R, S=S)
 

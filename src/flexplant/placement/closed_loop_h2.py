@@ -157,7 +157,8 @@ class PoiLqr(MotionAndEffort):
             B, own = pushed_columns(plant, candidates), plant.system.A[:n, :n]
             late = StateSpace(own, B, rows, np.zeros((len(rows), B.shape[1])), dt=plant.dt)
         # states that a part of a sample adds, a row for each candidate
-        held = np.arange(n, late.n_states).reshape(len(candidates), -1)
+        each = (late.n_states - n) // max(len(candidates), 1)
+        held = np.arange(n, late.n_states).reshape(len(candidates), each)
         S = np.zeros((noise.shape[1], late.n_states))
         S[:, :n] = noise.T
         H, items = late.C.T @ late.C, late.B.T / self.effort
