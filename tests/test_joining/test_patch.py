@@ -86,3 +86,17 @@ def test_the_mean_of_rigid_motion_is_that_motion():
         fx.Patch("bar")
     with pytest.raises(ModelError, match="must be positive"):
         fx.Patch("bar", [1, 2], weights=[1.0, 0.0])
+
+
+def test_a_component_of_rigid_body_modes_alone_has_no_compliance():
+    """All elastic modes truncated: the bounds of its patch are not known, the machine is."""
+    size, steel = (0.2, 0.2), {"density": 7800.0, "youngs_modulus": 2.1e11, "poisson_ratio": 0.3}
+    plate = fx.kirchhoff_plate(size=size, thickness=0.01, elements=(2, 2), **steel)
+    rigid = fx.reduce(fx.solve_modes(plate, count=3), fx.reduction.ModalTruncation(3))
+    foot = fx.Patch("lower", box=[(0.0, 0.0, 0.0), (*size, 0.0)])
+    with pytest.warns(fx.errors.FlexplantWarning, match="no static shape"):
+        machine = fx.joined(
+            {"lower": rigid, "upper": plate}, fx.Joint(foot, "upper/5:z", stiffness=1e6)
+        )
+    assert np.isnan(list(machine.joining.patches.values())).all()
+    assert machine.joining.mass == pytest.approx(2 * plate.mass, rel=1e-9)

@@ -455,7 +455,7 @@ def patch_errors(links: Sequence[Link], parts: Sequence[Component]) -> dict[str,
     rigid motions of the patch and W the mean, ``W A = I``: a load on the mean motion meets
     ``W C W^T``, on a patch that stays rigid ``(A^T C^-1 A)^-1``, which is less (Gauss and Markov).
     What is returned is the largest of 1 - rigid / mean over the axes joined; NaN for a patch of
-    more than 1000 displacements, or of an unstable component.
+    more than 1000 displacements, or of a component that is unstable or has no elastic modes.
     """
     found: dict[str, float] = {}
     joints = list({id(link.joint): link.joint for link in links}.values())
@@ -477,9 +477,11 @@ def compliances(
     """Return the elastic compliance (k,) along axes: of the mean motion, and of a rigid patch."""
     rows, point = patch.rows(part.dofs), patch.point(part.dofs)
     W, A, _ = patch.mean(part.dofs, point)
-    if rows.size > _MOST or part.model.n_unstable:
+    model = part.model
+    # a component of rigid-body modes alone (all others truncated) has no elastic compliance
+    if rows.size > _MOST or model.n_unstable or model.rigid_body.shape[1] == model.K.shape[0]:
         return np.full(len(axes), np.nan), np.full(len(axes), np.nan)
-    model, loads = part.model, dense(part.T[rows].T)
+    loads = dense(part.T[rows].T)
     C = loads.T @ static_response(model, loads)
     C = 0.5 * (C + C.T)
     W, A = W[list(axes)], A[:, list(axes)]

@@ -371,7 +371,7 @@ class _Filters:
         return next(MovingPlant(self.plant, standing).each(1))
 
     def steady(self, values: Mapping[str, FloatArray] | None = None) -> FloatArray:
-        """Return the covariance of the steady filter, where the trajectory begins if not told."""
+        """Return the covariance of the steady filter, by default where the trajectory begins."""
         sample = self._sample(self.machine.path.at(np.zeros(1)) if values is None else values)
         return solve_dare(sample.A, sample.C[self.y], Q=sample.G @ sample.G.T, R=self.R).P
 
