@@ -22,12 +22,7 @@ from typing import Any
 import numpy as np
 
 import flexplant as fx
-from flexplant.synthesis import (
-    reduce_controller,
-    robust_stability,
-    worst_case_gain,
-    write_c,
-)
+from flexplant.synthesis import reduce_controller, robust_stability, worst_case_gain, write_c
 from wafer_stage import RATE, models, ports
 
 OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook

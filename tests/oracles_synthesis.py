@@ -27,10 +27,7 @@ def closed_loop(p, AK, BK, CK, DK):
     # [I, -DK; -D22, I] [u; y] = [0, CK, 0; C2, 0, D21] [x; xk; w]
     left = np.block([[np.eye(nu), -DK], [-p["D22"], np.eye(ny)]])
     right = np.block(
-        [
-            [np.zeros((nu, n)), CK, np.zeros((nu, nw))],
-            [p["C2"], np.zeros((ny, k)), p["D21"]],
-        ]
+        [[np.zeros((nu, n)), CK, np.zeros((nu, nw))], [p["C2"], np.zeros((ny, k)), p["D21"]]]
     )
     uy = np.linalg.solve(left, right)
     u, y = uy[:nu], uy[nu:]

@@ -9,13 +9,7 @@ from flexplant.modes import solve_modes
 from flexplant.reduction import DesiredDofs, reduce, select_dofs
 from flexplant.sparse.factor import dense
 from flexplant.structure import ModalDamping, kirchhoff_plate
-from flexplant.updating import (
-    AddedMass,
-    Eigenvalues,
-    FrfResidual,
-    MatrixParameter,
-    ModeShapes,
-)
+from flexplant.updating import AddedMass, Eigenvalues, FrfResidual, MatrixParameter, ModeShapes
 
 SIZE, ELEMENTS, ZETA = (0.5, 0.36), (6, 5), 0.008
 #: kg, kg, E of the left part, E of all, damping of all

@@ -12,11 +12,7 @@ from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.labels import DIRECTIONS, DofSet, Interpolation
 from flexplant.store import load
 
-DOFS = DofSet(
-    [7, 7, 3, 3],
-    ["z", "rx", "z", "rx"],
-    [[0, 0, 0], [0, 0, 0], [1, 2, 0], [1, 2, 0]],
-)
+DOFS = DofSet([7, 7, 3, 3], ["z", "rx", "z", "rx"], [[0, 0, 0], [0, 0, 0], [1, 2, 0], [1, 2, 0]])
 
 
 @st.composite

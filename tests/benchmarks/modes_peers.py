@@ -77,10 +77,7 @@ def default(A):
 def superlu(A):
     """SuperLU in symmetric mode."""
     return spla.splu(
-        A,
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
+        A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     ).solve
 
 

@@ -174,9 +174,7 @@ def simulated():
     times, twin = g.dt * np.arange(count), g.to_control()
     options = {"duration": count * g.dt, "reference": 1e-6, "noise": False}
     ours, peer, *spent = race(
-        lambda: fx.simulate(loop, **options),
-        lambda: control.forced_response(twin, times, given),
-        2,
+        lambda: fx.simulate(loop, **options), lambda: control.forced_response(twin, times, given), 2
     )
     shown = ours.names.index("die:z")
     near(ours.data[shown], peer.outputs[shown], 1e-8)

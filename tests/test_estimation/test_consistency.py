@@ -169,12 +169,7 @@ def test_a_folded_mode_beside_a_kept_one_is_named():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("mode", "kind", "amount"),
-    [
-        (7, "freq", 0.04),
-        (4, "damping", -0.8),
-        (11, "freq", 0.05),
-    ],
+    ("mode", "kind", "amount"), [(7, "freq", 0.04), (4, "damping", -0.8), (11, "freq", 0.05)]
 )
 def test_a_changed_mode_is_no_other_mode(mode, kind, amount):
     moved = with_changes(plant(count=12), [(Delta("change", mode, kind, 1.0), amount)])

@@ -10,13 +10,7 @@ from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation import check_bias, design_kalman
 from flexplant.estimation.filter_model import filter_model
 from flexplant.loop import close_loop
-from flexplant.plant import (
-    Disturbance,
-    RandomWalk,
-    RigidForce,
-    Sensor,
-    assemble_plant,
-)
+from flexplant.plant import Disturbance, RandomWalk, RigidForce, Sensor, assemble_plant
 from flexplant.simulation import simulate
 from flexplant.synthesis import design_servo
 from oracles_estimation import correlated_covariance

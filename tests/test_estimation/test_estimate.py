@@ -186,10 +186,7 @@ def test_the_stationary_filter_in_blocks_is_the_plain_loop():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "method",
-    [Filter(), FixedLag(60), Predictor(), FixedLag(7), Smoother()],
-)
+@pytest.mark.parametrize("method", [Filter(), FixedLag(60), Predictor(), FixedLag(7), Smoother()])
 def test_blocks_and_the_time_varying_filter_agree_around_gaps(method, monkeypatch):
     kalman = observer()
     model = kalman.model

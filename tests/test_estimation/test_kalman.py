@@ -99,11 +99,7 @@ PLANTS = {
     "0.1 %, loud forces": lambda: plate_plant(1e-3, asd=0.1, sensor_asd=1e-12),
     "fractional delay": lambda: plate_plant(1e-3, delay=1.6),
     "velocity too": lambda: plate_plant(
-        1e-3,
-        y=[
-            *ports().y,
-            Sensor("v", at=(0.3, 0.3, 0), quantity="velocity", asd=1e-8),
-        ],
+        1e-3, y=[*ports().y, Sensor("v", at=(0.3, 0.3, 0), quantity="velocity", asd=1e-8)]
     ),
     "by hand": stage,
 }

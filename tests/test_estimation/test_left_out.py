@@ -5,12 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from flexplant.errors import (
-    AssumptionError,
-    FlexplantWarning,
-    LabelError,
-    ModelError,
-)
+from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError
 from flexplant.estimation import design_kalman, design_static
 from flexplant.estimation.error import error_variances
 from flexplant.estimation.left_out import left_out

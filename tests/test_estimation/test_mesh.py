@@ -11,14 +11,7 @@ from flexplant.estimation.left_out import nodes_per_wavelength
 from flexplant.modes import solve_modes
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
 from flexplant.reduction import ModalTruncation, reduce
-from flexplant.structure import (
-    FEModel,
-    ModalDamping,
-    Rectangle,
-    beam,
-    kirchhoff_plate,
-    solid_block,
-)
+from flexplant.structure import FEModel, ModalDamping, Rectangle, beam, kirchhoff_plate, solid_block
 
 WIDE, DEEP = 0.5, 0.3
 CORNERS = [(x, y, 0.0) for y in (0.0, DEEP) for x in (0.0, WIDE)]

@@ -114,10 +114,7 @@ def chain_record(count, rate, seed, duration=4.0):
     masses = chain(masses=[1.0] * count, stiffnesses=[4e5] * (count - 1))
     every = solve_modes(masses, count=count, damping=ModalDamping(0.01))
     own = three_masses().assembled.ports
-    sensors = [
-        Sensor("y1", at="1:x", asd=1e-12),
-        Sensor("y2", at=f"{count}:x", asd=3e-12),
-    ]
+    sensors = [Sensor("y1", at="1:x", asd=1e-12), Sensor("y2", at=f"{count}:x", asd=3e-12)]
     truth = assemble_plant(every, own.replace(y=sensors)).discretized(rate, delay=1)
     observer = design_kalman(truth, larger=truth)
     servo = design_servo(truth, bandwidth=20.0, observer=observer)
@@ -127,8 +124,7 @@ def chain_record(count, rate, seed, duration=4.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("count", "kept", "rate", "kind"),
-    [(5, 3, 2e3, "modes"), (8, 4, 1e4, "plant")],
+    ("count", "kept", "rate", "kind"), [(5, 3, 2e3, "modes"), (8, 4, 1e4, "plant")]
 )
 def test_modes_left_out_are_no_noise_of_the_sensors(count, kept, rate, kind):
     """Given the true densities: without larger= sensors would be 100 times noisier, +- 0.3 %."""

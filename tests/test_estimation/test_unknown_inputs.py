@@ -8,11 +8,7 @@ import scipy.linalg as la
 from test_kalman import CORNERS, INSET, modes, plate_plant
 
 from flexplant.errors import AssumptionError, LabelError, ModelError
-from flexplant.estimation import (
-    Augmented,
-    design_input_estimator,
-    invertibility,
-)
+from flexplant.estimation import Augmented, design_input_estimator, invertibility
 from flexplant.lti import StateSpace
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, StandardPlant, assemble_plant
 from oracles_estimation import unbiased_direct, unbiased_late

@@ -151,11 +151,7 @@ def test_refusals_of_units(tmp_path):
         (ModelError, r"\.fmu", lambda: fx.io.write_fmu(plant, tmp_path / "a.zip")),
         (ModelError, "version", lambda: fx.io.write_fmu(plant, tmp_path / "a.fmu", version="1")),
         (LabelError, "C allows", lambda: fx.io.write_fmu(plant, tmp_path / "1a.fmu")),
-        (
-            ModelError,
-            "continuous",
-            lambda: fx.io.write_fmu(plant.continuous, tmp_path / "a.fmu"),
-        ),
+        (ModelError, "continuous", lambda: fx.io.write_fmu(plant.continuous, tmp_path / "a.fmu")),
     ):
         with pytest.raises(error, match=cause):
             call()

@@ -330,8 +330,7 @@ def test_a_reduced_machine_is_a_model_like_any():
     assert fit.model.joining is None  # its checks are of the machine before
     wafer = fx.chain(masses=[1.0, 0.5], stiffnesses=[1e7]).with_damping(fx.Rayleigh(0.0, 1e-6))
     outer = fx.joined(
-        {"machine": machine, "wafer": wafer},
-        placed={"wafer": fx.Pose(rotation=(0, np.pi / 2, 0))},
+        {"machine": machine, "wafer": wafer}, placed={"wafer": fx.Pose(rotation=(0, np.pi / 2, 0))}
     )
     assert dict(outer.joining.pieces) == {"machine": 4, "wafer": 1}
     assert "machine/left/1:z" in outer.full_dofs

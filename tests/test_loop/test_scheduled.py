@@ -54,10 +54,7 @@ def test_runs_and_predictions_of_a_machine_that_stands(schedule):
     x = 0.033
     still, moving = schedule.at(x), {"x": np.full(200, x)}
     options = {"duration": 0.02, "reference": 1e-6, "noise": False}
-    run, wanted = (
-        fx.simulate(schedule, moving=moving, **options),
-        fx.simulate(still, **options),
-    )
+    run, wanted = (fx.simulate(schedule, moving=moving, **options), fx.simulate(still, **options))
     np.testing.assert_allclose(run["die:z"], wanted["die:z"], atol=1e-9 * 1e-6)
     found = fx.simulation.rms_along(schedule, moving={"x": np.full(20, x)}, duration=2e-3)
     np.testing.assert_allclose(found["die:error"], still.budget("die:error").rms, rtol=1e-6)

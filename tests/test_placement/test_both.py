@@ -75,10 +75,7 @@ def test_the_cost_is_the_h2_norm_of_the_best_controller(make):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "delay",
-    [0.0, 1.0, 2.0],
-)
+@pytest.mark.parametrize("delay", [0.0, 1.0, 2.0])
 def test_pairs_equal_every_pair_and_the_bound_bounds(make, delay):
     plant, sensors, actuators = make(44, count=6, delay=delay)
     every = place_both(plant, sensors, actuators, (3, 3), COST, method=Exhaustive())

@@ -46,10 +46,7 @@ CASES = {
         Excluded([Disc((0.5, 0.35), 0.1), Rectangle((-0.1, -0.1), (0.1, 0.1))]),
         lambda s: not s & {0, 11},
     ),
-    "off the die": (
-        OffPoi(0.16),
-        lambda s: all(np.hypot(*(XY[i] - (0.2, 0.0))) > 0.16 for i in s),
-    ),
+    "off the die": (OffPoi(0.16), lambda s: all(np.hypot(*(XY[i] - (0.2, 0.0))) > 0.16 for i in s)),
     "within": (Within(Rectangle((-1, -1), (0.45, 1))), lambda s: not s & {9, 10, 11}),
     "few in a zone": (
         Within([Disc((0, 0), 0.01), Disc((0.5, 0), 0.01)], at_most=1, at_least=1),

@@ -8,13 +8,7 @@ from multiprocessing import get_context
 import numpy as np
 import pytest
 
-from flexplant.errors import (
-    AssumptionError,
-    CertificateError,
-    LabelError,
-    ModelError,
-    SolverError,
-)
+from flexplant.errors import AssumptionError, CertificateError, LabelError, ModelError, SolverError
 from flexplant.lti import lowpass
 from flexplant.placement import PoiLqr, PoiVariance, convex, score_actuators, score_sensors
 from flexplant.placement.convex import Quadratic

@@ -25,8 +25,7 @@ def heavy():
 def one(at, *, direction="z", model=None, freq=FREQ, quantity="displacement", push=INSET[0]):
     """The FRF from a force at the first inset to one sensor."""
     channels = Ports(
-        u=[Actuator("u", at=push)],
-        y=[Sensor("y", at=at, direction=direction, quantity=quantity)],
+        u=[Actuator("u", at=push)], y=[Sensor("y", at=at, direction=direction, quantity=quantity)]
     )
     plant = assemble_plant(model or heavy(), channels)
     return frequency_response(plant.Gyu, freq)["y", "u"]

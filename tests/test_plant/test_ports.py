@@ -167,14 +167,8 @@ def test_names_of_derived_channels_are_reserved(kind, ending):
         (lambda: Actuator("u", at=P, direction=2), "no direction of 'u' 2"),
         (lambda: Sensor("y", at=P, direction=["z"]), "no direction of 'y'"),
         (lambda: Poi("p", at=P, axes=3), r"axes of POI 'p' are chosen by name, got 3"),
-        (
-            lambda: Reference(Poi("p", at=P)),
-            r"of type str, got Poi.*Reference\('die'\)",
-        ),
-        (
-            lambda: RigidForce("f", shape=RandomWalk(1.0)),
-            r"is a filter, got RandomWalk, wh",
-        ),
+        (lambda: Reference(Poi("p", at=P)), r"of type str, got Poi.*Reference\('die'\)"),
+        (lambda: RigidForce("f", shape=RandomWalk(1.0)), r"is a filter, got RandomWalk, wh"),
         (lambda: Ports(u=5), r"Ports.u must be a sequence of Actuators, got 5.*u=\["),
         (lambda: Ports(u=[Sensor("y", at=P)]), r"got Sensor. It belongs in y"),
         (lambda: Sensor("y", at=P, asd=True), "asd of 'y' must be one number"),

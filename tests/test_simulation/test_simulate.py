@@ -10,13 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import oracles_loop as oracle
-from flexplant.errors import (
-    AssumptionError,
-    FlexplantWarning,
-    LabelError,
-    ModelError,
-    ShapeError,
-)
+from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.loop import close_loop
 from flexplant.lti import StateSpace
 from flexplant.plant import Foreign, StandardPlant, Weighted

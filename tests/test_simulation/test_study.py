@@ -15,13 +15,7 @@ import numpy as np
 import pytest
 
 import flexplant as fx
-from flexplant.errors import (
-    FlexplantError,
-    FlexplantWarning,
-    LabelError,
-    ModelError,
-    SolverError,
-)
+from flexplant.errors import FlexplantError, FlexplantWarning, LabelError, ModelError, SolverError
 from flexplant.simulation import StudyTable, study
 from flexplant.store import load
 

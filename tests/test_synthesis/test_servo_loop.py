@@ -210,9 +210,7 @@ def test_refusals():
     plant, static, kalman = updated()
     with pytest.raises(LabelError, match="the servo acts on die:ry:hat too"):
         design_servo(
-            plant,
-            bandwidth=50.0,
-            observer=static.system.select(outputs=["die:hat", "die:rx:hat"]),
+            plant, bandwidth=50.0, observer=static.system.select(outputs=["die:hat", "die:rx:hat"])
         )
     other = kalman.system.renamed(inputs={"y1": "q1"})
     with pytest.raises(LabelError, match="reads q1"):

@@ -297,9 +297,7 @@ def test_frequencies_are_uncertain_by_what_was_not_explained():
     """Measured modes by their deviation, others by the misfit of those measured and by the mesh."""
     model = drawing()
     fit = fx.update(
-        model,
-        [fx.MatrixParameter("E", dK=model.K)],
-        [fx.Eigenvalues(machine().poles([4, 6, 7]))],
+        model, [fx.MatrixParameter("E", dK=model.K)], [fx.Eigenvalues(machine().poles([4, 6, 7]))]
     )
     poles = machine().poles([4, 6, 7, 9, 13])
     wide = poles.replace(covariance=np.diag((0.002 * np.abs(np.r_[poles.poles, poles.poles])) ** 2))

@@ -8,13 +8,7 @@ from scipy import stats
 from flexplant.errors import FlexplantWarning, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
 from flexplant.structure import PointMass, kirchhoff_plate
-from flexplant.updating import (
-    AddedMass,
-    Eigenvalues,
-    MatrixParameter,
-    changed_model,
-    update,
-)
+from flexplant.updating import AddedMass, Eigenvalues, MatrixParameter, changed_model, update
 from other_plate import TRUTH, OtherPlate
 
 

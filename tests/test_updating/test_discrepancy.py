@@ -53,9 +53,7 @@ def measured(individual, modes=KNOWN):
     rng = np.random.default_rng([individual, 5])
     noise = rng.normal(size=(2, poles.size)) * std
     return fx.MeasuredModes(
-        poles + noise[0] + 1j * noise[1],
-        modes=modes,
-        covariance=np.diag(np.r_[std, std] ** 2),
+        poles + noise[0] + 1j * noise[1], modes=modes, covariance=np.diag(np.r_[std, std] ** 2)
     )
 
 
@@ -76,10 +74,7 @@ def test_variances_are_those_of_balanced_groups():
     r = np.r_[0.3 + 0.02 * rng.normal(size=400), -0.1 + 0.5 * rng.normal(size=300)]
     J = np.zeros((700, 2))
     J[:400, 0] = J[400:, 1] = 1.0
-    kinds = [
-        Kind("a", np.eye(700)[:, :400], 0.01),
-        Kind("b", np.eye(700)[:, 400:], 0.3),
-    ]
+    kinds = [Kind("a", np.eye(700)[:, :400], 0.01), Kind("b", np.eye(700)[:, 400:], 0.3)]
     found, V = restricted(r, J, 1e-4**2 * np.eye(700), kinds)
     for one, part, usual in zip(found, (r[:400], r[400:]), (0.01, 0.3), strict=True):
         n = part.size

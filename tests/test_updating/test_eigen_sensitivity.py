@@ -9,12 +9,7 @@ import oracles_updating as oracle
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.labels import DofSet
 from flexplant.structure import FEModel
-from flexplant.updating import (
-    AddedDamping,
-    AddedMass,
-    AddedStiffness,
-    eigenvalue_sensitivities,
-)
+from flexplant.updating import AddedDamping, AddedMass, AddedStiffness, eigenvalue_sensitivities
 
 KINDS = [AddedMass, AddedDamping, AddedStiffness]
 

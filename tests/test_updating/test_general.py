@@ -143,11 +143,7 @@ def test_stiffness_between_dofs_and_matrix_and_mode_parameters(chain):
     force = chain.M @ phi[:, 1]
     D = chain.D + 2 * 0.01 * omega[1] * np.outer(force, force)
     parts = (np.array(chain.M), D, K + 12.0 * spring + 0.1 * K)
-    parameters = [
-        AddedStiffness("2:z", to="3:z"),
-        MatrixParameter("all", dK=K),
-        ModeDamping(2),
-    ]
+    parameters = [AddedStiffness("2:z", to="3:z"), MatrixParameter("all", dK=K), ModeDamping(2)]
     fit = update(chain, parameters, [Eigenvalues(measured(parts))])
     np.testing.assert_allclose(fit.values, [12.0, 0.1, 0.01], rtol=1e-6)
     assert parameters[0].name == "stiffness at 2:z to 3:z"

@@ -172,10 +172,7 @@ def changed_plate(plate, zeta, mass, stiffer):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("zeta", "mass", "stiffer"),
-    [(0.01, 0.7, -0.09), (0.002, 0.6, 0.05)],
-)
+@pytest.mark.parametrize(("zeta", "mass", "stiffer"), [(0.01, 0.7, -0.09), (0.002, 0.6, 0.05)])
 def test_responses_are_fitted_from_far_away(plate, zeta, mass, stiffer):
     """Peaks far from those of the model: by magnitude first it is found, at once it is not."""
     M, D, K = changed_plate(plate, zeta, mass, stiffer)
@@ -191,11 +188,7 @@ def test_responses_are_fitted_from_far_away(plate, zeta, mass, stiffer):
     H = H + std * (rng.normal(size=H.shape) + 1j * rng.normal(size=H.shape)) / np.sqrt(2)
     names = [plate.model.dofs.nearest((*xy, 0.0), "z") for xy in corners]
     data = FrfResidual(Frf(freq, H, inputs=names[:1], outputs=names[1:]), variance=std**2)
-    unknowns = [
-        AddedMass(plate.z8),
-        AddedDamping(plate.z8),
-        MatrixParameter("E", dK=plate.model.K),
-    ]
+    unknowns = [AddedMass(plate.z8), AddedDamping(plate.z8), MatrixParameter("E", dK=plate.model.K)]
     rom = plate.reduced(zeta, True)
     with warnings.catch_warnings():
         # what truncation leaves is more than this noise

@@ -128,11 +128,7 @@ def test_other_starts_are_tried_where_the_first_explains_nothing(plate):
     H, variance = responses(M, D, (1 + stiffer) * K, freq, rows[1:], rows[0], rng)
     names = [plate.model.dofs.nearest((*xy, 0.0), "z") for xy in corners]
     frf = Frf(freq, H, inputs=names[:1], outputs=names[1:], variance=variance)
-    unknown = [
-        AddedMass(plate.z8),
-        AddedDamping(plate.z8),
-        MatrixParameter("E", dK=plate.model.K),
-    ]
+    unknown = [AddedMass(plate.z8), AddedDamping(plate.z8), MatrixParameter("E", dK=plate.model.K)]
     fit = update(plate.reduced(zeta, True), unknown, [FrfResidual(frf)])
     assert fit.p_value > 1e-3
     np.testing.assert_allclose(fit.values[[0, 2]], [mass, stiffer], rtol=0.01)

@@ -379,12 +379,7 @@ def test_a_fit_that_no_physical_step_improves_raises(make, as_reduced):
 @pytest.mark.slow
 def test_start_at_the_answer_takes_no_step(plate):
     fit = fitted(plate, plate.reduced(0.01, True), oracle.truth(0.01))
-    again = fitted(
-        plate,
-        plate.reduced(0.01, True),
-        fit.history.eigenvalues[-1],
-        start=fit.values,
-    )
+    again = fitted(plate, plate.reduced(0.01, True), fit.history.eigenvalues[-1], start=fit.values)
     assert len(again.history) == 0
     assert again.converged
     assert np.array_equal(again.values, fit.values)

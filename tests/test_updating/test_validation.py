@@ -8,14 +8,7 @@ import oracles_updating as oracle
 from flexplant.errors import FlexplantWarning, ModelError
 from flexplant.identification import MeasuredModes
 from flexplant.lti import Frf
-from flexplant.updating import (
-    AddedDamping,
-    AddedMass,
-    Eigenvalues,
-    FrfResidual,
-    split,
-    validate,
-)
+from flexplant.updating import AddedDamping, AddedMass, Eigenvalues, FrfResidual, split, validate
 
 LINKS = [(0, None, 90), (0, 1, 110), (1, 2, 70), (2, 3, 130), (3, 4, 90), (4, 5, 70), (5, None, 60)]
 

@@ -30,13 +30,7 @@ from ..parallel import one_thread
 from .estimator_channels import ChannelError, estimates, recorded
 from .filter_model import FEW_DIGITS, FilterModel, Sight, Steady, innovation_root
 from .lag_report import Filter, FixedLag, Lag, Predictor, Smoother
-from .passage import (
-    SETTLED,
-    Moment,
-    Start,
-    Walk,
-    stationary_start,
-)
+from .passage import SETTLED, Moment, Start, Walk, stationary_start
 
 #: part of a sensor's samples above which those beyond a gate are no outliers
 _MOST = 0.1
@@ -417,12 +411,7 @@ def _information(steady: Steady, lag: int) -> FloatArray:
 
 
 def _smooth_transient(
-    passage: Walk,
-    sight: Sight,
-    ks: IntArray,
-    lag: int,
-    hat: FloatArray,
-    variance: FloatArray,
+    passage: Walk, sight: Sight, ks: IntArray, lag: int, hat: FloatArray, variance: FloatArray
 ) -> None:
     """Fill samples from which the gain is not stationary all through the lag."""
     steady, N = passage.steady, passage.hat.shape[0]

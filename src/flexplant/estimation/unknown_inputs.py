@@ -89,9 +89,7 @@ class Augmented(Value):
 
 @one_thread()
 def design_input_estimator(
-    plant: StandardPlant | System,
-    inputs: Sequence[str],
-    method: Unbiased | Augmented = Unbiased(),
+    plant: StandardPlant | System, inputs: Sequence[str], method: Unbiased | Augmented = Unbiased()
 ) -> InputEstimator:
     """Return a filter of the POIs that also estimates disturbances held over each sample.
 

@@ -12,13 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray, instance, mapping
-from ..errors import (
-    FlexplantError,
-    LabelError,
-    ModelError,
-    ShapeError,
-    require_known,
-)
+from ..errors import FlexplantError, LabelError, ModelError, ShapeError, require_known
 from ..lti.frequency import Frf
 from ..store import written
 from .files import decimal, file_path, parsing, refused, text_of

@@ -25,14 +25,7 @@ from ..tolerances import TINY, divisor
 from .component import Component, JoinedShape, Model, Pose, components_of
 from .frf_coupling import joined_frfs
 from .joint import Joint, Patch, split_end
-from .links import (
-    Link,
-    eliminated,
-    links_of,
-    machine_size,
-    stretch_rows,
-    warn_of_missing_statics,
-)
+from .links import Link, eliminated, links_of, machine_size, stretch_rows, warn_of_missing_statics
 
 #: more coordinates of a machine with reduced components would not fit the memory comfortably
 _LARGEST = 5000

@@ -47,10 +47,7 @@ def driving_blocks(
         still = StateSpace([], [], [], np.zeros((len(silent), 0)), plant.dt, outputs=silent)
         systems = [*systems, still]
     return connect(
-        systems,
-        inputs=[*plant.y, *outer.values()],
-        outputs=[*driven, *watched],
-        adding=driven,
+        systems, inputs=[*plant.y, *outer.values()], outputs=[*driven, *watched], adding=driven
     )
 
 

@@ -22,11 +22,7 @@ _SAME = 1e-12
 
 
 def discretized(
-    sys: System,
-    rate: float,
-    *,
-    delay: float = 0.0,
-    delayed: Iterable[str] | None = None,
+    sys: System, rate: float, *, delay: float = 0.0, delayed: Iterable[str] | None = None
 ) -> StateSpace:
     """Return the zero-order-hold equivalent at a rate, with the inputs delayed.
 

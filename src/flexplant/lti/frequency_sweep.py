@@ -121,10 +121,7 @@ def _halve_intervals(
         fresh = grid.size + np.arange(worst.size)
         grid = np.concatenate([grid, middle[worst]])
         values = np.concatenate([values, there[:, worst]], axis=1)
-        left, right = (
-            np.concatenate([left[worst], fresh]),
-            np.concatenate([fresh, right[worst]]),
-        )
+        left, right = (np.concatenate([left[worst], fresh]), np.concatenate([fresh, right[worst]]))
     return np.sort(grid)
 
 

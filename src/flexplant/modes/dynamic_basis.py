@@ -471,10 +471,7 @@ _DEPTH = 0.5
 _MOST = 40
 
 
-def dips(
-    find: Callable[[FloatArray], ComplexArray],
-    grid: FloatArray,
-) -> FloatArray:
+def dips(find: Callable[[FloatArray], ComplexArray], grid: FloatArray) -> FloatArray:
     """Return the antiresonances [Hz] of responses: deep local minima of the size of a channel."""
     size = np.abs(find(grid)).reshape(grid.size, -1)
     place, channel = np.nonzero((size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:]))

@@ -419,11 +419,7 @@ def wider(count: int, top: float, n: int) -> tuple[int, float]:
 
 
 def damped_modes(
-    model: FEModel,
-    phi: FloatArray,
-    count: int,
-    top: float,
-    method: Pardiso | Cholmod | None,
+    model: FEModel, phi: FloatArray, count: int, top: float, method: Pardiso | Cholmod | None
 ) -> Modes:
     """Return the complex modes of a large model, by a basis that grows until they are right.
 

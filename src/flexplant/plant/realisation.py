@@ -297,11 +297,7 @@ def _complex(
 
 
 def _with_two_shapes(
-    found: ModalRealisation,
-    omega: FloatArray,
-    zeta: FloatArray,
-    phi: ComplexArray,
-    unstable: slice,
+    found: ModalRealisation, omega: FloatArray, zeta: FloatArray, phi: ComplexArray, unstable: slice
 ) -> ModalRealisation:
     """Return a realisation whose unstable blocks have a shape for each of their poles.
 

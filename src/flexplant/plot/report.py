@@ -16,14 +16,7 @@ from ..checks import Value, short, with_unit
 from ..errors import FlexplantError, ModelError, counted
 from ..estimation import LagReport, consistency
 from ..identification import StabilisationDiagram
-from ..loop import (
-    ClosedLoop,
-    ErrorBudget,
-    LoopComparison,
-    LoopFigures,
-    compare_loops,
-    report_loops,
-)
+from ..loop import ClosedLoop, ErrorBudget, LoopComparison, LoopFigures, compare_loops, report_loops
 from ..loop.blocks import references
 from ..loop.report import axis_sensitivities, error_sensitivity
 from ..lti.frequency import Frf, frequency_response

@@ -435,11 +435,7 @@ def _postorder_key(names: IntArray) -> FloatArray:
 
 
 def _structures(
-    graph: sp.csr_array,
-    sequence: IntArray,
-    position: IntArray,
-    starts: IntArray,
-    parent: IntArray,
+    graph: sp.csr_array, sequence: IntArray, position: IntArray, starts: IntArray, parent: IntArray
 ) -> Sequence[IntArray]:
     """Return for each part the positions of the later nodes that it and its children touch."""
     ordered: Any = graph[sequence]

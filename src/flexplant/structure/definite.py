@@ -290,9 +290,7 @@ def elastic_modes(
     # the lowest few alone are faster; divide and conquer gives all of them
     few = kept <= (n - r) // 4
     squares, vectors = la.eigh(
-        stiffness,
-        subset_by_index=(0, kept - 1) if few else None,
-        driver="evr" if few else "evd",
+        stiffness, subset_by_index=(0, kept - 1) if few else None, driver="evr" if few else "evd"
     )
     if squares.size > 1 and squares[0] < _DIRECT * largest:
         if few:  # all of them, for the space of the soft ones to be right

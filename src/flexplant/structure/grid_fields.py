@@ -155,11 +155,7 @@ def centres_of(lengths: Sequence[float], counts: Sequence[int]) -> FloatArray:
 
 
 def field_of(
-    value: Any,
-    name: str,
-    lengths: Sequence[float],
-    counts: Sequence[int],
-    present: Any = None,
+    value: Any, name: str, lengths: Sequence[float], counts: Sequence[int], present: Any = None
 ) -> Any:
     """Return one number, or an array (nz, ny, nx) of positive ones where elements are."""
     if callable(value):

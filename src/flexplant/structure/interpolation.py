@@ -230,11 +230,7 @@ class _Field:
             ) from error
 
     def _exact(
-        self,
-        weights: FloatArray,
-        chosen: IntArray,
-        at: FloatArray,
-        axis: int | None,
+        self, weights: FloatArray, chosen: IntArray, at: FloatArray, axis: int | None
     ) -> FloatArray:
         """Take rounding out: constant and linear fields (rigid-body motion) come out exactly."""
         linear = np.column_stack([np.ones(chosen.size), self.flat[chosen] / self.extent])

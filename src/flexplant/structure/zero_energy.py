@@ -87,12 +87,7 @@ def zero_energy(
 
 
 def _of_bodies(
-    K: Any,
-    M: Any,
-    motions: FloatArray,
-    several: list[IntArray],
-    rounding: float,
-    xyz: FloatArray,
+    K: Any, M: Any, motions: FloatArray, several: list[IntArray], rounding: float, xyz: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return orthonormal motions of all bodies: all of them, and those that nothing holds."""
     every: list[FloatArray] = []

@@ -9,16 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import (
-    ComplexArray,
-    FloatArray,
-    Value,
-    generator,
-    instance,
-    positive,
-    several,
-    whole,
-)
+from ..checks import ComplexArray, FloatArray, Value, generator, instance, positive, several, whole
 from ..errors import ModelError, unknown_label
 from ..estimation import design_static
 from ..identification import MeasuredModes

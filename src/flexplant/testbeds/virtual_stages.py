@@ -7,13 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import (
-    FloatArray,
-    positive,
-    real_array,
-    short,
-    whole,
-)
+from ..checks import FloatArray, positive, real_array, short, whole
 from ..errors import ModelError
 from ..modes import solve_modes
 from ..plant import (

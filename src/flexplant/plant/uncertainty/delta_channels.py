@@ -178,9 +178,7 @@ class _Part(NamedTuple):
     feed: FloatArray
 
 
-def _sampled_channels(
-    uncertain: UncertainPlant[Any],
-) -> tuple[StateSpace, list[tuple[str, int]]]:
+def _sampled_channels(uncertain: UncertainPlant[Any]) -> tuple[StateSpace, list[tuple[str, int]]]:
     """Return the bilinear image with channels, and the number of each Delta's."""
     rate = 1.0 / uncertain.plant.dt
     gains = [delta for delta in uncertain.deltas if delta.kind == "gain"]
