@@ -65,11 +65,9 @@ def explanation(
     error: Exception,
     caller: Mapping[str, Any],
 ) -> Exception | None:
-    """Return the error that names the argument at fault; None: the error says it itself.
-
-    Calls from within the package are noted for the outermost one: its arguments are the user's,
-    and come first.
-    """
+    """Return the error that names the argument at fault; None: the error says it itself."""
+    # calls from within the package are noted for the outermost one: its arguments are the user's,
+    # and come first
     if isinstance(error, FlexplantError):
         return None
     inner = vars(error).setdefault("calls_of_flexplant", [])

@@ -64,11 +64,9 @@ def real_array(
     limit: float = TOO_LARGE,
     copy: bool = True,
 ) -> FloatArray:
-    """Return `value` as a finite float64 array of the given shape (None: any length).
-
-    Records of a loop that diverges may be larger than the numbers that one calculates with. Not
-    copied, an array of float64 comes back itself: for values, whose own copies are read-only.
-    """
+    """Return `value` as a finite float64 array of the given shape (None: any length)."""
+    # records of a loop that diverges may be larger than the numbers that one calculates with. Not
+    # copied, an array of float64 comes back itself: for values, whose own copies are read-only
     array = floats(value, name, shape)
     if copy:
         array = np.array(array)
@@ -125,10 +123,8 @@ def complex_array(
 
 
 def floats(value: Any, name: str, shape: tuple[int | None, ...] | None = None) -> FloatArray:
-    """Return real numbers as float64, of any shape, finite or not; masked entries are NaN.
-
-    An array of float64 comes back itself, not a copy.
-    """
+    """Return real numbers as float64, of any shape, finite or not; masked entries are NaN."""
+    # an array of float64 comes back itself, not a copy
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     array = _array_of(value, name)
@@ -301,10 +297,8 @@ def one_of(value: Any, name: str, choices: Iterable[str]) -> str:
 
 
 def seed_sequence(rng: Any, name: str = "rng") -> np.random.SeedSequence:
-    """Return the SeedSequence that a seed, SeedSequence, Generator or None stands for.
-
-    A Generator is drawn from, so that two calls with the same one differ.
-    """
+    """Return the SeedSequence that a seed, SeedSequence, Generator or None stands for."""
+    # a Generator is drawn from, so that two calls with the same one differ
     if isinstance(rng, np.random.SeedSequence):
         return rng
     if isinstance(rng, np.random.Generator):

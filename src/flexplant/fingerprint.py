@@ -55,11 +55,9 @@ _PACKAGES = ("site-packages", "dist-packages")
 
 
 def fingerprint(items: Iterable[Any]) -> str:
-    """Return a digest of values by content and of functions by code.
-
-    Code is the bytecode of functions, with their closures, defaults and the global values that
-    they reach in modules of the user; functions and classes of installed packages count by name.
-    """
+    """Return a digest of values by content and of functions by code."""
+    # code is the bytecode of functions, with their closures, defaults and the global values that
+    # they reach in modules of the user; functions and classes of installed packages count by name
     reader = _Contents()
     try:
         parts = [reader.token(item, f"item {i}") for i, item in enumerate(items)]

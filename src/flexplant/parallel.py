@@ -55,11 +55,10 @@ _original: Any = None
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Return a context, also a decorator, in which BLAS runs on one thread.
-
-    For loops over small matrices: more threads wait for each other, 3 to 30 times as long on a busy
-    machine. Inside another one it costs nothing; the last of several threads restores what was.
-    """
+    """Return a context, also a decorator, in which BLAS runs on one thread."""
+    # for loops over small matrices: more threads wait for each other, 3 to 30 times as long on a
+    # busy machine. Inside another one it costs nothing; the last of several threads restores what
+    # was
     global _inside, _original
     if getattr(_depth, "value", 0):
         yield
@@ -212,13 +211,11 @@ def survived(
     executor: Executor,
     timeout: float | None = None,
 ) -> Iterator[tuple[int, Any]]:
-    """Yield numbers and results of ``function(*call)`` as they come.
-
-    When a process of a pool dies, the rest goes on in as many processes as the pool had, started
-    as its own were, one call at a time in each: the calls that were out are done once more, and
-    one whose process dies again yields `Lost`. With a timeout [s] this is so from the beginning,
-    and a process that takes longer is ended. What the function raises is raised.
-    """
+    """Yield numbers and results of ``function(*call)`` as they come."""
+    # when a process of a pool dies, the rest goes on in as many processes as the pool had, started
+    # as its own were, one call at a time in each: the calls that were out are done once more, and
+    # one whose process dies again yields `Lost`. With a timeout [s] this is so from the beginning,
+    # and a process that takes longer is ended. What the function raises is raised
     left, tried = dict(calls), set[int]()
     if timeout is None:
         for number, result in _pooled(function, left, executor, tried):
@@ -234,11 +231,9 @@ def _pooled(
     executor: Executor,
     lost: set[int],
 ) -> Iterator[tuple[int, Any]]:
-    """Yield what an executor finds; when it breaks, the calls that were out go to lost.
-
-    What a scheduler of dask had when it died comes back as cancelled, or not at all: all is sent
-    once more, and waits until the scheduler is back, as long as its client does.
-    """
+    """Yield what an executor finds; when it breaks, the calls that were out go to lost."""
+    # what a scheduler of dask had when it died comes back as cancelled, or not at all: all is sent
+    # once more, and waits until the scheduler is back, as long as its client does
     waiting = deque(calls)
     out: dict[Future[Any], int] = {}
     broken, again = False, set[int]()
@@ -287,10 +282,8 @@ def _single(
     tried: set[int],
     timeout: float,
 ) -> Iterator[tuple[int, Any]]:
-    """Yield what processes like those of a pool find, each of which has one call at a time.
-
-    The process that dies is that of the call to blame, and it can be ended without another.
-    """
+    """Yield what processes like those of a pool find, each of which has one call at a time."""
+    # the process that dies is that of the call to blame, and it can be ended without another
     waiting = list(calls)[::-1]
     first = next(iter(calls.values()))[0]  # a function that the calls have in common
     #: the process of each call that is out, its number (None while it starts), and its end [s]
@@ -356,10 +349,8 @@ def _single(
 
 
 def _one_like(executor: Executor) -> ProcessPoolExecutor:
-    """Return a pool of one process, which starts as those of an executor do.
-
-    The settings of a pool are not public; those that another kind of executor lacks are defaults.
-    """
+    """Return a pool of one process, which starts as those of an executor do."""
+    # the settings of a pool are not public; those that another kind of executor lacks are defaults
     if isinstance(executor, ThreadPoolExecutor):  # its threads could not start
         raise SolverError(
             "the executor is broken: its initializer failed. Mend that, or leave it out."
@@ -544,10 +535,8 @@ _LEAST = 1e-12
 
 
 def expect(multiplications: float = 0.0, *, seconds: float = 0.0) -> None:
-    """Say how long the outermost work under way takes in all, where that is long.
-
-    `multiplications` are those of products of matrices that take as long.
-    """
+    """Say how long the outermost work under way takes in all, where that is long."""
+    # `multiplications` are those of products of matrices that take as long
     bars = _open_bars()
     if bars:
         if multiplications * _LEAST > BAR_DELAY * 1e-2:
@@ -556,10 +545,8 @@ def expect(multiplications: float = 0.0, *, seconds: float = 0.0) -> None:
 
 
 def tick(description: str) -> None:
-    """Count an item of the innermost work, where that is its description.
-
-    For loops far below the function that shows the bar; without such a bar it does nothing.
-    """
+    """Count an item of the innermost work, where that is its description."""
+    # for loops far below the function that shows the bar; without such a bar it does nothing
     bars = _open_bars()
     if bars and bars[-1].description == description:
         bars[-1].advance()

@@ -28,10 +28,8 @@ _HEADER = "__flexplant__"
 
 
 def checked(check: Callable[..., Any], *, unit: str = "", **rules: Any) -> dict[str, Any]:
-    """Return the metadata of a field of a Value: ``check(value, name=..., **rules)`` returns it.
-
-    `name`, in messages, is the field's unless the rules have another; a default None passes.
-    """
+    """Return the metadata of a field of a Value: ``check(value, name=..., **rules)`` returns it."""
+    # `name`, in messages, is the field's unless the rules have another; a default None passes
     return {"check": (check, rules), "unit": unit}
 
 
@@ -378,10 +376,8 @@ _CELL = "padding:.1em .8em .1em 0;text-align:left;vertical-align:top;border:0;ba
 
 
 def as_html(text: str) -> str:
-    """Return the repr of a value as HTML: a heading, named entries as rows, the rest as it is.
-
-    Lines that are aligned by spaces, tables among them, keep their alignment.
-    """
+    """Return the repr of a value as HTML: a heading, named entries as rows, the rest as it is."""
+    # lines that are aligned by spaces, tables among them, keep their alignment
     first, *rest = text.split("\n")
     parts = []
     if first.startswith("<"):

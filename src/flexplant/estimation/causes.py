@@ -57,12 +57,10 @@ class Outliers(NamedTuple):
 def outliers(
     observer: KalmanEstimator, white: FloatArray, normal: FloatArray, alpha: float
 ) -> Outliers | None:
-    """Return single samples of sensors that are off, or None.
-
-    One is found by an innovation beyond what chance makes of Gaussian ones of their own size
-    (median); its effect on all later ones, the filter's response to one sample, is taken away
-    before the next is looked for. Many in a row are no outliers but a motion of the machine.
-    """
+    """Return single samples of sensors that are off, or None."""
+    # one is found by an innovation beyond what chance makes of Gaussian ones of their own size
+    # (median); its effect on all later ones, the filter's response to one sample, is taken away
+    # before the next is looked for. Many in a row are no outliers but a motion of the machine
     from scipy.stats import norm
 
     count = int(np.isfinite(normal).sum())
@@ -217,11 +215,9 @@ def peak_verdicts(
     whole: tuple[StandardPlant, IntArray] | None,
     before: Examined,
 ) -> list[LikelyCause]:
-    """Return the verdicts of peaks beyond the pooled `level` (m,); U (m, nu) are the commands.
-
-    `whole` is the larger plant with the numbers of the modes left out, where it is known. Of the
-    highest peak any cause, of the others only whether a kept mode has changed.
-    """
+    """Return the verdicts of peaks beyond the pooled `level` (m,); U (m, nu) are the commands."""
+    # `whole` is the larger plant with the numbers of the modes left out, where it is known. Of the
+    # highest peak any cause, of the others only whether a kept mode has changed
     plant, rate = observer.plant, 1.0 / observer.plant.dt
     kept = sampled_modes(plant)
     seen = folded(kept.freq, rate)

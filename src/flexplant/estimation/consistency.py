@@ -474,11 +474,9 @@ def _level_text(facts: _Facts, names: Any) -> str:
 
 
 def _fitted_levels(parts: FloatArray, density: FloatArray) -> FloatArray:
-    """Return the levels (process, sensors) of the parts (2, m) that explain a density best.
-
-    By Whittle's likelihood, ``sum log m + I / m`` with m the sum of both at their levels, by
-    scoring.
-    """
+    """Return the levels (process, sensors) of the parts (2, m) that explain a density best."""
+    # by Whittle's likelihood, `sum log m + I / m` with m the sum of both at their levels, by
+    # scoring
     parts = np.maximum(parts, 0.0)
     levels = np.full(2, density.mean() / parts.sum(axis=0).mean())
     for _ in range(_SCORING):
@@ -512,10 +510,8 @@ def _nees(
 
 
 def _mean_square(error: FloatArray, level: float) -> tuple[float, float, float]:
-    """Return the mean square of a Gaussian record and its interval.
-
-    Its variance is ``2 sum_l c_l^2 / N``, c the autocovariance.
-    """
+    """Return the mean square of a Gaussian record and its interval."""
+    # its variance is `2 sum_l c_l^2 / N`, c the autocovariance
     from scipy.stats import norm
 
     n = error.size

@@ -210,13 +210,12 @@ def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | No
 
 
 def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
-    """Return the same error in states beside what follows the plant's modes, and what is missed.
-
-    A mode T_j of eigenvalue lambda_j moves the observer by V_j, ``(lambda_j - A_o) V_j = B_y C2
-    T_j``. A suspension moves up to 1e5 times as far as the estimate errs, whose variance is then a
-    difference of large squares; beside ``[T_j; V_j]`` nothing cancels but amplitudes. V_j need not
-    be exact: what still couples the modes to the other states stays in A.
-    """
+    """Return the same error in states beside what follows the plant's modes, and what is missed."""
+    # a mode T_j of eigenvalue lambda_j moves the observer by V_j,
+    # `(lambda_j - A_o) V_j = B_y C2 T_j`. A suspension moves up to 1e5 times as far as the estimate
+    # errs, whose variance is then a difference of large squares; beside `[T_j; V_j]` nothing
+    # cancels but amplitudes. V_j need not be exact: what still couples the modes to the other
+    # states stays in A
     n = joint.n_elastic
     own, keep = joint.A[n:, n:], joint.E[:, n:]
     modes = joint.any_modal
@@ -317,10 +316,8 @@ def _primal(joint: _Joint) -> FloatArray:
 
 
 def _state_sizes(joint: _Joint) -> FloatArray:
-    """Return the sizes of the observer's states by the sensor noise alone, powers of two.
-
-    Of all states alike, also of those that the POIs do not see: the dual's are their inverses.
-    """
+    """Return the sizes of the observer's states by the sensor noise alone, powers of two."""
+    # of all states alike, also of those that the POIs do not see: the dual's are their inverses
     A, noise = joint.A[joint.n_elastic :, joint.n_elastic :], joint.noise[joint.n_elastic :]
     return scale_of(accumulated(A, noise @ noise.T))
 
@@ -358,12 +355,10 @@ def _dual_dense(joint: _Joint, row: FloatArray) -> float:
 
 
 def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop) -> FloatArray:
-    """Return the variances (nz,) of ``z - hat`` in a closed loop, at the sample instants.
-
-    What u does to a machine that is not the estimator's model enters the error, although the
-    estimator reads u: the Stein equation of the whole loop, ``X = A X A' + G G'``, each noise
-    twice (`loop.budget`).
-    """
+    """Return the variances (nz,) of ``z - hat`` in a closed loop, at the sample instants."""
+    # what u does to a machine that is not the estimator's model enters the error, although the
+    # estimator reads u: the Stein equation of the whole loop, `X = A X A' + G G'`, each noise twice
+    # (`loop.budget`)
     same_pois(plant, loop.plant)
     channels = poi_channels(plant)
     hats = estimates(channels)

@@ -193,10 +193,8 @@ def estimated(
     units: Mapping[str, str],
     gate: float = np.inf,
 ) -> Estimate:
-    """Return the estimate of a record by the filter of a model, stationary covariance P, gain K.
-
-    `place` gives the rows of POIs that move, for a number of samples.
-    """
+    """Return the estimate of a record by the filter of a model, stationary covariance P, gain K."""
+    # `place` gives the rows of POIs that move, for a number of samples
     instance(
         lag, Predictor | Filter | FixedLag | Smoother, "lag", "Say when: Filter() or Smoother()."
     )
@@ -249,10 +247,8 @@ def _across(columns: FloatArray) -> FloatArray:
 def in_unit_states(
     model: FilterModel, P: FloatArray, K: FloatArray
 ) -> tuple[Steady, Sight, FloatArray, FloatArray]:
-    """Return the stationary filter and the POIs in states x / d and measurements y / s.
-
-    Covariances are followed from P: SolverError where it has too few digits for the gain K.
-    """
+    """Return the stationary filter and the POIs in states x / d and measurements y / s."""
+    # covariances are followed from P: SolverError where it has too few digits for the gain K
     d, s = scale_of(P.diagonal()), scale_of(model.innovation(P).diagonal())
     unit = model.scaled(d, s)
     sight = Sight(
@@ -361,11 +357,9 @@ def _adjoint_pass(
 
 
 def lagged(passage: Walk, sight: Sight, lag: int) -> tuple[FloatArray, FloatArray]:
-    """Return estimates and variances (N, nz) from the measurements up to `lag` samples later.
-
-    ``hat[k|k+l] = hat[k|k] + sum_j T[k] F[k+1]' ... F[k+j-1]' C2' S^-1 e[k+j]``, j = 1 ... l. Where
-    the filter is stationary the sum is ``T (r[k] - F'^l r[k+l])`` of the adjoint r of `smoothed`.
-    """
+    """Return estimates and variances (N, nz) from the measurements up to `lag` samples later."""
+    # `hat[k|k+l] = hat[k|k] + sum_j T[k] F[k+1]' ... F[k+j-1]' C2' S^-1 e[k+j]`, j = 1 ... l. Where
+    # the filter is stationary the sum is `T (r[k] - F'^l r[k+l])` of the adjoint r of `smoothed`
     hat, variance = passage.hat.copy(), passage.variance.copy()
     steady, N = passage.steady, passage.hat.shape[0]
     onward = steady.onward(steady.P, steady.gains)

@@ -307,11 +307,9 @@ _TOGETHER = 128
 def moving_sight(
     plant: StandardPlant, found: LeftOut | None, model: FilterModel, path: Any, count: int
 ) -> Sight:
-    """Return the rows of all POIs at each sample, those on a path at its points.
-
-    Each distinct point is a POI of its own of the same plant: its rows of C and D are exact, and so
-    are the covariances of the modes left out there.
-    """
+    """Return the rows of all POIs at each sample, those on a path at its points."""
+    # each distinct point is a POI of its own of the same plant: its rows of C and D are exact, and
+    # so are the covariances of the modes left out there
     pois = {poi.name: poi for poi in plant.assembled.ports.z}
     if not isinstance(path, Mapping):
         if len(pois) != 1:
@@ -385,12 +383,10 @@ def filterpy_twin(model: FilterModel, covariance: FloatArray) -> Any:
 
 @cache
 def twin_class() -> Any:
-    """Return a subclass of `filterpy.kalman.KalmanFilter` whose y and u are 1-D or columns.
-
-    filterpy adds ``B u`` to the column x as it comes: a 1-D u would make x an (n, n) array. Its
-    smoother, which takes no u, inverts covariances: here in states of unit variance, and without
-    the states of delay lines, which are known exactly.
-    """
+    """Return a subclass of `filterpy.kalman.KalmanFilter` whose y and u are 1-D or columns."""
+    # filterpy adds `B u` to the column x as it comes: a 1-D u would make x an (n, n) array. Its
+    # smoother, which takes no u, inverts covariances: here in states of unit variance, and without
+    # the states of delay lines, which are known exactly
     from filterpy.kalman import KalmanFilter
 
     class Twin(KalmanFilter):  # type: ignore[misc]

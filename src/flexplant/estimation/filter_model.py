@@ -221,11 +221,8 @@ def filter_system(
     name: str,
     inputs: Sequence[str] = (),
 ) -> StateSpace:
-    """Return the filter, from sensors and u to the estimates of POIs and of unknown inputs.
-
-    ``x+ = A x + B u + K e``, ``hat = C1 x + D1 u + L_z e`` with the innovation
-    ``e = y - C2 x - D2 u``.
-    """
+    """Return the filter, from sensors and u to the estimates of POIs and of unknown inputs."""
+    # `x+ = A x + B u + K e`, `hat = C1 x + D1 u + L_z e` with the innovation `e = y - C2 x - D2 u`
     m, more = model, len(model.A) - plant.system.n_states
     units = {f"{one}:hat": plant.units[one] for one in inputs if one in plant.units}
     return StateSpace(
@@ -304,10 +301,8 @@ class Steady:
     def variances(
         self, sight: Sight, P: FloatArray, g: FilterGains, *, predict: bool
     ) -> FloatArray:
-        """Return the variances (1 or k, nz) of the estimates of a covariance P and its gains.
-
-        ``(C1 - L_z C2) P (C1 - L_z C2)' + V - L_z N' - N L_z' + L_z R L_z'``: Joseph's form.
-        """
+        """Return the variances (1 or k, nz) of the estimates of a covariance P and its gains."""
+        # `(C1 - L_z C2) P (C1 - L_z C2)' + V - L_z N' - N L_z' + L_z R L_z'`: Joseph's form
         m, n = self.model, P.shape[0]
         C1, N = sight.c[:, :, :n], sight.c[:, :, n:]
         L_z = sight.c @ self.entering(g, predict=predict)

@@ -38,10 +38,8 @@ class PooledSpectrum(NamedTuple):
 
 
 def level_test(squares: float, count: int) -> Statistic:
-    """Return the mean square of `count` numbers of unit variance, and how unlikely it is.
-
-    The sum is chi-square; the probability is of both tails.
-    """
+    """Return the mean square of `count` numbers of unit variance, and how unlikely it is."""
+    # the sum is chi-square; the probability is of both tails
     from scipy.stats import chi2
 
     p = 2 * min(chi2.cdf(squares, count), chi2.sf(squares, count))
@@ -49,12 +47,10 @@ def level_test(squares: float, count: int) -> Statistic:
 
 
 def ljung_box(white: FloatArray, lags: int) -> Statistic:
-    """Return the portmanteau statistic of vectors (N, p) over some lags.
-
-    ``N^2 sum_l tr(G_l' G_0^-1 G_l G_0^-1) / (N - l)``, chi-square with p^2 lags degrees of freedom;
-    [LjungBox1978]_ for one channel, [Hosking1980]_ for several. Missing rows (NaN) count as zero, N
-    is the number of pairs.
-    """
+    """Return the portmanteau statistic of vectors (N, p) over some lags."""
+    # `N^2 sum_l tr(G_l' G_0^-1 G_l G_0^-1) / (N - l)`, chi-square with p^2 lags degrees of freedom;
+    # [LjungBox1978]_ for one channel, [Hosking1980]_ for several. Missing rows (NaN) count as zero,
+    # N is the number of pairs
     from scipy.stats import chi2
 
     there = np.all(np.isfinite(white), axis=1)
@@ -74,11 +70,9 @@ def ljung_box(white: FloatArray, lags: int) -> Statistic:
 
 
 def cumulative_periodogram(found: PooledSpectrum) -> Statistic:
-    """Return the largest distance of the cumulative periodogram from a straight line.
-
-    Bartlett's test; the distance times (m p)^(1/2), m lines of p channels, has Kolmogorov's
-    distribution for white noise of any level.
-    """
+    """Return the largest distance of the cumulative periodogram from a straight line."""
+    # Bartlett's test; the distance times (m p)^(1/2), m lines of p channels, has Kolmogorov's
+    # distribution for white noise of any level
     from scipy.stats import kstwobign
 
     total = np.cumsum(found.density)
@@ -97,12 +91,10 @@ class ExcessPeak(NamedTuple):
 
 
 def excess_peaks(found: PooledSpectrum, alpha: float) -> list[ExcessPeak]:
-    """Return where the spectrum exceeds its mean, the most significant ones first.
-
-    Averages over b lines of p channels are chi-square with 2 b p degrees of freedom; each of the
-    bands of three widths is tested at alpha over their number (Bonferroni). Bands that touch are
-    one peak.
-    """
+    """Return where the spectrum exceeds its mean, the most significant ones first."""
+    # Averages over b lines of p channels are chi-square with 2 b p degrees of freedom; each of the
+    # bands of three widths is tested at alpha over their number (Bonferroni). Bands that touch are
+    # one peak
     from scipy.stats import chi2
 
     density = found.density / found.density.mean()
@@ -186,11 +178,9 @@ def lines_of(white: FloatArray) -> InnovationLines:
 def seen_from_states(
     A: FloatArray, C: FloatArray, freq: FloatArray, blocks: Sequence[int] | None = None
 ) -> ComplexArray:
-    """Return ``C (z I - A)^-1`` (m, p, n) at frequencies [cycles per sample].
-
-    Of the transposed system, which has the fewer inputs, from its last state to its first: upper
-    triangular in the same blocks.
-    """
+    """Return ``C (z I - A)^-1`` (m, p, n) at frequencies [cycles per sample]."""
+    # of the transposed system, which has the fewer inputs, from its last state to its first: upper
+    # triangular in the same blocks
     n, p = C.shape[1], C.shape[0]
     back = None if blocks is None else tuple(blocks)[::-1]
     parts = A.T[::-1, ::-1], C.T[::-1], np.eye(n)[::-1], np.zeros((n, p))
@@ -229,13 +219,11 @@ def density_of(
     freq: FloatArray,
     white: ComplexArray | None = None,
 ) -> InnovationParts:
-    """Return the density of the whitened innovations of a filter that runs on a plant.
-
-    ``V (Y Y* + R) V*`` with V that of `whitening`, ``Y = C (z I - A)^-1 G + H`` from the noises of
-    the plant to its sensors and R the sensors' own. None: on the filter's own model, where modes
-    left out are white noise of the sensors and the sum of both parts is I. `white`: V, where it is
-    known.
-    """
+    """Return the density of the whitened innovations of a filter that runs on a plant."""
+    # `V (Y Y* + R) V*` with V that of `whitening`, `Y = C (z I - A)^-1 G + H` from the noises of
+    # the plant to its sensors and R the sensors' own. None: on the filter's own model, where modes
+    # left out are white noise of the sensors and the sum of both parts is I. `white`: V, where it
+    # is known
     p = len(observer.sensors)
     process = np.empty((freq.size, p, p), dtype=np.complex128)
     sensors = np.empty_like(process)
@@ -256,11 +244,9 @@ def density_of(
 
 
 def expected(observer: KalmanEstimator, plant: StandardPlant, samples: int) -> InnovationParts:
-    """Return the mean of the periodogram of so many samples, at the lines of `lines_of`.
-
-    The density seen through the record's length (Fejer's kernel): its covariance c_l counts
-    ``1 - |l| / N``. A line narrower than 1 / N leaks into its neighbours in just this way.
-    """
+    """Return the mean of the periodogram of so many samples, at the lines of `lines_of`."""
+    # the density seen through the record's length (Fejer's kernel): its covariance c_l counts
+    # `1 - |l| / N`. A line narrower than 1 / N leaks into its neighbours in just this way
     freq = np.arange(1, samples + 1) / (2.0 * samples)
     lag = np.minimum(np.arange(2 * samples), 2 * samples - np.arange(2 * samples))
     weight = (1.0 - lag / samples)[:, None, None]

@@ -205,11 +205,9 @@ def _unit_sized(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _zeros(A: FloatArray, G: FloatArray, C: FloatArray, F: FloatArray, delay: int) -> ComplexArray:
-    """Return the zeros that do not decay: modes of A - G F^+ C (or ... C A) that C does not see.
-
-    With d eliminated by what it does first, ``d = -F^+ C x`` or ``-F^+ C A x``, they are the
-    modes of the rest that the sensors do not see.
-    """
+    """Return the zeros that do not decay: modes of A - G F^+ C (or ... C A) that C does not see."""
+    # with d eliminated by what it does first, `d = -F^+ C x` or `-F^+ C A x`, they are the modes of
+    # the rest that the sensors do not see
     size = np.linalg.norm(F, axis=0)
     left = np.linalg.pinv(F / size) / size[:, None]
     inner = A - G @ left @ (C if delay == 0 else C @ A)

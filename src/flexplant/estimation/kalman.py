@@ -126,10 +126,8 @@ def design_kalman(
 def redesigned(
     observer: KalmanEstimator, change: Callable[[StandardPlant], StandardPlant]
 ) -> KalmanEstimator:
-    """Return the observer of a changed plant, the modes left out and their noise as they are.
-
-    Its predicted errors are those of its own model.
-    """
+    """Return the observer of a changed plant, the modes left out and their noise as they are."""
+    # its predicted errors are those of its own model
     found = observer.left_out
     if found is not None:
         found = found.replace(plant=change(found.plant))

@@ -121,11 +121,9 @@ def lag_errors(
     lags: npt.ArrayLike,
     channels: Sequence[str],
 ) -> LagReport:
-    """Return the report of a stationary filter.
-
-    ``var(l) = var(filter) - T M_l T'``, M_l what l further samples say of the state, up to
-    ``M = F' M F + C2' S^-1 C2`` of the smoother.
-    """
+    """Return the report of a stationary filter."""
+    # `var(l) = var(filter) - T M_l T'`, M_l what l further samples say of the state, up to
+    # `M = F' M F + C2' S^-1 C2` of the smoother
     wanted = positive_array(lags, "lags", (None,), hint="They are times [s]: try 1e-3.")
     counts = {f"{1e3 * s:.4g} ms": round(s / plant.dt) for s in sorted(wanted.tolist())}
     counts = {name: count for name, count in counts.items() if count}

@@ -192,11 +192,9 @@ def _same_modes(kept: _Blocks, larger: _Blocks, genuine: IntArray) -> tuple[IntA
 
 
 def _may_follow(plant: StandardPlant, ports: Ports) -> FloatArray:
-    """Return which forces a static compliance may answer (m,).
-
-    A white disturbance has no value at an instant, and u must not reach y in the sample in which
-    it is computed from y.
-    """
+    """Return which forces a static compliance may answer (m,)."""
+    # a white disturbance has no value at an instant, and u must not reach y in the sample in which
+    # it is computed from y
     late = {port.name: plant.delay + port.latency / plant.dt > 0 for port in ports.u}
     parts = [(port.name, port.filter) for port in ports.forces]
     return np.array(
@@ -236,10 +234,8 @@ def _siso_response(part: StateSpace | None, at: ComplexArray) -> ComplexArray:
 
 
 def _quiet(fresh: StandardPlant, plant: StandardPlant, modes: IntArray) -> StandardPlant:
-    """Return the new plant with the old one's noise, less that on some modes (from 0).
-
-    Shapes that stand in for modes left out have none: it is in the noise of the sensors already.
-    """
+    """Return the new plant with the old one's noise, less that on some modes (from 0)."""
+    # shapes that stand in for modes left out have none: it is in the noise of the sensors already
     factor = np.array(plant.noise_factor)
     factor[plant.modal_states.reshape(-1, 2)[modes].reshape(-1)] = 0.0
     return fresh.replace(origin=fresh.assembled.replace(noise_factor=factor))
@@ -264,15 +260,13 @@ _LONG = 2.0
 def nodes_per_wavelength(
     model: FEModel | Modes | ReducedModel, shapes: FloatArray
 ) -> FloatArray | None:
-    """Return how many nodes of a mesh there are per wavelength of each shape; None: no mesh.
-
-    Neighbours i, j are translations in one direction that the mass matrix couples; of modes, whose
-    matrices are not known, those of nodes side by side. In a wave of wave number k and nodes h
-    apart ``mean (p_i - p_j)^2 / mean (p_i^2 + p_j^2) = 1 - cos(k h)``, and ``2 pi / (k h)`` nodes
-    make a wavelength. Diagonals of elements count as neighbours, so that this is a mean over all
-    directions. Both kinds of neighbours differ by 2 % to 7 % on plates and blocks. A full mass
-    matrix has no mesh.
-    """
+    """Return how many nodes of a mesh there are per wavelength of each shape; None: no mesh."""
+    # neighbours i, j are translations in one direction that the mass matrix couples; of modes,
+    # whose matrices are not known, those of nodes side by side. In a wave of wave number k and
+    # nodes h apart `mean (p_i - p_j)^2 / mean (p_i^2 + p_j^2) = 1 - cos(k h)`, and `2 pi / (k h)`
+    # nodes make a wavelength. Diagonals of elements count as neighbours, so that this is a mean
+    # over all directions. Both kinds of neighbours differ by 2 % to 7 % on plates and blocks. A
+    # full mass matrix has no mesh
     dofs = model.full_dofs if isinstance(model, ReducedModel) else model.dofs
     count = np.count_nonzero(np.isin(dofs.directions, _MOVES))
     i, j = _mass_coupling(model) if isinstance(model, FEModel) else (_NONE, _NONE)

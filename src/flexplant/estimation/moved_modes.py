@@ -155,12 +155,10 @@ class MovedModes(Value):
 def moved_modes(
     observer: KalmanEstimator, estimate: Estimate, starts: Sequence[ModeChange], skip: int
 ) -> tuple[MovedModes, KalmanEstimator, Estimate]:
-    """Return where modes are on the machine, and observer and estimate of the changed plant.
-
-    Maximum likelihood of the record by the innovations of the filter of the changed plant, the
-    commands counted, so that feedback does not bias it; Gauss-Newton, the noises known but for one
-    common level: ``n/2 log(sum |W e|^2 / n) - n_k log det W``. The first samples are skipped.
-    """
+    """Return where modes are on the machine, and observer and estimate of the changed plant."""
+    # maximum likelihood of the record by the innovations of the filter of the changed plant, the
+    # commands counted, so that feedback does not bias it; Gauss-Newton, the noises known but for
+    # one common level: `n/2 log(sum |W e|^2 / n) - n_k log det W`. The first samples are skipped
     task = _Likelihood(observer, estimate, [one.mode for one in starts], skip)
     theta = np.array([[one.frequency for one in starts], [one.decay for one in starts]]).ravel()
     information = np.eye(theta.size)
@@ -271,14 +269,13 @@ def peak_band(
 def explained_by_change(
     observer: KalmanEstimator, band: PeakBand, mode: int, freq: float, sign: float
 ) -> ModeChange | None:
-    """Return the change of a mode [Hz] that explains a peak better than one more mode, or None.
-
-    Both are fitted to the lines around by Whittle's likelihood: the mode's change by what the
-    commands and the noises of the changed plant make of the innovations, ``V (G - G') U`` and the
-    density, the new mode as ``h v v* g^2 / ((f - f_0)^2 + g^2)`` with any direction v; each
-    parameter costs half the logarithm of the number of lines. A changed mode is missing where the
-    model has it, and shows itself in its own direction. `sign` is -1 where its frequency is folded.
-    """
+    """Return the change of a mode [Hz] that explains a peak better than one more mode, or None."""
+    # both are fitted to the lines around by Whittle's likelihood: the mode's change by what the
+    # commands and the noises of the changed plant make of the innovations, `V (G - G') U` and the
+    # density, the new mode as `h v v* g^2 / ((f - f_0)^2 + g^2)` with any direction v; each
+    # parameter costs half the logarithm of the number of lines. A changed mode is missing where the
+    # model has it, and shows itself in its own direction. `sign` is -1 where its frequency is
+    # folded
     from scipy.optimize import minimize
 
     plant, p = observer.plant, band.X.shape[1]

@@ -289,10 +289,8 @@ class _Scored(NamedTuple):
 
 
 def _scored(spectrum: _LevelSpectrum, start: FloatArray, lowest: FloatArray) -> _Scored:
-    """Return the variances of the largest likelihood, by scoring in their logarithms.
-
-    Those at the lower end that would still fall are left out of the steps.
-    """
+    """Return the variances of the largest likelihood, by scoring in their logarithms."""
+    # those at the lower end that would still fall are left out of the steps
     bottom = np.log(lowest)
     log_t = np.log(start)
     value, slope, information = _likelihood(spectrum, np.exp(log_t))
@@ -415,10 +413,8 @@ class NoiseLevels(Value):
         return "\n".join([first, *shown, *more]) + ">"
 
     def _shown(self, i: int) -> str:
-        """Return a level in words: a bound where it may be 0 just as well (two deviations).
-
-        The variance t of a ratio has the deviation 2 t times that of the density's logarithm.
-        """
+        """Return a level in words: a bound where it may be 0 just as well (two deviations)."""
+        # the variance t of a ratio has the deviation 2 t times that of the density's logarithm
         ratio, off = float(self.ratios[i]), self.relative[self.channels[i]]
         if off > _BOUND:
             return f"at most {ratio * np.sqrt(1.0 + 4.0 * off):.2g} times the given density"

@@ -137,10 +137,8 @@ class Walk:
         return first + int(hit[0])
 
     def _screened(self, k: int, until: int, x: FloatArray) -> tuple[int, FloatArray]:
-        """Run the stationary filter up to a sample, or to the first that the gate drops.
-
-        Later samples count with their innovations after it is dropped: they are filtered again.
-        """
+        """Run the stationary filter up to a sample, or to the first that the gate drops."""
+        # later samples count with their innovations after it is dropped: they are filtered again
         length = until - k if not np.isfinite(self.gate) else LONGEST
         while k < until:
             end = min(k + length, until)
@@ -337,13 +335,11 @@ class ShownSoFar(NamedTuple):
 def excess(
     steady: Steady, weight: FloatArray, P: FloatArray, Z: FloatArray, found: KnownParameters | None
 ) -> FloatArray | None:
-    """Return Y (n, r) with ``P_k = P + Y Y'``, P_k the covariance now and P the stationary one.
-
-    The filter of any first covariance P_k above the stationary P is the stationary filter of a
-    first state ``x + Y eta``, eta of zero mean and unit covariance, whose innovations ``e = C F^k Y
-    eta + white noise`` show eta by least squares: the partitioned filter. None where P_k is not
-    above P, or has so much to show still that digits would be lost. [Lainiotis1975]_.
-    """
+    """Return Y (n, r) with ``P_k = P + Y Y'``, P_k the covariance now and P the stationary one."""
+    # the filter of any first covariance P_k above the stationary P is the stationary filter of a
+    # first state `x + Y eta`, eta of zero mean and unit covariance, whose innovations
+    # `e = C F^k Y eta + white noise` show eta by least squares: the partitioned filter. None where
+    # P_k is not above P, or has so much to show still that digits would be lost. [Lainiotis1975]_
     more = P - steady.P
     if Z.shape[1]:
         if found is None or found.open.size:
@@ -435,14 +431,12 @@ class Start(NamedTuple):
 
 
 def stationary_start(model: FilterModel) -> Start:
-    """Return the state before a record of a machine that has run for long, with u at rest.
-
-    Modes that are damped have the covariance of their stationary motion, ``P = A P A' + Q``. Modes
-    on or outside the unit circle (rigid bodies, undamped ones) have none: their states x_r are
-    unknown parameters delta, without any prior. Others that follow them (such as late outputs) do
-    so with the states V x_r, ``A_e V - V A_r = -A_er``, so that the rest ``x' = x - V x_r`` is
-    stationary.
-    """
+    """Return the state before a record of a machine that has run for long, with u at rest."""
+    # modes that are damped have the covariance of their stationary motion, `P = A P A' + Q`. Modes
+    # on or outside the unit circle (rigid bodies, undamped ones) have none: their states x_r are
+    # unknown parameters delta, without any prior. Others that follow them (such as late outputs) do
+    # so with the states V x_r, `A_e V - V A_r = -A_er`, so that the rest `x' = x - V x_r` is
+    # stationary
     n = model.A.shape[0]
     kept = kept_states(model.A)
     rest = np.setdiff1d(np.arange(n), kept)
@@ -462,11 +456,9 @@ def stationary_start(model: FilterModel) -> Start:
 
 
 def kept_states(A: FloatArray) -> IntArray:
-    """Return the states of modes on or outside the unit circle.
-
-    Judged on the parts of A that are coupled both ways, so that the two eigenvalues 1 of a
-    rigid-body mode are exact.
-    """
+    """Return the states of modes on or outside the unit circle."""
+    # judged on the parts of A that are coupled both ways, so that the two eigenvalues 1 of a
+    # rigid-body mode are exact
     count, owner = csgraph.connected_components(A != 0, directed=True, connection="strong")
     kept = []
     for part in range(count):

@@ -519,12 +519,10 @@ class MachineError(NamedTuple):
     root: FloatArray
 
     def value_and_slopes(self, part: FilterPart) -> tuple[float, Gains]:
-        """Return the mean relative variance and its derivatives to K and L of the part.
-
-        ``J = tr(E X E')``, X = F X F' + N N', Y = F' Y F + E' E: dJ/dF = 2 Y F X,
-        dJ/dN = 2 Y N, dJ/dE = 2 E X with ``F = [A, 0; B, A_o]``, B = K C - back; of Y the rows of
-        the filter are enough.
-        """
+        """Return the mean relative variance and its derivatives to K and L of the part."""
+        # `J = tr(E X E')`, X = F X F' + N N', Y = F' Y F + E' E: dJ/dF = 2 Y F X, dJ/dN = 2 Y N,
+        # dJ/dE = 2 E X with `F = [A, 0; B, A_o]`, B = K C - back; of Y the rows of the filter are
+        # enough
         A, A_o, Y = self.powers[0], part.powers[0], part.sight
         powers = self.powers
         while len(powers) < len(part.powers):
@@ -558,11 +556,9 @@ def machine_error(
     scale: FloatArray,
     unit: FloatArray,
 ) -> MachineError:
-    """Return the error of filters on a plant's matrices when they run on a machine.
-
-    Undamped motions x_r of the machine have no variance. A filter that holds them follows with
-    V_o x_r whatever its gains are: ``A0 V_o = V_o A_rr``, ``C0 V_o = C_r``, ``C1 V_o = C1_r``.
-    """
+    """Return the error of filters on a plant's matrices when they run on a machine."""
+    # undamped motions x_r of the machine have no variance. A filter that holds them follows with
+    # V_o x_r whatever its gains are: `A0 V_o = V_o A_rr`, `C0 V_o = C_r`, `C1 V_o = C1_r`
     m, own = model, filter_model(machine)
     G_all = machine.noise_factor
     rigid, rest = moving_parts(machine)

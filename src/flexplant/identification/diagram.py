@@ -362,11 +362,9 @@ class Moments:
         return np.asarray(np.linalg.solve(below, above).transpose(2, 1, 0))
 
     def fraction(self, order: int) -> tuple[ComplexArray, ComplexArray]:
-        """Return A (order + 1, n_in, n_in) with A_0 = I and B (n_out, order + 1, n_in).
-
-        This constraint makes the mathematical poles unstable and leaves the physical ones
-        stable, which is what makes the stabilisation diagram clear [Cauberghe2004]_.
-        """
+        """Return A (order + 1, n_in, n_in) with A_0 = I and B (n_out, order + 1, n_in)."""
+        # this constraint makes the mathematical poles unstable and leaves the physical ones stable,
+        # which is what makes the stabilisation diagram clear [Cauberghe2004]_
         n, m = order + 1, self.n_in
         taken = self.taken[:, :n, : n * m]
         rows = taken.reshape(-1, n * m)
@@ -378,10 +376,8 @@ class Moments:
 
 
 def _pole_vectors(z: ComplexArray, matrices: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return (n, m) left and right null vectors l, r of A(z) (n, m, m): l A = 0, A r = 0.
-
-    Those of a pole that is repeated but for rounding are independent.
-    """
+    """Return (n, m) left and right null vectors l, r of A(z) (n, m, m): l A = 0, A r = 0."""
+    # those of a pole that is repeated but for rounding are independent
     U, _, Vh = np.linalg.svd(matrices)
     alike = np.abs(z[:, None] - z) < REPEATED
     first = np.sum(np.cumsum(alike, axis=1) == 0, axis=1)

@@ -272,12 +272,10 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
 
 
 def _freedom(correlation: ComplexArray, size: FloatArray, spare: int, n_in: int) -> float:
-    """Return the complex degrees of freedom of variances of product form.
-
-    To first order the relative variances of the three means add up, those they share taken out:
-    ``1/nu = (1/n_in + 1/n_e - 1/(n_in n_e)) / (R - 1)``, with the number of outputs that err
-    independently, ``n_e = (sum_a s_a)^2 / sum_ab |C_ab|^2 s_a s_b``.
-    """
+    """Return the complex degrees of freedom of variances of product form."""
+    # to first order the relative variances of the three means add up, those they share taken out:
+    # `1/nu = (1/n_in + 1/n_e - 1/(n_in n_e)) / (R - 1)`, with the number of outputs that err
+    # independently, `n_e = (sum_a s_a)^2 / sum_ab |C_ab|^2 s_a s_b`
     power = np.mean(size**2, axis=1)
     chance = 1.0 / (spare * n_in)  # mean |C|^2 of independent errors
     alike = np.mean(np.abs(correlation) ** 2, axis=2)

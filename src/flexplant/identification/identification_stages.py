@@ -59,12 +59,10 @@ BESIDE = 3.0
 def gated(
     fit: Fit, steps: int, *, alone: bool, compare: bool
 ) -> tuple[Fit, IntArray, tuple[Rejected, ...]]:
-    """Return the fit without poles that are none, the places of those reported, and the others.
-
-    Twins, and poles that nothing is known of, are left out of the fit, one by one; what lies at the
-    edge of the band or is mains remains in it, not reported. Poles chosen by hand (not `alone`) are
-    not merged.
-    """
+    """Return the fit without poles that are none, the places of those reported, and the others."""
+    # twins, and poles that nothing is known of, are left out of the fit, one by one; what lies at
+    # the edge of the band or is mains remains in it, not reported. Poles chosen by hand (not
+    # `alone`) are not merged
     listed: list[Rejected] = []
     while (found := _needless(fit, steps, alone, compare)) is not None:
         place, reason = found
@@ -91,11 +89,9 @@ def _without(fit: Fit, place: int, steps: int) -> Fit:
 def steady(
     fit: Fit, reported: IntArray, apart: Disagreement
 ) -> tuple[IntArray, tuple[Rejected, ...]]:
-    """Return which poles outputs (or inputs) that disagree share, and the others.
-
-    One beside another, whose damping at one output is not known from zero (95 %), stands for what
-    they differ by; of one whose mean damping is known no better, nothing is known.
-    """
+    """Return which poles outputs (or inputs) that disagree share, and the others."""
+    # one beside another, whose damping at one output is not known from zero (95 %), stands for what
+    # they differ by; of one whose mean damping is known no better, nothing is known
     damping, m = -fit.poles.real, fit.m
     beside = np.array([
         np.any(np.abs(np.delete(fit.poles.imag, k) - pole.imag) < -pole.real)
@@ -175,11 +171,9 @@ def lesser(fit: Fit, vectors: ComplexArray, alike: float = 0.0) -> list[int]:
 
 
 def single(lines: Lines, fit: Fit, vectors: ComplexArray, steps: int) -> Fit:
-    """Return the fit of lines, of one pole a resonance, whose participation are these vectors.
-
-    Rows that disagree give each resonance several poles of one participation (or, exchanged,
-    shape). It is held: poles that the rows do not share would bend it.
-    """
+    """Return the fit of lines, of one pole a resonance, whose participation are these vectors."""
+    # rows that disagree give each resonance several poles of one participation (or, exchanged,
+    # shape). It is held: poles that the rows do not share would bend it
     keep = np.delete(np.arange(fit.m), lesser(fit, vectors, ALIKE))
     start = pivoted(lines, fit.poles[keep], vectors[:, keep])
     now = start.poles, start.participation
@@ -443,10 +437,8 @@ def _odd(frf: Frf, lines: Lines, apart: Disagreement) -> str:
 
 
 def _highest_pole(lines: Lines, diagram: StabilisationDiagram) -> PoleSelection | None:
-    """Return the diagram's pole nearest the largest response, None where nothing stands out.
-
-    In a narrow band, which affords few orders, outputs that disagree have no stable poles.
-    """
+    """Return the diagram's pole nearest the largest response, None where nothing stands out."""
+    # in a narrow band, which affords few orders, outputs that disagree have no stable poles
     power = np.sum(np.abs(lines.data * lines.weight) ** 2, axis=(0, 1))
     inner = slice(FLANK, -FLANK)
     place = int(np.argmax(power[inner]))
@@ -484,10 +476,8 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
 def _first_fit(
     lines: Lines, chosen: PoleSelection, alone: bool, steps: int
 ) -> tuple[Fit, tuple[Rejected, ...]]:
-    """Return the fit near the poles chosen, with all residual terms and no search for others.
-
-    Of more poles than are requested the strongest are kept; the others are returned too.
-    """
+    """Return the fit near the poles chosen, with all residual terms and no search for others."""
+    # of more poles than are requested the strongest are kept; the others are returned too
     if not alone:
         fit = Fit(lines, chosen.poles, chosen.participation)
         now = fit.poles, fit.participation

@@ -66,10 +66,8 @@ class PreparedLines:
         return float(np.median(self.line_correlation.sum(axis=1)))
 
     def spread(self, a: int, b: int, rows: ComplexArray) -> ComplexArray | None:
-        """Return the correlation of the errors of rows a and b times `rows` (n_in, n_freq, k).
-
-        None where the two are independent.
-        """
+        """Return the correlation of the errors of rows a and b times `rows` (n_in, n_freq, k)."""
+        # None where the two are independent
         C, R = self.correlation, self.line_correlation
         if a != b and (C is None or self.swapped):
             return None
@@ -200,13 +198,10 @@ def without_mains(ready: PreparedLines, tapered: bool) -> PreparedLines:
 
 
 def _disturbed(data: ComplexArray, d: FloatArray, chance: float, tapered: bool) -> BoolArray:
-    r"""Return which of some lines hold a disturbance of the frequency in their middle.
-
-    The lines aside are fitted by :math:`(1 + g d) H = a + b d + c d^2 + r/d`, d the distance in
-    lines, g of a resonance nearby: one of half-width w in the middle has the height :math:`|r|/w`,
-    a disturbance no r; through a Hann window it has side lobes of :math:`1/(\pi d^3)` of its
-    height.
-    """
+    """Return which of some lines hold a disturbance of the frequency in their middle."""
+    # the lines aside are fitted by `(1 + g d) H = a + b d + c d^2 + r/d`, d the distance in lines,
+    # g of a resonance nearby: one of half-width w in the middle has the height `|r|/w`, a
+    # disturbance no r; through a Hann window it has side lobes of `1/(\pi d^3)` of its height
     middle = d.size // 2
     near = np.abs(np.arange(d.size) - middle) <= SPREAD
     aside, rows = d[~near], data.reshape(-1, d.size)

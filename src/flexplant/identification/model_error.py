@@ -58,11 +58,9 @@ def outputs_disagree(fit: Fit, least: float = np.inf) -> bool:
 
 
 def coherence(fit: Fit, pole: complex) -> float:
-    r"""Return by how much more a misfit near a pole lowers the cost by chance than noise does.
-
-    The mean of :math:`|e|^2/\sigma^2` there, times :math:`1 + 2 \sum_k \rho_k` of the correlation
-    of e over neighbouring lines: misfit that is smooth over some of them counts as one error.
-    """
+    """Return by how much more a misfit near a pole lowers the cost by chance than noise does."""
+    # the mean of `|e|^2/\sigma^2` there, times `1 + 2 \sum_k \rho_k` of the correlation of e over
+    # neighbouring lines: misfit that is smooth over some of them counts as one error
     lines = fit.lines
     spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
     reach = max(NEAR * spacing, WIDE * abs(pole.real))
@@ -143,11 +141,9 @@ class Disagreement:
 
 
 def disagreement(fit: Fit, least: float, excess: float) -> Disagreement | None:
-    """Return by how much the outputs of a fit differ, and the mean of their own poles.
-
-    None where poles of their own lower the cost by less than `least`, or do not explain nearly all
-    of the cost's `excess` over that of noise: something else is wrong then.
-    """
+    """Return by how much the outputs of a fit differ, and the mean of their own poles."""
+    # None where poles of their own lower the cost by less than `least`, or do not explain nearly
+    # all of the cost's `excess` over that of noise: something else is wrong then
     if len(fit.lines.parts) == 1:
         return None
     own = fit.own
@@ -184,12 +180,10 @@ def _variance(one: Fit) -> FloatArray:
 
 
 def _strayed(fit: Fit, own: list[Fit]) -> tuple[FloatArray, FloatArray]:
-    """Return the squares (n, m) of how far own poles are that stand for something else.
-
-    First of those that came nearer to another shared pole, then of those that are much broader
-    than in most outputs: where an output hardly sees a mode, its pole becomes a part of the smooth
-    remainder.
-    """
+    """Return the squares (n, m) of how far own poles are that stand for something else."""
+    # first of those that came nearer to another shared pole, then of those that are much broader
+    # than in most outputs: where an output hardly sees a mode, its pole becomes a part of the
+    # smooth remainder
     poles = np.array([one.poles for one in own])
     away = np.abs(poles[:, :, None] - fit.poles)
     other = np.argmin(away, axis=2) != np.arange(fit.m)

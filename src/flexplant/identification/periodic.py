@@ -411,12 +411,10 @@ def _differences(x: FloatArray) -> FloatArray:
 
 
 def transient_warned(freq: FloatArray, e: ComplexArray, Y: ComplexArray, discard: int) -> None:
-    r"""Warn of the slowest decay of what periods leave, where it biases their mean.
-
-    At line k period p is ``S_k + tau_k z^p`` with ``z = exp(lambda T)``, the same for all lines,
-    outputs and experiments that a mode reaches. Over a grid of z the energy that this explains
-    of the periods' spread is compared with the rest by an F-test.
-    """
+    """Warn of the slowest decay of what periods leave, where it biases their mean."""
+    # at line k period p is `S_k + tau_k z^p` with `z = exp(lambda T)`, the same for all lines,
+    # outputs and experiments that a mode reaches. Over a grid of z the energy that this explains of
+    # the periods' spread is compared with the rest by an F-test
     import scipy.ndimage as ndi  # both cost a tenth of a second that few need
     from scipy.stats import f as fisher
 

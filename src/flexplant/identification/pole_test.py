@@ -55,11 +55,9 @@ def _seen(lines: Lines, poles: ComplexArray, part: ComplexArray, kept: list[int]
 
 
 def corroborated(lines: Lines, less: ComplexArray, more: ComplexArray) -> bool:
-    """Return whether other lines than the two that gain most bear a pole out.
-
-    By a chi-square of four degrees, the pole and its size: a disturbance of one frequency, or a
-    variance that is too small there, changes other lines by chance only.
-    """
+    """Return whether other lines than the two that gain most bear a pole out."""
+    # by a chi-square of four degrees, the pole and its size: a disturbance of one frequency, or a
+    # variance that is too small there, changes other lines by chance only
     before, after = (
         np.sum(np.abs((lines.data - model) * lines.weight) ** 2, axis=(0, 1))
         for model in (less, more)
@@ -70,21 +68,17 @@ def corroborated(lines: Lines, less: ComplexArray, more: ComplexArray) -> bool:
 
 
 def price(lines: Lines, count: int, chance: float) -> float:
-    """Return by how much noise lowers the cost with so many numbers more: a chi-square quantile.
-
-    Errors that neighbouring lines share have `inflation` times the power of independent ones.
-    """
+    """Return by how much noise lowers the cost with so many numbers more: a chi-square quantile."""
+    # errors that neighbouring lines share have `inflation` times the power of independent ones
     from scipy.special import chdtri
 
     return lines.inflation * float(chdtri(count, chance))
 
 
 def pole_price(lines: Lines) -> float:
-    """Return by how much a pole must lower the cost, wherever in the band it is.
-
-    Its pole, shape and participation are 2 (n_out + n_in) numbers. One kept in vain costs little;
-    one left out biases its neighbours by up to the root of this.
-    """
+    """Return by how much a pole must lower the cost, wherever in the band it is."""
+    # its pole, shape and participation are 2 (n_out + n_in) numbers. One kept in vain costs little;
+    # one left out biases its neighbours by up to the root of this
     n_out, n_in, n_freq = lines.data.shape
     return price(lines, 2 * (n_out + n_in), CHANCE / n_freq)
 
@@ -125,12 +119,10 @@ Kind: TypeAlias = Callable[[Fit], Proposals]
 def improved(
     fit: Fit, kinds: Sequence[tuple[Kind, int]], *, steps: int, rough: bool = False
 ) -> Fit:
-    """Return the fit with the changes that lower its cost by more than noise does.
-
-    Each kind proposes changes, until none is accepted or so many are: refined, it lowers the cost
-    by what it must, no pole becomes broader than a mode, and a pole more is borne out by several
-    lines. `rough`: a fit that leaves nothing but rounding is changed no more.
-    """
+    """Return the fit with the changes that lower its cost by more than noise does."""
+    # each kind proposes changes, until none is accepted or so many are: refined, it lowers the cost
+    # by what it must, no pole becomes broader than a mode, and a pole more is borne out by several
+    # lines. `rough`: a fit that leaves nothing but rounding is changed no more
     for propose, most in kinds:
         for _ in range(most):
             if rough and _is_exact(fit):
@@ -187,10 +179,8 @@ def shared(fit: Fit, more: Fit, least: float) -> bool:
 
 
 def _proven(fit: Fit, more: Fit, least: float) -> bool:
-    """Return whether a few outputs, with poles of their own, prove the pole more already.
-
-    Most poles are: fits of the other outputs, which take most of the time, are not made then.
-    """
+    """Return whether a few outputs, with poles of their own, prove the pole more already."""
+    # most poles are: fits of the other outputs, which take most of the time, are not made then
     found: list[Fit] = []
     gain = 0.0
     for rows, own in zip(fit.lines.parts, more.own, strict=True):
@@ -220,10 +210,8 @@ def own_price(fit: Fit) -> float:
 
 
 def unwindowed(fit: Fit) -> Proposals:
-    """Propose lines that are not seen through the window of segments.
-
-    H2, Hv and bursts that end within a segment are not, H1 of an input that is white nearby is.
-    """
+    """Propose lines that are not seen through the window of segments."""
+    # H2, Hv and bursts that end within a segment are not, H1 of an input that is white nearby is
     if fit.lines.segment is not None:
         plain = replace(fit.lines, segment=None)
         yield [Trial(plain, fit.poles, fit.participation, np.inf, 0.0)]
@@ -261,10 +249,8 @@ def fewer_terms(fit: Fit) -> Proposals:
 
 
 def more_terms(fit: Fit) -> Proposals:
-    """Propose more residual terms where the data require them, as many as the lines afford.
-
-    Folded modes are weak and broad: what few terms leave of them is not seen, but biases.
-    """
+    """Propose more residual terms where the data require them, as many as the lines afford."""
+    # folded modes are weak and broad: what few terms leave of them is not seen, but biases
     lines = fit.lines
     afforded = [u for u in MORE if u > lines.upper and lines.freq.size >= 8 * (u + lines.lower)]
     trials = (_refit_terms(fit, upper, CHANCE) for upper in afforded)
@@ -306,10 +292,8 @@ def _pairs(fit: Fit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
 
 
 def relocated(fit: Fit) -> Proposals:
-    """Propose other places for weak poles, within seven half-widths.
-
-    The likelihood of a mode that is hardly seen has several peaks; a fit climbs the nearest.
-    """
+    """Propose other places for weak poles, within seven half-widths."""
+    # the likelihood of a mode that is hardly seen has several peaks; a fit climbs the nearest
     for k, pole in enumerate(fit.poles):
         if fit.m == 1 or -pole.real > 0.05 * abs(pole):
             continue
@@ -362,12 +346,10 @@ class Peak:
 
 
 def unexplained(fit: Fit) -> list[Peak]:
-    r"""Return the stretches whose residual is more than noise, each once, the highest first.
-
-    Over L lines of c channels the sum of :math:`2 |e|^2/\sigma^2` is chi-square with 2 c L degrees
-    of freedom. Its middle and spread are also taken from all stretches (median, median absolute
-    deviation): an estimated variance is off everywhere, a missed pole is off in one place.
-    """
+    """Return the stretches whose residual is more than noise, each once, the highest first."""
+    # over L lines of c channels the sum of `2 |e|^2/\sigma^2` is chi-square with 2 c L degrees of
+    # freedom. Its middle and spread are also taken from all stretches (median, median absolute
+    # deviation): an estimated variance is off everywhere, a missed pole is off in one place
     lines, model = fit.lines, fit.model
     if _is_exact(fit):
         return []
@@ -412,10 +394,8 @@ def unexplained(fit: Fit) -> list[Peak]:
 
 
 def _isolated(power: FloatArray, first: int, length: int, middle: float, spread: float) -> bool:
-    """Return whether a peak is one or two lines and nothing around them.
-
-    A disturbance, or a mode narrower than the lines are apart; others show at the neighbours too.
-    """
+    """Return whether a peak is one or two lines and nothing around them."""
+    # a disturbance, or a mode narrower than the lines are apart; others show at the neighbours too
     aside = max(0, (AROUND - length + 1) // 2)
     near = np.sort(power[max(0, first - aside) : first + length + aside])[:-2]
     share = near.size / length
@@ -424,12 +404,10 @@ def _isolated(power: FloatArray, first: int, length: int, middle: float, spread:
 
 
 def _surpassing(lines: Lines, model: ComplexArray, where: slice) -> bool:
-    r"""Whether a response at single lines is off by more than its estimated variance explains.
-
-    With nu complex degrees of freedom :math:`|e|^2/\sigma^2` exceeds x by chance with probability
-    :math:`(1 + x/\nu)^{-\nu}` (F distribution of 2 and 2 nu degrees), which chi-square, nu without
-    limit, understates: one variance in hundreds comes out several times too small.
-    """
+    """Whether a response at single lines is off by more than its estimated variance explains."""
+    # with nu complex degrees of freedom `|e|^2/\sigma^2` exceeds x by chance with probability
+    # `(1 + x/\nu)^{-\nu}` (F distribution of 2 and 2 nu degrees), which chi-square, nu without
+    # limit, understates: one variance in hundreds comes out several times too small
     nu = lines.variance_freedom
     if nu is None:
         return True
@@ -455,11 +433,9 @@ def _is_smooth(lines: Lines, model: ComplexArray) -> bool:
 
 
 def _with_pole(fit: Fit, peak: Peak) -> tuple[ComplexArray, ComplexArray]:
-    """Return poles and participation with the one added that explains a peak best.
-
-    Of frequencies across the peak and some damping ratios; the participation is the leading right
-    singular vector of what the pole has in common with the residual.
-    """
+    """Return poles and participation with the one added that explains a peak best."""
+    # of frequencies across the peak and some damping ratios; the participation is the leading right
+    # singular vector of what the pole has in common with the residual
     lines = fit.lines
     error = (lines.data - fit.model) * lines.weight**2
     best, pole, part = -1.0, 0j, fit.participation
@@ -479,10 +455,8 @@ def _with_pole(fit: Fit, peak: Peak) -> tuple[ComplexArray, ComplexArray]:
 
 
 def warned(left: list[Peak], apart: tuple[float, str, str] | None) -> None:
-    """Warn of stretches that no pole explains, of single lines, or of outputs that disagree.
-
-    These by how much, what they are, and which one is off by far more than the others.
-    """
+    """Warn of stretches that no pole explains, of single lines, or of outputs that disagree."""
+    # these by how much, what they are, and which one is off by far more than the others
     stretches = [peak for peak in left if not peak.isolated]
     if apart is not None:
         warn(

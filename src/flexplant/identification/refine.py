@@ -75,10 +75,8 @@ class Lines:
         return self.setups or tuple(np.arange(len(self.data))[:, None])
 
     def freedom(self, m: int) -> float:
-        """Return the expected cost of a fit with m poles: real data less real parameters.
-
-        Where errors of lines are correlated each parameter fits `inflation` times as much of them.
-        """
+        """Return the expected cost of a fit with m poles: real data less real parameters."""
+        # where errors of lines are correlated each parameter fits `inflation` times as much of them
         n_out, n_in, _ = self.data.shape
         used = n_out * n_in * (self.lower + self.upper) + 2 * m * (n_out + n_in)
         return float(max(1.0, 2 * self.data.size - self.inflation * used))
@@ -325,10 +323,8 @@ class Fit:
         return np.asarray(self.modal + self.terms @ self.lines.smooth)
 
     def _moving(self, o: int) -> FloatArray:
-        """Return how rows (n_in, 4 m, 2 n_freq) of an output move, what residual terms take too.
-
-        With Re and Im of the poles, then with those of the participation of the row's own input.
-        """
+        """Return how rows (n_in, 4 m, 2 n_freq) of an output move, what residual terms take too."""
+        # with Re and Im of the poles, then with those of the participation of the row's own input
         shape = self.shapes[o][:, None]
         l = self.participation[:, :, None]  # noqa: E741
         a, b = shape * l * self.slope, (shape * l).conj() * self.slope_minus
@@ -339,10 +335,8 @@ class Fit:
 
     @cached_property
     def _places(self) -> list[tuple[Any, Any]]:
-        """Per input which of the 4 m columns of its rows are parameters, and which ones.
-
-        Re and Im of the poles, then the participation, input by input, without the pivots.
-        """
+        """Per input which of the 4 m columns of its rows are parameters, and which ones."""
+        # Re and Im of the poles, then the participation, input by input, without the pivots
         m, k = self.m, np.arange(self.m)
         found = []
         for i in range(self.participation.shape[0]):
@@ -355,10 +349,8 @@ class Fit:
         return found
 
     def _jacobian(self, o: int) -> FloatArray:
-        """Return J (n_in 2 n_freq, n_parameters) of an output.
-
-        ``J = D - Q Q^T D`` with how the rows of each input move, D, and the basis Q of the shapes.
-        """
+        """Return J (n_in 2 n_freq, n_parameters) of an output."""
+        # `J = D - Q Q^T D` with how the rows of each input move, D, and the basis Q of the shapes
         n_in = self.participation.shape[0]
         Q = self.bases[o][0]
         J = np.zeros((n_in, Q.shape[0] // n_in, 2 * self.m * n_in))
@@ -375,13 +367,11 @@ class Fit:
 
     @cached_property
     def _equations(self) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
-        """J^T J and J^T e, and per output what the shapes take of J, Q^T D.
-
-        ``J^T J = D^T D - (Q^T D)^T Q^T D`` and ``J^T e = D^T e``, summed over the inputs, whose
-        rows feel only their own participation; Q of the residual terms and of the shapes, which
-        are free of them, as e is. J itself is formed where the difference would lose more than the
-        least damping of a step makes up for.
-        """
+        """J^T J and J^T e, and per output what the shapes take of J, Q^T D."""
+        # `J^T J = D^T D - (Q^T D)^T Q^T D` and `J^T e = D^T e`, summed over the inputs, whose rows
+        # feel only their own participation; Q of the residual terms and of the shapes, which are
+        # free of them, as e is. J itself is formed where the difference would lose more than the
+        # least damping of a step makes up for
         n_in = self.participation.shape[0]
         count = 2 * self.participation.size
         self.lines.work.add(self.lines.data.size * count**2)
@@ -414,11 +404,9 @@ class Fit:
             yield split[:, 0] + 1j * split[:, 1]
 
     def maps(self) -> list[tuple[FloatArray, ComplexArray]]:
-        """Return per output how its shapes follow.
-
-        d[Re psi; Im psi] / d(poles, participation) and, these held, its rows by the weighted data
-        (n_in, n_freq, 2 m).
-        """
+        """Return per output how its shapes follow."""
+        # d[Re psi; Im psi] / d(poles, participation) and, these held, its rows by the weighted data
+        # (n_in, n_freq, 2 m)
         n_in, n_freq = self.lines.data.shape[1:]
         found = []
         for o, ((Q, _), common) in enumerate(zip(self.bases, self._equations[2], strict=True)):
@@ -466,11 +454,9 @@ OWN_PART, FAR_APART, OWN_SQUARE = 1e-4, 0.1, 1e-6
 
 
 def _orthonormal(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return Q and R of columns of length one, whose memory runs along the columns.
-
-    By the triangle of their products, twice where they are not far apart: many times as fast as
-    `_qr`, and as exact where no column is nearly a combination of the others.
-    """
+    """Return Q and R of columns of length one, whose memory runs along the columns."""
+    # by the triangle of their products, twice where they are not far apart: many times as fast as
+    # `_qr`, and as exact where no column is nearly a combination of the others
     rows, whole = columns.T, np.eye(columns.shape[1])
     for _ in range(2):
         try:
@@ -569,11 +555,9 @@ def pole_terms(
 def residual_terms(
     s: ComplexArray, *, lower: int, upper: int, hold: float | None, top: float
 ) -> ComplexArray:
-    """Return ``1/s, ..., 1/s^lower`` and ``1, s, ..., s^(upper-1)`` (lower + upper, n_freq).
-
-    1/s^2 is the motion of a rigid body; with a hold 1/s and 1/s^2 are T/(z-1) and
-    T^2 (z+1)/(2 (z-1)^2). Powers are of s/top, top in rad/s.
-    """
+    """Return ``1/s, ..., 1/s^lower`` and ``1, s, ..., s^(upper-1)`` (lower + upper, n_freq)."""
+    # 1/s^2 is the motion of a rigid body; with a hold 1/s and 1/s^2 are T/(z-1) and T^2 (z+1)/(2
+    # (z-1)^2). Powers are of s/top, top in rad/s
     rows = []
     for power in range(1, lower + 1):
         term = s ** (-float(power))

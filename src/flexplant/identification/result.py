@@ -79,14 +79,12 @@ def answer(
 
 
 def _covariances(fit: Fit, ready: PreparedLines) -> tuple[FloatArray, ComplexArray]:
-    r"""Return the covariance of [Re lambda; Im lambda] and that of shapes and participation.
-
-    The latter E[n n^H] of the errors n (n_out + n_in,) of each mode. With poles and participation
-    theta, the error of the shape at output a is ``S_a d theta + D_a^T e_a``,
-    ``d theta = N^{-1} sum_b J_b^T e_b``; D_a and J_a are orthogonal, so that the two are
-    independent unless outputs share errors. Noise that acts on the machine is shared: near a
-    resonance it moves all outputs along the shape, which is scale.
-    """
+    """Return the covariance of [Re lambda; Im lambda] and that of shapes and participation."""
+    # the latter E[n n^H] of the errors n (n_out + n_in,) of each mode. With poles and participation
+    # theta, the error of the shape at output a is `S_a d theta + D_a^T e_a`,
+    # `d theta = N^{-1} sum_b J_b^T e_b`; D_a and J_a are orthogonal, so that the two are
+    # independent unless outputs share errors. Noise that acts on the machine is shared: near a
+    # resonance it moves all outputs along the shape, which is scale
     N, maps = fit.gradient()[0], fit.maps()
     m, n_out, n_in = fit.poles.size, len(maps), fit.participation.shape[0]
     # participation of repeated poles is known up to a rotation only: it gets no variance
@@ -186,13 +184,11 @@ def hann_segment(frf: Frf) -> float | None:
 
 
 def leakage_warned(frf: Frf, found: IdentifiedModes) -> None:
-    r"""Warn of resonances that windowed segments widen by more than their deviation.
-
-    Segments of length T without a taper shift a pole by about -1/T: of its width of n lines,
-    ``1/(pi n)``; tapered ones leave about ``0.15 n^-1.25`` ([BendatPiersol2010]_, section 11.6;
-    random excitation). What leaks is not coherent: no more than ``1 - gamma^2`` at the resonance.
-    Where the window is fitted through, nothing is left but below half a line.
-    """
+    """Warn of resonances that windowed segments widen by more than their deviation."""
+    # segments of length T without a taper shift a pole by about -1/T: of its width of n lines,
+    # `1/(pi n)`; tapered ones leave about `0.15 n^-1.25` ([BendatPiersol2010]_, section 11.6;
+    # random excitation). What leaks is not coherent: no more than `1 - gamma^2` at the resonance.
+    # Where the window is fitted through, nothing is left but below half a line
     if frf.window is None or frf.resolution is None:
         return
     poles = found.poles

@@ -385,11 +385,9 @@ CHANCE = 3.0
 
 
 def dropouts_warned(data: Records) -> None:
-    """Warn of outputs that repeat one value for longer than quantisation would make them.
-
-    A cable, a buffer or an interferometer that lost its fringe: a disturbance at all lines of an
-    FRF. Values before the first change are the machine at rest.
-    """
+    """Warn of outputs that repeat one value for longer than quantisation would make them."""
+    # a cable, a buffer or an interferometer that lost its fringe: a disturbance at all lines of an
+    # FRF. Values before the first change are the machine at rest
     for name, record in zip(data.outputs, np.moveaxis(data.y, 1, 0), strict=True):
         for signal in record:
             at, length = _longest(signal)

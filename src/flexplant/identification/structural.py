@@ -191,10 +191,8 @@ class MeasuredPlaces:
         self.top = 2 * np.pi * measured.top
 
     def maps(self, poles: ComplexArray) -> ComplexArray:
-        """Return the maps (m, places, n_out + n_in) from [shape; participation] to a shape.
-
-        The mean of both where a place was driven and measured.
-        """
+        """Return the maps (m, places, n_out + n_in) from [shape; participation] to a shape."""
+        # the mean of both where a place was driven and measured
         found = np.zeros((poles.size, self.count, len(self.outputs) + len(self.inputs)), complex)
         for channel, place in enumerate([*self.outputs, *self.inputs]):
             found[:, place, channel] = 1.0 if channel < len(self.outputs) else 2j * poles.imag
@@ -224,11 +222,9 @@ class MeasuredPlaces:
         return Beside(poles[keep], known[:, :, keep], phi[:, keep])
 
     def smooth(self, beside: Beside) -> tuple[FloatArray, FloatArray, float]:
-        """Return A, G and w of ``A/s^2 + G w^2/(s^2 + w^2)``, nearest to all but the modes.
-
-        The residual terms, and what poles outside the band are no modes of a structure, on 200
-        frequencies of the band, relative to the whole response; w is searched.
-        """
+        """Return A, G and w of ``A/s^2 + G w^2/(s^2 + w^2)``, nearest to all but the modes."""
+        # the residual terms, and what poles outside the band are no modes of a structure, on 200
+        # frequencies of the band, relative to the whole response; w is searched
         measured, top = self.measured, self.top
         freq = np.geomspace(0.5 * float(measured.freq.min()), measured.top, 200)
         s2 = -((2 * np.pi * freq) ** 2)

@@ -108,11 +108,9 @@ def read_ansys(
 
 
 def cosines_of(angles: Any) -> FloatArray:
-    """Return the direction cosines (3, 3) of ANSYS nodal angles THXY, THYZ, THZX [deg].
-
-    The axes are turned about z, then about the new x, then about the new y; row i holds the global
-    components of local axis i.
-    """
+    """Return the direction cosines (3, 3) of ANSYS nodal angles THXY, THYZ, THZX [deg]."""
+    # the axes are turned about z, then about the new x, then about the new y; row i holds the
+    # global components of local axis i
     (sz, sx, sy), (cz, cx, cy) = np.sin(np.deg2rad(angles)), np.cos(np.deg2rad(angles))
     about_z = np.array([[cz, sz, 0], [-sz, cz, 0], [0, 0, 1]])
     about_x = np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])

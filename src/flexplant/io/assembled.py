@@ -90,10 +90,8 @@ def from_triplets(
 def chosen(
     variables: Mapping[str, Any], wanted: Mapping[str, str | None], source: str
 ) -> dict[str, Any]:
-    """Return which variables of a file are K, M and D, where there; those named must be.
-
-    "usual" stands for one that has a usual name, as does None, but for D: None leaves it out.
-    """
+    """Return which variables of a file are K, M and D, where there; those named must be."""
+    # "usual" stands for one that has a usual name, as does None, but for D: None leaves it out
     # the shortest path first: K before model.K
     there = sorted(variables, key=lambda text: (text.count("."), text))
     found: dict[str, Any] = {}

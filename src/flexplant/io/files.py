@@ -59,10 +59,8 @@ def _separated(fields: Any) -> Any:
 
 
 def spaced_numbers(text: bytes, count: int | None = None) -> FloatArray | None:
-    """Return the numbers of a text that separates them with spaces or line ends.
-
-    None when one is no number, or there are not `count`.
-    """
+    """Return the numbers of a text that separates them with spaces or line ends."""
+    # None when one is no number, or there are not `count`
     clean = text.translate(_LETTERS)
     seen = np.frombuffer(clean, np.uint8)
     signs = np.flatnonzero((seen[1:] == ord("+")) | (seen[1:] == ord("-")))
@@ -132,10 +130,8 @@ def printed_digits(words: Iterable[bytes]) -> int | None:
 
 
 def cut_short(content: bytes, words: Iterable[bytes]) -> bool:
-    r"""Return whether a text ends, without a line end, in a number shorter than all others.
-
-    A number without its last digits still is a number.
-    """
+    """Return whether a text ends, without a line end, in a number shorter than all others."""
+    # a number without its last digits still is a number
     last = content[-80:].split()[-1:]
     if content.endswith((b"\n", b"\r")) or not last:
         return False

@@ -96,10 +96,8 @@ def _plain_value(value: Any) -> Any:
 
 
 def sound(matrix: Any) -> Any:
-    """Return a sparse matrix whose pointers and indices were checked, anything else as it is.
-
-    Damaged ones make SciPy write outside of its arrays; its own check passes over empty matrices.
-    """
+    """Return a sparse matrix whose pointers and indices were checked, anything else as it is."""
+    # damaged ones make SciPy write outside of its arrays; its own check passes over empty matrices
     import numpy as np
 
     if hasattr(matrix, "indptr"):

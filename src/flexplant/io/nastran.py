@@ -37,11 +37,9 @@ class Nodes:
 
 
 def read_nodes(path: str | Path) -> Nodes:
-    """Return the nodes of a Nastran bulk data file.
-
-    GRID, GRDSET and CORD2R, CORD2C, CORD2S in free, small or large fields, also in files that it
-    INCLUDEs, up to ENDDATA; all other cards are passed over.
-    """
+    """Return the nodes of a Nastran bulk data file."""
+    # GRID, GRDSET and CORD2R, CORD2C, CORD2S in free, small or large fields, also in files that it
+    # INCLUDEs, up to ENDDATA; all other cards are passed over
     lines = _bulk_lines(file_path(path, "bdf"))
     grids: dict[int, list[str]] = {}
     systems: dict[int, tuple[str, list[str]]] = {}
@@ -90,10 +88,8 @@ def basic_nodes(
 
 
 def _bulk_lines(path: Path, above: tuple[Path, ...] = ()) -> list[tuple[str, int, str]]:
-    """Return (file, line number, text) of all lines, those of INCLUDEd files in their place.
-
-    ENDDATA, in whatever file, ends all of them.
-    """
+    """Return (file, line number, text) of all lines, those of INCLUDEd files in their place."""
+    # ENDDATA, in whatever file, ends all of them
     found = []
     continued = ""
     for number, line in enumerate(path.read_text(encoding="latin-1").splitlines(), 1):
@@ -335,12 +331,10 @@ class Block:
 
 
 def blocks(content: bytes, path: str) -> Iterator[Block]:
-    """Yield the data blocks of a file.
-
-    Format: MSC Nastran DMAP Programmer's Guide, OUTPUT2. Fortran records, of which those of one
-    word are keys: above 0 as many words follow as the next record, below 0 a logical record ends,
-    0 ends a data block, and once more the file. Each logical record begins with its kind.
-    """
+    """Yield the data blocks of a file."""
+    # format: MSC Nastran DMAP Programmer's Guide, OUTPUT2. Fortran records, of which those of one
+    # word are keys: above 0 as many words follow as the next record, below 0 a logical record ends,
+    # 0 ends a data block, and once more the file. Each logical record begins with its kind
     order, size = _word_layout(content, path)
     at, pieces, records = 0, list[bytes](), list[bytes]()
     while at < len(content):

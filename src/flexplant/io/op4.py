@@ -111,12 +111,10 @@ def _matrix(
     kind: int,
     places: list[tuple[int, int]],
 ) -> Any:
-    """Return one matrix from the places of its columns.
-
-    A column is (column, first row, words of data) and then the values; the first row is 0 where
-    it is sparse, and the data are strings, each with a header: (L + 1, row) in the big form,
-    row + 65536 (L + 1) in the other, for L words of values.
-    """
+    """Return one matrix from the places of its columns."""
+    # a column is (column, first row, words of data) and then the values; the first row is 0 where
+    # it is sparse, and the data are strings, each with a header: (L + 1, row) in the big form, row
+    # + 65536 (L + 1) in the other, for L words of values
     size, dtype = words.integer, np.dtype(words.real[0] if kind in (1, 3) else words.real[1])
     per = dtype.itemsize * (2 if kind > 2 else 1)
     value: Any = np.dtype(f"{words.order}c{per}") if kind > 2 else dtype
@@ -177,10 +175,8 @@ def _placed(
 
 
 def _strings(words: _Words, first: Any, end: Any, big: bool, per: int, name: str) -> Any:
-    """Return where each string's values begin, how many there are, their row and their column.
-
-    The strings of a column are a chain; those of all columns are followed at once.
-    """
+    """Return where each string's values begin, how many there are, their row and their column."""
+    # the strings of a column are a chain; those of all columns are followed at once
     size, integer = words.integer, np.dtype(f"{words.order}i{words.integer}")
     head = 2 * size if big else size
     alive = np.arange(first.size)

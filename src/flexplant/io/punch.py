@@ -231,10 +231,8 @@ def _read_block(
 
 
 def _large(part: list[bytes], first: int, real: bool, path: str) -> Any:
-    """Return columns, rows, values of cards in large fields, all at once.
-
-    Of a real matrix the last field, the imaginary part, must be empty or 0.
-    """
+    """Return columns, rows, values of cards in large fields, all at once."""
+    # of a real matrix the last field, the imaginary part, must be empty or 0
     table = np.frombuffer(b"".join(line[:72].ljust(72) for line in part), np.uint8)
     table = table.reshape(-1, 72)
     heads = table[:, 0] == ord("D")
@@ -379,11 +377,9 @@ _EIGENVALUE = re.compile(rb"\$EIGENVALUE\s*=\s*(\S+)\s+MODE\s*=\s*(\d+)")
 
 
 def read_punch_shapes(path: Path, nodes: Path | None) -> FileShapes:
-    """Return the mode shapes of a punch file.
-
-    Two lines a point: number, kind and three displacements, then `-CONT-` and three rotations;
-    columns 73 to 80 count lines. A header `$EIGENVALUE = ... MODE = ...` begins each mode.
-    """
+    """Return the mode shapes of a punch file."""
+    # two lines a point: number, kind and three displacements, then `-CONT-` and three rotations;
+    # columns 73 to 80 count lines. A header `$EIGENVALUE = ... MODE = ...` begins each mode
     lines = [line[:72] for line in path.read_bytes().splitlines()]
     parts: list[tuple[float, dict[int, tuple[bytes, list[float]]]]] = []
     inside, node, kind = False, 0, b""

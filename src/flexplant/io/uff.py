@@ -270,10 +270,8 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
 
 
 def raw_nodes(path: str | Path) -> tuple[IntArray, FloatArray, tuple[float, float]]:
-    """Return node numbers (n,), their places (n, 3) and the factors of length and force to SI.
-
-    Numbers divided by these factors are in SI; 1 where the file has no dataset 164.
-    """
+    """Return node numbers (n,), their places (n, 3) and the factors of length and force to SI."""
+    # numbers divided by these factors are in SI; 1 where the file has no dataset 164
     sets = datasets(path, (15, 2411, 164, 2420))
     factors = next((part for part in sets if part["type"] == 164), dict.fromkeys(_FACTORS, 1.0))
     check_systems([part for part in sets if part["type"] == 2420], str(path))

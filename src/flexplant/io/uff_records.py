@@ -78,11 +78,9 @@ def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
 
 
 def _check_end(path: Path) -> None:
-    """Refuse a file that ends within a dataset: pyuff passes over what has no end.
-
-    Lines of -1, in columns 5 and 6, begin and end each dataset, right behind the bytes of a binary
-    one (58b); its type stands in the second line.
-    """
+    """Refuse a file that ends within a dataset: pyuff passes over what has no end."""
+    # lines of -1, in columns 5 and 6, begin and end each dataset, right behind the bytes of a
+    # binary one (58b); its type stands in the second line
     place, inside, kind = 0, False, ""
     with path.open("rb") as file:
         for line in file:

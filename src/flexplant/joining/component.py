@@ -95,10 +95,8 @@ def _static_rows(model: Model, pose: Pose) -> FloatArray:
 
 
 def placed_model(model: Model, pose: Pose) -> Model:
-    """Return a model where it stands, its DOFs in the directions of the machine.
-
-    Coordinates of a reduced model that the rotation makes oblique stay, as generalised ones.
-    """
+    """Return a model where it stands, its DOFs in the directions of the machine."""
+    # coordinates of a reduced model that the rotation makes oblique stay, as generalised ones
     if np.array_equal(pose.rotation, np.eye(3)) and not np.any(pose.shift):
         return model
     full = model.full_dofs
@@ -377,11 +375,9 @@ class Pose(Value):
 
 
 def turned_dofs(dofs: DofSet, pose: Pose) -> tuple[DofSet, sp.csc_array]:
-    """Return DOFs in the directions and places of the machine, and C with ``q = C q_own``.
-
-    The interpolation is left out. C is orthogonal: it turns each node's displacements, and its
-    rotations.
-    """
+    """Return DOFs in the directions and places of the machine, and C with ``q = C q_own``."""
+    # the interpolation is left out. C is orthogonal: it turns each node's displacements, and its
+    # rotations
     kinds, n = np.array(dofs.kinds), len(dofs)
     rows, columns, values = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]
     for first in (0, 3):

@@ -39,10 +39,8 @@ class MeasuredParts(NamedTuple):
 
 
 def joined_parts(frfs: Mapping[str, Frf], signs: Mapping[str, float]) -> MeasuredParts:
-    """Return responses in one matrix, channels behind the prefixes that name them.
-
-    A response without a variance has none: computed ones have no errors.
-    """
+    """Return responses in one matrix, channels behind the prefixes that name them."""
+    # a response without a variance has none: computed ones have no errors
     outputs = [f"{name}{channel}" for name, frf in frfs.items() for channel in frf.outputs]
     inputs = [f"{name}{channel}" for name, frf in frfs.items() for channel in frf.inputs]
     n_freq = next(iter(frfs.values())).freq.size
@@ -67,11 +65,9 @@ def joined_parts(frfs: Mapping[str, Frf], signs: Mapping[str, float]) -> Measure
 def variance_of(
     variance: FloatArray, correlation: ComplexArray | None, left: Any, right: Any
 ) -> FloatArray:
-    """Return E|L dY R|^2 (n_out, n_in, n_freq), dY of independent columns.
-
-    L (n_freq, n_out, ...) and R (n_freq, ..., n_in); the errors of different outputs under one
-    input are independent, or correlated.
-    """
+    """Return E|L dY R|^2 (n_out, n_in, n_freq), dY of independent columns."""
+    # L (n_freq, n_out, ...) and R (n_freq, ..., n_in); the errors of different outputs under one
+    # input are independent, or correlated
     if correlation is None:
         found = np.abs(left) ** 2 @ np.moveaxis(variance, 2, 0) @ np.abs(right) ** 2
         return np.moveaxis(found, 0, 2)
@@ -87,11 +83,9 @@ def variance_of(
 def warn_of_errors(
     data: ComplexArray, error: FloatArray, freq: FloatArray, *, known: bool, done: str
 ) -> None:
-    """Warn of lines at which the error of all answers together exceeds these.
-
-    `error` is the variance, or, where none is `known`, what errors of the size of all responses
-    would add up to.
-    """
+    """Warn of lines at which the error of all answers together exceeds these."""
+    # `error` is the variance, or, where none is `known`, what errors of the size of all responses
+    # would add up to
     answer, part = np.sum(np.abs(data) ** 2, axis=(0, 1)), 1.0 if known else _USUAL**2
     hidden = part * np.sum(error, axis=(0, 1)) > answer
     if not hidden.any():
@@ -120,12 +114,10 @@ def joined_frfs(
     joints: Iterable[Joint] | Joint,
     dofs: Mapping[str, DofSet] | None = None,
 ) -> Frf:
-    """Return the responses of a machine from those of its components; see `joined`.
-
-    ``Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y``, Y being block-diagonal, B the stretches of the joints by
-    outputs, B_f their forces by inputs and Z what they give way: dual coupling by Lagrange
-    multipliers (LM-FBS). [deKlerk2008]_, [vanderSeijs2013]_.
-    """
+    """Return the responses of a machine from those of its components; see `joined`."""
+    # `Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y`, Y being block-diagonal, B the stretches of the joints by
+    # outputs, B_f their forces by inputs and Z what they give way: dual coupling by Lagrange
+    # multipliers (LM-FBS). [deKlerk2008]_, [vanderSeijs2013]_
     _same_lines(frfs)
     places, listed = known_places(dofs, frfs), joint_list(joints)
     parts = [channels_as_dofs(name, frf, places.get(name)) for name, frf in frfs.items()]
@@ -296,13 +288,10 @@ def _coupled_response(
     kept: tuple[IntArray, IntArray],
     more: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[ComplexArray, FloatArray]:
-    """Return ``Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y`` between kept channels, and its variance.
-
-    With `more` rows of B and B_f, of rigid joints alone, the inverse is that of the rank of these.
-
-    To first order an error dY of the parts becomes ``(I - Y B_f^T S^-1 B) dY (I - B_f^T S^-1 B Y)``
-    with S the inverted matrix. Where no variance is known, |dY| is as large as Y.
-    """
+    """Return ``Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y`` between kept channels, and its variance."""
+    # with `more` rows of B and B_f, of rigid joints alone, the inverse is that of the rank of these
+    # to first order an error dY of the parts becomes `(I - Y B_f^T S^-1 B) dY (I - B_f^T S^-1 B Y)`
+    # with S the inverted matrix. Where no variance is known, |dY| is as large as Y
     Y, outputs, inputs = parts.data, parts.outputs, parts.inputs
     size_of_error = np.abs(Y) ** 2 if parts.variance is None else parts.variance
     rows, columns = kept

@@ -168,10 +168,8 @@ def warn_of_bending(
 
 
 def softness(links: Sequence[FrfLink], freq: FloatArray, quantity: str | None) -> ComplexArray:
-    """Return what links give way (m, n_freq) per force: ``(2 pi i f)^p / (k + 2 pi i f c)``.
-
-    p is 0, 1 or 2 where displacements, velocities or accelerations are measured.
-    """
+    """Return what links give way (m, n_freq) per force: ``(2 pi i f)^p / (k + 2 pi i f c)``."""
+    # p is 0, 1 or 2 where displacements, velocities or accelerations are measured
     s = 2j * np.pi * freq
     found = np.zeros((len(links), freq.size), dtype=np.complex128)
     for row, link in zip(found, links, strict=True):

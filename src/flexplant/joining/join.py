@@ -326,12 +326,10 @@ class JoinedMachine:
         return [np.flatnonzero(label == number) for number in range(int(label.max()) + 1)]
 
     def motions(self, rows: Any, *, free: bool) -> FloatArray:
-        """Return the M-orthonormal motions (k, m) of components as rigid bodies along joints.
-
-        They stretch none of the rows. For each part of the machine first those of the whole, then
-        those of one component against others (a slide, a hinge): all are combinations of the
-        components' own motions, those without energy or, unless `free`, the held ones too.
-        """
+        """Return the M-orthonormal motions (k, m) of components as rigid bodies along joints."""
+        # they stretch none of the rows. For each part of the machine first those of the whole, then
+        # those of one component against others (a slide, a hinge): all are combinations of the
+        # components' own motions, those without energy or, unless `free`, the held ones too
         found = []
         for group in self.groups:
             several = [part.model for part in (self.parts[i] for i in group)]
@@ -401,10 +399,9 @@ class JoinedMachine:
         return found
 
     def _inertia(self) -> tuple[FloatArray, float]:
-        """Return the inertia (6, 6) of all components, and how far that of the machine is off.
-
-        Motions that a reduced component cannot make (it is held, say) have no inertia of the whole.
-        """
+        """Return the inertia (6, 6) of all components, and how far that of the machine is off."""
+        # motions that a reduced component cannot make (it is held, say) have no inertia of the
+        # whole
         own = [part.model.rigid_motions() for part in self.parts]
         apart, missed = np.zeros((6, 6)), np.zeros(6)
         for part, motions in zip(self.parts, own, strict=True):
@@ -442,14 +439,12 @@ _RANK = 1e-11
 
 
 def patch_errors(links: Sequence[Link], parts: Sequence[Component]) -> dict[str, float]:
-    """Return, for each patch of a joint, how far apart its bounds of the compliance are.
-
-    With u the displacements of the nodes, C their elastic compliance on the component alone, A the
-    rigid motions of the patch and W the mean, ``W A = I``: a load on the mean motion meets
-    ``W C W^T``, on a patch that stays rigid ``(A^T C^-1 A)^-1``, which is less (Gauss and Markov).
-    What is returned is the largest of 1 - rigid / mean over the axes joined; NaN for a patch of
-    more than 1000 displacements, or of a component that is unstable or has no elastic modes.
-    """
+    """Return, for each patch of a joint, how far apart its bounds of the compliance are."""
+    # with u the displacements of the nodes, C their elastic compliance on the component alone, A
+    # the rigid motions of the patch and W the mean, `W A = I`: a load on the mean motion meets
+    # `W C W^T`, on a patch that stays rigid `(A^T C^-1 A)^-1`, which is less (Gauss and Markov).
+    # What is returned is the largest of 1 - rigid / mean over the axes joined; NaN for a patch of
+    # more than 1000 displacements, or of a component that is unstable or has no elastic modes
     found: dict[str, float] = {}
     joints = list({id(link.joint): link.joint for link in links}.values())
     for number, joint in enumerate(joints, 1):

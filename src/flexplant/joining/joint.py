@@ -353,10 +353,8 @@ class JointEnd:
         return bool(np.linalg.norm(point - self.point) <= _SHORT_ARM * self._size)
 
     def row(self, axis: str, point: FloatArray) -> FloatArray:
-        """Return the motion (n,) along an axis at a point that moves with this end.
-
-        A displacement there is ``u + theta x (point - own point)``.
-        """
+        """Return the motion (n,) along an axis at a point that moves with this end."""
+        # a displacement there is `u + theta x (point - own point)`
         if axis not in self._rows:
             raise LabelError(
                 f"the joint at {self.text} has no axis {axis!r}: it moves along "
@@ -386,10 +384,8 @@ class JointEnd:
         return found
 
     def _turn_of_neighbours(self, turn: str) -> FloatArray | None:
-        """Return the mean rotation (n,) of the nodes next to this end, None where there is none.
-
-        Coordinates with few digits leave gaps between nodes that are meant to be one.
-        """
+        """Return the mean rotation (n,) of the nodes next to this end, None where there is none."""
+        # coordinates with few digits leave gaps between nodes that are meant to be one
         dofs = self._dofs
         first = np.unique(dofs.node_index, return_index=True)[1]
         distance = np.linalg.norm(dofs.xyz[first] - self.point, axis=1)

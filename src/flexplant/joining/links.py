@@ -261,12 +261,10 @@ class Elimination(NamedTuple):
 
 
 def eliminated(B: sp.csr_array, size: FloatArray, order: IntArray) -> Elimination:
-    """Return the motions that fulfil ``B q = 0``.
-
-    Coordinates that no constraint names are left alone, one that a single constraint names follows
-    it, and of the others, constraints that share no coordinate are solved apart: sparse matrices
-    stay sparse.
-    """
+    """Return the motions that fulfil ``B q = 0``."""
+    # coordinates that no constraint names are left alone, one that a single constraint names
+    # follows it, and of the others, constraints that share no coordinate are solved apart: sparse
+    # matrices stay sparse
     n = B.shape[1]
     lead = _own_followers(B, size, order)
     plain = lead >= 0

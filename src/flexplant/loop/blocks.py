@@ -28,11 +28,9 @@ def driving_blocks(
     *,
     applied: bool = False,
 ) -> StateSpace:
-    """Return the blocks as one system from y to the driven actuators and what is watched.
-
-    With `applied`, what the driven actuators apply are inputs too, after y: blocks that read an
-    actuator's name read these, not the commands.
-    """
+    """Return the blocks as one system from y to the driven actuators and what is watched."""
+    # with `applied`, what the driven actuators apply are inputs too, after y: blocks that read an
+    # actuator's name read these, not the commands
     read = [name for name in plant.u if any(name in sys.inputs for sys in systems)]
     silent = [name for name in read if name not in driven]
     used = [name for sys in systems for name in (*sys.inputs, *sys.outputs)]
@@ -243,11 +241,9 @@ _SEEN = 1e-12
 
 
 def applied_law(loop: Any, recovery: float | None) -> tuple[StateSpace, FloatArray]:
-    """Return the law [y; applied u] -> [u; watched], and L (n, nu) of its anti-windup.
-
-    Its states move by ``L (applied - commanded)`` besides: slow ones of blocks that drive actuators
-    return within `recovery` [samples]; L is zero without.
-    """
+    """Return the law [y; applied u] -> [u; watched], and L (n, nu) of its anti-windup."""
+    # its states move by `L (applied - commanded)` besides: slow ones of blocks that drive actuators
+    # return within `recovery` [samples]; L is zero without
     plant, driven = loop.plant, list(loop.driven)
     law = driving_blocks(plant, loop.blocks, driven, list(loop.watched), applied=True)
     ny, nu = len(plant.y), len(driven)
@@ -264,12 +260,10 @@ def applied_law(loop: Any, recovery: float | None) -> tuple[StateSpace, FloatArr
 
 
 def _mirror_gain(loop: Any, A: FloatArray, C: FloatArray, radius: float) -> FloatArray:
-    """Return L that mirrors the slow poles of the driving blocks at a circle.
-
-    Only poles beyond the circle move: with V a basis of their invariant subspace, ``A V = V S``
-    and ``L = V L_s``, where L_s is the filter gain of (S / radius, C V) for no process noise. It
-    takes each pole p to radius^2 / p, with the least gain that does.
-    """
+    """Return L that mirrors the slow poles of the driving blocks at a circle."""
+    # only poles beyond the circle move: with V a basis of their invariant subspace, `A V = V S` and
+    # `L = V L_s`, where L_s is the filter gain of (S / radius, C V) for no process noise. It takes
+    # each pole p to radius^2 / p, with the least gain that does
     owner = np.repeat(np.arange(len(loop.blocks)), [b.n_states for b in loop.blocks])
     drives = [bool(set(b.outputs) & set(loop.driven)) for b in loop.blocks]
     own = np.flatnonzero(np.asarray(drives, dtype=bool)[owner])

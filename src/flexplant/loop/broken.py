@@ -189,12 +189,10 @@ _CHUNK = 32
 
 
 def scaled_size(S: ComplexArray) -> FloatArray:
-    """Return ``min_D sigma_max(D S D^-1)``, D diagonal, of S (k, n, n).
-
-    It is the upper bound of the structured singular value of one perturbation for each axis
-    [Skogestad2005]_, section 8.8, whatever the units of the axes. Where it cannot be the
-    largest it is a bound from above.
-    """
+    """Return ``min_D sigma_max(D S D^-1)``, D diagonal, of S (k, n, n)."""
+    # it is the upper bound of the structured singular value of one perturbation for each axis
+    # [Skogestad2005]_, section 8.8, whatever the units of the axes. Where it cannot be the largest
+    # it is a bound from above
     log = _log_scaling(S)
     size = np.asarray(np.linalg.norm(_d_scaled(S, log), 2, axis=(1, 2)))
     if S.shape[-1] < 3:  # the product of both singular values is fixed: balanced is optimal

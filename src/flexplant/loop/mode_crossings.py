@@ -354,10 +354,8 @@ def _horner(polynomial: Any, at: Any) -> Any:
 def axis_crossings(
     swept: SweptLoop, modes: SweptModes, freq: FloatArray, kind: str, ends: FloatArray
 ) -> FloatArray:
-    """Return the real changes (modes, 2) next to none, down and up, at which a pole crosses.
-
-    `freq` [Hz] of each pair, rising within a mode; `ends` (modes, 2) of the changes looked for.
-    """
+    """Return the real changes (modes, 2) next to none, down and up, at which a pole crosses."""
+    # `freq` [Hz] of each pair, rising within a mode; `ends` (modes, 2) of the changes looked for
     found = np.tile([-np.inf, np.inf], (len(ends), 1))
     limits = np.abs(ends).max(axis=1)[modes.mode]
     delta = modes.changes(kind, limits)
@@ -405,11 +403,9 @@ def size_reached(
     limits: FloatArray,
     size: float,
 ) -> FloatArray:
-    """Return the changes of frequency (modes, 2), down and up, at which |S| at u reaches a size.
-
-    Where the resonance does not pass, |S| changes little and one way: only points are examined
-    that come near the size at an end. `freq` [Hz] of each pair, rising within a mode.
-    """
+    """Return the changes of frequency (modes, 2), down and up, at which |S| at u reaches a size."""
+    # where the resonance does not pass, |S| changes little and one way: only points are examined
+    # that come near the size at an end. `freq` [Hz] of each pair, rising within a mode
     count = len(limits)
     high = np.linalg.norm(swept.S, 2, axis=(1, 2)) >= size
     every = SizeBound.of(np.where(high[:, None, None], 0.0, swept.S), modes, size)

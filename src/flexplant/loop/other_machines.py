@@ -412,14 +412,11 @@ def mode_tolerances(
     known: Any = None,
     limit: float | Mapping[int, float] = LIMIT,
 ) -> ModeTolerances:
-    """Return the smallest changes of each mode that harm a stable loop, up to `limit`.
-
-    A mapping names the modes that are examined, each with a limit of its own.
-
-    At each point of the stability boundary that a pole lies there is an equation for a complex
-    change of one mode (`mode_crossings`); where its imaginary part changes its sign along the
-    boundary, a pole crosses it at a real change. The sampled plant's matrices are exact.
-    """
+    """Return the smallest changes of each mode that harm a stable loop, up to `limit`."""
+    # a mapping names the modes that are examined, each with a limit of its own
+    # at each point of the stability boundary that a pole lies there is an equation for a complex
+    # change of one mode (`mode_crossings`); where its imaginary part changes its sign along the
+    # boundary, a pole crosses it at a real change. The sampled plant's matrices are exact
     modal_realisation(plant)
     margin = positive(margin, "margin")
     if margin >= 1.0:
@@ -460,10 +457,8 @@ def mode_tolerances(
 def machine_draws(
     loop: Any, uncertain: object, margin: float, count: int, rng: Any = 0
 ) -> MachineDraws:
-    """Return the margins of a closed loop's controller on machines of an uncertain plant.
-
-    With the modes left out, whose frequencies are off too, where these are known.
-    """
+    """Return the margins of a closed loop's controller on machines of an uncertain plant."""
+    # with the modes left out, whose frequencies are off too, where these are known
     if not isinstance(uncertain, UncertainPlant):
         raise ModelError(
             "machines are drawn from an UncertainPlant: close the loop on "
@@ -480,11 +475,9 @@ def machine_draws(
 
 
 def reported_tolerances(loop: Any) -> ModeTolerances | None:
-    """Return what the modes of a closed loop hold to, beside what its plant says of them.
-
-    With the modes left out, where these are known and frequencies are uncertain; of a sure plant
-    without: its models are large, and what they add to the answer is little.
-    """
+    """Return what the modes of a closed loop hold to, beside what its plant says of them."""
+    # with the modes left out, where these are known and frequencies are uncertain; of a sure plant
+    # without: its models are large, and what they add to the answer is little
     uncertain = loop.plant.uncertainty
     if uncertain is None:
         sure = loop.plant.has_own_modes and loop.is_stable and _swinging_modes(loop.plant)[0].size

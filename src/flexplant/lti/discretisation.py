@@ -190,14 +190,12 @@ def block_diagonal(pairs: FloatArray) -> FloatArray:
 
 
 def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
-    """Return ``e^(A h)`` and ``int_0^h e^(A s) ds`` of (b, 2, 2) blocks, both (b, 2, 2).
-
-    With m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so
-    ``e^(A h) = e^(m h) (cosh(r h) I + sinh(r h) / r N)``, r^2 = q: trigonometric for an oscillating
-    pair, linear in h for a rigid-body pair. The integral is a Taylor series on h / 2^s, doubled
-    by ``I(2 t) = I(t) + e^(A t) I(t)``: no division by small frequencies. There both states of a
-    pair have units in which they are of one size, so that s is small.
-    """
+    """Return ``e^(A h)`` and ``int_0^h e^(A s) ds`` of (b, 2, 2) blocks, both (b, 2, 2)."""
+    # with m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so
+    # `e^(A h) = e^(m h) (cosh(r h) I + sinh(r h) / r N)`, r^2 = q: trigonometric for an oscillating
+    # pair, linear in h for a rigid-body pair. The integral is a Taylor series on h / 2^s, doubled
+    # by `I(2 t) = I(t) + e^(A t) I(t)`: no division by small frequencies. There both states of a
+    # pair have units in which they are of one size, so that s is small
     given, pairs, units = pairs, pairs.copy(), _even_units(pairs)
     pairs[:, 0, 1] /= units
     pairs[:, 1, 0] *= units
@@ -226,12 +224,10 @@ def _even_units(pairs: FloatArray) -> FloatArray:
 
 
 def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
-    """Return ``e^(A h)`` of (b, 2, 2) blocks in closed form.
-
-    An overdamped pair has poles m +- r whose exponentials are formed each by itself: cosh(r h) of
-    its own overflows long before the decay e^(m h) that tames it. The smaller of the two poles is
-    the determinant over the larger, which keeps the digits that m +- r would cancel.
-    """
+    """Return ``e^(A h)`` of (b, 2, 2) blocks in closed form."""
+    # an overdamped pair has poles m +- r whose exponentials are formed each by itself: cosh(r h) of
+    # its own overflows long before the decay e^(m h) that tames it. The smaller of the two poles is
+    # the determinant over the larger, which keeps the digits that m +- r would cancel
     mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
     N = pairs - mean[:, None, None] * np.eye(2)
     q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
@@ -392,14 +388,12 @@ _NODES = 10
 def accumulated_noise(
     at: Callable[[float], FloatArray], force: FloatArray, time: float, rate: float
 ) -> FloatArray:
-    """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``.
-
-    Gauss-Legendre quadrature. Over the whole interval where as many nodes as make it exact to
-    rounding give less than n columns, as for a large structure with few forces. Else over a piece
-    so short that ten nodes are exact, then ``G(2 t) = [G(t), e^(A t) G(t)]``: log2(time rate)
-    steps, however fast the modes are. Sums of squares, so that G G' is positive semidefinite in
-    any units; the block exponential of [VanLoan1978]_ was seen to lose that on large models.
-    """
+    """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``."""
+    # Gauss-Legendre quadrature. Over the whole interval where as many nodes as make it exact to
+    # rounding give less than n columns, as for a large structure with few forces. Else over a piece
+    # so short that ten nodes are exact, then `G(2 t) = [G(t), e^(A t) G(t)]`: log2(time rate)
+    # steps, however fast the modes are. Sums of squares, so that G G' is positive semidefinite in
+    # any units; the block exponential of [VanLoan1978]_ was seen to lose that on large models
     n, m = force.shape
     # the error is a Bessel function of order 2 count and argument |A| time: nothing beyond there
     size = min(rate * time, 2.0 * n)
@@ -534,10 +528,8 @@ class Blocks(NamedTuple):
     size: int
 
     def run(self, v: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the outputs (N, p) for inputs (N, m) from a state (n,), and the last state.
-
-        N is a whole number of blocks. All is a product of two matrices but ``step x``.
-        """
+        """Return the outputs (N, p) for inputs (N, m) from a state (n,), and the last state."""
+        # N is a whole number of blocks. All is a product of two matrices but `step x`
         count = v.shape[0] // self.size
         inputs = np.ascontiguousarray(v).reshape(count, -1)
         states = np.empty((count + 1, x.size))

@@ -11,12 +11,10 @@ from ..tolerances import SPLIT, divisor
 
 
 def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
-    """Return d (n,), powers of two, for states ``x = d x_scaled``: ``A d / d[:, None]`` is even.
-
-    A is bordered by the sizes of B's rows and C's columns and balanced with them: balancing A
-    alone shrinks whatever lies above its diagonal blocks without end (a Schur form of 84 states
-    got units of 1e26 beside 1e-34), which costs B and C all their digits.
-    """
+    """Return d (n,), powers of two, for states ``x = d x_scaled``: ``A d / d[:, None]`` is even."""
+    # A is bordered by the sizes of B's rows and C's columns and balanced with them: balancing A
+    # alone shrinks whatever lies above its diagonal blocks without end (a Schur form of 84 states
+    # got units of 1e26 beside 1e-34), which costs B and C all their digits
     drive, sight = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
     # borders as large as the balanced A, whatever the units of A, inputs, outputs
     size = float(np.linalg.norm(balanced_matrix(A))) or 1.0
@@ -183,11 +181,9 @@ def shifted_columns(A: FloatArray, shifts: ComplexArray, right: ComplexArray) ->
 def doubled_riccati(
     A: FloatArray, G: FloatArray, H: FloatArray, *, quick: bool = False
 ) -> tuple[FloatArray, int]:
-    """Return X of ``X = A' X (I + G X)^-1 A + H`` and the number of doublings [Chu2004]_.
-
-    Quick: converged once no variance grows by 1e-8, which a closed loop that is barely
-    stable may seem to reach: check the residual.
-    """
+    """Return X of ``X = A' X (I + G X)^-1 A + H`` and the number of doublings [Chu2004]_."""
+    # quick: converged once no variance grows by 1e-8, which a closed loop that is barely stable may
+    # seem to reach: check the residual
     n = A.shape[0]
     for k in range(1, DOUBLINGS + 1):
         inner = G @ H

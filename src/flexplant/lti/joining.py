@@ -277,11 +277,9 @@ def pair_eigenvalues(
 def zpk_fields(
     zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float, dt: float = 0.0
 ) -> dict[str, Any]:
-    """Return A, B, C, D and blocks of ``gain prod(s - zeros) / prod(s - poles)``.
-
-    Each pair of poles is a block of two states with the zeros nearest to it, the least damped
-    first, so that A keeps its poles to rounding: a companion form of many poles does not.
-    """
+    """Return A, B, C, D and blocks of ``gain prod(s - zeros) / prod(s - poles)``."""
+    # each pair of poles is a block of two states with the zeros nearest to it, the least damped
+    # first, so that A keeps its poles to rounding: a companion form of many poles does not
     z, p, dt = _as_roots(zeros, "zeros"), _as_roots(poles, "poles"), positive(dt, "dt", zero=True)
     if z.size > p.size:
         raise ModelError(
@@ -401,13 +399,11 @@ _ROUNDING = 1e-11
 
 
 def invariant_zeros(g: Any) -> ComplexArray:
-    """Return the finite invariant zeros, where ``[A - s I, B; C, D]`` loses its normal rank.
-
-    The system is compressed until D has full row and column rank: outputs that do not feel an input
-    directly are states, and states of the rest. What is left is a regular pencil, whose eigenvalues
-    are the zeros; those at infinity have left with the compressed states.
-    [EmamiNaeiniVanDooren1982]_.
-    """
+    """Return the finite invariant zeros, where ``[A - s I, B; C, D]`` loses its normal rank."""
+    # the system is compressed until D has full row and column rank: outputs that do not feel an
+    # input directly are states, and states of the rest. What is left is a regular pencil, whose
+    # eigenvalues are the zeros; those at infinity have left with the compressed states.
+    # [EmamiNaeiniVanDooren1982]_
     A, B, C, D = _even(*_scaled_matrices(g))
     A, B, C, D = _full_rank_part(A, B, C, D)
     A, C, B, D = (part.T for part in _full_rank_part(A.T, C.T, B.T, D.T))
@@ -459,14 +455,12 @@ def _even(
 
 
 def axis_zeros(g: Any) -> ComplexArray:
-    """Return the invariant zeros on the imaginary axis (unit circle), upper half plane.
-
-    Where ``[A - s I, B; C, D]`` loses column rank. With more outputs than inputs they are among the
-    generalised eigenvalues of the pencil with its outputs mixed down to as many as inputs;
-    candidates near the limit are moved onto it. The rank of the whole matrix, states, inputs and
-    outputs scaled to unit size, decides. [EmamiNaeiniVanDooren1982]_; the random mixing replaces
-    their compression.
-    """
+    """Return the invariant zeros on the imaginary axis (unit circle), upper half plane."""
+    # where `[A - s I, B; C, D]` loses column rank. With more outputs than inputs they are among the
+    # generalised eigenvalues of the pencil with its outputs mixed down to as many as inputs;
+    # candidates near the limit are moved onto it. The rank of the whole matrix, states, inputs and
+    # outputs scaled to unit size, decides. [EmamiNaeiniVanDooren1982]_; the random mixing replaces
+    # their compression
     n, m = g.n_states, len(g.inputs)
     A, B, C, D = _scaled_matrices(g)
     mixing = np.linalg.qr(np.random.default_rng(0).standard_normal((C.shape[0], m)))[0].T

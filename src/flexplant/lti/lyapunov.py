@@ -225,12 +225,10 @@ def _modal_gramian(
 
 
 def _of_oscillators(pairs: FloatArray, swing: FloatArray, W: FloatArray) -> FloatArray:
-    """Solve ``A X + X A' + W = 0`` for A of (b, 2, 2) blocks that oscillate, by Cayley-Hamilton.
-
-    With t and d the sum of the traces and the difference of the determinants of two blocks,
-    ``(t A_i + d I) X_ij = -A_i W_ij - W_ij adj(A_j)'``. Pairs of real poles, of unlike size, would
-    lose digits. `swing` (b,) are the squares of the frequencies.
-    """
+    """Solve ``A X + X A' + W = 0`` for A of (b, 2, 2) blocks that oscillate, by Cayley-Hamilton."""
+    # with t and d the sum of the traces and the difference of the determinants of two blocks,
+    # `(t A_i + d I) X_ij = -A_i W_ij - W_ij adj(A_j)'`. Pairs of real poles, of unlike size, would
+    # lose digits. `swing` (b,) are the squares of the frequencies
     (a, e), (c, g) = pairs.transpose(1, 2, 0)  # [[a, e], [c, g]]
     half, det = 0.5 * (a + g), a * g - c * e
     t = 2.0 * (half[:, None] + half)
@@ -292,12 +290,10 @@ def triangular(L: FloatArray) -> FloatArray:
 
 
 def _hammarling(A: FloatArray, B: FloatArray) -> FloatArray:
-    """Solve ``A L L' + L L' A' + B B' = 0`` for L column by column of the Schur form.
-
-    Hammarling's method: P is never formed, so that its small eigenvalues keep their digits. With S
-    upper triangular, last row b of B, ``t = |b| / a, a^2 = -2 Re s_nn, v = b* / |b|``: column ``u =
-    -(S_1 + conj(s_nn) I)^-1 (s t + a B_1 v)``, then ``B_1 <- B_1 - a u v*``. [Hammarling1982]_.
-    """
+    """Solve ``A L L' + L L' A' + B B' = 0`` for L column by column of the Schur form."""
+    # Hammarling's method: P is never formed, so that its small eigenvalues keep their digits. With
+    # S upper triangular, last row b of B, `t = |b| / a, a^2 = -2 Re s_nn, v = b* / |b|`: column
+    # `u = -(S_1 + conj(s_nn) I)^-1 (s t + a B_1 v)`, then `B_1 <- B_1 - a u v*`. [Hammarling1982]_
     n = A.shape[0]
     if not n:
         return np.zeros((0, 0))
@@ -335,10 +331,8 @@ _LAST_ROOT = 1e-9
 
 
 def square_root(X: FloatArray) -> FloatArray:
-    """Return L with ``L L' = X``, which is positive semidefinite apart from rounding.
-
-    By its eigenvectors, each row scaled to unit size before.
-    """
+    """Return L with ``L L' = X``, which is positive semidefinite apart from rounding."""
+    # by its eigenvectors, each row scaled to unit size before
     size = divisor(np.sqrt(np.maximum(X.diagonal(), 0.0)))
     values, vectors = np.linalg.eigh(symmetrised(X) / size / size[:, None])
     return np.asarray(size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))

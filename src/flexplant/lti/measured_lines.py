@@ -225,14 +225,12 @@ def low_slope(freq: FloatArray, plant: ComplexArray) -> float:
 
 
 def hidden_modes(freq: FloatArray, plant: ComplexArray, controller: ComplexArray) -> HiddenModes:
-    """Return what lies between lines.
-
-    With S K that of one end, ``det(I - L)`` changes over an interval as ``1 - g``,
-    ``g = tr(S K P) = a + b f + rho / (f - p)``: a mode p of the plant is ``p + d`` in the loop,
-    d rho over what 1 - g is beside it. Three fits through four lines each, by S K of both ends,
-    find p and d. Where they agree a mode is there, unstable in the loop when its half-width Im p
-    is below -Im d; where they do not, d bounds what may be there unseen.
-    """
+    """Return what lies between lines."""
+    # with S K that of one end, `det(I - L)` changes over an interval as `1 - g`,
+    # `g = tr(S K P) = a + b f + rho / (f - p)`: a mode p of the plant is `p + d` in the loop, d rho
+    # over what 1 - g is beside it. Three fits through four lines each, by S K of both ends, find p
+    # and d. Where they agree a mode is there, unstable in the loop when its half-width Im p is
+    # below -Im d; where they do not, d bounds what may be there unseen
     slope = 2 if low_slope(freq, plant) > 1.0 else 0  # f^slope P is level at the lowest lines
     plant, controller = (np.moveaxis(part, -1, 0) for part in (plant, controller))
     n, L = freq.size, controller @ plant

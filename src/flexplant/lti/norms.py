@@ -264,13 +264,11 @@ class Obstacle(NamedTuple):
 def obstacle(
     g: StateSpace, *, axis_only: bool = False, known: ComplexArray | None = None
 ) -> Obstacle | None:
-    """Return the worst pole on or beyond the edge of stability (or on it alone), or None.
-
-    Computed poles are moved by rounding: those of a rigid body in dense A come out at some 1e-4
-    rad/s, on either side. A pole nearer to the edge than its own uncertainty (rounding of A times
-    the condition of the eigenvalue) counts as lying on it. Eigenvalues that are known are not
-    computed again.
-    """
+    """Return the worst pole on or beyond the edge of stability (or on it alone), or None."""
+    # computed poles are moved by rounding: those of a rigid body in dense A come out at some 1e-4
+    # rad/s, on either side. A pole nearer to the edge than its own uncertainty (rounding of A times
+    # the condition of the eigenvalue) counts as lying on it. Eigenvalues that are known are not
+    # computed again
     if not g.n_states:
         return None
     poles, error = uncertain_poles(g, known)

@@ -120,12 +120,10 @@ def newton_maxima(model: Residues, start: FloatArray, tolerance: float) -> Peaks
 def _zone_radii(
     model: Residues, omega: FloatArray, near: FloatArray, one: _Expansion, tolerance: float
 ) -> FloatArray:
-    """Return the radius around each frequency within which no gain is higher than there.
-
-    With G = T_0 + T_1 d + T_2 d^2 + O(d^3), in the singular vectors of T_0: t - G*G is positive
-    definite when the Schur complement of the block of its largest eigenvalue is, for which bounds
-    of the others suffice.
-    """
+    """Return the radius around each frequency within which no gain is higher than there."""
+    # with G = T_0 + T_1 d + T_2 d^2 + O(d^3), in the singular vectors of T_0: t - G*G is positive
+    # definite when the Schur complement of the block of its largest eigenvalue is, for which bounds
+    # of the others suffice
     t0, t1, t2 = (np.linalg.norm(T, axis=(1, 2))[:, None] for T in one.T)
     r = near[:, None] * ZONES  # (n_omega, n_zones)
     beta = model.rest(np.repeat(omega, ZONES.size), r.reshape(-1), 2).reshape(r.shape)
@@ -148,10 +146,8 @@ def _zone_radii(
 
 
 def exceeding(model: Residues, level: float, peaks: Peaks) -> FloatArray | None:
-    """Return frequencies at which the gain is above a level, empty when proved: there are none.
-
-    None: undecided, at as much work as an eigenvalue problem.
-    """
+    """Return frequencies at which the gain is above a level, empty when proved: there are none."""
+    # None: undecided, at as much work as an eigenvalue problem
     through = float(np.linalg.norm(model.through, 2))
     if not level > through * (1.0 + CLEAR):
         return None
@@ -254,10 +250,8 @@ class Residues(NamedTuple):
         return np.asarray(self.apart(omega)[0].min(axis=0))
 
     def series(self, omega: FloatArray, order: int) -> list[ComplexArray]:
-        """Return T_0 to T_order (n_omega, p, m) of ``G(omega + d) = sum T_k d^k``.
-
-        ``T_k = (-j)^k sum R_i / (j omega - p_i)^(k+1)``, T_0 with the feedthrough.
-        """
+        """Return T_0 to T_order (n_omega, p, m) of ``G(omega + d) = sum T_k d^k``."""
+        # `T_k = (-j)^k sum R_i / (j omega - p_i)^(k+1)`, T_0 with the feedthrough
         upper = 1.0 / (1j * omega - self.poles[:, None])
         lower = 1.0 / (1j * omega - self.poles.conj()[:, None])
         found, u, v = [], upper, lower
@@ -293,12 +287,10 @@ class Residues(NamedTuple):
 
 
 def residues(g: StateSpace) -> tuple[Residues | None, ComplexArray | None]:
-    """Return poles and residues, a sampled system mapped by ``z = (1 + s) / (1 - s)``.
-
-    Block by block where A is block diagonal, by the eigenvectors of A otherwise. None where these
-    are poor or too many, or a pole lies at z = -1. Beside them the eigenvalues of A where they were
-    computed.
-    """
+    """Return poles and residues, a sampled system mapped by ``z = (1 + s) / (1 - s)``."""
+    # block by block where A is block diagonal, by the eigenvectors of A otherwise. None where these
+    # are poor or too many, or a pole lies at z = -1. Beside them the eigenvalues of A where they
+    # were computed
     if g.n_states * g.D.size > LARGEST:
         return None, None
     pairs = modal_pairs(g)

@@ -177,12 +177,10 @@ def prepared(
 
 
 def normalised(D: FloatArray, own: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return an orthogonal Z and a scaling S with ``Z' D S = [0; I]`` where D has full rank.
-
-    Rank must depend neither on units nor on rounding: columns are brought to unit size first,
-    together with `own` (m,), what the plant itself does on their channels. A direction of D that
-    is nothing beside it (rank-deficient) is only turned.
-    """
+    """Return an orthogonal Z and a scaling S with ``Z' D S = [0; I]`` where D has full rank."""
+    # rank must depend neither on units nor on rounding: columns are brought to unit size first,
+    # together with `own` (m,), what the plant itself does on their channels. A direction of D that
+    # is nothing beside it (rank-deficient) is only turned
     m = D.shape[1]
     columns = np.hypot(np.linalg.norm(D, axis=0), own)
     columns = divisor(columns)
@@ -220,12 +218,10 @@ def departure_from_normal(A: FloatArray) -> float:
 def _balanced(
     A: FloatArray, B: FloatArray, C: FloatArray, s: complex
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the system in states scaled (by powers of two) so that rows and columns match.
-
-    Osborne's balancing of A bordered by the sizes of the rows of B and of the columns of C; the
-    border counts as much as it takes to give ``C (s I - A)^-1 B`` unit size, which no scaling of
-    states or channels changes.
-    """
+    """Return the system in states scaled (by powers of two) so that rows and columns match."""
+    # Osborne's balancing of A bordered by the sizes of the rows of B and of the columns of C; the
+    # border counts as much as it takes to give `C (s I - A)^-1 B` unit size, which no scaling of
+    # states or channels changes
     n = A.shape[0]
     if not n:
         return A, B, C

@@ -168,12 +168,10 @@ def _modal_pairs(g: StateSpace | Part, pairs: FloatArray, slots: IntArray) -> Mo
 
 
 def _modal(g: Part, pairs: FloatArray, slots: IntArray) -> Solver:
-    """Block-diagonal A: one real matrix product of residues and scalar functions of frequency.
-
-    ``(s I - A)^-1 = ((s - m) I + N) / ((s - m)^2 - q)`` of each block: no cancellation near s = m,
-    which matters for slow modes of a sampled system. Complex numbers are pairs of real columns, so
-    that no complex product is formed.
-    """
+    """Block-diagonal A: one real matrix product of residues and scalar functions of frequency."""
+    # `(s I - A)^-1 = ((s - m) I + N) / ((s - m)^2 - q)` of each block: no cancellation near s = m,
+    # which matters for slow modes of a sampled system. Complex numbers are pairs of real columns,
+    # so that no complex product is formed
     mean, N, q, B, C = _modal_pairs(g, pairs, slots)
     split, swing = np.sqrt(np.maximum(q, 0.0)), np.sqrt(np.maximum(-q, 0.0))
     channels = len(g.C) * g.B.shape[1]
@@ -219,12 +217,10 @@ def _nonzero_columns(residues: FloatArray) -> npt.NDArray[np.bool_] | slice:
 
 
 def _fed_by_lines(g: Part, head: int, pairs: FloatArray, slots: IntArray) -> Solver:
-    """Modes, the first states, fed by a few further ones, such as a sampled plant's delay lines.
-
-    With A = [[A_h, A_ht], [0, A_t]] and A_h block diagonal, the tail's response X_t is cheap and
-    sparse (a line belongs to one input), and the head is again one matrix product: that of the
-    inputs [B_h, A_ht], of B_h those that do not wait in a line alone.
-    """
+    """Modes, the first states, fed by a few further ones, such as a sampled plant's delay lines."""
+    # with A = [[A_h, A_ht], [0, A_t]] and A_h block diagonal, the tail's response X_t is cheap and
+    # sparse (a line belongs to one input), and the head is again one matrix product: that of the
+    # inputs [B_h, A_ht], of B_h those that do not wait in a line alone
     n, m = g.B.shape
     direct = np.flatnonzero(np.any(g.B[:head], axis=0))
     feeding = np.flatnonzero(np.any(g.A[:head, head:], axis=0))

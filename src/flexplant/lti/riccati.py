@@ -534,11 +534,9 @@ def _measured(
 
 
 def riccati_root(A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray) -> RiccatiRoot:
-    """Return the stationary filter, by Newton's steps from that of noisier sensors.
-
-    In square roots ``P = L L'``, twice the digits of P: little noise beside much motion leaves P
-    with directions that are 1e-16 of others, below its rounding, and yet the gain hangs on them.
-    """
+    """Return the stationary filter, by Newton's steps from that of noisier sensors."""
+    # in square roots `P = L L'`, twice the digits of P: little noise beside much motion leaves P
+    # with directions that are 1e-16 of others, below its rounding, and yet the gain hangs on them
     start = _noisier(A, C, G, H)
     d = scale_of(np.abs(start.P.diagonal()))
     found = _newton_in_roots(A * d / d[:, None], C * d, G / d[:, None], H, start.gain / d[:, None])

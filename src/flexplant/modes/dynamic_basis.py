@@ -270,10 +270,8 @@ def _couples(C: FloatArray) -> bool:
 def static_shapes(
     model: FEModel, loads: FloatArray, dampers: FloatArray | None = None
 ) -> FloatArray:
-    """Return static responses ``u = G f`` to loads (n, m) and, of few loads, ``G M u``.
-
-    To the forces of dampers, (n, d), only the former.
-    """
+    """Return static responses ``u = G f`` to loads (n, m) and, of few loads, ``G M u``."""
+    # to the forces of dampers, (n, d), only the former
     if not loads.shape[1]:
         return loads
     factor = held_factor(model)

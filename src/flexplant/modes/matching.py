@@ -54,10 +54,8 @@ def clusters(values: Any, gap: float) -> list[IntArray]:
 
 
 def assigned(cost: FloatArray, most: float = np.inf) -> IntArray:
-    """Return the column of each row, one to one with the least total cost.
-
-    -1 where none is left, or where the cost is above `most`.
-    """
+    """Return the column of each row, one to one with the least total cost."""
+    # -1 where none is left, or where the cost is above `most`
     from scipy.optimize import linear_sum_assignment
 
     rows, columns = linear_sum_assignment(cost)
@@ -159,12 +157,10 @@ def _cosines(gram: Any, cross: Any, other_gram: Any) -> FloatArray:
 
 
 def likeness(shapes: ComplexArray, freq: FloatArray) -> FloatArray:
-    """Return the MAC (m, m) of modes with each other, repeated ones by the span of their shapes.
-
-    Two spans are as like as their nearest shapes (cosine squared of the smallest principal angle);
-    repeated modes among themselves 1 where their shapes, as far as they are known, are nearly
-    dependent, else 0. A mode with a node at all places is like no other.
-    """
+    """Return the MAC (m, m) of modes with each other, repeated ones by the span of their shapes."""
+    # two spans are as like as their nearest shapes (cosine squared of the smallest principal
+    # angle); repeated modes among themselves 1 where their shapes, as far as they are known, are
+    # nearly dependent, else 0. A mode with a node at all places is like no other
     order = np.argsort(freq, kind="stable")
     spans = [order[run] for run in runs(freq[order], CLUSTER)]
     alike = np.eye(freq.size)

@@ -421,13 +421,11 @@ def wider(count: int, top: float, n: int) -> tuple[int, float]:
 def damped_modes(
     model: FEModel, phi: FloatArray, count: int, top: float, method: Pardiso | Cholmod | None
 ) -> Modes:
-    """Return the complex modes of a large model, by a basis that grows until they are right.
-
-    Rayleigh-Ritz in real vectors V: the undamped modes, the static responses to the forces of
-    dampers, and ``(K - sigma M)^-1`` times what the complex modes leave in ``(lambda^2 M + lambda D
-    + K) x = 0``, again and again (Davidson's method for the quadratic problem), until they leave no
-    more than undamped modes may [Sleijpen1996]_.
-    """
+    """Return the complex modes of a large model, by a basis that grows until they are right."""
+    # Rayleigh-Ritz in real vectors V: the undamped modes, the static responses to the forces of
+    # dampers, and `(K - sigma M)^-1` times what the complex modes leave in
+    # `(lambda^2 M + lambda D + K) x = 0`, again and again (Davidson's method for the quadratic
+    # problem), until they leave no more than undamped modes may [Sleijpen1996]_
     factor, r = stiffness_factor(model, method), model.rigid_body.shape[1]
     V = np.hstack([phi, beyond(model.M, phi, factor.solve(damper_forces(model)))])
     for _ in range(_STEPS):

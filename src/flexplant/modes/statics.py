@@ -247,12 +247,10 @@ def place_of(place: Place) -> str:
 def attachment_vectors(
     model: FEModel, phi: FloatArray, at: Sequence[Place]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return residual attachment vectors (n, m) and their frequencies (m,) [rad/s].
-
-    The static response to a unit load at each place (free structures accelerate as rigid bodies
-    under it: inertia relief), less the part that the modes give; then made M-orthogonal to the
-    modes, mass-normalised, and diagonal in K among each other.
-    """
+    """Return residual attachment vectors (n, m) and their frequencies (m,) [rad/s]."""
+    # the static response to a unit load at each place (free structures accelerate as rigid bodies
+    # under it: inertia relief), less the part that the modes give; then made M-orthogonal to the
+    # modes, mass-normalised, and diagonal in K among each other
     M, K = model.M, model.K
     loads = np.column_stack([model.dofs.row(place) for place in at])
     response = static_response(model, loads)

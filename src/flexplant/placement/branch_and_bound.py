@@ -119,11 +119,9 @@ class _Run:
     def _promising(
         self, trials: Sequence[Sequence[int]], chosen: Sequence[int], value: float
     ) -> FloatArray:
-        """Return the scores of choices; infinite where a lower bound is above the value already.
-
-        The bound is the tangent where the weights of the choice touch: it costs about as much as
-        ten scores, and leaves few of hundreds to be computed.
-        """
+        """Return the scores of choices; infinite where a lower bound is above the value already."""
+        # the bound is the tangent where the weights of the choice touch: it costs about as much as
+        # ten scores, and leaves few of hundreds to be computed
         low = np.full(len(trials), -np.inf)
         scorer = self.problem.layouts.scorer
         if len(trials) >= _MANY and np.isfinite(value) and isinstance(scorer, Quadratic):

@@ -194,10 +194,8 @@ class Places:
 
 
 def candidate_places(plant: StandardPlant, candidates: Sequence[Any]) -> Places:
-    """Return where candidates and POIs are; a port with several points is at each of them.
-
-    Of a plant made elsewhere no places are known.
-    """
+    """Return where candidates and POIs are; a port with several points is at each of them."""
+    # of a plant made elsewhere no places are known
     if not plant.is_assembled:
         return Places(tuple(port.name for port in candidates), (), ())
     dofs = plant.assembled.realisation.model.full_dofs

@@ -291,10 +291,8 @@ class Separation(Scorer):
         return float(np.sum(S * self.W) + np.sum(V * self.ahead(self.covariance(seeing))))
 
     def bound(self, count: int, required: Sequence[int]) -> float:
-        """Return the larger of two bounds: with all sensors, and with all actuators.
-
-        Without numbers of each, the cost with all candidates.
-        """
+        """Return the larger of two bounds: with all sensors, and with all actuators."""
+        # without numbers of each, the cost with all candidates
         if self.counts is None:
             return self.value(range(self.measuring.size))
         y, u = self._sides(required)
@@ -366,10 +364,8 @@ def of_sensors(p: Separation) -> Quadratic:
 
 
 def of_actuators(p: Separation) -> Quadratic:
-    """Return the cost as a function of the actuators beside all sensors of the problem.
-
-    ``tr(S N) + tr(H P_d)`` with the innovations' covariance ``N = A^d (A P A' + W - P) A'^d``.
-    """
+    """Return the cost as a function of the actuators beside all sensors of the problem."""
+    # `tr(S N) + tr(H P_d)` with the innovations' covariance `N = A^d (A P A' + W - P) A'^d`
     P = p.covariance(tuple(range(len(p.sensors))))
     power = np.linalg.matrix_power(p.A, p.delay)
     innovations = square_root(power @ (p.A @ P @ p.A.T + p.W - P) @ power.T).T

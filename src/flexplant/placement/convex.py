@@ -227,11 +227,9 @@ class Tangent(Below):
 def least_sum(
     parts: Sequence[Tangent], shares: FloatArray, branch: Branch, start: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Return a number below ``sum_p share_p cost_p`` in a branch, and weights near the least.
-
-    ``h = 1 / sum_p share_p (cost_p - constant_p)`` is concave in w: a harmonic sum of information
-    that is concave, block by block.
-    """
+    """Return a number below ``sum_p share_p cost_p`` in a branch, and weights near the least."""
+    # `h = 1 / sum_p share_p (cost_p - constant_p)` is concave in w: a harmonic sum of information
+    # that is concave, block by block
     constant = float(shares @ [part.constant for part in parts])
 
     def inverse(weights: FloatArray) -> tuple[float, FloatArray] | None:
@@ -281,12 +279,10 @@ class Convex(Scorer, ABC):
         return self.relaxation(Branch.beside(required, free, count))[0]
 
     def relaxation(self, branch: Branch) -> tuple[float, FloatArray]:
-        """Return a lower bound over a branch, and weights near the least relaxed cost.
-
-        The least weights of a tangent are in a direction in which the cost falls: it is convex,
-        above the tangent and equal to it where they touch. The step is halved until it does fall,
-        for whole steps may jump to and fro.
-        """
+        """Return a lower bound over a branch, and weights near the least relaxed cost."""
+        # the least weights of a tangent are in a direction in which the cost falls: it is convex,
+        # above the tangent and equal to it where they touch. The step is halved until it does fall,
+        # for whole steps may jump to and fro
         centre = branch.centre(self.total)
         weights, best, cost = centre, self.everything(), np.inf
         for _ in range(_TANGENTS):
@@ -382,15 +378,13 @@ class Quadratic(Value, Convex):
             return np.inf
 
     def tangent(self, weights: FloatArray) -> Tangent:
-        """Return the tangent of the information ``(X+)^-1`` at weights (N,).
-
-        The information is the limit of iterates that are concave in w (a parallel sum is). Its
-        derivative by w_i is ``(X+)^-1 D_i (X+)^-1`` with the Stein equation ``D_i = M D_i M' + X+
-        g_i g_i' X+``, solved for all i by the eigenvectors of M, or one by one where it lacks some;
-        the adjoint equation ``Y = M' Y M + S' S``, by which J falls with w_i by
-        ``g_i' X+ Y X+ g_i``, confirms the slopes. Directions of no variance are left out: a
-        compression of an inverse has an inverse that is concave as well.
-        """
+        """Return the tangent of the information ``(X+)^-1`` at weights (N,)."""
+        # the information is the limit of iterates that are concave in w (a parallel sum is). Its
+        # derivative by w_i is `(X+)^-1 D_i (X+)^-1` with the Stein equation
+        # `D_i = M D_i M' + X+ g_i g_i' X+`, solved for all i by the eigenvectors of M, or one by
+        # one where it lacks some; the adjoint equation `Y = M' Y M + S' S`, by which J falls with
+        # w_i by `g_i' X+ Y X+ g_i`, confirms the slopes. Directions of no variance are left out: a
+        # compression of an inverse has an inverse that is concave as well
         cost, after, closed, adjoint, seen = self._stationary(weights)
         sizes, axes = np.linalg.eigh(0.5 * (after + after.T))
         kept = sizes > _NOTHING * sizes[-1]

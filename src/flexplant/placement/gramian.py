@@ -153,10 +153,8 @@ class _LogDet(Below):
         return self.costs.score(sets)
 
     def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
-        """Return a number below the cost of all choices of a branch, and weights near the least.
-
-        A weight of zero may make the sum singular, so that the start is moved inwards.
-        """
+        """Return a number below the cost of all choices of a branch, and weights near the least."""
+        # a weight of zero may make the sum singular, so that the start is moved inwards
         inner = 0.9 * branch.nearest(start) + 0.1 * branch.centre(start.size)
         most, weights = ascended(
             self.costs.climbed,

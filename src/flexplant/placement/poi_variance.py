@@ -148,10 +148,8 @@ def pushed(plant: StandardPlant, candidates: Sequence[Port], rows: FloatArray) -
 
 
 def plain(plant: StandardPlant, candidates: Sequence[Port]) -> bool:
-    """Return whether candidates change rows of B or C only: they, y and u have no states.
-
-    Disturbances may have: a shape, the acceleration of the base.
-    """
+    """Return whether candidates change rows of B or C only: they, y and u have no states."""
+    # disturbances may have: a shape, the acceleration of the base
     if not plant.is_assembled:
         return not np.any(plant.D22)
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
@@ -327,11 +325,9 @@ def _with_past(
 
 
 def _lagged(estimator: KalmanEstimator, rows: FloatArray, lag: Any) -> FloatArray:
-    """Return the variances of ``rows x`` before the measurement, or some samples after it.
-
-    ``P_k|k+L = P - sum_{i=0..L} W_i' S^-1 W_i`` with ``W_i = C M^i P`` and M of the predictor
-    ([AndersonMoore1979]_, chapter 7).
-    """
+    """Return the variances of ``rows x`` before the measurement, or some samples after it."""
+    # `P_k|k+L = P - sum_{i=0..L} W_i' S^-1 W_i` with `W_i = C M^i P` and M of the predictor
+    # ([AndersonMoore1979]_, chapter 7)
     model, P = estimator.model, estimator.predicted_covariance
     found = np.einsum("ij,jk,ik->i", rows, P, rows)
     M = model.A - estimator.predictor_gain @ model.C2

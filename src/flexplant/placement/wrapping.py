@@ -266,11 +266,9 @@ class BelowAll(Below):
         return np.asarray(over(self.measure, [part.values(sets) for part in self.parts]))
 
     def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
-        """Return a number below the cost of all choices of a branch, and weights near the least.
-
-        For any shares that add up to one ``min_w sum_p share_p f_p(w) <= min_w max_p f_p(w)``;
-        they are moved to the worst parts as far as that lifts the bound.
-        """
+        """Return a number below the cost of all choices of a branch, and weights near the least."""
+        # for any shares that add up to one `min_w sum_p share_p f_p(w) <= min_w max_p f_p(w)`; they
+        # are moved to the worst parts as far as that lifts the bound
         tangents = [part for part in self.parts if isinstance(part, Tangent)]
         if len(tangents) < len(self.parts):
             found = [part.least(branch, start) for part in self.parts]

@@ -183,10 +183,8 @@ def _has_other_states(origin: Assembled) -> bool:
 def sampled_motions(
     plant: Partition, blocks: Iterable[FloatArray], outputs: Sequence[str], inputs: Sequence[str]
 ) -> list[StateSpace]:
-    """Return a plant from actuators to sensors, no more, for each set of its modes' (b, 2, 2).
-
-    Sampled like the plant; the states are some of the plant's.
-    """
+    """Return a plant from actuators to sensors, no more, for each set of its modes' (b, 2, 2)."""
+    # sampled like the plant; the states are some of the plant's
     origin = plant.continuous.assembled
     some, found = origin.replace(physical=origin.physical.select(outputs, inputs)), []
     for pairs in blocks:

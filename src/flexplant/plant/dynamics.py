@@ -69,13 +69,10 @@ def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
 
 
 def with_filters(structure: StateSpace, realisation: ModalRealisation, ports: Ports) -> StateSpace:
-    """Return the structure between the filters of its ports, absolute motions included.
-
-    Noise at an amplifier's input is an input more, beside the command: it has no states.
-
-    States are those of the sensors' filters, the structure's, those of the forces' filters: what
-    drives stands behind what is driven, so that A is block upper triangular.
-    """
+    """Return the structure between the filters of its ports, absolute motions included."""
+    # noise at an amplifier's input is an input more, beside the command: it has no states
+    # states are those of the sensors' filters, the structure's, those of the forces' filters: what
+    # drives stands behind what is driven, so that A is block upper triangular
     before = {port.name: _named_system(port.filter, port.name) for port in ports.forces}
     filters = {sensor.name: sensor.filter for sensor in ports.y}
     after = {name: _named_system(filters.get(name), name) for name in structure.outputs}

@@ -136,12 +136,11 @@ def draws_with_left_out(
     *,
     shapes: float = 0.0,
 ) -> Iterator[StandardPlant] | None:
-    """Return machines of a larger plant, drawn one by one; None where no Delta is of its modes.
-
-    The plant's own modes are off as its Deltas say, normally with 1 at some deviations. Nothing is
-    measured of the modes left out: each frequency is off like that of the plant's least known. The
-    logarithm of the damping of a mode that was not measured is off by 0.3: a loop may live on it.
-    """
+    """Return machines of a larger plant, drawn one by one; None where no Delta is of its modes."""
+    # the plant's own modes are off as its Deltas say, normally with 1 at some deviations. Nothing
+    # is measured of the modes left out: each frequency is off like that of the plant's least known.
+    # The logarithm of the damping of a mode that was not measured is off by 0.3: a loop may live on
+    # it
     unknown = _Unmeasured.of(uncertain, whole)
     if unknown is None:
         return None

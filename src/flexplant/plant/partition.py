@@ -497,13 +497,11 @@ TYPE_THIS = "StandardPlant.from_statespace(sys, w=[...], u=[...], z=[...], y=[..
 
 
 def sides(g: StateSpace) -> tuple[list[str], list[str], list[str], list[str]]:
-    """Return w, u, z, y of a system whose channels are named like those of an assembled plant.
-
-    Each actuator `u1` has its effort `u1:effort` among the outputs: these inputs are u, the others
-    w. Outputs that are efforts, errors (`die:error`) or motions of POIs (`die:z`) are z; the
-    others are y: references (`die:ref`, an input too), outputs with a noise `y1:noise` in w, and
-    plain names.
-    """
+    """Return w, u, z, y of a system whose channels are named like those of an assembled plant."""
+    # each actuator `u1` has its effort `u1:effort` among the outputs: these inputs are u, the
+    # others w. Outputs that are efforts, errors (`die:error`) or motions of POIs (`die:z`) are z;
+    # the others are y: references (`die:ref`, an input too), outputs with a noise `y1:noise` in w,
+    # and plain names
     efforts = [name.removesuffix(":effort") for name in g.outputs if name.endswith(":effort")]
     u = [name for name in g.inputs if name in efforts]
     noisy = [name.removesuffix(":noise") for name in g.inputs if name.endswith(":noise")]

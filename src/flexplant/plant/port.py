@@ -51,10 +51,8 @@ def observed(
     order: int = 0,
     carried: FloatArray | None = None,
 ) -> Seen:
-    """Return how the time derivative of some order of a displacement (a row over DOFs) is seen.
-
-    Against the ground, or with its motion `carried` (6,) along.
-    """
+    """Return how the time derivative of some order of a displacement (a row over DOFs) is seen."""
+    # against the ground, or with its motion `carried` (6,) along
     along = np.zeros(6) if carried is None else carried
     if order == 0:
         return Seen(realisation.motion(row, 0), realisation.at_once(row), along)

@@ -38,10 +38,8 @@ def none() -> FloatArray:
 
 
 def natural(pairs: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return angular frequencies [rad/s] and damping ratios of blocks (b, 2, 2).
-
-    ``omega^2 = det, 2 zeta omega = -trace``; a frequency is 0 where nothing holds the mode back.
-    """
+    """Return angular frequencies [rad/s] and damping ratios of blocks (b, 2, 2)."""
+    # `omega^2 = det, 2 zeta omega = -trace`; a frequency is 0 where nothing holds the mode back
     omega = np.sqrt(np.maximum(np.linalg.det(pairs), 0.0))
     trace = np.trace(pairs, axis1=1, axis2=2)
     return omega, np.asarray(-0.5 * trace / np.maximum(omega, TINY))
@@ -267,12 +265,10 @@ def _real(
 def _complex(
     model: Structure, omega: FloatArray, zeta: FloatArray, phi: ComplexArray, rigid: int
 ) -> ModalRealisation:
-    """Real 2 x 2 blocks [[s, w], [-w, s]] of complex modes lambda = s + i w.
-
-    With ``phi' (2 lambda M + D) phi = 2 i w`` the displacement per force is the sum of
-    ``phi phi' / (2 i w (s - lambda))`` and its conjugate; the states are scaled like those of a
-    real mode (omega q, dq/dt). Rigid-body and unstable modes are blocks of real form.
-    """
+    """Real 2 x 2 blocks [[s, w], [-w, s]] of complex modes lambda = s + i w."""
+    # with `phi' (2 lambda M + D) phi = 2 i w` the displacement per force is the sum of
+    # `phi phi' / (2 i w (s - lambda))` and its conjugate; the states are scaled like those of a
+    # real mode (omega q, dq/dt). Rigid-body and unstable modes are blocks of real form
     n, start = phi.shape[0], int(np.count_nonzero(omega <= 0))
     elastic = pole_pairs(omega, zeta)[0][start:]
     swing, size = elastic.imag, omega[start:]
@@ -299,12 +295,10 @@ def _complex(
 def _with_two_shapes(
     found: ModalRealisation, omega: FloatArray, zeta: FloatArray, phi: ComplexArray, unstable: slice
 ) -> ModalRealisation:
-    """Return a realisation whose unstable blocks have a shape for each of their poles.
-
-    ``v1 v1' / ((s1 - s2) (s - s1)) - v2 v2' / ((s1 - s2) (s - s2))`` is the displacement per force;
-    the states (|omega| q, dq/dt) of a block are ``[[|omega|, |omega|], [s1, s2]]`` times those of
-    its two poles.
-    """
+    """Return a realisation whose unstable blocks have a shape for each of their poles."""
+    # `v1 v1' / ((s1 - s2) (s - s1)) - v2 v2' / ((s1 - s2) (s - s2))` is the displacement per force;
+    # the states (|omega| q, dq/dt) of a block are `[[|omega|, |omega|], [s1, s2]]` times those of
+    # its two poles
     n = phi.shape[0]
     inputs, outputs = found.inputs.reshape(n, -1, 2).copy(), found.outputs.reshape(n, -1, 2).copy()
     grow, decay = (part.real for part in pole_pairs(omega, zeta))

@@ -35,14 +35,11 @@ class RigidModes(NamedTuple):
 
 
 def rigid_modes(realisation: ModalRealisation, body: RigidBody | None) -> RigidModes:
-    """Return the rigid-body motions of a structure that is free, or on weak springs.
-
-    Its rigid body is None when it is held, or has no geometry.
-
-    With R the motions of `rigid_body_of`, m their mass and S = R m^(-1/2), mode i has the part
-    ``tr(S' M G_i M S)`` of its kinetic energy in them, G_i its velocities per impulse. Motions
-    of a structure without springs are its modes at 0 Hz; there may be none of either.
-    """
+    """Return the rigid-body motions of a structure that is free, or on weak springs."""
+    # its rigid body is None when it is held, or has no geometry
+    # with R the motions of `rigid_body_of`, m their mass and S = R m^(-1/2), mode i has the part
+    # `tr(S' M G_i M S)` of its kinetic energy in them, G_i its velocities per impulse. Motions of a
+    # structure without springs are its modes at 0 Hz; there may be none of either
     r = realisation.n_rigid
     place = np.arange(r) * 2
     swing = realisation.pairs[:r, 0, 1]
@@ -142,11 +139,9 @@ def rigid_parts(rows: Sequence[FloatArray], motions: FloatArray) -> FloatArray:
 def rigid_gain(
     plant: Partition, motions: RigidModes, outputs: Sequence[str], inputs: Sequence[str]
 ) -> FloatArray:
-    """Return the accelerations at outputs per force at inputs, of the rigid body alone.
-
-    ``rows R m^-1 R' pushes'`` with R the rigid-body motions and m their mass; filters of the ports
-    count with their static gains.
-    """
+    """Return the accelerations at outputs per force at inputs, of the rigid body alone."""
+    # `rows R m^-1 R' pushes'` with R the rigid-body motions and m their mass; filters of the ports
+    # count with their static gains
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     forces = {port.name: port for port in ports.forces}
     require_known("force", inputs, forces)

@@ -240,12 +240,10 @@ _SYMMETRIC = 1e-6
 
 
 def _suspend_complex(modes: Modes, springs: _Springs) -> Modes:
-    """Return complex modes on springs.
-
-    In first-order form, as no mass is known for truncated complex modes: ``x' = A x + N' f``,
-    ``q = S x`` and ``f = -rows' (k rows q + d rows q')`` give A', the residues of which,
-    ``S v w' N' = phi phi' / (2i Im lambda)``, are the new shapes. Exact within the span.
-    """
+    """Return complex modes on springs."""
+    # in first-order form, as no mass is known for truncated complex modes: `x' = A x + N' f`,
+    # `q = S x` and `f = -rows' (k rows q + d rows q')` give A', the residues of which,
+    # `S v w' N' = phi phi' / (2i Im lambda)`, are the new shapes. Exact within the span
     if modes.n_unstable:
         raise ModelError(
             "complex modes with an unstable pair cannot be suspended once more: suspend the "

@@ -250,12 +250,10 @@ def stage_weights(
 
 
 def _arm(plant: StandardPlant, ports: Ports, motions: RigidModes) -> float:
-    """Return the length that makes rotations displacements: how far the sensors are, in shape.
-
-    The largest rms displacement of the sensors for a unit rotation of the POI about the axis for
-    which it is least: what is added to it by moving without turning does not count, so that the
-    arbitrary basis of the motions (columns of ``t = R v, s = S v``) does not enter.
-    """
+    """Return the length that makes rotations displacements: how far the sensors are, in shape."""
+    # the largest rms displacement of the sensors for a unit rotation of the POI about the axis for
+    # which it is least: what is added to it by moving without turning does not count, so that the
+    # arbitrary basis of the motions (columns of `t = R v, s = S v`) does not enter
     turning = [p.channel(a) for p in ports.z for a in p.axes if a.startswith("r")]
     if not turning:
         return 1.0

@@ -56,10 +56,8 @@ TOGETHER, _LEGEND = 4, 6
 def panel_axes(
     ax: Axes | None, count: int, *, columns: int | None = None, **options: Any
 ) -> list[Axes]:
-    """Return the given axes, or `count` new ones with the same abscissa.
-
-    Few are one above the other; more than fit there are small multiples in two columns.
-    """
+    """Return the given axes, or `count` new ones with the same abscissa."""
+    # few are one above the other; more than fit there are small multiples in two columns
     if ax is not None:
         return [ax] * count
     wide = columns or (1 if count <= TOGETHER else 2)
@@ -107,10 +105,8 @@ def quantity_of(unit: str | None) -> str:
 
 
 def shown_in(axis: Axis, size: float, unit: str | None) -> tuple[float, str]:
-    """Return the factor and the unit in which an axis shows values up to a size.
-
-    An axis that has a label with a unit keeps it, so that what is drawn later lies right.
-    """
+    """Return the factor and the unit in which an axis shows values up to a size."""
+    # an axis that has a label with a unit keeps it, so that what is drawn later lies right
     label = re.search(r"\[(.+)\]$", axis.get_label_text())
     if label is None:
         return in_unit(size, unit)
@@ -346,10 +342,8 @@ def differ(kinds: Mapping[str, Sequence[Device]]) -> bool:
 def mark_devices(
     ax: Axes, factor: float, kinds: Mapping[str, Sequence[Device]], *, various: bool | None = None
 ) -> None:
-    """Mark and name devices by kind in a view from above, in x and y with arrows.
-
-    Directions that no arrow shows stand beside the names where they are various.
-    """
+    """Mark and name devices by kind in a view from above, in x and y with arrows."""
+    # directions that no arrow shows stand beside the names where they are various
     various = differ(kinds) if various is None else various
     extent = np.ptp(ax.dataLim.get_points(), axis=0).max() or 1.0
     names: dict[tuple[float, ...], list[str]] = {}
@@ -406,11 +400,9 @@ def apart(ax: Axes | None, labels: Iterable[str]) -> bool:
 def styles(
     labels: Iterable[str], colors: Mapping[str, str] | None = None, *, taken: int = 0
 ) -> list[Style]:
-    """Return the styles of lines by their labels; those that name nothing follow the cycle.
-
-    So many lines are there already. More than the cycle holds are solid, each of its own colour;
-    what is named keeps its colour for itself, where the cycle has enough others.
-    """
+    """Return the styles of lines by their labels; those that name nothing follow the cycle."""
+    # so many lines are there already. More than the cycle holds are solid, each of its own colour;
+    # what is named keeps its colour for itself, where the cycle has enough others
     found, others = [], taken
     labels = list(labels)
     used = {STYLES[role]["color"] for role in map(role_of, labels) if role}
@@ -465,10 +457,8 @@ def by_label(found: Any, one: type = Frf) -> dict[str, Any]:
 def curves(
     found: Any, freq: FloatArray | None = None, colors: Mapping[str, str] | None = None
 ) -> list[Curve]:
-    """Return what to draw of a system, an Frf, or a mapping {label: one of these} or list.
-
-    Systems are evaluated at `freq`; when it is not given, on their own grids.
-    """
+    """Return what to draw of a system, an Frf, or a mapping {label: one of these} or list."""
+    # systems are evaluated at `freq`; when it is not given, on their own grids
     named = labelled(found)
     measured = [label for label, one in named.items() if _is_measured(label, one)]
     modelled = iter(styles([label for label in named if label not in measured], colors))
@@ -507,10 +497,8 @@ _MOST = 36
 
 
 def channel_axes(ax: Any, rows: int, columns: int, ratios: Sequence[int], height: float) -> Any:
-    """Return the axes of channels, so many below each other for each as there are heights.
-
-    They are those given for one channel, or new ones.
-    """
+    """Return the axes of channels, so many below each other for each as there are heights."""
+    # they are those given for one channel, or new ones
     channels, each = rows * columns, len(ratios)
     if not channels:
         raise ModelError(

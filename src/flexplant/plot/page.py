@@ -346,11 +346,9 @@ def _thinned(xyz: FloatArray) -> IntArray:
 
 
 def neighbours(xyz: FloatArray) -> IntArray:
-    """Return the pairs (m, 2) of nodes between which no other lies (a Gabriel graph).
-
-    A pair is joined when the sphere with it as diameter holds no third node: the lines of a
-    regular mesh without its diagonals, whatever its ratio of sides.
-    """
+    """Return the pairs (m, 2) of nodes between which no other lies (a Gabriel graph)."""
+    # a pair is joined when the sphere with it as diameter holds no third node: the lines of a
+    # regular mesh without its diagonals, whatever its ratio of sides
     from scipy.spatial import cKDTree
 
     count = min(len(xyz), _NEIGHBOURS)

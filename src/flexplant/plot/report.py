@@ -160,10 +160,8 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
 
 
 def _axis_responses(plant: StandardPlant) -> None:
-    """Draw the plant from a force at the centre of gravity to the POI, along each axis.
-
-    Where its rigid-body motions cannot be decoupled, the singular values from u to y.
-    """
+    """Draw the plant from a force at the centre of gravity to the POI, along each axis."""
+    # where its rigid-body motions cannot be decoupled, the singular values from u to y
     pois = plant.assembled.ports.z
     try:
         axes = decouple(plant, axes=pois[0].axes)

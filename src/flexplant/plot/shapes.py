@@ -264,11 +264,9 @@ class Surface(NamedTuple):
 
 
 def surface_of(dofs: DofSet) -> Surface:
-    """Return the surface of a structure, by Delaunay's triangulation of its nodes.
-
-    Edges much longer than the distance between nodes are left out: holes and notches stay open
-    where they are wider than two elements, half an element of their corners is filled.
-    """
+    """Return the surface of a structure, by Delaunay's triangulation of its nodes."""
+    # edges much longer than the distance between nodes are left out: holes and notches stay open
+    # where they are wider than two elements, half an element of their corners is filled
     numbers, first, node = np.unique(dofs.nodes, return_index=True, return_inverse=True)
     if numbers.size > MOST:
         raise ModelError(

@@ -177,12 +177,10 @@ class Greedy(SelectionCriterion):
 
 
 def _smallest_with(taken: Rows, pool: Rows) -> FloatArray:
-    """Return the smallest eigenvalue of the Gram matrix of the taken rows plus one of the pool.
-
-    The root below all eigenvalues of the Gram matrix of the taken rows of the secular equation
-    ``v'v - mu - sum_i w_i^2 / (lambda_i - mu) = 0``, w the products of v with their eigenvectors,
-    bisected for all of the pool at once.
-    """
+    """Return the smallest eigenvalue of the Gram matrix of the taken rows plus one of the pool."""
+    # the root below all eigenvalues of the Gram matrix of the taken rows of the secular equation
+    # `v'v - mu - sum_i w_i^2 / (lambda_i - mu) = 0`, w the products of v with their eigenvectors,
+    # bisected for all of the pool at once
     size = np.einsum("ij,ij->i", pool, pool.conj()).real
     if not taken.shape[0]:
         return np.asarray(size)

@@ -262,11 +262,9 @@ def _largest_modal_gain(omega: FloatArray, zeta: FloatArray, top: float) -> Floa
 
 
 def _largest_change(omega: FloatArray, zeta: FloatArray, top: float) -> FloatArray:
-    """Return the largest departure of the same response from its value at 0, for w up to `top`.
-
-    With ``x = w^2 / omega^2`` and ``a = 4 zeta^2`` its square is, times omega^4,
-    ``(x^2 + a x) / ((1 - x)^2 + a x)``, rising up to ``x = (1 + sqrt(1 + 2 a)) / 2``.
-    """
+    """Return the largest departure of the same response from its value at 0, for w up to `top`."""
+    # with `x = w^2 / omega^2` and `a = 4 zeta^2` its square is, times omega^4,
+    # `(x^2 + a x) / ((1 - x)^2 + a x)`, rising up to `x = (1 + sqrt(1 + 2 a)) / 2`
     a = 4 * zeta**2
     x = np.minimum((top / omega) ** 2, 0.5 * (1 + np.sqrt(1 + 2 * a)))
     with np.errstate(divide="ignore"):

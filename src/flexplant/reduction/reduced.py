@@ -414,11 +414,9 @@ class ReducedModel(Value):
 def static_followers(
     D: FloatArray, K: FloatArray, light: IntArray
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Return the coordinates with mass (c,), how all k follow them (k, c), flexibility and K.
-
-    ``q_light = -K_ll^-1 K_lh q_heavy + K_ll^-1 f_light``, exactly; the flexibility (k, k) is that
-    of the second term, K (c, c) what is left of the stiffness.
-    """
+    """Return the coordinates with mass (c,), how all k follow them (k, c), flexibility and K."""
+    # `q_light = -K_ll^-1 K_lh q_heavy + K_ll^-1 f_light`, exactly; the flexibility (k, k) is that
+    # of the second term, K (c, c) what is left of the stiffness
     k = K.shape[0]
     heavy = np.setdiff1d(np.arange(k), light)
     if np.any(D[light]):

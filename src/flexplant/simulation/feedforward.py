@@ -246,10 +246,8 @@ def _inverse_of(
     name: str,
     along: npt.ArrayLike | None,
 ) -> Inverse:
-    """Return the function of s that gives F (p, r) in a loop with known forces, at p places.
-
-    A place changes what is seen of the states and of u, which the feedback does not read.
-    """
+    """Return the function of s that gives F (p, r) in a loop with known forces, at p places."""
+    # a place changes what is seen of the states and of u, which the feedback does not read
     g, plant, r = forced.monitored, forced.plant, len(poi.axes)
     acts = np.zeros((len(plant.w), T.shape[1] + 1))
     acts[g.input_index([force_name(u) for u in plant.u]), :-1] = T

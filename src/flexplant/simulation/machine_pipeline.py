@@ -270,11 +270,9 @@ class MachinePipeline(Value):
     def _fitted(
         self, found: MeasuredModes
     ) -> tuple[MeasuredModes, Localisation | None, UpdateResult]:
-        """Return the modes that are used, the places of a change, and the update.
-
-        Modes without numbers are paired with those of the drawing, then with those of the updated
-        model, until the pairs stay: a change that is not small turns the shapes of close modes.
-        """
+        """Return the modes that are used, the places of a change, and the update."""
+        # modes without numbers are paired with those of the drawing, then with those of the updated
+        # model, until the pairs stay: a change that is not small turns the shapes of close modes
         known = self._numbered(found, self.model)
         for _ in range(_PAIRINGS):
             places, fit = self._updated(known)

@@ -178,13 +178,11 @@ class Phase(NamedTuple):
 
 
 def spans(t: tuple[float, ...]) -> tuple[list[float], list[float]]:
-    """Return the lengths b_k of the pulse of each level, and their effective widths w_k.
-
-    Level 1 holds the highest derivative for t_1. Level k puts two pulses of level k - 1, the
-    second with the opposite sign, a time t_k apart: ``b_k = 2 b_(k-1) + t_k``. Its integral is
-    ``w_k = b_(k-1) + t_k`` times the peak of level k - 1, so that the last one covers the distance
-    ``w_1 w_2 ... w_n`` times the highest derivative.
-    """
+    """Return the lengths b_k of the pulse of each level, and their effective widths w_k."""
+    # level 1 holds the highest derivative for t_1. Level k puts two pulses of level k - 1, the
+    # second with the opposite sign, a time t_k apart: `b_k = 2 b_(k-1) + t_k`. Its integral is
+    # `w_k = b_(k-1) + t_k` times the peak of level k - 1, so that the last one covers the distance
+    # `w_1 w_2 ... w_n` times the highest derivative
     b, w = [0.0], []
     for length in t:
         w.append(b[-1] + length)
@@ -193,11 +191,9 @@ def spans(t: tuple[float, ...]) -> tuple[list[float], list[float]]:
 
 
 def shortest(distance: float, bounds: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the durations t_1, ..., t_n of each level, bounds those of velocity and upwards.
-
-    Each duration is the longest that the bounds and the distance allow, from the highest
-    derivative downwards.
-    """
+    """Return the durations t_1, ..., t_n of each level, bounds those of velocity and upwards."""
+    # each duration is the longest that the bounds and the distance allow, from the highest
+    # derivative downwards
     if len(bounds) == 1:
         return (distance / bounds[0],)
     if len(bounds) == 2:
@@ -209,12 +205,10 @@ def shortest(distance: float, bounds: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def on_grid(distance: float, bounds: tuple[float, ...], rate: float) -> tuple[float, ...]:
-    """Return the durations in whole samples: the shortest motion near the optimum off the grid.
-
-    Any durations give the distance exactly with one level of the highest derivative. For those of
-    the levels 1 to n - 1 the last one, a constant velocity, is as short as all bounds allow:
-    ``w_n >= distance / (bound_m w_(n-1) ... w_(n-m+1))``. So every bound holds for every choice.
-    """
+    """Return the durations in whole samples: the shortest motion near the optimum off the grid."""
+    # any durations give the distance exactly with one level of the highest derivative. For those of
+    # the levels 1 to n - 1 the last one, a constant velocity, is as short as all bounds allow:
+    # `w_n >= distance / (bound_m w_(n-1) ... w_(n-m+1))`. So every bound holds for every choice
     off = shortest(distance, bounds)
     choices = []
     for level, length in enumerate(off[:-1]):
@@ -236,11 +230,9 @@ def on_grid(distance: float, bounds: tuple[float, ...], rate: float) -> tuple[fl
 
 
 def flank(t: tuple[float, ...], change: float) -> list[Phase]:
-    """Return the phases in which the velocity rises from 0 by a change, durations t in seconds.
-
-    The first half is expanded from rest, the second from its end by the symmetry of the flank,
-    ``v(T - t) = change - v(t)`` and ``p(T - t) = change (T / 2 - t) + p(t)``.
-    """
+    """Return the phases in which the velocity rises from 0 by a change, durations t in seconds."""
+    # the first half is expanded from rest, the second from its end by the symmetry of the flank,
+    # `v(T - t) = change - v(t)` and `p(T - t) = change (T / 2 - t) + p(t)`
     b, w = spans(t)
     level = change / float(np.prod(w))
     pulse = [(t[0], level)]
@@ -288,11 +280,9 @@ def constant_snap(state: FloatArray, t: float | FloatArray) -> FloatArray:
 def _durations(
     distance: float, velocity: float, acceleration: float, jerk: float, snap: float | None = None
 ) -> tuple[float, float, float, float]:
-    """Return for how long snap, jerk, acceleration and velocity are held in one flank.
-
-    A jerk pulse lasts J = 2 ramp + hold and adds the acceleration a; the acceleration lasts
-    2 J + steady and adds the velocity a (J + steady).
-    """
+    """Return for how long snap, jerk, acceleration and velocity are held in one flank."""
+    # a jerk pulse lasts J = 2 ramp + hold and adds the acceleration a; the acceleration lasts 2 J +
+    # steady and adds the velocity a (J + steady)
     if snap is None:
         ramp, peak = 0.0, jerk
         hold = min(acceleration / jerk, np.sqrt(velocity / jerk), np.cbrt(distance / (2.0 * jerk)))
@@ -519,10 +509,8 @@ def _assembled(
     order: int,
     moving: bool,
 ) -> SetPoint:
-    """Return rest, rise, cruise and fall as one value.
-
-    `waits` are rest, settle and exposure; the last two at constant velocity when `moving`.
-    """
+    """Return rest, rise, cruise and fall as one value."""
+    # `waits` are rest, settle and exposure; the last two at constant velocity when `moving`
     rest, settle, exposure = waits
     rise = sum(row.length for row in up)
     speed = total / (rise + cruise)

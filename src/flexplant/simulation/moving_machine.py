@@ -377,11 +377,9 @@ class _Rule:
 
     @cached_property
     def white(self) -> tuple[FloatArray, FloatArray]:
-        """Mixing (q, r) of white samples at the nodes, and what r of them add (b, 2 r, 6).
-
-        Over the states of each mode, for three columns of two entries: nodes for the fastest mode
-        are many, the singular values of what they add to all modes fall fast.
-        """
+        """Mixing (q, r) of white samples at the nodes, and what r of them add (b, 2 r, 6)."""
+        # over the states of each mode, for three columns of two entries: nodes for the fastest mode
+        # are many, the singular values of what they add to all modes fall fast
         weight, share, flow = self._at(0.0, self.h)
         parts = np.einsum("q,qj,qbcd->qbcjd", np.sqrt(weight), share, flow)
         full = parts.reshape(weight.size, -1)

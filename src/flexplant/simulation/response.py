@@ -261,13 +261,11 @@ def as_numbers(values: FloatArray) -> Numbers:
 
 
 def moving_moments(signal: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return mean and standard deviation (..., n) over `count` samples around each sample.
-
-    Cumulative sums restart at every multiple of `count`, and each window spans exactly one such
-    edge: it is the tail of one stretch and the head of the next. Both are taken relative to the
-    sample at the edge, which the window holds, so that an offset or a far-away motion, however
-    large, costs no digits.
-    """
+    """Return mean and standard deviation (..., n) over `count` samples around each sample."""
+    # cumulative sums restart at every multiple of `count`, and each window spans exactly one such
+    # edge: it is the tail of one stretch and the head of the next. Both are taken relative to the
+    # sample at the edge, which the window holds, so that an offset or a far-away motion, however
+    # large, costs no digits
     n = signal.shape[-1]
     before = count // 2
     lead = count  # a stretch of no weight before the record, so that every window has its edge

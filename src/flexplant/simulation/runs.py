@@ -128,15 +128,12 @@ def step_through(
     answering: Answering | None = None,
     w: FloatArray | None = None,
 ) -> FloatArray:
-    """Fill `buffers` sample by sample and return the controller's states (runs, n) after them.
-
-    Elements `sensed` act on y before it is read, `applied` on the commands of a machine that has
-    them; forces `answering` motions are added to w (runs, k, nw). All is done in place. The
-    controller acts in the first of every `hold` samples, and what it commands is held.
-
-    Every product is one matrix-vector product per run, never a matrix-matrix product over runs:
-    its rounding, and so a run, does not depend on how many runs go side by side.
-    """
+    """Fill `buffers` sample by sample and return the controller's states (runs, n) after them."""
+    # elements `sensed` act on y before it is read, `applied` on the commands of a machine that has
+    # them; forces `answering` motions are added to w (runs, k, nw). All is done in place. The
+    # controller acts in the first of every `hold` samples, and what it commands is held
+    # every product is one matrix-vector product per run, never a matrix-matrix product over runs:
+    # its rounding, and so a run, does not depend on how many runs go side by side
     states, y, out = buffers
     runs, n = states.shape[1:]
     nc, split = m.n_controller, m.n_controller + m.n_driven
@@ -243,10 +240,8 @@ class Drawn:
     def draw(
         self, generator: np.random.Generator, samples: int, hold: int = 1
     ) -> tuple[FloatArray, FloatArray]:
-        """Return white samples (samples, few) for the factor, and noises of the columns of w.
-
-        Sensors are read in the first of every `hold` samples, with the noise of that rate.
-        """
+        """Return white samples (samples, few) for the factor, and noises of the columns of w."""
+        # sensors are read in the first of every `hold` samples, with the noise of that rate
         rank, few = self.mix.shape
         white, single = np.empty((samples, few)), np.empty((samples, self.columns.size))
         for start in range(0, samples, _CHUNK):
@@ -372,10 +367,8 @@ class SampleBySample:
                 acting.begin(generators)
 
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
-        """Run one stretch: w as `given` (k, nw) or (runs, k, nw) plus noise; return if finite.
-
-        The channels z, y, driven u and monitored go into `data` (runs, channels, k).
-        """
+        """Run one stretch: w as `given` (k, nw) or (runs, k, nw) plus noise; return if finite."""
+        # the channels z, y, driven u and monitored go into `data` (runs, channels, k)
         states, y, _ = self.buffers
         k = given.shape[-2]
         self.w[:, :k], self.w[:, k:] = given, 0.0

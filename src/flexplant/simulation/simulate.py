@@ -209,10 +209,8 @@ def simulate(
 
 
 def finer_loop(loop: ClosedLoop, finer: int) -> ClosedLoop:
-    """Return a loop whose plant is sampled so many times in a sample of its controller.
-
-    The same plant before sampling, with the same delay in seconds.
-    """
+    """Return a loop whose plant is sampled so many times in a sample of its controller."""
+    # the same plant before sampling, with the same delay in seconds
     if whole(finer, "finer", maximum=10_000) == 1:
         return loop
     plant = loop.plant

@@ -419,11 +419,9 @@ def _inequality_holds(
     moves: list[FloatArray],
     speed: float,
 ) -> bool:
-    """Return whether the inequality holds all over a part, for all speeds up to the largest.
-
-    Between rest and full speed A and P+ are linear in the speed, and ``A' P+ A`` lies below the
-    same combination of its four corners: each of A at rest and at speed, with each P+.
-    """
+    """Return whether the inequality holds all over a part, for all speeds up to the largest."""
+    # between rest and full speed A and P+ are linear in the speed, and `A' P+ A` lies below the
+    # same combination of its four corners: each of A at rest and at speed, with each P+
     matrices = {s: _Quadratic.of(motion, ends, s * speed) for s in (-1.0, 0.0, 1.0)}
     error = max(one.error(P) for one in matrices.values())
     if not error < 1.0:
@@ -473,10 +471,8 @@ class _Quadratic(NamedTuple):
 def _coefficients(
     A: _Quadratic, P: list[FloatArray], move: FloatArray, error: float
 ) -> Iterator[FloatArray]:
-    """Yield Bernstein coefficients of ``(1 - e - e^2) P - (1 + e) A' (P + move) A``, degree 5.
-
-    With ``(A + E)' P (A + E) <= (1 + e) A' P A + (1 + 1/e) E' P E`` and ``E' P E <= e^2 P``.
-    """
+    """Yield Bernstein coefficients of ``(1 - e - e^2) P - (1 + e) A' (P + move) A``, degree 5."""
+    # with `(A + E)' P (A + E) <= (1 + e) A' P A + (1 + 1/e) E' P E` and `E' P E <= e^2 P`
     n = _DEGREE
     left, right = (1.0 - error - error**2), 1.0 + error
     for k in range(n + 1):

@@ -235,10 +235,8 @@ class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
 
 
 def tabled(rows: Sequence[Mapping[str, Any] | str]) -> StudyTable:
-    """Return the table of rows; a text in place of a row is the reason why there is none.
-
-    A row whose value is of another kind than most in its column counts as failed.
-    """
+    """Return the table of rows; a text in place of a row is the reason why there is none."""
+    # a row whose value is of another kind than most in its column counts as failed
     found = [row for row in rows if not isinstance(row, str)]
     kinds: dict[str, type] = {}
     for name in dict.fromkeys(name for row in found for name in row):

@@ -84,10 +84,8 @@ def diagonal(matrix: Matrix) -> FloatArray:
 
 
 def unit_diagonal(matrix: Matrix) -> tuple[Matrix, FloatArray]:
-    """Return ``S A S`` with ones (or zeros) on its diagonal, and the diagonal of S.
-
-    Displacements and rotations have different units: only after this scaling do entries compare.
-    """
+    """Return ``S A S`` with ones (or zeros) on its diagonal, and the diagonal of S."""
+    # displacements and rotations have different units: only after this scaling do entries compare
     size = np.sqrt(np.abs(diagonal(matrix)))
     scale = 1.0 / np.where(size > 0, size, size.max(initial=0.0) or 1.0)
     if sp.issparse(matrix):
@@ -97,10 +95,9 @@ def unit_diagonal(matrix: Matrix) -> tuple[Matrix, FloatArray]:
 
 
 def diagonal_lu(matrix: Any, singular: str) -> Any:
-    """Return the SuperLU factorisation of a symmetric sparse matrix, real or complex.
-
-    Pivots are taken from the diagonal where they are not zero, so that solutions need a refinement.
-    """
+    """Return the SuperLU factorisation of a symmetric sparse matrix, real or complex."""
+    # pivots are taken from the diagonal where they are not zero, so that solutions need a
+    # refinement
     splu: Any = spla.splu
     try:
         return splu(
@@ -151,11 +148,9 @@ def is_positive_definite(
     nodes: IntArray | None = None,
     xyz: FloatArray | None = None,
 ) -> bool:
-    """Return whether ``S A S + tolerance I`` is positive definite, S scaling A's diagonal to 1.
-
-    Large sparse matrices are tried by a bound on their lowest eigenvalue first, then factored;
-    the node and coordinates of each DOF make the factorisation cheaper.
-    """
+    """Return whether ``S A S + tolerance I`` is positive definite, S scaling A's diagonal to 1."""
+    # large sparse matrices are tried by a bound on their lowest eigenvalue first, then factored;
+    # the node and coordinates of each DOF make the factorisation cheaper
     if np.any(diagonal(matrix) < 0) or (tolerance == 0 and np.any(diagonal(matrix) == 0)):
         return False
     scaled, _ = unit_diagonal(matrix)
@@ -438,12 +433,9 @@ def _exchanged(exchanges: IntArray) -> IntArray:
 def assembled_fronts(
     lower: Any, dissection: Dissection
 ) -> Iterator[tuple[Front, FloatArray, FloatArray, FloatArray]]:
-    """Yield each front with its assembled blocks: pivots, below, rest; its caller eliminates it.
-
-    The blocks are real or complex, as the matrix is, their lower triangles.
-
-    `rest` must hold what remains for the parent when the next front is allocated.
-    """
+    """Yield each front with its assembled blocks: pivots, below, rest; its caller eliminates it."""
+    # the blocks are real or complex, as the matrix is, their lower triangles
+    # `rest` must hold what remains for the parent when the next front is allocated
     pointer, index, value = _permuted_triangle(lower, dissection.order)
     place = np.zeros(dissection.order.size, dtype=np.int64)
     left: dict[int, FloatArray] = {}

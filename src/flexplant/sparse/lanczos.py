@@ -27,12 +27,10 @@ _EPS = float(np.finfo(np.float64).eps)
 
 
 def rayleigh_ritz(K: Any, M: Any, X: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return omega^2 (k,), ascending, and M-orthonormal shapes (n, k) in the span of X.
-
-    LAPACK's error is a rounding of the largest eigenvalue. The soft modes, separated from the
-    stiff ones to first order, are therefore solved for again by themselves, group by group, as
-    often as the spread of the eigenvalues needs it. X is overwritten.
-    """
+    """Return omega^2 (k,), ascending, and M-orthonormal shapes (n, k) in the span of X."""
+    # LAPACK's error is a rounding of the largest eigenvalue. The soft modes, separated from the
+    # stiff ones to first order, are therefore solved for again by themselves, group by group, as
+    # often as the spread of the eigenvalues needs it. X is overwritten
     K, M = by_rows(K), by_rows(M)
     squares, mix = _eigh(K, M, X)
     X = mixed(X, mix)
@@ -55,11 +53,9 @@ def soft_group(squares: FloatArray) -> int:
 
 
 def rounding_of(K: Any, phi: FloatArray) -> FloatArray:
-    """Return ``eps |phi|^T |K| |phi|`` of each M-orthonormal shape [1/s^2].
-
-    By so much the eigenvalue of a shape may change when the entries of K are rounded to double
-    precision: no method finds it closer to that of the structure.
-    """
+    """Return ``eps |phi|^T |K| |phi|`` of each M-orthonormal shape [1/s^2]."""
+    # by so much the eigenvalue of a shape may change when the entries of K are rounded to double
+    # precision: no method finds it closer to that of the structure
     size_of_K, found = Absolute(K), np.zeros(phi.shape[1])
     for at in column_groups(phi.shape[1]):
         size = np.abs(phi[:, at])
@@ -220,15 +216,13 @@ class BlockLanczos:
         extra: int = 0,
         needed: Callable[[FloatArray], FloatArray] | None = None,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the `count` largest theta found and their shapes (n, count).
-
-        The last `extra` of them need not be shapes yet, only values. Of shapes (n, m) that are
-        found to `tolerance` but no further, `needed` says which tolerance (m,) each must reach.
-        Fewer than `count` are returned where the others are so much smaller than the largest that
-        its rounding hides them, or where a value has as many copies as the block has vectors, which
-        see no more of them: with those returned locked, another search, of a larger block, finds
-        the rest.
-        """
+        """Return the `count` largest theta found and their shapes (n, count)."""
+        # the last `extra` of them need not be shapes yet, only values. Of shapes (n, m) that are
+        # found to `tolerance` but no further, `needed` says which tolerance (m,) each must reach.
+        # Fewer than `count` are returned where the others are so much smaller than the largest that
+        # its rounding hides them, or where a value has as many copies as the block has vectors,
+        # which see no more of them: with those returned locked, another search, of a larger block,
+        # finds the rest
         n = self._V.shape[1]
         count = min(count, n - self._r)
         check_at = self.steps
@@ -336,11 +330,9 @@ class BlockLanczos:
     def _orthonormal(
         self, W: FloatArray
     ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
-        """Return the M-orthonormal part of W beyond the basis, M times it, and the coefficients.
-
-        Gram-Schmidt until it takes next to nothing away, twice at most: that is enough
-        [Giraud2005]_; and again where the block itself had next to nothing new in some direction.
-        """
+        """Return the M-orthonormal part of W beyond the basis, M times it, and the coefficients."""
+        # Gram-Schmidt until it takes next to nothing away, twice at most: that is enough
+        # [Giraud2005]_; and again where the block itself had next to nothing new in some direction
         basis = self._V[: self._r + self._m]
         along = np.zeros((basis.shape[0], W.shape[1]))
         over = np.eye(W.shape[1])
@@ -382,10 +374,8 @@ class BlockLanczos:
 def iterated(
     solve: Callable[[FloatArray], FloatArray], M: Matrix, locked: FloatArray, phi: FloatArray
 ) -> None:
-    """Move shapes on by one inverse iteration beside the locked ones, in place.
-
-    What is left in them of high modes, most of their residual, is gone then.
-    """
+    """Move shapes on by one inverse iteration beside the locked ones, in place."""
+    # what is left in them of high modes, most of their residual, is gone then
     deflated = np.asarray(M @ locked)
     for at in column_groups(phi.shape[1], _SOLVED):
         force = np.asarray(M @ phi[:, at])

@@ -39,13 +39,12 @@ _VECTORS, _MISSED, _POWER = 12, 0.1, 10
 def multifrontal_inertia(
     matrix: Any, dissection: Dissection | None = None, *, single: bool = True
 ) -> int:
-    """Return how many eigenvalues of a sparse symmetric matrix are negative.
-
-    With `single`, and where the factorisation is most of the work, it is tried in single precision
-    first, and taken if refinement shows that its rounding changes no sign. In double precision the
-    factor is not kept. A random ``b = A x`` is eliminated along: ``x^T A x = y^T D^-1 y`` with
-    ``L y = b`` shows whether pivots restricted to the blocks were stable.
-    """
+    """Return how many eigenvalues of a sparse symmetric matrix are negative."""
+    # with `single`, and where the factorisation is most of the work, it is tried in single
+    # precision first, and taken if refinement shows that its rounding changes no sign. In double
+    # precision the factor is not kept. A random `b = A x` is eliminated along:
+    # `x^T A x = y^T D^-1 y` with `L y = b` shows whether pivots restricted to the blocks were
+    # stable
     lower = sp.csc_array(matrix)
     chosen = dissect(lower) if dissection is None else dissection
     if single and chosen.is_costly:
@@ -83,13 +82,11 @@ def signed_factor(matrix: Any, dissection: Dissection) -> MultifrontalFactor | N
 
 
 def _error_radius(factor: MultifrontalFactor, matrix: Any) -> float:
-    """Return a bound of the spectral radius of ``G = I - (L D L^T)^-1 A``, wrong once in 1e12.
-
-    With ``L D L^T = A + E`` the matrices ``A + t E``, t from 0 to 1, are regular when it is
-    below 1: no eigenvalue changes its sign, and A has the inertia of D. ``G^k`` stretches some
-    direction v most; of Gaussian x nearly all have ``|v^T x| > 0.1``, and then
-    ``rho^k <= ||G^k|| <= ||G^k x|| / |v^T x|``.
-    """
+    """Return a bound of the spectral radius of ``G = I - (L D L^T)^-1 A``, wrong once in 1e12."""
+    # with `L D L^T = A + E` the matrices `A + t E`, t from 0 to 1, are regular when it is below 1:
+    # no eigenvalue changes its sign, and A has the inertia of D. `G^k` stretches some direction v
+    # most; of Gaussian x nearly all have `|v^T x| > 0.1`, and then
+    # `rho^k <= ||G^k|| <= ||G^k x|| / |v^T x|`
     A = by_rows(matrix)
     x = np.random.default_rng(0).standard_normal((A.shape[0], _VECTORS))
     size, bound = np.inf, np.inf
@@ -137,11 +134,9 @@ def lowest_modes(
     nodes: IntArray | None = None,
     xyz: FloatArray | None = None,
 ) -> Lowest:
-    """Return the `count` lowest eigenvalues and more, until one of them is not zero.
-
-    By inverse iteration at a shift below zero, hence exact to rounding also where K is singular
-    and M has massless rows.
-    """
+    """Return the `count` lowest eigenvalues and more, until one of them is not zero."""
+    # by inverse iteration at a shift below zero, hence exact to rounding also where K is singular
+    # and M has massless rows
     K, M = sp.csc_array(K), sp.csc_array(M)
     first = np.zeros((K.shape[0], 0)) if known is None else known
     stiff, heavy = np.abs(diagonal(K)), diagonal(M)

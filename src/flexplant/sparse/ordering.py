@@ -66,10 +66,8 @@ class Dissection:
 
     @property
     def is_costly(self) -> bool:
-        """Whether single precision pays: a factorisation costs far more than solutions with it.
-
-        So it is for bulky structures, whose modes are also not lost in its rounding.
-        """
+        """Whether single precision pays: a factorisation costs far more than solutions with it."""
+        # so it is for bulky structures, whose modes are also not lost in its rounding
         return self.multiplications > _COSTLY * self.n_factor
 
 
@@ -80,11 +78,9 @@ def dissect(
     *,
     leaf: int = LEAF,
 ) -> Dissection:
-    """Return the nested dissection of a symmetric matrix [George1973]_.
-
-    Where coordinates fit the graph, parts are cut across their longest side; else along the
-    graph itself (`_graph_cut`), which costs eight times the time.
-    """
+    """Return the nested dissection of a symmetric matrix [George1973]_."""
+    # where coordinates fit the graph, parts are cut across their longest side; else along the graph
+    # itself (`_graph_cut`), which costs eight times the time
     if nodes is None:
         nodes = _supervariables(matrix)
     _, first, member = np.unique(nodes, return_index=True, return_inverse=True)
@@ -106,11 +102,9 @@ def dissect(
 
 
 def _supervariables(matrix: sp.csc_array) -> IntArray:
-    """Return a number for each DOF, the same where DOFs touch each other and the same others.
-
-    So are the DOFs of a node; sums of a random integer for each DOF touched tell them apart.
-    Where few are alike (elements whose axes do not couple), groups of unlike sizes cost fill.
-    """
+    """Return a number for each DOF, the same where DOFs touch each other and the same others."""
+    # so are the DOFs of a node; sums of a random integer for each DOF touched tell them apart.
+    # Where few are alike (elements whose axes do not couple), groups of unlike sizes cost fill
     n = matrix.shape[0]
     lower: Any = sp.tril(matrix, -1, format="csc")
     lower = sp.csc_array((np.ones(lower.nnz, np.int64), lower.indices, lower.indptr), shape=(n, n))
@@ -223,11 +217,9 @@ def _coordinate_cut(where: FloatArray) -> _Cut:
 
 
 def _graph_cut(level: _GraphLevel) -> tuple[BoolArray, BoolArray]:
-    """Return the smallest separator near the middle of the longest way through each part.
-
-    Its nodes are the minimum cut of the flow through a band of nodes, each of which passes as
-    much as it has DOFs (Menger's theorem), for all parts in one network.
-    """
+    """Return the smallest separator near the middle of the longest way through each part."""
+    # its nodes are the minimum cut of the flow through a band of nodes, each of which passes as
+    # much as it has DOFs (Menger's theorem), for all parts in one network
     piece, along = _long_axis(level)
     order = np.lexsort((along, piece, level.part))
     begin = np.searchsorted(level.part[order], np.arange(int(level.part.max()) + 2))
@@ -248,11 +240,9 @@ def _graph_cut(level: _GraphLevel) -> tuple[BoolArray, BoolArray]:
 
 
 def _long_axis(level: _GraphLevel) -> tuple[IntArray, FloatArray]:
-    """Return each node's connected piece, and a coordinate along the longest way through it.
-
-    The difference of the distances to two far ends, averaged over neighbours: steps towards the
-    vector of Fiedler [Fiedler1973]_, whose level sets are smaller than those of distances.
-    """
+    """Return each node's connected piece, and a coordinate along the longest way through it."""
+    # the difference of the distances to two far ends, averaged over neighbours: steps towards the
+    # vector of Fiedler [Fiedler1973]_, whose level sets are smaller than those of distances
     n = level.nodes.size
     ends = (np.r_[level.heads, level.tails], np.r_[level.tails, level.heads])
     graph = sp.csr_array((np.ones(ends[0].size), ends), shape=(n, n))
@@ -292,11 +282,9 @@ def _steps(graph: sp.csr_array, starts: IntArray) -> FloatArray:
 def _minimum_cut(
     level: _GraphLevel, low: BoolArray, high: BoolArray, band: BoolArray
 ) -> tuple[BoolArray, BoolArray]:
-    """Return the upper sides and the fewest DOFs in the band that part `low` from `high`.
-
-    Node k of the band is an edge from k to m + k; of the cuts nearest to `low` and nearest to
-    `high` the one of the more equal sides is taken, part by part.
-    """
+    """Return the upper sides and the fewest DOFs in the band that part `low` from `high`."""
+    # node k of the band is an edge from k to m + k; of the cuts nearest to `low` and nearest to
+    # `high` the one of the more equal sides is taken, part by part
     nodes = np.flatnonzero(band)
     m = nodes.size
     local = np.zeros(band.size, dtype=np.int64)

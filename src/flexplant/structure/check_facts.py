@@ -244,11 +244,9 @@ def _try_lowest_modes(
     rounding: float,
     motions: ZeroEnergy | None,
 ) -> tuple[Lowest | None, bool, str]:
-    """Return the lowest modes, whether M made them, and why there are none.
-
-    DOFs without stiffness (`loose`) are motions without energy as they are; the others are judged
-    without them, since shapes that M couples to them have no energy but rounding.
-    """
+    """Return the lowest modes, whether M made them, and why there are none."""
+    # DOFs without stiffness (`loose`) are motions without energy as they are; the others are judged
+    # without them, since shapes that M couples to them have no energy but rounding
     if not there.size or not K.nnz:
         return None, False, "K is zero"
     there = np.setdiff1d(there, loose)

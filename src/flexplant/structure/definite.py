@@ -130,11 +130,9 @@ def slow(M: Matrix, K: Matrix, directions: Sequence[str]) -> str:
 
 
 def are_swapped(K: Matrix, M: Matrix | None, dofs: DofSet | None) -> bool:
-    """Return whether M moves freely as a stiffness does, and K resists as a mass does.
-
-    By the energy of rigid translations; where supports hold the structure, by single DOFs, if no
-    motion is as fast as a structure's.
-    """
+    """Return whether M moves freely as a stiffness does, and K resists as a mass does."""
+    # by the energy of rigid translations; where supports hold the structure, by single DOFs, if no
+    # motion is as fast as a structure's
     if dofs is None or M is None:
         return False
     moves = [(dofs.kinds == axis).astype(np.float64) for axis in range(3)]
@@ -189,10 +187,8 @@ _RIGID = 0.99
 
 
 def signed_root(squares: FloatArray) -> FloatArray:
-    """Return frequencies omega [rad/s] of omega^2, negative ones for a negative omega^2.
-
-    As finite-element programs print them: a mode of -3 rad/s has the poles +3 and -3 1/s.
-    """
+    """Return frequencies omega [rad/s] of omega^2, negative ones for a negative omega^2."""
+    # as finite-element programs print them: a mode of -3 rad/s has the poles +3 and -3 1/s
     return np.asarray(np.sign(squares) * np.sqrt(np.abs(squares)))
 
 
@@ -213,11 +209,9 @@ def are_rigid(M: Any, motions: FloatArray, phi: FloatArray) -> np.ndarray:
 
 
 def unstable_stiffness(K: Any, motions: FloatArray) -> FloatArray:
-    """Return the negative eigenvalues [1/s^2] of ``R' K R``, R M-orthonormal rigid-body motions.
-
-    There are as many as K has negative ones when these belong to rigid-body motion; they lie
-    above those (Rayleigh, Courant).
-    """
+    """Return the negative eigenvalues [1/s^2] of ``R' K R``, R M-orthonormal rigid-body motions."""
+    # there are as many as K has negative ones when these belong to rigid-body motion; they lie
+    # above those (Rayleigh, Courant)
     if not motions.shape[1]:
         return np.zeros(0)
     energy = motions.T @ np.asarray(by_rows(K) @ motions)
@@ -361,12 +355,10 @@ def check_stiffness(
     dofs: DofSet | None = None,
     unstable: np.ndarray | None = None,
 ) -> None:
-    """Raise ModelError when an elastic omega^2 (k,) is not above its rounding (k,).
-
-    `unstable` (k,) says which are rigid-body motions on springs of negative stiffness: those may
-    be negative, by more than their rounding.
-    The DOFs that the first such motion moves most are named as `check` names those of a mechanism.
-    """
+    """Raise ModelError when an elastic omega^2 (k,) is not above its rounding (k,)."""
+    # `unstable` (k,) says which are rigid-body motions on springs of negative stiffness: those may
+    # be negative, by more than their rounding. The DOFs that the first such motion moves most are
+    # named as `check` names those of a mechanism
     meant = False if unstable is None else unstable & (squares < -rounding)
     lost = np.flatnonzero((squares <= rounding) & ~np.asarray(meant))
     if not lost.size:

@@ -152,12 +152,10 @@ def brick_mass(a: float, b: float, c: float) -> FloatArray:
 
 
 def brick_stiffness(a: float, b: float, c: float, nu: float) -> FloatArray:
-    """Return the stiffness (24, 24) of a brick for E = 1, three bending modes inside condensed.
-
-    Trilinear displacements and, for each of x, y, z, the incompatible parabolas 1 - xi^2: without
-    them a brick in bending shears and is far too stiff (Wilson and Taylor; on rectangular elements
-    the patch test holds as it stands).
-    """
+    """Return the stiffness (24, 24) of a brick for E = 1, three bending modes inside condensed."""
+    # trilinear displacements and, for each of x, y, z, the incompatible parabolas 1 - xi^2: without
+    # them a brick in bending shears and is far too stiff (Wilson and Taylor; on rectangular
+    # elements the patch test holds as it stands)
     law = np.diag([0.5 * (1 - 2 * nu)] * 6)
     law[:3, :3] += nu + 0.5 * (1 - 2 * nu) * np.eye(3)  # lambda + 2 mu on the diagonal
     law /= (1 + nu) * (1 - 2 * nu)
@@ -326,10 +324,9 @@ class Grid:
 
 
 def _symmetric_sum(weights: FloatArray, table: FloatArray) -> FloatArray:
-    """Return weights @ table, summed in one order: the matrix is symmetric to the last bit.
-
-    BLAS may fuse a product with a sum, and then (w e)_1 + (w e)_2 depends on which one comes first.
-    """
+    """Return weights @ table, summed in one order: the matrix is symmetric to the last bit."""
+    # BLAS may fuse a product with a sum, and then (w e)_1 + (w e)_2 depends on which one comes
+    # first
     used = np.flatnonzero(weights.any(axis=0))
     found = np.zeros((weights.shape[0], table.shape[1]))
     part = np.empty_like(found)

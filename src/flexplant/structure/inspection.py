@@ -528,11 +528,9 @@ _SMALL = 1e-6
 
 
 def _free_axes(motions: ZeroEnergy, dofs: DofSet) -> list[str]:
-    """Return in words the free motions that are combinations of x to rz, one by one.
-
-    A motion ``t + w x (r - r_0)`` turns about the axis along w through ``r_0 + w x t / |w|^2``, and
-    moves along it by ``t . w / |w|`` per radian.
-    """
+    """Return in words the free motions that are combinations of x to rz, one by one."""
+    # a motion `t + w x (r - r_0)` turns about the axis along w through `r_0 + w x t / |w|^2`, and
+    # moves along it by `t . w / |w|` per radian
     center = dofs.xyz.mean(axis=0)
     every = rigid_motions(dofs, center)
     size = float(np.abs(dofs.xyz - center).max()) or 1.0

@@ -460,11 +460,9 @@ def square(given: Any, name: str) -> sp.csc_array:
 
 
 def completed(given: Any, name: str) -> tuple[sp.csc_array, str | None]:
-    """Return a symmetric matrix of which a file holds one triangle, and a note of what was done.
-
-    A matrix that stores every pair (i, j), (j, i) at most once, in either triangle, is completed;
-    one that stores both is left as it is, for `check` to compare them.
-    """
+    """Return a symmetric matrix of which a file holds one triangle, and a note of what was done."""
+    # a matrix that stores every pair (i, j), (j, i) at most once, in either triangle, is completed;
+    # one that stores both is left as it is, for `check` to compare them
     matrix = square(given, name)
     lower: Any = sp.tril(matrix, -1, format="csc")
     upper: Any = sp.triu(matrix, 1, format="csc")

@@ -387,11 +387,9 @@ class FEModel(Placed, Value):
 
     @classmethod
     def _proven(cls, **fields: Any) -> Self:
-        """Return a model whose matrices are known to be symmetric and definite, and read-only.
-
-        Without the checks of the constructor: a factorisation that proves it again takes
-        longer than everything before.
-        """
+        """Return a model whose matrices are known to be symmetric and definite, and read-only."""
+        # without the checks of the constructor: a factorisation that proves it again takes longer
+        # than everything before
         model = object.__new__(cls)
         for name, value in fields.items():
             object.__setattr__(model, name, value)

@@ -33,12 +33,10 @@ _COHERENT = 4.0
 def unheld(
     K: Matrix, motions: FloatArray, rounding: float = PRECISION, far: float = 1.0
 ) -> FloatArray:
-    """Return the combinations (r, m) of almost force-free motions (n, r) that no spring holds.
-
-    Rounding of K leaves forces at all DOFs, of about the same size relative to what cancels there.
-    A few springs leave larger ones at a few DOFs, however soft they are; springs everywhere, a
-    bed, leave work of one sign, which sums to an energy above that of rounding.
-    """
+    """Return the combinations (r, m) of almost force-free motions (n, r) that no spring holds."""
+    # rounding of K leaves forces at all DOFs, of about the same size relative to what cancels
+    # there. A few springs leave larger ones at a few DOFs, however soft they are; springs
+    # everywhere, a bed, leave work of one sign, which sums to an energy above that of rounding
     mix = np.eye(motions.shape[1])
     if not motions.size:
         return mix
@@ -99,10 +97,8 @@ def _in_their_order(null: FloatArray, untouched: Any) -> FloatArray:
 
 
 def _uncancelled_forces(size_of_K: Absolute, motions: FloatArray) -> FloatArray:
-    """Return the forces (n, r) that do not cancel, each DOF moving as far as the farthest.
-
-    So that rounding is seen in proportion also where a motion passes through zero.
-    """
+    """Return the forces (n, r) that do not cancel, each DOF moving as far as the farthest."""
+    # so that rounding is seen in proportion also where a motion passes through zero
     most = np.abs(motions).max(axis=0, initial=0.0)
     return np.asarray((size_of_K @ np.ones((motions.shape[0], 1))) * most)
 
@@ -112,10 +108,8 @@ _MOST_MOTIONS = 2000
 
 
 def pieces(K: Any, M: Any, dofs: DofSet | None) -> IntArray:
-    """Return the number (n,) of the piece each DOF belongs to, 0 being the largest.
-
-    Pieces are joined by no entry of K or M, the DOFs of one node counting as joined.
-    """
+    """Return the number (n,) of the piece each DOF belongs to, 0 being the largest."""
+    # pieces are joined by no entry of K or M, the DOFs of one node counting as joined
     # step by step, each among the parts found before: most structures are whole after the first
     label: Any = csgraph.connected_components(sp.csr_array(by_rows(K)), directed=False)[1]
     if M is not None and label.max(initial=0) > 0:
@@ -132,12 +126,10 @@ def pieces(K: Any, M: Any, dofs: DofSet | None) -> IntArray:
 
 
 def bodies(K: Any, M: Any, dofs: DofSet) -> list[IntArray]:
-    """Return the DOFs of each body: of the pieces that nothing joins, the largest first.
-
-    A mass that no stiffness joins to anything is a body, a single DOF that only ground holds is
-    none. DOFs with neither mass nor stiffness go with the first. Where the bodies may have more
-    than 2000 motions, all DOFs are taken together.
-    """
+    """Return the DOFs of each body: of the pieces that nothing joins, the largest first."""
+    # a mass that no stiffness joins to anything is a body, a single DOF that only ground holds is
+    # none. DOFs with neither mass nor stiffness go with the first. Where the bodies may have more
+    # than 2000 motions, all DOFs are taken together
     piece = pieces(K, M, dofs)
     stiffness = diagonal(K)
     there = np.abs(stiffness) > 0
@@ -177,11 +169,9 @@ _ASIDE = 1e-3
 
 
 def rigid_motions(dofs: DofSet, about: Any = (0.0, 0.0, 0.0)) -> FloatArray:
-    """Return the six rigid-body motions (n, 6) of the DOFs: x, y, z, rx, ry, rz.
-
-    Rotations are small ones about a point [m], the origin unless given: rx moves a point by
-    ``y rx`` in z and ``-z rx`` in y, hence a plate's rx = dz/dy and ry = -dz/dx.
-    """
+    """Return the six rigid-body motions (n, 6) of the DOFs: x, y, z, rx, ry, rz."""
+    # rotations are small ones about a point [m], the origin unless given: rx moves a point by
+    # `y rx` in z and `-z rx` in y, hence a plate's rx = dz/dy and ry = -dz/dx
     n = len(dofs)
     kind, xyz = dofs.kinds, dofs.xyz - np.asarray(about)
     motions = np.zeros((n, 6))
@@ -228,12 +218,10 @@ def farness(xyz: FloatArray) -> float:
 
 
 def body_motions(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
-    """Return the M-orthonormal rigid-body motions (n, r) of every piece of a structure.
-
-    Each piece that nothing joins to the others has its own six, as far as its DOFs can make them:
-    those of the largest piece come first. Translations precede rotations about the centre of
-    gravity.
-    """
+    """Return the M-orthonormal rigid-body motions (n, r) of every piece of a structure."""
+    # each piece that nothing joins to the others has its own six, as far as its DOFs can make them:
+    # those of the largest piece come first. Translations precede rotations about the centre of
+    # gravity
     motions, part = rigid_motions(dofs), cast(Any, M)
     found = []
     for rows in bodies(K, M, dofs):
@@ -247,14 +235,12 @@ def body_motions(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
 
 
 def rigid_body_basis(M: Matrix, K: Matrix, motions: FloatArray, xyz: FloatArray) -> FloatArray:
-    """Return the M-orthonormal rigid-body vectors (n, r) of a structure, ``K R = 0``.
-
-    They are those of the `motions` of its pieces, from `body_motions`, that cost no energy. They
-    come from the coordinates, not from an eigenvalue solver, so that they are exact. Partly held
-    structures (a hinge, say) keep the combinations that cost none. Where coordinates have few
-    digits, rotations are the null vectors of K next to theirs. Each body is judged by itself,
-    with the rounding that its coordinates `xyz` (n, 3) have.
-    """
+    """Return the M-orthonormal rigid-body vectors (n, r) of a structure, ``K R = 0``."""
+    # they are those of the `motions` of its pieces, from `body_motions`, that cost no energy. They
+    # come from the coordinates, not from an eigenvalue solver, so that they are exact. Partly held
+    # structures (a hinge, say) keep the combinations that cost none. Where coordinates have few
+    # digits, rotations are the null vectors of K next to theirs. Each body is judged by itself,
+    # with the rounding that its coordinates `xyz` (n, 3) have
     parts = _bodies_of(motions)
     if len(parts) < 2:
         return _free_motions(M, K, motions, farness(xyz))
@@ -338,12 +324,10 @@ def _null_vectors(
     basis: FloatArray,
     nearly: FloatArray,
 ) -> FloatArray:
-    """Return a basis and the null vectors of K next to nearly free motions, if there are such.
-
-    By inverse iteration, ``(K + s M) x' = s M x``: what the last digits of coordinates add are
-    elastic modes, which shrink by s / (lambda + s) each time, and motions without energy stay. A
-    motion that something holds, however softly, keeps its energy and is none.
-    """
+    """Return a basis and the null vectors of K next to nearly free motions, if there are such."""
+    # by inverse iteration, `(K + s M) x' = s M x`: what the last digits of coordinates add are
+    # elastic modes, which shrink by s / (lambda + s) each time, and motions without energy stay. A
+    # motion that something holds, however softly, keeps its energy and is none
     start = orthonormalised(M, np.hstack([basis, nearly]), dependent="drop")
     spread = float(np.einsum("ij,ij->j", np.abs(start), size_of_K @ np.abs(start)).max())
     shift = 30 * ROUNDING * spread
@@ -417,11 +401,9 @@ class RigidMass:
 
 
 def rigid_mass(M: Any, dofs: DofSet) -> RigidMass:
-    """Return mass, centre of gravity and inertia: ``R^T M R`` of the six rigid-body motions R.
-
-    With all six directions it is ``[[m I, -m [c]x], [m [c]x, J]]``; a flat model that moves in z
-    only determines m, two coordinates of c, and the inertia about two axes.
-    """
+    """Return mass, centre of gravity and inertia: ``R^T M R`` of the six rigid-body motions R."""
+    # with all six directions it is `[[m I, -m [c]x], [m [c]x, J]]`; a flat model that moves in z
+    # only determines m, two coordinates of c, and the inertia about two axes
     motions = rigid_motions(dofs)
     whole = motions.T @ np.asarray(M @ motions)
     there = np.array([np.any(dofs.kinds == kind) for kind in range(3)])

@@ -49,10 +49,8 @@ class GridShape(Interpolation):
     def _located(
         self, point: FloatArray, lengths: Sequence[float], lost: Callable[[], LabelError]
     ) -> tuple[tuple[int, ...], FloatArray, FloatArray]:
-        """Return the element of a point, its coordinates (d,) from 0 to 1 and the sizes (d,).
-
-        On an edge that is the element on the side of larger coordinates, unless it is missing.
-        """
+        """Return the element of a point, its coordinates (d,) from 0 to 1 and the sizes (d,)."""
+        # on an edge that is the element on the side of larger coordinates, unless it is missing
         grid = self._grid
         choices: list[list[tuple[int, float]]] = []
         for value, length, count in zip(point.tolist(), lengths, grid.counts, strict=False):

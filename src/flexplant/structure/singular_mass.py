@@ -25,11 +25,9 @@ _CONDITION = 1e12
 
 
 def null_motions(M: Any, digits: int | None) -> FloatArray:
-    """Return the motions (n, q) without inertia, block by block of M; (n, 0) when M is definite.
-
-    M is scaled to a unit diagonal first; eigenvalues below 1e-11, or below what the digits of a
-    text leave, are none.
-    """
+    """Return the motions (n, q) without inertia, block by block of M; (n, 0) when M is definite."""
+    # M is scaled to a unit diagonal first; eigenvalues below 1e-11, or below what the digits of a
+    # text leave, are none
     n = M.shape[0]
     tolerance = _SINGULAR if digits is None else max(_SINGULAR, 10.0 ** (1 - digits))
     if is_positive_definite(M, -tolerance):
@@ -70,12 +68,10 @@ def massless_dofs(motions: FloatArray, M: Any) -> IntArray:
 def condense_massless(
     K: Any, M: Any, D: Any, motions: FloatArray, names: Callable[[IntArray], tuple[str, ...]]
 ) -> tuple[FloatArray, FloatArray, FloatArray | None, IntArray]:
-    """Return K, M, D on the motions that M can accelerate, in n - q of the DOFs, and which.
-
-    Where N has no inertia, ``N^T K q = 0`` at every frequency. It gives q of the DOFs, s, by the
-    others, ``q_s = -(N^T K)_s^-1 (N^T K)_m q_m``: exact, all finite eigenvalues stay, and the
-    DOFs that are kept keep their meaning.
-    """
+    """Return K, M, D on the motions that M can accelerate, in n - q of the DOFs, and which."""
+    # where N has no inertia, `N^T K q = 0` at every frequency. It gives q of the DOFs, s, by the
+    # others, `q_s = -(N^T K)_s^-1 (N^T K)_m q_m`: exact, all finite eigenvalues stay, and the DOFs
+    # that are kept keep their meaning
     n, q = motions.shape
     if n > _LARGEST:
         raise ModelError(
@@ -192,10 +188,8 @@ def _row_sums(matrix: Any) -> Any:
 def condensed(
     K: Any, M: Any, D: Any, without: Any, names: Callable[[IntArray], tuple[str, ...]]
 ) -> tuple[Any, Any, Any]:
-    """Return K, M, D without the massless DOFs s: ``K_mm - K_ms K_ss^-1 K_sm``, M_mm, D_mm.
-
-    Exact: ``K_sm q_m + K_ss q_s = 0`` holds at every frequency. All finite eigenvalues stay.
-    """
+    """Return K, M, D without the massless DOFs s: ``K_mm - K_ms K_ss^-1 K_sm``, M_mm, D_mm."""
+    # exact: `K_sm q_m + K_ss q_s = 0` holds at every frequency. All finite eigenvalues stay
     s, m = np.flatnonzero(without), np.flatnonzero(~without)
     if not m.size:
         raise ModelError("no DOF has mass: M is zero. Was another matrix read as M?")

@@ -140,12 +140,11 @@ _UNITS = (
 
 
 def unusual(given: Any, body: RigidMass) -> tuple[str, str] | None:
-    """Return what is odd about density and wave speed of FEMatrices, and what to do, or None.
-
-    The speed follows from neighbours: ``c = sqrt(K_ii / M_ii) h / 2.4`` in solids, h the distance
-    of nodes. A plate of areal mass m'' that has transverse motion only shows ``c / density =
-    sqrt(K_ii / M_ii) h^2 / (2 m'')``. Both come from local entries: supports do not matter.
-    """
+    """Return what is odd about density and wave speed of FEMatrices, and what to do, or None."""
+    # the speed follows from neighbours: `c = sqrt(K_ii / M_ii) h / 2.4` in solids, h the distance
+    # of nodes. A plate of areal mass m'' that has transverse motion only shows
+    # `c / density = sqrt(K_ii / M_ii) h^2 / (2 m'')`. Both come from local entries: supports do not
+    # matter
     from scipy.spatial import cKDTree
 
     dofs, M, known = given.dofs, given.M, np.isfinite(body.mass)

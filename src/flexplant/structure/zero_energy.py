@@ -52,13 +52,11 @@ def zero_energy(
     M: Any = None,
     joint_motions: FloatArray | None = None,
 ) -> ZeroEnergy:
-    """Return the rigid-body motions that the geometry allows, and which of them cost no energy.
-
-    Free are those whose energy is below three times the relative `rounding` of the entries of K,
-    unless soft springs hold them: judged by `unheld`, as the rigid-body motions of a model are.
-    Rotations are left out where coordinates are not known. Pieces that neither K nor M joins have
-    their own motions each, and a joined machine those that its joints allow.
-    """
+    """Return the rigid-body motions that the geometry allows, and which of them cost no energy."""
+    # free are those whose energy is below three times the relative `rounding` of the entries of K,
+    # unless soft springs hold them: judged by `unheld`, as the rigid-body motions of a model are.
+    # Rotations are left out where coordinates are not known. Pieces that neither K nor M joins have
+    # their own motions each, and a joined machine those that its joints allow
     center = dofs.xyz.mean(axis=0) if len(dofs) else np.zeros(3)
     motions = rigid_motions(dofs, center)
     if not located:
@@ -234,12 +232,10 @@ _EVERY_DIGIT = 0.6
 
 
 def digits_of(given: Any) -> int | None:
-    """Return the decimal digits that entries hold, None for double precision.
-
-    Rounding to nearest changes an entry by half a unit in the last place: 2^-24 of it, hence 7
-    digits, in single precision. Entries in double precision that came from a text of few digits
-    show it: written with as few digits as distinguish them, none has more.
-    """
+    """Return the decimal digits that entries hold, None for double precision."""
+    # rounding to nearest changes an entry by half a unit in the last place: 2^-24 of it, hence 7
+    # digits, in single precision. Entries in double precision that came from a text of few digits
+    # show it: written with as few digits as distinguish them, none has more
     if not hasattr(given, "dtype"):
         real_array(given, "K")
         given = np.asarray(given)
@@ -267,12 +263,10 @@ def _written_digits(given: Any) -> int | None:
 
 
 def shown_digits(K: Any, dofs: DofSet) -> int | None:
-    """Return to how many digits the entries of K are right, None where they are to more than 11.
-
-    Rigid translations t cost no energy, so that ``K t`` is rounding: in every row, of either sign.
-    Springs to ground act in few rows, or with the motion. Errors uniform up to a relative d leave
-    ``|K t|_i = 0.39 d (sum_j K_ij^2 t_j^2)^(1/2)`` in the median.
-    """
+    """Return to how many digits the entries of K are right, None where they are to more than 11."""
+    # rigid translations t cost no energy, so that `K t` is rounding: in every row, of either sign.
+    # Springs to ground act in few rows, or with the motion. Errors uniform up to a relative d leave
+    # `|K t|_i = 0.39 d (sum_j K_ij^2 t_j^2)^(1/2)` in the median
     stiffness: Any = sp.csr_array(K)
     size = stiffness.multiply(stiffness)
     worst = 0.0
@@ -292,10 +286,8 @@ def shown_digits(K: Any, dofs: DofSet) -> int | None:
 
 
 def loss(found: Lowest, digits: int) -> float | None:
-    """Return the relative error of the first elastic eigenvalue that `digits` digits allow.
-
-    ``10^-digits |phi|^T |K| |phi| / lambda``: rounding each entry of K by that much.
-    """
+    """Return the relative error of the first elastic eigenvalue that `digits` digits allow."""
+    # `10^-digits |phi|^T |K| |phi| / lambda`: rounding each entry of K by that much
     if found.n_zero >= found.values.size:
         return None
     first = found.n_zero

@@ -240,10 +240,8 @@ def checked_loop(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Cl
 def with_left_out(
     answer: Controller, plant: StandardPlant, larger: Any, block: StateSpace | None = None
 ) -> Controller:
-    """Return an answer with its check on the modes left out, or the note that none are known.
-
-    The block is its part from the plant's y to u, unless all of its system is.
-    """
+    """Return an answer with its check on the modes left out, or the note that none are known."""
+    # the block is its part from the plant's y to u, unless all of its system is
     loop = checked_loop(plant, [answer.system if block is None else block], larger)
     return with_checks(answer, plant, loop)
 

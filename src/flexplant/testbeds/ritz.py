@@ -83,13 +83,11 @@ def ritz_plate(
     order: int = ORDER,
     stiffer: Any = None,
 ) -> FEModel:
-    """Return a free rectangular plate with rotary inertia by the method of Ritz, dense.
-
-    The energies of bending, ``D/2 (w_xx^2 + w_yy^2 + 2 nu w_xx w_yy + 2 (1 - nu) w_xy^2)`` with
-    ``D = E h^3 / (12 (1 - nu^2))``, and of ``rho h w_t^2 / 2 + rho h^3 (w_xt^2 + w_yt^2) / 24``, in
-    polynomials that meet each boundary condition in the limit; integrals exact. `stiffer` is a
-    function of (x, y): a factor of E there.
-    """
+    """Return a free rectangular plate with rotary inertia by the method of Ritz, dense."""
+    # the energies of bending, `D/2 (w_xx^2 + w_yy^2 + 2 nu w_xx w_yy + 2 (1 - nu) w_xy^2)` with `D
+    # = E h^3 / (12 (1 - nu^2))`, and of `rho h w_t^2 / 2 + rho h^3 (w_xt^2 + w_yt^2) / 24`, in
+    # polynomials that meet each boundary condition in the limit; integrals exact. `stiffer` is a
+    # function of (x, y): a factor of E there
     nodes = lobatto(order)
     points, weights = legendre.leggauss(order + 3)
     a, b = (0.5 * float(length) for length in size)
@@ -182,13 +180,10 @@ def ritz_block(
     orders: tuple[int, int, int] = ORDERS,
     stiffer: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
 ) -> FEModel:
-    """Return a free block of linear elasticity by the method of Ritz, dense.
-
-    Of the energies ``rho u_t . u_t / 2`` and ``lambda (tr e)^2 / 2 + mu e : e`` of the strains
-    ``e = (grad u + grad u') / 2`` integrals are exact; free faces meet their conditions in the
-    limit. `stiffer` is a function of
-    (x, y): a factor of E there.
-    """
+    """Return a free block of linear elasticity by the method of Ritz, dense."""
+    # of the energies `rho u_t . u_t / 2` and `lambda (tr e)^2 / 2 + mu e : e` of the strains
+    # `e = (grad u + grad u') / 2` integrals are exact; free faces meet their conditions in the
+    # limit. `stiffer` is a function of (x, y): a factor of E there
     lengths = tuple(float(length) for length in size)
     shape = SolidShape(lengths, tuple(orders))
     gauss = [legendre.leggauss(order + 2) for order in orders]

@@ -35,10 +35,8 @@ def changed_model(
     family: Family | None = None,
     std: FloatArray | None = None,
 ) -> Any:
-    """Return the model with the parameters at `p`, a reduced one with the rigid-body basis left.
-
-    `family`: of the same parameters; `std`: their standard deviations, for an error.
-    """
+    """Return the model with the parameters at `p`, a reduced one with the rigid-body basis left."""
+    # `family`: of the same parameters; `std`: their standard deviations, for an error
     if isinstance(model, FEModel):
         total = _changes(model, parameters, p)
         try:
@@ -87,10 +85,8 @@ def _changes(
 
 
 def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
-    """Return the model when its D fails for nothing but a slight negative drag of rigid motion.
-
-    Its sign does not matter below 1e-4 of the first elastic frequency (`normal_form`).
-    """
+    """Return the model when its D fails for nothing but a slight negative drag of rigid motion."""
+    # its sign does not matter below 1e-4 of the first elastic frequency (`normal_form`)
     D = changes["D"]
     if D is None or not model.rigid_body.shape[1]:
         return None

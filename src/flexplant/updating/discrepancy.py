@@ -142,11 +142,9 @@ class _Weighed(Bound):
 def weigh_discrepancy(
     objective: Objective, search: SearchPlan, end: SearchEnd
 ) -> tuple[SearchEnd, tuple[Discrepancy, ...]]:
-    """Return the end of a search with the discrepancy as part of the noise, and the discrepancy.
-
-    In turn: the variances at the estimate, the estimate with these. None with responses, where an
-    error of a model is no noise from line to line.
-    """
+    """Return the end of a search with the discrepancy as part of the noise, and the discrepancy."""
+    # in turn: the variances at the estimate, the estimate with these. None with responses, where an
+    # error of a model is no noise from line to line
     rows = objective.rows(objective.at(end.p))
     kinds = [bound.kinds() for bound, _ in rows]
     count = rows[-1][1].stop
@@ -315,12 +313,10 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
 def _conditioned(
     S: FloatArray, both: FloatArray, gap: FloatArray, noise: FloatArray, grown: FloatArray, fit: Any
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return mean and covariance of the relative errors of all modes, given the measured ones.
-
-    ``d = S dp + s g (e + 1 c)`` with independent e of each mode and c of all, s by restricted
-    likelihood, g how errors grow with frequency; normal, conditioned on ``gap = d + noise``.
-    Degrees of freedom of s last.
-    """
+    """Return mean and covariance of the relative errors of all modes, given the measured ones."""
+    # `d = S dp + s g (e + 1 c)` with independent e of each mode and c of all, s by restricted
+    # likelihood, g how errors grow with frequency; normal, conditioned on `gap = d + noise`.
+    # Degrees of freedom of s last
     m, measured = len(S) // 2, both.size // 2
     shared = np.kron(np.eye(2), np.ones((m, 1))) * grown[:, None]
     each = np.diag(grown[both])

@@ -521,13 +521,11 @@ NEARNESS = 1.0
 
 
 def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntArray:
-    """Return for each old mode the column of the new mode that continues it, -1 for none.
-
-    A one-to-one assignment of largest MAC. Modes of a cluster (a gap under 2 %) are found
-    together, by what of each new shape lies in their subspace; inside it, shapes that have
-    nothing of each other keep to themselves and may cross, all others keep their order of
-    frequency, since two modes that couple veer instead of crossing.
-    """
+    """Return for each old mode the column of the new mode that continues it, -1 for none."""
+    # a one-to-one assignment of largest MAC. Modes of a cluster (a gap under 2 %) are found
+    # together, by what of each new shape lies in their subspace; inside it, shapes that have
+    # nothing of each other keep to themselves and may cross, all others keep their order of
+    # frequency, since two modes that couple veer instead of crossing
     shapes = mac_matrix(old_X, X)
     score, close = shapes.copy(), clusters(old_poles, CLUSTER)
     for cluster in close:
@@ -542,10 +540,8 @@ def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntAr
 def measured_pairs(
     psi: ComplexArray, psi_poles: ComplexArray, X: ComplexArray, poles: ComplexArray
 ) -> IntArray:
-    """Return for each measured mode the column of the model's, one to one.
-
-    Minimises the sum of ``1 - MAC + |ln(f_j / f_i)|`` over the pairs.
-    """
+    """Return for each measured mode the column of the model's, one to one."""
+    # minimises the sum of `1 - MAC + |ln(f_j / f_i)|` over the pairs
     far = np.abs(np.log(np.abs(poles) / np.abs(psi_poles)[:, None]))
     return assigned(NEARNESS * far - mac_matrix(psi, X))
 

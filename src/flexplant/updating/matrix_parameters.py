@@ -490,10 +490,8 @@ def _interpolated(
     powers: int,
     name: str,
 ) -> tuple[dict[str, list[Matrix | None]], dict[str, tuple[float, float]]]:
-    """Return the matrices of all powers, and what they miss at most and where, of M, D and K.
-
-    `points` holds the models made so far, by place; those at the nodes join them.
-    """
+    """Return the matrices of all powers, and what they miss at most and where, of M, D and K."""
+    # `points` holds the models made so far, by place; those at the nodes join them
     nodes = np.cos(np.pi * (np.arange(powers + 1) + 0.5) / (powers + 1)).tolist()
     for x in nodes:
         if x not in points:

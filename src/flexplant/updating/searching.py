@@ -41,11 +41,9 @@ ENOUGH = 1e-3
 
 
 def _led(search: SearchPlan, objective: Objective, begin: FloatArray) -> SearchEnd:
-    """Return the end of a search from `begin` that goes through easier problems first.
-
-    Responses have a minimum wherever a peak of the model lies between two measured ones; the
-    logarithm of their magnitude hardly any. Shapes turn when modes are near: poles come first.
-    """
+    """Return the end of a search from `begin` that goes through easier problems first."""
+    # responses have a minimum wherever a peak of the model lies between two measured ones; the
+    # logarithm of their magnitude hardly any. Shapes turn when modes are near: poles come first
     easier = _easier(objective.residuals)
     if easier is None:
         return search.begun(objective, begin)
@@ -181,11 +179,10 @@ class _Tried:
 def from_one_start(
     objective: Objective, begin: FloatArray, search: SearchPlan, rng: Rng, *, given: bool
 ) -> tuple[SearchEnd, list[FloatArray], list[Reached]]:
-    """Return the best end, the objective being there, all starts that were tried and their ends.
-
-    A few others are always tried, the default first where a start was given; more where none leads
-    to an end, or the best leaves what noise does not (a peak on a wrong one, a wrong pairing).
-    """
+    """Return the best end, the objective being there, all starts that were tried and their ends."""
+    # a few others are always tried, the default first where a start was given; more where none
+    # leads to an end, or the best leaves what noise does not (a peak on a wrong one, a wrong
+    # pairing)
     if given:
         # a start that is no model is a mistake of the call
         objective.family.at(begin)
@@ -367,10 +364,8 @@ def _same_minimum(objective: Objective, point: Point, a: SearchEnd, b: SearchEnd
 
 
 def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> FloatArray:
-    """Return by how much -2 ln of the likelihood is larger at other minima.
-
-    The difference of chi-square, or ``n ln(e/e_least)`` where noise is not all that is left.
-    """
+    """Return by how much -2 ln of the likelihood is larger at other minima."""
+    # the difference of chi-square, or `n ln(e/e_least)` where noise is not all that is left
     if not minima:
         return np.zeros(0)
     point, free = objective.at(best.p), np.ones(best.p.size, dtype=bool)
@@ -388,10 +383,8 @@ def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> Fl
 
 
 def _scattered(objective: Objective, middle: FloatArray, count: int, rng: Rng) -> list[FloatArray]:
-    """Return starts around one, as far as each parameter moves eigenvalues by 10 %.
-
-    Sizes are drawn evenly over decades; masses, springs and dampers are added, not taken away.
-    """
+    """Return starts around one, as far as each parameter moves eigenvalues by 10 %."""
+    # sizes are drawn evenly over decades; masses, springs and dampers are added, not taken away
     objective.path = []
     eigen = objective.begin(middle).eigen
     every = list(range(eigen.poles.size))

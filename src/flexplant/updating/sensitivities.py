@@ -22,10 +22,8 @@ Split: TypeAlias = Callable[[FloatArray], tuple[Eigen, dict[int, ComplexArray]]]
 
 
 def splitting(family: Family, eigen: Eigen) -> Split:
-    """Return how repeated modes split along a direction, to eigenvectors of their derivative.
-
-    The modes of a group come in the order of the frequencies they move to.
-    """
+    """Return how repeated modes split along a direction, to eigenvectors of their derivative."""
+    # the modes of a group come in the order of the frequencies they move to
     groups = [(one, family.group_derivative(eigen, one)) for one in repeated_groups(eigen.poles)]
 
     def split(direction: FloatArray) -> tuple[Eigen, dict[int, ComplexArray]]:
@@ -217,12 +215,10 @@ class PoleRows:
 
 
 def split_point(point: Point, data: PoleRows) -> Point:
-    """Return the point with exactly repeated modes turned to the split of the next step.
-
-    How they split depends on the step, and the step on how they split: of both directions of every
-    parameter, the step that fits best by the split it causes itself. Their numbers rise with the
-    frequencies they move to.
-    """
+    """Return the point with exactly repeated modes turned to the split of the next step."""
+    # how they split depends on the step, and the step on how they split: of both directions of
+    # every parameter, the step that fits best by the split it causes itself. Their numbers rise
+    # with the frequencies they move to
     groups = repeated_groups(point.eigen.poles)
     if not groups:
         return point

@@ -329,10 +329,8 @@ def corrected(
 
 
 def normalised_step(objective: Objective, p: FloatArray, before: FloatArray) -> float:
-    """Return how far an estimate moved, in standard deviations: ``|J dp| / sqrt(q)``.
-
-    Of residuals of unit variance where the noise is known; else relative to what is left of them.
-    """
+    """Return how far an estimate moved, in standard deviations: ``|J dp| / sqrt(q)``."""
+    # of residuals of unit variance where the noise is known; else relative to what is left of them
     point = objective.at(p)
     change = objective.slopes(point) @ (p - before)
     size = 1.0

@@ -293,10 +293,8 @@ class UpdateResult(Value):
         return float(stdtrit(least, (1 + share) / 2))
 
     def _printed_deviations(self) -> list[float | None]:
-        """Return deviations of which two hold 95 % of machines, None where nothing says so.
-
-        Of responses that a model does not explain, the misfit is coherent from line to line.
-        """
+        """Return deviations of which two hold 95 % of machines, None where nothing says so."""
+        # of responses that a model does not explain, the misfit is coherent from line to line
         from scipy.special import ndtri
 
         std, rejected = self.std, is_bad(self.p_value)

@@ -158,11 +158,9 @@ def step_of_model(
 
 
 def step_of_lines(loop: AxisLoop, duration: float) -> tuple[FloatArray, FloatArray]:
-    """Return time and error of an axis after a unit step, by the transform of S on its lines.
-
-    Below the lines S falls as the loop gain grows there, above them it is 1; the samples of the
-    error are the sums of its impulse response.
-    """
+    """Return time and error of an axis after a unit step, by the transform of S on its lines."""
+    # below the lines S falls as the loop gain grows there, above them it is 1; the samples of the
+    # error are the sums of its impulse response
     rate, f = loop.law.rate, loop.freq
     grid = np.linspace(0.0, 0.5 * rate, _LINES // 2 + 1)
     S = np.interp(grid, f, loop.S.real) + 1j * np.interp(grid, f, loop.S.imag)

@@ -37,10 +37,8 @@ class Field(NamedTuple):
 
 
 def parsed(text: str, unit: str | None = None) -> float:
-    """Return the number that was typed, in SI: ``1.2 kHz``, ``-20 dB``, ``0.1 %``.
-
-    Of a known unit, "Hz" or none, others are refused.
-    """
+    """Return the number that was typed, in SI: ``1.2 kHz``, ``-20 dB``, ``0.1 %``."""
+    # of a known unit, "Hz" or none, others are refused
     found = _NUMBER.fullmatch(text.replace(",", ".").replace("µ", "u"))
     typed = found.group(2).lower() if found else ""
     if not found or typed not in _KINDS.get("any" if unit is None else unit, {*_UNITS, "db"}):

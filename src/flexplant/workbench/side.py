@@ -82,10 +82,8 @@ def _written(name: str, write: Callable[[Path], Any]) -> bytes:
 
 
 def given_file(data: bytes) -> LoopDesign | tuple[Any, ...]:
-    """Return the design of a file that was handed over, or the elements that it gives a law.
-
-    Files are ours alone (`.save`): arrays and JSON, never a pickle.
-    """
+    """Return the design of a file that was handed over, or the elements that it gives a law."""
+    # files are ours alone (`.save`): arrays and JSON, never a pickle
     if len(data) > _LARGEST:
         raise ModelError(f"the file has {len(data) / 1e6:.0f} MB: a design has less than 64.")
     with tempfile.TemporaryDirectory() as folder:

@@ -48,14 +48,12 @@ class DeltaChannels(NamedTuple):
 
 
 def delta_channels(uncertain: UncertainPlant[Any]) -> DeltaChannels:
-    """Return the channels of an uncertain plant's Deltas, those of each side by side.
-
-    A continuous plant is the exact LFT that `UncertainPlant.system` is. The matrices of a sampled
-    one, mapped to continuous time (``s = 2 / dt (z - 1) / (z + 1)``, which keeps an undamped mode
-    undamped), are nearly affine in the Deltas: each Delta's channels are the difference of the
-    machines at its ends, widened by what is curved, and the whole is compared with machines at
-    corners of the uncertainty. A gain is exact: it is a channel of what all others act on.
-    """
+    """Return the channels of an uncertain plant's Deltas, those of each side by side."""
+    # a continuous plant is the exact LFT that `UncertainPlant.system` is. The matrices of a sampled
+    # one, mapped to continuous time (`s = 2 / dt (z - 1) / (z + 1)`, which keeps an undamped mode
+    # undamped), are nearly affine in the Deltas: each Delta's channels are the difference of the
+    # machines at its ends, widened by what is curved, and the whole is compared with machines at
+    # corners of the uncertainty. A gain is exact: it is a channel of what all others act on
     plant = uncertain.plant
     if not plant.dt:
         system, sizes = _paired_channels(uncertain)
@@ -244,11 +242,9 @@ class _EvenUnits(NamedTuple):
         return _Change(0.5 * (up - down), 0.5 * (up + down))
 
     def part(self, name: str, change: _Change) -> _Part:
-        """Return the channels of a Delta, widened by what is curved and no fraction.
-
-        Half the difference of the ends is ``L (1 - F^2)^-1 R``, half their sum, which is zero of
-        what is affine, ``L F (1 - F^2)^-1 R``.
-        """
+        """Return the channels of a Delta, widened by what is curved and no fraction."""
+        # half the difference of the ends is `L (1 - F^2)^-1 R`, half their sum, which is zero of
+        # what is affine, `L F (1 - F^2)^-1 R`
         left, values, right = la.svd(change.matrix, full_matrices=False)
         rank = int(np.count_nonzero(values > _RANK * values[0]))
         left, right, root = left[:, :rank], right[:rank], np.sqrt(values[:rank])

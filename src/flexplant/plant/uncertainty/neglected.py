@@ -175,11 +175,9 @@ def _bounding(pair: Pair, follow: int) -> NeglectedModes:
 
 
 def with_neglected(system: StateSpace, neglected: NeglectedModes, deltas: int) -> StateSpace:
-    """Return a system with the channels of neglected modes after its first, those of Deltas.
-
-    Inputs `y1:neglected:w` pass the weights and add to the outputs; outputs `u1:neglected:z` are
-    the inputs over their scales.
-    """
+    """Return a system with the channels of neglected modes after its first, those of Deltas."""
+    # inputs `y1:neglected:w` pass the weights and add to the outputs; outputs `u1:neglected:z` are
+    # the inputs over their scales
     W, mirrored = neglected.weights, neglected.mirrored
     of = W.output_index(mirrored.values())
     ends = [f"{name}:neglected:w" for name in neglected.outputs]
@@ -338,12 +336,10 @@ _LEAST = 1e-13
 def covering(
     freq: FloatArray, height: FloatArray, poles: ComplexArray, resonances: int
 ) -> StateSpace:
-    """Return a stable weight w with a stable inverse and ``|w(i omega)| >= height`` at all freq.
-
-    ``|w|^2 = p_0 + sum_k p_k t_k`` with p > 0: t_k is ``1 / |d_k(i omega)|^2`` of a resonance or of
-    a well damped pair, or a hump ``omega^4 / |d_k d_k'|^2``. With ``x = omega^2`` the right side
-    is a rational function of x, positive for x >= 0; w has its zeros and poles ``s = -sqrt(-x)``.
-    """
+    """Return a stable weight w with a stable inverse and ``|w(i omega)| >= height`` at all freq."""
+    # `|w|^2 = p_0 + sum_k p_k t_k` with p > 0: t_k is `1 / |d_k(i omega)|^2` of a resonance or of a
+    # well damped pair, or a hump `omega^4 / |d_k d_k'|^2`. With `x = omega^2` the right side is a
+    # rational function of x, positive for x >= 0; w has its zeros and poles `s = -sqrt(-x)`
     unit = 2 * np.pi * freq[-1]
     own = _peak_poles(freq, height, poles)[:resonances] / unit
     corners = np.geomspace(20 * np.pi * freq[1] / unit, 1.0, _SMOOTH)
@@ -418,11 +414,9 @@ def _envelope(freq: FloatArray, square: FloatArray, last: ComplexArray) -> Float
 
 
 def _log_fit(terms: FloatArray, square: FloatArray, spacing: FloatArray) -> FloatArray:
-    """Return p > 0 with ``terms p`` near a curve in logarithms: below it counts four times.
-
-    Least squares over q = log p, weighted half by the logarithm of frequency, half by the points
-    (most of which stand at resonances).
-    """
+    """Return p > 0 with ``terms p`` near a curve in logarithms: below it counts four times."""
+    # least squares over q = log p, weighted half by the logarithm of frequency, half by the points
+    # (most of which stand at resonances)
     from scipy.optimize import least_squares  # not loaded with the package
 
     goal = np.log(square)
@@ -461,10 +455,8 @@ def _raised(terms: FloatArray, p: FloatArray, square: FloatArray) -> FloatArray:
 
 
 def _spectral_factor(constant: float, ends: dict[complex, complex], unit: float) -> StateSpace:
-    """Return the spectral factor of ``constant + sum_k 2 Re(r_k / (x + l_k^2))``, in modal form.
-
-    Its zeros, as x, are the finite eigenvalues of an arrow matrix.
-    """
+    """Return the spectral factor of ``constant + sum_k 2 Re(r_k / (x + l_k^2))``, in modal form."""
+    # its zeros, as x, are the finite eigenvalues of an arrow matrix
     poles = np.array(list(ends), dtype=np.complex128)
     share = np.array(list(ends.values()), dtype=np.complex128)
     at = -(np.concatenate([poles, poles.conj()]) ** 2)

@@ -234,10 +234,8 @@ class _Channel(NamedTuple):
 def _opened(
     plant: Partition, system: StateSpace, found: Mapping[Delta, Sequence[_Channel]]
 ) -> StateSpace:
-    """Return a plant's system with the channels of Deltas after those that it has already.
-
-    First those of all Deltas, then their further ones.
-    """
+    """Return a plant's system with the channels of Deltas after those that it has already."""
+    # first those of all Deltas, then their further ones
     n, m = plant.system.n_states, len(plant.system.inputs)
     before = len(system.inputs) - m
     rates = np.hstack([system.A, system.B])
@@ -257,15 +255,13 @@ def _opened(
 
 
 def _mode_channels(plant: Partition, delta: Delta, base: FloatArray) -> list[_Channel]:
-    """Return the channel of a mode's stiffness or damping, two where accelerations need it.
-
-    A mode's A is affine in its Deltas, ``A0 + sum_j delta_j l_j R_j``, and so are displacements and
-    velocities. An acceleration ``S A (A x + N' f)`` holds products of them where the damping of a
-    mode is not proportional. With the rate ``x'`` of the states, which a first copy of the Deltas
-    drives, it is ``S A0 x' + sum_j (S l_j) delta_j R_j x'``: a second copy of each Delta that reads
-    ``R_j x'`` makes it exact. The columns are read off the plant assembled with one mode changed,
-    so that they hold for any port.
-    """
+    """Return the channel of a mode's stiffness or damping, two where accelerations need it."""
+    # a mode's A is affine in its Deltas, `A0 + sum_j delta_j l_j R_j`, and so are displacements and
+    # velocities. An acceleration `S A (A x + N' f)` holds products of them where the damping of a
+    # mode is not proportional. With the rate `x'` of the states, which a first copy of the Deltas
+    # drives, it is `S A0 x' + sum_j (S l_j) delta_j R_j x'`: a second copy of each Delta that reads
+    # `R_j x'` makes it exact. The columns are read off the plant assembled with one mode changed,
+    # so that they hold for any port
     n = plant.system.n_states
     changed = system_matrix(with_changes(plant, [(delta, _READ_OFF)]).system)
     change = (changed - base) / _READ_OFF
@@ -286,13 +282,11 @@ def _mode_channels(plant: Partition, delta: Delta, base: FloatArray) -> list[_Ch
 
 
 def _shape_channels(plant: Partition, delta: Delta, base: FloatArray) -> list[_Channel]:
-    r"""Return the channels of the shape of a mode.
-
-    ``phi + d v`` drives the mode by ``d v^T f`` more and shows ``d v q``, ``d v q'`` or
-    ``d v q''`` of its motion more: four channels at most, of which q'' feels what the first one
-    drives. Their columns are read off the plant assembled with forces or motions changed alone, so
-    that they hold for any port and filter.
-    """
+    """Return the channels of the shape of a mode."""
+    # `phi + d v` drives the mode by `d v^T f` more and shows `d v q`, `d v q'` or `d v q''` of its
+    # motion more: four channels at most, of which q'' feels what the first one drives. Their
+    # columns are read off the plant assembled with forces or motions changed alone, so that they
+    # hold for any port and filter
     q, v = (int(plant.modal_states[2 * delta.mode - i]) for i in (2, 1))
     realisation = modal_realisation(plant)
     driven, seen = (
@@ -343,11 +337,9 @@ def with_channels(
     right: FloatArray,
     feed: FloatArray | None = None,
 ) -> StateSpace:
-    """Return a system with channels `name:w` and `name:z` after its first inputs and outputs.
-
-    left (n + p, k): what w adds to states and later outputs; right (k, n + m): what z reads of
-    states and all inputs; feed (k, k): from w to z, zero when not given.
-    """
+    """Return a system with channels `name:w` and `name:z` after its first inputs and outputs."""
+    # left (n + p, k): what w adds to states and later outputs; right (k, n + m): what z reads of
+    # states and all inputs; feed (k, k): from w to z, zero when not given
     n, k = g.n_states, len(names)
     feed = np.zeros((k, k)) if feed is None else feed
     D = np.block([
@@ -372,12 +364,10 @@ def with_channels(
 def with_gain_channels(
     plant: Partition, system: StateSpace, deltas: Sequence[Delta]
 ) -> tuple[StateSpace, list[tuple[str, int]]]:
-    """Return a system with a first channel for each Delta on a gain, and their names, in order.
-
-    ``(1 + d) u`` acts by d times the command's column more, all but its own effort, and so does
-    noise at the amplifier's input; ``(1 + d) y`` adds d times what the sensor shows of the motion,
-    with what the actuators' Deltas do.
-    """
+    """Return a system with a first channel for each Delta on a gain, and their names, in order."""
+    # `(1 + d) u` acts by d times the command's column more, all but its own effort, and so does
+    # noise at the amplifier's input; `(1 + d) y` adds d times what the sensor shows of the motion,
+    # with what the actuators' Deltas do
     order = sorted(deltas, key=lambda one: one.name.removesuffix(":gain") in plant.y)
     for delta in order:
         name = delta.name.removesuffix(":gain")
@@ -466,13 +456,11 @@ class _Felt(SensorPort):
 def _parameter_channels(
     plant: Partition, parameters: Sequence[Parameter], scales: FloatArray
 ) -> tuple[StateSpace, tuple[Delta, ...]]:
-    """Return the continuous plant with channels for Deltas on the parameters, and these.
-
-    ``(M + sum d_i dM_i) q'' + (D + sum d_i dD_i) q' + (K + sum d_i dK_i) q = f``: with
-    ``dM_i = U s U'`` the change is the force ``-U s d_i U' q''``, a feedback around the (absolute)
-    acceleration, and so for velocities and displacements. Each Delta has as many channels as its
-    matrices have rank. Exact for any port and any damping.
-    """
+    """Return the continuous plant with channels for Deltas on the parameters, and these."""
+    # `(M + sum d_i dM_i) q'' + (D + sum d_i dD_i) q' + (K + sum d_i dK_i) q = f`: with `dM_i = U s
+    # U'` the change is the force `-U s d_i U' q''`, a feedback around the (absolute) acceleration,
+    # and so for velocities and displacements. Each Delta has as many channels as its matrices have
+    # rank. Exact for any port and any damping
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     model: Any = realisation.model  # one with M, D and K: `uncertain` has checked it
     deltas: list[Delta] = []

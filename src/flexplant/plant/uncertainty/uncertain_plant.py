@@ -75,11 +75,9 @@ def modal_realisation(plant: Partition) -> ModalRealisation:
 
 
 def with_changes(plant: P, changes: Sequence[tuple[Delta, float]]) -> P:
-    """Return the plant with modes' stiffness, damping or shape changed by some relative amounts.
-
-    Rows [1, 0] and [a00 / s, 1] of a block [[a00, s], [a10, a11]] are a mode's displacement and
-    its rate over s; only the second row of the block changes, whatever its form.
-    """
+    """Return the plant with modes' stiffness, damping or shape changed by some relative amounts."""
+    # rows [1, 0] and [a00 / s, 1] of a block [[a00, s], [a10, a11]] are a mode's displacement and
+    # its rate over s; only the second row of the block changes, whatever its form
     if all(delta.kind in ("gain", "delay") for delta, _ in changes):
         return _with_ports(plant, plant.assembled.realisation, changes)
     return _with_ports(plant, changed_modes(plant, changes), changes)
@@ -362,10 +360,8 @@ def _normal(rng: np.random.Generator, covariance: FloatArray) -> FloatArray:
 
 
 def elastic_part(model: Any, realisation: ModalRealisation, D: FloatArray) -> FloatArray:
-    """Return what a damper does beside rigid-body motion, which is undamped by convention.
-
-    All of it where the plant's own dampers slow rigid-body motion down.
-    """
+    """Return what a damper does beside rigid-body motion, which is undamped by convention."""
+    # all of it where the plant's own dampers slow rigid-body motion down
     r = realisation.n_rigid
     coupled = realisation.coupling is not None and np.any(realisation.coupling[:r])
     if not model.rigid_body.shape[1] or coupled or np.any(realisation.pairs[:r, 1, 1]):

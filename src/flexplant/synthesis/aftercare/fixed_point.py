@@ -254,10 +254,8 @@ def _run_channel(run: Any, name: str) -> FloatArray:
 
 
 def _replayed_powers(form: TwoStateForm, inputs: FloatArray, headroom: float) -> list[Integers]:
-    """Return the powers of two of inputs, states and outputs above a run, replayed.
-
-    A signal that is zero counts as 1.
-    """
+    """Return the powers of two of inputs, states and outputs above a run, replayed."""
+    # a signal that is zero counts as 1
     A = form.change
     x, most = np.zeros(len(A)), np.zeros(len(A))
     largest = np.zeros(len(form.C))

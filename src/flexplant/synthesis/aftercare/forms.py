@@ -84,11 +84,9 @@ class TwoStateForm(NamedTuple):
 def two_state_form(
     K: StateSpace, *, driven: Sequence[slice] = (), inputs: int | None = None, single: bool = False
 ) -> TwoStateForm:
-    """Return a sampled system in blocks of two states, its response compared with the system's.
-
-    For each group of outputs that are `driven` a start is computed that gives their commands at
-    the values of the first `inputs`.
-    """
+    """Return a sampled system in blocks of two states, its response compared with the system's."""
+    # for each group of outputs that are `driven` a start is computed that gives their commands at
+    # the values of the first `inputs`
     most, error = (_SINGLE if single else _DOUBLE), np.inf
     for form, sizes in _block_forms(K):
         found = _compared(K, _arranged(form, sizes, driven, inputs), single)
@@ -109,11 +107,9 @@ def two_state_form(
 def scheduled_form(
     laws: Sequence[StateSpace], *, driven: int, single: bool = False
 ) -> TwoStateForm:
-    """Return systems that differ in A too, one for each place, as full matrices.
-
-    Between places their entries are linear: no coordinates but the systems' own keep them so, up
-    to a scale for each state.
-    """
+    """Return systems that differ in A too, one for each place, as full matrices."""
+    # between places their entries are linear: no coordinates but the systems' own keep them so, up
+    # to a scale for each state
     sizes = [state_scale(K.A, K.B, K.C) for K in laws]
     d = np.exp(np.mean(np.log(sizes), axis=0))
     found = []
@@ -201,11 +197,9 @@ def _compared(K: StateSpace, form: TwoStateForm, single: bool) -> TwoStateForm:
 
 
 def _at_rest(K: StateSpace, driven: slice) -> FloatArray:
-    """Return the states (n, m + driven) that give the wanted commands and move least.
-
-    Of all x with ``C x = out - D in`` (in least squares, where states cannot give them) that with
-    the smallest ``(A - I) x + B in``, of these the smallest x.
-    """
+    """Return the states (n, m + driven) that give the wanted commands and move least."""
+    # of all x with `C x = out - D in` (in least squares, where states cannot give them) that with
+    # the smallest `(A - I) x + B in`, of these the smallest x
     C, D = K.C[driven], K.D[driven]
     first = np.linalg.pinv(C, rcond=RANK) @ np.hstack([-D, np.eye(len(C))])
     free, move = la.null_space(C, rcond=RANK), K.A - np.eye(K.n_states)

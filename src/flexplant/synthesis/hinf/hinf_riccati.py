@@ -149,10 +149,8 @@ class Riccati(Value):
         )
 
     def _searched(self, problem: Prepared, bar: Progress) -> tuple[float, float]:
-        """Return the smallest gamma that bisection reached from 1, and the largest refuted one.
-
-        Reached: what the equations promise of a step is seen at the resonances of its loop.
-        """
+        """Return the smallest gamma that bisection reached from 1, and the largest refuted one."""
+        # reached: what the equations promise of a step is seen at the resonances of its loop
         high = 1.0
         low = tried = min(_direct_bound(problem), high)
         for _ in range(_BISECTION):
@@ -190,11 +188,9 @@ class Riccati(Value):
 
 
 def quick_answer(problem: Prepared) -> SolvedController:
-    """Return a controller near the smallest gamma, not verified: for the steps of a search.
-
-    Where ranks are missing with the most noise and effort that `made_regular` adds; gains are seen
-    at resonances alone.
-    """
+    """Return a controller near the smallest gamma, not verified: for the steps of a search."""
+    # where ranks are missing with the most noise and effort that `made_regular` adds; gains are
+    # seen at resonances alone
     quick = Riccati(tolerance=_QUICK, progress=False)
     if not missing_ranks(problem):
         return quick._regular(problem, _REGULAR, _resonance_gain)

@@ -39,12 +39,10 @@ def raised_bound(problem: Prepared, gamma: float, known: float) -> float:
 
 
 def pointwise_bound(problem: Prepared) -> float:
-    """Return what no controller undercuts at some frequency, nor by the feedthrough.
-
-    Parrott: at s = j omega the loop's gain is at least that of Pzw on the outputs which u cannot
-    reach, ``N_z' Pzw`` with N_z' Pzu = 0, and on the inputs which y does not show, ``Pzw N_w``
-    with Pyw N_w = 0.
-    """
+    """Return what no controller undercuts at some frequency, nor by the feedthrough."""
+    # parrott: at s = j omega the loop's gain is at least that of Pzw on the outputs which u cannot
+    # reach, `N_z' Pzw` with N_z' Pzu = 0, and on the inputs which y does not show, `Pzw N_w` with
+    # Pyw N_w = 0
     m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
     system = problem.system
     poles = system.poles()
@@ -105,10 +103,8 @@ def parrott(P: ComplexArray | FloatArray, m1: int, p1: int) -> FloatArray:
 
 
 def _perp_norms(M: ComplexArray | FloatArray, Pzw: ComplexArray | FloatArray) -> FloatArray:
-    """Return the norms of Pzw on what is perpendicular to the columns of M.
-
-    Its dimension is that of M of full rank: more would hang on rounding.
-    """
+    """Return the norms of Pzw on what is perpendicular to the columns of M."""
+    # its dimension is that of M of full rank: more would hang on rounding
     if M.shape[1] <= M.shape[2]:
         return np.zeros(M.shape[0])
     part = _adjoint(np.linalg.svd(M)[0][:, :, M.shape[2] :]) @ Pzw
@@ -151,10 +147,8 @@ class FullInformation(NamedTuple):
         return float(np.linalg.norm(beyond, 2)) if beyond.size else 0.0
 
     def value(self, gamma: float) -> FloatArray | None:
-        """Return X (n, n) of the game's value ``x' X x``, None where gamma is refuted.
-
-        The sup over w of the inf over v of ``|z|^2 - gamma^2 |w|^2``, by a Riccati equation.
-        """
+        """Return X (n, n) of the game's value ``x' X x``, None where gamma is refuted."""
+        # the sup over w of the inf over v of `|z|^2 - gamma^2 |w|^2`, by a Riccati equation
         if gamma <= self.direct:
             return None
         D = np.hstack([self.D11, self.D12])
@@ -172,11 +166,9 @@ class FullInformation(NamedTuple):
 def full_information(
     A: FloatArray, B1: FloatArray, B2: FloatArray, C: FloatArray, D11: FloatArray, D12: FloatArray
 ) -> FullInformation:
-    """Return the problem of a plant with all states known, in which D12 has full rank.
-
-    Directions of u that z does not contain move some states at any speed at no cost: these states
-    become inputs, with their columns of A and C; and again, until no direction is free.
-    """
+    """Return the problem of a plant with all states known, in which D12 has full rank."""
+    # directions of u that z does not contain move some states at any speed at no cost: these states
+    # become inputs, with their columns of A and C; and again, until no direction is free
     T = np.eye(A.shape[0])
     while B2.shape[1]:
         sizes = np.linalg.norm(np.vstack([B2, D12]), axis=0)
@@ -196,13 +188,11 @@ def full_information(
 
 
 def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
-    """Return the largest gamma, up to the one reached, that is refuted for every controller.
-
-    Where ||w -> z|| < gamma is reached, it is reached with a little noise and effort added too.
-    Their Riccati equations have solutions X and Y with rho(X Y) < gamma^2, which are at least the
-    values of the same problem with all states known and free states as inputs, and of its dual.
-    [Stoorvogel1992]_ (the two quadratic matrix inequalities of singular problems).
-    """
+    """Return the largest gamma, up to the one reached, that is refuted for every controller."""
+    # where ||w -> z|| < gamma is reached, it is reached with a little noise and effort added too.
+    # Their Riccati equations have solutions X and Y with rho(X Y) < gamma^2, which are at least the
+    # values of the same problem with all states known and free states as inputs, and of its dual.
+    # [Stoorvogel1992]_ (the two quadratic matrix inequalities of singular problems)
     sides = [full_information(*side) for side in _sides(p)]
     low = max(known, *(one.direct for one in sides))
     high = gamma

@@ -74,14 +74,13 @@ class ModeChannel(Value):
 def mode_channels(
     weighted: StandardPlant, uncertain: UncertainPlant[Any], damped_below: float = 0.0
 ) -> tuple[ModeChannel, ...]:
-    """Return a channel for each mode of uncertain frequency that the weighted plant moves.
-
-    D is one over the modal force of the weighted disturbances: what a Delta feeds back then counts
-    as a disturbance does. Modes below a frequency [Hz] that actuators push are to be damped, not
-    only tolerated: they are off by 1 % at least, and c = 0 (complex deltas), which also covers
-    errors of their shapes and damping. Modes above half the rate are left out: samples show them
-    folded back, where no change of a force's response by one sample stands for their frequency's.
-    """
+    """Return a channel for each mode of uncertain frequency that the weighted plant moves."""
+    # D is one over the modal force of the weighted disturbances: what a Delta feeds back then
+    # counts as a disturbance does. Modes below a frequency [Hz] that actuators push are to be
+    # damped, not only tolerated: they are off by 1 % at least, and c = 0 (complex deltas), which
+    # also covers errors of their shapes and damping. Modes above half the rate are left out:
+    # samples show them folded back, where no change of a force's response by one sample stands for
+    # their frequency's
     own: Any = uncertain.plant
     g, dt = weighted.system, weighted.dt
     ranges = uncertain.frequencies
@@ -203,10 +202,8 @@ def tolerated(
     controller: StateSpace,
     times: float = 1.0,
 ) -> float:
-    """Return an upper bound of real mu of the channels, the largest over a grid of frequencies.
-
-    Below 1 no Deltas of a size (`times`), all at once, put a pole on the grid's frequencies.
-    """
+    """Return an upper bound of real mu of the channels, the largest over a grid of frequencies."""
+    # below 1 no Deltas of a size (`times`), all at once, put a pole on the grid's frequencies
     return times * ModeLoop(channels, plant, controller, times).level(1.0 / times)
 
 
@@ -247,11 +244,9 @@ class ModeLoop:
         self.where = block_places([*blocks, FullBlock(p - m, q - m)] if weighted else blocks)
 
     def level(self, near: float) -> float:
-        """Return beta, the largest over the grid: the Deltas and gains over it are all shown.
-
-        The design's D and G first, D for a beta that is `near`; where that is the largest, D that
-        evens out the loop, with G and without, and the best of the three.
-        """
+        """Return beta, the largest over the grid: the Deltas and gains over it are all shown."""
+        # the design's D and G first, D for a beta that is `near`; where that is the largest, D that
+        # evens out the loop, with G and without, and the best of the three
         plain = self._levels(self.M, self.shift, near)
         most = 0.0
         for part in np.array_split(np.argsort(-plain), -(-plain.size // _AT_ONCE)):

@@ -37,12 +37,10 @@ def over_positions(
     design: Callable[[StandardPlant], Controller],
     progress: bool | None = None,
 ) -> Controller:
-    """Return the controller whose worst norm over the positions is least of those tried.
-
-    Tried are the mean plant and those at the ends and in the middle, each by itself; then the mean
-    plant with a channel for each row and column that moves, ``y = (C + delta dC) x`` and ``x+ =
-    ... + (B + delta dB) u``, whose size and scale are searched.
-    """
+    """Return the controller whose worst norm over the positions is least of those tried."""
+    # tried are the mean plant and those at the ends and in the middle, each by itself; then the
+    # mean plant with a channel for each row and column that moves, `y = (C + delta dC) x` and
+    # `x+ = ... + (B + delta dB) u`, whose size and scale are searched
     moving = PlantRange.of(given)
     search, motion = _Search(moving, design), _MotionChannels(moving)
     with Progress(_MOST, _DESIGNS, progress=progress):

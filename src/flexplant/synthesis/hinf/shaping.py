@@ -281,14 +281,12 @@ _SLOW = 1e-4
 
 
 def following(shaped: StateSpace, model: StateSpace, weight: float) -> tuple[StateSpace, float]:
-    """Return ``[K1 W, K2]``, from references and y to u, of a shaped plant, and its gamma.
-
-    ``u = K1 r + K2 y`` minimises the norm from [r; phi] to [u; y; e], where ``y = M^-1 (N u +
-    phi)`` with the normalised left coprime factors N, M of the plant, ``r`` counts rho times and
-    ``e = rho (y - rho T_ref r)``: the larger rho (`weight`), the closer the loop follows the model
-    T_ref, the less robust it is. W brings the gain at zero frequency to that of the model.
-    [Hoyle1991]_; [Limebeer1993]_.
-    """
+    """Return ``[K1 W, K2]``, from references and y to u, of a shaped plant, and its gamma."""
+    # `u = K1 r + K2 y` minimises the norm from [r; phi] to [u; y; e], where `y = M^-1 (N u + phi)`
+    # with the normalised left coprime factors N, M of the plant, `r` counts rho times and
+    # `e = rho (y - rho T_ref r)`: the larger rho (`weight`), the closer the loop follows the model
+    # T_ref, the less robust it is. W brings the gain at zero frequency to that of the model.
+    # [Hoyle1991]_; [Limebeer1993]_
     p, m = len(shaped.outputs), len(shaped.inputs)
     if model.dt or model.D.shape != (p, p) or not model.is_stable:
         raise ModelError(

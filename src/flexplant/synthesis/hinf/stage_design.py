@@ -217,11 +217,9 @@ class _StageTask:
             return None
 
     def _judged(self, system: StateSpace) -> tuple[float, float]:
-        """Return the modulus margin of a controller, and the least with its modes off.
-
-        The latter is 0 where a mode may not be off by itself. No further machine is drawn after one
-        on which the loop does not hold.
-        """
+        """Return the modulus margin of a controller, and the least with its modes off."""
+        # the latter is 0 where a mode may not be off by itself. No further machine is drawn after
+        # one on which the loop does not hold
         block = self._block(system)
         loop = close_loop(self.plant, block)
         wholes = [] if self.whole is None else [close_loop(self.whole, block)]

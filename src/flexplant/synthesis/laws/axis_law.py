@@ -421,11 +421,9 @@ def linear_step(
     aim: Sequence[int] | IntArray,
     penalty: float,
 ) -> tuple[FloatArray, float]:
-    """Return the step that raises the mean of some numbers most, and its gain less a penalty.
-
-    On the largest lack of ``room + slopes step >= 0``, within a radius and within bounds: least
-    and largest steps, and ``rows @ step <= most``.
-    """
+    """Return the step that raises the mean of some numbers most, and its gain less a penalty."""
+    # on the largest lack of `room + slopes step >= 0`, within a radius and within bounds: least and
+    # largest steps, and `rows @ step <= most`
     from scipy.optimize import linprog
 
     low, high, rows, most = bounds
@@ -512,10 +510,8 @@ def _sets(of: AxisLaw) -> list[FloatArray]:
 def _best_starts(
     of: AxisLaw, w: float, sets: list[FloatArray], rows: IntArray
 ) -> list[tuple[float, FloatArray]]:
-    """Return for each set of notches the numbers of the best start at one bandwidth [Hz].
-
-    With a score: the logarithm of the bandwidth, less where the peak is not held yet.
-    """
+    """Return for each set of notches the numbers of the best start at one bandwidth [Hz]."""
+    # with a score: the logarithm of the bandwidth, less where the peak is not held yet
     top, s = of.axis.ceiling, np.append(of.s[rows], tustin_s(np.array([w]), of.axis.rate))
     shapes = sorted({(a, min(b, top / w), min(c, top / w)) for a, b in _LEADS for c in _TAILS})
     numbers = [np.log([w, *shape]) for shape in shapes]

@@ -55,10 +55,8 @@ class ServoLoop:
         return np.asarray(act @ self.moved)
 
     def peak(self, axis: Axis) -> tuple[float, float]:
-        """Return max_f sigma_max(S_u) over the grid and its frequency [Hz].
-
-        Of an unstable loop too, so check that.
-        """
+        """Return max_f sigma_max(S_u) over the grid and its frequency [Hz]."""
+        # of an unstable loop too, so check that
         L = self.gain(axis)
         mixed = len({self.plant.units.get(name) for name in self.plant.u}) > 1
         size = scaled_size(inverted(L)) if mixed else sensitivity_size(L)

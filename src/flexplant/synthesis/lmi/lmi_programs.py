@@ -157,10 +157,8 @@ def lqg_states(p: Plant) -> Plant:
 def lqg_balanced(
     p: Plant, Q: FloatArray, W: FloatArray, R: FloatArray, V: FloatArray, *, sampled: bool = False
 ) -> Plant:
-    """Return a plant in states balanced by its LQG problem, A less one if it is sampled.
-
-    In the unit of frequency of the LQG loop; R and V weigh the effort and the noise of sensors.
-    """
+    """Return a plant in states balanced by its LQG problem, A less one if it is sampled."""
+    # in the unit of frequency of the LQG loop; R and V weigh the effort and the noise of sensors
     solve_control, solve_filter = (
         (control_dare, solve_dare) if sampled else (control_care, solve_care)
     )
@@ -351,12 +349,10 @@ def verified(problem: Prepared, K: Matrices, target: float) -> float:
 def solve_program(
     problem: Any, settings: dict[str, float], *, violation: float = VIOLATION
 ) -> None:
-    """Solve a semidefinite program; its LMIs are checked by their eigenvalues afterwards.
-
-    Where Clarabel stops without an answer, the next of `ATTEMPTS` is made; the last resort is a
-    point at which progress became insufficient, which often is one that holds; with a larger
-    `violation` also one at which numbers failed, its residuals below that.
-    """
+    """Solve a semidefinite program; its LMIs are checked by their eigenvalues afterwards."""
+    # where Clarabel stops without an answer, the next of `ATTEMPTS` is made; the last resort is a
+    # point at which progress became insufficient, which often is one that holds; with a larger
+    # `violation` also one at which numbers failed, its residuals below that
     data, chain, inverse = problem.get_problem_data("CLARABEL", solver_opts={})
     reached: Any = None
     for attempt in ATTEMPTS:

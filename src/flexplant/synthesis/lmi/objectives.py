@@ -329,12 +329,9 @@ def h2(v: Variables, channel: Channel, square: Any) -> list[Any]:
 
 
 def peak(v: Variables, channel: Channel, gamma: Any, decay: float) -> list[Any]:
-    """Return the LMIs of the star norm: peak to peak below gamma units, for one rate.
-
-    ``x' P x`` shrinks by the rate beside what |w| < 1 adds, so that x stays in an ellipsoid, and z
-    is bounded there [Abedor1996]_. Of a sampled plant a step shrinks it by
-    ``1 - decay t``.
-    """
+    """Return the LMIs of the star norm: peak to peak below gamma units, for one rate."""
+    # `x' P x` shrinks by the rate beside what |w| < 1 adds, so that x stays in an ellipsoid, and z
+    # is bounded there [Abedor1996]_. Of a sampled plant a step shrinks it by `1 - decay t`
     B, C, D = v.of(channel)
     z, w = D.shape
     n = v.P.shape[0]
@@ -388,14 +385,11 @@ class PoleDisc(NamedTuple):
 
 
 def damped(ratio: float) -> list[tuple[float, float, float]]:
-    """Return the edges of a polygon in which poles z have at least a damping ratio.
-
-    Each as (x, y, most) of ``x Re z + y |Im z| <= most``.
-
-    ``z = e^(s dt)`` of that ratio is the spiral ``|z| = e^(-a phi)``, phi = |arg z|,
-    a = ratio / (1 - ratio^2)^(1/2); from phi = 0 on it is convex, up to where the real part is that
-    of its end on the negative axis. Its chords are the edges.
-    """
+    """Return the edges of a polygon in which poles z have at least a damping ratio."""
+    # each as (x, y, most) of `x Re z + y |Im z| <= most`
+    # `z = e^(s dt)` of that ratio is the spiral `|z| = e^(-a phi)`, phi = |arg z|, a = ratio / (1 -
+    # ratio^2)^(1/2); from phi = 0 on it is convex, up to where the real part is that of its end on
+    # the negative axis. Its chords are the edges
     from scipy.optimize import brentq
 
     a = ratio / np.sqrt(1.0 - ratio**2)

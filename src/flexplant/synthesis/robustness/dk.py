@@ -260,10 +260,8 @@ _CLOSE = 0.05
 
 
 def fitted_magnitude(omega: FloatArray, size: FloatArray, order: int) -> StateSpace:
-    """Return ``k prod (s + a_i) / (s + b_i)`` near a magnitude, of at most some order.
-
-    Least squares of the logarithm; the fewest factors that come close.
-    """
+    """Return ``k prod (s + a_i) / (s + b_i)`` near a magnitude, of at most some order."""
+    # least squares of the logarithm; the fewest factors that come close
     from scipy.optimize import least_squares  # not loaded with the package
 
     # a fit of logarithms: zeros would count without limit
@@ -314,11 +312,9 @@ def _by_mode_channels(
     method: SynthesisMethod | None,
     progress: bool | None,
 ) -> Controller | None:
-    """Return the controller of the smallest mu over the steps; None where no step shows any.
-
-    Step k solves the H-infinity problem of Deltas and weights divided by the mu of the step before:
-    at a fixed point the norm is 1 and mu what it was divided by.
-    """
+    """Return the controller of the smallest mu over the steps; None where no step shows any."""
+    # step k solves the H-infinity problem of Deltas and weights divided by the mu of the step
+    # before: at a fixed point the norm is 1 and mu what it was divided by
     plant = uncertain.plant
     weighted = _performance_plant(plant, w, z)
     stated = None

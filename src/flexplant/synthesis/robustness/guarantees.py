@@ -222,10 +222,8 @@ def _worst(
 def _worst_machine(
     loop: UncertainLoop, worst: Destabilising | None
 ) -> tuple[dict[str, float], StandardPlant | None, float]:
-    """Return the Deltas of the worst machine, that machine and one over its size.
-
-    Only what is not stable when closed exactly counts.
-    """
+    """Return the Deltas of the worst machine, that machine and one over its size."""
+    # only what is not stable when closed exactly counts
     if worst is None:
         return {}, None, 0.0
     values: dict[str, float] = {}

@@ -119,10 +119,8 @@ class Destabilising(NamedTuple):
 def smallest_multiple(
     M: StateSpace, blocks: Sequence[Block], found: Perturbation, least: float, most: float
 ) -> Destabilising | None:
-    """Return the multiple t between two sizes at which ``t Delta`` makes M's loop unstable.
-
-    The loop's eigenvalues decide: on the size before it is stable, on this one it is not.
-    """
+    """Return the multiple t between two sizes at which ``t Delta`` makes M's loop unstable."""
+    # the loop's eigenvalues decide: on the size before it is stable, on this one it is not
     delta = realised_delta(found, blocks)
     ladder = least * _LADDER
     if most < ladder[-1]:  # one loop decides whether this perturbation is worse than the best
@@ -148,10 +146,8 @@ def smallest_multiple(
 def crossing_multiple(
     M: ComplexArray, where: Sequence[Place], found: Perturbation
 ) -> tuple[float, Perturbation] | None:
-    """Return t and the perturbation, its complex blocks turned, with ``det(I - t M Delta) = 0``.
-
-    One phase common to all complex blocks is chosen so that an eigenvalue of M Delta is real.
-    """
+    """Return t and the perturbation, its complex blocks turned, with ``det(I - t M Delta) = 0``."""
+    # one phase common to all complex blocks is chosen so that an eigenvalue of M Delta is real
     fixed = np.zeros((where[-1].w.stop, where[-1].z.stop), dtype=np.complex128)
     turned = matrix_of(found, where)
     for p in where:
@@ -197,11 +193,9 @@ def crossing_multiple(
 def smallest_with_block(
     M: ComplexArray, where: Sequence[Place], start: Perturbation, least: float
 ) -> tuple[float, Perturbation] | None:
-    """Return the smallest t for real scalars and one full block, the last, at a frequency.
-
-    With the reals closed at t q, the block needs ``t sigma_max(F(M, t q)) = 1``: its own worst is
-    known. The reals are moved one after the other to an end of their interval.
-    """
+    """Return the smallest t for real scalars and one full block, the last, at a frequency."""
+    # with the reals closed at t q, the block needs `t sigma_max(F(M, t q)) = 1`: its own worst is
+    # known. The reals are moved one after the other to an end of their interval
     repeats = [p.block.w for p in where[:-1]]
     sizes = least * np.geomspace(1.0, 100.0, 60)
 
@@ -260,10 +254,8 @@ def _abscissa(M: StateSpace, delta: StateSpace, t: float) -> tuple[float, float]
 def worse_signs(
     M: StateSpace, blocks: Sequence[Block], one: Destabilising, near: complex | None = None
 ) -> Perturbation | None:
-    """Return the perturbation with real Deltas at the ends that move a pole out most.
-
-    The pole with the largest real part, or the one near some value. None where nothing changes.
-    """
+    """Return the perturbation with real Deltas at the ends that move a pole out most."""
+    # the pole with the largest real part, or the one near some value. None where nothing changes
     delta = realised_delta(one.found, blocks)
     A = loop_matrix(M, delta, one.size)
     eigen: Any = la.eig(A, left=True, right=True)
@@ -317,10 +309,8 @@ def destabilising(
 def _at_corners(
     M: StateSpace, blocks: Sequence[Block], least: float, best: Destabilising | None
 ) -> Destabilising | None:
-    """Return the best so far, after every choice of signs of a few Deltas that are all real.
-
-    At many sizes: those that destabilise may be a narrow range, stable on both sides.
-    """
+    """Return the best so far, after every choice of signs of a few Deltas that are all real."""
+    # at many sizes: those that destabilise may be a narrow range, stable on both sides
     real = all(isinstance(block, RepeatedScalar) and block.real for block in blocks)
     if not real or len(blocks) > _FEW:
         return best

@@ -97,11 +97,9 @@ class UncertainLoop:
         return dict(zip(names, numbers, strict=True))
 
     def machine(self, found: Perturbation, size: float) -> StandardPlant:
-        """Return the plant of a perturbation: its modes exact, sampled like the nominal one.
-
-        White noises do not pass the neglected modes in a sampled machine: their covariance is that
-        of the modes it has.
-        """
+        """Return the plant of a perturbation: its modes exact, sampled like the nominal one."""
+        # white noises do not pass the neglected modes in a sampled machine: their covariance is
+        # that of the modes it has
         plant: StandardPlant = self.uncertain.lft(self.deltas(found, size))
         part, factor = self.neglected, None
         if part is None:
@@ -165,10 +163,8 @@ def _delayed(delta: StateSpace, dt: float) -> StateSpace:
 def open_plant(
     uncertain: UncertainPlant[Any], *, w: Any = (), z: Any = (), loop: ClosedLoop | None = None
 ) -> UncertainLoop:
-    """Return an uncertain plant with its channels, weighted w and z, and all y and u.
-
-    Given a loop, with the channels of neglected modes that it drives and sees.
-    """
+    """Return an uncertain plant with its channels, weighted w and z, and all y and u."""
+    # given a loop, with the channels of neglected modes that it drives and sees
     require_uncertain(uncertain)
     channels = delta_channels(uncertain)
     (into, before), (out, behind) = weighted_names(w, "w"), weighted_names(z, "z")

@@ -196,10 +196,8 @@ class Scalings:
         return [np.einsum("bp,pij->bij", x[own], basis) for own, basis in self.alike]
 
     def shifted(self, x: FloatArray, M: ComplexArray) -> FloatArray:
-        """Return x with G of real scalars that takes the imaginary part from the diagonal of M.
-
-        ``G = -D Im M``: of one real scalar alone F is then ``D (level - |M|^2 + 2 (Im M)^2)``.
-        """
+        """Return x with G of real scalars that takes the imaginary part from the diagonal of M."""
+        # `G = -D Im M`: of one real scalar alone F is then `D (level - |M|^2 + 2 (Im M)^2)`
         x = x.copy()
         for place, (own, _), all_x in zip(self.places, self.d_ranges, self.ranges, strict=True):
             size = place.block.w
@@ -292,11 +290,9 @@ def perturbed(M: ComplexArray, delta: ComplexArray | FloatArray) -> ComplexArray
 
 
 def realised_delta(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
-    """Return a real, stable system Delta(s) of norm one with the perturbation at its frequency.
-
-    Each entry of a and b is a number times an all-pass ``+-(s - p) / (s + p)`` of its phase, so
-    that the gain is one at all frequencies.
-    """
+    """Return a real, stable system Delta(s) of norm one with the perturbation at its frequency."""
+    # each entry of a and b is a number times an all-pass `+-(s - p) / (s + p)` of its phase, so
+    # that the gain is one at all frequencies
     where = block_places(blocks)
     scalars, vectors = iter(found.scalars), iter(found.vectors)
     parts: list[StateSpace] = []

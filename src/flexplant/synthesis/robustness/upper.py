@@ -45,12 +45,10 @@ def upper_level(
     enough: float = 0.0,
     widest: float = FREE,
 ) -> Certified:
-    """Return the smallest level that scalings D, G reach: mu^2 (of a skewed problem, gain^2).
-
-    Generalised eigenvalue minimisation by the method of centres [BoydElGhaoui1993]_: at a
-    level, Newton steps to the maximum of ``log det F + sum log det D`` with the trace of D fixed;
-    the next level lies between it and what those scalings reach.
-    """
+    """Return the smallest level that scalings D, G reach: mu^2 (of a skewed problem, gain^2)."""
+    # generalised eigenvalue minimisation by the method of centres [BoydElGhaoui1993]_: at a level,
+    # Newton steps to the maximum of `log det F + sum log det D` with the trace of D fixed; the next
+    # level lies between it and what those scalings reach
     W = np.vstack([np.eye(scalings.w), M])
     size = float(np.linalg.norm(M)) ** 2
     if not size:
@@ -140,12 +138,10 @@ def centred(
     steps: int = _STEPS,
     widest: float = WIDE,
 ) -> FloatArray:
-    """Return scalings after Newton steps to the analytic centre of ``F > 0, D > 0`` at a level.
-
-    Where no real Delta at all closes the loop (M is complex beside a resonance) F grows with G
-    without end, and scalings that hold at one frequency hold nowhere else: a square of G counts
-    from `widest` times the trace of D and the size of M on.
-    """
+    """Return scalings after Newton steps to the analytic centre of ``F > 0, D > 0`` at a level."""
+    # where no real Delta at all closes the loop (M is complex beside a resonance) F grows with G
+    # without end, and scalings that hold at one frequency hold nowhere else: a square of G counts
+    # from `widest` times the trace of D and the size of M on
     slopes = _Slopes.of(scalings, scalings.coefficients(level))
     size = float(np.linalg.norm(W[scalings.w :])) * float(scalings.start @ x)
     wide = np.where(scalings.of_G, 1.0 / max(widest * size, TINY) ** 2, 0.0)
@@ -239,10 +235,8 @@ def _add_of_D(scalings: Scalings, x: FloatArray, gradient: FloatArray, hessian: 
 def _skewed(
     W: ComplexArray, scalings: Scalings, x: FloatArray, reached: float, enough: float
 ) -> Certified:
-    """Return the smallest level of a skewed problem: linear in it once D of its block is one.
-
-    Path following: Newton steps on ``t level - log det F - sum log det D`` for growing t.
-    """
+    """Return the smallest level of a skewed problem: linear in it once D of its block is one."""
+    # path following: Newton steps on `t level - log det F - sum log det D` for growing t
     fixed = int(scalings.owner[np.flatnonzero(scalings.leveled)[0]])
     x = x / x[fixed]
     # the level takes the place of the parameter that is fixed at one

@@ -166,10 +166,8 @@ class Closed(NamedTuple):
         return np.asarray(freq[chosen])
 
     def channels(self, freq: FloatArray, order: int = 0) -> tuple[ComplexArray, ...]:
-        """Return the responses of w and u to z and y, (k, ., .): zu, yw, zw, yu.
-
-        Their derivatives by the angular frequency for order 1 and 2.
-        """
+        """Return the responses of w and u to z and y, (k, ., .): zu, yw, zw, yu."""
+        # their derivatives by the angular frequency for order 1 and 2
         B, C = np.hstack([self.B, self.Bu]), np.vstack([self.C, self.Cy])
         D = np.block([[self.D, self.Du], [self.Dy, self.Dyu]])
         p, m, n = self.D.shape[0], self.D.shape[1], self.A.shape[0]
@@ -185,12 +183,10 @@ class Closed(NamedTuple):
         return all_[:, :p, m:], all_[:, p:, :m], all_[:, :p, :m], all_[:, p:, m:]
 
     def hessian(self, freq: float, which: int, by: FloatArray) -> FloatArray:
-        """Return the second derivatives (n, n) of the logarithm of a singular value.
-
-        ``T(K + dK) = T + To dK (I - G dK)^-1 Ti``; the singular value s of u and v changes by
-        ``Re u* T'' v``, and by the parts of ``T' v`` and ``T'* u`` along the others, over their
-        distances to s. At a peak also by the frequency's way to the peak of the changed loop.
-        """
+        """Return the second derivatives (n, n) of the logarithm of a singular value."""
+        # `T(K + dK) = T + To dK (I - G dK)^-1 Ti`; the singular value s of u and v changes by
+        # `Re u* T'' v`, and by the parts of `T' v` and `T'* u` along the others, over their
+        # distances to s. At a peak also by the frequency's way to the peak of the changed loop
         at = np.array([freq])
         (o, i, T, G), (o1, i1, T1, _) = (
             [part[0] for part in self.channels(at, order)] for order in (0, 1)
@@ -249,11 +245,9 @@ class Judge(Protocol):
         """Return the number, infinite when the loop is not stable, and its place."""
 
     def pieces(self, K: Matrices, by: FloatArray, place: Any, /, *, sweep: bool) -> Pieces:
-        """Return logarithms of functions near it, the number of the place among them.
-
-        `by` (n, rows, columns) are derivatives of [A, B; C, D] by the parameters; without `sweep`
-        the place alone counts.
-        """
+        """Return logarithms of functions near it, the number of the place among them."""
+        # `by` (n, rows, columns) are derivatives of [A, B; C, D] by the parameters; without `sweep`
+        # the place alone counts
 
 
 class LoopObjective(Protocol):

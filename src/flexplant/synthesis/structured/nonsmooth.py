@@ -135,13 +135,12 @@ def _line_search(
 def minimax(
     function: Maximum, x: FloatArray, *, steps: int, spent: Callable[[], bool] = lambda: False
 ) -> Minimum:
-    """Return a local minimum of the largest function near x.
-
-    Each step minimises ``max_i (f_i + g_i' d) + d' (|H| + mu I) d / 2``, H the Hessian of the
-    functions weighted as the step weights their gradients, |H| with its negative eigenvalues
-    turned round. A step that another peak refuses is tried again with the model of that peak, at
-    x, and a larger mu. After so many steps, or when `spent` is true, it stops. [ApkarianNoll2006]_
-    """
+    """Return a local minimum of the largest function near x."""
+    # each step minimises `max_i (f_i + g_i' d) + d' (|H| + mu I) d / 2`, H the Hessian of the
+    # functions weighted as the step weights their gradients, |H| with its negative eigenvalues
+    # turned round. A step that another peak refuses is tried again with the model of that peak, at
+    # x, and a larger mu. After so many steps, or when `spent` is true, it stops.
+    # [ApkarianNoll2006]_
     value, _ = function.value(x)
     pieces, weights, mu = function.pieces(x), None, None
     values, refused = [value], 0

@@ -68,10 +68,8 @@ class ControllerFamily:
         self._slopes = slopes
 
     def jacobian(self, theta: FloatArray) -> FloatArray:
-        """Return the derivatives (n, rows, columns) of [A, B; C, D] by the parameters.
-
-        Those of `slopes`; without them by differences, exact up to the fourth power.
-        """
+        """Return the derivatives (n, rows, columns) of [A, B; C, D] by the parameters."""
+        # those of `slopes`; without them by differences, exact up to the fourth power
         if self._slopes is not None:
             return self._slopes(theta)
         return np.array(

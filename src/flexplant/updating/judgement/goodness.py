@@ -25,12 +25,10 @@ NAMED = 3
 
 
 def chi_square(objective: Objective, point: Point, free: FloatArray) -> tuple[float | None, int]:
-    """Return chi-square (None where the noise is not known) and its degrees of freedom.
-
-    ``min_d |N^-1/2 (r + J d)|^2`` to first order, which for residuals weighted by their own
-    covariance is ``|r|^2``: distributed as chi-square with (residuals and priors) - (parameters
-    that are free) degrees of freedom, whatever the weights of the fit.
-    """
+    """Return chi-square (None where the noise is not known) and its degrees of freedom."""
+    # `min_d |N^-1/2 (r + J d)|^2` to first order, which for residuals weighted by their own
+    # covariance is `|r|^2`: distributed as chi-square with (residuals and priors) - (parameters
+    # that are free) degrees of freedom, whatever the weights of the fit
     r = objective.values(point)
     dof = r.size - int(np.sum(free))
     if not objective.noise_known:
@@ -95,11 +93,9 @@ SINGULAR = 1e-9
 
 
 def covariance(objective: Objective, point: Point) -> tuple[FloatArray | None, FloatArray]:
-    """Return covariance (or None) and correlation of the estimate, to first order.
-
-    ``G N G^T`` with ``G = (J^T J)^-1 J^T`` and N the covariance of the weighted residuals where it
-    is known, else ``s^2 (J^T J)^-1`` with the variance s^2 of the residuals.
-    """
+    """Return covariance (or None) and correlation of the estimate, to first order."""
+    # `G N G^T` with `G = (J^T J)^-1 J^T` and N the covariance of the weighted residuals where it is
+    # known, else `s^2 (J^T J)^-1` with the variance s^2 of the residuals
     J, r = objective.slopes(point), objective.values(point)
     q = J.shape[1]
     length = np.linalg.norm(J, axis=0)

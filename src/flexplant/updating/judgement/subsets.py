@@ -137,10 +137,8 @@ class Subsets:
         return (None if found is None else found.chi2), dof
 
     def runner_up(self, best: Subset) -> tuple[Subset, float]:
-        """Return the fitted set of least criterion that names another place, and its criterion.
-
-        A set with more candidates beside those of the best names no other place.
-        """
+        """Return the fitted set of least criterion that names another place, and its criterion."""
+        # a set with more candidates beside those of the best names no other place
         other = [
             (found.score, one)
             for one, found in self.done.items()
@@ -175,11 +173,9 @@ class Subsets:
         return self.whole.noise_known and not is_bad(chance(*self.chi2(subset)))
 
     def explained(self, subset: Subset) -> FloatArray:
-        """Return what each candidate explains to first order of what a subset leaves.
-
-        What the subset and the nuisance explain is taken out of its slopes:
-        ``(J_c^T r)^2 / (J_c^T J_c)`` with r and J_c free of them.
-        """
+        """Return what each candidate explains to first order of what a subset leaves."""
+        # what the subset and the nuisance explain is taken out of its slopes:
+        # `(J_c^T r)^2 / (J_c^T J_c)` with r and J_c free of them
         if self.fit(subset) is None:
             return np.zeros(self.count)
         fixed = [*subset, *self.beside]
@@ -205,10 +201,8 @@ class Subsets:
         return float(_explained(J[:, :1], J[:, 1:], r)[0])
 
     def _end_of(self, objective: Objective, rows: Sequence[int], subset: Subset) -> Point:
-        """Return the end of the fit of a subset as a point of `objective`.
-
-        The fitted parameters are the `rows` of those of the objective, the others are zero.
-        """
+        """Return the end of the fit of a subset as a point of `objective`."""
+        # the fitted parameters are the `rows` of those of the objective, the others are zero
         end, p = self.ends[subset], np.zeros(len(objective.parameters))
         p[list(rows)] = self.ways[subset][-1]
         return objective.place(Point(objective.family, p, end.eigen, end.labels))
@@ -341,10 +335,8 @@ class Subsets:
         return [first + part * (guess - first) for part in WAY]
 
     def _guess(self, subset: Subset) -> FloatArray | None:
-        """Return values near the fit of a subset: of the best part of it, or to first order.
-
-        From zero a trust region grows by a factor of two a step to where one of these begins.
-        """
+        """Return values near the fit of a subset: of the best part of it, or to first order."""
+        # from zero a trust region grows by a factor of two a step to where one of these begins
         parts = [tuple(k for k in subset if k != out) for out in subset]
         parts = [part for part in parts if part and self.done.get(part) is not None]
         if parts:
@@ -393,10 +385,8 @@ NEARLY = 1e-3
 
 
 def load_vectors(family: Family, parameter: int) -> FloatArray | None:
-    """Return the forces (k, r) by which a parameter couples the modes; None if it does by many.
-
-    ``dM = sum_i s_i b_i b_i^T``, and so dD and dK. A diagonal matrix couples none.
-    """
+    """Return the forces (k, r) by which a parameter couples the modes; None if it does by many."""
+    # `dM = sum_i s_i b_i b_i^T`, and so dD and dK. A diagonal matrix couples none
     found: list[FloatArray] = []
     for stack in family.terms:
         for j in np.flatnonzero(np.array(family.owner) == parameter).tolist():
@@ -410,12 +400,10 @@ def load_vectors(family: Family, parameter: int) -> FloatArray | None:
 
 
 def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | None:
-    r"""Return B (k, k') of few coordinates for modes up to `top` [rad/s], None if not worth it.
-
-    The modes up to 1.5 `top`; and of those beyond, what a load b moves of them at three
-    frequencies, :math:`b_i/(\omega_i^2 - \sigma)`: eigenvalues have the error of this rational
-    interpolation squared. Columns are orthonormal, and diagonal in K.
-    """
+    """Return B (k, k') of few coordinates for modes up to `top` [rad/s], None if not worth it."""
+    # the modes up to 1.5 `top`; and of those beyond, what a load b moves of them at three
+    # frequencies, `b_i/(\omega_i^2 - \sigma)`: eigenvalues have the error of this rational
+    # interpolation squared. Columns are orthonormal, and diagonal in K
     squares = np.diag(family.K)
     low = squares <= (BEYOND * top) ** 2
     high = np.flatnonzero(~low)
@@ -440,10 +428,8 @@ def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | N
 
 
 def is_physical(family: Family, p: FloatArray) -> bool:
-    """Return whether M is positive definite and K indefinite nowhere, in all coordinates.
-
-    A negative mass that few coordinates allow may be more than there is at its place.
-    """
+    """Return whether M is positive definite and K indefinite nowhere, in all coordinates."""
+    # a negative mass that few coordinates allow may be more than there is at its place
     M, _, K = family.matrices(p)
     elastic = np.sort(np.diag(family.K))[family.n_rigid]
     try:
@@ -455,12 +441,10 @@ def is_physical(family: Family, p: FloatArray) -> bool:
 
 
 def lifted_point(family: Family, B: FloatArray, point: Point, numbers: Sequence[int]) -> Point:
-    r"""Return a point of few coordinates in all those of `family`, corrected to second order.
-
-    What the coordinates miss, :math:`\rho = P(\lambda) B x`, moves the shape by
-    :math:`-P_0(\lambda)^{-1} \rho` and the eigenvalue by
-    :math:`\rho^T P_0^{-1} \rho/(x^T (2 \lambda M + D) x)`, P_0 the pencil's diagonal.
-    """
+    """Return a point of few coordinates in all those of `family`, corrected to second order."""
+    # what the coordinates miss, `\rho = P(\lambda) B x`, moves the shape by
+    # `-P_0(\lambda)^{-1} \rho` and the eigenvalue by
+    # `\rho^T P_0^{-1} \rho/(x^T (2 \lambda M + D) x)`, P_0 the pencil's diagonal
     M, D, K = family.matrices(point.p)
     X, poles = B @ point.eigen.X, point.eigen.poles.copy()
     followed = np.array(point.columns(numbers))

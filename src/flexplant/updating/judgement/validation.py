@@ -429,10 +429,8 @@ def _misfit(
     *,
     spread: bool,
 ) -> tuple[FloatArray, float | None]:
-    """Return the rms before and after, and the chance that noise leaves more than after.
-
-    With `spread`, that of the parameters counts as noise: r^T (N + J C J^T)^-1 r / m.
-    """
+    """Return the rms before and after, and the chance that noise leaves more than after."""
+    # with `spread`, that of the parameters counts as noise: r^T (N + J C J^T)^-1 r / m
     objective = Objective(model, parameters, residuals, prior=False)
     before = objective.values(objective.begin(start))
     # in steps, so that modes are followed and not lost

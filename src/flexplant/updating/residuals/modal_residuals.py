@@ -37,12 +37,10 @@ ZETA = 1e-6
 
 
 def growth(omega: FloatArray, measured: FloatArray) -> FloatArray:
-    """Return by how much more than the usual the frequencies (m,) of a model are off.
-
-    What it leaves out (shear, rotary inertia, what lies between nodes) costs a share that grows
-    with omega, of plates and beams; what is wrong everywhere (material, thickness) a constant one.
-    Both are alike at the middle of the measured frequencies.
-    """
+    """Return by how much more than the usual the frequencies (m,) of a model are off."""
+    # what it leaves out (shear, rotary inertia, what lies between nodes) costs a share that grows
+    # with omega, of plates and beams; what is wrong everywhere (material, thickness) a constant
+    # one. Both are alike at the middle of the measured frequencies
     return np.asarray(0.5 * (1.0 + omega / np.mean(measured)))
 
 
@@ -180,11 +178,9 @@ class BoundEigenvalues(Bound):
         self.name = f"modes {', '.join(map(str, self.numbers))}"
 
     def kinds(self) -> list[Kind]:
-        """Return relative errors of frequency (at constant zeta) and of damping.
-
-        Of each mode, and one as large of all modes together (the material's, say), which no mode
-        shows by itself.
-        """
+        """Return relative errors of frequency (at constant zeta) and of damping."""
+        # of each mode, and one as large of all modes together (the material's, say), which no mode
+        # shows by itself
         grown = growth(np.abs(self.target), np.abs(self.target))
         pole = self.target
         zeta = -pole.real / np.abs(pole)

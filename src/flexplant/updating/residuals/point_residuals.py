@@ -351,11 +351,9 @@ class Held:
         return found
 
     def zeros(self) -> tuple[ComplexArray, ComplexArray]:
-        """Return the zeros (m,) of one input to one output as s = ln(z)/T, and ds/dp (m, q).
-
-        Those of the upper half plane, below half the rate. ``[A - z, Gamma; C, 0] [x; u] = 0`` with
-        ``y`` from the left: ``dz = y^T (dA x + dGamma u) / y^T x``.
-        """
+        """Return the zeros (m,) of one input to one output as s = ln(z)/T, and ds/dp (m, q)."""
+        # those of the upper half plane, below half the rate. `[A - z, Gamma; C, 0] [x; u] = 0` with
+        # `y` from the left: `dz = y^T (dA x + dGamma u) / y^T x`
         n = 2 * self.k
         row = self.C / np.abs(self.C).max()
         gain = self.stepped[:n, n:]

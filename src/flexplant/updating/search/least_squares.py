@@ -172,10 +172,8 @@ class TrustRegion(UpdateMethod):
 
 
 def _is_stuck(answer: Any, size: FloatArray, tolerance: float) -> bool:
-    """Return whether slopes promise a lower cost, though every step was refused.
-
-    At a minimum they promise next to nothing; at a jump of the cost they do.
-    """
+    """Return whether slopes promise a lower cost, though every step was refused."""
+    # at a minimum they promise next to nothing; at a jump of the cost they do
     J = answer.jac[:, answer.active_mask == 0]
     Q = la.qr(J / divisor(np.linalg.norm(J, axis=0)), mode="economic")[0]
     change = Q @ (Q.T @ answer.fun)
@@ -185,10 +183,8 @@ def _is_stuck(answer: Any, size: FloatArray, tolerance: float) -> bool:
 
 
 def _data_loss(name: Loss, rows: int) -> Callable[[FloatArray], FloatArray]:
-    """Return rho, rho', rho'' with the named loss on the first rows and squares on the others.
-
-    A prior is no outlier, however far the data pull.
-    """
+    """Return rho, rho', rho'' with the named loss on the first rows and squares on the others."""
+    # a prior is no outlier, however far the data pull
 
     def rho(z: FloatArray) -> FloatArray:
         out = np.vstack([z, np.ones_like(z), np.zeros_like(z)])
@@ -305,10 +301,8 @@ def _is_small(rows: FloatArray, size: FloatArray, tolerance: float) -> bool:
 def _gauss_newton_step(
     objective: Objective, point: Point, r: FloatArray, truncate: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the step of (13) and the change of the residuals to first order.
-
-    As the real least-squares problem that (13) comes from.
-    """
+    """Return the step of (13) and the change of the residuals to first order."""
+    # as the real least-squares problem that (13) comes from
     J = objective.slopes(point)
     length = np.linalg.norm(J, axis=0)
     names = [parameter.name for parameter in objective.parameters]
