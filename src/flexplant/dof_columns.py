@@ -25,22 +25,10 @@ class Interpolation(Value):
 
     @abstractmethod
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) with which all n DOFs give the motion `direction` at `xyz`.
-
-        Raises
-        ------
-        LabelError
-            When the point is off the structure or the direction is unknown to it.
-        """
+        """Return the weights (n,) with which all n DOFs give the motion `direction` at `xyz`."""
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (p, n) at many points (p, 3); the same as `row` one by one.
-
-        Raises
-        ------
-        LabelError
-            When one of them is off the structure.
-        """
+        """Return the weights (p, n) at many points (p, 3); the same as `row` one by one."""
         places = real_array(points, "points", (None, 3))
         return np.array([self.row(point, direction) for point in places])
 

@@ -12,9 +12,12 @@
     └── CertificateError (RuntimeError)  an answer failed the check by another route
     FlexplantWarning     (UserWarning)
 
-Every message says what is wrong, what was got, why it matters and what to do next. What is tried
-inside, fails and is replaced by something else is no error: ``logging.getLogger("flexplant")`` says
-so at the level INFO (``logging.basicConfig(level="INFO")`` shows it).
+An unknown name is a `LabelError`, sizes that do not match are a `ShapeError` and a value out of
+range is a `ModelError` everywhere: a method or a constructor lists under Raises only what one would
+not expect. Every message says what is wrong, what was got, why it matters and what to do next. What
+is tried inside, fails and is replaced by something else is no error:
+``logging.getLogger("flexplant")`` says so at the level INFO (``logging.basicConfig(level="INFO")``
+shows it).
 """
 
 import logging

@@ -181,11 +181,6 @@ class DofSet(Value):
         ----------
         label : str
             Such as `"41:z"`.
-
-        Raises
-        ------
-        LabelError
-            When there is no such DOF, with close matches.
         """
         row = self._index.found(label)
         if row < 0:
@@ -202,13 +197,7 @@ class DofSet(Value):
         return None if self.interpolation is None else self.interpolation.dependent(label)
 
     def location(self, label: str) -> FloatArray:
-        """Return the coordinates (3,) [m] of a DOF's node, of one that follows others too.
-
-        Raises
-        ------
-        LabelError
-            When there is no such DOF, with close matches.
-        """
+        """Return the coordinates (3,) [m] of a DOF's node, of one that follows others too."""
         found = None if label in self else self._dependent(label)
         return self.xyz[self.index(label)] if found is None else found[1]
 
@@ -265,11 +254,6 @@ class DofSet(Value):
             edge. Infinite entries are allowed.
         component : str, optional
             Of a joined machine.
-
-        Raises
-        ------
-        LabelError
-            When a node, direction or component is not there, or no DOF is in the box.
         """
         keep = self._owned(component)
         if nodes is not None:
@@ -317,11 +301,6 @@ class DofSet(Value):
             One of the directions present.
         component : str, optional
             Of a joined machine; None: of all.
-
-        Raises
-        ------
-        LabelError
-            When no DOF has this direction.
         """
         known = isinstance(direction, str) and direction in DIRECTIONS
         kind = DIRECTIONS.index(direction) if known else -1
@@ -347,11 +326,6 @@ class DofSet(Value):
             {label or (x, y, z): weight}.
         direction : str
             The motion at points; a label carries its own.
-
-        Raises
-        ------
-        LabelError
-            When the DOF is unknown or the point is off the structure.
         """
         row = np.zeros(len(self))
         if isinstance(at, str):
@@ -382,13 +356,7 @@ class DofSet(Value):
         return row
 
     def rows(self, points: FloatArray, direction: str = "z") -> FloatArray:
-        """Return the rows (p, n) of the motion at many points (p, 3) [m]; see `row`.
-
-        Raises
-        ------
-        LabelError
-            When a point is off the structure.
-        """
+        """Return the rows (p, n) of the motion at many points (p, 3) [m]; see `row`."""
         places = real_array(points, "points", (None, 3))
         if self.interpolation is not None and direction in DIRECTIONS:
             return self.interpolation.rows(places, direction)
@@ -402,10 +370,5 @@ class DofSet(Value):
         ----------
         table : path of a CSV file, or an iterable of mappings
             One row per DOF, in the order of the matrices.
-
-        Raises
-        ------
-        LabelError
-            When a column is missing.
         """
         return cls(*columns_of(table))

@@ -58,11 +58,6 @@ class FilterModel(Value):
     root : (n + ny, r) array, optional
         A factor of ``[Q S; S' R]``, where one is known.
 
-    Raises
-    ------
-    ModelError
-        When `root` is no such factor.
-
     Examples
     --------
     >>> import flexplant as fx

@@ -65,11 +65,6 @@ class Augmented(Value):
     corner : float [Hz]
         Zero: a random walk.
 
-    Raises
-    ------
-    ModelError
-        When drift is not positive or corner is negative.
-
     Examples
     --------
     >>> import flexplant as fx

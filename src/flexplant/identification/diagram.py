@@ -146,11 +146,6 @@ class StabilisationDiagram(Value):
         ----------
         presence : float
             Between 0 and 1.
-
-        Raises
-        ------
-        ModelError, SolverError
-            When presence is out of range, or no pole stays.
         """
         presence = between(presence, "presence", 0.0, 1.0, "Try 0.5.", ends="]")
         known = np.unique(self.orders)

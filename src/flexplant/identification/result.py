@@ -359,11 +359,6 @@ class IdentifiedModes(MeasuredModes):
         as_measured : bool
             As the lines of the windowed segments show it, where the poles were fitted so: with
             lower and wider resonances than those of the machine.
-
-        Raises
-        ------
-        ModelError
-            When a frequency is not positive.
         """
         freq = checked_freq(freq)
         if freq.size and freq.min() <= 0:

@@ -46,11 +46,6 @@ class H1Estimator(SpectralMethod):
     window : str or tuple
         As `scipy.signal.get_window` takes; "boxcar" where all signals are periodic in a segment.
 
-    Raises
-    ------
-    ModelError
-        When a value is out of range.
-
     References
     ----------
     [BendatPiersol2010]_, chapter 9.

@@ -107,13 +107,7 @@ class ScheduledLoop(Value):
         return tuple((1.0 - share) * part[i] + share * part[i + 1] for part in self.stacked)
 
     def at(self, x: float) -> ClosedLoop:
-        """Return the loop of the machine that stands at a position.
-
-        Raises
-        ------
-        ModelError
-            When the position is out of the plant's range.
-        """
+        """Return the loop of the machine that stands at a position."""
         loop = self.loops[0]
         # the references that its blocks know derivatives of are read there too
         plant = with_known(loop.plant.at(None, **{self.position: x}), loop.blocks)

@@ -349,13 +349,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     def select(
         self, outputs: Sequence[str] | str | None = None, inputs: Sequence[str] | str | None = None
     ) -> Frf:
-        """Return the responses between some channels, in the order given.
-
-        Raises
-        ------
-        LabelError
-            When a name is unknown.
-        """
+        """Return the responses between some channels, in the order given."""
         chosen_out = name_list(self.outputs if outputs is None else outputs, "outputs")
         chosen_in = name_list(self.inputs if inputs is None else inputs, "inputs")
         rows = rows_of(self.outputs, chosen_out, "output", None)
@@ -456,13 +450,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
 
     @classmethod
     def from_control(cls, frd: Any) -> Frf:
-        """Return a `control.FrequencyResponseData` as Frf, with its names.
-
-        Raises
-        ------
-        ModelError
-            When it is none, or a frequency is there twice.
-        """
+        """Return a `control.FrequencyResponseData` as Frf, with its names."""
         if not all(hasattr(frd, part) for part in ("frdata", "omega", "input_labels")):
             raise ModelError(
                 f"need a python-control FrequencyResponseData, got {type(frd).__name__}. Make "

@@ -185,13 +185,7 @@ class StateSpace(Value):
     def select(
         self, outputs: Iterable[str] | None = None, inputs: Iterable[str] | None = None
     ) -> StateSpace:
-        """Return the system between some channels, in the order given; all states are kept.
-
-        Raises
-        ------
-        LabelError
-            When a name is unknown.
-        """
+        """Return the system between some channels, in the order given; all states are kept."""
         rows = self.output_index(self.outputs if outputs is None else outputs)
         cols = self.input_index(self.inputs if inputs is None else inputs)
         if [*rows] == [*range(len(self.outputs))] and [*cols] == [*range(len(self.inputs))]:
@@ -361,13 +355,7 @@ class StateSpace(Value):
         return invariant_zeros(self)
 
     def evaluated(self, s: complex) -> ComplexArray:
-        """Return the gain ``C (s I - A)^-1 B + D`` (p, m) at one complex s (z when sampled).
-
-        Raises
-        ------
-        ModelError
-            When s is a pole.
-        """
+        """Return the gain ``C (s I - A)^-1 B + D`` (p, m) at one complex s (z when sampled)."""
         point = complex(complex_array(s, "s", ()))
         shifted = point * np.eye(self.n_states) - self.A
         try:
@@ -402,11 +390,6 @@ class StateSpace(Value):
 
         A transfer function becomes sections in series, each channel of a matrix with its own
         states: `minimal` removes what they share.
-
-        Raises
-        ------
-        ModelError
-            When it is none, or its sampling time is not stated.
         """
         return cls(**foreign_fields(sys))
 

@@ -528,11 +528,6 @@ class Modes(Placed, Value):
             A DOF label, a point, or {label: weight}.
         direction : str
             The motion at a point.
-
-        Raises
-        ------
-        LabelError
-            When the place is unknown.
         """
         motion: FloatArray | ComplexArray = self.dofs.row(place, direction) @ self.phi
         return motion

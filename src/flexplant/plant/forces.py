@@ -57,11 +57,6 @@ class Disturbance(_PlacedForce):
     moves : mapping {position: (3,) array} or PlaceTable, optional
         How its point follows the positions of `Ports`; `at` is where all of them are zero.
 
-    Raises
-    ------
-    LabelError, ModelError
-        For a bad name, place, direction, shape or a negative asd.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -101,11 +96,6 @@ class BaseAcceleration(ForcePort):
         A stable filter between the channel and the base: the floor's spectrum.
     about : (3,) array [m]
         The point that a rotation turns about.
-
-    Raises
-    ------
-    LabelError, ModelError, ShapeError
-        For a bad name, direction, shape, point or a negative asd.
 
     Notes
     -----
@@ -163,11 +153,6 @@ class OutputDisturbance(ForcePort):
         One-sided amplitude spectral density of white noise; 0 for none.
     shape : StateSpace, optional
         A stable filter between the channel and the sensor: drift, mains hum.
-
-    Raises
-    ------
-    LabelError, ModelError
-        For a bad name, shape or a negative asd.
 
     Examples
     --------
@@ -276,11 +261,6 @@ class FirstOrder(_Spectrum):
     corner : float [Hz]
         omega / (2 pi).
 
-    Raises
-    ------
-    ModelError
-        When one is not positive.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -320,11 +300,6 @@ class NarrowBand(_Spectrum):
         omega / (2 pi).
     zeta : float
         Half the relative bandwidth, below 1.
-
-    Raises
-    ------
-    ModelError
-        When one is not positive, or zeta not below 1.
 
     Examples
     --------
@@ -371,11 +346,6 @@ class RandomWalk(_Spectrum):
     corner : float [Hz]
         Below the inverse of the longest record.
 
-    Raises
-    ------
-    ModelError
-        When one is not positive.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -408,11 +378,6 @@ class RigidForce(ForcePort):
         As for `Disturbance`.
     direction : str
         x, y, z [N] or rx, ry, rz [N m].
-
-    Raises
-    ------
-    LabelError, ModelError
-        For a bad name, direction, shape or a negative asd.
 
     Examples
     --------

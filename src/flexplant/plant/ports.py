@@ -104,11 +104,6 @@ class Poi(Value):
     moves : mapping {position: (3,) array} or PlaceTable, optional
         How its point follows the positions of `Ports`; `at` is where all of them are zero.
 
-    Raises
-    ------
-    LabelError, ModelError
-        For a bad name, place or axis.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -196,11 +191,6 @@ class Reference(Value):
         The POI's name.
     axes : sequence of str, optional
         Which of the POI's axes get one; its first when not given.
-
-    Raises
-    ------
-    LabelError
-        When the POI is no name, or an axis is unknown or named twice.
 
     Examples
     --------

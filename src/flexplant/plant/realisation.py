@@ -355,11 +355,6 @@ class Feedthrough(ResidualForm):
     above : float [Hz], optional
         Also the modes above this frequency; only the attachment vectors when not given.
 
-    Raises
-    ------
-    ModelError
-        When above is not positive.
-
     Examples
     --------
     >>> import flexplant as fx

@@ -109,11 +109,6 @@ class PlaceTable(Value):
     places : (k, ..., 3) array [m]
         The place at each point of the grid, one axis for each position, in their order.
 
-    Raises
-    ------
-    ModelError, ShapeError
-        When values do not increase, or sizes do not fit.
-
     Examples
     --------
     >>> import flexplant as fx

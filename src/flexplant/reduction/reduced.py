@@ -186,11 +186,6 @@ class ReducedModel(Value):
             desired DOFs.
         direction : str
             The motion at a point.
-
-        Raises
-        ------
-        LabelError
-            When the place is unknown.
         """
         return np.asarray(self.full_dofs.row(at, direction) @ self.T)
 

@@ -138,11 +138,6 @@ class MachinePipeline(Value):
         Of an FEModel in place of its D, for models of any size: a `ModalDamping`, say. Parameters
         of damping are not in it; give Modes to have them.
 
-    Raises
-    ------
-    ModelError
-        When a value is of another kind or out of range.
-
     Examples
     --------
     >>> import flexplant as fx

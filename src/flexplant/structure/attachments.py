@@ -202,13 +202,7 @@ class HeldShape(Interpolation):
         return f"<HeldShape of {counted(np.size(self.rows_left), 'DOF')} in {self.free!r}>"
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) of the DOFs that are left in a motion at a point.
-
-        Raises
-        ------
-        LabelError
-            When the point is off the structure or the direction is unknown to it.
-        """
+        """Return the weights (n,) of the DOFs that are left in a motion at a point."""
         return np.asarray(self.free.row(xyz, direction)[self.rows_left])
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:

@@ -183,13 +183,7 @@ class ModalDamping(Damping):
         )
 
     def zeta(self, omega: FloatArray) -> FloatArray:
-        """Return the damping ratios (k,) of modes at `omega` [rad/s]; 0 for rigid-body modes.
-
-        Raises
-        ------
-        ShapeError
-            When there is one ratio per mode and their numbers differ.
-        """
+        """Return the damping ratios (k,) of modes at `omega` [rad/s]; 0 for rigid-body modes."""
         omega = real_array(omega, "omega", (None,))
         ratio: Any = self.ratio
         if self.others is not None:

@@ -236,11 +236,6 @@ class Hysteretic(Damping):
             ``phi_out phi_in`` of each mode, of mass-normalised shapes: receptance [m/N].
         zeta : (k,) array [-], optional
             As in `error`.
-
-        Raises
-        ------
-        ModelError, ShapeError
-            When a frequency is negative or the sizes differ.
         """
         own = _checked_hertz(natural, "natural")
         weights = np.abs(real_array(gains, "gains", own.shape))
@@ -340,11 +335,6 @@ class LossRegion(Value):
         youngs_modulus : float or array [Pa]
             Of the structure.
 
-        Raises
-        ------
-        ModelError, ShapeError
-            When no elements are given, or shapes differ.
-
         Examples
         --------
         >>> import flexplant as fx
@@ -366,15 +356,7 @@ class LossRegion(Value):
         return cls(loss_factor, sp.csc_array(more))
 
     def matrix(self, dofs: DofSet) -> Any:
-        """Return K_i (n, n), sparse.
-
-        Raises
-        ------
-        ShapeError
-            When it is of other DOFs.
-        LabelError
-            When a spring is at none of them.
-        """
+        """Return K_i (n, n), sparse."""
         given: Any = self.stiffness
         if isinstance(given, tuple):
             return added_matrices(dofs, given).get("K", sp.csc_array((len(dofs),) * 2))

@@ -165,11 +165,6 @@ class FEMatrices(Value):
         ----------
         dofs : DofSet, or path of a CSV file
             In the order of the rows, with coordinates.
-
-        Raises
-        ------
-        ShapeError
-            When their number is not that of the rows.
         """
         given = DofSet.from_table(dofs) if isinstance(dofs, str | Path) else dofs
         instance(given, DofSet, "dofs", "Pass one, or the path of a table.")
@@ -184,11 +179,6 @@ class FEMatrices(Value):
             Node numbers, in any order, all those of the DOFs among them.
         xyz : (m, 3) array [m]
             Where they are.
-
-        Raises
-        ------
-        LabelError
-            When the DOFs are not named, or a node has no coordinates.
         """
         dofs = self._named_dofs
         numbers = node_numbers(nodes)
@@ -203,11 +193,6 @@ class FEMatrices(Value):
         ----------
         labels : sequence of str
             DOFs to hold, such as those a penalty holds already.
-
-        Raises
-        ------
-        LabelError
-            When the DOFs are not named, or one is not there.
         """
         dofs = self._named_dofs
         held = name_list(labels, "DOFs to hold")

@@ -214,13 +214,7 @@ class FEModel(Placed, Value):
 
     @property
     def mass(self) -> float:
-        """Total mass [kg]: the inertia against translation in one direction.
-
-        Raises
-        ------
-        ModelError
-            When the model has no translational DOF.
-        """
+        """Total mass [kg]: the inertia against translation in one direction."""
         for direction in ("x", "y", "z"):
             if direction in self.dofs.directions:
                 moved = np.array([d == direction for d in self.dofs.directions], dtype=np.float64)
@@ -281,13 +275,6 @@ class FEModel(Placed, Value):
         parts : PointMass, Spring, Damper, or a sequence of them
             What is added.
 
-        Raises
-        ------
-        ModelError
-            When one of them is no part.
-        LabelError
-            When a place is unknown.
-
         Examples
         --------
         >>> from flexplant.structure import Damper, PointMass, Spring, chain
@@ -313,13 +300,6 @@ class FEModel(Placed, Value):
         labels : sequence of str, or DofSet
             The DOFs that do not move; ``model.dofs.where(directions="z", box=...)`` finds those of
             an edge.
-
-        Raises
-        ------
-        LabelError
-            When a DOF is unknown.
-        ModelError
-            When no DOF would be left.
 
         Examples
         --------

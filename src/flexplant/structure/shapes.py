@@ -114,11 +114,6 @@ class PlateShape(GridShape):
 
         Between elements z is continuous; the slope across an edge is not (the element is
         non-conforming), and the element on the side of larger coordinates is taken.
-
-        Raises
-        ------
-        LabelError
-            When the point is off the plate, or the direction is not z, rx or ry.
         """
         if not isinstance(direction, str) or direction not in ("z", "rx", "ry"):
             raise LabelError(
@@ -136,13 +131,7 @@ class PlateShape(GridShape):
         return self._row(element, _plate_weights(direction, s, t, a, b))
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (p, n) at many points (p, 3); the same as `row` one by one.
-
-        Raises
-        ------
-        LabelError
-            When one of them is off the plate, or the direction is not z, rx or ry.
-        """
+        """Return the weights (p, n) at many points (p, 3); the same as `row` one by one."""
         points = real_array(points, "points", (None, 3))
         grid, size, count = self._grid, np.array(self.size), np.array(self.elements)
         place = np.clip(points[:, :2] / size, 0.0, 1.0) * count
@@ -271,11 +260,6 @@ class BlockShape(GridShape):
 
         Rotations rx, ry, rz are half the curl of the displacements; they step between elements, and
         the element on the side of larger coordinates is taken.
-
-        Raises
-        ------
-        LabelError
-            When the point is outside the block, or the direction is unknown.
         """
         if not isinstance(direction, str) or direction not in _BLOCK_MOTIONS:
             raise LabelError(

@@ -246,11 +246,6 @@ class WaferStage(Value):
             Of the plant with its zero-order hold, without the delay; zero frequency left out. With
             two periods or more, what changes between them gives coherence, variance and
             correlation.
-
-        Raises
-        ------
-        ModelError
-            When ports lack actuators or sensors, or a number is out of range.
         """
         instance(ports, Ports, "ports", "Pass Ports(u=[...], y=[...]).")
         if not ports.u or not ports.y:

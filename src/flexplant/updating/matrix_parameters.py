@@ -250,11 +250,6 @@ class ModeDamping(Parameter):
     bounds, prior : optional
         As for `AddedMass`.
 
-    Raises
-    ------
-    LabelError
-        When the mode number is no whole number from 1.
-
     Examples
     --------
     >>> ModeDamping(6)

@@ -70,11 +70,6 @@ class Riccati(Value):
         True shows a bar of the bisection at once, False never; None after two seconds on a
         terminal.
 
-    Raises
-    ------
-    ModelError
-        When a value is not positive.
-
     References
     ----------
     [GloverDoyle1988]_.

@@ -67,11 +67,6 @@ class Pid(SingleElement):
             Corner of the integral action; 0 without.
         zero, pole : float [Hz], optional
             Of the lead; both or none.
-
-        Raises
-        ------
-        ModelError
-            When one of zero and pole is missing, or a number is not positive.
         """
         k = number(gain, "gain")
         w_i = 2.0 * np.pi * positive(integrator, "integrator", zero=True)
@@ -338,13 +333,6 @@ class FixedBlock(SingleElement):
             is ``-K``. A StateSpace is taken from error to command as it is.
         label : str, optional
             What it is; else what `given` says of itself.
-
-        Raises
-        ------
-        ModelError
-            When it is no system.
-        ShapeError
-            When it has several channels.
         """
         if isinstance(given, Controller | ShapedLoop):
             method = getattr(given, "method", "shaped loop")

@@ -259,11 +259,6 @@ class LoopDesign(Value):
             The axis.
         axis : ShapedAxis
             Its elements.
-
-        Raises
-        ------
-        LabelError
-            When there is no such axis.
         """
         require_known("axis", [name], self.axes)
         return self.replace(axes={**self.axes, name: axis})
@@ -292,11 +287,6 @@ class LoopDesign(Value):
         Its inputs after y are the references and those of their derivatives that a feedforward
         uses, ``z:ref:acceleration`` say: what `close_loop`, `simulate` and `write_c` take. Axes
         that are not closed while others are shaped take part.
-
-        Raises
-        ------
-        ModelError
-            As for `laws`.
         """
         axes = Axes(None, self.before, self.after, self.rate)
         feedback = connected(axes, axes_controller(axes, self.laws), self._followed)
@@ -344,11 +334,6 @@ class LoopDesign(Value):
         ----------
         plant : StandardPlant, StateSpace or Frf
             With its channels.
-
-        Raises
-        ------
-        LabelError, ModelError, ShapeError
-            When it does not go with the design.
         """
         if isinstance(plant, Frf) or hasattr(plant, "frdata"):
             rate = self.rate or None

@@ -259,11 +259,6 @@ class Law(LawElement):
         ----------
         freq : (n_freq,) array [Hz]
             Increasing; below half the rate of a sampled law.
-
-        Raises
-        ------
-        ModelError
-            When it is not.
         """
         return self.at(sampled_freq(freq, 1.0 / self.rate if self.rate else 0.0))
 

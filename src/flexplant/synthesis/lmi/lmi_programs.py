@@ -452,11 +452,6 @@ class Lmi(Value):
     progress : bool, optional
         A bar of these programs, as for `Riccati`.
 
-    Raises
-    ------
-    ModelError
-        When a value is not positive.
-
     References
     ----------
     [GahinetApkarian1994]_ (the smallest gamma); [Scherer1997]_ (the controller, section IV; its

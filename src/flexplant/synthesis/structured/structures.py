@@ -298,11 +298,6 @@ class Parametrised:
     spread : float
         Relative size of the differences between starts.
 
-    Raises
-    ------
-    ModelError, ShapeError
-        When make is no function, or start no array.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -362,11 +357,6 @@ class TunedLaws(Value):
     free : sequence of str
         Which numbers of the elements are free, of p, i, d, pole, freq, ratio, width, damping and
         depth; all but the depth unless given.
-
-    Raises
-    ------
-    LabelError
-        When one of these names is unknown.
 
     Examples
     --------

@@ -54,13 +54,7 @@ class Posterior(Value):
         return np.atleast_2d(np.cov(self.draws.T))
 
     def interval(self, level: float = 0.95) -> FloatArray:
-        """Return the central credible intervals (q, 2).
-
-        Raises
-        ------
-        ModelError
-            When the level is no probability.
-        """
+        """Return the central credible intervals (q, 2)."""
         level = between(level, "level", 0.0, 1.0, "Choose 0.95, say.")
         return np.quantile(self.draws, [(1 - level) / 2, (1 + level) / 2], axis=0).T
 

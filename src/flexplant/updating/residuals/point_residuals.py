@@ -62,11 +62,6 @@ class Antiresonances(_PointResidual):
         Rate of the zero-order hold of a sampled measurement; its zeros are then ``ln(z) rate``,
         which differ from the continuous ones. A delay of whole samples moves none.
 
-    Raises
-    ------
-    ModelError, ShapeError
-        When zeros are not finite or real, or lie above half the rate.
-
     Examples
     --------
     >>> import flexplant as fx
@@ -207,11 +202,6 @@ class StaticCompliance(_PointResidual):
         Where the motion and the force are, as for `Antiresonances`.
     std : float [m/N], optional
         Standard deviation. None: not known; the residual is relative to `value`.
-
-    Raises
-    ------
-    ModelError
-        When the value is zero or not finite.
 
     Examples
     --------
