@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from flexplant.errors import AssumptionError, CertificateError, LabelError, ModelError, SolverError
+from flexplant.estimation import design_kalman
 from flexplant.lti import lowpass
 from flexplant.placement import PoiLqr, PoiVariance, convex, score_actuators, score_sensors
 from flexplant.placement.convex import Quadratic
@@ -256,3 +257,15 @@ def test_candidates_that_fit_no_filter_are_refused(make):
     still = plant.with_ports(plant.assembled.ports.replace(w=plant.assembled.ports.w[:2]))
     with pytest.raises(AssumptionError, match="w does not excite"):
         score_sensors(still, [sensors[:3]])
+
+
+def test_accelerations_see_held_disturbances_at_once(make):
+    plant, sensors, _ = make(4)
+    ports = plant.assembled.ports
+    held = plant.with_ports(ports.replace(w=[port.replace(held=True) for port in ports.w]))
+    shaken = Sensor("acc", at=sensors[0].at, quantity="acceleration", asd=1e-4)
+    layouts = [sensors[:3], [*sensors[:3], shaken]]
+    found = score_sensors(held, layouts, PoiVariance("die", "z"))
+    honest = score_sensors(held, layouts, lambda plant: design_kalman(plant).rms("die:z") ** 2)
+    np.testing.assert_allclose(found.values, honest.values, rtol=1e-9)
+    assert found.best[-1] == "acc"

@@ -11,6 +11,7 @@ import numpy as np
 from ..checks import ComplexArray, IntArray
 from ..errors import ModelError, ShapeError, SolverError, attempted, counted, warn
 from ..lti.frequency import Frf
+from ..modes.matching import mac_matrix
 from ..parallel import Progress, expect
 from ..tolerances import TINY
 from .diagram import (
@@ -25,7 +26,6 @@ from .model_error import (
     ALIKE,
     NOISE,
     Disagreement,
-    column_mac,
     disagreement,
     outputs_disagree,
     strength,
@@ -150,8 +150,8 @@ def _needless(fit: Fit, steps: int, alone: bool, compare: bool) -> tuple[int, st
     found = twin_poles(fit)
     if found is not None:
         other, place = found
-        alike = column_mac(fit.shapes, other, place) > ALIKE
-        if not compare or alike or not is_shared(place):
+        alike = mac_matrix(fit.shapes[:, [other]], fit.shapes[:, [place]]) > ALIKE
+        if not compare or alike.all() or not is_shared(place):
             return place, f"a twin of the pole at {size[other] / (2 * np.pi):.5g} Hz"
     for place in lesser(fit, fit.shapes) if compare else []:
         if not is_shared(place):
@@ -165,7 +165,7 @@ def lesser(fit: Fit, vectors: ComplexArray, alike: float = 0.0) -> list[int]:
     for k in np.argsort(height):
         reach = BESIDE * (-fit.poles.real - fit.poles.real[k])
         near = (np.abs(fit.poles - fit.poles[k]) < reach) & (height > height[k])
-        if any(column_mac(vectors, int(j), int(k)) >= alike for j in np.flatnonzero(near)):
+        if np.any(mac_matrix(vectors[:, near], vectors[:, [k]]) >= alike):
             found.append(int(k))
     return found
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..checks import ComplexArray, FloatArray
+from ..modes.matching import mac_matrix
 from ..tolerances import TINY
 from .refine import Fit, scaled_inverse
 
@@ -93,12 +94,13 @@ def twin_poles(fit: Fit) -> tuple[int, int] | None:
     do too, unless they leave nothing but noise of a known variance.
     """
     height = strength(fit)
+    alike = [mac_matrix(vectors, vectors) > ALIKE for vectors in (fit.shapes, fit.participation)]
     for k in np.argsort(height):
         for j in np.argsort(-height):
             if height[j] <= height[k]:
                 continue
             apart, widths = abs(fit.poles[j].imag - fit.poles[k].imag), -fit.poles.real[[j, k]]
-            same = min(column_mac(fit.shapes, j, k), column_mac(fit.participation, j, k)) > ALIKE
+            same = alike[0][j, k] and alike[1][j, k]
             reach = BANDWIDTH if widths[1] > widths[0] else WITHIN
             if apart > (widths.sum() if same else reach * np.sqrt(widths.prod())):
                 continue
@@ -108,14 +110,6 @@ def twin_poles(fit: Fit) -> tuple[int, int] | None:
             ):
                 return int(j), int(k)
     return None
-
-
-def column_mac(vectors: ComplexArray, j: int, k: int) -> float:
-    """Return the MAC of two columns."""
-    a, b = vectors[:, j], vectors[:, k]
-    return float(
-        abs(np.vdot(a, b)) ** 2 / max(TINY, float(np.vdot(a, a).real * np.vdot(b, b).real))
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from ..errors import (
 )
 from ..lti.frequency_sweep import resonance_grid
 from ..lti.lyapunov import solve_lyapunov, solve_stein
-from ..lti.responses import continuous_poles, responder
+from ..lti.responses import responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..tolerances import divisor
@@ -217,8 +217,8 @@ Densities = Callable[[FloatArray], FloatArray]
 #: intervals are halved until the error of each source's integral is below this part of it
 TOLERANCE = 1e-8
 ROUNDS = 40
-#: edges over all frequencies, beside those at resonances: what a picture of the stairs needs
-_STAIRS = 150
+#: edges over all frequencies, as a picture of the stairs needs them; half-widths beside resonances
+_STAIRS, _BESIDE = 150, (0.0, 3.0, 20.0)
 #: frequencies at a time
 STEP = 2048
 
@@ -276,7 +276,8 @@ def integrated(
     # by adaptive Gauss-Kronrod quadrature:
     # intervals are halved where 7 and 15 points differ; continuous: to infinity, t = f / (f + f_c)
     top = 0.5 / monitored.dt if monitored.dt else np.inf
-    grid = _starts(monitored, top)
+    grid = resonance_grid(monitored.poles(), monitored.dt, points=_STAIRS, around=_BESIDE)
+    grid = np.concatenate([[0.0], grid[grid < top], [top]])
     centre = float(np.sqrt(grid[1] * grid[-2]))
     edges = grid if monitored.dt else np.append(grid[:-1] / (grid[:-1] + centre), 1.0)
     nodes, gauss, kronrod = _rule()
@@ -312,16 +313,6 @@ def integrated(
         ends = np.append(centre * ends[:-1] / (1.0 - ends[:-1]), np.inf)
     total = np.cumsum(fine[:, order], axis=1)
     return ends, np.concatenate([np.zeros((total.shape[0], 1)), total], axis=1)
-
-
-def _starts(monitored: StateSpace, top: float) -> FloatArray:
-    """Return edges from 0 to the top: some over all frequencies, five at each resonance."""
-    base = resonance_grid(monitored.poles(), monitored.dt, points=25)
-    s = continuous_poles(monitored)
-    s = s[(s.imag > 0) & (np.abs(s.real) < 0.1 * s.imag)]
-    near = (s.imag[:, None] - s.real[:, None] * np.array([-20, -3, 0, 3, 20])) / (2.0 * np.pi)
-    edges = np.concatenate([np.geomspace(base[0], base[-1], _STAIRS), near.ravel()])
-    return np.concatenate([[0.0], np.unique(edges[(edges > 0) & (edges < top)]), [top]])
 
 
 def _rule() -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..checks import ComplexArray, FloatArray, Value, instance, short, whole
 from ..errors import LabelError, ModelError, counted, require_known, unknown_label
-from ..lti.frequency_sweep import climbed_grid, crossings
+from ..lti.frequency_sweep import climbed_grid, crossings, highest
 from ..lti.measured_lines import FEWEST, low_slope
 from ..tolerances import TINY
 from .blocks import references
@@ -25,6 +25,8 @@ _INTEGRATES = 1e-9
 _REAL = 0.05
 #: slope of its size over frequency at the first line below which it is taken to be level
 _LEVEL = 0.5
+#: divisions of the lines beside the largest |S|
+_ROUNDS = 6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -278,7 +280,9 @@ def loop_margins(
     def between(f: FloatArray) -> ComplexArray:
         return np.asarray(np.interp(f, freq, L.real) + 1j * np.interp(f, freq, L.imag))
 
-    from scipy.optimize import minimize_scalar
+    @np.errstate(divide="ignore")
+    def closeness(L: ComplexArray) -> FloatArray:
+        return np.asarray(1.0 / np.abs(1.0 - L))
 
     find = between if exact is None else exact
     crossovers = crossings(lambda f: np.abs(find(f)) - 1.0, freq, np.abs(L) - 1.0)
@@ -302,23 +306,15 @@ def loop_margins(
         ((abs(np.log(x)), place) for x, place in zip(reals, places, strict=True) if x > 0.0),
         default=(0.0, float("nan")),
     )
-    size = np.abs(1.0 - L)
-    least = int(np.argmin(size))
-    where, margin = float(freq[least]), float(size[least])
-    if exact is not None and 0 < least < freq.size - 1:
-        low, high = float(freq[least - 1]), float(freq[least + 1])
-        closer = minimize_scalar(
-            lambda f: abs(1 - find(np.array([f]))[0]), bounds=(low, high), method="bounded"
-        )
-        if closer.fun < margin:
-            where, margin = float(closer.x), float(closer.fun)
+    rounds = 0 if exact is None else _ROUNDS
+    peak, where = highest(lambda f: closeness(find(f)), freq, rounds, closeness(L))
     return LoopMargins(
         name,
         tuple(crossovers.tolist()),
         1.0 / max(below) if below else float("inf"),
         1.0 / min(above) if above else 0.0,
         float(phases.min(initial=180.0)),
-        margin,
+        1.0 / peak,
         where,
         float(near[1]),
         float(crossovers[np.argmin(phases)]) if crossovers.size else float("nan"),

@@ -172,12 +172,17 @@ def resonance_grid(
     return np.asarray(grid[(grid >= low) & (grid <= high)])
 
 
+def local_maxima(values: FloatArray) -> IntArray:
+    """Return where a function's values are at least their neighbours', ends too, highest first."""
+    padded = np.concatenate([[-np.inf], values, [-np.inf]])
+    tops = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]))
+    return np.asarray(tops[np.argsort(-values[tops], kind="stable")])
+
+
 def _tops(values: FloatArray) -> IntArray:
     """Return where the highest local maxima are, the highest first."""
-    padded = np.concatenate([[-np.inf], values, [-np.inf]])
-    high = values >= _HIGH * values.max(initial=0.0)
-    tops = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]) & high)
-    return np.asarray(tops[np.argsort(values[tops])[::-1][:_PEAKS]])
+    tops = local_maxima(values)[:_PEAKS]
+    return np.asarray(tops[values[tops] >= _HIGH * values.max(initial=0.0)])
 
 
 def _between(grid: FloatArray, tops: IntArray, parts: int = 8) -> FloatArray:
@@ -201,11 +206,17 @@ def climbed_grid(
 
 
 def highest(
-    find: Callable[[FloatArray], FloatArray], grid: FloatArray, rounds: int
+    find: Callable[[FloatArray], FloatArray],
+    grid: FloatArray,
+    rounds: int,
+    values: FloatArray | None = None,
 ) -> tuple[float, float]:
-    """Return the largest value of a function of frequency, and its frequency [Hz]."""
+    """Return the largest value of a function of frequency, and its frequency [Hz].
+
+    `values` on the grid where these are known.
+    """
     # brackets around the highest maxima are divided, until a parabola gains no more
-    values = find(grid)
+    values = find(grid) if values is None else values
     ends = np.clip(_tops(values)[:, None] + _ASIDE, 0, grid.size - 1)
     freq, size = grid[ends], values[ends]  # (k, 3): left, top and right of each
     for n in range(1, rounds + 1):

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, IntArray
-from ..tolerances import TINY
+from ..tolerances import TINY, divisor
 
 #: shapes below this part of the largest one of their span are none: rounding
 _NONE = 1e-9
@@ -31,7 +31,7 @@ _FREQUENCY = 0.1
 def mac_matrix(X: Any, Y: Any) -> FloatArray:
     """Return the modal assurance criterion of each column of X with each of Y, from 0 to 1."""
     sizes = np.outer(np.sum(np.abs(X) ** 2, axis=0), np.sum(np.abs(Y) ** 2, axis=0))
-    return np.asarray(np.abs(X.conj().T @ Y) ** 2 / sizes, dtype=np.float64)
+    return np.asarray(np.abs(X.conj().T @ Y) ** 2 / divisor(sizes), dtype=np.float64)
 
 
 def in_span(X: Any, Y: Any) -> FloatArray:

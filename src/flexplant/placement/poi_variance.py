@@ -342,8 +342,9 @@ def _lagged(estimator: KalmanEstimator, rows: FloatArray, lag: Any) -> FloatArra
 def _check_direct(plant: StandardPlant, candidates: Sequence[Any]) -> None:
     """Raise AssumptionError when white noise of a disturbance reaches a sensor at once."""
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
-    # noise that is shaped first does not arrive at once
-    loud = [port for port in ports.forces if port.asd > 0 and bare(port)]
+    # noise that is shaped first does not arrive at once, and samples of held noise are finite
+    white = (port for port in ports.forces if port.asd > 0 and port.name not in plant.held)
+    loud = [port for port in white if bare(port)]
     push = np.array([port.push(realisation) for port in loud])
     ground = np.array([port.ground for port in loud])
     for sensor in candidates:

@@ -516,8 +516,6 @@ def _bordered(point: Point, groups: IntArray) -> list[tuple[ComplexArray, Comple
 CLUSTER = 0.02
 #: MAC below which two shapes of a cluster have nothing of each other
 FOREIGN = 1e-4
-#: part of the MAC that a frequency ratio of e counts for: few sensors see many modes alike
-NEARNESS = 1.0
 
 
 def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntArray:
@@ -543,7 +541,7 @@ def measured_pairs(
     """Return for each measured mode the column of the model's, one to one."""
     # minimises the sum of `1 - MAC + |ln(f_j / f_i)|` over the pairs
     far = np.abs(np.log(np.abs(poles) / np.abs(psi_poles)[:, None]))
-    return assigned(NEARNESS * far - mac_matrix(psi, X))
+    return assigned(far - mac_matrix(psi, X))
 
 
 def _match_cluster(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:

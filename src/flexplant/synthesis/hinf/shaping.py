@@ -15,7 +15,8 @@ from ...errors import CertificateError, ModelError, SolverError, warn
 from ...loop import LoopReport, report_loops
 from ...lti.discretisation import tustin
 from ...lti.filters import lowpass
-from ...lti.interconnection import series, side_by_side
+from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
+from ...lti.interconnection import loop_poles, series, side_by_side
 from ...lti.minimal import minimal
 from ...lti.responses import responses
 from ...lti.statespace import StateSpace, System, as_statespace
@@ -37,6 +38,8 @@ from .ncf import (
 
 #: how near the crossover comes to the bandwidth, and the steps that it may take
 _NEAR, _STEPS = 0.02, 8
+#: divisions of a grid at the largest error of following a model
+_ROUNDS = 3
 #: weight of following a model above which a warning is given
 _HEAVY = 10.0
 
@@ -240,11 +243,14 @@ def _shaped_controller(
 
 def _following_error(shaped: StateSpace, model: StateSpace, K: StateSpace) -> float:
     """Return the largest singular value of closed loop minus model over a sweep."""
-    poles = np.abs(model.poles()) / (2.0 * np.pi)
-    top = 0.499 / shaped.dt if shaped.dt else 1e3 * float(poles.max(initial=1.0))
-    freq = np.geomspace(1e-3 * float(poles.min(initial=1.0)), top, 400)
-    closed, T = _followed(shaped, model, K, freq)
-    return float(np.linalg.norm(closed - T, 2, axis=(1, 2)).max())
+    poles = loop_poles(shaped, K.select(inputs=K.inputs[len(shaped.outputs) :]))
+    grid = resonance_grid(poles, shaped.dt, around=SOUGHT)
+
+    def error(freq: FloatArray) -> FloatArray:
+        closed, T = _followed(shaped, model, K, freq)
+        return np.asarray(np.linalg.norm(closed - T, 2, axis=(1, 2)))
+
+    return highest(error, grid[grid < 0.499 / shaped.dt] if shaped.dt else grid, _ROUNDS)[0]
 
 
 def _followed(

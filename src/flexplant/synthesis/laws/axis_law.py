@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ...checks import ComplexArray, FloatArray, IntArray
 from ...errors import SolverError
 from ...loop.measured_loop import nyquist_count
+from ...lti.frequency_sweep import local_maxima
 from ...lti.measured_lines import FEWEST, between_lines, hidden_modes, steps_between
 from ...tolerances import TINY
 from .controller_elements import LowPass, Notch, Pid
@@ -229,7 +230,7 @@ class AxisLaw:
         At the points closest to the critical point, at modes and above the bandwidth.
         """
         axis = self.axis
-        close = axis.points[0][lowest_of(self.room(numbers))[:_TRIED]]
+        close = axis.points[0][local_maxima(-self.room(numbers))[:_TRIED]]
         above = np.exp(numbers[0]) * np.array(_ABOVE)
         trials = [
             self.raised(np.append(numbers, np.log([f, *_SLIGHT])), _FEW)
@@ -445,16 +446,9 @@ def _first(numbers: FloatArray) -> float:
     return float(numbers[0])
 
 
-def lowest_of(room: FloatArray) -> IntArray:
-    """Return the local minima, the lowest first."""
-    wide = np.concatenate([[np.inf], room, [np.inf]])
-    places = np.flatnonzero((room <= wide[:-2]) & (room <= wide[2:]))
-    return np.asarray(places[np.argsort(room[places], kind="stable")])
-
-
 def near_lowest(room: FloatArray, most: int, level: float) -> IntArray:
     """Return so many of the lowest local minima, those below a level, and the points about them."""
-    least = lowest_of(room)[:most]
+    least = local_maxima(-room)[:most]
     near = (least[room[least] < level, None] + np.array([-1, 0, 1])).ravel()
     return np.asarray(near[(near >= 0) & (near < room.size)])
 

@@ -201,8 +201,7 @@ _DFilters: TypeAlias = tuple[list[StateSpace], list[StateSpace]]
 
 def _fit_grid(g: StateSpace) -> FloatArray:
     """Return frequencies [rad/s] over which D is fitted."""
-    grid = resonance_grid(g.poles(), 0.0, points=200)
-    return 2 * np.pi * np.geomspace(grid[0], grid[-1], _POINTS)
+    return 2 * np.pi * resonance_grid(g.poles(), 0.0, points=_POINTS, around=())
 
 
 def _scaled_controller(

@@ -12,7 +12,7 @@ import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray
 from ...errors import AssumptionError
-from ...lti.frequency_sweep import climbed_grid, resonance_grid
+from ...lti.frequency_sweep import climbed_grid, local_maxima, resonance_grid
 from ...lti.lyapunov import solve_lyapunov
 from ...lti.norms import peak_gain
 from ...lti.preparation import Prepared, prepared
@@ -160,9 +160,9 @@ class Closed(NamedTuple):
             return np.asarray(np.linalg.norm(all_, 2, axis=(1, 2)))
 
         freq, gain = climbed_grid(gains, first, _REFINEMENTS)
-        beside = np.concatenate([[-np.inf], gain, [-np.inf]])
-        peak = (gain >= beside[:-2]) & (gain >= beside[2:])
-        chosen = (peak | np.isin(freq, first)) & (gain >= _PART * gain.max())
+        chosen = np.isin(freq, first)
+        chosen[local_maxima(gain)] = True
+        chosen &= gain >= _PART * gain.max()
         return np.asarray(freq[chosen])
 
     def channels(self, freq: FloatArray, order: int = 0) -> tuple[ComplexArray, ...]:
