@@ -49,8 +49,6 @@
    model spaces, Biometrika 95, 2008.
 .. [Chu2004] Chu, Fan, Lin, Wang, Structure-preserving algorithms for periodic discrete-time
    algebraic Riccati equations, Int. J. Control 77, 2004.
-.. [Chu2005] Chu, Fan, Lin, A structure-preserving doubling algorithm for continuous-time algebraic
-   Riccati equations, Linear Algebra Appl. 396, 2005.
 .. [CraigBampton1968] Craig, Bampton, Coupling of substructures for dynamic analyses, AIAA J. 6,
    1968.
 .. [CraigKurdila2006] Craig, Kurdila, Fundamentals of Structural Dynamics, 2nd ed., Wiley, 2006.
@@ -148,6 +146,8 @@
    Autom. Control 20, 1975.
 .. [Lambrechts2005] Lambrechts, Boerlage, Steinbuch, Trajectory planning and feedforward design for
    electromechanical motion systems, Control Eng. Pract. 13, 2005.
+.. [Laub1979] Laub, A Schur method for solving algebraic Riccati equations, IEEE Trans. Autom.
+   Control 24, 1979.
 .. [Laub1987] Laub, Heath, Paige, Ward, Computation of system balancing transformations, IEEE Trans.
    Autom. Control 32, 1987.
 .. [Lawrence2000] Lawrence, Tits, Van Dooren, A fast algorithm for the computation of an upper bound

@@ -97,8 +97,12 @@ def test_two_degrees_of_freedom_follow_a_model():
         y = closed(found, freq)
         assert y[0] == pytest.approx(wanted[0], abs=1e-3)
         errors.append(np.abs(y - wanted).max())
+        # the mode at 900 Hz, 2 Hz wide, is in it
+        at = 900.0 + np.linspace(-5.0, 5.0, 501)
+        beside = 1 / ((1j * at / 40.0) ** 2 + np.sqrt(2) * 1j * at / 40.0 + 1)
+        whole = max(errors[-1], np.abs(closed(found, at) - beside).max())
         claimed = found.controller.certificate["error of following"]
-        assert claimed == pytest.approx(errors[-1], rel=0.02)
+        assert claimed == pytest.approx(whole, rel=2e-3)
         margins.append(found.controller.certificate["margin"])
         assert margins[-1] >= (1 - 1e-3) / found.controller.gamma
         assert crossover(mechanism(), found.system.select(inputs=["y1"])) == pytest.approx(

@@ -208,7 +208,7 @@ class OnAxisError(Exception):
     """A Hamiltonian has eigenvalues on the imaginary axis."""
 
     def __init__(self, omega: FloatArray) -> None:
-        super().__init__(f"eigenvalues at {omega} rad/s")
+        super().__init__(f"its Hamiltonian has eigenvalues on the imaginary axis, at {omega} rad/s")
         self.omega = omega
 
 
@@ -216,7 +216,6 @@ def stabilising(
     A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return X and F of ``A'X + X A - (X B + S) R^-1 (B'X + S') + Q = 0``, A + B F stable."""
-    # R is indefinite: by the stable subspace of the Hamiltonian, X need not be reached from zero
     n = A.shape[0]
     inner = np.linalg.solve(R, np.hstack([B.T, S.T]))
     BR, SR = inner[:, :n], inner[:, n:]
@@ -224,31 +223,8 @@ def stabilising(
         return np.zeros((0, 0)), np.asarray(-SR)
     drift, spread = A - B @ SR, B @ BR
     rest = Q - S @ SR
-    # units of the states from A, B and C together, and one of the adjoint states: still Hamiltonian
     d = state_scale(A, B, np.sqrt(np.abs(Q.diagonal()))[None, :])
-    scaled = (
-        drift * d / d[:, None],
-        spread / d / d[:, None],
-        rest * d * d[:, None],
-        Q * d * d[:, None],
-    )
-    inner_size, reach, cost, own = (float(np.linalg.norm(part)) for part in scaled)
-    if cost <= _CANCELLED * own:  # nothing but rounding: X has the size of drift over spread
-        cost = inner_size**2 / reach if reach else 0.0
-    unit = float(2.0 ** np.round(0.5 * np.log2(cost / reach))) if cost and reach else 1.0
-    scale = np.concatenate([d, unit / d])
-    hamiltonian = np.block([[drift, -spread], [-rest, -drift.T]])
-    balanced = hamiltonian * scale / scale[:, None]
-    triangle, vectors, count = la.schur(balanced, sort="lhp")
-    values = la.eigvals(triangle)
-    margin = _AXIS * (np.abs(values) + 1e-2 * np.linalg.norm(balanced))
-    on_axis = np.abs(values.real) <= margin
-    if count != n or np.any(on_axis):
-        near = np.argsort(np.abs(values.real))[:2]
-        raise OnAxisError(np.unique(np.abs(values.imag[on_axis if np.any(on_axis) else near])))
-    basis = vectors[:, :n] * scale[:, None]
-    top, bottom = basis[:n], basis[n:]
-    X = symmetrised(np.linalg.solve(top.T, bottom.T).T)
+    X = stable_subspace(drift, spread, rest, d, Q)
     for _ in range(_CORRECTIONS):
         moved, bent = drift.T @ X, X @ spread @ X
         residual = moved + moved.T - bent + rest
@@ -258,6 +234,31 @@ def stabilising(
         closed = (drift - spread @ X).T
         X = X + lyapunov(closed * d[:, None] / d, residual * d * d[:, None]) / d / d[:, None]
     raise SolverError("the stabilising solution is too inaccurate.")
+
+
+def stable_subspace(
+    A: FloatArray, G: FloatArray, Q: FloatArray, d: FloatArray, whole: FloatArray
+) -> FloatArray:
+    """Return X of ``A'X + X A - X G X + Q = 0``, A - G X stable, by Laub's method [Laub1979]_.
+
+    From the stable subspace of the Hamiltonian, states x = d x_scaled. Q is a part of `whole`.
+    """
+    # units of the states, and one of the adjoint states: still Hamiltonian
+    parts = (A * d / d[:, None], G / d / d[:, None], Q * d * d[:, None], whole * d * d[:, None])
+    inner, reach, cost, own = (float(np.linalg.norm(part)) for part in parts)
+    if cost <= _CANCELLED * own:  # nothing but rounding: X has the size of A over G
+        cost = inner**2 / reach if reach else 0.0
+    unit = float(2.0 ** np.round(0.5 * np.log2(cost / reach))) if cost and reach else 1.0
+    scale = np.concatenate([d, unit / d])
+    balanced = np.block([[A, -G], [-Q, -A.T]]) * scale / scale[:, None]
+    triangle, vectors, count = la.schur(balanced, sort="lhp")
+    values = la.eigvals(triangle)
+    on_axis = np.abs(values.real) <= _AXIS * (np.abs(values) + 1e-2 * np.linalg.norm(balanced))
+    if count != d.size or np.any(on_axis):
+        near = np.argsort(np.abs(values.real))[:2]
+        raise OnAxisError(np.unique(np.abs(values.imag[on_axis if np.any(on_axis) else near])))
+    top, bottom = np.split(vectors[:, : d.size] * scale[:, None], 2)
+    return symmetrised(np.linalg.solve(top.T, bottom.T).T)
 
 
 @np.errstate(over="ignore", invalid="ignore")

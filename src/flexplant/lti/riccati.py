@@ -1,4 +1,4 @@
-"""Riccati equations by structure-preserving doubling, scaled inside, corrected, checked.
+"""Riccati equations: doubling (discrete), the Hamiltonian (continuous); scaled, corrected, checked.
 
 The forms are those of the filter (`control_dare` and `control_care` are the duals)::
 
@@ -21,14 +21,17 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, Value, real_array
 from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
-from ..tolerances import RANK, SPLIT, TINY, divisor
+from ..tolerances import RANK, SPLIT, divisor
 from .equations import (
+    OnAxisError,
     accumulated,
     doubled,
     doubled_riccati,
     lyapunov,
     relative,
     scale_of,
+    stable_subspace,
+    state_scale,
     symmetric,
     symmetrised,
 )
@@ -131,8 +134,8 @@ def solve_care(
 ) -> RiccatiSolution:
     """Return the stabilising solution of the continuous filter Riccati equation.
 
-    ``0 = A P + P A' - (P C' + S) R^-1 (P C' + S)' + Q``, by a Cayley transform to the doubling
-    of the discrete equation, then Newton steps on its own residual.
+    ``0 = A P + P A' - (P C' + S) R^-1 (P C' + S)' + Q``, by the stable subspace of the Hamiltonian
+    in scaled states, then Newton steps as for `solve_dare`.
 
     Parameters
     ----------
@@ -151,7 +154,7 @@ def solve_care(
 
     References
     ----------
-    [Chu2005]_.
+    [Laub1979]_.
 
     Examples
     --------
@@ -279,9 +282,6 @@ RESIDUAL, CORRECTION = 1e-9, 1e-7
 SETTLED, NEWTON_STEPS = 1e-11, 10
 
 
-#: relative to the mean speed of the closed loop: shifts of the Cayley transform, tried in turn
-#: until its condition leaves half of the digits to Newton's steps
-SHIFTS, WELL = (1.0, 1.7, 0.6, 3.1, 0.33), 1e8
 #: relative: a closed loop that decays in over a hundred steps (or periods) is examined for modes
 #: that only rounding stabilises; a pole, or a singular value, that is undamped but for rounding
 SLOW, EDGE = 0.01, 1e-9
@@ -302,6 +302,11 @@ class RiccatiProblem(NamedTuple):
     def G(self) -> FloatArray:
         """Return ``C' J C``, the information that one measurement brings."""
         return np.asarray((self.C.T * self.J) @ self.C)
+
+    @property
+    def whole(self) -> FloatArray:
+        """Return Q with what the cross term took from it."""
+        return np.asarray(self.Q + (self.gain * self.J) @ self.gain.T)
 
     def scaled(self, d: FloatArray) -> RiccatiProblem:
         """Return the problem in states x / d."""
@@ -339,39 +344,18 @@ def _residual(p: RiccatiProblem, P: FloatArray, K: FloatArray) -> tuple[FloatArr
     return residual, relative(residual, float(np.linalg.norm(p.A)) * size, float(la.norm(p.Q)))
 
 
-def _cayley(p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return A, G, Q of the discrete equation (control form) of the same solution, by Cayley."""
-    if p.discrete:
-        return p.A.T, p.G, p.Q
-    n = p.A.shape[0]
-    moduli = np.abs(la.eigvals(np.block([[p.A.T, -p.G], [-p.Q, -p.A]])))
-    # a rigid-body mode does not say how fast the closed loop is
-    typical = np.exp(np.mean(np.log(np.maximum(moduli, 1e-6 * np.max(moduli, initial=TINY)))))
-    best: tuple[float, tuple[FloatArray, FloatArray, FloatArray]] | None = None
-    for factor in SHIFTS:
-        shift = float(typical * factor)
-        moved = p.A.T - shift * np.eye(n)
-        try:
-            inner = moved + p.G @ np.linalg.solve(moved.T, p.Q)
-            condition = float(np.linalg.cond(moved) * np.linalg.cond(inner))
-        except np.linalg.LinAlgError:
-            continue  # a pole lies at the shift: the next one misses it
-        if not np.isfinite(condition):
-            continue
-        if best is None or condition < best[0]:
-            inverse = np.linalg.inv(inner)
-            A = np.eye(n) + 2 * shift * inverse
-            G = 2 * shift * np.linalg.solve(moved, p.G) @ inverse.T
-            Q = 2 * shift * inverse.T @ p.Q @ np.linalg.inv(moved)
-            best = condition, (A, symmetrised(G), symmetrised(Q))
-        if best[0] < WELL:
-            break
-    if best is None:
-        raise SolverError(
-            "continuous Riccati equation: no shift makes its Cayley transform regular, so it "
-            "has no stabilising solution. Is an unstable mode without input or output?"
+def _state_sizes(p: RiccatiProblem) -> FloatArray:
+    """Return sizes of the states for which noise and information are even."""
+    if not p.discrete:
+        return 1.0 / state_scale(p.A.T, p.C.T, np.sqrt(np.abs(p.whole.diagonal()))[None, :])
+    states, information = accumulated(p.A, p.Q), accumulated(p.A.T, p.G)
+    return scale_of(
+        np.where(
+            (states > 0) & (information > 0),
+            np.sqrt(states) / np.sqrt(divisor(information)),
+            np.where(states > 0, states, 1.0 / divisor(information)),
         )
-    return best[1]
+    )
 
 
 @one_thread()
@@ -383,17 +367,19 @@ def _solve_riccati(problem: RiccatiProblem) -> RiccatiSolution:
         empty = np.zeros((0, problem.C.shape[0]))
         return RiccatiSolution(np.zeros((0, 0)), empty, np.zeros(0, dtype=np.complex128), 0.0, 0)
     equation = f"{'discrete' if problem.discrete else 'continuous'} Riccati equation"
-    A, G, Q = _cayley(problem)
-    d = _scale(accumulated(A.T, Q), accumulated(A, G))
+    d, doublings = _state_sizes(problem), 0
     first = problem.scaled(d)
     try:
-        P, doublings = doubled_riccati(*_cayley(first))
+        if first.discrete:
+            P, doublings = doubled_riccati(first.A.T, first.G, first.Q)
+        else:
+            P = stable_subspace(first.A.T, first.G, first.Q, np.ones(n), first.whole)
         # to unit variances: there residual and correction are relative
         unit = scale_of(np.abs(P.diagonal()))
         d, P = d * unit, P / unit / unit[:, None]
         scaled = problem.scaled(d)
         P, K, residual, steps = _newton(scaled, P)
-    except (SolverError, np.linalg.LinAlgError) as error:
+    except (SolverError, OnAxisError, np.linalg.LinAlgError) as error:
         raise SolverError(f"{equation}: {_defect(first) or error}") from error
     poles = np.asarray(la.eigvals(scaled.A - K @ scaled.C), dtype=np.complex128)
     stable = np.max(_growth(first, poles)) < 0.0
@@ -432,16 +418,6 @@ def _newton(p: RiccatiProblem, P: FloatArray) -> tuple[FloatArray, FloatArray, f
         )
     K = _riccati_gain(p, P)
     return P, K, _residual(p, P, K)[1], taken
-
-
-def _scale(states: FloatArray, information: FloatArray) -> FloatArray:
-    """Return d for which noise and information have equal size in x / d."""
-    variance = np.where(
-        (states > 0) & (information > 0),
-        np.sqrt(states) / np.sqrt(divisor(information)),
-        np.where(states > 0, states, 1.0 / divisor(information)),
-    )
-    return scale_of(variance)
 
 
 def _defect(p: RiccatiProblem) -> str:
