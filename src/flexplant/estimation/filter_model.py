@@ -162,9 +162,9 @@ def filter_model(plant: StandardPlant, found: LeftOut | None = None) -> FilterMo
 
 def check_noises(plant: StandardPlant) -> None:
     """Raise AssumptionError for a sensor without noise, or one that white noise reaches at once."""
-    model = filter_model(plant)
-    own = [plant.sensor_noise[i, i] for i in map(plant.y.index, model.sensors)]
-    silent = [name for name, v in zip(model.sensors, own, strict=True) if v <= 0]
+    _ = plant.noise_factor  # raises where it is not known
+    read, own = sensors(plant), plant.sensor_noise.diagonal()
+    silent = [name for name in read if own[plant.y.index(name)] <= 0]
     if silent:
         raise AssumptionError(
             f"sensors {', '.join(silent)} have no noise (asd 0): the filter would trust them "
@@ -177,11 +177,11 @@ def check_noises(plant: StandardPlant) -> None:
         for name in plant.w
         if plant.asd.get(name, 0.0) > 0 and ":noise" not in name and name not in plant.held
     ]
-    direct = inner.D[np.ix_(inner.output_index(model.sensors), inner.input_index(loud))]
+    direct = inner.D[np.ix_(inner.output_index(read), inner.input_index(loud))]
     if np.any(direct):
         row, column = (int(i) for i in np.argwhere(direct)[0])
         raise AssumptionError(
-            f"white noise of {loud[column]!r} reaches {model.sensors[row]!r} at once (an "
+            f"white noise of {loud[column]!r} reaches {read[row]!r} at once (an "
             "acceleration sensor, say), so a sample of it would have infinite variance. Measure "
             "displacement or velocity, shape the disturbance, or let it be held over each sample: "
             "Disturbance(..., held=True)."

@@ -19,8 +19,8 @@ from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..modes.matching import assigned
 from ..plant import StandardPlant
-from ..plant.building import with_flexibility
-from ..plant.dynamics import structure_system
+from ..plant.building import sampled_like, structure_system, wired, with_filters
+from ..plant.partition import Assembled
 from ..plant.ports import Ports
 from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
@@ -118,7 +118,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     read = plant.reading_gain[np.ix_(
         [plant.y.index(name) for name in sensors(plant)], [y.index(port.name) for port in ports.y]
     )]  # fmt: skip
-    quiet = _quiet(with_flexibility(plant, flexibility), plant, plant.n_rigid + stand_ins)
+    quiet = _quiet(_with_flexibility(plant, flexibility), plant, plant.n_rigid + stand_ins)
     return LeftOut(
         others + big.n_rigid + 1,
         read @ covariance[nz:, nz:] @ read.T,
@@ -231,6 +231,21 @@ def _siso_response(part: StateSpace | None, at: ComplexArray) -> ComplexArray:
     if part is None:
         return np.ones(at.size, dtype=np.complex128)
     return np.array([part.evaluated(s)[0, 0] for s in at])
+
+
+def _with_flexibility(plant: StandardPlant, flexibility: FloatArray) -> StandardPlant:
+    """Return a plant whose motions (p, m) also answer forces at once, sampled alike."""
+    ports, realisation = plant.assembled.ports, plant.assembled.realisation
+    bare = structure_system(realisation, ports)
+    physical = with_filters(bare.replace(D=bare.D + flexibility), realisation, ports)
+    direct = [p for p in ports.u if p.asd > 0 and (p.filter is None or np.any(p.filter.D))]
+    if direct:  # white noise has no value at an instant that a compliance could follow
+        columns = physical.input_index([f"{port.name}:disturbance" for port in direct])
+        without = with_filters(bare, realisation, ports)
+        B, D = np.array(physical.B), np.array(physical.D)
+        B[:, columns], D[:, columns] = without.B[:, columns], without.D[:, columns]
+        physical = physical.replace(B=B, D=D)
+    return sampled_like(plant, wired(StandardPlant, Assembled(ports, realisation, physical)))
 
 
 def _quiet(fresh: StandardPlant, plant: StandardPlant, modes: IntArray) -> StandardPlant:

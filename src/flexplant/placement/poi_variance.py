@@ -16,7 +16,7 @@ from ..lti.discretisation import held_exactly
 from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..plant import Actuator, StandardPlant, larger_plant
-from ..plant.dynamics import direct_effect
+from ..plant.building import direct_effect
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from .candidates import Port, with_side

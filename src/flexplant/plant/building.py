@@ -1,15 +1,15 @@
-"""Building plants: wired from a physical system, sampled, with other ports, modes or weights."""
+"""Building plants: from modes, ports and their filters; sampled, with other ports or weights."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..checks import FloatArray, Value, instance, positive
-from ..errors import ModelError, require_known
+from ..errors import ModelError, counted, require_known
 from ..lti.discretisation import (
     acting,
     check_latency,
@@ -25,12 +25,213 @@ from ..lti.statespace import StateSpace, System, as_statespace
 from ..modes import Modes
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..tolerances import SAME
-from .dynamics import structure_system, with_filters
+from ..structure.rigid import SPANNED, Structure
+from ..tolerances import ROUNDING, SAME
 from .partition import Assembled, Foreign, Partition, Weighted
+from .port import QUANTITIES, ForcePort, Seen, SensorPort
 from .ports import Poi, Ports
 from .realisation import ModalRealisation, natural, plant_modes
 from .sampling import sampled_physical
+
+
+class PortRows(NamedTuple):
+    """What the ports of a structure push and see; sensors stand behind the motions of POIs."""
+
+    inputs: list[str]
+    outputs: list[str]
+    push: FloatArray  # (m, n) loads over the DOFs
+    ground: FloatArray  # (m, 6) rigid-body motions of the ground
+    seen: list[Seen]
+    orders: list[int]  # time derivatives that are seen
+    added: FloatArray  # (p, m) what is added to a sensor
+
+
+def port_rows(realisation: ModalRealisation, ports: Ports) -> PortRows:
+    """Return the rows and loads of all ports."""
+    forces, sensors = ports.forces, ports.y
+    if not forces or not (ports.z or sensors):
+        raise ModelError(
+            f"a model needs inputs (w or u) and outputs (z or y), got {ports!r}. Add ports."
+        )
+    pois = [(poi, axis) for poi in ports.z for axis in poi.axes]
+    outputs = ports.motions
+    added = [[outputs.index(port.added_to) if port.added_to else -1] for port in forces]
+    return PortRows(
+        [port.name for port in forces],
+        outputs,
+        np.array([port.push(realisation) for port in forces]),
+        np.array([port.ground for port in forces]),
+        [*(p.see(realisation, axis) for p, axis in pois), *(s.see(realisation) for s in sensors)],
+        [*(0 for _ in pois), *(sensor.order for sensor in sensors)],
+        np.equal(added, np.arange(len(outputs))).T.astype(np.float64),
+    )
+
+
+def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
+    """Return the structure alone, from all forces to the motions of POIs and sensors."""
+    own = port_rows(realisation, ports)
+    both = zip(own.seen, own.orders, strict=True)
+    return StateSpace(
+        realisation.A,
+        np.array([realisation.force(load) for load in own.push]).T,
+        np.array([one.row for one in own.seen]),
+        np.array([direct_effect(realisation.model, *one, own.push, own.ground) for one in both])
+        + own.added,
+        inputs=own.inputs,
+        outputs=own.outputs,
+        states=realisation.names,
+        blocks=realisation.blocks,
+    )
+
+
+def with_filters(structure: StateSpace, realisation: ModalRealisation, ports: Ports) -> StateSpace:
+    """Return the structure between the filters of its ports, absolute motions included."""
+    # noise at an amplifier's input is an input more, beside the command: it has no states
+    # states are those of the sensors' filters, the structure's, those of the forces' filters: what
+    # drives stands behind what is driven, so that A is block upper triangular
+    before, after = _named_filters(ports.forces), _named_filters(ports.y)
+    system = structure
+    if any(np.any(port.ground) for port in ports.forces):
+        system = _with_ground(structure, before, after, port_rows(realisation, ports))
+    if before:
+        system = series(_side_by_side(before, structure.inputs), system)
+    if after:
+        system = series(system, _side_by_side(after, structure.outputs))
+    noisy = [name.rpartition(":")[0] for name in ports.input_noises]
+    if not noisy:
+        return system
+    twice = [*range(len(system.inputs)), *system.input_index(noisy).tolist()]
+    return system.replace(
+        B=system.B[:, twice], D=system.D[:, twice], inputs=[*system.inputs, *ports.input_noises]
+    )
+
+
+def _named_filters(ports: Iterable[ForcePort | SensorPort]) -> dict[str, StateSpace]:
+    """Return the filters of the ports that have one, their channels named like the port."""
+    found = {port.name: port.filter for port in ports}
+    return {n: g.replace(inputs=[n], outputs=[n]) for n, g in found.items() if g is not None}
+
+
+def _side_by_side(filters: Mapping[str, StateSpace], names: Iterable[str]) -> StateSpace:
+    """Return the filters of channels as one; a channel without a filter passes through."""
+    one = as_statespace(1.0)
+    return append(*(filters.get(n) or one.replace(inputs=[n], outputs=[n]) for n in names))
+
+
+#: relative: a gain at 0 Hz smaller than this is a zero there
+_ZERO = 1e-9
+
+
+def direct_effect(
+    model: Structure, one: Seen, order: int, push: FloatArray, ground: FloatArray
+) -> FloatArray:
+    """Return what a channel shows at once (m,) of loads `push` (m, n) and of `ground` (m, 6)."""
+    direct = push @ one.direct
+    sizes = np.linalg.norm(push, axis=1) * np.linalg.norm(one.direct)
+    direct[np.abs(direct) <= ROUNDING * sizes] = 0.0  # lumped masses do not feel each other
+    if order < 2:
+        return direct
+    # an accelerometer on a free body shows none of the ground's: the load -M r takes back what it
+    # adds, up to modes left out; on a held structure a part stays, that of the held DOFs' inertia
+    along = ground @ one.carried
+    total: FloatArray = direct + along
+    held = isinstance(model, FEModel) and model.held_inertia is not None
+    total[np.abs(total) <= (SAME if held else SPANNED) * np.abs(along)] = 0.0
+    return total
+
+
+def _with_ground(
+    structure: StateSpace,
+    before: dict[str, StateSpace],
+    after: dict[str, StateSpace],
+    own: PortRows,
+) -> StateSpace:
+    """Return the structure with absolute displacements and velocities, its filters changed for it.
+
+    The ground moves by ``a / s^p``, p = 2 for displacements and 1 for velocities. A filter of a
+    sensor with m zeros at 0 Hz integrates m times without a state more, ``F / s^m`` being
+    ``(A, A^-m B, C, 0)``, and so does a shape, ``(A, B, C A^-m, 0)``.
+    """
+    needed: dict[str, set[int]] = {}
+    entries: dict[tuple[str, str], float] = {}
+    for output, order, one in zip(own.outputs, own.orders, own.seen, strict=True):
+        moved = {
+            n: float(g) for n, g in zip(own.inputs, own.ground @ one.carried, strict=True) if g
+        }
+        if order == 2 or not moved:
+            continue
+        times = _integrals(after.get(output), 2 - order)
+        shown, left = output, 2 - order - times
+        if times:
+            after[output] = _with_ground_input(after[output], output, times)
+            shown = after[output].inputs[1]
+        for name, gain in moved.items():
+            found = _integrals(before.get(name), left)
+            if found < left:
+                raise ModelError(_unbounded(output, order, name, left, found))
+            if left:
+                needed.setdefault(name, set()).add(left)
+            entries[shown, _ground_name(name, left)] = gain
+    if not entries:
+        return structure
+    for name, lefts in needed.items():
+        before[name] = _with_integrals(before[name], name, sorted(lefts))
+    inputs = [n for one in own.inputs for n in (before[one].outputs if one in before else [one])]
+    outputs = [n for one in own.outputs for n in (after[one].inputs if one in after else [one])]
+    return among(structure, inputs, outputs, entries)
+
+
+def _ground_name(name: str, times: int) -> str:
+    """Return the name of the ground's acceleration, integrated some times."""
+    return name if not times else f"{name}:{QUANTITIES[2 - times]}"
+
+
+def _integrals(part: StateSpace | None, most: int) -> int:
+    """Return how many zeros at 0 Hz a filter has, up to `most`."""
+    if part is None or not part.n_states:
+        return 0
+    B, direct = part.B, float(part.D[0, 0])
+    for times in range(most):
+        B = np.asarray(np.linalg.solve(part.A, B), dtype=np.float64)
+        size = abs(direct) + float((np.abs(part.C) @ np.abs(B))[0, 0])
+        if abs(direct - float((part.C @ B)[0, 0])) > _ZERO * size:
+            return times
+        direct = 0.0
+    return most
+
+
+def _with_ground_input(part: StateSpace, name: str, times: int) -> StateSpace:
+    """Return a filter with a second input that it integrates some times besides."""
+    B = np.linalg.matrix_power(np.linalg.inv(part.A), times) @ part.B
+    return part.replace(
+        B=np.hstack([part.B, B]),
+        D=np.hstack([part.D, np.zeros((1, 1))]),
+        inputs=[name, f"{name}:ground"],
+        units={},
+    )
+
+
+def _with_integrals(part: StateSpace, name: str, times: list[int]) -> StateSpace:
+    """Return a filter that shows integrals of its output too."""
+    inverse = np.linalg.inv(part.A)
+    rows = [part.C @ np.linalg.matrix_power(inverse, count) for count in times]
+    return part.replace(
+        C=np.vstack([part.C, *rows]),
+        D=np.vstack([part.D, np.zeros((len(times), 1))]),
+        outputs=[name, *(_ground_name(name, count) for count in times)],
+        units={},
+    )
+
+
+def _unbounded(output: str, order: int, name: str, left: int, found: int) -> str:
+    has = f"the shape of {name!r} has {found or 'none'}"
+    return (
+        f"{output!r} is an absolute {QUANTITIES[order]}, which grows without bound with the "
+        f"acceleration of {name!r}: its integrals need {counted(left, 'zero')} at 0 Hz more "
+        f"than the sensor has, and {has}. Give it one that has, shape=highpass(0.1, "
+        f"order={left}) say, or dynamics to the sensor (a geophone's), or measure relative to the "
+        "ground: absolute=False."
+    )
 
 
 def with_ports_of(own: Assembled, ports: Ports) -> Assembled | None:
@@ -288,21 +489,6 @@ def with_modes_of(plant: P, larger: object) -> P:
     return rebuilt(plant, realisation=plant_modes(whole))
 
 
-def with_flexibility(plant: P, flexibility: FloatArray) -> P:
-    """Return a plant whose motions (p, m) also answer forces at once, sampled alike."""
-    ports, realisation = plant.assembled.ports, plant.assembled.realisation
-    bare = structure_system(realisation, ports)
-    physical = with_filters(bare.replace(D=bare.D + flexibility), realisation, ports)
-    direct = [p for p in ports.u if p.asd > 0 and (p.filter is None or np.any(p.filter.D))]
-    if direct:  # white noise has no value at an instant that a compliance could follow
-        columns = physical.input_index([f"{port.name}:disturbance" for port in direct])
-        without = with_filters(bare, realisation, ports)
-        B, D = np.array(physical.B), np.array(physical.D)
-        B[:, columns], D[:, columns] = without.B[:, columns], without.D[:, columns]
-        physical = physical.replace(B=B, D=D)
-    return sampled_like(plant, wired(type(plant), Assembled(ports, realisation, physical)))
-
-
 def weighted(plant: P, z: Any, w: Any) -> P:
     """Return ``W_z P W_w``; a weight None drops its channel."""
     z, w = _mapping(z, "z"), _mapping(w, "w")
@@ -355,16 +541,6 @@ def measured_through(plant: P, block: System) -> P:
         y=tuple(g.outputs),
         origin=Weighted(plant.unweighted, block, plant.origin.scaled, (*plant.origin.steps, g)),
     )
-
-
-def altered_like(plant: P, plain: P) -> P:
-    """Return a plain plant with the weights and blocks of another one, in their order."""
-    for step in plant.origin.steps:
-        if isinstance(step, StateSpace):
-            plain = measured_through(plain, step)
-        else:
-            plain = weighted(plain, *map(dict, step))
-    return plain
 
 
 def _weight(plant: Partition, weight: Any, name: str) -> StateSpace:

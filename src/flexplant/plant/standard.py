@@ -12,9 +12,9 @@ import numpy.typing as npt
 from ..checks import FloatArray, short
 from ..errors import LabelError, ModelError
 from ..labels import Place
-from ..lti.statespace import System
+from ..lti.statespace import StateSpace, System
 from .assumptions import AssumptionReport
-from .building import altered_like, continuous_plant, measured_through, rebuilt, sampled, weighted
+from .building import continuous_plant, measured_through, rebuilt, sampled, weighted
 from .moving import Along, PositionMap, along, moved_ports, position_map, seen_elsewhere
 from .partition import Partition
 from .ports import Ports
@@ -195,7 +195,13 @@ class StandardPlant(Partition):
                 f"({', '.join(self.assembled.ports.values) or 'this plant has none'})."
             )
         if self.is_weighted and self.is_assembled:
-            return altered_like(self, self.unweighted.at(poi, **positions))
+            found = self.unweighted.at(poi, **positions)
+            for step in self.origin.steps:  # in their order: a block, or weights of z and w
+                if isinstance(step, StateSpace):
+                    found = found.through(step)
+                else:
+                    found = weighted(found, *map(dict, step))
+            return found
         ports = self.assembled.ports
         if positions:
             ports = ports.at(positions)

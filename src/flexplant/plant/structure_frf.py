@@ -24,7 +24,7 @@ from ..modes.statics import held_factor
 from ..parallel import Progress
 from ..reduction import ReducedModel
 from ..structure import Damping, FEModel
-from .dynamics import port_rows
+from .building import port_rows
 from .ports import Ports
 from .realisation import Structure, none, plant_modes
 
