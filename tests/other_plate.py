@@ -7,7 +7,7 @@ from flexplant.identification import MeasuredModes
 from flexplant.lti import Frf
 from flexplant.modes import solve_modes
 from flexplant.reduction import DesiredDofs, reduce, select_dofs
-from flexplant.sparse.factor import dense
+from flexplant.sparse.symmetric import dense
 from flexplant.structure import ModalDamping, kirchhoff_plate
 from flexplant.updating import AddedMass, Eigenvalues, FrfResidual, MatrixParameter, ModeShapes
 

@@ -14,7 +14,7 @@ from flexplant.modes import statics
 from flexplant.modes.sparse_modes import counted_modes
 from flexplant.modes.statics import modes_below, stiffness_factor
 from flexplant.sparse import ordering
-from flexplant.sparse.lanczos import BlockLanczos
+from flexplant.sparse.lowest import BlockLanczos
 from flexplant.structure import FEModel
 
 

@@ -8,7 +8,7 @@ import scipy.linalg as la
 
 import flexplant as fx
 from flexplant.errors import InfeasibleError, LabelError, ModelError
-from flexplant.sparse.factor import dense
+from flexplant.sparse.symmetric import dense
 from flexplant.testbeds.ritz import ritz_plate
 from stages import RATE, ports
 

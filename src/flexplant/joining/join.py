@@ -18,7 +18,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
 from ..modes.statics import static_response
 from ..reduction import ReducedModel
-from ..sparse.factor import dense
+from ..sparse.symmetric import dense
 from ..structure import FEModel
 from ..structure.rigid import SPANNED, orthonormalised, rigid_body_basis
 from ..tolerances import TINY, divisor

@@ -12,8 +12,8 @@ import scipy.sparse as sp
 
 from ..checks import ComplexArray, FloatArray
 from ..errors import ModelError, SolverError
-from ..sparse.factor import DENSE_LIMIT, ComplexSymmetricFactor, dense
-from ..sparse.lanczos import beyond
+from ..sparse.factor import DENSE_LIMIT, ComplexSymmetricFactor
+from ..sparse.symmetric import beyond, dense
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping, Rayleigh
 from ..structure.definite import signed_root, unstable_stiffness
 from ..tolerances import TINY, divisor

@@ -14,9 +14,18 @@ from ..checks import ComplexArray, FloatArray, instance, positive, short
 from ..errors import ModelError, SolverError, counted, warn
 from ..labels import Place
 from ..parallel import Progress
-from ..sparse.factor import DENSE_LIMIT, by_rows, dense, diagonal
-from ..sparse.lanczos import STEPS, Absolute, beyond, column_groups, rounding_of
+from ..sparse.factor import DENSE_LIMIT
+from ..sparse.lowest import STEPS
 from ..sparse.other_factors import Cholmod, Pardiso
+from ..sparse.symmetric import (
+    Absolute,
+    beyond,
+    by_rows,
+    column_groups,
+    dense,
+    diagonal,
+    rounding_of,
+)
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping
 from ..structure.definite import elastic_modes, signed, signed_root, signed_square
 from ..tolerances import ROUNDING, TINY, divisor

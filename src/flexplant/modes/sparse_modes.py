@@ -12,22 +12,9 @@ import scipy.linalg as la
 from ..checks import FloatArray, IntArray, Matrix, Rng
 from ..errors import ModelError, SolverError, counted
 from ..parallel import expect, one_thread, tick
-from ..sparse.factor import by_rows
-from ..sparse.lanczos import (
-    BLOCK,
-    REACHED,
-    SAME,
-    SPREAD,
-    STEPS,
-    Absolute,
-    BlockLanczos,
-    along_basis,
-    column_groups,
-    iterated,
-    rayleigh_ritz,
-    rounding_of,
-)
+from ..sparse.lowest import BLOCK, REACHED, SAME, STEPS, BlockLanczos, along_basis, iterated
 from ..sparse.other_factors import Cholmod, Pardiso
+from ..sparse.symmetric import SPREAD, Absolute, by_rows, column_groups, rayleigh_ritz, rounding_of
 from ..structure.definite import are_rigid, check_stiffness
 from ..structure.model import FEModel
 from .statics import (

@@ -13,11 +13,11 @@ import scipy.sparse as sp
 from ..checks import FloatArray, Matrix, short
 from ..errors import ModelError, SolverError, attempted, counted
 from ..labels import DofSet, Place
-from ..sparse.factor import DENSE_LIMIT, MultifrontalFactor, dense, diagonal, same_pattern
-from ..sparse.lanczos import rounding_of
+from ..sparse.factor import DENSE_LIMIT, MultifrontalFactor
 from ..sparse.lowest import multifrontal_inertia, signed_factor
 from ..sparse.ordering import Dissection, dissect
 from ..sparse.other_factors import Cholmod, CholmodCholesky, Pardiso, PardisoCholesky
+from ..sparse.symmetric import dense, diagonal, rounding_of, same_pattern
 from ..structure import FEModel
 from ..structure.definite import signed, unstable_stiffness
 from ..tolerances import ROUNDING, TINY, divisor

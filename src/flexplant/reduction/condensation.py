@@ -13,7 +13,7 @@ from ..checks import FloatArray, IntArray, checked, positive, several, whole
 from ..errors import ModelError, ShapeError, SolverError, counted
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
-from ..sparse.factor import dense, unit_diagonal
+from ..sparse.symmetric import dense, unit_diagonal
 from ..structure import FEModel, ModalDamping
 from ..tolerances import RANK, ROUNDING, SAME, TINY
 from .methods import (

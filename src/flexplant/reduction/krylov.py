@@ -16,7 +16,8 @@ from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..modes.modes import Modes
 from ..modes.statics import held_factor, labels_of, places, static_response
-from ..sparse.factor import DENSE_LIMIT, dense, dynamic_lu
+from ..sparse.factor import DENSE_LIMIT, dynamic_lu
+from ..sparse.symmetric import dense
 from ..structure import FEModel
 from ..tolerances import RANK, TINY
 from .methods import ReductionMethod, fe_model, projected_model

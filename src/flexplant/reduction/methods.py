@@ -18,7 +18,8 @@ from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..modes.statics import places
 from ..parallel import Progress
-from ..sparse.factor import DENSE_LIMIT, MultifrontalFactor, dense, unit_diagonal
+from ..sparse.factor import DENSE_LIMIT, MultifrontalFactor
+from ..sparse.symmetric import dense, unit_diagonal
 from ..structure import Damping, FEModel
 from ..structure.definite import elastic_modes, refuse_unstable
 from ..tolerances import RANK, TINY

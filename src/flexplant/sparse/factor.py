@@ -16,82 +16,14 @@ from ..checks import ComplexArray, FloatArray, IntArray, Matrix
 from ..errors import SolverError
 from ..parallel import one_thread
 from .ordering import Dissection, Front, dissect
+from .symmetric import by_rows, dense, diagonal, unit_diagonal
 
 #: up to this many DOFs dense LAPACK is as fast as a sparse factorisation, and safer
 DENSE_LIMIT = 1500
-#: stored zeros are left out for products where fewer entries than this part are none
-_FULL = 0.8
 #: from here on a bound by Lanczos is cheaper than a factorisation
 _BOUND_LIMIT = 10_000
 #: steps of that bound, and the chance that it is wrong
 _BOUND_STEPS, _BOUND_CHANCE = 180, 1e-9
-
-
-def dense(matrix: Matrix) -> FloatArray:
-    """Return a matrix as a dense array."""
-    if sp.issparse(matrix):
-        sparse: Any = matrix
-        return np.asarray(sparse.toarray(), dtype=np.float64)
-    return np.asarray(matrix, dtype=np.float64)
-
-
-def by_rows(matrix: Any) -> Any:
-    """Return a symmetric sparse matrix (dense: itself) stored by rows: faster times many vectors.
-
-    No copy is made: the columns of a symmetric matrix are its rows.
-    """
-    if not sp.issparse(matrix):
-        return np.asarray(matrix, dtype=np.float64)
-    given: Any = matrix
-    if given.format == "csr":
-        return given
-    stored: Any = sp.csc_array(given)
-    return sp.csr_array((stored.data, stored.indices, stored.indptr), shape=stored.shape)
-
-
-def same_pattern(given: Any, other: Any) -> bool:
-    """Return whether the same entries of two sparse matrices are stored."""
-    pairs = ((given.indptr, other.indptr), (given.indices, other.indices))
-    return all(a.size == b.size and (_same_memory(a, b) or np.array_equal(a, b)) for a, b in pairs)
-
-
-def _same_memory(a: IntArray, b: IntArray) -> bool:
-    return a.dtype == b.dtype and a.ctypes.data == b.ctypes.data
-
-
-def with_pattern_of(given: Any, other: Matrix) -> Any:
-    """Return a matrix that shares the index arrays of another where both store the same entries."""
-    matrix: Any = given
-    beside: Any = other
-    if not sp.issparse(given) or not sp.issparse(other) or not same_pattern(given, other):
-        return given
-    return sp.csc_array((matrix.data, beside.indices, beside.indptr), shape=beside.shape)
-
-
-def without_zeros(matrix: Any) -> Any:
-    """Return a sparse matrix without stored zeros, a copy where there are many."""
-    given: Any = matrix
-    if not sp.issparse(matrix) or np.count_nonzero(given.data) > _FULL * given.nnz:
-        return given
-    kept = given.copy()
-    kept.eliminate_zeros()
-    return kept
-
-
-def diagonal(matrix: Matrix) -> FloatArray:
-    """Return the diagonal of a dense or sparse matrix."""
-    return np.asarray(matrix.diagonal(), dtype=np.float64)
-
-
-def unit_diagonal(matrix: Matrix) -> tuple[Matrix, FloatArray]:
-    """Return ``S A S`` with ones (or zeros) on its diagonal, and the diagonal of S."""
-    # displacements and rotations have different units: only after this scaling do entries compare
-    size = np.sqrt(np.abs(diagonal(matrix)))
-    scale = 1.0 / np.where(size > 0, size, size.max(initial=0.0) or 1.0)
-    if sp.issparse(matrix):
-        weight = sp.diags_array(scale)
-        return sp.csc_array(weight @ matrix @ weight), scale
-    return scale[:, None] * np.asarray(matrix) * scale, scale
 
 
 def diagonal_lu(matrix: Any, singular: str) -> Any:

@@ -10,8 +10,9 @@ import scipy.sparse as sp
 
 from ..checks import FloatArray, IntArray
 from ..errors import ModelError, SolverError
-from ..sparse.factor import by_rows, diagonal, is_positive_definite, unit_diagonal
-from ..sparse.lowest import PRECISION, ROUNDING, Lowest, lowest_modes
+from ..sparse.factor import is_positive_definite
+from ..sparse.lowest import Lowest, lowest_modes
+from ..sparse.symmetric import PRECISION, ZERO, by_rows, diagonal, unit_diagonal
 from ..tolerances import SAME, divisor
 from .definite import are_rigid, are_swapped, unstable_stiffness
 from .matrices import FEMatrices
@@ -114,7 +115,7 @@ def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
                 K,
                 given.dofs,
                 located=given.located,
-                rounding=max(ROUNDING, _rounding(K, M, given, digits)),
+                rounding=max(ZERO, _rounding(K, M, given, digits)),
                 M=M,
                 joint_motions=None if model is None else model.joint_motions,
             )

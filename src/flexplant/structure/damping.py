@@ -25,7 +25,7 @@ from ..checks import (
 )
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
-from ..sparse.factor import dense
+from ..sparse.symmetric import dense
 from ..tolerances import ROUNDING, divisor
 from .definite import elastic_modes
 

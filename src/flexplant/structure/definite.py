@@ -13,15 +13,16 @@ import scipy.sparse as sp
 from ..checks import FloatArray, Matrix, real_array
 from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
-from ..sparse.factor import (
-    DENSE_LIMIT,
+from ..sparse.factor import DENSE_LIMIT, is_positive_definite
+from ..sparse.symmetric import (
     by_rows,
     dense,
     diagonal,
-    is_positive_definite,
+    rayleigh_ritz,
+    rounding_of,
+    soft_group,
     unit_diagonal,
 )
-from ..sparse.lanczos import rayleigh_ritz, rounding_of, soft_group
 from ..tolerances import TYPED
 from .zero_energy import most_moved, nonrigid
 

@@ -13,7 +13,7 @@ from ..checks import FloatArray, Value, one_of
 from ..errors import ModelError, counted, some_names
 from ..labels import DIRECTIONS, DofSet
 from ..parallel import Progress
-from ..sparse.factor import diagonal
+from ..sparse.symmetric import diagonal
 from ..tolerances import TYPED
 from .check_facts import Facts, facts
 from .matrices import FEMatrices

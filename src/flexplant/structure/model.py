@@ -14,7 +14,8 @@ import scipy.sparse as sp
 from ..checks import FloatArray, Matrix, Value, frozen, instance, real_array
 from ..errors import ModelError, counted, warn
 from ..labels import DofSet
-from ..sparse.factor import is_positive_definite, with_pattern_of
+from ..sparse.factor import is_positive_definite
+from ..sparse.symmetric import with_pattern_of
 from .attachments import HeldShape, Part, added_matrices, matrix_sum
 from .damping import Damping, Rayleigh, damping_matrix
 from .definite import (

@@ -14,9 +14,8 @@ import scipy.sparse.csgraph as csgraph
 from ..checks import FloatArray, IntArray, Matrix, real_array
 from ..errors import ModelError, SolverError
 from ..labels import DIRECTIONS, DofSet, Place
-from ..sparse.factor import by_rows, diagonal
-from ..sparse.lanczos import Absolute
-from ..sparse.lowest import PRECISION, ROUNDING, definite_solver
+from ..sparse.lowest import definite_solver
+from ..sparse.symmetric import PRECISION, ZERO, Absolute, by_rows, diagonal
 from ..tolerances import SAME, divisor
 
 #: times the usual rounding of a row: a force larger than this is of a spring
@@ -330,7 +329,7 @@ def _null_vectors(
     # motion that something holds, however softly, keeps its energy and is none
     start = orthonormalised(M, np.hstack([basis, nearly]), dependent="drop")
     spread = float(np.einsum("ij,ij->j", np.abs(start), size_of_K @ np.abs(start)).max())
-    shift = 30 * ROUNDING * spread
+    shift = 30 * ZERO * spread
     try:
         solve = definite_solver(K, M, shift)
         found = start
@@ -340,7 +339,7 @@ def _null_vectors(
         return basis  # K is indefinite: the solver of the modes says so
     energy = np.asarray(found.T @ np.asarray(K @ found))
     values, mix = la.eigh(0.5 * (energy + energy.T))
-    null = found @ mix[:, np.abs(values) < ROUNDING * spread]
+    null = found @ mix[:, np.abs(values) < ZERO * spread]
     # the geometry's own motions, seen in the null space: what turns stays a turn about its axis
     for candidates in (motions, nearly):
         seen = null.T @ np.asarray(M @ candidates)

@@ -12,7 +12,8 @@ import scipy.sparse.csgraph as csgraph
 
 from ..checks import FloatArray, IntArray
 from ..errors import ModelError, SolverError, counted
-from ..sparse.factor import dense, diagonal, is_positive_definite, symmetric_lu, unit_diagonal
+from ..sparse.factor import is_positive_definite, symmetric_lu
+from ..sparse.symmetric import dense, diagonal, unit_diagonal
 
 #: relative to a unit diagonal: an eigenvalue of M below this is none
 _SINGULAR = 1e-11

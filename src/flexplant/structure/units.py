@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from ..checks import FloatArray, positive, short
 from ..errors import ModelError
 from ..labels import DofSet
-from ..sparse.factor import diagonal
+from ..sparse.symmetric import diagonal
 from ..tolerances import TYPED
 from .rigid import RigidMass
 

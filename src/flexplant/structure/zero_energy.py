@@ -12,8 +12,8 @@ import scipy.sparse as sp
 from ..checks import FloatArray, IntArray, real_array
 from ..errors import ModelError, SolverError, attempted
 from ..labels import DIRECTIONS, DofSet
-from ..sparse.factor import by_rows, dense
-from ..sparse.lowest import PRECISION, ROUNDING, Lowest, lowest_modes
+from ..sparse.lowest import Lowest, lowest_modes
+from ..sparse.symmetric import PRECISION, ZERO, by_rows, dense
 from ..tolerances import divisor
 from .rigid import bodies, farness, force_free, orthonormalised, rigid_motions, unheld
 
@@ -95,7 +95,7 @@ def _of_bodies(
         stiffness, mass = (A if whole or A is None else A[rows][:, rows] for A in (K, M))
         own = own_motions(mass, motions[rows])
         found = _energy_free(stiffness, abs(stiffness), own, _MARGIN * rounding)
-        written, far = rounding * PRECISION / ROUNDING, farness(xyz[rows])
+        written, far = rounding * PRECISION / ZERO, farness(xyz[rows])
         mix = unheld(by_rows(stiffness), found, written, far)
         for part, kept in ((every, _independent(own)), (free, _independent(found @ mix))):
             part.append(np.zeros((motions.shape[0], kept.shape[1])))
@@ -149,7 +149,7 @@ def _independent(motions: FloatArray) -> FloatArray:
 
 def nearly_free(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
     """Return the rigid-body motions of the geometry that cost no more energy than rounding."""
-    rounding = ROUNDING if digits is None else max(ROUNDING, 10.0**-digits)
+    rounding = ZERO if digits is None else max(ZERO, 10.0**-digits)
     return zero_energy(K, dofs, located=True, rounding=rounding, M=M).rigid
 
 

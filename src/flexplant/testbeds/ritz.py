@@ -14,7 +14,7 @@ from ..checks import FloatArray
 from ..dof_columns import Interpolation
 from ..errors import LabelError
 from ..labels import DofSet
-from ..sparse.factor import dense
+from ..sparse.symmetric import dense
 from ..structure import FEModel
 
 #: order in each direction: of the paper's plate the first twenty frequencies to 2e-6 and forty, to

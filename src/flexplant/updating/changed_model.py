@@ -16,7 +16,7 @@ from ..modes.dynamic_basis import static_shapes
 from ..modes.normal_form import RIGID_DRAG
 from ..modes.sparse_modes import counted_modes
 from ..reduction import ReducedModel
-from ..sparse.lanczos import beyond
+from ..sparse.symmetric import beyond
 from ..structure.attachments import matrix_sum
 from ..structure.definite import why_indefinite
 from ..structure.model import FEModel

@@ -26,7 +26,8 @@ from ..checks import (
 from ..errors import LabelError, ModelError, ShapeError
 from ..modes import solve_modes
 from ..reduction import ReducedModel
-from ..sparse.factor import DENSE_LIMIT, dense
+from ..sparse.factor import DENSE_LIMIT
+from ..sparse.symmetric import dense
 from ..structure import FEModel, ModalDamping
 from ..structure.definite import elastic_modes
 from .parameters import MAKES, Derivatives, Parameter, checked_bounds, checked_text

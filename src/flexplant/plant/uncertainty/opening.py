@@ -14,7 +14,7 @@ from ...errors import ModelError
 from ...identification import MeasuredModes
 from ...labels import Place
 from ...lti.statespace import StateSpace
-from ...sparse.factor import dense
+from ...sparse.symmetric import dense
 from ...tolerances import ROUNDING, SAME, TINY
 from ...updating import ModalUncertainty, UpdateResult
 from ...updating.matrix_parameters import MatrixParameter

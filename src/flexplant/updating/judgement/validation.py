@@ -13,7 +13,7 @@ from ...checks import ComplexArray, FloatArray, Rng, Value, between, complex_arr
 from ...errors import ModelError, ShapeError
 from ...identification import MeasuredModes
 from ...modes import matching
-from ...sparse.factor import dense
+from ...sparse.symmetric import dense
 from ..family import Point
 from ..parameters import Parameter
 from ..residuals.frf_residual import FrfResidual

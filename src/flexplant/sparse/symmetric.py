@@ -1,0 +1,202 @@
+"""Symmetric matrices, sparse or dense, and their eigenvalues in the span of shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+
+from ..checks import FloatArray, IntArray, Matrix
+from ..tolerances import divisor
+
+#: stored zeros are left out for products where fewer entries than this part are none
+_FULL = 0.8
+#: eigenvalues closer together than this are found to 1e-9 of themselves in one go
+SPREAD = 1e-6
+#: a group of soft modes ends below this part of the largest eigenvalue, at the widest gap
+_END = 1e-3
+#: rows that are worked on at a time
+_ROWS = 65536
+#: shapes that are multiplied at a time: a product of all at once is memory at its peak
+_COLUMNS = 16
+#: relative error of an entry in double precision
+PRECISION = float(np.finfo(np.float64).eps)
+#: eigenvalues that rounding of this many units in the last place could make are zero
+ZERO = 30 * PRECISION
+
+
+def dense(matrix: Matrix) -> FloatArray:
+    """Return a matrix as a dense array."""
+    if sp.issparse(matrix):
+        sparse: Any = matrix
+        return np.asarray(sparse.toarray(), dtype=np.float64)
+    return np.asarray(matrix, dtype=np.float64)
+
+
+def by_rows(matrix: Any) -> Any:
+    """Return a symmetric sparse matrix (dense: itself) stored by rows: faster times many vectors.
+
+    No copy is made: the columns of a symmetric matrix are its rows.
+    """
+    if not sp.issparse(matrix):
+        return np.asarray(matrix, dtype=np.float64)
+    given: Any = matrix
+    if given.format == "csr":
+        return given
+    stored: Any = sp.csc_array(given)
+    return sp.csr_array((stored.data, stored.indices, stored.indptr), shape=stored.shape)
+
+
+def same_pattern(given: Any, other: Any) -> bool:
+    """Return whether the same entries of two sparse matrices are stored."""
+    pairs = ((given.indptr, other.indptr), (given.indices, other.indices))
+    return all(a.size == b.size and (_same_memory(a, b) or np.array_equal(a, b)) for a, b in pairs)
+
+
+def _same_memory(a: IntArray, b: IntArray) -> bool:
+    return a.dtype == b.dtype and a.ctypes.data == b.ctypes.data
+
+
+def with_pattern_of(given: Any, other: Matrix) -> Any:
+    """Return a matrix that shares the index arrays of another where both store the same entries."""
+    matrix: Any = given
+    beside: Any = other
+    if not sp.issparse(given) or not sp.issparse(other) or not same_pattern(given, other):
+        return given
+    return sp.csc_array((matrix.data, beside.indices, beside.indptr), shape=beside.shape)
+
+
+def without_zeros(matrix: Any) -> Any:
+    """Return a sparse matrix without stored zeros, a copy where there are many."""
+    given: Any = matrix
+    if not sp.issparse(matrix) or np.count_nonzero(given.data) > _FULL * given.nnz:
+        return given
+    kept = given.copy()
+    kept.eliminate_zeros()
+    return kept
+
+
+def diagonal(matrix: Matrix) -> FloatArray:
+    """Return the diagonal of a dense or sparse matrix."""
+    return np.asarray(matrix.diagonal(), dtype=np.float64)
+
+
+def unit_diagonal(matrix: Matrix) -> tuple[Matrix, FloatArray]:
+    """Return ``S A S`` with ones (or zeros) on its diagonal, and the diagonal of S."""
+    # displacements and rotations have different units: only after this scaling do entries compare
+    size = np.sqrt(np.abs(diagonal(matrix)))
+    scale = 1.0 / np.where(size > 0, size, size.max(initial=0.0) or 1.0)
+    if sp.issparse(matrix):
+        weight = sp.diags_array(scale)
+        return sp.csc_array(weight @ matrix @ weight), scale
+    return scale[:, None] * np.asarray(matrix) * scale, scale
+
+
+def rayleigh_ritz(K: Any, M: Any, X: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return omega^2 (k,), ascending, and M-orthonormal shapes (n, k) in the span of X."""
+    # LAPACK's error is a rounding of the largest eigenvalue. The soft modes, separated from the
+    # stiff ones to first order, are therefore solved for again by themselves, group by group, as
+    # often as the spread of the eigenvalues needs it. X is overwritten
+    K, M = by_rows(K), by_rows(M)
+    squares, mix = _eigh(K, M, X)
+    X = mixed(X, mix)
+    end = squares.size
+    while end > 1 and squares[0] < SPREAD * squares[end - 1]:
+        end = soft_group(squares[:end])
+        part = np.ascontiguousarray(X[:, :end])
+        squares[:end], mix = _eigh(K, M, part)
+        X[:, :end] = mixed(part, mix)
+    return squares, X
+
+
+def soft_group(squares: FloatArray) -> int:
+    """Return how many of some ascending eigenvalues form a soft group, up to the widest gap."""
+    top = float(squares[-1])
+    # those below are wrong by a rounding of the largest one: gaps among them say nothing
+    sure = np.maximum(squares, 0.1 * SPREAD * top)
+    ratio = np.where(sure[:-1] <= _END * top, sure[1:] / sure[:-1], 0.0)
+    return int(np.argmax(ratio)) + 1
+
+
+def rounding_of(K: Any, phi: FloatArray) -> FloatArray:
+    """Return ``eps |phi|^T |K| |phi|`` of each M-orthonormal shape [1/s^2]."""
+    # by so much the eigenvalue of a shape may change when the entries of K are rounded to double
+    # precision: no method finds it closer to that of the structure
+    size_of_K, found = Absolute(K), np.zeros(phi.shape[1])
+    for at in column_groups(phi.shape[1]):
+        size = np.abs(phi[:, at])
+        found[at] = PRECISION * np.einsum("ij,ij->j", size, size_of_K @ size)
+    return found
+
+
+def column_groups(count: int, most: int = _COLUMNS) -> Iterator[slice]:
+    """Yield the columns of a wide array in groups of one size: made of one, little is large."""
+    groups = -(-count // most)
+    for k in range(groups):
+        yield slice(k * count // groups, (k + 1) * count // groups)
+
+
+class Absolute:
+    """``|K|``, entry by entry, for products: a copy of a large matrix is memory at its peak."""
+
+    def __init__(self, K: Any) -> None:
+        self._K: Any = by_rows(K) if sp.issparse(K) else np.abs(K)
+
+    def __matmul__(self, X: FloatArray) -> FloatArray:
+        if not sp.issparse(self._K):
+            return np.asarray(self._K @ X)
+        K: Any = self._K
+        found = np.empty((K.shape[0], *X.shape[1:]))
+        for begin in range(0, K.shape[0], _ROWS):
+            pointer = K.indptr[begin : begin + _ROWS + 1]
+            at = slice(int(pointer[0]), int(pointer[-1]))
+            rows = sp.csr_array(
+                (np.abs(K.data[at]), K.indices[at], pointer - pointer[0]),
+                shape=(pointer.size - 1, K.shape[1]),
+            )
+            found[begin : begin + _ROWS] = rows @ X
+        return found
+
+
+def mixed(X: FloatArray, mix: FloatArray) -> FloatArray:
+    """Return ``X mix`` in the place of X: a second array of this size is memory at its peak."""
+    for begin in range(0, X.shape[0], _ROWS):
+        rows = slice(begin, begin + _ROWS)
+        X[rows, : mix.shape[1]] = X[rows] @ mix
+    return X[:, : mix.shape[1]]
+
+
+def _eigh(K: Any, M: Any, X: FloatArray) -> tuple[FloatArray, FloatArray]:
+    stiffness, mass = np.zeros((2, X.shape[1], X.shape[1]))
+    for at in column_groups(X.shape[1]):
+        part, later = np.ascontiguousarray(X[:, at]), X[:, at.start :].T
+        # lower triangles
+        stiffness[at.start :, at] = later @ (K @ part)
+        mass[at.start :, at] = later @ (M @ part)
+    squares, mix = la.eigh(stiffness, mass)
+    return np.asarray(squares), np.asarray(mix)
+
+
+#: part of a vector, beyond the basis, below which it depends on it
+_DEPENDENT = 1e-5
+
+
+def beyond(M: Any, V: FloatArray, part: FloatArray, *, dependent: float = _DEPENDENT) -> FloatArray:
+    """Return M-orthonormal vectors that span, with V, what V and `part` span."""
+    if not part.shape[1]:
+        return part
+    length = np.sqrt(np.sum(part * np.asarray(M @ part), axis=0))
+    part = part / divisor(length)
+    for _ in range(2):
+        part = part - V @ (V.T @ np.asarray(M @ part))
+    gram = part.T @ np.asarray(M @ part)
+    size, mix = la.eigh((gram + gram.T) / 2)
+    keep = size > dependent**2
+    new = part @ (mix[:, keep] / np.sqrt(size[keep]))
+    # once more: what was nearly dependent has lost digits
+    new = new - V @ (V.T @ np.asarray(M @ new))
+    factor = la.cholesky(new.T @ np.asarray(M @ new), lower=True)
+    return np.asarray(la.solve_triangular(factor, new.T, lower=True).T)
