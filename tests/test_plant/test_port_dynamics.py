@@ -7,7 +7,7 @@ import scipy.linalg as la
 from flexplant.errors import AssumptionError, LabelError, ModelError, ShapeError
 from flexplant.estimation import design_kalman
 from flexplant.labels import DofSet
-from flexplant.lti import StateSpace, frequency_response, lowpass, pade
+from flexplant.lti import StateSpace, frequency_response, lowpass, pade, tf
 from flexplant.lti.discretisation import discretized
 from flexplant.plant import (
     Actuator,
@@ -213,6 +213,18 @@ def test_the_flow_is_the_dense_exponential():
             wanted = la.expm(A * t)
             size = np.abs(wanted).max()
             np.testing.assert_allclose(flow.at(t), wanted, rtol=1e-9, atol=1e-14 * size)
+
+
+def test_a_filter_of_several_sections_keeps_its_blocks():
+    """The exponential of its block triangular matrix has rounding below the blocks."""
+    triple = tf([8.0], [1.0, 6.0, 12.0, 8.0])
+    own = channels(w=[Disturbance("force", at="2:x", asd=1e-3, shape=triple)])
+    plant = assemble_plant(model(), own)
+    sampled, wanted = plant.discretized(5e3), discretized(plant.system, 5e3)
+    assert {1, 2} <= set(sampled.system.blocks)
+    where = [sampled.system.states.index(name) for name in plant.system.states]
+    A = sampled.system.A[np.ix_(where, where)]
+    np.testing.assert_allclose(A, wanted.A, rtol=1e-9, atol=1e-12 * np.abs(A).max())
 
 
 def test_process_noise_holds_the_filters_and_late_samples():

@@ -261,7 +261,8 @@ class Flow:
         E[self.modes, self.modes] = block_diagonal(pair_expm(self.pairs, time))
         if not h + self.t:
             return E
-        direct = la.expm(self.direct * time)
+        # rounding of expm would leave entries below the blocks of a filter of several
+        direct = np.where(acting(self.direct != 0), la.expm(self.direct * time), 0.0)
         parts = np.asarray(la.expm(self.small * time)) if b else self.small
         E[self.head, self.head], E[self.tail, self.tail] = direct[:h, :h], direct[h:, h:]
         through = direct[:h, h:] + parts[:, :h, h + 2 :].sum(axis=0)
