@@ -246,7 +246,6 @@ class DofSet(Value):
         Parameters
         ----------
         nodes : int or sequence of int, optional
-            Node numbers.
         directions : str or sequence of str, optional
             Such as `"z"`.
         box : (2, 3) array [m], optional
@@ -296,7 +295,6 @@ class DofSet(Value):
         Parameters
         ----------
         xyz : (3,) array [m]
-            The point.
         direction : str
             One of the directions present.
         component : str, optional

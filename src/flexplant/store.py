@@ -250,7 +250,6 @@ def load(path: str | Path) -> Any:
     Parameters
     ----------
     path : str or Path
-        The file.
 
     Returns
     -------

@@ -444,7 +444,6 @@ class MachineTable(Value):
     channel : str
         The motion.
     names : sequence of str
-        The estimators.
     nominal : (k,) array [m or rad]
         Each on its own model, as the machines run: in a closed loop where they are in one.
     values : (k, n) array

@@ -46,7 +46,6 @@ class Estimate(Value, Mapping[str, FloatArray]):
     Parameters
     ----------
     time : (N,) array [s]
-        Sampling instants.
     names : sequence of str
         Of the estimates.
     data : (nz, N) array [m or rad]
@@ -55,7 +54,6 @@ class Estimate(Value, Mapping[str, FloatArray]):
         Standard deviations of their errors, on the filter's own model: modes left out count as
         white noise. Infinite while nothing determines an estimate yet.
     sensors : sequence of str
-        The sensors.
     innovations : (ny, N) array
         Measurements less their prediction, in the sensors' units; NaN where one is missing, or
         nothing predicts it yet.
@@ -69,7 +67,6 @@ class Estimate(Value, Mapping[str, FloatArray]):
     state : (n,) array
         x[N|N-1], from which `estimate(..., start=)` goes on with the next record.
     units : mapping {channel: unit}
-        SI units.
     gate : float
         Deviations beyond which an innovation made its sample a missing one; infinite without a
         gate.

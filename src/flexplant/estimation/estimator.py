@@ -50,7 +50,6 @@ class KalmanEstimator(PoiFilter):
     covariance : (n, n) array
         Of the error of x[k|k], after the measurement, on the filter's own model.
     certificate : KalmanCertificate
-        What was checked.
     variances : (nz,) array [m^2 or rad^2]
         Predicted, of the errors at the POIs: on the plant with the modes left out where these are
         known.

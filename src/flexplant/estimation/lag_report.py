@@ -56,7 +56,6 @@ class LagReport(Value):
     note : str
         Why there is no static relation, or "".
     units : mapping {channel: unit}
-        SI units.
 
     Examples
     --------

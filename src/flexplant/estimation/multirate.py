@@ -77,7 +77,6 @@ class PeriodicEstimator(Value):
     variances : (period, nz) array [m^2 or rad^2]
         Of the errors at the POIs in each sample of a period.
     certificate : PeriodicCertificate
-        What was checked.
     """
 
     plant: StandardPlant

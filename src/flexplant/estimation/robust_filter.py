@@ -124,7 +124,6 @@ class RobustFilter(PoiFilter):
     variances : (nz,) array [m^2 or rad^2]
         Of its errors on its own plant.
     certificate : HinfFilterCertificate or MinimaxCertificate
-        What was checked.
     """
 
     system: StateSpace

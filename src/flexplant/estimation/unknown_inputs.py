@@ -401,7 +401,6 @@ class InputEstimator(Value):
     invertibility : Invertibility
         Whether the sensors determine the inputs without any assumption of them.
     certificate : InputCertificate
-        What was checked.
     """
 
     system: StateSpace

@@ -132,7 +132,6 @@ def estimate_frf(
     outputs : (n_out, n_time) or (n_exp, n_out, n_time) array, or mapping
         What was measured, the same way.
     rate : float [Hz]
-        Sampling rate.
     reference : array or mapping, optional
         The excitation added inside the loop, one signal per input.
     method : H1Estimator, H2Estimator, HvEstimator or Periodic

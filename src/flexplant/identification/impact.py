@@ -209,7 +209,6 @@ def impact_frf(
     response : array or mapping
         What was measured, as for `estimate_frf`.
     rate : float [Hz]
-        Sampling rate.
     segment : float [s]
         Length of record for each blow; its inverse is the resolution.
     decay : float [s], optional

@@ -226,9 +226,7 @@ def multisine(
     Parameters
     ----------
     count : int
-        Number of inputs.
     rate : float [Hz]
-        Sampling rate.
     period : float [s]
         A whole number of samples.
     periods : int

@@ -166,7 +166,6 @@ def read_modes(
     Parameters
     ----------
     path : str or Path
-        The file.
     zeta : float, (k,) array or None
         Damping ratios, which only universal files hold: None takes those of the file. Rigid-body
         modes have none.

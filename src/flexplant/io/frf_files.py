@@ -38,7 +38,6 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     path : str or Path
         The file, written atomically.
     frf : Frf
-        What to write.
     units : mapping {channel: unit}, optional
         Such as {"y1": "rad", "u1": "N m"}. Where not given, those of the Frf; else N for inputs,
         and m, m/s or m/s^2 for outputs by the quantity of the Frf; none when that is not known.
@@ -269,8 +268,7 @@ def read_frf_mat(
     path : str or Path
         A .mat file (up to version 7; save with '-v7') with the variables of `read_frf_npz`;
         `inputs` and `outputs` are cell arrays of names.
-    freq, data, quantity, frequency_axis : optional
-        As in `read_frf_npz`.
+    freq, data, quantity, frequency_axis : as in `read_frf_npz`
 
     Raises
     ------

@@ -87,8 +87,7 @@ def read_npz(
     stiffness, mass, damping : str or Path
         One file each, as `scipy.sparse.save_npz` or `numpy.save` writes it; or as `stiffness` alone
         an .npz of `numpy.savez(path, K=K, M=M, D=D)`.
-    dofs : optional
-        As for `read_matlab`.
+    dofs : as for `read_matlab`
 
     Raises
     ------

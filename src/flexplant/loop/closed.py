@@ -381,8 +381,7 @@ class ClosedLoop(Value):
 
         Parameters
         ----------
-        channel : str
-            As for `rms`.
+        channel : as for `rms`
         freq : (n_freq,) array [Hz], optional
             Not above half the rate, else ModelError; through all resonances when not given.
         """
@@ -395,8 +394,7 @@ class ClosedLoop(Value):
 
         Parameters
         ----------
-        channel : str
-            As for `rms`.
+        channel : as for `rms`
         residue : Response, mapping {channel: samples} or (n_time,) array, optional
             A run of this loop without noise, ``simulate(loop, reference=move, noise=False, ...)``:
             what is left of the set-point is a source of its own, with its mean square.

@@ -74,8 +74,7 @@ def sensitivity(
 
     Parameters
     ----------
-    loop, freq, at
-        As for `loop_gain`.
+    loop, freq, at : as for `loop_gain`
 
     Raises
     ------
@@ -105,8 +104,7 @@ def complementary_sensitivity(
 
     Parameters
     ----------
-    loop, freq, at
-        As for `loop_gain`.
+    loop, freq, at : as for `loop_gain`
 
     Raises
     ------
@@ -134,8 +132,7 @@ def control_sensitivity(loop: Loop, *, freq: npt.ArrayLike | None = None) -> Frf
 
     Parameters
     ----------
-    loop, freq
-        As for `loop_gain`.
+    loop, freq : as for `loop_gain`
 
     Returns
     -------
@@ -352,8 +349,7 @@ def bandwidth(loop: Loop) -> float:
 
     Parameters
     ----------
-    loop : ClosedLoop, or (plant, controller)
-        As for `loop_gain`.
+    loop : as for `loop_gain`
 
     Returns
     -------

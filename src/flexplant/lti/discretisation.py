@@ -34,7 +34,6 @@ def discretized(
     sys : StateSpace
         A continuous system.
     rate : float [Hz]
-        Sampling rate.
     delay : float [samples]
         From the sampling of an input to its arrival; its integer part adds that many states per
         delayed input, a fraction one more.
@@ -258,7 +257,6 @@ def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSp
     sys : StateSpace
         A continuous system: a weight or a controller; for a plant use `discretized`.
     rate : float [Hz]
-        Sampling rate.
     prewarp : float [Hz], optional
         The frequency at which the response is kept.
 

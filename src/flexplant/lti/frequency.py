@@ -135,7 +135,6 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     freq : (n_freq,) array [Hz]
         Increasing, not negative.
     data : (n_out, n_in, n_freq) complex array [output unit / input unit]
-        The responses.
     inputs, outputs : sequences of str, optional
         Names; `u1`..., `y1`... when not given.
     quantity : str, optional

@@ -45,7 +45,6 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
-        The system.
     points : int
         Most points. 64 channels of 24 lightly damped modes need some 3500.
     tolerance : float

@@ -277,7 +277,6 @@ def connect(
     Parameters
     ----------
     systems : sequence of StateSpace
-        The blocks.
     inputs : sequence of str
         Outer inputs; each drives every block input of its name.
     outputs : sequence of str

@@ -36,8 +36,7 @@ def hinf_norm(sys: System, *, progress: bool | None = None) -> float:
     ----------
     sys : StateSpace or control.StateSpace
         Continuous or sampled, any numbers of channels.
-    progress : bool, optional
-        As for `peak_gain`.
+    progress : as for `peak_gain`, optional
 
     Returns
     -------

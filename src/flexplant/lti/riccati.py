@@ -214,8 +214,7 @@ def control_care(
 
     Parameters
     ----------
-    A, B, Q, R, S : arrays
-        As in `control_dare`.
+    A, B, Q, R, S : as in `control_dare`
 
     Raises
     ------

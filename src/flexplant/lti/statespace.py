@@ -66,7 +66,6 @@ class StateSpace(Value):
     inputs, outputs, states : sequences of str, optional
         Unique names; `u1`..., `y1`..., `x1`... when not given.
     name : str, optional
-        For display.
     blocks : sequence of int, optional
         Sizes of the diagonal blocks of A where A is block upper triangular: a structure's modes
         give 2 x 2 blocks. Poles, frequency responses and discretisation then cost O(n).

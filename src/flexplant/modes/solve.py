@@ -68,7 +68,6 @@ def solve_modes(
     Parameters
     ----------
     model : FEModel
-        The structure.
     count : int, optional
         Number of modes, rigid-body modes included. A cut through a repeated pair keeps an
         arbitrary half of it.

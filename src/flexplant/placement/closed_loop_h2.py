@@ -189,8 +189,7 @@ class ClosedLoopH2(MotionAndEffort):
 
     Parameters
     ----------
-    poi, axes : optional
-        As for `PoiLqr`.
+    poi, axes : as for `PoiLqr`
     effort : float [m/N]
         The motion of the POI that one newton of one actuator is worth.
 

@@ -276,7 +276,6 @@ class Among(Constraint):
     Parameters
     ----------
     names : sequence of str
-        Candidates.
     at_least, at_most : int, optional
         How many of them.
 

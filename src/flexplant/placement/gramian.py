@@ -263,8 +263,7 @@ class ModalControllability(ModalGramian):
 
     Parameters
     ----------
-    measure
-        As for `ModalObservability`.
+    measure : as for `ModalObservability`
 
     References
     ----------

@@ -232,8 +232,7 @@ class ActuatorIndices(SensorIndices):
 
     Parameters
     ----------
-    norm
-        As for `SensorIndices`.
+    norm : as for `SensorIndices`
 
     Examples
     --------

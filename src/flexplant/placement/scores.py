@@ -114,8 +114,7 @@ def score_sensors(
     constraints : sequence of Constraint, optional
         As for `place_sensors`: a layout that breaks one is infeasible. Sensors may lie on a POI
         here unless OffPoi() is among them: layouts that are named are scored.
-    executor, progress : optional
-        As for `place_sensors`.
+    executor, progress : as for `place_sensors`
 
     Returns
     -------
@@ -255,7 +254,6 @@ class DeviceWorth(Value):
     Parameters
     ----------
     names : sequence of str
-        The devices.
     value : float
         With all of them.
     without : (n,) array
@@ -310,8 +308,7 @@ def device_worth(
         From `place_sensors`, `place_actuators` or `place_both`.
     criterion : Criterion or callable, optional
         As for the placement.
-    executor, progress : optional
-        As for `place_sensors`.
+    executor, progress : as for `place_sensors`
 
     Raises
     ------

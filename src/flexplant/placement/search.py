@@ -177,7 +177,6 @@ def place_both(
     plant : StandardPlant
         Sampled, assembled from a structure; its own sensors and actuators are not used.
     sensors, actuators : sequence of Sensor, sequence of Actuator
-        The candidates.
     counts : (int, int)
         How many sensors and how many actuators, `required` included.
     criterion : ClosedLoopH2 or callable, optional

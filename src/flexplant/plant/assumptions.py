@@ -159,7 +159,6 @@ class ModeVisibility(Value):
     freq : float [Hz]
         Frequency.
     zeta : float
-        Damping ratio.
     shares : mapping {"w", "u", "y", "z": float}
         The best channel's modal force per unit force (or modal displacement per unit motion)
         beside that of the elastic mode where this channel is strongest: 1 at best, 0 at a node.

@@ -40,7 +40,6 @@ class Disturbance(_PlacedForce):
     Parameters
     ----------
     name : str
-        The channel's name.
     at : str, (3,) array [m] or mapping
         A DOF label, a point, or a sum {label or point: weight}.
     direction : str
@@ -87,7 +86,6 @@ class BaseAcceleration(ForcePort):
     Parameters
     ----------
     name : str
-        The channel's name.
     direction : str
         x, y, z [m/s^2] or rx, ry, rz [rad/s^2].
     asd : float [m/s^2/sqrt(Hz), rad/s^2/sqrt(Hz)]
@@ -374,8 +372,7 @@ class RigidForce(ForcePort):
 
     Parameters
     ----------
-    name, asd, shape
-        As for `Disturbance`.
+    name, asd, shape : as for `Disturbance`
     direction : str
         x, y, z [N] or rx, ry, rz [N m].
 

@@ -30,9 +30,7 @@ class Along(Value):
     Parameters
     ----------
     name : str
-        The port.
     points : (p, 3) array [m]
-        The places.
     channels : sequence of str
         Of z for a POI, the one input of an actuator or disturbance.
     C : (p, channels, n) array

@@ -77,8 +77,7 @@ class Foreign(_Unknown, Value):
 
     Parameters
     ----------
-    noise_factor, delay, continuous
-        As for `Assembled`.
+    noise_factor, delay, continuous : as for `Assembled`
 
     Examples
     --------

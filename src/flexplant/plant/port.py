@@ -122,7 +122,6 @@ class SensorPort(Value):
     Parameters
     ----------
     name : str
-        The channel's name.
     at : str, (3,) array [m] or mapping
         Where it is drawn, and what `StandardPlant.at` moves.
     asd : float

@@ -27,8 +27,7 @@ class Sensor(SensorPort):
     ----------
     name : str
         The channel's name; its noise is the channel `name:noise` of w.
-    at, direction, moves
-        As for `Disturbance`.
+    at, direction, moves : as for `Disturbance`
     quantity : {"displacement", "velocity", "acceleration"}
         What is measured. An acceleration answers forces at once (D21, D22); a white disturbance
         that reaches it would give its samples infinite variance, which Kalman filters and
@@ -94,7 +93,6 @@ class Poi(Value):
     Parameters
     ----------
     name : str
-        Its name.
     at : str or (3,) array [m]
         A DOF label (whose direction is replaced by the axes) or any point of the structure.
     axes : sequence of str
@@ -188,7 +186,6 @@ class Reference(Value):
     Parameters
     ----------
     poi : str
-        The POI's name.
     axes : sequence of str, optional
         Which of the POI's axes get one; its first when not given.
 

@@ -45,7 +45,6 @@ class StandardPlant(Partition):
     system : StateSpace
         ``[w; u] -> [z; y]``.
     w, u, z, y : sequences of str
-        Names of its channels.
     asd : mapping {str: float}
         One-sided amplitude spectral density of the w channels that are white noise.
     origin : Assembled, Weighted or Foreign
@@ -81,7 +80,6 @@ class StandardPlant(Partition):
         Parameters
         ----------
         rate : float [Hz]
-            Sampling rate.
         delay : float [samples]
             From a measurement to the moment the actuators answer it; any fraction. A delay of at
             least one sample leaves the controller the whole interval to compute.
@@ -238,7 +236,6 @@ class StandardPlant(Partition):
         name : str
             A POI; or an actuator or disturbance of a continuous plant.
         points : (p, 3) array [m]
-            The places.
 
         Raises
         ------
@@ -396,7 +393,6 @@ def assemble_plant(
     model : FEModel, Modes or ReducedModel
         The structure. A plant's `realisation` serves too: the modes are then not solved again.
     ports : Ports
-        The channels.
     residual : FastStates or Feedthrough, optional
         What residual attachment vectors of Modes become: fast modes (when not given), or a
         compliance that answers at once.

@@ -37,8 +37,7 @@ class StructureFrf(Frf):
     ----------
     freq, data, inputs, outputs, quantity, coherence, variance, correlation, resolution
         As of `Frf`.
-    window, overlap, freedom, units
-        As of `Frf`.
+    window, overlap, freedom, units : as of `Frf`
     route : str
         How the responses were found.
     check_freq : (c,) array [Hz]

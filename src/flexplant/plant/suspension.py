@@ -117,7 +117,6 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
         softer than the structure is exact to the ratio of the two. Modes that a reduced model left
         out are stiffened and damped each by itself.
     springs : GroundSpring or sequence
-        The springs.
 
     Returns
     -------

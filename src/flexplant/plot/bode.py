@@ -150,10 +150,8 @@ def singular_values(
 
     Parameters
     ----------
-    systems, freq
-        As for `bode`.
+    systems, freq : as for `bode`
     ax : Axes, optional
-        Where to draw.
 
     Raises
     ------
@@ -207,7 +205,6 @@ def frf(
     responses : mapping {label: Frf or system}
         What to compare.
     output, input : str
-        The channel.
     colors : mapping {label: color}, optional
         Of some lines.
     unit : str, optional

@@ -50,7 +50,6 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
     most : int
         Sources that are drawn by themselves, the largest first; the others are one area.
     ax : Axes, optional
-        Where to draw.
 
     Raises
     ------
@@ -118,7 +117,6 @@ def spectra(
     colors : mapping {label: color}, optional
         Of some lines.
     ax : Axes, optional
-        Where to draw.
 
     Returns
     -------
@@ -199,7 +197,6 @@ def exposures(
     exposures : (k, 2) array [s], optional
         Beginning and end of each, such as `SetPoint.exposures`.
     ax : Axes, optional
-        Where to draw.
 
     Raises
     ------
@@ -265,7 +262,6 @@ def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> A
     what : str
         "ma" or "msd".
     ax : Axes, optional
-        Where to draw.
 
     Returns
     -------

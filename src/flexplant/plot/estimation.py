@@ -55,7 +55,6 @@ def predictions(
     unit : str
         SI unit of the errors; a prefix is chosen.
     ax : Axes, optional
-        Where to draw.
 
     Returns
     -------
@@ -121,7 +120,6 @@ def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None
     channel : str, optional
         A POI's motion; the first when not given.
     ax : Axes, optional
-        Where to draw.
 
     Returns
     -------
@@ -188,7 +186,6 @@ def estimate(
     deviations : float
         Half the width of the band.
     ax : Axes, optional
-        Where to draw.
 
     Raises
     ------
@@ -282,7 +279,6 @@ def consistency(
     level : float
         Of the bounds.
     ax : three Axes, optional
-        Where to draw.
 
     Returns
     -------

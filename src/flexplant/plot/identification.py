@@ -49,7 +49,6 @@ def stabilisation(
     frf : Frf, optional
         Its sum over all channels is drawn behind.
     ax : Axes, optional
-        Where to draw.
 
     Examples
     --------
@@ -94,13 +93,10 @@ def identified(
     Parameters
     ----------
     frf : Frf
-        The measurement.
     modes : IdentifiedModes
         Identified from it.
     output, input : str
-        The channel.
     ax : Axes, optional
-        Where to draw.
 
     Returns
     -------
@@ -161,7 +157,6 @@ class PolePicker:
     diagram : StabilisationDiagram
         What poles are picked from.
     frf : Frf
-        The measurement.
     **options
         For `identify_modes`, by which picked modes are fitted: ``hold=``, ``lower=``, ...
 

@@ -79,7 +79,6 @@ def nyquist(
     reach : float
         The picture shows real and imaginary parts up to it.
     ax : Axes, optional
-        Where to draw.
 
     Raises
     ------
@@ -191,7 +190,6 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
     zeros : bool
         Whether invariant zeros are drawn too, as circles.
     ax : Axes, optional
-        Where to draw.
 
     Returns
     -------
@@ -298,7 +296,6 @@ def sensitivity(
     freq : (n_freq,) array [Hz], optional
         Where pairs of plant and controller are evaluated; a grid of each when not given.
     ax : Axes, optional
-        Where to draw.
 
     Raises
     ------

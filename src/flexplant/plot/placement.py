@@ -47,7 +47,6 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     ports : Ports, optional
         Sensors and actuators that are there already and POIs, where their places are points.
     ax : Axes, optional
-        Where to draw.
 
     Returns
     -------
@@ -109,7 +108,6 @@ def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
     found : ParetoCurve
         From `flexplant.placement.pareto_curve`.
     ax : Axes, optional
-        Where to draw.
 
     Returns
     -------

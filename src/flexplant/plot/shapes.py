@@ -67,7 +67,6 @@ def mode_shape(
     color : str, optional
         One colour for the surface.
     ax : Axes3D, optional
-        Where to draw.
 
     Raises
     ------
@@ -102,8 +101,7 @@ def animate_mode(
 
     Parameters
     ----------
-    modes, number, scale, color, ax
-        As for `mode_shape`.
+    modes, number, scale, color, ax : as for `mode_shape`
     frames : int
         Pictures in one period.
     seconds : float [s]
@@ -377,7 +375,6 @@ def layout(
     marked : mapping {text: place}, optional
         Further places to name.
     ax : Axes, optional
-        Where to draw.
 
     Raises
     ------

@@ -60,7 +60,6 @@ def localisation(
     dofs : DofSet, optional
         Of the model.
     ax : Axes, optional
-        Where to draw.
 
     Returns
     -------
@@ -179,7 +178,6 @@ def update(
     Parameters
     ----------
     fit : UpdateResult
-        The update.
     before : ReducedModel or FEModel
         The model that was updated.
     residuals : sequence of Residual
@@ -360,11 +358,9 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
     Parameters
     ----------
     fit : UpdateResult
-        The update.
     measured : (m,) complex array [rad/s]
         The measured eigenvalues, in the same order.
     ax : Axes, optional
-        Where to draw.
 
     Returns
     -------
@@ -408,9 +404,7 @@ def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
     Parameters
     ----------
     fit : UpdateResult
-        The update.
     ax : Axes, optional
-        Where to draw.
 
     Returns
     -------
@@ -440,7 +434,6 @@ def parameters(
     Parameters
     ----------
     fit : UpdateResult
-        The update.
     truth : dict, optional
         True values, drawn as wide lines.
     axs : list of Axes, optional

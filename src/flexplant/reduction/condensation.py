@@ -149,8 +149,7 @@ class Irs(ReductionMethod):
 
     Parameters
     ----------
-    dofs, damping
-        As for `Guyan`.
+    dofs, damping : as for `Guyan`
     iterations : int
         At most so many.
     tolerance : float
@@ -236,8 +235,7 @@ class Serep(ReductionMethod):
 
     Parameters
     ----------
-    dofs, damping
-        As for `Guyan`.
+    dofs, damping : as for `Guyan`
     modes : sequence of int, optional
         As many mode numbers (from 1, rigid-body modes included and all there); None: the lowest.
 

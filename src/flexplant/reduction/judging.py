@@ -335,7 +335,6 @@ class ReductionQuality(Value):
     condition : float
         Of what the method inverted.
     inputs, outputs : sequence of str
-        The channels.
     route : str
         How the full responses were found.
     full_error : float

@@ -35,7 +35,6 @@ class ModeRanking(Value):
     modes : (m,) array of int
         Mode numbers, from 1.
     freq : (m,) array [Hz]
-        Their frequencies.
     values : (m, p, q) array [m/N]
         Modal Hankel values of each mode from each of q inputs to each of p outputs,
         ``|c b| / (4 zeta omega^2)``.
@@ -47,7 +46,6 @@ class ModeRanking(Value):
         Hankel singular values of all elastic modes together, by Lyapunov equations, the largest
         first; two for each mode, close to its `total` when damping is low and modes are apart.
     inputs, outputs : sequence of str
-        The channels.
 
     Examples
     --------

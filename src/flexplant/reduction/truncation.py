@@ -157,8 +157,7 @@ class ModalBalanced(ReductionMethod):
     among : int, optional
         With an FEModel: how many of its lowest modes are used; None: all of a model that is
         not large.
-    static_at, damping
-        As for `ModalTruncation`.
+    static_at, damping : as for `ModalTruncation`
 
     Notes
     -----

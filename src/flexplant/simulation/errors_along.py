@@ -59,7 +59,6 @@ class RmsAlong(Value):
     Parameters
     ----------
     time : (n_time,) array [s]
-        The samples.
     rms : (n_channels, n_time) array
         Of each channel, in its unit.
     names : sequence of str
@@ -209,7 +208,6 @@ class FiltersAlong(Value):
     Parameters
     ----------
     time : (n_time,) array [s]
-        The samples.
     names : sequence of str
         Motions of POIs, such as `die:z`.
     exact, scheduled, frozen : (n_names, n_time) arrays [m or rad]

@@ -280,7 +280,6 @@ class ErrorMap(Value):
     axis, unit : str
         Direction of the error, and its SI unit.
     points : (p, 3) array [m]
-        The places.
     ma, msd : (p,) arrays [unit]
         Largest |MA| and MSD at each point.
     window : float [s]
@@ -330,15 +329,12 @@ def error_map(
     loop : ClosedLoop
         Around a sampled plant that was assembled from a structure.
     points : (p, 3) array [m]
-        The places.
-    duration, noise, rng
-        As for `simulate`.
+    duration, noise, rng : as for `simulate`
     reference : signal, optional
         As for `simulate`; along `axis`. Rest when not given.
     axis : str
         x, y, z, rx, ry or rz: the direction of the error.
-    window, start, exposures
-        As for `exposure_errors`.
+    window, start, exposures : as for `exposure_errors`
 
     Returns
     -------

@@ -50,7 +50,6 @@ class Feedforward(Value):
     T : (nu, r) array
         Forces to actuators.
     actuators : sequence of str
-        Their names.
     gains : (p, r, 5) array
         On position, velocity, acceleration, jerk and snap; one row, or one for each of p places.
     dt : float [s]

@@ -83,7 +83,6 @@ def learn_feedforward(
     loop : ClosedLoop
         The same controller (without feedforward) on a model of the machine, for Phi.
     move : SetPoint
-        The move.
     duration : float [s]
         Of each run.
     terms : sequence of str

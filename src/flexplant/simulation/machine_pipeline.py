@@ -374,7 +374,6 @@ class MachineReport(Value):
     observer : KalmanEstimator
         Of the POI, with the modes left out as noise.
     blocks : tuple of StateSpace or Controller
-        The controller.
     left_out : SpillOver or None
         The certificate on the larger model: how the loop on the updated one stands with the modes
         left out.

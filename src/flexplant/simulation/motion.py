@@ -429,8 +429,7 @@ def scan(
         At constant velocity before the exposure.
     start : float [m]
         Position before the scan. The exposure begins later: see ``at(exposures)``.
-    rest, rate
-        As for `setpoint`.
+    rest, rate : as for `setpoint`
 
     Returns
     -------

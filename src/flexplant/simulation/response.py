@@ -40,9 +40,7 @@ class Response(Value, Mapping[str, FloatArray]):
     time : (n_time,) array [s]
         Equidistant sampling instants.
     data : (n_channel, n_time) or (n_runs, n_channel, n_time) array
-        The signals, in SI units.
     names : sequence of str
-        The channels.
     units : mapping {channel: unit}, optional
         SI units of the channels that have a known one.
     seed : int or tuple of int, optional

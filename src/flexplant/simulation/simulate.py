@@ -465,7 +465,6 @@ def spectral_noise(
     runs : int, optional
         So many records; one without that axis when not given.
     rng : int, SeedSequence, Generator or None
-        Seed.
 
     Returns
     -------

@@ -231,11 +231,9 @@ class Hysteretic(Damping):
         freq : (n_freq,) array [Hz]
             Where; above 0 when there are rigid-body modes.
         natural : (k,) array [Hz]
-            Natural frequencies.
         gains : (k,) array [1/kg]
             ``phi_out phi_in`` of each mode, of mass-normalised shapes: receptance [m/N].
-        zeta : (k,) array [-], optional
-            As in `error`.
+        zeta : as in `error`, optional
         """
         own = _checked_hertz(natural, "natural")
         weights = np.abs(real_array(gains, "gains", own.shape))

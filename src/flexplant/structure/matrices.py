@@ -302,7 +302,6 @@ class FEMatrices(Value):
             Free the rigid-body motions that only lost digits hold (a text, or single precision), as
             `freed` does, where there are such.
         name : str, optional
-            For display.
 
         Raises
         ------

@@ -50,7 +50,6 @@ class FEModel(Placed, Value):
     dofs : DofSet
         What the n rows stand for, with coordinates.
     name : str, optional
-        For display.
     held_inertia : (n, 6) array, optional
         Loads ``M_fs r_s`` that the acceleration of held DOFs s makes by their mass coupling, for
         the six rigid-body motions of the ground about the origin; kept by `fixed`.

@@ -75,7 +75,6 @@ def chain(
     spacing : float [m]
         Between neighbours; only the coordinates depend on it.
     name : str, optional
-        For display.
 
     Returns
     -------
@@ -162,7 +161,6 @@ def beam(
     ends : (str, str)
         How each end is held: "free", "pinned" (z), "clamped" (z and ry) or "guided" (ry).
     name : str, optional
-        For display.
 
     Returns
     -------
@@ -249,9 +247,7 @@ def kirchhoff_plate(
     elements : (2,) array of int
         Number of elements nx, ny.
     density : float, (nx, ny) array or function [kg/m^3]
-        Mass density.
     youngs_modulus : float, (nx, ny) array or function [Pa]
-        Young's modulus.
     poisson_ratio : float, (nx, ny) array or function [-]
         Above -1 and below 0.5.
     holes : Rectangle, Disc, list of them, (nx, ny) array of bool or function of (x, y), optional
@@ -261,7 +257,6 @@ def kirchhoff_plate(
     ribs : Rib or list of them
         Beams along edges of elements.
     name : str, optional
-        For display.
 
     Returns
     -------
@@ -347,15 +342,12 @@ def solid_block(
     elements : (3,) array of int
         Number of elements nx, ny, nz.
     density : float, (nx, ny, nz) array or function of an element's centre [kg/m^3]
-        Mass density.
     youngs_modulus : float, (nx, ny, nz) array or function of an element's centre [Pa]
-        Young's modulus.
     poisson_ratio : float [-]
         Above -1 and below 0.5, the same everywhere.
     holes : (nx, ny, nz) array of bool or function of an element's centre, optional
         Which elements are missing (True).
     name : str, optional
-        For display.
 
     Returns
     -------

@@ -179,9 +179,7 @@ class WaferStage(Value):
         *blocks : StateSpace, KalmanEstimator or Controller; or one ScheduledLoop
             What runs on it.
         duration : float [s]
-            Length of the run.
         reference : SetPoint, array or mapping, optional
-            The reference.
         rng : int or Generator, optional
             Of the noise.
         runs : int, optional

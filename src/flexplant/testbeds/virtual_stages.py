@@ -62,7 +62,6 @@ def wafer_stage(
     size : (float, float) [m]
         Sides of the plate along x and y; the paper's when not given.
     thickness : float [m]
-        Of the plate.
     damping : float
         Modal damping ratio of the bare plate's elastic modes; of a machine their mean.
     added_mass : float [kg]

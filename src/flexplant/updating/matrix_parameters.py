@@ -96,13 +96,11 @@ class MatrixParameter(_GivenParameter):
     Parameters
     ----------
     name : str
-        For results.
     dM, dD, dK : (k, k) or (n, n) array or sparse matrix, optional
         Symmetric; of the model's own DOFs or of the full structure's.
     unit : str
         Of p; none for a relative change.
-    bounds, prior : optional
-        As for `AddedMass`.
+    bounds, prior : as for `AddedMass`
 
     Raises
     ------
@@ -247,9 +245,7 @@ class ModeDamping(Parameter):
     mode : int
         Number from 1, rigid-body modes included, of the undamped model that is updated.
     name : str, optional
-        For results.
-    bounds, prior : optional
-        As for `AddedMass`.
+    bounds, prior : as for `AddedMass`
 
     Examples
     --------
@@ -425,8 +421,7 @@ class PolynomialParameter(_GivenParameter):
 
         Parameters
         ----------
-        name, build, value, unit, bounds, prior
-            As for `MatrixParameter.from_difference`.
+        name, build, value, unit, bounds, prior : as for `MatrixParameter.from_difference`
         degree : int, optional
             Highest power. None: the first of 3, 6 and 12 that is good enough.
         width : float, optional

@@ -53,7 +53,6 @@ class Sensitivities(Value):
     S : (m, q) complex array [rad/s per unit]
         ``S_ab = d lambda_a / d p_b``.
     parameters : sequence of q str
-        Names.
     """
 
     modes: tuple[int, ...]

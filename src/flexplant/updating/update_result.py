@@ -138,11 +138,8 @@ class UpdateResult(Value):
     Parameters
     ----------
     parameters : sequence of q str
-        Names, in the order given.
     units : sequence of q str
-        Their units.
     values : (q,) array
-        The estimate.
     covariance : (q, q) array or None
         Of the estimate. With measured covariances C: ``G C G^T`` of the linear estimator
         ``G = (J^T W J)^-1 J^T W`` with J = [Re S; Im S], whatever the weights. Without:
@@ -155,7 +152,6 @@ class UpdateResult(Value):
     model : ReducedModel or FEModel
         Of the kind given, with M, D and K changed.
     history : History
-        Iterations.
     converged : bool
         Whether a tolerance was met.
     reason : str

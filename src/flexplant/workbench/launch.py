@@ -118,8 +118,7 @@ class Workbench(Bench):
         The first is shaped.
     design : LoopDesign
         To begin with; `design` is what was shaped last in any tab.
-    model, larger, channel, move, limits, source
-        As for `workbench`.
+    model, larger, channel, move, limits, source : as for `workbench`
 
     Examples
     --------

@@ -62,7 +62,6 @@ class LoopLimits(Value):
         Parameters
         ----------
         loop : AxisLoop
-            The loop.
         rms : float, optional
             The predicted rms, where it is known.
         """

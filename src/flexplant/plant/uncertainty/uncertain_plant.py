@@ -312,7 +312,6 @@ class UncertainPlant(Value, Generic[P]):
         rng : int, SeedSequence, Generator or None
             Seeds are spawned: machine i is the same whatever n is.
         n : int
-            How many.
 
         Raises
         ------

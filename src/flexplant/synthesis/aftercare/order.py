@@ -330,8 +330,7 @@ def discretise_controller(
         A frequency that keeps its response: a notch, the crossover.
     loss : float
         Relative loss of the modulus margin that is allowed.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        As for `larger_plant`.
+    larger : as for `larger_plant`, optional
 
     Returns
     -------

@@ -87,8 +87,7 @@ def design_stage(
         As for `stage_weights` and `reference_errors`.
     disturbance, effort : float
         As for `stage_weights` of an uncertain plant.
-    larger, progress
-        As for `design_hinf`.
+    larger, progress : as for `design_hinf`
 
     Returns
     -------

@@ -205,12 +205,10 @@ class LoopDesign(Value):
 
         Parameters
         ----------
-        plant : StandardPlant, StateSpace or Frf
-            As for `design_loops`.
+        plant : as for `design_loops`
         axes : mapping {axis: ShapedAxis}, optional
             Axes that are missing have a gain of 1.
-        before, after, rate, delay, hold, unstable, references
-            As for `design_loops`.
+        before, after, rate, delay, hold, unstable, references : as for `design_loops`
         rigid : int, optional
             Rigid-body modes of a measured plant; unless given, one for each axis that falls
             with slope 2 at its lowest lines.
@@ -246,7 +244,6 @@ class LoopDesign(Value):
         Parameters
         ----------
         plant : StandardPlant, StateSpace or Frf
-            The plant.
         """
         return self.fingerprint == _digest(plant)
 
@@ -256,7 +253,6 @@ class LoopDesign(Value):
         Parameters
         ----------
         name : str
-            The axis.
         axis : ShapedAxis
             Its elements.
         """
@@ -315,8 +311,7 @@ class LoopDesign(Value):
         ----------
         plant : StandardPlant, StateSpace or Frf
             With the channels and the rate of the design.
-        larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-            As for `design_loops`.
+        larger : as for `design_loops`, optional
 
         Raises
         ------

@@ -183,7 +183,6 @@ class Law(LawElement):
     factors : sequence of elements
         `Pid`, `Lead`, `Lag`, `Integrator`, `Notch`, `LowPass`, `FixedBlock`.
     gain : float
-        A factor.
     rate : float [Hz]
         Sampling rate; 0 when continuous.
     prewarped : bool

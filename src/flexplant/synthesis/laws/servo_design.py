@@ -193,8 +193,7 @@ def servo_bandwidth(
 
     Parameters
     ----------
-    plant, poi, rolloff, integrator, notches, observer, larger
-        As for `design_servo`.
+    plant, poi, rolloff, integrator, notches, observer, larger : as for `design_servo`
     peak : float
         Bound on the largest singular value of S at u; 2 is 6 dB.
 

@@ -56,8 +56,7 @@ def tune_loops(
 
     Parameters
     ----------
-    plant, before, after, rate, delay, hold
-        As for `design_loops`.
+    plant, before, after, rate, delay, hold : as for `design_loops`
     peak : float
         Bound on |S|, at u, at y and of each axis; 2 is a modulus margin of 6 dB.
     rigid : int, optional

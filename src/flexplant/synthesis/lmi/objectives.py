@@ -93,8 +93,7 @@ class Hinf(_ChannelNorm):
 
     Parameters
     ----------
-    w, z, below
-        As for `H2`.
+    w, z, below : as for `H2`
 
     Examples
     --------
@@ -121,8 +120,7 @@ class PeakGain(_ChannelNorm):
 
     Parameters
     ----------
-    w, z, below
-        As for `H2`.
+    w, z, below : as for `H2`
     decay : float [rad/s], optional
         Rate at which the reachable set is taken to shrink; several are tried when not given.
 

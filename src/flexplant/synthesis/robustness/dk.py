@@ -101,8 +101,7 @@ def design_mu(
     w, z : mapping {name: weight}, or sequence of str
         Weights of performance, as for `StandardPlant.weighted`, those of `stage_weights` too:
         None leaves a channel out, as does not naming it.
-    method : Riccati or Lmi, optional
-        As for `design_hinf`.
+    method : as for `design_hinf`, optional
     iterations : int
         Most steps.
     order : int

@@ -352,14 +352,12 @@ def worst_case_gain(
 
     Parameters
     ----------
-    uncertain, *blocks
-        As for `robust_stability`.
+    uncertain, *blocks : as for `robust_stability`
     w, z : sequence of str, or mapping {name: weight}
         Channels of the gain; weights are numbers or systems of one input and output.
     rng : int, SeedSequence, Generator or None
         Of the search.
-    progress : bool, optional
-        As for `robust_stability`.
+    progress : as for `robust_stability`, optional
 
     Returns
     -------

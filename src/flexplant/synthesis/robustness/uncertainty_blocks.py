@@ -27,7 +27,6 @@ class RepeatedScalar(Value):
     real : bool
         Whether delta is a real number (a parameter) or a complex one.
     name : str
-        For messages.
 
     Examples
     --------
@@ -60,7 +59,6 @@ class FullBlock(Value):
     w, z : int
         Numbers of its outputs, which drive the plant, and of its inputs.
     name : str
-        For messages.
 
     Examples
     --------

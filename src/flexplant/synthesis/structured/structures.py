@@ -350,10 +350,8 @@ class TunedLaws(Value):
 
     Parameters
     ----------
-    laws : Law or mapping {axis: Law}
-        As for `design_loops`.
-    before, after : StateSpace or array, optional
-        As for `design_loops`.
+    laws : as for `design_loops`
+    before, after : as for `design_loops`, optional
     free : sequence of str
         Which numbers of the elements are free, of p, i, d, pole, freq, ratio, width, damping and
         depth; all but the depth unless given.

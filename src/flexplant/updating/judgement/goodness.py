@@ -142,7 +142,6 @@ class Identifiability(Value):
     Parameters
     ----------
     parameters : sequence of q str
-        Names.
     singular_values : (q,) array
         Of the sensitivities, each column scaled to length one: sqrt(q) to zero.
     combinations : (q, q) array
@@ -216,8 +215,7 @@ def identifiability(
 
     Parameters
     ----------
-    model, parameters, start
-        As for `update`.
+    model, parameters, start : as for `update`
     residuals : sequence of Residual
         Data; the values are not used, only what they would depend on (and their noise).
 

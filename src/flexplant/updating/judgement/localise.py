@@ -194,7 +194,6 @@ class Localisation(Value):
     Parameters
     ----------
     candidates : sequence of c str
-        Names, in the order given.
     values : (c,) array
         What each candidate would have to be if it were the only change; NaN when it could not
         be fitted.

@@ -27,7 +27,6 @@ class Posterior(Value):
     Parameters
     ----------
     parameters : sequence of q str
-        Names.
     draws : (n, q) array
         In order, walkers next to each other.
     acceptance : float
@@ -35,7 +34,6 @@ class Posterior(Value):
         normal posterior are accepted in 0.6 to 0.8 of the cases, those of ten in 0.3 to 0.5;
         below 0.15 the walkers hardly move.
     walkers : int
-        Number of walkers.
     """
 
     parameters: tuple[str, ...]

@@ -328,8 +328,7 @@ def validate(
 
     Parameters
     ----------
-    model, parameters, method, start, starts, rng, prior
-        As for `update`.
+    model, parameters, method, start, starts, rng, prior : as for `update`
     residuals, unused : sequences of Residual
         To fit, and to judge by. `Eigenvalues.select`, `ModeShapes.select` and
         `FrfResidual.select` take parts, as does `split`.

@@ -489,8 +489,7 @@ class ShapeCorrelation(ModeShapes):
 
     Parameters
     ----------
-    measured, shapes, at, direction, assign
-        As in `ModeShapes`.
+    measured, shapes, at, direction, assign : as in `ModeShapes`
     std, covariance : optional
         As in `ModeShapes`: weighs the entries in the MAC; the residuals have no known noise.
 
