@@ -163,7 +163,7 @@ def test_a_loop_is_shaped_in_a_browser(browser, served, plant, tmp_path):
 def drag(tab, freq, above):
     """Drag a handle by 9 pixels to the right; again where a busy machine drew under the mouse."""
     mouse = tab.page.mouse
-    for _ in range(5):
+    for wait in (6.0, 6.0, 12.0, 25.0, 50.0):  # [s] a lost move is seen soon, a slow one too
         places = [[], handle_of(tab.page, freq())]
 
         def rests(places=places):
@@ -184,7 +184,7 @@ def drag(tab, freq, above):
             return above < reached[-1] == reached[-2] == reached[-3] == reached[-4]
 
         try:
-            return tab.until(arrived, 6.0)
+            return tab.until(arrived, wait)
         except AssertionError:
             continue
     raise AssertionError(f"the handle at {freq()} Hz does not move: {tab.verdict}")
