@@ -8,9 +8,9 @@ import warnings
 import numpy as np
 import scipy.io as sio
 
+from flexplant import DofSet
 from flexplant.errors import FlexplantWarning
 from flexplant.identification import MeasuredModes
-from flexplant.labels import DofSet
 from flexplant.reduction import ReducedModel
 from flexplant.updating import Eigenvalues, MatrixParameter, ModeShapes, update
 from shared_data import DATA

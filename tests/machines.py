@@ -4,8 +4,8 @@ import time
 
 import numpy as np
 
-from flexplant.lti import StateSpace
-from flexplant.lti.discretisation import discretized, noise_factor
+from flexplant.lti import StateSpace, discretized
+from flexplant.lti.discretisation import noise_factor
 from flexplant.plant import Foreign, StandardPlant
 
 RATE = 2000.0

@@ -3,7 +3,7 @@
 import numpy as np
 import scipy.sparse as sp
 
-from flexplant.labels import DofSet
+from flexplant import DofSet
 from flexplant.structure import kirchhoff_plate
 from plates import PLATE
 

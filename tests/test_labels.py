@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flexplant import DofSet, load
 from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.labels import DIRECTIONS, DofSet, Interpolation
-from flexplant.store import load
+from flexplant.labels import DIRECTIONS, Interpolation
 
 DOFS = DofSet([7, 7, 3, 3], ["z", "rx", "z", "rx"], [[0, 0, 0], [0, 0, 0], [1, 2, 0], [1, 2, 0]])
 

@@ -17,6 +17,7 @@ from flexplant.estimation import kalman
 from flexplant.lti import (
     balanced,
     balancing,
+    control_care,
     controllability_gramian,
     lyapunov,
     norms,
@@ -26,7 +27,6 @@ from flexplant.lti import (
 )
 from flexplant.lti import norms as h2_norms
 from flexplant.lti import riccati as doubling
-from flexplant.lti.riccati import control_care
 from flexplant.parallel import CHUNK, PROBE, mapped
 from flexplant.synthesis.hinf import hinf_design as attempts
 from flexplant.synthesis.laws import servo_design as servo

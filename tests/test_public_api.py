@@ -258,6 +258,21 @@ def test_names_in_advice_are_at_the_front_or_have_their_room():
     assert not bare
 
 
+@pytest.mark.slow
+def test_tests_import_public_names_where_users_do():
+    """From the front or a room: a name that moves between modules moves no test."""
+    shown = {n: room for room, where in rooms().items() for n in dir(where) if room != "errors"}
+    inner = []
+    for path in Path(__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            place = (getattr(node, "module", None) or "").split(".")
+            if place[0] == "flexplant" and (len(place) > 2 or place[1:] == ["store"]):
+                public = {shown.get(one.name) for one in node.names} & set(place)
+                public |= {one.name for one in node.names} & {"load"}
+                inner += [f"{path.name}:{node.lineno}: {'.'.join(place)}"] if public else []
+    assert not inner
+
+
 @pytest.mark.parametrize(
     "verb", ["identify_modes", "localise", "update", "design_hinf", "tune_loops"]
 )

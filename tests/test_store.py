@@ -10,11 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from flexplant import DofSet, load
 from flexplant.checks import Value
 from flexplant.errors import FlexplantError
-from flexplant.labels import DofSet
 from flexplant.lti import StateSpace
-from flexplant.store import load
 
 
 @dataclass(frozen=True, eq=False, repr=False)

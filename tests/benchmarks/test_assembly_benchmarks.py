@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.sparse.linalg as spla
 
-from flexplant.labels import DofSet
+from flexplant import DofSet
 from flexplant.structure import FEModel, Rib, Spring, kirchhoff_plate, solid_block
 from flexplant.structure.element_matrices import Grid, plate_mass, plate_stiffness
 from plates import PLATE, make_plate
@@ -86,7 +86,7 @@ def test_the_door_at_a_hundred_thousand():
 def test_files_at_a_million(tmp_path):
     dofs = make_plate(elements=(577, 577)).dofs
     line(f"DofSet of {len(dofs)} saved", cpu(lambda: dofs.save(tmp_path / "dofs.npz"))[0])
-    from flexplant.store import load
+    from flexplant import load
 
     seconds, _ = cpu(lambda: load(tmp_path / "dofs.npz"))
     line("  and loaded", seconds)

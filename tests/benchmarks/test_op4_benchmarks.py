@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from flexplant.io.op4 import read_op4_matrices
+from flexplant.io import read_op4_matrices
 
 pytestmark = pytest.mark.benchmark
 op4 = pytest.importorskip("pyyeti.nastran.op4")

@@ -15,8 +15,8 @@ from flexplant.estimation.innovations import cumulative_periodogram, density_of,
 from flexplant.identification import MeasuredModes
 from flexplant.loop import close_loop
 from flexplant.modes import solve_modes
-from flexplant.plant import Sensor, assemble_plant
-from flexplant.plant.uncertainty.uncertain_plant import Delta, with_changes
+from flexplant.plant import Delta, Sensor, assemble_plant
+from flexplant.plant.uncertainty.uncertain_plant import with_changes
 from flexplant.plot import report
 from flexplant.simulation import setpoint, simulate
 from flexplant.structure import ModalDamping, chain

@@ -10,7 +10,7 @@ from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeErro
 from flexplant.estimation import Filter, FixedLag, Predictor, Smoother, design_kalman, design_static
 from flexplant.estimation.estimate import estimated
 from flexplant.estimation.passage import Walk
-from flexplant.lti.riccati import solve_dare
+from flexplant.lti import solve_dare
 from machines import stage
 from oracles_estimation import batch, error_covariance
 
@@ -247,8 +247,8 @@ class Frame:
 
 
 def test_what_counts_as_a_record_and_what_comes_out(tmp_path):
+    from flexplant import load
     from flexplant.simulation import Response
-    from flexplant.store import load
 
     kalman = observer()
     model = kalman.model

@@ -300,7 +300,7 @@ def test_the_repr_says_how_many_axes_it_leaves_out():
 
 
 def test_saves_and_loads(tmp_path):
-    from flexplant.store import load
+    from flexplant import load
 
     estimator = design_kalman(stage())
     estimator.save(tmp_path / "k.npz")

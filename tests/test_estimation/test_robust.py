@@ -12,8 +12,8 @@ import flexplant as fx
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation import design_hinf_filter, design_kalman, design_minimax_filter
 from flexplant.lti import StateSpace
-from flexplant.plant import StandardPlant
-from flexplant.plant.uncertainty.uncertain_plant import Delta, with_changes
+from flexplant.plant import Delta, StandardPlant
+from flexplant.plant.uncertainty.uncertain_plant import with_changes
 from oracles_estimation import error_by_frequency, error_peak, scalar_filter_variance
 
 DT = 1e-3

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from flexplant import load
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
 from flexplant.identification.diagram import Moments
 from flexplant.identification.refine import pole_terms, residual_terms
 from flexplant.lti import Frf
-from flexplant.store import load
 from oracles_identification import held_mode, modal_frf, pole
 
 FREQ = np.linspace(10.0, 90.0, 161)

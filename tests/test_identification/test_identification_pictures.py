@@ -12,8 +12,7 @@ from matplotlib.backend_bases import MouseEvent
 from flexplant.errors import ModelError
 from flexplant.identification import identify_modes, stabilisation_diagram
 from flexplant.lti import Frf
-from flexplant.plot import PolePicker
-from flexplant.plot.identification import identified, stabilisation
+from flexplant.plot import PolePicker, identified, stabilisation
 from oracles_identification import modal_frf, noisy, pole
 
 

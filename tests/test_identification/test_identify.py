@@ -9,6 +9,7 @@ import scipy.signal
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
+from flexplant import load
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError, SolverError
 from flexplant.identification import (
     H1Estimator,
@@ -29,7 +30,6 @@ from flexplant.identification.pole_test import (
 )
 from flexplant.identification.refine import LEAST, Fit, Lines, refined
 from flexplant.lti import Frf
-from flexplant.store import load
 from oracles_identification import held_mode, mac, modal_frf, noisy, pole
 
 FREQ = np.arange(42.0, 170.0, 0.1)

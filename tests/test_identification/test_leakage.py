@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal as ss
 
+from flexplant import load
 from flexplant.errors import FlexplantWarning, ModelError, SolverError
 from flexplant.identification import (
     H1Estimator,
@@ -19,7 +20,6 @@ from flexplant.identification import (
 from flexplant.identification.refine import hann_ratio
 from flexplant.io import read_frf_csv, write_frf_csv
 from flexplant.lti import Frf
-from flexplant.store import load
 from oracles_identification import pole
 
 

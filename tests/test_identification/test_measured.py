@@ -5,9 +5,9 @@ import pickle
 import numpy as np
 import pytest
 
+from flexplant import load
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
-from flexplant.store import load
 
 POLES = [-28.5 - 2870j, -39.3 + 3970j]
 

@@ -7,6 +7,7 @@ import pytest
 import scipy.io
 
 from disagreeing import drifting, roving
+from flexplant import load
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.identification import (
     H1Estimator,
@@ -15,7 +16,6 @@ from flexplant.identification import (
     stabilisation_diagram,
 )
 from flexplant.lti import Frf
-from flexplant.store import load
 from oracles_identification import modal_frf, noisy, pole
 from shared_data import DATA
 

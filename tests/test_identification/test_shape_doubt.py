@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
+from flexplant import DofSet
 from flexplant.identification import PoleSelection, average_frfs, identify_modes
-from flexplant.labels import DofSet
 from flexplant.lti import Frf
 from flexplant.structure import FEModel
 from flexplant.updating import AddedMass, ModeShapes

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 import flexplant as fx
+from flexplant import DofSet
 from flexplant.errors import FlexplantError, LabelError, ModelError, ShapeError
-from flexplant.io.abaqus import read_abaqus
-from flexplant.io.punch import read_dmig
-from flexplant.io.sierra import read_sierra
-from flexplant.labels import DofSet
+from flexplant.io import read_abaqus, read_dmig, read_sierra
 
 K = np.array(
     [[4.0, -1.5, 0.0, 0.25], [-1.5, 3.0, 1e-3, 0.0], [0.0, 1e-3, 2.0, -0.5], [0.25, 0.0, -0.5, 5.0]]

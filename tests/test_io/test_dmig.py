@@ -8,8 +8,8 @@ import scipy.linalg as la
 
 import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
+from flexplant.io import read_dmig
 from flexplant.io.nastran import read_nodes
-from flexplant.io.punch import read_dmig
 from shared_data import DATA, needs
 
 SHARED = DATA / "fe" / "nastran"

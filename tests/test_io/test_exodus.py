@@ -5,7 +5,7 @@ import pytest
 import scipy.io
 
 from flexplant.errors import FlexplantError, LabelError, ModelError, ShapeError
-from flexplant.io.sierra import read_exodus_modes
+from flexplant.io import read_exodus_modes
 
 FREQ = np.array([0.0, 1e-5, 12.5, 40.0])
 XYZ = np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.0], [6.0, 7.0, 8.0]])

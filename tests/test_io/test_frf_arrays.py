@@ -5,7 +5,7 @@ import pytest
 import scipy.io
 
 from flexplant.errors import FlexplantError, LabelError, ModelError, ShapeError
-from flexplant.io.frf_files import read_frf_mat, read_frf_npz
+from flexplant.io import read_frf_mat, read_frf_npz
 from flexplant.lti import Frf
 
 FREQ = np.array([1.0, 2.0, 5.0, 9.0])

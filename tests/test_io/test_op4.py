@@ -9,7 +9,7 @@ import scipy.sparse as sp
 
 import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
-from flexplant.io.op4 import read_op4, read_op4_matrices
+from flexplant.io import read_op4, read_op4_matrices
 from shared_data import DATA, needs
 
 SHARED = DATA / "fe" / "nastran"

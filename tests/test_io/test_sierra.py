@@ -5,7 +5,7 @@ import pytest
 import scipy.io
 
 from flexplant.errors import FlexplantError, ModelError, ShapeError
-from flexplant.io.sierra import read_sierra
+from flexplant.io import read_sierra
 from shared_data import DATA, needs
 
 SHARED = DATA / "fe" / "sierra"

@@ -10,7 +10,7 @@ import pytest
 import flexplant as fx
 import shared_data
 from flexplant.errors import FlexplantError, LabelError, ModelError
-from flexplant.io.uff import read_frf_uff, read_modes_uff, read_nodes_uff
+from flexplant.io import read_frf_uff, read_modes_uff, read_nodes_uff
 from uff_files import analysis
 
 pyuff = pytest.importorskip("pyuff")

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 import flexplant as fx
 import oracles_loop as oracle
+from flexplant import load
 from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError
 from flexplant.estimation import design_static
 from flexplant.loop import ClosedLoop, bandwidth, close_loop
 from flexplant.lti import StateSpace
 from flexplant.plant import StandardPlant
-from flexplant.store import load
 from flexplant.synthesis import design_servo
 from machines import RATE, block, matrices, observer, servo, stage
 from stages import reduced, sampled

@@ -5,11 +5,11 @@ import pytest
 import scipy.linalg as la
 
 import oracles_loop as oracle
+from flexplant import load
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.loop import close_loop, compare_loops
 from flexplant.lti import StateSpace
 from flexplant.plant import StandardPlant
-from flexplant.store import load
 from machines import RATE, observer, servo, stage
 
 

@@ -10,7 +10,8 @@ import scipy.linalg as la
 import flexplant as fx
 from flexplant.errors import AssumptionError, FlexplantWarning, ModelError
 from flexplant.loop.other_machines import mode_tolerances
-from flexplant.plant.uncertainty.uncertain_plant import Delta, with_changes
+from flexplant.plant import Delta
+from flexplant.plant.uncertainty.uncertain_plant import with_changes
 from stages import RATE, ports, sampled, some_modes
 
 ZETA, COUNT = 1e-3, 15

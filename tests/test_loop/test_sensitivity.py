@@ -15,8 +15,7 @@ from flexplant.loop import (
     sensitivity,
 )
 from flexplant.loop.broken import sensitivity_size
-from flexplant.lti import StateSpace
-from flexplant.lti.frequency import Frf, frequency_response
+from flexplant.lti import Frf, StateSpace, frequency_response
 from machines import RATE, observer, servo, stage
 
 FREQ = np.array([0.5, 4.0, 9.0, 59.0, 153.0, 700.0])

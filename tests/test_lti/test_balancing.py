@@ -11,17 +11,17 @@ from flexplant.lti import (
     StateSpace,
     append,
     balanced,
+    discretized,
     frequency_response,
     hankel_norm,
     hankel_values,
     hinf_norm,
     linf_norm,
     norm_report,
+    split_stable,
+    tf,
 )
-from flexplant.lti.discretisation import discretized
-from flexplant.lti.filters import tf
 from flexplant.lti.lyapunov import controllability_factor, observability_factor
-from flexplant.lti.modal import split_stable
 from oracles_lti import hankel, largest_gain, lyapunov, stein, sweep
 from systems_lti import machine
 

@@ -9,14 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
-from flexplant.lti import StateSpace, append, frequency_response, lowpass, series, tustin
-from flexplant.lti.discretisation import (
-    bilinear,
+from flexplant.lti import (
+    StateSpace,
+    append,
     discretized,
-    held_exactly,
-    pair_expm,
-    pair_exponential,
+    frequency_response,
+    lowpass,
+    series,
+    tustin,
 )
+from flexplant.lti.discretisation import bilinear, held_exactly, pair_expm, pair_exponential
 from oracles_plant import delayed_run, hold
 
 RATE = 200.0

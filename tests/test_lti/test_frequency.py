@@ -7,9 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.lti import Frf, StateSpace, append, frequency_response, series
-from flexplant.lti.discretisation import discretized
-from flexplant.lti.frequency import default_freq
+from flexplant.lti import (
+    Frf,
+    StateSpace,
+    append,
+    default_freq,
+    discretized,
+    frequency_response,
+    series,
+)
 from flexplant.lti.responses import diagonal_form
 from oracles_lti import sweep
 from systems_lti import machine
@@ -244,7 +250,7 @@ def test_frf_is_a_mapping_and_selects():
 
 
 def test_frf_saves_and_loads(tmp_path):
-    from flexplant.store import load
+    from flexplant import load
 
     frf = frequency_response(machine(0, 2, m=1, p=1), FREQ)
     frf.save(tmp_path / "frf.npz")

@@ -9,8 +9,15 @@ from hypothesis import strategies as st
 from scipy.io import loadmat
 
 from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.lti import StateSpace, minimal, modal_form, parallel, series, split_stable
-from flexplant.lti.discretisation import discretized
+from flexplant.lti import (
+    StateSpace,
+    discretized,
+    minimal,
+    modal_form,
+    parallel,
+    series,
+    split_stable,
+)
 from flexplant.lti.equations import balanced_matrix, state_scale
 from oracles_lti import sweep
 from shared_data import DATA

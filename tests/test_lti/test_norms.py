@@ -7,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexplant.errors import ModelError
-from flexplant.lti import StateSpace, h2_norm, hinf_norm, lft, norms, peak_gain, peaks
+from flexplant.lti import StateSpace, discretized, h2_norm, hinf_norm, lft, norms, peak_gain, peaks
 from flexplant.lti import norms as level_set
-from flexplant.lti.discretisation import discretized
 from flexplant.lti.peaks import Peaks, exceeding, newton_maxima, proved_peak, residues
 from flexplant.parallel import Progress
 from oracles_lti import largest_gain, lyapunov, peak_by_search, stein, sweep

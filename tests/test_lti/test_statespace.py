@@ -8,9 +8,9 @@ import scipy.linalg as la
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flexplant import load
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.lti import StateSpace, as_statespace
-from flexplant.store import load
 from oracles_lti import gain_at
 from systems_lti import same, system
 

@@ -5,11 +5,10 @@ import pickle
 import numpy as np
 import pytest
 
+from flexplant import DofSet, load
 from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.labels import DofSet
 from flexplant.modes import Modes, solve_modes
 from flexplant.modes.matching import mac_matrix
-from flexplant.store import load
 from flexplant.structure import ModalDamping
 from plates import make_plate
 

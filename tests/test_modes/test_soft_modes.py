@@ -8,9 +8,8 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 import oracles_modes as oracle
-from flexplant import check
+from flexplant import DofSet, check
 from flexplant.errors import ModelError
-from flexplant.labels import DofSet
 from flexplant.modes import solve, solve_modes, statics
 from flexplant.structure import FEModel, Spring, beam, kirchhoff_plate
 

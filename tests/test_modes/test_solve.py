@@ -5,8 +5,8 @@ import pytest
 import scipy.sparse as sp
 
 import oracles_structure as oracle
+from flexplant import DofSet
 from flexplant.errors import LabelError, ModelError, ShapeError, SolverError
-from flexplant.labels import DofSet
 from flexplant.modes import solve, solve_modes, statics
 from flexplant.modes import sparse_modes as counted
 from flexplant.modes.solve import rigid_residual

@@ -5,8 +5,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from flexplant import DofSet, load
 from flexplant.errors import AssumptionError, InfeasibleError, ModelError
-from flexplant.labels import DofSet
 from flexplant.lti import StateSpace
 from flexplant.modes import solve_modes
 from flexplant.placement import (
@@ -38,7 +38,6 @@ from flexplant.plant import (
     StandardPlant,
     assemble_plant,
 )
-from flexplant.store import load
 from flexplant.structure import Disc, FEModel, ModalDamping
 from flexplant.synthesis import design_h2
 from placement_plate import plate_modes

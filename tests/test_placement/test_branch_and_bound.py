@@ -7,8 +7,8 @@ from math import comb
 import numpy as np
 import pytest
 
+from flexplant import DofSet
 from flexplant.errors import FlexplantWarning, ModelError
-from flexplant.labels import DofSet
 from flexplant.modes import solve_modes
 from flexplant.placement import (
     BranchAndBound,

@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 
 from flexplant.errors import ModelError
-from flexplant.placement import BranchAndBound, ByRows, Exchange, ModeInformation, place_sensors
+from flexplant.placement import (
+    BranchAndBound,
+    ByRows,
+    Exchange,
+    ModeInformation,
+    Problem,
+    place_sensors,
+)
 from flexplant.placement.constraints import LinearRows
 from flexplant.placement.mode_shapes import ModeRows
-from flexplant.placement.problem import Layouts, Problem, RigidPart
+from flexplant.placement.problem import Layouts, RigidPart
 from flexplant.reduction import EffectiveIndependence, PivotedQr
 from flexplant.work import Work
 

@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from flexplant import load
 from flexplant.errors import InfeasibleError, LabelError, ModelError
 from flexplant.placement import (
     Among,
@@ -26,7 +27,6 @@ from flexplant.placement import (
 )
 from flexplant.placement.problem import layouts_of
 from flexplant.plant import Poi, Sensor
-from flexplant.store import load
 from flexplant.structure import Disc, Rectangle
 
 GRID = [(x, y, 0.0) for x in (0.0, 0.2, 0.3, 0.5) for y in (0.0, 0.175, 0.35)]

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from flexplant import load
 from flexplant.errors import AssumptionError, LabelError, ModelError
 from flexplant.estimation import design_kalman
 from flexplant.placement import Exchange, PoiLqr, PoiVariance, place_sensors, score_sensors
 from flexplant.plant import Sensor, StandardPlant
 from flexplant.reduction import ModalTruncation, reduce
-from flexplant.store import load
 from oracles_placement import kalman_variance, lqr_cost
 from stages import ports, sampled, some_modes
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
+from flexplant import DofSet
 from flexplant.errors import ModelError
-from flexplant.labels import DofSet
 from flexplant.modes import solve_modes
 from flexplant.placement import ModalControllability, ModalObservability, OffPoi, place_sensors
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant

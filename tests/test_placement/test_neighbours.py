@@ -6,9 +6,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from flexplant import DofSet
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation import FixedLag, Predictor, Smoother, design_kalman
-from flexplant.labels import DofSet
 from flexplant.modes import solve_modes
 from flexplant.placement import (
     ActuatorIndices,

@@ -8,6 +8,7 @@ from multiprocessing import get_context
 import numpy as np
 import pytest
 
+from flexplant import load
 from flexplant.errors import AssumptionError, CertificateError, LabelError, ModelError, SolverError
 from flexplant.estimation import design_kalman
 from flexplant.lti import lowpass
@@ -15,7 +16,6 @@ from flexplant.placement import PoiLqr, PoiVariance, convex, score_actuators, sc
 from flexplant.placement.convex import Quadratic
 from flexplant.placement.problem import layouts_of
 from flexplant.plant import Sensor, StandardPlant
-from flexplant.store import load
 from oracles_placement import kalman_variance, lqr_cost
 
 

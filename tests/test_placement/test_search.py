@@ -6,6 +6,7 @@ from math import comb
 import numpy as np
 import pytest
 
+from flexplant import load
 from flexplant.errors import AssumptionError, InfeasibleError, LabelError, ModelError
 from flexplant.placement import (
     BranchAndBound,
@@ -18,7 +19,6 @@ from flexplant.placement import (
 )
 from flexplant.placement.problem import layouts_of
 from flexplant.plant import Sensor
-from flexplant.store import load
 from oracles_placement import best_subset
 
 CASES = [(seed, n, k) for seed, n, k in ((11, 9, 3), (12, 9, 5), (13, 10, 4), (14, 12, 4))]

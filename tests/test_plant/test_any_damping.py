@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 import flexplant as fx
 import oracles_damping as oracle
+from flexplant import DofSet
 from flexplant.errors import FlexplantWarning, ModelError
-from flexplant.labels import DofSet
 from flexplant.lti import frequency_response, lowpass
 from flexplant.modes import normal_form, solve_modes
 from flexplant.modes.normal_form import modal, real_form

@@ -5,9 +5,9 @@ from time import perf_counter
 import numpy as np
 import pytest
 
+from flexplant import DofSet
 from flexplant.errors import AssumptionError, LabelError
 from flexplant.estimation import design_kalman
-from flexplant.labels import DofSet
 from flexplant.lti import StateSpace, lowpass
 from flexplant.lti.joining import axis_zeros
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, StandardPlant, assemble_plant

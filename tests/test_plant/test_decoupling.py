@@ -5,8 +5,15 @@ import pytest
 
 from flexplant.errors import AssumptionError, LabelError, ModelError
 from flexplant.lti import StateSpace, lowpass
-from flexplant.plant import Actuator, Sensor, StandardPlant, assemble_plant, decouple, suspend
-from flexplant.plant.suspension import GroundSpring
+from flexplant.plant import (
+    Actuator,
+    GroundSpring,
+    Sensor,
+    StandardPlant,
+    assemble_plant,
+    decouple,
+    suspend,
+)
 from stages import CORNERS, INSET, NOISE, RATE, Z8, L, full, ports, reduced, some_modes
 
 MASS = 0.6 * 0.6 * 0.0272 * 2702

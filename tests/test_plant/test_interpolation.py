@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
+from flexplant import DofSet, load
 from flexplant.errors import LabelError, ModelError
-from flexplant.labels import DofSet
 from flexplant.modes import solve_modes
 from flexplant.plant import Actuator, Poi, Ports, Sensor, assemble_plant
 from flexplant.reduction import DesiredDofs, reduce, select_dofs
-from flexplant.store import load
 from flexplant.structure import FEModel, ModalDamping, ScatteredShape, interpolated
 from plates import make_plate
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
+from flexplant import DofSet
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation import design_kalman
 from flexplant.identification import MeasuredModes
-from flexplant.labels import DofSet
 from flexplant.loop import close_loop
 from flexplant.lti import frequency_response
 from flexplant.modes import solve_modes

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from flexplant import load
 from flexplant.errors import ModelError
 from flexplant.estimation import design_kalman
 from flexplant.labels import Place
@@ -14,7 +15,6 @@ from flexplant.placement import PoiVariance, score_sensors
 from flexplant.plant import ForcePort, Seen, Sensor, SensorPort, assemble_plant
 from flexplant.reduction import ModalTruncation, reduce
 from flexplant.simulation import simulate
-from flexplant.store import load
 from stages import CORNERS, INSET, NOISE, RATE, Z8, full, ports, reduced, sampled, some_modes
 
 OMEGA = 1j * 2 * np.pi * np.array([3.0, 70.0, 451.0, 900.0])

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
+from flexplant import DofSet, load
 from flexplant.errors import AssumptionError, LabelError, ModelError, ShapeError
 from flexplant.estimation import design_kalman
-from flexplant.labels import DofSet
-from flexplant.lti import StateSpace, frequency_response, lowpass, pade, tf
-from flexplant.lti.discretisation import discretized
+from flexplant.lti import StateSpace, discretized, frequency_response, lowpass, pade, tf
 from flexplant.plant import (
     Actuator,
     BaseAcceleration,
@@ -24,7 +23,6 @@ from flexplant.plant import (
     suspend,
 )
 from flexplant.plant.sampling import Flow, sampled_physical
-from flexplant.store import load
 from flexplant.structure import FEModel
 from oracles_ports import (
     chain,

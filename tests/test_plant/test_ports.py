@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from flexplant import load
 from flexplant.errors import FlexplantError, LabelError, ModelError, ShapeError
 from flexplant.lti import StateSpace
 from flexplant.placement import place_both, place_sensors
@@ -18,7 +19,6 @@ from flexplant.plant import (
     StandardPlant,
     assemble_plant,
 )  # fmt: skip
-from flexplant.store import load
 from flexplant.structure import chain
 from flexplant.testbeds import three_masses
 from stages import ports

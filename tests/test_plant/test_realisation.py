@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from flexplant import DofSet
 from flexplant.errors import ModelError
-from flexplant.labels import DofSet
 from flexplant.lti import frequency_response
 from flexplant.modes import solve_modes
 from flexplant.plant import assemble_plant

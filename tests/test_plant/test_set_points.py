@@ -6,8 +6,7 @@ import pytest
 import flexplant as fx
 from flexplant.errors import LabelError
 from flexplant.plant import Poi, Reference, reference_errors
-from flexplant.simulation import error_map, exposure_errors
-from flexplant.simulation.feedforward import inverse_forces, known_forces
+from flexplant.simulation import error_map, exposure_errors, inverse_forces, known_forces
 from oracles_synthesis import rigid_sensor
 from stages import AXES, CORNERS, L, ports, sampled, some_modes
 

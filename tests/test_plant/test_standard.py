@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flexplant import load
 from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.lti import StateSpace, frequency_response, highpass, lowpass
 from flexplant.plant import (
@@ -17,7 +18,6 @@ from flexplant.plant import (
     assemble_plant,
     building,
 )
-from flexplant.store import load
 from stages import OFF_NODE, RATE, Z8, L, ports, reduced, sampled, some_modes
 
 

@@ -5,9 +5,9 @@ import re
 import numpy as np
 import pytest
 
+from flexplant import DofSet
 from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import design_kalman
-from flexplant.labels import DofSet
 from flexplant.lti import frequency_response
 from flexplant.modes import solve_modes
 from flexplant.plant import (

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from test_uncertainty import closed
 
+from flexplant import DofSet
 from flexplant.errors import CertificateError, ModelError, ShapeError
 from flexplant.identification import (
     MeasuredModes,
@@ -13,7 +14,6 @@ from flexplant.identification import (
     shape_deviations,
     structural_modes,
 )
-from flexplant.labels import DofSet
 from flexplant.lti import Frf, frequency_response
 from flexplant.modes import Modes, solve_modes
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant

@@ -13,9 +13,16 @@ import oracles_uncertainty as oracle
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.identification import MeasuredModes
 from flexplant.lti import StateSpace, frequency_response, lft, lowpass
-from flexplant.plant import BaseAcceleration, Poi, Ports, Sensor, StandardPlant, assemble_plant
+from flexplant.plant import (
+    BaseAcceleration,
+    Poi,
+    Ports,
+    Sensor,
+    StandardPlant,
+    assemble_plant,
+    neglected_modes,
+)
 from flexplant.plant.larger_plant import damped_less, draws_with_left_out
-from flexplant.plant.uncertainty.neglected import neglected_modes
 from flexplant.testbeds import wafer_stage
 from flexplant.updating import AddedDamping, AddedMass, Eigenvalues, update
 from oracles_plant import machine, motion_row, undamped, z_row

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from flexplant import DofSet
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.identification import identify_modes, numbered, structural_modes
-from flexplant.labels import DofSet
 from flexplant.lti import Frf, frequency_response
 from flexplant.modes import solve_modes
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from flexplant import plot
+from flexplant import DofSet, plot
 from flexplant.errors import ModelError
-from flexplant.labels import DofSet
-from flexplant.updating import AddedMass
-from flexplant.updating.judgement.localise import Localisation
+from flexplant.updating import AddedMass, Localisation
 
 
 @pytest.fixture

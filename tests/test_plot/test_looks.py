@@ -10,7 +10,8 @@ import flexplant as fx
 from flexplant.checks import in_unit
 from flexplant.errors import ModelError
 from flexplant.lti import inverse_sensitivity, tf
-from flexplant.plot._axes import CYCLE, STYLES, styles
+from flexplant.plot import CYCLE, STYLES
+from flexplant.plot._axes import styles
 from stages import reduced, sampled
 
 PLANT = tf([1.0], [1.0, 1.0, 0.0])

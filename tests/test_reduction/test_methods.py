@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 import oracles_reduction as oracle
 import oracles_structure
+from flexplant import DofSet
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
-from flexplant.labels import DofSet
 from flexplant.lti import frequency_response
 from flexplant.modes import solve_modes
 from flexplant.plant import assemble_plant, decouple

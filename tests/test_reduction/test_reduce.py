@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 import oracles_structure as oracle
+from flexplant import DofSet, load
 from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.labels import DofSet
 from flexplant.modes import solve_modes
 from flexplant.reduction import DesiredDofs, ReducedModel, reduce, select_dofs
-from flexplant.store import load
 from flexplant.structure import FEModel, ModalDamping
 from plates import make_plate
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from flexplant import load
 from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import design_kalman, design_static
 from flexplant.loop import close_loop
 from flexplant.lti import StateSpace
 from flexplant.simulation import compare_estimators, reading_along, simulate
-from flexplant.store import load
 from flexplant.synthesis import design_servo
 from stages import reduced, sampled
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import oracles_loop as oracle
+from flexplant import load
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.simulation import Response
-from flexplant.store import load
 
 
 def response(signal, dt=1e-3):

@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import oracles_loop as oracle
+from flexplant import load
 from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.loop import close_loop
 from flexplant.lti import StateSpace
 from flexplant.plant import Foreign, StandardPlant, Weighted
 from flexplant.simulation import Quantiser, setpoint, simulate
 from flexplant.simulation import simulate as simulate_function
-from flexplant.store import load
 from machines import RATE, block, matrices, observer, servo, stage
 
 

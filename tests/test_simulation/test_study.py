@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import flexplant as fx
+from flexplant import load
 from flexplant.errors import FlexplantError, FlexplantWarning, LabelError, ModelError, SolverError
 from flexplant.simulation import StudyTable, study
-from flexplant.store import load
 
 
 def drawn(machine, generator):

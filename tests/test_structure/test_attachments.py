@@ -7,10 +7,9 @@ import pytest
 import scipy.linalg as la
 
 import oracles_structure as oracle
+from flexplant import DofSet, load
 from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.labels import DofSet
 from flexplant.modes import solve_modes
-from flexplant.store import load
 from flexplant.structure import (
     Damper,
     FEModel,

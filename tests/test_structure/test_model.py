@@ -7,10 +7,9 @@ import pytest
 import scipy.sparse as sp
 
 import oracles_structure as oracle
+from flexplant import DofSet, load
 from flexplant.errors import ModelError, ShapeError, SolverError
-from flexplant.labels import DofSet
 from flexplant.sparse.factor import is_positive_definite, negative_pivots, symmetric_lu
-from flexplant.store import load
 from flexplant.structure import FEModel, ModalDamping, Rayleigh
 from flexplant.structure.rigid import orthonormalised
 from plates import make_plate

@@ -8,8 +8,7 @@ from scipy.signal import freqz_sos, sosfilt
 
 import flexplant as fx
 from flexplant.errors import AssumptionError, CertificateError, ModelError
-from flexplant.lti import StateSpace, frequency_response, lft, minimal, tustin
-from flexplant.lti.discretisation import discretized
+from flexplant.lti import StateSpace, discretized, frequency_response, lft, minimal, tustin
 from flexplant.synthesis import (
     anti_windup_form,
     design_ncf,

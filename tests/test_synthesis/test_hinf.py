@@ -7,6 +7,7 @@ import control
 import numpy as np
 import pytest
 
+from flexplant import load
 from flexplant.errors import (
     AssumptionError,
     CertificateError,
@@ -18,7 +19,6 @@ from flexplant.errors import (
 from flexplant.loop import close_loop
 from flexplant.lti import StateSpace, hinf_norm, lft
 from flexplant.plant import Sensor, StandardPlant, assemble_plant, reference_errors, stage_weights
-from flexplant.store import load
 from flexplant.synthesis import Riccati, design_hinf
 from flexplant.synthesis.controller import certified_norm
 from flexplant.testbeds import wafer_stage

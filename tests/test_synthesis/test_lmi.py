@@ -9,21 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flexplant import load
 from flexplant.errors import CertificateError, InfeasibleError, ModelError, SolverError
 from flexplant.lti import StateSpace, lft
 from flexplant.lti.preparation import prepared
-from flexplant.store import load
+from flexplant.synthesis import Lmi, Riccati, design_hinf
 from flexplant.synthesis.controller import certified_norm
-from flexplant.synthesis.hinf.hinf_design import design_hinf
-from flexplant.synthesis.hinf.hinf_riccati import Riccati
 from flexplant.synthesis.lmi import lmi_programs as lmi_programs
-from flexplant.synthesis.lmi.lmi_programs import (
-    Lmi,
-    Plant,
-    dual_bound,
-    smallest_gamma,
-    symmetric_blocks,
-)
+from flexplant.synthesis.lmi.lmi_programs import Plant, dual_bound, smallest_gamma, symmetric_blocks
 from oracles_lmi import closed_loop, output_feedback_gamma, state_feedback_gamma, swept_norm
 from shared_data import DATA
 

@@ -6,9 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from flexplant import DofSet, load
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.estimation import design_static
-from flexplant.labels import DofSet
 from flexplant.loop import SpillOver, close_loop
 from flexplant.loop.other_machines import growing_modes
 from flexplant.modes import solve_modes
@@ -24,7 +24,6 @@ from flexplant.plant import (
     stage_weights,
 )
 from flexplant.reduction import DesiredDofs, reduce
-from flexplant.store import load
 from flexplant.structure import FEModel, ModalDamping
 from flexplant.synthesis import Lmi, Riccati, design_hinf, design_servo
 from flexplant.synthesis.controller import checked_loop

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flexplant.labels import DofSet
+from flexplant import DofSet
 from flexplant.modes import solve_modes
 from flexplant.reduction import DesiredDofs, ReducedModel, reduce
 from flexplant.structure import FEModel, ModalDamping

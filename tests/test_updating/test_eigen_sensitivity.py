@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import oracles_updating as oracle
+from flexplant import DofSet
 from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.labels import DofSet
 from flexplant.structure import FEModel
 from flexplant.updating import AddedDamping, AddedMass, AddedStiffness, eigenvalue_sensitivities
 

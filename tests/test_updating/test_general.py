@@ -5,10 +5,10 @@ import pytest
 
 import flexplant as fx
 import oracles_updating as oracle
+from flexplant import load
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
 from flexplant.lti import Frf
-from flexplant.store import load
 from flexplant.updating import (
     AddedDamping,
     AddedMass,

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import oracles_updating as oracle
+from flexplant import DofSet
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
-from flexplant.labels import DofSet
 from flexplant.lti import Frf
 from flexplant.reduction import ReducedModel
 from flexplant.updating import (

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from flexplant import load
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
-from flexplant.store import load
 from flexplant.updating import AddedMass, AddedStiffness, ModeShapes, ShapeCorrelation, update
 from flexplant.updating.search import Objective
 

@@ -5,8 +5,8 @@ import pytest
 import scipy.sparse as sp
 
 import flexplant as fx
+from flexplant import load
 from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.store import load
 from flexplant.updating import AddedDamping, AddedMass, AddedStiffness
 
 KINDS = [(AddedMass, 0, "kg"), (AddedDamping, 1, "N s/m"), (AddedStiffness, 2, "N/m")]

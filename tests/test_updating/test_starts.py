@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
+from flexplant import DofSet
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, SolverError
 from flexplant.identification import MeasuredModes
-from flexplant.labels import DofSet
 from flexplant.structure import FEModel
 from flexplant.updating import (
     AddedDamping,

@@ -5,9 +5,9 @@ import pytest
 import scipy.sparse as sp
 
 import oracles_updating as oracle
+from flexplant import load
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError, SolverError
 from flexplant.identification import MeasuredModes
-from flexplant.store import load
 from flexplant.updating import (
     AddedDamping,
     AddedMass,

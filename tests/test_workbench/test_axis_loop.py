@@ -5,8 +5,9 @@ import pytest
 
 import flexplant as fx
 from bench_plants import RATE, closed_poles, coupled, design, law, light, lines, measured
+from flexplant.workbench import LoopLimits
 from flexplant.workbench.evaluation import BenchMachine, Evaluator, coupling
-from flexplant.workbench.verdict import LoopLimits, of_fleet, stability_verdict
+from flexplant.workbench.verdict import of_fleet, stability_verdict
 
 SAMPLED = {"rate": RATE, "hold": False}
 

@@ -24,11 +24,10 @@ from bench_plants import (
     measured,
 )
 from flexplant.synthesis import FixedBlock, LoopDesign, ShapedAxis
-from flexplant.workbench import side
+from flexplant.workbench import open_file, side
 from flexplant.workbench.consequences import step_of_lines, step_of_model
 from flexplant.workbench.controls import fields_of, parsed
 from flexplant.workbench.evaluation import BenchMachine, Evaluator
-from flexplant.workbench.launch import open_file
 from flexplant.workbench.page import Page
 
 pytest.importorskip("panel")
