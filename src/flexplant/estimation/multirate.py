@@ -224,7 +224,7 @@ def design_multirate(
         raise CertificateError(
             f"one period of the recursion changes the variances by {difference:.1e} (allowed "
             f"{AGREEMENT:.0e}), spectral radius {radius:.9f}. The filter cannot be trusted. Choose "
-            "a shorter period."
+            "a shorter period; sensors that are far better than their data sheet do this too."
         )
     return PeriodicEstimator(
         plant,

@@ -17,7 +17,7 @@ from .blocks import references
 from .broken import BrokenLoop, inverted
 from .closed import ClosedLoop
 from .measured_loop import NyquistCount, nyquist_count
-from .sensitivity import Loop, first_above, taken_apart
+from .sensitivity import Loop, first_crossing, taken_apart
 
 #: a pole of the controller this near to zero frequency integrates
 _INTEGRATES = 1e-9
@@ -467,7 +467,7 @@ def compare_loops(
         name: error_sensitivity(loop, *pair) if pair and loop.is_stable else None
         for name, loop in loops.items()
     }
-    reached = {name: _bandwidth(curve) for name, curve in curves.items()}
+    reached = {name: _bandwidth(loops[name], pair, curve) for name, curve in curves.items()}
     known = [value for value in reached.values() if np.isfinite(value)]
     low_freq = LOW * max(known, default=np.nan)
     rows = {
@@ -520,18 +520,15 @@ def axis_sensitivities(loop: ClosedLoop) -> dict[str, tuple[FloatArray, FloatArr
     }
 
 
-def _bandwidth(curve: tuple[FloatArray, FloatArray] | None) -> float:
-    """Return where |S| first crosses 1 from below, between two points of the grid by logarithms."""
+def _bandwidth(
+    loop: ClosedLoop, pair: tuple[str, ...], curve: tuple[FloatArray, FloatArray] | None
+) -> float:
+    """Return where |S| first crosses 1 from below; 0 where it is nowhere below."""
     if curve is None:
         return float("nan")
-    freq, size = curve
-    if not np.any(size < 1.0):
-        return 0.0
-    right = first_above(size)
-    if right is None:
-        return float("inf")
-    pair = slice(right - 1, right + 1)
-    return float(np.exp(np.interp(0.0, np.log(size[pair]), np.log(freq[pair]))))
+    gain = loop.gain(*pair)
+    below = np.any(curve[1] < 1.0)
+    return first_crossing(*curve, lambda freq: np.abs(gain(freq)[0, 0])) if below else 0.0
 
 
 def _figures(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -390,23 +391,25 @@ def broken_bandwidth(parts: BrokenLoop) -> float:
             f"|S| is nowhere below 0 dB (least {values.min():.4g}): this feedback suppresses "
             "nothing, so it has no bandwidth. Check the sign of the controller, u = K y."
         )
-    right = first_above(values)
-    if right is None:
-        return float("inf")
-    if parts.measured is not None:
-        return float(grid[right])
-    pair = slice(right - 1, right + 1)
-
-    def above(freq: FloatArray) -> FloatArray:
-        return _sensitivity_along(acting, parts, freq) - 1.0
-
-    return float(next(iter(crossings(above, grid[pair], values[pair] - 1.0)), grid[right]))
+    find = None if parts.measured is not None else partial(_sensitivity_along, acting, parts)
+    return first_crossing(grid, values, find)
 
 
-def first_above(size: FloatArray) -> int | None:
-    """Return where a size that was below 1 first is not, or None."""
+def first_crossing(
+    freq: FloatArray, size: FloatArray, find: Callable[[FloatArray], FloatArray] | None
+) -> float:
+    """Return where a size first rises to 1 from below [Hz], infinite where it stays below.
+
+    Between two points where it can be found there.
+    """
     beyond = np.flatnonzero((size >= 1.0) & np.logical_or.accumulate(size < 1.0))
-    return int(beyond[0]) if beyond.size else None
+    if not beyond.size:
+        return float("inf")
+    pair, found = slice(beyond[0] - 1, beyond[0] + 1), freq[beyond[:1]]
+    if find is not None:
+        between = crossings(lambda f: find(f) - 1.0, freq[pair], size[pair] - 1.0)
+        found = np.append(between, found)
+    return float(found[0])
 
 
 def _sensitivity_along(acting: ComplexArray, parts: BrokenLoop, grid: FloatArray) -> FloatArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.linalg as la
 
@@ -55,6 +57,15 @@ def balanced_matrix(A: FloatArray) -> FloatArray:
     return np.asarray(la.lapack.dgebal(A, scale=1, permute=0)[0])
 
 
+def axis_frequencies(hamiltonian: FloatArray | ComplexArray) -> FloatArray:
+    """Return the imaginary parts of the eigenvalues that lie, or nearly lie, on the axis."""
+    # those that only seem to do no harm: what they stand for is computed there
+    gebal: Any = la.get_lapack_funcs("gebal", (hamiltonian,))
+    balanced = gebal(hamiltonian, scale=1, permute=0)[0]
+    values: ComplexArray = np.asarray(la.eigvals(balanced), dtype=np.complex128)
+    return values.imag[np.abs(values.real) <= _NEARLY * np.linalg.norm(balanced)]
+
+
 def mean_speed(poles: ComplexArray) -> float:
     """Return the geometric mean [rad/s] of the sizes of poles, those near zero left out; 1 if none.
 
@@ -77,8 +88,9 @@ DOUBLINGS = 60
 _LAST = 1e-17
 #: a doubled Riccati equation has converged: the next term would be the square of this
 _CONVERGED, _CONVERGED_QUICKLY = 1e-15, 1e-8
-#: relative: eigenvalues of a Hamiltonian count as on the imaginary axis; Q - S R^-1 S' is rounding
-_AXIS, _CANCELLED = 1e-10, 1e-12
+#: relative: eigenvalues of a Hamiltonian count as on the imaginary axis, or may do; Q - S R^-1 S'
+#: is rounding
+_AXIS, _NEARLY, _CANCELLED = 1e-10, 1e-9, 1e-12
 #: largest residual of an equation with indefinite R: near the least gamma X grows without bound
 _OFF = 1e-6
 #: residuals that are examined: Newton's correction between them squares the error

@@ -11,7 +11,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray
 from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
-from .equations import balanced_matrix, even_scale, state_scale
+from .equations import axis_frequencies, even_scale, state_scale
 from .frequency_sweep import SOUGHT, highest, largest_gains, resonance_grid
 from .joining import bilinear_matrices
 from .lyapunov import controllability_gramian, observability_gramian
@@ -403,11 +403,7 @@ class _Level:
         mixed[np.arange(d.size), np.arange(d.size)] = d / gap_in[: d.size]
         F = A + BV @ mixed @ CU
         H = np.block([[F, (BV / gap_in) @ BV.T], [-(CU.T / gap_out) @ CU, -F.T]])
-        balanced = balanced_matrix(H)
-        values: ComplexArray = np.asarray(la.eigvals(balanced), dtype=np.complex128)
-        # eigenvalues that only seem to lie on the axis do no harm: the gain is computed there
-        near = np.abs(values.real) <= 1e-9 * np.linalg.norm(balanced)
-        swing = np.unique(np.abs(values.imag[near]))
+        swing = np.unique(np.abs(axis_frequencies(H)))
         if self.dt:
             return np.asarray(np.arctan(swing) / (np.pi * self.dt))
         return np.asarray(swing / (2 * np.pi))

@@ -15,6 +15,7 @@ import scipy.linalg as la
 
 from ..checks import FloatArray, IntArray, Value
 from ..errors import SolverError, attempted
+from ..estimation.filter_model import weigh
 from ..lti.equations import doubled, doubled_riccati, relative
 from ..lti.lyapunov import square_root
 from ..lti.riccati import control_dare, riccati_root
@@ -493,11 +494,7 @@ def measured(X: FloatArray, g: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _update_gain(X: FloatArray, g: FloatArray) -> FloatArray:
     """Return K with ``X+ = (I - K g) X``."""
     seen = X @ g.T
-    inner = g @ seen
-    inner.flat[:: inner.shape[0] + 1] += 1.0
-    size = np.sqrt(inner.diagonal())
-    unit = inner / size / size[:, None]
-    return np.asarray(np.linalg.solve(unit, (seen / size).T).T / size)
+    return weigh(seen, g @ seen + np.eye(len(g)))
 
 
 def _quotients(S: FloatArray, X: FloatArray, g: FloatArray) -> FloatArray:

@@ -13,12 +13,11 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg as la
 
 from ...checks import ComplexArray, FloatArray, Value, generator
 from ...errors import AssumptionError, ModelError, SolverError
 from ...lti.discretisation import bilinear, image_freq
-from ...lti.equations import state_scale
+from ...lti.equations import axis_frequencies, state_scale
 from ...lti.norms import obstacle
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace, System, as_statespace
@@ -50,8 +49,6 @@ _INTERVALS, _LARGE = 3000, 260
 #: sampling within an interval, in half widths of the resonances, and for the rest of it
 _BESIDE = np.array([0.0, 0.15, 0.4, 0.8, 1.5, 3.0, 6.0])
 _POINTS = 24
-#: an eigenvalue this close to the axis, relative to the Hamiltonian, counts as lying on it
-_ON_AXIS = 1e-9
 #: growth of the heights over an interval that is tried at once, the last if need be
 _GROWTH = (3.0, 1.3, 1.03)
 
@@ -436,8 +433,5 @@ class Cover:
         RY, RB = (np.linalg.solve(R, part) for part in (Y.conj().T, B.T))
         F = A - B @ RY
         H = np.block([[F, -B @ RB], [-Q + Y @ RY, -F.conj().T]])
-        balanced: Any = la.matrix_balance(H, permute=False)[0]
-        values = la.eigvals(balanced)
-        near = np.abs(values.real) <= _ON_AXIS * np.linalg.norm(balanced)
-        swing = values.imag[near]
-        return np.sort(np.asarray(swing[swing > 0], dtype=np.float64))
+        swing = axis_frequencies(H)
+        return np.sort(swing[swing > 0])
