@@ -13,7 +13,7 @@ from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..parallel import one_thread
 from .equations import scaled_schur, state_scale
-from .joining import diagonal_blocks, is_block_diagonal, pair_eigenvalues
+from .joining import diagonal_blocks, is_block_diagonal
 from .statespace import StateSpace
 
 #: so many complex numbers are less than 128 kB
@@ -109,30 +109,28 @@ def _solver(g: Part) -> tuple[Solver, int, int]:
 
     The arrays of a part of a short grid are below 128 kB: no memory is fetched from the system.
     """
+    n, m = g.B.shape
     if g.blocks is None or not set(g.blocks) <= {1, 2}:
         return dense_solver(g)
-    n, m = g.B.shape
-    pairs, slots, coupling = _diagonal_blocks(g)
-    tied = np.flatnonzero(np.any(coupling, axis=0))
-    head = int(slots[np.isin(slots, tied).any(axis=1), 0].min(initial=n))  # before: decoupled
-    modal = max(MODAL_CHUNK, 64 * n), PARTS
-    if head == n:
-        return _modal(g, pairs, slots), *modal
-    if head and 4 * (n - head) <= n:
-        cut = int(np.searchsorted(slots[:, 0], head))
-        return _fed_by_lines(g, head, pairs[:cut], slots[:cut]), *modal
-    return _substitution(g, pairs, slots, coupling), CHUNK // (m + 2), 1
+    first, end = _uncoupled(g.A, np.asarray(g.blocks))
+    sizes = max(MODAL_CHUNK, 64 * n), PARTS
+    if end - first == n:
+        return _modal(g), *sizes
+    if 2 * (end - first) < n:
+        return dense_solver(g)
+    return _among_others(g, first, end), CHUNK // (m + 2), PARTS
 
 
-def _diagonal_blocks(g: StateSpace | Part) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Return the diagonal blocks as (b, 2, 2), the states of each (b, 2; -1 none), and the rest."""
-    pairs, slots = diagonal_blocks(g.A, g.blocks or ())
-    real, coupling = slots >= 0, g.A.copy()
-    for i in (0, 1):
-        for j in (0, 1):
-            both = real[:, i] & real[:, j]
-            coupling[slots[both, i], slots[both, j]] = 0.0
-    return pairs, slots, coupling
+def _uncoupled(A: FloatArray, blocks: IntArray) -> tuple[int, int]:
+    """Return the first state, and that after the last, of the longest run of uncoupled blocks."""
+    ends = np.cumsum(blocks)
+    owner = np.repeat(np.arange(blocks.size), blocks)
+    rows, columns = (owner[part] for part in np.nonzero(A))
+    after = np.zeros(blocks.size, dtype=np.int64)  # the block behind the last that each acts on
+    np.maximum.at(after, columns, np.where(rows < columns, rows + 1, 0))
+    first = (ends - blocks)[np.maximum.accumulate(after)]
+    longest = int(np.argmax(ends - first))
+    return int(first[longest]), int(ends[longest])
 
 
 class ModalPairs(NamedTuple):
@@ -152,11 +150,12 @@ def modal_pairs(g: StateSpace) -> ModalPairs | None:
     """Return the blocks of a block-diagonal A, None for another."""
     if not is_block_diagonal(g):
         return None
-    return _modal_pairs(g, *diagonal_blocks(g.A, g.blocks or ()))
+    return _modal_pairs(g)
 
 
-def _modal_pairs(g: StateSpace | Part, pairs: FloatArray, slots: IntArray) -> ModalPairs:
-    real, pairs = slots >= 0, pairs.copy()
+def _modal_pairs(g: StateSpace | Part) -> ModalPairs:
+    pairs, slots = diagonal_blocks(g.A, g.blocks or ())
+    real = slots >= 0
     pairs[~real[:, 1], 1, 1] = pairs[~real[:, 1], 0, 0]
     mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
     N = pairs.copy()
@@ -167,12 +166,12 @@ def _modal_pairs(g: StateSpace | Part, pairs: FloatArray, slots: IntArray) -> Mo
     return ModalPairs(mean, N, q, g.B[slots] * real[:, :, None], C)
 
 
-def _modal(g: Part, pairs: FloatArray, slots: IntArray) -> Solver:
+def _modal(g: Part) -> Solver:
     """Block-diagonal A: one real matrix product of residues and scalar functions of frequency."""
     # `(s I - A)^-1 = ((s - m) I + N) / ((s - m)^2 - q)` of each block: no cancellation near s = m,
     # which matters for slow modes of a sampled system. Complex numbers are pairs of real columns,
     # so that no complex product is formed
-    mean, N, q, B, C = _modal_pairs(g, pairs, slots)
+    mean, N, q, B, C = _modal_pairs(g)
     split, swing = np.sqrt(np.maximum(q, 0.0)), np.sqrt(np.maximum(-q, 0.0))
     channels = len(g.C) * g.B.shape[1]
     with_s = np.einsum("bip,bim->pmb", C, B).reshape(channels, -1)
@@ -216,91 +215,40 @@ def _nonzero_columns(residues: FloatArray) -> npt.NDArray[np.bool_] | slice:
     return slice(None) if some.all() else some
 
 
-def _fed_by_lines(g: Part, head: int, pairs: FloatArray, slots: IntArray) -> Solver:
-    """Modes, the first states, fed by a few further ones, such as a sampled plant's delay lines."""
-    # with A = [[A_h, A_ht], [0, A_t]] and A_h block diagonal, the tail's response X_t is cheap and
-    # sparse (a line belongs to one input), and the head is again one matrix product: that of the
-    # inputs [B_h, A_ht], of B_h those that do not wait in a line alone
-    n, m = g.B.shape
-    direct = np.flatnonzero(np.any(g.B[:head], axis=0))
-    feeding = np.flatnonzero(np.any(g.A[:head, head:], axis=0))
-    inputs = np.hstack([g.B[:head, direct], g.A[:head, head + feeding]])
-    driven = _modal(Part(g.A[:head, :head], inputs, g.C[:, :head], g.dt), pairs, slots)
-    rest = list(g.blocks or ())[len(slots) :]
-    lines = Part(g.A[head:, head:], g.B[head:], np.eye(n - head), g.dt, rest)
-    tail, reached = _substitution(lines, *_diagonal_blocks(lines)), _reachable(lines.A, lines.B)
-    seen = np.flatnonzero(np.any(g.C[:, head:], axis=0))
+def _among_others(g: Part, first: int, end: int) -> Solver:
+    """Modes, the states from `first` to `end`, between others that see them and that drive them."""
+    # with A = [[A_h, A_hm, A_ht], [0, A_m, A_mt], [0, 0, A_t]], head (filters of sensors, weights
+    # of z) and tail (those of amplifiers, delay lines) are solved for all their states, and the
+    # modes are one matrix product again, from [B_m, A_mt] to [C_m; A_hm]. Most filters and lines
+    # belong to one channel: products of zeros are left out
+    p, (n, m) = len(g.C), g.B.shape
+    h, own, t = slice(0, first), slice(first, end), slice(end, n)
+    inputs = np.hstack([g.B[own], g.A[own, t]])
+    used = np.flatnonzero(inputs.any(axis=0))
+    ends = np.cumsum(g.blocks)
+    blocks = np.asarray(g.blocks)[(ends > first) & (ends <= end)].tolist()
+    outputs = np.vstack([g.C[:, own], g.A[h, own]])
+    modes = _modal(Part(g.A[own, own], inputs[:, used], outputs, g.dt, blocks))
+    head, *_ = dense_solver(Part(g.A[h, h], np.eye(first), g.C[:, h], g.dt))
+    tail, *_ = dense_solver(Part(g.A[t, t], g.B[t], np.eye(n - end), g.dt))
+    beside = np.block([[np.zeros((p, m)), g.C[:, t]], [g.B[h], g.A[h, t]]])
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
-        X = np.zeros((n - head, m, s.size), dtype=np.complex128)
-        tail(s, X)
-        both = np.zeros((len(out), inputs.shape[1], s.size), dtype=np.complex128)
-        driven(s, both)
-        out[:, direct] += both[:, : direct.size]
-        for i, line in enumerate(feeding, direct.size):
-            for j in np.flatnonzero(reached[line]):
-                out[:, j] += both[:, i] * X[line, j]
-        for line in seen:
-            for j in np.flatnonzero(reached[line]):
-                out[:, j] += g.C[:, head + line, None] * X[line, j]
-        return False
-
-    return add
-
-
-def _reachable(A: FloatArray, B: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which states (n, m) each input can move at all."""
-    now = B != 0
-    for _ in range(A.shape[0]):
-        now = now | ((A != 0).astype(float) @ now.astype(float) > 0)
-    return np.asarray(now)
-
-
-def _substitution(g: Part, pairs: FloatArray, slots: IntArray, coupling: FloatArray) -> Solver:
-    """Block upper triangular A: all blocks of one level (no coupling among them) at once."""
-    real = slots >= 0
-    a, b, c, d = (pairs[:, i, j].copy() for i in (0, 1) for j in (0, 1))
-    # a 1 x 1 block gets a partner that nothing drives, with a pole at no frequency of interest
-    d[~real[:, 1]] = 0.0 if g.dt else -1.0
-    first, second = pair_eigenvalues(a, b, c, d)
-    n, m = g.B.shape
-    owner = np.empty(n, dtype=np.int64)
-    for i in (0, 1):
-        owner[slots[real[:, i], i]] = np.flatnonzero(real[:, i])
-    level = np.zeros(len(a), dtype=np.int64)
-    for i in range(len(a) - 2, -1, -1):
-        used = np.flatnonzero(coupling[slots[i][real[i]]].any(axis=0))
-        level[i] = 1 + level[owner[used]].max() if used.size else 0
-
-    steps = []
-    for rank in range(int(level.max(initial=0)) + 1):
-        blocks = np.flatnonzero(level == rank)
-        rows, sides = slots[blocks], []
-        for i in (0, 1):
-            there = real[blocks, i]
-            into = rows[there, i]
-            used = np.flatnonzero(coupling[into].any(axis=0))
-            sides.append((i, there, g.B[into][:, :, None], used, coupling[np.ix_(into, used)]))
-        steps.append((blocks, rows, sides[: 1 + real[blocks, 1].any()]))
-
-    def add(s: ComplexArray, out: ComplexArray) -> bool:
-        X = np.zeros((n + 1, m, s.size), dtype=np.complex128)  # the last row takes padding
-        for blocks, rows, sides in steps:
-            right = np.zeros((len(blocks), len(sides), m, s.size), dtype=np.complex128)
-            for i, there, driven, used, tie in sides:
-                right[there, i] = driven
-                if used.size:
-                    known = tie @ X[used].reshape(used.size, -1)
-                    right[there, i] += known.reshape(-1, m, s.size)
-            if len(sides) == 1:
-                X[rows[:, 0]] = right[:, 0] / (s - a[blocks, None])[:, None]
-                continue
-            x1, x2 = right[:, 0], right[:, 1]
-            inverse = 1.0 / ((s - first[blocks, None]) * (s - second[blocks, None]))
-            ab, bb, cb, db = (v[blocks, None, None] for v in (a, b, c, d))
-            X[rows[:, 0]] = ((s - db) * x1 + bb * x2) * inverse[:, None]
-            X[rows[:, 1]] = (cb * x1 + (s - ab) * x2) * inverse[:, None]
-        out += (g.C @ X[:n].reshape(n, -1)).reshape(out.shape)
+        gain = np.repeat(beside[:, :, None], s.size, axis=2).astype(np.complex128)
+        shown, known, both = (
+            np.zeros((*size, s.size), dtype=np.complex128)
+            for size in ((p, first), (n - end, m), (p + first, used.size))
+        )
+        head(s, shown)
+        tail(s, known)
+        modes(s, both)
+        gain[:, used] += both
+        found, through = gain[:, :m], gain[:, m:]
+        for line, j in np.argwhere(known.any(axis=2)):
+            found[:, j] += through[:, line] * known[line, j]
+        out += found[:p]
+        for i, state in np.argwhere(shown.any(axis=2)):
+            out[i] += shown[i, state] * found[p + state]
         return False
 
     return add
