@@ -4,8 +4,8 @@ import time
 
 import numpy as np
 
-from flexplant.lti import StateSpace, discretized
-from flexplant.lti.discretisation import noise_factor
+from flexplant.lti import StateSpace
+from flexplant.lti.sampling import sample_and_hold
 from flexplant.plant import Foreign, StandardPlant
 
 RATE = 2000.0
@@ -40,9 +40,8 @@ def stage(*, delay=1.0, rate=RATE, asd=1e-2, sensor_asd=1e-9, stiffer=1.0, block
         outputs=["die:z", "y1", "y2"],
         blocks=[2] * omega.size if blocks else None,
     )
-    sampled = discretized(physical, rate, delay=delay, delayed=["u1", "u2"])
-    factor = noise_factor(physical, np.array([asd, 0.0, 0.0]), 1.0 / rate)
-    factor = np.vstack([factor, np.zeros((sampled.n_states - n, factor.shape[1]))])
+    late = dict.fromkeys(["u1", "u2"], delay / rate)
+    sampled, factor = sample_and_hold(physical, rate, late, asd=np.array([asd, 0.0, 0.0]))
     w = ["amp", "y1:noise", "y2:noise", "die:ref"]
     z = ["die:z", "die:error", "u1:effort", "u2:effort"]
     wide = np.zeros((sampled.n_states, 6))

@@ -18,7 +18,8 @@ from flexplant.lti import (
     series,
     tustin,
 )
-from flexplant.lti.discretisation import bilinear, held_exactly, pair_expm, pair_exponential
+from flexplant.lti.discretisation import bilinear
+from flexplant.lti.sampling import held_exactly, pair_expm, pair_exponential
 from oracles_plant import delayed_run, hold
 
 RATE = 200.0

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad_vec
 
 from flexplant.lti import StateSpace
-from flexplant.lti.discretisation import noise_factor
+from flexplant.lti.sampling import sample_and_hold
 from oracles_plant import noise_by_doubling
 
 
@@ -32,6 +32,10 @@ def covariance(g, asd, h):
 def scaled_gap(found, wanted):
     size = np.sqrt(np.outer(wanted.diagonal(), wanted.diagonal()))
     return float(np.abs((found - wanted) / size).max())
+
+
+def noise_factor(g, asd, h):
+    return sample_and_hold(g, 1.0 / h, {}, asd=asd)[1]
 
 
 MODEL = ([0.0, 30.0, 300.0, 4000.0], [0.0, 0.3, 0.01, 0.001])

@@ -8,6 +8,8 @@ from flexplant import DofSet, load
 from flexplant.errors import AssumptionError, LabelError, ModelError, ShapeError
 from flexplant.estimation import design_kalman
 from flexplant.lti import StateSpace, discretized, frequency_response, lowpass, pade, tf
+from flexplant.lti.equations import state_scale
+from flexplant.lti.sampling import Flow, held_exactly, sample_and_hold
 from flexplant.plant import (
     Actuator,
     BaseAcceleration,
@@ -22,7 +24,6 @@ from flexplant.plant import (
     stage_weights,
     suspend,
 )
-from flexplant.plant.sampling import Flow, sampled_physical
 from flexplant.structure import FEModel
 from oracles_ports import (
     chain,
@@ -181,16 +182,12 @@ def test_an_acceleration_keeps_its_direct_part_through_delays():
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
 
 
-def test_one_delay_for_all_is_that_of_discretized():
+def test_one_delay_for_all_is_that_of_the_dense_system():
     plant = assemble_plant(model(), channels(u=[Actuator("u1", at="1:x")], w=[], y=[]))
     g = plant.assembled.physical
     for delay in (0.0, 1.0, 0.25, 2.75):
-        wanted = discretized(g, 5e3, delay=delay, delayed=["u1"])
-        pairs = g.A.reshape(5, 2, 5, 2)[np.arange(5), :, np.arange(5)]
-        found, noise = sampled_physical(
-            g, 5e3, head=0, pairs=pairs, late_inputs={"u1": delay / 5e3}, late_outputs={},
-            asd=np.zeros(1),
-        )  # fmt: skip
+        wanted = held_exactly(g.replace(blocks=None), 5e3, delay=delay, delayed=["u1"])
+        found, noise = sample_and_hold(g, 5e3, {"u1": delay / 5e3})
         assert found.states == wanted.states
         for name in "ABCD":
             np.testing.assert_allclose(
@@ -201,12 +198,11 @@ def test_one_delay_for_all_is_that_of_discretized():
 
 def test_the_flow_is_the_dense_exponential():
     g = assemble_plant(model(), channels()).assembled.physical
-    pairs = g.A[2:12, 2:12].reshape(5, 2, 5, 2)[np.arange(5), :, np.arange(5)]
     for scale in (1.0, 1e7):  # units of the inputs' filters: N or 0.1 uN
         A = g.A.copy()
         A[:, 12:] *= scale
         A[12:, 12:] /= scale
-        flow = Flow(A, 2, pairs)
+        flow = Flow(A, g.blocks, state_scale(A, g.B, g.C))
         for t in (1e-5, 2e-4, 3e-3):
             wanted = la.expm(A * t)
             size = np.abs(wanted).max()

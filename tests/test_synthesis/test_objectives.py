@@ -10,7 +10,7 @@ from scipy.linalg import expm
 import flexplant as fx
 from flexplant.errors import AssumptionError, InfeasibleError, LabelError, ModelError
 from flexplant.lti import StateSpace, lft
-from flexplant.lti.discretisation import held_exactly
+from flexplant.lti.sampling import held_exactly
 from flexplant.synthesis import H2, Hinf, PeakGain, PoleRegion, design_lmi
 from flexplant.synthesis.lmi.objective_design import _balanced_plant
 from flexplant.synthesis.lmi.objectives import ObjectivePrograms, damped, within

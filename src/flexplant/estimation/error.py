@@ -37,11 +37,11 @@ from ..errors import (
 )
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import check_stationary, source_variances, sources
-from ..lti.discretisation import uncoupled_pairs
 from ..lti.equations import accumulated, scale_of, shifted_columns, stein, sylvester
 from ..lti.joining import equal_matrices
 from ..lti.lyapunov import difference_of, dual_variances, solve_stein, stein_root
 from ..lti.modal import ModalMap
+from ..lti.sampling import uncoupled_pairs
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
 from ..tolerances import SAME, TINY, divisor

@@ -25,8 +25,8 @@ import numpy as np
 
 from ..checks import BoolArray, ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
-from ..lti.discretisation import acting
 from ..lti.responses import Responder, points, responder
+from ..lti.sampling import acting
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..plant.building import sampled_motions

@@ -1,20 +1,17 @@
-"""Sampling: exact zero-order hold with any delay, Tustin, noise; a sampled system over a record."""
+"""Sampling by zero-order hold and by Tustin, judged rates; a sampled system over a record."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
-import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray, between, positive
+from ..checks import ComplexArray, FloatArray, between, positive
 from ..errors import ModelError, warn
-from ..tolerances import TINY, divisor
 from .joining import bilinear_matrices, trapezoidal
-from .lyapunov import compressed
+from .sampling import held_exactly
 from .statespace import StateSpace, System, as_statespace
 
 #: distance of a pole from where a map is singular, relative to it, that counts as none
@@ -76,174 +73,6 @@ def discretized(
         )
     check_rate(light_modes(g.poles()), rate, delay)
     return held_exactly(g, rate, delay=delay, delayed=delayed)
-
-
-def held_exactly(
-    g: StateSpace, rate: float, *, delay: float = 0.0, delayed: Iterable[str] | None = None
-) -> StateSpace:
-    """Return the zero-order-hold equivalent of a continuous system; see `discretized`."""
-    h = 1.0 / positive(rate, "rate")
-    late = g.input_index(g.inputs if delayed is None else delayed)
-    whole, fraction = divmod(positive(delay, "delay", zero=True), 1.0)
-    if not late.size:
-        whole = fraction = 0.0
-    Ad, Bd = whole_step = propagated(g, h)
-    rest = propagated(g, (1.0 - fraction) * h) if fraction else whole_step
-    held, D = Bd.copy(), g.D.copy()
-    # u[k - whole] holds for the last (1 - fraction) of the interval, its predecessor before that
-    held[:, late] = rest.integral[:, late]
-    before = rest.exponential @ propagated(g, fraction * h).integral[:, late]
-    return _with_delay_line(
-        g.replace(A=Ad, B=held, dt=h), late, int(whole), before if fraction else None, D
-    )
-
-
-def _with_delay_line(
-    g: StateSpace, late: IntArray, whole: int, before: FloatArray | None, D: FloatArray
-) -> StateSpace:
-    """Route the late inputs through unit delays: the newest last, so A stays upper triangular."""
-    length = whole + (before is not None)
-    if not length:
-        return g
-    n, m = g.n_states, late.size
-    A = np.zeros((n + m * length,) * 2)
-    B = np.zeros((n + m * length, len(g.inputs)))
-    C = np.hstack([g.C, np.zeros((len(g.outputs), m * length))])
-    A[:n, :n], B[:n] = g.A, g.B
-    D = D.copy()
-
-    def slot(age: int) -> slice:  # states that hold u[k - age]
-        return slice(n + m * (length - age), n + m * (length - age + 1))
-
-    if whole:  # the input acts from the line, not at once
-        A[:n, slot(whole)] = g.B[:, late]
-        B[:n, late] = 0.0
-    if before is not None:
-        A[:n, slot(length)] = before
-    C[:, slot(length)] = D[:, late]
-    D[:, late] = 0.0
-    for age in range(2, length + 1):
-        A[slot(age), slot(age - 1)] = np.eye(m)
-    B[slot(1), late] = np.eye(m)
-    names = [f"{g.inputs[i]}:delay{age}" for age in range(length, 0, -1) for i in late]
-    blocks = None if g.blocks is None else [*g.blocks, *[1] * (m * length)]
-    return g.replace(A=A, B=B, C=C, D=D, states=[*g.states, *names], blocks=blocks)
-
-
-class Propagated(NamedTuple):
-    """``e^(A h)`` and ``int_0^h e^(A s) ds B``."""
-
-    exponential: FloatArray
-    integral: FloatArray
-
-
-def propagated(g: StateSpace, h: float) -> Propagated:
-    """Return ``e^(A h)`` (n, n) and ``int_0^h e^(A s) ds B`` (n, m)."""
-    n = g.n_states
-    if not n or not h:
-        return Propagated(np.eye(n), np.zeros_like(g.B))
-    pairs = diagonal_pairs(g)
-    if pairs is None:
-        augmented = np.zeros((n + g.B.shape[1],) * 2)
-        augmented[:n, :n], augmented[:n, n:] = g.A * h, g.B * h
-        # rounding of expm would leave entries below the blocks of a series of systems
-        exponential = np.where(acting(augmented != 0), la.expm(augmented), 0.0)
-        return Propagated(exponential[:n, :n], exponential[:n, n:])
-    E, integral = pair_exponential(pairs, h)
-    driven = np.einsum("bij,bjm->bim", integral, g.B.reshape(len(integral), 2, g.B.shape[1]))
-    return Propagated(block_diagonal(E), driven.reshape(g.B.shape))
-
-
-def acting(direct: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Return which states (n, n) act on which in the end: where an exponential may be non-zero."""
-    reached = direct | np.eye(direct.shape[0], dtype=bool)
-    while True:
-        wider = (reached.astype(np.float32) @ reached.astype(np.float32)) > 0
-        if np.array_equal(wider, reached):
-            return reached
-        reached = wider
-
-
-def diagonal_pairs(g: StateSpace) -> FloatArray | None:
-    """Return the diagonal blocks of a system that is known to be made of pairs alone, or None."""
-    if g.blocks is None or set(g.blocks) - {2}:
-        return None
-    return uncoupled_pairs(g.A)
-
-
-def uncoupled_pairs(A: FloatArray) -> FloatArray | None:
-    """Return the (n/2, 2, 2) diagonal blocks of A, or None when A is not made of those alone."""
-    b, odd = divmod(len(A), 2)
-    if odd:
-        return None
-    pairs = A.reshape(b, 2, b, 2)[np.arange(b), :, np.arange(b), :]
-    return pairs if np.count_nonzero(A) == np.count_nonzero(pairs) else None
-
-
-def block_diagonal(pairs: FloatArray) -> FloatArray:
-    """Return the (2 b, 2 b) matrix with the (b, 2, 2) blocks on its diagonal."""
-    b = pairs.shape[0]
-    matrix = np.zeros((b, 2, b, 2))
-    matrix[np.arange(b), :, np.arange(b), :] = pairs
-    return matrix.reshape(2 * b, 2 * b)
-
-
-def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
-    """Return ``e^(A h)`` and ``int_0^h e^(A s) ds`` of (b, 2, 2) blocks, both (b, 2, 2)."""
-    # with m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so
-    # `e^(A h) = e^(m h) (cosh(r h) I + sinh(r h) / r N)`, r^2 = q: trigonometric for an oscillating
-    # pair, linear in h for a rigid-body pair. The integral is a Taylor series on h / 2^s, doubled
-    # by `I(2 t) = I(t) + e^(A t) I(t)`: no division by small frequencies. There both states of a
-    # pair have units in which they are of one size, so that s is small
-    given, pairs, units = pairs, pairs.copy(), _even_units(pairs)
-    pairs[:, 0, 1] /= units
-    pairs[:, 1, 0] *= units
-    size = float(np.max(np.abs(pairs).sum(axis=2))) * h
-    doublings = max(0, int(np.ceil(np.log2(max(size, TINY) / 0.5))))
-    t = h / 2**doublings
-    identity = np.broadcast_to(np.eye(2), pairs.shape)
-    term = identity * t
-    integral = term.copy()
-    for k in range(2, 18):
-        term = pairs @ term * (t / k)
-        integral = integral + term
-    for k in range(doublings):
-        integral = integral + pair_expm(pairs, t * 2**k) @ integral
-    integral[:, 0, 1] *= units
-    integral[:, 1, 0] /= units
-    return pair_expm(given, h), integral
-
-
-def _even_units(pairs: FloatArray) -> FloatArray:
-    """Return the unit (b,) of each first state, a power of two, that makes a pair symmetric."""
-    ahead, back = np.abs(pairs[:, 0, 1]), np.abs(pairs[:, 1, 0])
-    both = (ahead > 0) & (back > 0)
-    gap = np.log2(np.where(both, ahead, 1.0)) - np.log2(np.where(both, back, 1.0))
-    return np.asarray(np.exp2(np.round(0.5 * gap)))
-
-
-def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
-    """Return ``e^(A h)`` of (b, 2, 2) blocks in closed form."""
-    # an overdamped pair has poles m +- r whose exponentials are formed each by itself: cosh(r h) of
-    # its own overflows long before the decay e^(m h) that tames it. The smaller of the two poles is
-    # the determinant over the larger, which keeps the digits that m +- r would cancel
-    mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
-    N = pairs - mean[:, None, None] * np.eye(2)
-    q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
-    root = np.sqrt(np.abs(q))
-    safe = divisor(root)
-    swing = q < 0
-    determinant = pairs[:, 0, 0] * pairs[:, 1, 1] - pairs[:, 0, 1] * pairs[:, 1, 0]
-    large = mean + np.where(mean > 0, root, -root)
-    small = np.where(large != 0, determinant / np.where(large != 0, large, 1.0), 0.0)
-    upper, lower = np.maximum(large, small), np.minimum(large, small)
-    turning, decay = np.where(swing, root * h, 0.0), np.where(swing, mean * h, upper * h)
-    decay = np.exp(decay)
-    apart = np.where(swing, 0.0, root * h)
-    even = np.where(swing, decay * np.cos(turning), 0.5 * (decay + np.exp(lower * h)))
-    odd = np.where(swing, np.sin(turning), -0.5 * np.expm1(-2.0 * apart)) / safe
-    odd = decay * np.where(root > 0, odd, h)
-    return np.asarray(even[:, None, None] * np.eye(2) + odd[:, None, None] * N)
 
 
 def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSpace:
@@ -377,52 +206,6 @@ def light_modes(poles: ComplexArray) -> FloatArray:
     """Return the frequencies [Hz] of the lightly damped pairs among continuous poles [rad/s]."""
     size = np.abs(poles)
     return np.asarray(size[(poles.imag > 0) & (-poles.real < _LIGHT * size)] / (2.0 * np.pi))
-
-
-#: nodes that integrate ``e^(A s) B B' e^(A' s)`` to rounding over a piece of |A| s <= 1
-_NODES = 10
-
-
-def accumulated_noise(
-    at: Callable[[float], FloatArray], force: FloatArray, time: float, rate: float
-) -> FloatArray:
-    """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``."""
-    # Gauss-Legendre quadrature. Over the whole interval where as many nodes as make it exact to
-    # rounding give less than n columns, as for a large structure with few forces. Else over a piece
-    # so short that ten nodes are exact, then `G(2 t) = [G(t), e^(A t) G(t)]`: log2(time rate)
-    # steps, however fast the modes are. Sums of squares, so that G G' is positive semidefinite in
-    # any units; the block exponential of [VanLoan1978]_ was seen to lose that on large models
-    n, m = force.shape
-    # the error is a Bessel function of order 2 count and argument |A| time: nothing beyond there
-    size = min(rate * time, 2.0 * n)
-    count, doublings = _NODES + int(np.ceil(0.5 * size + 4.0 * np.cbrt(size))), 0
-    if count * m >= n:
-        count, doublings = _NODES, max(0, int(np.ceil(np.log2(max(rate * time, TINY)))))
-    piece = time / 2**doublings
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    parts = [
-        np.sqrt(0.5 * piece * weight) * (at(0.5 * piece * (node + 1.0)) @ force)
-        for node, weight in zip(nodes, weights, strict=True)
-    ]
-    G = compressed(np.hstack(parts))
-    for k in range(doublings):
-        G = compressed(np.hstack([G, at(piece * 2**k) @ G]))
-    return G
-
-
-def noise_factor(g: StateSpace, asd: FloatArray, h: float) -> FloatArray:
-    """Return G with ``G G' = int_0^h e^(A s) B S B' e^(A' s) ds``, S = diag(asd^2 / 2)."""
-    n = g.n_states
-    active = np.flatnonzero(asd)
-    if not n or not active.size:
-        return np.zeros((n, 0))
-    B = g.B[:, active] * (np.asarray(asd)[active] / np.sqrt(2.0))
-    pairs = diagonal_pairs(g)
-    if pairs is None:
-        rate = float(np.linalg.norm(g.A, 1))
-        return accumulated_noise(lambda time: np.asarray(la.expm(g.A * time)), B, h, rate)
-    rate = float(np.max(np.abs(g.poles()), initial=0.0))
-    return accumulated_noise(lambda time: block_diagonal(pair_expm(pairs, time)), B, h, rate)
 
 
 #: samples in a piece, whose arrays stay in the cache; a whole number of blocks of any size

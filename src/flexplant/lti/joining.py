@@ -203,6 +203,23 @@ def diagonal_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[FloatArray, I
     return pairs, slots
 
 
+def uncoupled_run(A: FloatArray, blocks: Sequence[int]) -> tuple[int, int]:
+    """Return the first state, and that after the last, of the longest run of uncoupled blocks.
+
+    Blocks of one or two states that do not see each other: modes among filters and delay lines.
+    """
+    sizes = np.asarray(blocks, dtype=np.int64)
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    owner = np.repeat(np.arange(sizes.size), sizes)
+    rows, columns = (owner[part] for part in np.nonzero(A))
+    # the block behind the last that each acts on: a run that ends here begins there
+    after = np.where(sizes > 2, np.arange(1, sizes.size + 1), 0)
+    np.maximum.at(after, columns, np.where(rows < columns, rows + 1, 0))
+    first = starts[np.maximum.accumulate(after)]
+    longest = int(np.argmax(starts[1:] - first)) if sizes.size else 0
+    return (int(first[longest]), int(starts[longest + 1])) if sizes.size else (0, 0)
+
+
 def checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:
     """Return block sizes as a tuple; ShapeError unless A is block upper triangular with them."""
     hint = "Pass whole numbers, or blocks=None."

@@ -13,7 +13,7 @@ from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..parallel import one_thread
 from .equations import scaled_schur, state_scale
-from .joining import diagonal_blocks, is_block_diagonal
+from .joining import diagonal_blocks, is_block_diagonal, uncoupled_run
 from .statespace import StateSpace
 
 #: so many complex numbers are less than 128 kB
@@ -110,27 +110,15 @@ def _solver(g: Part) -> tuple[Solver, int, int]:
     The arrays of a part of a short grid are below 128 kB: no memory is fetched from the system.
     """
     n, m = g.B.shape
-    if g.blocks is None or not set(g.blocks) <= {1, 2}:
+    if g.blocks is None:
         return dense_solver(g)
-    first, end = _uncoupled(g.A, np.asarray(g.blocks))
+    first, end = uncoupled_run(g.A, g.blocks)
     sizes = max(MODAL_CHUNK, 64 * n), PARTS
     if end - first == n:
         return _modal(g), *sizes
     if 2 * (end - first) < n:
         return dense_solver(g)
     return _among_others(g, first, end), CHUNK // (m + 2), PARTS
-
-
-def _uncoupled(A: FloatArray, blocks: IntArray) -> tuple[int, int]:
-    """Return the first state, and that after the last, of the longest run of uncoupled blocks."""
-    ends = np.cumsum(blocks)
-    owner = np.repeat(np.arange(blocks.size), blocks)
-    rows, columns = (owner[part] for part in np.nonzero(A))
-    after = np.zeros(blocks.size, dtype=np.int64)  # the block behind the last that each acts on
-    np.maximum.at(after, columns, np.where(rows < columns, rows + 1, 0))
-    first = (ends - blocks)[np.maximum.accumulate(after)]
-    longest = int(np.argmax(ends - first))
-    return int(first[longest]), int(ends[longest])
 
 
 class ModalPairs(NamedTuple):

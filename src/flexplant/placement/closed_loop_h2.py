@@ -14,9 +14,9 @@ from ..checks import FloatArray, checked, mapping, positive
 from ..errors import CertificateError, SolverError
 from ..estimation import design_kalman
 from ..estimation.estimator_channels import sensors
-from ..lti.discretisation import held_exactly
 from ..lti.lyapunov import solve_stein, square_root
 from ..lti.riccati import control_dare
+from ..lti.sampling import held_exactly
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
 from ..synthesis import design_hinf

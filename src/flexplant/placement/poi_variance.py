@@ -12,7 +12,7 @@ from ..checks import FloatArray, checked, flag, instance, one_of, positive, shor
 from ..errors import AssumptionError, LabelError, ModelError, counted, require_known
 from ..estimation import Filter, FixedLag, KalmanEstimator, Predictor, design_kalman
 from ..estimation.estimator_channels import sensors
-from ..lti.discretisation import held_exactly
+from ..lti.sampling import held_exactly
 from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..plant import Actuator, StandardPlant, larger_plant

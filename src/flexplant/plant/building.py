@@ -10,17 +10,9 @@ import numpy.typing as npt
 
 from ..checks import FloatArray, Value, instance, positive
 from ..errors import ModelError, counted, require_known
-from ..lti.discretisation import (
-    acting,
-    check_latency,
-    check_rate,
-    diagonal_pairs,
-    held_exactly,
-    light_modes,
-    noise_factor,
-    tustin,
-)
+from ..lti.discretisation import check_latency, check_rate, light_modes, tustin
 from ..lti.interconnection import among, append, series
+from ..lti.sampling import acting, held_exactly, sample_and_hold
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..modes import Modes
 from ..reduction import ReducedModel
@@ -31,7 +23,6 @@ from .partition import Assembled, Foreign, Partition, Weighted
 from .port import QUANTITIES, ForcePort, Seen, SensorPort
 from .ports import Poi, Ports
 from .realisation import ModalRealisation, natural, plant_modes
-from .sampling import sampled_physical
 
 
 class PortRows(NamedTuple):
@@ -363,22 +354,11 @@ def sampled(plant: P, rate: float, delay: float) -> P:
     asd = np.array(
         [0.0 if name in held else plant.asd.get(name, 0.0) for name in origin.physical.inputs]
     )
-    if _has_other_states(origin):
-        physical, factor = _with_own_delays(origin, rate, delay, asd)
-    else:
-        physical = held_exactly(origin.physical, rate, delay=delay, delayed=plant.u)
-        white = noise_factor(origin.physical, asd, physical.dt)
-        lines = physical.n_states - origin.physical.n_states
-        factor = np.vstack([white, np.zeros((lines, white.shape[1]))])
+    physical, factor = _held(origin, rate, delay, asd)
     sizes = np.array([plant.asd[name] for name in held]) * np.sqrt(0.5 * rate)
     factor = np.hstack([factor, physical.B[:, physical.input_index(held)] * sizes])
     known = {"noise_factor": factor, "delay": float(delay), "continuous": plant}
     return wired(type(plant), origin.replace(physical=physical, **known))
-
-
-def _has_other_states(origin: Assembled) -> bool:
-    """Return whether ports have filters or delays of their own: modes are not all its states."""
-    return bool(origin.ports.latencies) or diagonal_pairs(origin.physical) is None
 
 
 def sampled_motions(
@@ -390,13 +370,7 @@ def sampled_motions(
     some, found = origin.replace(physical=origin.physical.select(outputs, inputs)), []
     for pairs in blocks:
         own = _with_modes(some, origin.realisation.replace(pairs=pairs))
-        if not plant.dt:
-            found.append(own.physical)
-        elif _has_other_states(own):
-            silent = np.zeros(len(own.physical.inputs))
-            found.append(_with_own_delays(own, 1.0 / plant.dt, plant.delay, silent)[0])
-        else:
-            found.append(held_exactly(own.physical, 1.0 / plant.dt, delay=plant.delay))
+        found.append(_held(own, 1.0 / plant.dt, plant.delay)[0] if plant.dt else own.physical)
     return found
 
 
@@ -432,21 +406,14 @@ def _elastic_frequencies(plant: Partition) -> FloatArray:
     return np.asarray(size[size > 0] / (2.0 * np.pi))
 
 
-def _with_own_delays(
-    origin: Assembled, rate: float, delay: float, asd: FloatArray
+def _held(
+    origin: Assembled, rate: float, delay: float, asd: FloatArray | None = None
 ) -> tuple[StateSpace, FloatArray]:
-    """Sample a plant whose ports have filters or delays: these add to that of all u."""
-    ports, g, realisation = origin.ports, origin.physical, origin.realisation
+    """Return the sampled physical system and its noise; delays of ports add to that of all u."""
     common = positive(delay, "delay", zero=True) / positive(rate, "rate")
-    return sampled_physical(
-        g,
-        rate,
-        head=g.states.index(realisation.names[0]) if realisation.names else 0,
-        pairs=realisation.pairs,
-        late_inputs={port.name: port.latency + common for port in ports.u},
-        late_outputs={port.name: port.latency for port in ports.y},
-        asd=asd,
-    )
+    late_inputs = {port.name: port.latency + common for port in origin.ports.u}
+    late_outputs = {port.name: port.latency for port in origin.ports.y}
+    return sample_and_hold(origin.physical, rate, late_inputs, late_outputs, asd)
 
 
 def sampled_like(nominal: Any, plant: P) -> P:

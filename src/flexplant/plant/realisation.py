@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, Value, checked, instance, positive
 from ..errors import ModelError, SolverError, warn
 from ..labels import Place
-from ..lti.discretisation import block_diagonal
+from ..lti.sampling import block_diagonal
 from ..modes import Modes, NormalForm
 from ..modes.modes import pole_pairs
 from ..modes.normal_form import PROPORTIONAL, RealForm, modal, real_form

@@ -13,8 +13,9 @@ from ..checks import FloatArray, instance, name_list, positive, real_array
 from ..errors import ModelError, require_known
 from ..loop import ClosedLoop
 from ..loop.blocks import references
-from ..lti.discretisation import Recursion, held_exactly
+from ..lti.discretisation import Recursion
 from ..lti.responses import continuous_poles
+from ..lti.sampling import held_exactly
 from ..lti.statespace import StateSpace, as_statespace
 from ..simulation import Response
 from ..tolerances import SPLIT

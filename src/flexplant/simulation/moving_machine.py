@@ -19,7 +19,7 @@ from ..checks import FloatArray, instance, real_array
 from ..errors import ModelError, require_known
 from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.budget import WhiteNoise, continuous_factor, white_noise
-from ..lti.discretisation import pair_expm
+from ..lti.sampling import pair_expm
 from ..plant import Actuator, Poi, StandardPlant
 from ..plant.scheduling import Position
 from ..tolerances import SAME

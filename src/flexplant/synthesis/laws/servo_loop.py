@@ -13,9 +13,9 @@ from ...checks import ComplexArray, FloatArray, frozen
 from ...errors import AssumptionError, LabelError, counted
 from ...loop.blocks import as_block
 from ...loop.broken import inverted, scaled_size, sensitivity_size
-from ...lti.discretisation import held_exactly
 from ...lti.frequency_sweep import highest, resonance_grid
 from ...lti.responses import responder, responses
+from ...lti.sampling import held_exactly
 from ...lti.statespace import StateSpace
 from ...plant import Foreign, Poi, StandardPlant
 from ...plant.realisation import natural

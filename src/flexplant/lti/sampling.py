@@ -1,0 +1,424 @@
+"""Zero-order hold of systems whose channels have delays of their own: exact, noise included."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg as la
+
+from ..checks import FloatArray, IntArray, positive
+from ..errors import AssumptionError
+from ..tolerances import SAME, TINY, divisor
+from .equations import state_scale
+from .joining import diagonal_blocks, uncoupled_run
+from .lyapunov import compressed
+from .statespace import StateSpace
+
+
+def held_exactly(
+    g: StateSpace, rate: float, *, delay: float = 0.0, delayed: Iterable[str] | None = None
+) -> StateSpace:
+    """Return the zero-order-hold equivalent of a continuous system; see `discretized`."""
+    late = positive(delay, "delay", zero=True) / positive(rate, "rate")
+    some = range(len(g.inputs)) if delayed is None else g.input_index(delayed)
+    return sample_and_hold(g, rate, dict.fromkeys([g.inputs[i] for i in some], late))[0]
+
+
+class Late(NamedTuple):
+    """A delay per channel: whole samples, and a fraction of one in seconds."""
+
+    whole: IntArray
+    fraction: FloatArray
+
+    @classmethod
+    def of(cls, names: Sequence[str], delays: Mapping[str, float], h: float) -> Late:
+        """Split delays [s] at a sampling time; what is whole to rounding is whole."""
+        samples = np.array([delays.get(name, 0.0) for name in names]) / h
+        near = np.round(samples)
+        samples = np.where(np.abs(samples - near) < SAME * np.maximum(near, 1.0), near, samples)
+        whole = np.floor(samples).astype(np.int64)
+        return cls(whole, (samples - whole) * h)
+
+    @property
+    def length(self) -> IntArray:
+        """Samples of an input that must be remembered."""
+        return self.whole + (self.fraction > 0)
+
+
+def sample_and_hold(
+    g: StateSpace,
+    rate: float,
+    late_inputs: Mapping[str, float],
+    late_outputs: Mapping[str, float] | None = None,
+    asd: FloatArray | None = None,
+) -> tuple[StateSpace, FloatArray]:
+    """Return the zero-order-hold equivalent of a continuous system with delays [s] per channel.
+
+    And the factor (n, r) of what white inputs of densities `asd` add to its states in a sample.
+    """
+    # x(k h + t) = E(t) x[k] + N(t) u[k - m] + O(t) u[k - m - 1]: an input that is (m h + f) late is
+    # the new sample for the last t - f and the old one before that. A late output is the motion at
+    # its own instant between samples, a state of its own; its noise is the part of the same noise
+    # that has acted until then
+    h = 1.0 / rate
+    inputs = Late.of(g.inputs, late_inputs, h)
+    outputs = Late.of(g.outputs, late_outputs or {}, h)
+    loud = np.zeros(len(g.inputs)) if asd is None else asd
+    _check_noise(g, loud, outputs)
+    layout = _Layout(g, inputs, outputs)
+    n, first = g.n_states, layout.first
+    states = slice(first, first + n)
+    units = state_scale(g.A, g.B, g.C) if n else np.ones(0)
+    held = HeldFlow(g, units)
+    A = np.zeros((layout.size, layout.size))
+    B = np.zeros((layout.size, len(g.inputs)))
+    C = np.zeros((len(g.outputs), layout.size))
+    E, new, old = _flow_at(held, inputs, h)
+    A[states, states] = E
+    layout.enter(A, B, states, new, old)
+    layout.shift_inputs(A, B)
+    D_new, D_old = _acting_sample(g.D, inputs, 0.0)
+    now = np.zeros((len(g.outputs), layout.size)), np.zeros_like(g.D)
+    now[0][:, states] = g.C
+    layout.enter(now[0], now[1], slice(None), D_new, D_old)
+    D = now[1].copy()
+    D[outputs.length > 0] = 0.0
+    C[outputs.length == 0] = now[0][outputs.length == 0]
+    for j in np.flatnonzero(outputs.length):
+        line = layout.line(int(j))
+        C[j, line[0]] = 1.0
+        for older, newer in pairwise(line):
+            A[older, newer] = 1.0
+        row = slice(line[-1], line[-1] + 1)
+        if not outputs.fraction[j]:
+            A[row], B[row] = now[0][j], now[1][j]
+            continue
+        t = h - float(outputs.fraction[j])
+        E, new, old = _flow_at(held, inputs, t)
+        direct_new, direct_old = _acting_sample(g.D[j : j + 1], inputs, t)
+        A[row, states] = g.C[j] @ E
+        layout.enter(A, B, row, g.C[j] @ new + direct_new, g.C[j] @ old + direct_old)
+    blocks = None
+    if g.blocks is not None:
+        blocks = [*[1] * first, *g.blocks, *[1] * (layout.size - first - n)]
+    system = g.replace(A=A, B=B, C=C, D=D, dt=h, states=layout.names, blocks=blocks)
+    return system, _sampled_noise(g, Flow(g.A, g.blocks, units), loud, h, layout, outputs)
+
+
+class _Layout:
+    """Where the states are: late outputs, then those of the system, then late inputs."""
+
+    def __init__(self, g: StateSpace, inputs: Late, outputs: Late) -> None:
+        self.inputs, self.outputs = inputs, outputs
+        ages, lines = (
+            [
+                (age, j)
+                for age in range(int(late.length.max(initial=0)), 0, -1)
+                for j in np.flatnonzero(late.length >= age).tolist()
+            ]
+            for late in (outputs, inputs)
+        )
+        self.seen = {key: i for i, key in enumerate(ages)}
+        self.first = len(ages)
+        start = self.first + g.n_states
+        self.pushed = {key: start + i for i, key in enumerate(lines)}
+        self.size = start + len(lines)
+        self.names = [f"{g.outputs[j]}:late{age}" for age, j in ages]
+        self.names += [*g.states, *(f"{g.inputs[i]}:delay{age}" for age, i in lines)]
+
+    def line(self, output: int) -> list[int]:
+        """Return the states of a late output, oldest first."""
+        length = int(self.outputs.length[output])
+        return [self.seen[age, output] for age in range(length, 0, -1)]
+
+    def enter(
+        self, A: FloatArray, B: FloatArray, rows: slice, new: FloatArray, old: FloatArray
+    ) -> None:
+        """Put the effects (rows, m) of the new and the old sample of each input in their places."""
+        for effect, age_of in ((new, self.inputs.whole), (old, self.inputs.whole + 1)):
+            for i, age in enumerate(age_of.tolist()):
+                if not np.any(effect[:, i]):
+                    continue
+                if age == 0:
+                    B[rows, i] += effect[:, i]
+                else:
+                    A[rows, self.pushed[age, i]] += effect[:, i]
+
+    def shift_inputs(self, A: FloatArray, B: FloatArray) -> None:
+        """Shift the delay lines of the inputs by one sample."""
+        for (age, i), state in self.pushed.items():
+            if age == 1:
+                B[state, i] = 1.0
+            else:
+                A[state, self.pushed[age - 1, i]] = 1.0
+
+
+def _flow_at(held: HeldFlow, inputs: Late, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return E(t), and the effects of the new and the old sample of each input."""
+    E, whole = held.at(t)
+    new, old = whole.copy(), np.zeros_like(whole)
+    for f in np.unique(inputs.fraction[inputs.fraction > 0]):
+        columns = inputs.fraction == f
+        if t <= f:
+            new[:, columns], old[:, columns] = 0.0, whole[:, columns]
+            continue
+        rest, late = held.at(t - float(f))
+        new[:, columns] = late[:, columns]
+        old[:, columns] = rest @ held.at(float(f))[1][:, columns]
+    return E, new, old
+
+
+def _acting_sample(D: FloatArray, inputs: Late, t: float) -> tuple[FloatArray, FloatArray]:
+    """Return which sample of each input acts at t within the sample: the new or the old one."""
+    new = np.where(inputs.fraction <= t, D, 0.0)
+    return new, D - new
+
+
+def _check_noise(g: StateSpace, asd: FloatArray, outputs: Late) -> None:
+    loud = np.flatnonzero(asd > 0)
+    late = np.flatnonzero(outputs.length > 0)
+    direct = np.argwhere(g.D[np.ix_(late, loud)])
+    if direct.size:
+        output, name = g.outputs[late[direct[0][0]]], g.inputs[loud[direct[0][1]]]
+        raise AssumptionError(
+            f"white noise of {name!r} reaches {output!r} at once, so that a sample of it would "
+            "have infinite variance. Give the sensor dynamics that roll off (an anti-alias "
+            "filter), or shape the noise."
+        )
+
+
+def _sampled_noise(
+    g: StateSpace, flow: Flow, asd: FloatArray, h: float, layout: _Layout, outputs: Late
+) -> FloatArray:
+    """Return G (N, r), ``G G'`` the covariance that white inputs add in one sample."""
+    # piece by piece between the instants at which late outputs are taken
+    loud = np.flatnonzero(asd)
+    if not loud.size or not g.n_states:
+        return np.zeros((layout.size, 0))
+    force = g.B[:, loud] * (np.asarray(asd)[loud] / np.sqrt(2.0))
+    # late outputs by the instant within the sample at which they are taken
+    taken: dict[float, list[int]] = {}
+    for j in np.flatnonzero(outputs.fraction > 0).tolist():
+        taken.setdefault(h - float(outputs.fraction[j]), []).append(j)
+    edges = np.unique([0.0, h, *taken])
+    states = slice(layout.first, layout.first + g.n_states)
+    parts = []
+    for start, end in pairwise(edges):
+        G = flow.noise(force, end - start)
+        column = np.zeros((layout.size, G.shape[1]))
+        column[states] = flow.at(h - end) @ G
+        for instant, seen in taken.items():
+            if end <= instant:
+                rows = [layout.line(j)[-1] for j in seen]
+                column[rows] = g.C[seen] @ flow.at(instant - end) @ G
+        parts.append(column)
+    return compressed(np.hstack(parts))
+
+
+class Flow:
+    """``e^(A t)``, exactly 0 where a state does not act on another, in states of the given units.
+
+    Modes that do not see each other, among others that see them (head: sensors) and drive them
+    (tail: amplifiers, inputs): e^(A t) is a sum over modes of exponentials of the size of head,
+    mode and tail, O(n) for n modes instead of O(n^3), and the modes' own blocks in closed form,
+    rigid-body ones exact. Where there are no such modes it is the exponential of the whole.
+    """
+
+    def __init__(self, A: FloatArray, blocks: Sequence[int] | None, units: FloatArray) -> None:
+        n, self.units = len(A), units
+        self.A = A = A * units / units[:, None]
+        self.rate = float(np.linalg.norm(A, 1)) if n else 0.0
+        h, end = (0, 0) if blocks is None else uncoupled_run(A, blocks)
+        #: the tail stands still and no state but modes sees it: inputs that are held
+        self.still = not h and not A[end:].any()
+        self.modal = end > h and (self.still or 2 * (end - h) >= n)
+        if not self.modal:
+            self.reached = acting(A != 0)
+            return
+        ends = np.cumsum(blocks, dtype=np.int64)
+        own = np.asarray(blocks, dtype=np.int64)[(ends > h) & (ends <= end)]
+        pairs, slots = diagonal_blocks(A[h:end, h:end], own)
+        self.pairs, self.h, self.t = pairs, h, n - end
+        alone = slots[:, 1] < 0
+        pairs[alone, 1, 1] = pairs[alone, 0, 0]
+        #: the two states of each mode; what one of one state lacks is behind all others
+        self.at_modes = at = np.where(slots < 0, n, slots + h)
+        wide = np.pad(A, ((0, 1), (0, 1)))
+        self.entering = wide[at][:, :, end:n]
+        self.direct = np.zeros((h + self.t, h + self.t))
+        self.direct[:h, :h], self.direct[h:, h:] = A[:h, :h], A[end:, end:]
+        self.direct[:h, h:] = A[:h, end:]
+        self.reached = acting(self.direct != 0)
+        self.small = np.zeros((len(pairs), h + 2 + self.t, h + 2 + self.t))
+        self.small[:, :h, :h], self.small[:, h + 2 :, h + 2 :] = A[:h, :h], A[end:, end:]
+        self.small[:, h : h + 2, h : h + 2] = pairs
+        self.small[:, :h, h : h + 2] = wide[:h][:, at].transpose(1, 0, 2)
+        self.small[:, h : h + 2, h + 2 :] = self.entering
+
+    def at(self, time: float) -> FloatArray:
+        """Return ``e^(A time)`` (n, n)."""
+        n = len(self.A)
+        if not self.modal:
+            E = np.where(self.reached, la.expm(self.A * time), 0.0)
+            return np.asarray(E * self.units[:, None] / self.units)
+        E, at, h, t = np.zeros((n + 1, n + 1)), self.at_modes, self.h, self.t
+        tail = slice(n - t, n)
+        if t and self.still:
+            own, integral = pair_exponential(self.pairs, time)
+            E[at, tail] = integral @ self.entering
+            E[tail, tail] = np.eye(t)
+        else:
+            own = pair_expm(self.pairs, time)
+            if h + t:
+                # rounding of expm would leave entries below the blocks of a filter of several
+                direct = np.where(self.reached, la.expm(self.direct * time), 0.0)
+                parts = la.expm(self.small * time)
+                E[:h, :h], E[tail, tail] = direct[:h, :h], direct[h:, h:]
+                E[:h, tail] = direct[:h, h:] + parts[:, :h, h + 2 :].sum(axis=0)
+                E[:h, at] = parts[:, :h, h : h + 2].transpose(1, 0, 2)
+                E[at, tail] = parts[:, h : h + 2, h + 2 :]
+        E[at[:, :, None], at[:, None, :]] = own
+        return np.asarray(E[:n, :n] * self.units[:, None] / self.units)
+
+    def noise(self, force: FloatArray, time: float) -> FloatArray:
+        """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``."""
+        return accumulated_noise(self.at, force, time, self.rate)
+
+
+class HeldFlow:
+    """``e^(A t)`` and ``int_0^t e^(A s) ds B``: held inputs are states that stand still."""
+
+    def __init__(self, g: StateSpace, units: FloatArray) -> None:
+        self.n, m = g.B.shape
+        grown = np.pad(g.A, (0, m))
+        grown[: self.n, self.n :] = g.B
+        # inputs no larger than the rates: large units would make expm square too often
+        rate = float(np.abs(g.A * units / units[:, None]).max(initial=TINY))
+        drive = float(np.abs(g.B / units[:, None]).max(initial=rate))
+        both = np.append(units, np.full(m, np.exp2(np.floor(np.log2(max(rate, TINY) / drive)))))
+        self.flow = Flow(grown, None if g.blocks is None else [*g.blocks, *[1] * m], both)
+
+    def at(self, time: float) -> tuple[FloatArray, FloatArray]:
+        """Return both at one time."""
+        E = self.flow.at(time)
+        return E[: self.n, : self.n], E[: self.n, self.n :]
+
+
+def acting(direct: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Return which states (n, n) act on which in the end: where an exponential may be non-zero."""
+    reached = direct | np.eye(direct.shape[0], dtype=bool)
+    while True:
+        wider = (reached.astype(np.float32) @ reached.astype(np.float32)) > 0
+        if np.array_equal(wider, reached):
+            return reached
+        reached = wider
+
+
+def uncoupled_pairs(A: FloatArray) -> FloatArray | None:
+    """Return the (n/2, 2, 2) diagonal blocks of A, or None when A is not made of those alone."""
+    b, odd = divmod(len(A), 2)
+    if odd:
+        return None
+    pairs = A.reshape(b, 2, b, 2)[np.arange(b), :, np.arange(b), :]
+    return pairs if np.count_nonzero(A) == np.count_nonzero(pairs) else None
+
+
+def block_diagonal(pairs: FloatArray) -> FloatArray:
+    """Return the (2 b, 2 b) matrix with the (b, 2, 2) blocks on its diagonal."""
+    b = pairs.shape[0]
+    matrix = np.zeros((b, 2, b, 2))
+    matrix[np.arange(b), :, np.arange(b), :] = pairs
+    return matrix.reshape(2 * b, 2 * b)
+
+
+def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
+    """Return ``e^(A h)`` and ``int_0^h e^(A s) ds`` of (b, 2, 2) blocks, both (b, 2, 2)."""
+    # with m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so
+    # `e^(A h) = e^(m h) (cosh(r h) I + sinh(r h) / r N)`, r^2 = q: trigonometric for an oscillating
+    # pair, linear in h for a rigid-body pair. The integral is a Taylor series on h / 2^s, doubled
+    # by `I(2 t) = I(t) + e^(A t) I(t)`: no division by small frequencies. There both states of a
+    # pair have units in which they are of one size, so that s is small
+    given, pairs, units = pairs, pairs.copy(), _even_units(pairs)
+    pairs[:, 0, 1] /= units
+    pairs[:, 1, 0] *= units
+    size = float(np.max(np.abs(pairs).sum(axis=2))) * h
+    doublings = max(0, int(np.ceil(np.log2(max(size, TINY) / 0.5))))
+    t = h / 2**doublings
+    identity = np.broadcast_to(np.eye(2), pairs.shape)
+    term = identity * t
+    integral = term.copy()
+    for k in range(2, 18):
+        term = pairs @ term * (t / k)
+        integral = integral + term
+    for k in range(doublings):
+        integral = integral + pair_expm(pairs, t * 2**k) @ integral
+    integral[:, 0, 1] *= units
+    integral[:, 1, 0] /= units
+    return pair_expm(given, h), integral
+
+
+def _even_units(pairs: FloatArray) -> FloatArray:
+    """Return the unit (b,) of each first state, a power of two, that makes a pair symmetric."""
+    ahead, back = np.abs(pairs[:, 0, 1]), np.abs(pairs[:, 1, 0])
+    both = (ahead > 0) & (back > 0)
+    gap = np.log2(np.where(both, ahead, 1.0)) - np.log2(np.where(both, back, 1.0))
+    return np.asarray(np.exp2(np.round(0.5 * gap)))
+
+
+def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
+    """Return ``e^(A h)`` of (b, 2, 2) blocks in closed form."""
+    # an overdamped pair has poles m +- r whose exponentials are formed each by itself: cosh(r h) of
+    # its own overflows long before the decay e^(m h) that tames it. The smaller of the two poles is
+    # the determinant over the larger, which keeps the digits that m +- r would cancel
+    mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
+    N = pairs - mean[:, None, None] * np.eye(2)
+    q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
+    root = np.sqrt(np.abs(q))
+    safe = divisor(root)
+    swing = q < 0
+    determinant = pairs[:, 0, 0] * pairs[:, 1, 1] - pairs[:, 0, 1] * pairs[:, 1, 0]
+    large = mean + np.where(mean > 0, root, -root)
+    small = np.where(large != 0, determinant / np.where(large != 0, large, 1.0), 0.0)
+    upper, lower = np.maximum(large, small), np.minimum(large, small)
+    turning, decay = np.where(swing, root * h, 0.0), np.where(swing, mean * h, upper * h)
+    decay = np.exp(decay)
+    apart = np.where(swing, 0.0, root * h)
+    even = np.where(swing, decay * np.cos(turning), 0.5 * (decay + np.exp(lower * h)))
+    odd = np.where(swing, np.sin(turning), -0.5 * np.expm1(-2.0 * apart)) / safe
+    odd = decay * np.where(root > 0, odd, h)
+    return np.asarray(even[:, None, None] * np.eye(2) + odd[:, None, None] * N)
+
+
+#: nodes that integrate ``e^(A s) B B' e^(A' s)`` to rounding over a piece of |A| s <= 1
+_NODES = 10
+
+
+def accumulated_noise(
+    at: Callable[[float], FloatArray], force: FloatArray, time: float, rate: float
+) -> FloatArray:
+    """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``."""
+    # Gauss-Legendre quadrature. Over the whole interval where as many nodes as make it exact to
+    # rounding give less than n columns, as for a large structure with few forces. Else over a piece
+    # so short that ten nodes are exact, then `G(2 t) = [G(t), e^(A t) G(t)]`: log2(time rate)
+    # steps, however fast the modes are. Sums of squares, so that G G' is positive semidefinite in
+    # any units; the block exponential of [VanLoan1978]_ was seen to lose that on large models
+    n, m = force.shape
+    # the error is a Bessel function of order 2 count and argument |A| time: nothing beyond there
+    size = min(rate * time, 2.0 * n)
+    count, doublings = _NODES + int(np.ceil(0.5 * size + 4.0 * np.cbrt(size))), 0
+    if count * m >= n:
+        count, doublings = _NODES, max(0, int(np.ceil(np.log2(max(rate * time, TINY)))))
+    piece = time / 2**doublings
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    parts = [
+        np.sqrt(0.5 * piece * weight) * (at(0.5 * piece * (node + 1.0)) @ force)
+        for node, weight in zip(nodes, weights, strict=True)
+    ]
+    G = compressed(np.hstack(parts))
+    for k in range(doublings):
+        G = compressed(np.hstack([G, at(piece * 2**k) @ G]))
+    return G
