@@ -203,11 +203,11 @@ def diagonal_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[FloatArray, I
     return pairs, slots
 
 
-def uncoupled_run(A: FloatArray, blocks: Sequence[int]) -> tuple[int, int]:
-    """Return the first state, and that after the last, of the longest run of uncoupled blocks.
-
-    Blocks of one or two states that do not see each other: modes among filters and delay lines.
-    """
+def uncoupled_run(A: FloatArray, blocks: Sequence[int]) -> tuple[int, int, Sequence[int]]:
+    """Return the first state, that after the last and the blocks of the longest uncoupled run."""
+    # blocks of one or two states that do not see each other: modes among filters and delay lines
+    if not blocks:
+        return 0, 0, ()
     sizes = np.asarray(blocks, dtype=np.int64)
     starts = np.concatenate([[0], np.cumsum(sizes)])
     owner = np.repeat(np.arange(sizes.size), sizes)
@@ -216,8 +216,9 @@ def uncoupled_run(A: FloatArray, blocks: Sequence[int]) -> tuple[int, int]:
     after = np.where(sizes > 2, np.arange(1, sizes.size + 1), 0)
     np.maximum.at(after, columns, np.where(rows < columns, rows + 1, 0))
     first = starts[np.maximum.accumulate(after)]
-    longest = int(np.argmax(starts[1:] - first)) if sizes.size else 0
-    return (int(first[longest]), int(starts[longest + 1])) if sizes.size else (0, 0)
+    last = int(np.argmax(starts[1:] - first))
+    begin, end = int(first[last]), int(starts[last + 1])
+    return begin, end, sizes[np.searchsorted(starts, begin) : last + 1].tolist()
 
 
 def checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:

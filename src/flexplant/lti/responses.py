@@ -112,13 +112,13 @@ def _solver(g: Part) -> tuple[Solver, int, int]:
     n, m = g.B.shape
     if g.blocks is None:
         return dense_solver(g)
-    first, end = uncoupled_run(g.A, g.blocks)
+    first, end, blocks = uncoupled_run(g.A, g.blocks)
     sizes = max(MODAL_CHUNK, 64 * n), PARTS
     if end - first == n:
         return _modal(g), *sizes
     if 2 * (end - first) < n:
         return dense_solver(g)
-    return _among_others(g, first, end), CHUNK // (m + 2), PARTS
+    return _among_others(g, first, end, blocks), CHUNK // (m + 2), PARTS
 
 
 class ModalPairs(NamedTuple):
@@ -203,7 +203,7 @@ def _nonzero_columns(residues: FloatArray) -> npt.NDArray[np.bool_] | slice:
     return slice(None) if some.all() else some
 
 
-def _among_others(g: Part, first: int, end: int) -> Solver:
+def _among_others(g: Part, first: int, end: int, blocks: Sequence[int]) -> Solver:
     """Modes, the states from `first` to `end`, between others that see them and that drive them."""
     # with A = [[A_h, A_hm, A_ht], [0, A_m, A_mt], [0, 0, A_t]], head (filters of sensors, weights
     # of z) and tail (those of amplifiers, delay lines) are solved for all their states, and the
@@ -213,8 +213,6 @@ def _among_others(g: Part, first: int, end: int) -> Solver:
     h, own, t = slice(0, first), slice(first, end), slice(end, n)
     inputs = np.hstack([g.B[own], g.A[own, t]])
     used = np.flatnonzero(inputs.any(axis=0))
-    ends = np.cumsum(g.blocks)
-    blocks = np.asarray(g.blocks)[(ends > first) & (ends <= end)].tolist()
     outputs = np.vstack([g.C[:, own], g.A[h, own]])
     modes = _modal(Part(g.A[own, own], inputs[:, used], outputs, g.dt, blocks))
     head, *_ = dense_solver(Part(g.A[h, h], np.eye(first), g.C[:, h], g.dt))

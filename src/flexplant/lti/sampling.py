@@ -232,15 +232,13 @@ class Flow:
         n, self.units = len(A), units
         self.A = A = A * units / units[:, None]
         self.rate = float(np.linalg.norm(A, 1)) if n else 0.0
-        h, end = (0, 0) if blocks is None else uncoupled_run(A, blocks)
+        h, end, own = uncoupled_run(A, blocks or ())
         #: the tail stands still and no state but modes sees it: inputs that are held
         self.still = not h and not A[end:].any()
         self.modal = end > h and (self.still or 2 * (end - h) >= n)
         if not self.modal:
             self.reached = acting(A != 0)
             return
-        ends = np.cumsum(blocks, dtype=np.int64)
-        own = np.asarray(blocks, dtype=np.int64)[(ends > h) & (ends <= end)]
         pairs, slots = diagonal_blocks(A[h:end, h:end], own)
         self.pairs, self.h, self.t = pairs, h, n - end
         alone = slots[:, 1] < 0
