@@ -105,6 +105,15 @@ def some_names(names: Sequence[str], most: int = 6) -> str:
     return ", ".join(names[:most]) + more
 
 
+def aligned(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return a table: names (the first column, and what has no head) flush left, others right."""
+    cells = [tuple(head), *map(tuple, rows)]
+    wide = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    side = ["<" if not i or not name else ">" for i, name in enumerate(head)]
+    form = "  ".join(f"{{:{at}{width}}}" for at, width in zip(side, wide, strict=True))
+    return [form.format(*row).rstrip() for row in cells]
+
+
 def short(value: Any) -> str:
     """Return a value for a message: its repr, cut after 80 characters; arrays by their shape."""
     if isinstance(value, np.ndarray) and value.size > 6:

@@ -31,6 +31,7 @@ from ..errors import (
     FlexplantWarning,
     ModelError,
     SolverError,
+    aligned,
     counted,
     require_known,
     warn,
@@ -466,21 +467,17 @@ class MachineTable(Value):
     def __repr__(self) -> str:
         finite = self.nominal[np.isfinite(self.nominal)]
         factor, unit = in_unit(float(np.max(finite, initial=0.0)), self.unit)
-        width = max(10, *(len(name) for name in self.names)) + 2
-        heads = ("own model", "median", "95 %", "worst", "worst / own")
+        head = ("", "own model", "median", "95 %", "worst", "worst / own", "")
         title = f"rms error of {self.channel} [{unit or '?'}]"
-        lines = [
-            f"{title} on {counted(self.values.shape[1], 'machine')}",
-            " " * width + "".join(f"{head:>13s}" for head in heads),
-        ]
+        rows = []
         for name, own, row in zip(self.names, self.nominal, self.values, strict=True):
-            ordered = np.sort(row)
+            ordered, unstable = np.sort(row), int(np.count_nonzero(np.isinf(row)))
             cells = [own, np.median(row), ordered[int(np.ceil(0.95 * row.size)) - 1], ordered[-1]]
-            text = "".join(f"{value / factor:13.4g}" for value in cells)
-            lines.append(f"{name:{width}s}{text}{ordered[-1] / own:13.3g}")
-            if unstable := int(np.count_nonzero(np.isinf(row))):
-                lines.append(f"{'':{width}s}the loop is unstable on {unstable} of them")
-        return "\n".join(lines)
+            said = f"the loop is unstable on {unstable} of them" if unstable else ""
+            text = [f"{value / factor:.4g}" for value in cells]
+            rows.append((name, *text, f"{ordered[-1] / own:.3g}", said))
+        on = counted(self.values.shape[1], "machine")
+        return "\n".join([f"{title} on {on}", *aligned(head, rows)])
 
 
 def errors_on_machines(

@@ -5,7 +5,7 @@ That takes the POI from the sensors as if the structure were rigid.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import FloatArray, Value, checked, positive_array, whole
-from ..errors import AssumptionError, FlexplantError, ModelError, require_known
+from ..errors import AssumptionError, FlexplantError, ModelError, aligned, require_known
 from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
@@ -93,17 +93,11 @@ class LagReport(Value):
         scaled = [unit in ("m", "rad") for unit in units]
         nano = ["n" if small else "" for small in scaled]
         heads = [f"{name} [{n}{u}]" for name, n, u in zip(self.channels, nano, units, strict=True)]
-        width = max(14, *(len(head) + 2 for head in heads))
-
-        def line(name: str, cells: Iterable[str]) -> str:
-            return f"{name:17s}" + "".join(f"{cell:>{width}s}" for cell in cells)
-
-        lines = ["rms error at the POIs by lag", line("", heads)]
-        rows = dict(zip(self.names, self.rms, strict=True))
+        rows = dict(zip(self.names, self.rms * np.where(scaled, 1e9, 1.0), strict=True))
         beyond = not np.allclose(self.on_whole, self[FILTER], rtol=1e-6, atol=0.0)
-        for name, row in {**rows, **({"filter *": self.on_whole} if beyond else {})}.items():
-            values = row * np.where(scaled, 1e9, 1.0)
-            lines.append(line(name, ("-" if np.isnan(v) else f"{v:.4g}" for v in values)))
+        rows |= {"filter *": self.on_whole * np.where(scaled, 1e9, 1.0)} if beyond else {}
+        cells = [(n, *("-" if np.isnan(v) else f"{v:.4g}" for v in r)) for n, r in rows.items()]
+        lines = ["rms error at the POIs by lag", *aligned(("", *heads), cells)]
         if beyond:
             lines.append("* on the plant with the modes left out, which are white noise above")
         if self.note:

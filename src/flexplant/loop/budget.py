@@ -15,6 +15,7 @@ from ..errors import (
     CertificateError,
     LabelError,
     ModelError,
+    aligned,
     require_known,
     unknown_label,
 )
@@ -100,23 +101,20 @@ class ErrorBudget(Value):
 
     def __repr__(self) -> str:
         size, unit = in_unit(self.rms, self.unit)
-        factor = 1.0 / size
-        order = np.argsort(-self.variances, kind="stable")
-        width = max(5, *map(len, self.names)) + 2 if self.names else 7
         head = f"rms of {self.channel}" + (f" [{unit}]" if unit else "")
-        lines = [f"{head} by source", f"{'':{width}s}{'rms':>12s}{'share':>9s}{'half below':>14s}"]
-        for i in order:
-            name, rms = self.names[i], factor * np.sqrt(self.variances[i])
-            below = f"{self.half_below(name):.4g} Hz"
+        rows = []
+        for i in np.argsort(-self.variances, kind="stable"):
+            name, rms = self.names[i], np.sqrt(self.variances[i]) / size
             shown = f"{rms:.3f}" if rms >= 5e-4 or not rms else "< 0.001"
-            lines.append(f"{name:{width}s}{shown:>12s}{self.shares[i]:9.1%}{below:>14s}")
-        lines.append(f"{'total':{width}s}{factor * self.rms:12.3f}{1:9.1%}")
+            rows.append((name, shown, f"{self.shares[i]:.1%}", f"{self.half_below(name):.4g} Hz"))
+        rows.append(("total", f"{self.rms / size:.3f}", f"{1:.1%}", ""))
+        lines = [f"{head} by source", *aligned(("", "rms", "share", "half below"), rows)]
         if np.isinf(self.left_out):
             lines.append("with the modes left out of the model the loop is unstable")
         elif np.isnan(self.left_out):
             lines.append("modes left out of the model are not in it: none are known")
         else:
-            lines.append(f"with the modes left out of the model: {factor * self.left_out:.5g}")
+            lines.append(f"with the modes left out of the model: {self.left_out / size:.5g}")
         return "\n".join(lines)
 
 

@@ -22,7 +22,7 @@ from ..checks import (
     real_array,
     whole,
 )
-from ..errors import AssumptionError, ModelError, counted, warn
+from ..errors import AssumptionError, ModelError, aligned, counted, warn
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..plant.larger_plant import draws_with_left_out
@@ -379,15 +379,14 @@ class ModeTolerances(Value):
 
     def __repr__(self) -> str:
         lines = [f"<ModeTolerances of {counted(self.modes.size, 'mode')}: {self.summary}"]
-        known = "" if self.known is None else "     known to"
-        lines.append(f"  mode       Hz   |S| at u of {1 / self.margin:.3g}       unstable{known}")
+        head = ("mode", "Hz", f"|S| at u of {1 / self.margin:.3g}", "unstable", "known to", "")
+        rows = []
         for i in np.argsort(self.least, kind="stable")[:_SHOWN]:
             row = [_percent(ends, self.limit[i]) for ends in (self.within[i], self.stable[i])]
-            own = "" if self.known is None else f"{100 * self.known[i]:10.2g} %"
-            mark = "  !" if self.modes[i] in self.critical else ""
-            lines.append(
-                f"  {self.modes[i]:4d} {self.freq[i]:8.5g}  {row[0]:>16} {row[1]:>16}{own}{mark}"
-            )
+            own = "?" if self.known is None else f"{100 * self.known[i]:.2g} %"
+            mark = "!" if self.modes[i] in self.critical else ""
+            rows.append((str(self.modes[i]), f"{self.freq[i]:.5g}", *row, own, mark))
+        lines += [f"  {line}" for line in aligned(head, rows)]
         if self.modes.size > _SHOWN:
             lines.append(f"  ... and {self.modes.size - _SHOWN} more")
         if self.draws is not None:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..checks import ComplexArray, FloatArray, Value, instance, short, whole
-from ..errors import LabelError, ModelError, counted, require_known, unknown_label
+from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label
 from ..lti.frequency_sweep import climbed_grid, crossings, highest
 from ..lti.measured_lines import FEWEST, low_slope
 from ..tolerances import TINY
@@ -389,17 +389,11 @@ class LoopComparison(Value):
         return self.rows[name]
 
     def __repr__(self) -> str:
-        width = max(map(len, self.rows))  # each column after it starts with two spaces
         low_freq = next(iter(self.rows.values())).low_freq  # nan where none is stable
         measure = f"stable ({'spectral radius' if self.sampled else 'largest real part [rad/s]'})"
         low = f"|S| at {low_freq:.3g} Hz" if self.channel and low_freq > 0 else "|S| low"
-        head = (measure, "|S| < 1 up to", "max |S|", "at", low, "max |S| at u")
-        cells = [_cells(row) for row in self.rows.values()]
-        wide = [max(len(h), *(len(c[i]) for c in cells)) + 2 for i, h in enumerate(head)]
-        lines = [f"{'':{width}s}" + "".join(f"{h:>{w}s}" for h, w in zip(head, wide, strict=True))]
-        for name, cell in zip(self.rows, cells, strict=True):
-            shown = "".join(f"{c:>{w}s}" for c, w in zip(cell, wide, strict=True))
-            lines.append(f"{name:{width}s}{shown}")
+        head = ("", measure, "|S| < 1 up to", "max |S|", "at", low, "max |S| at u")
+        lines = aligned(head, [(name, *_cells(row)) for name, row in self.rows.items()])
         if self.channel:
             lines.append(f"S is {self.channel}; at u it is 1 / modulus margin.")
         return "\n".join(lines)

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, real_array, short, whole
-from ..errors import ModelError, counted
+from ..errors import ModelError, aligned, counted
 from ..labels import Place
 from ..lti.frequency_sweep import climbed_grid
 from ..modes.dynamic_basis import DirectCheck, DynamicBasis, antiresonances, checked_response
@@ -441,15 +441,14 @@ class ReductionQuality(Value):
     def table(self) -> str:
         """Return mode by mode: both frequencies, error, MAC and of which shape it may also be."""
         other = {
-            n: f"  alike: {', '.join(str(k) for k in members if k != n)}"
+            n: f"alike: {', '.join(str(k) for k in members if k != n)}"
             for members in self.alike
             for n in members
         }
-        lines = [f"mode{'full [Hz]':>12s}{'reduced [Hz]':>14s}{'error [%]':>12s}{'MAC':>9s}"]
-        lines += [
-            f"{n:4d}{f:12.4f}{g:14.4f}{100 * e:12.3g}{m:9.5f}{other.get(n, '')}"
-            for n, f, g, e, m in zip(
-                self.modes, self.full_freq, self.freq, self.freq_error, self.mac, strict=True
-            )
+        columns = (self.modes, self.full_freq, self.freq, self.freq_error, self.mac)
+        rows = [
+            (str(n), f"{f:.4f}", f"{g:.4f}", f"{100 * e:.3g}", f"{m:.5f}", other.get(n, ""))
+            for n, f, g, e, m in zip(*columns, strict=True)
         ]
-        return "\n".join(lines)
+        head = ("mode", "full [Hz]", "reduced [Hz]", "error [%]", "MAC", "")
+        return "\n".join(aligned(head, rows))

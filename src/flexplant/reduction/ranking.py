@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..checks import FloatArray, IntArray, Value, checked, name_list, positive, real_array, whole
-from ..errors import ModelError, counted
+from ..errors import ModelError, aligned, counted
 from ..labels import Place
 from ..lti.balancing import hankel_values
 from ..lti.sampling import block_diagonal
@@ -79,15 +79,15 @@ class ModeRanking(Value):
 
     def table(self, most: int = 12) -> str:
         """Return the most important modes as text, with the channels each matters most to."""
-        lines = [f"mode{'f [Hz]':>11s}{'Hankel':>11s}{'peak':>11s}  share of the largest, channel"]
+        rows = []
         top = float(self.total.max(initial=0.0)) or 1.0
         for i in np.argsort(-self.total, kind="stable")[:most]:
             out, into = np.unravel_index(int(np.argmax(self.values[i])), self.values[i].shape)
-            lines.append(
-                f"{self.modes[i]:4d}{self.freq[i]:11.2f}{self.total[i]:11.3g}{self.peak[i]:11.3g}"
-                f"  {self.total[i] / top:7.2%}  {self.inputs[into]} -> {self.outputs[out]}"
-            )
-        return "\n".join(lines)
+            sizes = f"{self.total[i]:.3g}", f"{self.peak[i]:.3g}", f"{self.total[i] / top:.2%}"
+            channel = f"{self.inputs[into]} -> {self.outputs[out]}"
+            rows.append((str(self.modes[i]), f"{self.freq[i]:.2f}", *sizes, channel))
+        head = ("mode", "f [Hz]", "Hankel", "peak", "of the largest", "channel")
+        return "\n".join(aligned(head, rows))
 
 
 def rank_modes(

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import FloatArray, Value, instance, name_list, positive, real_array
-from ..errors import LabelError, ModelError, ShapeError, counted, require_known
+from ..errors import LabelError, ModelError, ShapeError, aligned, counted, require_known
 from ..loop import ClosedLoop, close_loop
 from ..plant import Poi, Ports
 from .response import Numbers, Response, as_numbers, moving_moments, signal_unit
@@ -56,15 +56,13 @@ class ExposureErrors(Value):
         return ExposureFigures(*self.values[self.channels.index(channel)].tolist())
 
     def __repr__(self) -> str:
-        width = max(map(len, self.channels)) + 2
-        head = ("MA max", f"MA {SHARE:.1%}", "MSD max", f"MSD {SHARE:.1%}")
-        lines = [f"errors over windows of {1e3 * self.window:g} ms"]
-        lines.append(f"{'':{width}s}" + "".join(f"{h:>12s}" for h in head))
+        head = ("", "MA max", f"MA {SHARE:.1%}", "MSD max", f"MSD {SHARE:.1%}", "")
+        rows = []
         for name, unit, row in zip(self.channels, self.units, self.values, strict=True):
             factor, shown = (1e9, f"n{unit}") if unit in ("m", "rad") else (1.0, unit)
-            cells = "".join(f"{factor * value:12.4g}" for value in row)
-            lines.append(f"{name:{width}s}{cells}  {shown}")
-        return "\n".join(lines)
+            rows.append((name, *(f"{factor * value:.4g}" for value in row), shown))
+        table = aligned(head, rows)
+        return "\n".join([f"errors over windows of {1e3 * self.window:g} ms", *table])
 
 
 def exposure_errors(

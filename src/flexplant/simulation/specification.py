@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray, Value, checked, in_unit, instance, positive, short
-from ..errors import AssumptionError, LabelError, ModelError, counted, require_known
+from ..errors import AssumptionError, LabelError, ModelError, aligned, counted, require_known
 from ..loop import ClosedLoop, bandwidth
 from .exposure import exposure_errors, settling_time
 from .response import Response
@@ -85,21 +85,15 @@ class Verdict(Value):
         return float(self.values[self.names.index(name)])
 
     def __repr__(self) -> str:
-        width = max(map(len, self.names)) + 2
         lines = ["specification: passed" if self.passed else
                  f"specification: FAILED ({', '.join(self.failed)})"]  # fmt: skip
-        lines.append(f"{'':{width}s}{'reached':>12s}{'':4s}{'limit':<12s}")
-        rows = zip(
-            self.names, self.units, self.values, self.limits, self.at_least, self.met, strict=True
-        )
-        for name, unit, value, limit, least, met in rows:
-            sign = ">=" if least else "<="
+        columns = (self.names, self.units, self.values, self.limits, self.at_least, self.met)
+        rows = []
+        for name, unit, value, limit, least, met in zip(*columns, strict=True):
             factor, shown = in_unit(float(limit), unit) if np.isfinite(limit) else (1.0, unit)
-            lines.append(
-                f"{name:{width}s}{value / factor:12.4g} {sign} {limit / factor:<10.4g} {shown:5s}"
-                f"{'' if met else ' FAILED'}"
-            )
-        return "\n".join(line.rstrip() for line in lines)
+            must = f"{'>=' if least else '<='} {limit / factor:.4g}"
+            rows.append((name, f"{value / factor:.4g}", must, shown, "" if met else "FAILED"))
+        return "\n".join([*lines, *aligned(("", "reached", "limit", "", ""), rows)])
 
 
 @dataclass(frozen=True, eq=False)

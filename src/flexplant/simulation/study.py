@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import FloatArray, Value, instance, positive, seed_sequence, short
-from ..errors import LabelError, ModelError, counted, require_known, unknown_label, warn
+from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label, warn
 from ..estimation import KalmanEstimator, StaticEstimator
 from ..estimation.estimator_channels import estimates, poi_channels, row_of
 from ..fingerprint import fingerprint
@@ -216,18 +216,16 @@ class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
     def __repr__(self) -> str:
         reasons = [(i, reason) for i, reason in enumerate(self.failed) if reason]
         lines = [f"<StudyTable: {counted(len(self.failed), 'machine')}, {len(reasons)} failed>"]
-        width = max((len(name) for name in self.columns), default=0) + 2
-        numeric = {n: c for n, c in self.columns.items() if c.dtype.kind == "f"}
-        if numeric:
-            lines.append(f"  {'':{width}s}{'5 %':>10s}{'median':>10s}{'95 %':>10s}")
-        for name, column in numeric.items():
-            known = column[np.isfinite(column)]
-            shown = np.quantile(known, (0.05, 0.5, 0.95)) if known.size else np.full(3, np.nan)
-            lines.append(f"  {name:{width}s}" + "".join(f"{value:10.4g}" for value in shown))
-        done = np.array([not reason for reason in self.failed])
+        done, rows, said = np.array([not reason for reason in self.failed]), [], []
         for name, column in self.columns.items():
-            if column.dtype.kind == "b":
-                lines.append(f"  {name:{width}s}{np.count_nonzero(column[done])} of {done.sum()}")
+            if column.dtype.kind == "f":
+                known = column[np.isfinite(column)]
+                shown = np.quantile(known, (0.05, 0.5, 0.95)) if known.size else np.full(3, np.nan)
+                rows.append((name, *(f"{value:.4g}" for value in shown)))
+            elif column.dtype.kind == "b":
+                said.append(f"{name}  {np.count_nonzero(column[done])} of {done.sum()}")
+        numbers = aligned(("", "5 %", "median", "95 %"), rows) if rows else []
+        lines += [f"  {line}" for line in (*numbers, *said)]
         lines += [f"  machine {i}: {reason}" for i, reason in reasons[:_SHOWN]]
         if len(reasons) > _SHOWN:
             lines.append(f"  and {len(reasons) - _SHOWN} more that failed")
@@ -321,13 +319,13 @@ class EstimatorComparison(Value):
 
     def __repr__(self) -> str:
         unit = "nrad" if self.channel.rpartition(":")[2].startswith("r") else "nm"
-        width = max(map(len, self.names)) + 2
-        lines = [f"rms error of the estimate of {self.channel} [{unit}]"]
-        lines.append(f"{'':{width}s}{'predicted':>10s}{'measured':>10s}  {self.level:.0%} interval")
-        for name, (*both, low, high) in zip(self.names, 1e9 * self.errors, strict=True):
-            cells = "".join(f"{value:10.3f}" for value in both)
-            lines.append(f"{name:{width}s}{cells}  {low:.3f} to {high:.3f}")
-        return "\n".join(lines)
+        shown = [[f"{value:.3f}" for value in row] for row in 1e9 * self.errors]
+        rows = [
+            (name, *both, f"{low} to {high}")
+            for name, (*both, low, high) in zip(self.names, shown, strict=True)
+        ]
+        table = aligned(("", "predicted", "measured", f"{self.level:.0%} interval"), rows)
+        return "\n".join([f"rms error of the estimate of {self.channel} [{unit}]", *table])
 
 
 def reading_along(designs: Mapping[str, Estimator]) -> tuple[StateSpace, ...]:

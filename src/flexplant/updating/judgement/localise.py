@@ -10,7 +10,7 @@ import numpy as np
 
 from ...checks import FloatArray, Value
 from ...checks import whole as counted
-from ...errors import ModelError, require_known, some_names, warn
+from ...errors import ModelError, aligned, require_known, some_names, warn
 from ...parallel import Progress
 from ...structure.model import FEModel
 from ..changed_model import FullBasis
@@ -296,18 +296,16 @@ class Localisation(Value):
     @property
     def table(self) -> str:
         """The leading candidates in lines: value alone, share explained, BIC above the least."""
-        width = max(len("candidate"), *(len(name) for name in self.leading))
-        lines = [f"{'candidate':{width}s}{'value alone':>13s}{'explained':>11s}{'BIC +':>10s}"]
-        least = float(np.min(self.bic))
+        least, rows = float(np.min(self.bic)), []
         for name in self.leading:
             i = self.candidates.index(name)
-            known = np.isfinite(self.bic[i])
-            more = f"{self.bic[i] - least:10.1f}" if known else f"{'-':>10s}"
-            mark = "  chosen" if name in self.chosen else ""
+            more = f"{self.bic[i] - least:.1f}" if np.isfinite(self.bic[i]) else "-"
+            mark = "chosen" if name in self.chosen else ""
             others = len(self.alike) > 1 and name in self.alike
             mark += "  alike" if others else "  rival" if name in self.rivals else ""
-            lines.append(f"{name:{width}s}{self.values[i]:13.5g}{self.score[i]:11.4f}{more}{mark}")
-        rest = len(self.candidates) - len(lines) + 1
+            rows.append((name, f"{self.values[i]:.5g}", f"{self.score[i]:.4f}", more, mark))
+        rest = len(self.candidates) - len(rows)
+        lines = aligned(("candidate", "value alone", "explained", "BIC +", ""), rows)
         return "\n".join([*lines, *([f"and {rest} more"] if rest else [])])
 
     def __repr__(self) -> str:
