@@ -370,3 +370,15 @@ class DofSet(Value):
             One row per DOF, in the order of the matrices.
         """
         return cls(*columns_of(table))
+
+
+def node_dofs(
+    ids: IntArray,
+    directions: Sequence[str],
+    xyz: FloatArray,
+    interpolation: Interpolation | None = None,
+) -> DofSet:
+    """Return the DOFs of nodes (n,) at places (n, 3), the same directions at each."""
+    m = len(directions)
+    names, places = tuple(directions) * ids.size, np.repeat(xyz, m, axis=0)
+    return DofSet(np.repeat(ids, m), names, places, interpolation)

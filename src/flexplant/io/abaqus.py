@@ -25,10 +25,9 @@ from .files import (
     defined_twice,
     file_path,
     no_motion,
+    numbers_of_lines,
     printed_digits,
-    rows_of_numbers,
     unread,
-    wrong_line,
     wrong_line_of,
 )
 
@@ -160,13 +159,13 @@ def _triplets(path: str | Path) -> _Triplets:
     width = len(_WORD.findall(data[0]))
     if width not in (3, 5) or (width == 3 and b"," in data[0]):
         raise _abaqus_line_error(path, lines, data[0], 5)
-    table = rows_of_numbers(b"\n".join(data).replace(b",", b" "), width)
-    if table is None:
-        at = wrong_line((line.replace(b",", b" ") for line in data), width)
-        raise _abaqus_line_error(path, lines, data[at or 0], width)
+
+    def wrong_at(place: int, line: bytes) -> FlexplantError:
+        return _abaqus_line_error(path, lines, data[place], width)
+
+    table = numbers_of_lines(b"\n".join(data).replace(b",", b" "), width, wrong_at)
     labels = table[:, :-1]
-    wrong = ~np.isfinite(table).all(axis=1) | (labels != np.round(labels)).any(axis=1)
-    if np.any(wrong):
+    if np.any(wrong := (labels != np.round(labels)).any(axis=1)):
         raise _abaqus_line_error(path, lines, data[int(np.argmax(wrong))], width)
     whole: Any = labels.astype(np.int64)
     inner = whole[:, :: 2 if width == 5 else 1]

@@ -11,7 +11,7 @@ import numpy as np
 from ..checks import FloatArray, IntArray
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, counted
-from ..labels import DIRECTIONS, DofSet
+from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..structure import FEMatrices
 from .assembled import assembled, missing_extra
 from .fe_modes import MODE_READERS, FileShapes
@@ -187,9 +187,7 @@ def read_rst_shapes(path: Path, nodes: Path | None) -> FileShapes:
     values = np.asarray(found["shapes"], dtype=np.float64)  # (k, nodes, DOFs)
     known = np.asarray(found["nodes"], dtype=np.int64)
     places = np.asarray(found["xyz"], dtype=np.float64)[:, :3]
-    xyz = at_nodes(ids, known, places, str(path))
-    m = len(directions)
-    dofs = DofSet(np.repeat(ids, m), directions * ids.size, np.repeat(xyz, m, axis=0))
+    dofs = node_dofs(ids, directions, at_nodes(ids, known, places, str(path)))
     phi = values.reshape(len(values), -1).T
     omega = 2 * np.pi * np.asarray(found["freq"], dtype=np.float64)
     note = "ANSYS normalises to unit mass unless MODOPT's Nrmkey is ON"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -116,6 +117,14 @@ def chosen(
             "matrix. Say which it is: stiffness='...', mass='...'."
         )
     return found
+
+
+def extra_module(module: str, extra: str, what: str) -> Any:
+    """Return a module that `flexplant[extra]` installs, or say the line to type."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise missing_extra(module, extra, what) from None
 
 
 def missing_extra(package: str, extra: str, what: str) -> FlexplantError:

@@ -85,19 +85,34 @@ def rows_of_numbers(text: bytes, width: int) -> FloatArray | None:
     return None if numbers is None else numbers.reshape(-1, width)
 
 
+def numbers_of_lines(
+    text: bytes, width: int, wrong: Callable[[int, bytes], FlexplantError]
+) -> FloatArray:
+    """Return the finite numbers (m, width) of m lines.
+
+    `wrong` makes the error of the first line, by its place (from 0), that does not hold them.
+    """
+    table = rows_of_numbers(text, width)
+    if table is None or not np.all(np.isfinite(table)):
+        lines = text.split(b"\n")
+        at = wrong_line(lines, width) or 0
+        raise wrong(at, lines[at])
+    return table
+
+
 def wrong_line(lines: Iterable[bytes], width: int) -> int | None:
     """Return the place (from 0) of the first line that does not hold `width` finite numbers."""
     for place, line in enumerate(lines):
-        words = line.decode("latin-1").split()
         try:
-            if words and len([decimal(word) for word in words]) != width:
-                return place
+            held = [decimal(word.decode("latin-1")) for word in line.split()]
         except ValueError:
+            return place
+        if held and (len(held) != width or not np.all(np.isfinite(held))):
             return place
     return None
 
 
-_LETTERS = bytes.maketrans(b"DdEQ", b"eeee")
+_LETTERS = bytes.maketrans(b"DdEQq", b"eeeee")
 
 
 def _parse_numbers(text: bytes) -> FloatArray | None:
@@ -127,17 +142,6 @@ def printed_digits(words: Iterable[bytes]) -> int | None:
     most = max(counts, default=0)
     alike = sum(count >= most - _FIELD for count in counts) >= _ALIKE * len(counts)
     return most if most >= _DOUBLE or (most >= _ROUNDED and alike) else None
-
-
-def cut_short(content: bytes, words: Iterable[bytes]) -> bool:
-    """Return whether a text ends, without a line end, in a number shorter than all others."""
-    # a number without its last digits still is a number
-    last = content[-80:].split()[-1:]
-    if content.endswith((b"\n", b"\r")) or not last:
-        return False
-    # the last itself may be among them
-    others = [len(word) for word in (w.strip().lstrip(b"+-") for w in words) if word not in last[0]]
-    return bool(others) and len(last[0].lstrip(b"+-")) < min(others) >= _PRINTED
 
 
 #: what to do with a file that says a thing twice, and one in axes of its own
@@ -190,12 +194,6 @@ def unread(path: object, what: str, do: str) -> ModelError:
     return ModelError(f"{str(path)!r} {what}. {do}")
 
 
-def at_zero(path: object, kind: str, target: str) -> ModelError:
-    """Return the error of responses at 0 Hz that were to be integrated."""
-    what = f"holds {kind} at zero frequency, which cannot be integrated to {target}"
-    return unread(path, what, f"Read it as {kind}, or export from above zero.")
-
-
 def no_motion(path: object, kinds: object) -> ModelError:
     """Return the error of a file with DOFs that are no displacement or rotation."""
     what = (
@@ -216,8 +214,16 @@ def three_units(units: Any) -> tuple[Any, ...]:
 
 
 def check_whole(content: bytes, words: Iterable[bytes], path: object) -> None:
-    """Refuse a text that ends, without a line end, in a number shorter than all others."""
-    if cut_short(content, words):
+    """Refuse a text that ends, without a line end, in a number shorter than all others.
+
+    A number without its last digits still is a number.
+    """
+    last = content[-80:].split()[-1:]
+    if content.endswith((b"\n", b"\r")) or not last:
+        return
+    # the last itself may be among them
+    others = [len(word) for word in (w.strip().lstrip(b"+-") for w in words) if word not in last[0]]
+    if others and len(last[0].lstrip(b"+-")) < min(others) >= _PRINTED:
         raise damaged(path, "the last number is shorter than all others")
 
 

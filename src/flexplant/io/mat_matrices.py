@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from ..errors import FlexplantError
 from ..labels import DofSet
 from ..structure import FEMatrices
-from .assembled import assembled, chosen, missing_extra
+from .assembled import assembled, chosen, extra_module
 from .files import FORMATS, USUAL, Format, check_count, file_path, parsing
 from .foreign_parsers import in_child
 
@@ -151,12 +151,8 @@ def _flatten(name: str, value: Any, found: dict[str, Any]) -> None:
 
 
 def _version73(path: Path, wanted: Mapping[str, str | None]) -> dict[str, Any]:
-    try:
-        import h5py
-    except ImportError:
-        raise missing_extra(
-            "h5py", "hdf5", f"{path.name!r} is a MATLAB file of version 7.3 (HDF5), and reading it"
-        ) from None
+    what = f"{path.name!r} is a MATLAB file of version 7.3 (HDF5), and reading it"
+    h5py = extra_module("h5py", "hdf5", what)
     with parsing(path), h5py.File(path, "r") as file:
         variables: dict[str, Any] = {}
 

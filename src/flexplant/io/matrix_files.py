@@ -26,13 +26,12 @@ from .files import (
     check_whole,
     damaged,
     fixed_numbers,
+    numbers_of_lines,
     parsing,
     printed_digits,
     refused,
-    rows_of_numbers,
     spaced_numbers,
     unread,
-    wrong_line,
     wrong_line_of,
 )
 from .foreign_parsers import sound
@@ -123,14 +122,13 @@ def _matrix_market(path: Path) -> tuple[Any, int | None]:
 
 def _entry_table(body: bytes, head: _Header, path: Path) -> FloatArray:
     """Return the numbers (entries, 3 or 1) of all lines, in any notation of C or Fortran."""
-    width = 3 if head.listed else 1
-    table = rows_of_numbers(body, width)
-    if table is None or not np.all(np.isfinite(table)):
-        lines = body.split(b"\n")
-        at = wrong_line(lines, width) or 0
-        due = "row, column and value" if head.listed else "one number"
-        do = "A number is finite, with a decimal point and E, D or a sign before its exponent."
-        raise wrong_line_of(path, head.lines + at + 1, f"expected {due} is", lines[at], do)
+    width, due = (3, "row, column and value") if head.listed else (1, "one number")
+    do = "A number is finite, with a decimal point and E, D or a sign before its exponent."
+
+    def wrong_at(place: int, line: bytes) -> FlexplantError:
+        return wrong_line_of(path, head.lines + place + 1, f"expected {due} is", line, do)
+
+    table = numbers_of_lines(body, width, wrong_at)
     if len(table) != head.entries:
         raise damaged(path, f"announces {head.entries} entries and holds {len(table)}")
     return table

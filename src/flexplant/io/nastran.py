@@ -13,7 +13,7 @@ import numpy as np
 from ..checks import FloatArray, IntArray
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
-from ..labels import DIRECTIONS, DofSet
+from ..labels import DIRECTIONS, node_dofs
 from ..tolerances import ROUNDING
 from .fe_modes import MODE_READERS, FileShapes
 from .files import USUAL, damaged, decimal, defined_twice, file_path
@@ -288,7 +288,7 @@ def shapes_at(
     if local_rows:
         moved = counted(len(local_rows), "node")
         notes = (*notes, f"{moved} moved in local directions: turned into the basic ones")
-    dofs = DofSet(np.repeat(ids, 6), DIRECTIONS * ids.size, np.repeat(xyz, 6, axis=0))
+    dofs = node_dofs(ids, DIRECTIONS, xyz)
     phi = values.reshape(6 * ids.size, omega.size)
     return FileShapes(omega, phi, dofs, masses=masses, notes=notes)
 

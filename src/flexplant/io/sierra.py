@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -15,10 +14,10 @@ import scipy.sparse as sp
 
 from ..checks import FloatArray, IntArray, Matrix, one_of, real_array
 from ..errors import FlexplantError, LabelError, ModelError, ShapeError, counted
-from ..labels import DIRECTIONS, DofSet
+from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..modes import Modes
 from ..structure.matrices import FEMatrices
-from .assembled import from_triplets, missing_extra
+from .assembled import extra_module, from_triplets
 from .fe_modes import MODE_READERS, FileShapes, check_mass, frequencies
 from .files import (
     ELSEWHERE,
@@ -30,10 +29,9 @@ from .files import (
     damaged,
     file_path,
     no_motion,
+    numbers_of_lines,
     parsing,
     printed_digits,
-    rows_of_numbers,
-    wrong_line,
     wrong_line_of,
 )
 
@@ -134,7 +132,7 @@ def read_shapes(
         raise damaged(path, f"shapes of other sizes than {k} steps and {n} nodes")
     names = list(chosen)
     phi = np.stack(shapes).transpose(2, 0, 1).reshape(n * len(names), k)
-    dofs = DofSet(np.repeat(ids, len(names)), tuple(names) * n, np.repeat(xyz, len(names), axis=0))
+    dofs = node_dofs(ids, names, xyz)
     if not np.all(np.isfinite(values)):
         raise damaged(path, "NaN in the place of time")
     if times == "eigenvalue":
@@ -174,13 +172,8 @@ def open_exodus(path: str | Path) -> Iterator[ExodusFile]:
     """Return an Exodus file, netCDF-3 or netCDF-4, to be used in a `with` block."""
     with file_path(path).open("rb") as raw:
         is_hdf = raw.read(8) == b"\x89HDF\r\n\x1a\n"
-    h5py: Any = None
-    if is_hdf:
-        try:
-            h5py = importlib.import_module("h5py")
-        except ImportError:
-            what = f"{str(path)!r} is a netCDF-4 file, and reading it"
-            raise missing_extra("h5py", "hdf5", what) from None
+    what = f"{str(path)!r} is a netCDF-4 file, and reading it"
+    h5py = extra_module("h5py", "hdf5", what) if is_hdf else None
     do = "Is it an Exodus (netCDF) file, and whole? Write it again."
     with parsing(path, do), np.errstate(all="ignore"):  # sizes of a damaged file overflow
         file = h5py.File(path, "r") if is_hdf else scipy.io.netcdf_file(path, "r", mmap=False)
@@ -251,7 +244,6 @@ def read_exodus_shapes(path: Path, nodes: Path | None) -> FileShapes:
 MODE_READERS |= dict.fromkeys((".exo", ".e"), read_exodus_shapes)
 
 
-_WORD = re.compile(rb"[^\s,;]+")
 #: a map has so many entries a node: x, y, z, rx, ry, rz and two or three that are no motion
 _PER_NODE = (9, 8)
 #: x = zeros(5670, 1); x(1) = 1; x(2) = 2; ...
@@ -345,24 +337,24 @@ def _read_numbers(path: str | Path, width: int) -> tuple[FloatArray, int | None]
     lines = [
         line.split(b"%")[0].strip(b" \t\r;,") for line in content[start + 1 : stop].split(b"\n")
     ]
-    lines = [line.replace(b"...", b" ") for line in lines]
-    words = [_WORD.findall(line) for line in lines]
-    kept = [line for line in lines if line]
-    table = rows_of_numbers(re.sub(rb"[,;]", b" ", b"\n".join(kept)), width)
-    if table is None or not kept or not np.all(np.isfinite(table)):
-        at = wrong_line((b" ".join(row) for row in words), width)
-        if at is not None:
-            due, do = f"{counted(width, 'number')} are", "Write it again with 'mfile'."
-            if _ZEROS.search(content):
-                do = "A map of DOFs goes to dof_map=, a list of nodes to exodus=."
-            raise wrong_line_of(path, first + at, due, lines[at], do)
+    lines = [re.sub(rb"[,;]|\.\.\.", b" ", line) for line in lines]
+    kept = [line for line in lines if line.strip()]
+    if not kept:
         raise FlexplantError(f"{str(path)!r} holds no table of numbers. Write it with 'mfile'.")
+    do = "Write it again with 'mfile'."
+    if _ZEROS.search(content):
+        do = "A map of DOFs goes to dof_map=, a list of nodes to exodus=."
+
+    def wrong_at(place: int, line: bytes) -> FlexplantError:
+        return wrong_line_of(path, first + place, f"{counted(width, 'number')} are", line, do)
+
+    table = numbers_of_lines(b"\n".join(lines), width, wrong_at)
     whole = table[:, : width - 1] if width > 1 else table
     wrong = (whole != np.round(whole)) | ((whole < 1) & (width > 1))
     if np.any(wrong):
         what = f"{whole[wrong][0]:g} is no row or column, which are counted from 1"
         raise damaged(path, what, "Write it again with 'mfile'.")
-    shown = [row[-1] for row in words if row][:: max(1, len(kept) // 1000)]
+    shown = [line.split()[-1] for line in kept[:: max(1, len(kept) // 1000)]]
     if stop == len(content):
         check_whole(content, shown, path)
     return table, printed_digits(shown)

@@ -13,7 +13,7 @@ import numpy as np
 from ..checks import FloatArray, IntArray
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError
-from ..labels import DIRECTIONS, DofSet
+from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..structure.units import units
 from .files import decimal, file_path, refused, text_of
 
@@ -92,12 +92,7 @@ def read_dofs(
     scale = units(length).length
     if directions is not None:
         numbers, xyz = _node_table(table)
-        each = [_direction(name, path) for name in directions]
-        return DofSet(
-            np.repeat(numbers, len(each)),
-            tuple(each) * numbers.size,
-            scale * np.repeat(xyz, len(each), axis=0),
-        )
+        return node_dofs(numbers, [_direction(name, path) for name in directions], scale * xyz)
     needed = ("node", "direction") if nodes is not None else ("node", "direction", "x", "y", "z")
     missing = [name for name in needed if name not in columns]
     if missing:

@@ -11,11 +11,11 @@ from ..checks import FloatArray, IntArray, positive
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError, ModelError, require_known
 from ..identification import MeasuredModes
-from ..labels import DIRECTIONS, DofSet
+from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..lti.frequency import ORDERS, Frf
 from ..structure.units import Units
 from .fe_modes import MODE_READERS, FileShapes
-from .files import ELSEWHERE, GLOBAL, ONCE, Elsewhere, at_zero, damaged, file_path, refused, unread
+from .files import ELSEWHERE, GLOBAL, ONCE, Elsewhere, damaged, file_path, refused, unread
 from .tables import read_nodes_table
 from .uff_records import (
     KINDS,
@@ -26,6 +26,7 @@ from .uff_records import (
     coherence_of,
     common_frequencies,
     datasets,
+    derivative,
     mode_records,
     paired_records,
     record_scale,
@@ -134,11 +135,7 @@ def read_frf_uff(
         kind = KINDS.get(whole_entry(part, "ordinate_spec_data_type"))
         factor = sign * (scale or record_scale(part, factors, kind or target, str(path)))
         row = factor * np.asarray(part["data"], dtype=np.complex128)
-        if kind is not None and target is not None and kind != target:
-            order = ORDERS[target] - ORDERS[kind]
-            if order < 0 and freq[0] == 0:
-                raise at_zero(path, kind, target)
-            row = row * (2j * np.pi * freq) ** order
+        row = row * derivative(freq, kind or target, target, path)
         data[outputs.index(output), inputs.index(name)] = row
     measured = (
         [part for part in records if whole_entry(part, "func_type") == 6] if coherence else []
@@ -264,9 +261,7 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
     [0.1, 0.2, 0.0]
     """
     ids, xyz, (length, _) = raw_nodes(path)
-    count = len(directions)
-    xyz = np.repeat(xyz / length, count, axis=0)
-    return DofSet(np.repeat(ids, count), tuple(directions) * ids.size, xyz)
+    return node_dofs(ids, directions, xyz / length)
 
 
 def raw_nodes(path: str | Path) -> tuple[IntArray, FloatArray, tuple[float, float]]:
@@ -321,11 +316,7 @@ def read_uff_shapes(path: Path, nodes: Path | None) -> FileShapes:
         known, xyz, factors = raw_nodes(where)
     else:
         (known, xyz), factors = read_nodes_table(where), (1.0, 1.0)
-    dofs = DofSet(
-        np.repeat(ids, 6),
-        DIRECTIONS * ids.size,
-        np.repeat(at_nodes(ids, np.asarray(known), xyz, str(where)), 6, axis=0),
-    )
+    dofs = node_dofs(ids, DIRECTIONS, at_nodes(ids, np.asarray(known), xyz, str(where)))
     zeta, masses = np.array([part.zeta for part in parts]), np.array([part.mass for part in parts])
     length, force = factors
     return FileShapes(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 import warnings
 from collections.abc import Iterable, Iterator
@@ -16,17 +15,8 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS
 from ..lti.frequency import ORDERS, Frf
 from ..tolerances import SAME
-from .files import (
-    GLOBAL,
-    ONCE,
-    at_zero,
-    damaged,
-    file_path,
-    parsing,
-    refused,
-    spaced_numbers,
-    unread,
-)
+from .assembled import extra_module
+from .files import GLOBAL, ONCE, damaged, file_path, parsing, refused, spaced_numbers, unread
 
 
 def check_systems(parts: list[dict[str, Any]], path: str) -> None:
@@ -44,12 +34,7 @@ def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
     """Return the datasets of some kinds, as pyuff reads them."""
     with file_path(path).open("rb") as file:
         start = file.read(200)
-    try:
-        pyuff = importlib.import_module("pyuff")
-    except ImportError:
-        raise FlexplantError(
-            "universal files need pyuff. Install it: pip install 'flexplant[uff]'."
-        ) from None
+    pyuff = extra_module("pyuff", "uff", "reading universal files")
     if start.split()[:1] != [b"-1"]:
         what = f"is no universal file: it begins with {start[:20]!r}, not with -1"
         raise refused(path, what, "Export it as one, .uff or .unv.")
@@ -460,10 +445,7 @@ def responses_of_model(
     length = scale or (1.0 if factors is None else 1 / float(factors["length"]))
     motion = np.arange(data.shape[1]) % 6
     data[:, motion < 3] *= length
-    order = ORDERS[quantity or kind] - ORDERS[kind]
-    if order < 0 and freq[0] == 0:
-        raise at_zero(path, kind, str(quantity))
-    data = data * ((2j * np.pi * freq) ** order)[:, None, None]
+    data = data * derivative(freq, kind, quantity or kind, path)[:, None, None]
     seen = np.isin(motion, motion[np.any(data, axis=(0, 2))])
     names = [f"{node}:{axis}" for node in parts[0].nodes.tolist() for axis in DIRECTIONS]
     return Frf(
@@ -473,6 +455,17 @@ def responses_of_model(
         outputs=[name for name, there in zip(names, seen, strict=True) if there],
         quantity=quantity or kind,
     )
+
+
+def derivative(
+    freq: FloatArray, kind: str | None, target: str | None, path: str | Path
+) -> ComplexArray:
+    """Return the factors (n_freq,) from one quantity to another, 1 where neither is known."""
+    order = ORDERS[target] - ORDERS[kind] if kind and target else 0
+    if order < 0 and freq[0] == 0:
+        what = f"holds {kind} at zero frequency, which cannot be integrated to {target}"
+        raise unread(path, what, f"Read it as {kind}, or export from above zero.")
+    return np.asarray((2j * np.pi * freq) ** order)
 
 
 def _by_load(parts: list[AnalysisData], path: Path) -> dict[int, dict[float, AnalysisData]]:

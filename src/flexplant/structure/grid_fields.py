@@ -23,7 +23,7 @@ from ..checks import (
     why_not_called,
 )
 from ..errors import ModelError, ShapeError
-from ..labels import DofSet, Interpolation
+from ..labels import DofSet, Interpolation, node_dofs
 from .element_matrices import Grid, beam_mass, beam_rotary, beam_stiffness
 
 #: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre
@@ -290,13 +290,7 @@ def dofs_of(
     """Return the DOFs of a grid that begins at the origin; nodes keep their number beside holes."""
     xyz = np.zeros((grid.nodes.size, 3))
     xyz[:, : len(lengths)] = grid.coordinates(lengths)
-    times = len(directions)
-    return DofSet(
-        np.repeat(grid.nodes + 1, times),
-        directions * grid.nodes.size,
-        np.repeat(xyz, times, axis=0),
-        shape,
-    )
+    return node_dofs(grid.nodes + 1, directions, xyz, shape)
 
 
 #: of an element: a rib's ends are this close to nodes

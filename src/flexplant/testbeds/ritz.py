@@ -13,7 +13,7 @@ from numpy.polynomial import legendre
 from ..checks import FloatArray
 from ..dof_columns import Interpolation
 from ..errors import LabelError
-from ..labels import DofSet
+from ..labels import DofSet, node_dofs
 from ..sparse.symmetric import dense
 from ..structure import FEModel
 
@@ -207,7 +207,6 @@ def ritz_block(
             K[:, i, :, j] += first * each[i][j] + shear * each[j][i]
     places = [0.5 * a * (1.0 + lobatto(order)) for order, a in zip(orders, lengths, strict=True)]
     z, y, x = (one.reshape(-1) for one in np.meshgrid(*reversed(places), indexing="ij"))
-    xyz = np.repeat(np.column_stack([x, y, z]), 3, axis=0)
-    dofs = DofSet(np.repeat(np.arange(1, n + 1), 3), _AXES * n, xyz, shape)
+    dofs = node_dofs(np.arange(1, n + 1), _AXES, np.column_stack([x, y, z]), shape)
     M, K = (0.5 * (one + one.T) for one in (M.reshape(3 * n, -1), K.reshape(3 * n, -1)))
     return FEModel(M, K, dofs=dofs, name="block by Ritz")
