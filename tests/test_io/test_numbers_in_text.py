@@ -146,7 +146,7 @@ def test_plain_matrix_market_lines_go_through_the_fast_reader(tmp_path, monkeypa
     text = [f"%%MatrixMarket matrix coordinate real symmetric{end}400 400 {len(lines)}", *lines]
     (tmp_path / "K.mtx").write_bytes(end.join(text).encode())
     with monkeypatch.context() as patched:
-        patched.setattr("flexplant.io.matrix_files.rows_of_numbers", None)
+        patched.setattr("flexplant.io.files.rows_of_numbers", None)
         fast = fx.io.read_matrix_market(tmp_path / "K.mtx").K.toarray()
     assert np.array_equal(np.diag(fast), values)
     assert fast[6, 2] == fast[2, 6] == -0.5

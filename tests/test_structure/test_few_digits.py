@@ -57,6 +57,10 @@ def test_a_free_plate_with_few_digits_in_its_coordinates(digits):
     # the directions stay what they were called: z, rx, ry
     same = np.diag(R.T @ (exact.M @ exact.rigid_body))
     assert same == pytest.approx(1.0, abs=10.0 ** (1 - digits))
+    # the report judges as the model does, with its matrices alone too
+    for report in (fx.check(model), fx.check(FEMatrices(exact.K, exact.M, dofs=few))):
+        assert report.ok
+        assert (report.n_rigid, report.rigid, report.mechanisms) == (3, ("z", "rx", "ry"), ())
     modes = fx.solve_modes(model, count=9)
     assert modes.freq[:3].tolist() == [0, 0, 0]
     assert modes.freq[3:] == pytest.approx(elastic(exact), rel=1e-9)

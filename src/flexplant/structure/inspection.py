@@ -20,7 +20,7 @@ from .matrices import FEMatrices
 from .model import FEModel
 from .rigid import rigid_motions
 from .units import unusual
-from .zero_energy import ZeroEnergy, held_motions, most_moved, nearly_free, verdict
+from .zero_energy import ZeroEnergy, held_by_rounding, most_moved, nearly_free, verdict
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -225,10 +225,8 @@ def _rounding_warning(found: Facts, digits: int) -> str | None:
     given = found.given
     if given.dofs is None or not given.located or found.motions is None:
         return None
-    nearly, exactly = (
-        nearly_free(given.K, given.M, given.dofs, of).shape[1] for of in (digits, None)
-    )
-    return held_motions(nearly - exactly, digits)
+    exact = nearly_free(given.K, given.M, given.dofs, None)
+    return held_by_rounding(given.K, given.M, given.dofs, digits, exact)
 
 
 #: verdict, subject, finding, next step

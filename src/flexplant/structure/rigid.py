@@ -164,7 +164,7 @@ _RESIDUAL = 1e-12
 #: steps of inverse iteration from the geometry's motions to the null vectors of K
 _STEPS = 4
 #: part of a motion that may be lost on this way
-_ASIDE = 1e-3
+ASIDE = 1e-3
 
 
 def rigid_motions(dofs: DofSet, about: Any = (0.0, 0.0, 0.0)) -> FloatArray:
@@ -242,11 +242,11 @@ def rigid_body_basis(M: Matrix, K: Matrix, motions: FloatArray, xyz: FloatArray)
     # with the rounding that its coordinates `xyz` (n, 3) have
     parts = _bodies_of(motions)
     if len(parts) < 2:
-        return _free_motions(M, K, motions, farness(xyz))
+        return free_motions(M, K, motions, farness(xyz))
     found, mass, stiffness = [], cast(Any, M), cast(Any, K)
     for rows, columns in parts:
         own = mass[rows][:, rows], stiffness[rows][:, rows], motions[np.ix_(rows, columns)]
-        free = _free_motions(*own, farness(xyz[rows]))
+        free = free_motions(*own, farness(xyz[rows]))
         found.append(np.zeros((motions.shape[0], free.shape[1])))
         found[-1][rows] = free
     return np.hstack(found)
@@ -260,38 +260,44 @@ def _bodies_of(motions: FloatArray) -> list[tuple[IntArray, IntArray]]:
     return [(np.flatnonzero(moved[:, one].any(axis=1)), one) for one in columns]
 
 
-def _free_motions(M: Matrix, K: Matrix, motions: FloatArray, far: float) -> FloatArray:
-    """Return the M-orthonormal motions of one body that cost no energy."""
+def free_motions(
+    M: Matrix, K: Matrix, motions: FloatArray, far: float, rounding: float = PRECISION
+) -> FloatArray:
+    """Return the M-orthonormal motions of one body that cost no energy but that of `rounding`."""
+    # of entries of K, relatively; what coordinates of few digits cost is taken out
     # K r and |K| |r|, row by row: forces of rounding size say that no energy is stored
     K = by_rows(K)
     size_of_K = Absolute(K)
     scale = np.linalg.norm(size_of_K @ np.abs(motions), axis=0)
     scale = divisor(scale)
     force = np.asarray(K @ motions) / scale
-    free = np.linalg.norm(force, axis=0) < _ENERGY_TOLERANCE
+    tolerance = max(_ENERGY_TOLERANCE, 10 * ENERGY * rounding)
+    free = np.linalg.norm(force, axis=0) < tolerance
     if np.all(free):
-        return _not_held(M, K, motions, far)
+        return _not_held(M, K, motions, far, rounding)
     # of the small triangle: the left factor of all DOFs would be a full square matrix
     _, found, right = la.svd(la.qr(force, mode="economic")[1])
     values = np.zeros(scale.size)
     values[: found.size] = found
-    null = right[values < _ENERGY_TOLERANCE].T
+    null = right[values < tolerance].T
     basis = motions[:, free]
     if null.shape[1] > basis.shape[1]:
         basis = orthonormalised(M, motions @ (null / scale[:, None]))
-    basis = _not_held(M, K, basis, far)
-    near = right[(values >= _ENERGY_TOLERANCE) & (values < _NEARLY)].T
+    basis = _not_held(M, K, basis, far, rounding)
+    near = right[(values >= tolerance) & (values < _NEARLY)].T
     if not near.shape[1]:
         return basis
     nearly = motions @ (near / scale[:, None])
     # those without a large force at any DOF: nothing grounds them
     nearly = nearly[:, force_parts(K, nearly) < _EVERYWHERE]
-    return _null_vectors(M, K, size_of_K, motions, basis, nearly) if nearly.shape[1] else basis
+    if not nearly.shape[1]:
+        return basis
+    return _null_vectors(M, K, size_of_K, motions, basis, nearly, rounding * ZERO / PRECISION)
 
 
-def _not_held(M: Matrix, K: Matrix, motions: FloatArray, far: float) -> FloatArray:
+def _not_held(M: Matrix, K: Matrix, motions: FloatArray, far: float, rounding: float) -> FloatArray:
     """Return the almost force-free motions, or combinations, that no soft spring holds."""
-    mix = unheld(K, motions, far=far)
+    mix = unheld(K, motions, rounding, far)
     if np.array_equal(mix, np.eye(*mix.shape)[:, : mix.shape[1]]):
         return motions[:, : mix.shape[1]]
     if np.count_nonzero(mix) == mix.shape[1]:
@@ -322,6 +328,7 @@ def _null_vectors(
     motions: FloatArray,
     basis: FloatArray,
     nearly: FloatArray,
+    rounding: float,
 ) -> FloatArray:
     """Return a basis and the null vectors of K next to nearly free motions, if there are such."""
     # by inverse iteration, `(K + s M) x' = s M x`: what the last digits of coordinates add are
@@ -329,7 +336,7 @@ def _null_vectors(
     # motion that something holds, however softly, keeps its energy and is none
     start = orthonormalised(M, np.hstack([basis, nearly]), dependent="drop")
     spread = float(np.einsum("ij,ij->j", np.abs(start), size_of_K @ np.abs(start)).max())
-    shift = 30 * ZERO * spread
+    shift = 30 * rounding * spread
     try:
         solve = definite_solver(K, M, shift)
         found = start
@@ -339,12 +346,12 @@ def _null_vectors(
         return basis  # K is indefinite: the solver of the modes says so
     energy = np.asarray(found.T @ np.asarray(K @ found))
     values, mix = la.eigh(0.5 * (energy + energy.T))
-    null = found @ mix[:, np.abs(values) < ZERO * spread]
+    null = found @ mix[:, np.abs(values) < rounding * spread]
     # the geometry's own motions, seen in the null space: what turns stays a turn about its axis
     for candidates in (motions, nearly):
         seen = null.T @ np.asarray(M @ candidates)
         size = np.sqrt(np.einsum("ij,ij->j", candidates, np.asarray(M @ candidates)))
-        kept = np.linalg.norm(seen, axis=0) > (1 - _ASIDE) * size
+        kept = np.linalg.norm(seen, axis=0) > (1 - ASIDE) * size
         several = np.hstack([*([basis] if candidates is nearly else []), null @ seen[:, kept]])
         whole = orthonormalised(M, several, dependent="drop")
         if whole.shape[1] >= null.shape[1]:

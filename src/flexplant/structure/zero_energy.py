@@ -13,12 +13,10 @@ from ..checks import FloatArray, IntArray, real_array
 from ..errors import ModelError, SolverError, attempted
 from ..labels import DIRECTIONS, DofSet
 from ..sparse.lowest import Lowest, lowest_modes
-from ..sparse.symmetric import PRECISION, ZERO, by_rows, dense
+from ..sparse.symmetric import PRECISION, ZERO, dense, diagonal
 from ..tolerances import divisor
-from .rigid import bodies, farness, force_free, orthonormalised, rigid_motions, unheld
+from .rigid import ASIDE, bodies, farness, force_free, free_motions, orthonormalised, rigid_motions
 
-#: times the energy that rounding of the entries allows: free
-_MARGIN = 3.0
 #: a motion is in the space of others when less than this part of it is left over
 _LEFT = 1e-6
 #: a singular value below this part of the largest is none
@@ -53,8 +51,7 @@ def zero_energy(
     joint_motions: FloatArray | None = None,
 ) -> ZeroEnergy:
     """Return the rigid-body motions that the geometry allows, and which of them cost no energy."""
-    # free are those whose energy is below three times the relative `rounding` of the entries of K,
-    # unless soft springs hold them: judged by `unheld`, as the rigid-body motions of a model are.
+    # judged as the rigid-body motions of a model are, with the relative `rounding` of K's entries.
     # Rotations are left out where coordinates are not known. Pieces that neither K nor M joins have
     # their own motions each, and a joined machine those that its joints allow
     center = dofs.xyz.mean(axis=0) if len(dofs) else np.zeros(3)
@@ -67,7 +64,7 @@ def zero_energy(
     possible = motions if joint_motions is None else np.hstack([motions, joint_motions])
     every, basis = _of_bodies(K, M, possible, several, rounding, dofs.xyz)
     left = motions - basis @ (basis.T @ motions)
-    free = present & (np.linalg.norm(left, axis=0) < _RANK * np.linalg.norm(motions, axis=0))
+    free = present & (np.linalg.norm(left, axis=0) < ASIDE * np.linalg.norm(motions, axis=0))
     return ZeroEnergy(
         free=tuple(name for name, is_free in zip(names, free, strict=True) if is_free),
         grounded=tuple(
@@ -94,13 +91,17 @@ def _of_bodies(
         whole = rows.size == motions.shape[0]
         stiffness, mass = (A if whole or A is None else A[rows][:, rows] for A in (K, M))
         own = own_motions(mass, motions[rows])
-        found = _energy_free(stiffness, abs(stiffness), own, _MARGIN * rounding)
         written, far = rounding * PRECISION / ZERO, farness(xyz[rows])
-        mix = unheld(by_rows(stiffness), found, written, far)
-        for part, kept in ((every, _independent(own)), (free, _independent(found @ mix))):
+        found = free_motions(_metric(stiffness), stiffness, own, far, written)
+        for part, kept in ((every, _independent(own)), (free, _independent(found))):
             part.append(np.zeros((motions.shape[0], kept.shape[1])))
             part[-1][rows] = kept
     return np.hstack(every), np.hstack(free)
+
+
+def _metric(K: Any) -> Any:
+    """Return a mass (n, n) by which motions are normalised whose span alone counts, M or none."""
+    return sp.diags_array(divisor(np.abs(diagonal(K))), format="csc")
 
 
 def own_motions(M: Any, motions: FloatArray) -> FloatArray:
@@ -114,28 +115,6 @@ def own_motions(M: Any, motions: FloatArray) -> FloatArray:
         if found.shape == independent.shape:
             return found
     return independent
-
-
-def _energy_free(K: Any, size: Any, motions: FloatArray, allowed: float) -> FloatArray:
-    """Return those of some independent motions, or combinations, without energy (n, r)."""
-    most = np.einsum("ij,ij->j", np.abs(motions), np.asarray(size @ np.abs(motions)))
-    energy = np.abs(np.einsum("ij,ij->j", motions, np.asarray(K @ motions)))
-    free = energy < allowed * most
-    if free.all():
-        return motions
-    combined = _free_combinations(K, size, _independent(motions), allowed)
-    return combined if combined.shape[1] > np.count_nonzero(free) else motions[:, free]
-
-
-def _free_combinations(K: Any, size: Any, motions: FloatArray, allowed: float) -> FloatArray:
-    """Return an orthonormal basis (n, r) of the combinations of orthonormal motions without energy.
-
-    A hinge leaves one rotation about itself, which is none of those about the middle.
-    """
-    most = np.einsum("ij,ij->j", np.abs(motions), np.asarray(size @ np.abs(motions)))
-    scaled = motions / np.sqrt(divisor(most))
-    values, vectors = la.eigh(scaled.T @ np.asarray(K @ scaled))
-    return _independent(scaled @ vectors[:, np.abs(values) < allowed])
 
 
 def _independent(motions: FloatArray) -> FloatArray:
@@ -321,17 +300,13 @@ def held_by_rounding(
 ) -> str | None:
     """Return what to say when only rounding of the entries of K holds rigid-body motions."""
     nearly = nearly_free(K, M, dofs, digits).shape[1]
-    if found is not None and force_free(M, K, found):
+    metric = _metric(K)
+    if found is not None and force_free(metric, K, orthonormalised(metric, found)):
         nearly -= found.shape[1]
-    return held_motions(nearly, digits)
-
-
-def held_motions(count: int, digits: int) -> str | None:
-    """Return what to say of some rigid-body motions that rounding holds, None when it is none."""
-    if count <= 0:
+    if nearly <= 0:
         return None
     return (
-        f"{count} of its rigid-body motions are held by nothing but the rounding of K's entries "
+        f"{nearly} of its rigid-body motions are held by nothing but the rounding of K's entries "
         f"to {digits} digits, and modes at or below 0 would follow. Export in double precision, or "
         "free them: FEMatrices(K, M, dofs=dofs).model(free=True), read_model(..., free=True)."
     )
