@@ -88,10 +88,8 @@ def rows_of_numbers(text: bytes, width: int) -> FloatArray | None:
 def numbers_of_lines(
     text: bytes, width: int, wrong: Callable[[int, bytes], FlexplantError]
 ) -> FloatArray:
-    """Return the finite numbers (m, width) of m lines.
-
-    `wrong` makes the error of the first line, by its place (from 0), that does not hold them.
-    """
+    """Return the finite numbers (m, width) of m lines."""
+    # `wrong` makes the error of the first line, by its place from 0, that does not hold them
     table = rows_of_numbers(text, width)
     if table is None or not np.all(np.isfinite(table)):
         lines = text.split(b"\n")
@@ -214,10 +212,8 @@ def three_units(units: Any) -> tuple[Any, ...]:
 
 
 def check_whole(content: bytes, words: Iterable[bytes], path: object) -> None:
-    """Refuse a text that ends, without a line end, in a number shorter than all others.
-
-    A number without its last digits still is a number.
-    """
+    """Refuse a text that ends, without a line end, in a number shorter than all others."""
+    # a number without its last digits still is a number
     last = content[-80:].split()[-1:]
     if content.endswith((b"\n", b"\r")) or not last:
         return

@@ -271,7 +271,7 @@ def free_motions(
     scale = np.linalg.norm(size_of_K @ np.abs(motions), axis=0)
     scale = divisor(scale)
     force = np.asarray(K @ motions) / scale
-    tolerance = max(_ENERGY_TOLERANCE, 10 * ENERGY * rounding)
+    tolerance = max(_ENERGY_TOLERANCE, ENERGY * rounding)
     free = np.linalg.norm(force, axis=0) < tolerance
     if np.all(free):
         return _not_held(M, K, motions, far, rounding)
