@@ -173,7 +173,7 @@ def open_exodus(path: str | Path) -> Iterator[ExodusFile]:
     with file_path(path).open("rb") as raw:
         is_hdf = raw.read(8) == b"\x89HDF\r\n\x1a\n"
     what = f"{str(path)!r} is a netCDF-4 file, and reading it"
-    h5py = extra_module("h5py", "hdf5", what) if is_hdf else None
+    h5py: Any = extra_module("h5py", "hdf5", what) if is_hdf else None
     do = "Is it an Exodus (netCDF) file, and whole? Write it again."
     with parsing(path, do), np.errstate(all="ignore"):  # sizes of a damaged file overflow
         file = h5py.File(path, "r") if is_hdf else scipy.io.netcdf_file(path, "r", mmap=False)
