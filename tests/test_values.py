@@ -121,7 +121,7 @@ def test_values_are_known_by_name():
     ],
 )
 def test_bad_arrays(value, shape, error):
-    with pytest.raises(error):
+    with pytest.raises(error, match=r"^x "):
         real_array(value, "x", shape)
 
 
@@ -209,11 +209,11 @@ def test_positive():
     assert positive(np.float32(2), "x") == 2
     assert positive(0, "x", zero=True) == 0
     for bad in (0, -1, np.nan, "a", "1", True, None):
-        with pytest.raises(ModelError):
+        with pytest.raises(ModelError, match=r"^x "):
             positive(bad, "x")
     with pytest.raises(ModelError, match="zero or positive"):
         positive(-1, "x", zero=True)
-    with pytest.raises(ShapeError):
+    with pytest.raises(ShapeError, match="x must be one number"):
         positive([1, 2], "x")
 
 
@@ -227,5 +227,5 @@ def test_signal_names():
 
 @pytest.mark.parametrize("names", [["a.b"], ["-a"], [""], ["a", "b", "a"]])
 def test_names_that_would_break_others_are_refused(names):
-    with pytest.raises(LabelError):
+    with pytest.raises(LabelError, match=r"cannot name|more than once"):
         check_names(names, "inputs")

@@ -248,22 +248,22 @@ def test_bad_records_are_refused(changes, error, text):
 
 
 @pytest.mark.parametrize(
-    "make",
+    ("make", "cause"),
     [
-        lambda: H1Estimator(overlap=1.0),
-        lambda: H1Estimator(segment=-1.0),
-        lambda: H1Estimator(window="nonsense"),
-        lambda: Periodic(period=0.0),
-        lambda: Periodic(period=1.0, discard=-1),
-        lambda: Periodic(period=1.0, band=(3.0, 2.0)),
-        lambda: multisine(0, rate=1.0, period=10.0),
-        lambda: multisine(1, rate=1.0, period=10.5),
-        lambda: multisine(1, rate=1.0, period=10.0, band=(3.0, 4.0)),
-        lambda: multisine(1, rate=1.0, period=10.0, rms=0.0),
+        (lambda: H1Estimator(overlap=1.0), "overlap"),
+        (lambda: H1Estimator(segment=-1.0), "segment"),
+        (lambda: H1Estimator(window="nonsense"), "window"),
+        (lambda: Periodic(period=0.0), "period"),
+        (lambda: Periodic(period=1.0, discard=-1), "discard"),
+        (lambda: Periodic(period=1.0, band=(3.0, 2.0)), "band"),
+        (lambda: multisine(0, rate=1.0, period=10.0), "count"),
+        (lambda: multisine(1, rate=1.0, period=10.5), "period"),
+        (lambda: multisine(1, rate=1.0, period=10.0, band=(3.0, 4.0)), "band"),
+        (lambda: multisine(1, rate=1.0, period=10.0, rms=0.0), "rms"),
     ],
 )
-def test_bad_methods_are_refused(make):
-    with pytest.raises(ModelError):
+def test_bad_methods_are_refused(make, cause):
+    with pytest.raises(ModelError, match=cause):
         make()
 
 

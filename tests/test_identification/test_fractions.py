@@ -102,7 +102,7 @@ def test_an_frf_carries_its_doubt(tmp_path):
         ({"correlation": correlation * 1j}, ModelError),
         ({"correlation": correlation[:1]}, ShapeError),
     ):
-        with pytest.raises(error):
+        with pytest.raises(error, match=next(iter(change))):
             frf.replace(**change)
 
 

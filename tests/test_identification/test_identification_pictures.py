@@ -36,9 +36,9 @@ def test_pictures_show_poles_and_responses():
         np.abs(found.frf(lines["identified"].get_xdata())["y1", "u2"]),
     )
     assert np.allclose(lines["standard deviation"].get_ydata(), deviation)
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match="diagram must be of type StabilisationDiagram"):
         stabilisation(frf)
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match="modes must be of type IdentifiedModes"):
         identified(frf, frf, "y1", "u1")
 
 

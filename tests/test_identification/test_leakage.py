@@ -64,7 +64,7 @@ def test_window_and_resolution_stay_with_the_frf(tmp_path):
 
 def test_a_window_without_resolution_is_refused():
     for wrong in ({"window": "hann"}, {"window": "x", "resolution": 1.0}, {"resolution": -1.0}):
-        with pytest.raises(ModelError):
+        with pytest.raises(ModelError, match=r"resolution|window"):
             Frf([1.0], [[[1.0]]], **wrong)
     with pytest.raises(ModelError, match="overlap"):
         Frf([1.0], [[[1.0]]], overlap=0.99)

@@ -96,17 +96,17 @@ def test_places_may_be_given_by_point():
 
 
 @pytest.mark.parametrize(
-    ("measured", "model", "options", "error"),
+    ("measured", "model", "options", "error", "cause"),
     [
-        ("poles", modes, {}, ModelError),
-        (answer, lambda: 3, {}, ModelError),
-        (answer, modes, {"tolerance": 0.0}, ModelError),
-        (answer, modes, {"least_mac": 1.0}, ModelError),
-        (answer, modes, {"at": ["1:z"]}, LabelError),
-        (answer, lambda: solve_modes(make_plate(), count=3), {}, ModelError),
+        ("poles", modes, {}, ModelError, "measured must be"),
+        (answer, lambda: 3, {}, ModelError, "model must be"),
+        (answer, modes, {"tolerance": 0.0}, ModelError, "tolerance"),
+        (answer, modes, {"least_mac": 1.0}, ModelError, "least_mac"),
+        (answer, modes, {"at": ["1:z"]}, LabelError, "at"),
+        (answer, lambda: solve_modes(make_plate(), count=3), {}, ModelError, "elastic"),
     ],
 )
-def test_bad_arguments_are_refused(measured, model, options, error):
+def test_bad_arguments_are_refused(measured, model, options, error, cause):
     value = measured([4, 6]) if callable(measured) else measured
-    with pytest.raises(error):
+    with pytest.raises(error, match=cause):
         numbered(value, model(), **options)

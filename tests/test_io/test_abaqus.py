@@ -110,7 +110,7 @@ def test_coordinate_format(tmp_path):
         assert np.array_equal(found.K.toarray(), K)
         assert found.dofs.labels == dofs.labels
     assert read_abaqus(written(tmp_path, coordinates(K))).dofs is None
-    with pytest.raises(ShapeError):
+    with pytest.raises(ShapeError, match="K has 3 rows"):
         read_abaqus(written(tmp_path, coordinates(K[:3, :3])), dofs=dofs)
 
 

@@ -109,11 +109,11 @@ def test_what_is_no_system_is_refused(tmp_path):
     with pytest.raises(ModelError, match="dt must be zero or positive"):
         read_mat(path)
     scipy.io.savemat(path, matrices | {"B": np.ones((2, 1))})
-    with pytest.raises(ShapeError):
+    with pytest.raises(ShapeError, match="B must have shape"):
         read_mat(path)
     sides = {side: np.array([["x"]], dtype=object) for side in "wuzy"}
     scipy.io.savemat(path, matrices | sides)
-    with pytest.raises(LabelError):
+    with pytest.raises(LabelError, match=r"inputs .* are not "):
         read_mat(path)
     with pytest.raises(ModelError, match="python-control or SciPy, got str"):
         write_mat(path, "plant")
@@ -180,5 +180,5 @@ def test_one_reduced_model_or_responses_are_plain_variables(tmp_path):
     for name in ("my plant", "1st", "_x", 3, "x" * 64):
         with pytest.raises(LabelError, match="no name of a MATLAB variable"):
             write_mat(tmp_path / "g.mat", {name: frf})
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match="need a system"):
         write_mat(tmp_path / "g.mat", {"a": "plant"})

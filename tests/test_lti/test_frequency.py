@@ -292,7 +292,7 @@ def test_bad_frequencies():
         frequency_response(g, FREQ)["y9", "u1"]
     with pytest.raises(LabelError, match="no input 'z'"):
         frequency_response(g, FREQ).select(inputs=["z"])
-    with pytest.raises(LabelError):
+    with pytest.raises(LabelError, match="a channel is a pair"):
         frequency_response(g, FREQ)["y1"]
     assert la.norm(frequency_response(machine(0, 2), np.array([0.0])).data) > 0
 

@@ -112,7 +112,7 @@ def test_large_models_tell_what_was_counted():
     small = solve_modes(make_plate(), count=24)
     assert "counted" not in small.certificate
     assert small.residual.max() < 1e-8
-    with pytest.raises(ShapeError):
+    with pytest.raises(ShapeError, match="residual must have shape"):
         modes.replace(residual=[1.0, 2.0])
 
 

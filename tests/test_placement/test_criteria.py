@@ -81,7 +81,7 @@ def test_bad_input(make):
     with pytest.raises(ModelError, match="effort must be positive"):
         PoiLqr(effort=0.0)
     bare = StandardPlant.from_statespace(plant.system, w=plant.w, u=plant.u, z=plant.z, y=plant.y)
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match="no noise density"):
         PoiVariance("die")(bare)
 
 

@@ -91,7 +91,7 @@ def test_a_choice_that_loses_a_rigid_body_mode_somewhere_has_no_score():
     with pytest.raises(AssumptionError, match=r"at x = 0.1 .* all of them miss 1 rigid-body mode"):
         place_sensors(plant, [*fixed, moving], 3, criterion)
     # where it stands counts for a candidate too
-    with pytest.raises(AssumptionError):
+    with pytest.raises(AssumptionError, match="does not see the rigid-body"):
         place_sensors(plant.at(x=0.1), [*fixed, moving], 3, PoiVariance("die"))
 
 

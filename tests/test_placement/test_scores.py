@@ -219,7 +219,7 @@ def test_bad_input(make):
         score_sensors(plant, [("s0", "s0", "s1")])
     with pytest.raises(LabelError, match="two different candidates are called 's0'"):
         score_sensors(plant, [[*sensors[:3]], [sensors[4].replace(name="s0")]])
-    with pytest.raises(LabelError):
+    with pytest.raises(LabelError, match="off the plate"):
         score_sensors(plant, [[*sensors[:3], Sensor("far", at=(9.0, 0.0, 0.0), asd=1e-11)]])
     with pytest.raises(ModelError, match="candidates are Sensors"):
         score_sensors(plant, [actuators[:3]])

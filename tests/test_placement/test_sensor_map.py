@@ -77,7 +77,7 @@ def test_bad_input(make):
         sensor_map(plant, [(0.1, 0.1)], asd=1e-11)
     with pytest.raises(ModelError, match="no point"):
         sensor_map(plant, np.zeros((0, 3)), asd=1e-11)
-    with pytest.raises(LabelError):
+    with pytest.raises(LabelError, match="off the plate"):
         sensor_map(plant, [(5.0, 0.1, 0.0)], asd=1e-11)
     with pytest.raises(AssumptionError, match="no noise"):
         sensor_map(plant, GRID, asd=0.0)

@@ -77,7 +77,7 @@ def test_refusals():
     foreign = fx.StandardPlant.from_statespace(plant.system)
     with pytest.raises(ModelError, match="not assembled from a structure"):
         larger_plant(foreign, MODES)
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match="larger must be of type FEModel"):
         larger_plant(plant, "larger")
 
 

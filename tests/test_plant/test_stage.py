@@ -136,7 +136,7 @@ def test_missing_references_axes_and_sensors_are_named():
 )
 def test_numbers_out_of_range_are_refused(wrong):
     options = {"bandwidth": 30.0} | wrong
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match=next(iter(wrong))):
         stage_weights(sampled(some_modes()), options.pop("bandwidth"), **options)
 
 

@@ -210,9 +210,9 @@ def test_from_elsewhere_refuses():
         StandardPlant.from_statespace(g, u=["push"], y=["seen"])
     with pytest.raises(LabelError, match=r"no .*'look'"):
         StandardPlant.from_statespace(g, u=["force"], y=["look"])
-    with pytest.raises(LabelError):
+    with pytest.raises(LabelError, match=r"inputs hold .* more than once"):
         StandardPlant.from_statespace(g, u=["force"], y=["seen"], w=["wind", "force"])
-    with pytest.raises(LabelError):
+    with pytest.raises(LabelError, match=r"outputs hold .* more than once"):
         StandardPlant.from_statespace(g, u=["force"], y=["seen"], z=["die", "seen"])
     with pytest.raises(LabelError, match="no w channel with an asd 'storm'"):
         StandardPlant.from_statespace(g, u=["force"], y=["seen"], asd={"storm": 1.0})

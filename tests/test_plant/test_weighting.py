@@ -113,7 +113,7 @@ def test_refusals():
         plant.weighted(z=dict.fromkeys(plant.z))
     with pytest.raises(ModelError, match="NaN"):
         plant.weighted(z={"die:z": np.nan})
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match="need a system"):
         plant.weighted(z={"die:z": "heavy"})
     g = StateSpace([[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]], np.zeros((2, 2)))
     small = StandardPlant.from_statespace(g, u=["u2"], y=["y2"]).weighted(w={"u1": 2.0})

@@ -78,7 +78,7 @@ def test_nyquist_names_the_distance_from_minus_one():
     assert ax.get_aspect() == 1.0
     with pytest.raises(ModelError, match=r"has 6 channels: choose one"):
         fx.plot.nyquist(system())
-    with pytest.raises(LabelError):
+    with pytest.raises(LabelError, match="no channel"):
         fx.plot.nyquist(L, channel=("x", "y"))
 
 

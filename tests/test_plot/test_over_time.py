@@ -48,7 +48,7 @@ def test_steps_of_several_channels():
     with pytest.raises(ModelError, match="takes 1 axes, for one channel"):
         fx.plot.step(g, ax=plt.subplots()[1])
     for wrong in ("a", {}):
-        with pytest.raises(ModelError):
+        with pytest.raises(ModelError, match=r"need a system|nothing to draw"):
             fx.plot.step(wrong)
 
 

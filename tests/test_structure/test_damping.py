@@ -34,7 +34,7 @@ def test_rayleigh():
 
 @pytest.mark.parametrize("ratio", [-0.01, 1.0, np.nan, [0.1, 2.0], "a", 1j])
 def test_bad_ratios(ratio):
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match="ratio"):
         ModalDamping(ratio)
 
 
@@ -43,11 +43,11 @@ def test_bad_shapes():
         ModalDamping([[0.1]])
     with pytest.raises(ShapeError, match="2 damping ratios for 3 modes"):
         ModalDamping([0.1, 0.1]).zeta([1, 2, 3])
-    with pytest.raises(ShapeError):
+    with pytest.raises(ShapeError, match="omega must have shape"):
         ModalDamping(0.1).zeta(3.0)
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match="alpha must be zero or positive"):
         Rayleigh(-1, 0)
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match="beta has a NaN"):
         Rayleigh(0, np.nan)
 
 
@@ -197,7 +197,7 @@ def test_without_loss_there_is_no_error():
 
 def test_bad_loss_factors():
     for eta in (-0.1, 2.0, np.nan, "a"):
-        with pytest.raises(ModelError):
+        with pytest.raises(ModelError, match="loss_factor"):
             Hysteretic(eta)
     with pytest.raises(ModelError, match="negative"):
         Hysteretic(0.1).error([-1.0], [1.0])

@@ -233,14 +233,14 @@ def test_surfaces_and_edges_belong_to_the_plate(plate):
     ],
 )
 def test_bad_input(changes, error):
-    with pytest.raises(error):
+    with pytest.raises(error, match=next(iter(changes))):
         make_plate(**changes)
 
 
 def test_bad_point_is_refused(plate):
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match="at has a NaN"):
         plate.dofs.row((np.nan, 0, 0))
-    with pytest.raises(ShapeError):
+    with pytest.raises(ShapeError, match="at must have shape"):
         plate.dofs.row((0.1, 0.1))
 
 

@@ -519,7 +519,7 @@ def test_delays_of_a_sampled_plant():
 
 @pytest.mark.parametrize("wrong", [{"back_off": -0.1}, {"tolerance": 0.0}, {"tolerance": "x"}])
 def test_wrong_settings_are_refused(wrong):
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match=r"back_off|tolerance"):
         Riccati(**wrong)
 
 

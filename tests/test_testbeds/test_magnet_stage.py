@@ -119,7 +119,7 @@ def test_machines_differ_and_refuse():
     with pytest.raises(LabelError, match="elastic mode"):
         machine().poles([6])
     for bad in ({"size": (0.4, 0.3)}, {"size": (0.4, 0.3, 0.0)}, {"individual": -1}):
-        with pytest.raises(fx.FlexplantError):
+        with pytest.raises(fx.FlexplantError, match=r"size|individual"):
             fx.testbeds.magnet_stage(**bad)
     with pytest.raises(ModelError, match="three lengths"):
         fx.testbeds.magnet_stage(size=(0.4, -0.3, 0.05))

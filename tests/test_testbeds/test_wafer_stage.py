@@ -374,11 +374,11 @@ def test_refusals():
         stage(0.01).poles([244])
     for name in ("damping", "added_mass", "rate"):
         for bad in (-1.0, np.nan):
-            with pytest.raises(ModelError):
+            with pytest.raises(ModelError, match="ratio" if name == "damping" else name):
                 wafer_stage(elements=(8, 8), **{name: bad})
     with pytest.raises(ModelError, match="delay must be"):
         wafer_stage(elements=(8, 8), delay=-1)
-    with pytest.raises(ModelError):
+    with pytest.raises(ModelError, match="elements along x"):
         wafer_stage(elements=(0, 8))
     machine_ = stage(0.01)
     with pytest.raises(ModelError, match="needs actuators and sensors"):

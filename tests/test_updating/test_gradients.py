@@ -262,7 +262,7 @@ def test_bad_input_is_refused(plate):
             kind([1j], good, at)
         with pytest.raises(LabelError, match="mode numbers"):
             kind(MeasuredModes([-1 + 20j, -2 + 60j]), good, at)
-        with pytest.raises(ShapeError):
+        with pytest.raises(ShapeError, match="shapes must have shape"):
             kind(measured, [[1.0, 1.0]], at)
         with pytest.raises(ShapeError, match="two places"):
             kind(measured, [[1.0, 1.0]], ["1:z"])

@@ -59,21 +59,21 @@ def test_a_parameter_survives_a_file(tmp_path):
 
 @pytest.mark.parametrize("kind", [AddedMass, AddedDamping, AddedStiffness])
 def test_bad_places_are_refused(kind, plate):
-    for at, error in [
-        ("", LabelError),
-        ({}, LabelError),
-        ((0.1, 0.2), ShapeError),
-        ((0.1, 0.2, np.nan), ModelError),
-        ({"1:z": np.inf}, ModelError),
+    for at, error, cause in [
+        ("", LabelError, "is no place"),
+        ({}, LabelError, "is no place"),
+        ((0.1, 0.2), ShapeError, "at must have shape"),
+        ((0.1, 0.2, np.nan), ModelError, "at has a NaN"),
+        ({"1:z": np.inf}, ModelError, "weight of '1:z'"),
     ]:
-        with pytest.raises(error):
+        with pytest.raises(error, match=cause):
             kind(at)
     with pytest.raises(LabelError, match="direction"):
         kind("1:z", direction="up")
     rom = plate.reduced(0.01, False)
     with pytest.raises(LabelError, match="999:z"):
         kind("999:z").matrices(rom)
-    with pytest.raises(LabelError):
+    with pytest.raises(LabelError, match="off the plate"):
         kind((0.7, 0.1, 0.0)).matrices(rom)
     with pytest.raises(ModelError, match="acts on nothing"):
         kind({plate.z8: 0.0}).matrices(rom)
