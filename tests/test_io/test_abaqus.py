@@ -143,6 +143,8 @@ def test_rows_of_all_matrices_are_those_of_any(tmp_path):
         ("12,3, 1,2", "12,8, 1,2", ModelError, r"no displacement or rotation \(\[8\]"),
         ("12,3, 1,2", "12,3, 1,x", FlexplantError, r"line 4: 'node, dof, node, dof, value'"),
         ("12,3, 1,2", "12.5,3, 1,2", FlexplantError, "line 4"),
+        ("12,3, 1,2", "99999999999999999999,3, 1,2", FlexplantError, "line 4"),
+        ("2.000000000000000e+00", "2e999", FlexplantError, "line 5"),
         ("12,3, 1,2", "1,1, 1,1", FlexplantError, "stored twice: 1"),
         ("2.000000000000000e+00", "nan", FlexplantError, "line 5"),
         (", 2.000000000000000e+00", "", FlexplantError, "line 5"),

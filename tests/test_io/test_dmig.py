@@ -237,11 +237,26 @@ def test_displacements_in_local_directions_are_turned(tmp_path):
         ("KAAX", "KXXX", ModelError, "none of which has a usual name"),
         ("3.500000000D+00", "NAN             ", FlexplantError, "NaN"),
         ("DMIG", "DUMM", FlexplantError, "no DMIG cards"),
+        ("-1.000000000D+00", "-1.000000000D+001.000000000D+00", FlexplantError, "imaginary"),
     ],
 )
 def test_bad_cards_are_named(tmp_path, old, new, error, match):
     with pytest.raises(error, match=match):
         read_dmig(written(tmp_path, LARGE.replace(old, new)))
+
+
+@pytest.mark.parametrize(
+    ("cards", "match"),
+    [
+        ("DMIG,KAAX,1,1,,1,1,5.\nDMIG,KAAX,0,6,2,0\n", "line 3: one matrix KAAX only"),
+        (",1,1,5.\n", "line 2: DMIG, KAAX, GJ, CJ"),
+        ("DMIG,KAAX,1,9,,1,1,5.\n", "line 2"),
+        ("DMIG,KAAX,99999999999999999999,1,,1,1,5.\n", "line 2"),
+    ],
+)
+def test_bad_cards_in_free_fields_are_named(tmp_path, cards, match):
+    with pytest.raises(FlexplantError, match=match):
+        read_dmig(written(tmp_path, f"DMIG,KAAX,0,6,2,0\n{cards}"))
 
 
 def test_what_is_asked_for_must_be_there(tmp_path):

@@ -107,6 +107,13 @@ def test_names_of_variables(tmp_path):
     for wrong in ({"z": "q"}, {"up": "c"}, {}):
         with pytest.raises(LabelError, match="variables="):
             read_exodus_modes(strange, variables=wrong)
+    with pytest.raises(LabelError, match="variables must be a mapping"):
+        read_exodus_modes(strange, variables="c")
+    with pytest.raises(ShapeError, match="one of each of 4 modes"):
+        read_exodus_modes(strange, zeta=np.ones(3), rigid_below=0.1, variables={"z": "c"})
+    strange.write_bytes(strange.read_bytes().replace(b"coord", b"place"))
+    with pytest.raises(FlexplantError, match="no coordinates of nodes"):
+        read_exodus_modes(strange)
     with pytest.raises(FlexplantError, match="not clear"):
         read_exodus_modes(write(tmp_path / "c.exo", names=("ux", "DispX", "uy", "uz")))
 

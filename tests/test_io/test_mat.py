@@ -1,5 +1,7 @@
 """MATLAB files, read by scipy alone and read back."""
 
+import re
+
 import control
 import numpy as np
 import pytest
@@ -107,6 +109,9 @@ def test_what_is_no_system_is_refused(tmp_path):
     matrices = {"A": -1.0, "B": 1.0, "C": 1.0, "D": 0.0}
     scipy.io.savemat(path, matrices | {"dt": -1.0})
     with pytest.raises(ModelError, match="dt must be zero or positive"):
+        read_mat(path)
+    scipy.io.savemat(path, matrices | {"dt": [1.0, 2.0]})
+    with pytest.raises(FlexplantError, match=f"^'{re.escape(str(path))}', TypeError"):
         read_mat(path)
     scipy.io.savemat(path, matrices | {"B": np.ones((2, 1))})
     with pytest.raises(ShapeError, match="B must have shape"):

@@ -55,6 +55,19 @@ def test_every_kind_of_words(tmp_path, order, size):
     np.testing.assert_allclose(plain.dofs.xyz[6], [0.5e-3, 0.25e-3, 0], rtol=1e-6)
 
 
+@pytest.mark.parametrize(("mode", "mass"), [(1, 0.0), (2, -1.0), (2, np.inf), (3, np.nan)])
+def test_masses_that_none_has_are_refused(tmp_path, mode, mass):
+    masses = MASSES.copy()
+    masses[mode - 1] = mass
+    path = tmp_path / "run.op2"
+    path.write_bytes(op2(XYZ, {}, VALUES, EIGENVALUES, masses))
+    with pytest.raises(ModelError, match=f"gives mode {mode} a generalised mass of {mass:g}"):
+        read_modes(path, zeta=0.01, rigid_below=0.1)
+    with pytest.raises(ModelError, match="matrices need M"):
+        path.write_bytes(op2(XYZ, {}, VALUES, EIGENVALUES, MASSES))
+        read_modes(path, zeta=0.0, rigid_below=0.1, matrices=fx.FEMatrices(np.eye(12)))
+
+
 def test_what_op2_files_lack_is_said(tmp_path):
     path = tmp_path / "run.op2"
 
@@ -173,6 +186,8 @@ def test_a_plant_of_modes_of_a_file():
 
 def test_modes_of_exodus_and_universal_files(tmp_path):
     path = write_exodus(tmp_path / "a.exo")
+    with pytest.raises(ModelError, match="holds its nodes"):
+        read_modes(path, zeta=0.01, nodes=path)
     ours = read_modes(path, zeta=0.01, rigid_below=0.1)
     theirs = fx.io.read_exodus_modes(path, zeta=0.01, rigid_below=0.1)
     assert ours.dofs.labels == theirs.dofs.labels

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..checks import FloatArray, IntArray
-from ..dof_columns import at_nodes
+from ..dof_columns import LARGEST_NODE, at_nodes
 from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
@@ -165,7 +165,8 @@ def _triplets(path: str | Path) -> _Triplets:
 
     table = numbers_of_lines(b"\n".join(data).replace(b",", b" "), width, wrong_at)
     labels = table[:, :-1]
-    if np.any(wrong := (labels != np.round(labels)).any(axis=1)):
+    wrong = (labels != np.round(labels)) | (np.abs(labels) > LARGEST_NODE)
+    if np.any(wrong := wrong.any(axis=1)):
         raise _abaqus_line_error(path, lines, data[int(np.argmax(wrong))], width)
     whole: Any = labels.astype(np.int64)
     inner = whole[:, :: 2 if width == 5 else 1]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, instance, positive, real_array
+from ..checks import FloatArray, IntArray, instance, positive, real_array
 from ..errors import FlexplantError, LabelError, ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..modes import Modes
@@ -60,13 +60,6 @@ def scaled_modes(
     damping = shapes.zeta if zeta is None else zeta
     if damping is None:
         raise unread(path, "does not say how modes are damped", "Say it: zeta=0.01, or one a mode.")
-    k = shapes.omega.size
-    damping = real_array(damping, "zeta")
-    if damping.shape not in ((), (k,)):
-        raise ShapeError(
-            f"zeta must be one number or one of each of {counted(k, 'mode')}, got {damping.shape}."
-        )
-    damping = np.array(np.broadcast_to(damping, (k,)))
     phi, moved = shapes.phi, np.any(shapes.phi != 0, axis=1)
     notes = shapes.notes
     if not moved.all():
@@ -82,11 +75,21 @@ def scaled_modes(
     unit = np.where([d.startswith("r") for d in directions], system.length, 1.0)
     phi = phi[rows] / (unit * np.sqrt(system.mass))[:, np.newaxis]
     omega, n_rigid, order = frequencies(shapes.omega / system.time, rigid_below, path)
-    damping = damping[order]
+    damping = damping_ratios(damping, order)
     damping[:n_rigid] = 0.0
     return Modes(
         omega, damping, phi[:, order], system.placed(dofs), n_rigid, notes=(*notes, MISSING)
     )
+
+
+def damping_ratios(zeta: Any, order: IntArray) -> FloatArray:
+    """Return the damping ratios (k,) of modes in order, of one number or of one for each."""
+    given, k = real_array(zeta, "zeta"), order.size
+    if given.shape not in ((), (k,)):
+        raise ShapeError(
+            f"zeta must be one number or one of each of {counted(k, 'mode')}, got {given.shape}."
+        )
+    return np.broadcast_to(given, (k,))[order]
 
 
 def _unit_mass(shapes: FileShapes, path: str) -> FileShapes:
@@ -95,9 +98,9 @@ def _unit_mass(shapes: FileShapes, path: str) -> FileShapes:
     if masses is None:
         note = "taken as mass-normalised, which the file does not say"
         return replace(shapes, notes=(*shapes.notes, note))
-    if np.any(~np.isfinite(masses)) or np.any(masses <= 0):
-        mode = int(np.argmax(~(masses > 0))) + 1
-        what = f"gives mode {mode} a generalised mass of {masses[mode - 1]:g}, not above 0"
+    if np.any(wrong := ~((masses > 0) & np.isfinite(masses))):
+        mode = int(np.argmax(wrong)) + 1
+        what = f"gives mode {mode} a generalised mass of {masses[mode - 1]:g}, which none has"
         raise unread(path, what, "Was it written by a modal analysis?")
     off = float(np.max(np.abs(masses - 1)))
     if off < _ONE:

@@ -117,16 +117,16 @@ def read_mat(path: str | Path, name: str | None = None) -> MatValue:
     named = {key: item for key, item in content.items() if isinstance(item, dict)}
     if name is not None:
         require_known("structure", [name], named, repr(str(path)))
-        return _mat_value(named[name], f"{name!r} of {str(path)!r}")
+        return _mat_value(named[name], f"{name} of {path}")
     if not _value_kind(content) and len(named) == 1:
-        return _mat_value(next(iter(named.values())), repr(str(path)))
+        return _mat_value(next(iter(named.values())), str(path))
     if not _value_kind(content) and named:
         raise LabelError(
             f"{str(path)!r} holds several values, {sorted(named)[:8]}. Say which: "
             "io.read_mat(path, "
             f"{min(named)!r}), or read all: io.read_mat_values(path)."
         )
-    return _mat_value(content, repr(str(path)))
+    return _mat_value(content, str(path))
 
 
 def read_mat_values(path: str | Path) -> dict[str, MatValue]:
@@ -166,7 +166,7 @@ def read_mat_values(path: str | Path) -> dict[str, MatValue]:
             f"{str(path)!r} holds no structures of values, but {sorted(content)[:8]}. One value in "
             "plain variables is read by io.read_mat(path)."
         )
-    return {key: _mat_value(item, f"{key!r} of {str(path)!r}") for key, item in found.items()}
+    return {key: _mat_value(item, f"{key} of {path}") for key, item in found.items()}
 
 
 def _check_name(name: Any) -> None:
@@ -200,7 +200,7 @@ def _mat_value(content: Mapping[str, Any], where: str) -> MatValue:
     if make is None:
         missing = [name for name in "ABCD" if name not in content]
         raise ModelError(
-            f"{where} has no {', '.join(missing)}: it holds {sorted(content)[:8]}. A system "
+            f"{where!r} has no {', '.join(missing)}: it holds {sorted(content)[:8]}. A system "
             "object must be taken apart in MATLAB: [A, B, C, D, dt] = ssdata(P)."
         )
     with parsing(where):

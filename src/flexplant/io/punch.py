@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..checks import FloatArray, IntArray
+from ..dof_columns import LARGEST_NODE
 from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices, completed
@@ -188,9 +189,7 @@ def _read_blocks(lines: list[bytes], path: str) -> dict[str, _Block]:
         if not sound:
             raise _dmig_line_error(path, head, lines[head], "a header DMIG, NAME, 0, IFO, TIN")
         if name in blocks:
-            raise _dmig_line_error(
-                path, head, lines[head], f"one matrix {name} only, here is a second"
-            )
+            raise _dmig_line_error(path, head, lines[head], f"one matrix {name} only")
         size = fields[7].strip() if len(fields) > 7 else ""
         announced = int(size) if size.isdecimal() and size.isascii() else 0
         blocks[name] = _read_block(lines, first, last, (name, form, kind, announced), path)
@@ -322,7 +321,7 @@ def _any(part: list[bytes], first: int, name: str, real: bool, path: str) -> Any
 
 def _code(node: bytes, component: bytes) -> int:
     number, kind = int(node), int(component or b"0")
-    if number < 1 or not 0 <= kind <= 6:
+    if not 0 < number <= LARGEST_NODE or not 0 <= kind <= 6:
         raise ValueError
     return 16 * number + kind
 

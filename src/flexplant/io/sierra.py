@@ -12,13 +12,13 @@ import numpy as np
 import scipy
 import scipy.sparse as sp
 
-from ..checks import FloatArray, IntArray, Matrix, one_of, real_array
+from ..checks import FloatArray, IntArray, Matrix, mapping, one_of, real_array
 from ..errors import FlexplantError, LabelError, ModelError, ShapeError, counted
 from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..modes import Modes
 from ..structure.matrices import FEMatrices
 from .assembled import extra_module, from_triplets
-from .fe_modes import MODE_READERS, FileShapes, check_mass, frequencies
+from .fe_modes import MODE_READERS, FileShapes, check_mass, damping_ratios, frequencies
 from .files import (
     ELSEWHERE,
     FORMATS,
@@ -108,7 +108,7 @@ def read_exodus_modes(
     """
     omega, phi, dofs = read_shapes(path, times, variables)
     omega, n_rigid, order = frequencies(omega, rigid_below, str(path))
-    damping = np.broadcast_to(np.asarray(zeta, dtype=np.float64), omega.shape).copy()
+    damping = damping_ratios(zeta, order)
     damping[:n_rigid] = 0.0
     if M is not None:
         check_mass(phi[:, order], M, str(path))
@@ -120,6 +120,8 @@ def read_shapes(
 ) -> tuple[FloatArray, FloatArray, DofSet]:
     """Return frequencies [rad/s], shapes and DOFs of a file, as `read_exodus_modes` does."""
     one_of(times, "times", ("frequency", "omega", "eigenvalue"))
+    if variables is not None:
+        mapping(variables, "variables", "Pass {'x': 'DispX'}.", error=LabelError)
     with open_exodus(path) as file:
         xyz, ids = file.nodes()
         chosen = _motion_variables(file.variables(), variables, str(path))
@@ -337,8 +339,8 @@ def _read_numbers(path: str | Path, width: int) -> tuple[FloatArray, int | None]
     lines = [
         line.split(b"%")[0].strip(b" \t\r;,") for line in content[start + 1 : stop].split(b"\n")
     ]
-    lines = [re.sub(rb"[,;]|\.\.\.", b" ", line) for line in lines]
-    kept = [line for line in lines if line.strip()]
+    text = re.sub(rb"[,;]|\.\.\.", b" ", b"\n".join(lines))
+    kept = [line for line in text.split(b"\n") if line.strip()]
     if not kept:
         raise FlexplantError(f"{str(path)!r} holds no table of numbers. Write it with 'mfile'.")
     do = "Write it again with 'mfile'."
@@ -346,9 +348,10 @@ def _read_numbers(path: str | Path, width: int) -> tuple[FloatArray, int | None]
         do = "A map of DOFs goes to dof_map=, a list of nodes to exodus=."
 
     def wrong_at(place: int, line: bytes) -> FlexplantError:
-        return wrong_line_of(path, first + place, f"{counted(width, 'number')} are", line, do)
+        due = f"{counted(width, 'number')} are"
+        return wrong_line_of(path, first + place, due, lines[place], do)
 
-    table = numbers_of_lines(b"\n".join(lines), width, wrong_at)
+    table = numbers_of_lines(text, width, wrong_at)
     whole = table[:, : width - 1] if width > 1 else table
     wrong = (whole != np.round(whole)) | ((whole < 1) & (width > 1))
     if np.any(wrong):

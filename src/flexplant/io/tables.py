@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..checks import FloatArray, IntArray
-from ..dof_columns import at_nodes
+from ..dof_columns import LARGEST_NODE, at_nodes
 from ..errors import FlexplantError, LabelError
 from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..structure.units import units
@@ -162,8 +162,10 @@ class _Table:
     def whole(self, column: str) -> IntArray:
         """Return a column of whole numbers (n,)."""
         numbers = self.numbers(column)
-        if np.any(numbers != np.round(numbers)):
-            raise FlexplantError(f"{self.path!r}: column {column!r} must hold whole numbers.")
+        if np.any((numbers != np.round(numbers)) | (np.abs(numbers) > LARGEST_NODE)):
+            raise FlexplantError(
+                f"{self.path!r}: column {column!r} must hold whole numbers to 2^53."
+            )
         return numbers.astype(np.int64)
 
 
@@ -195,6 +197,8 @@ def _read_table(path: str | Path, plain: Sequence[str] = ()) -> _Table:
             f"{str(path)!r} does not begin with the names of its columns, got {rows[0][:6]}. Write "
             "node, direction, x, y, z in its first line."
         )
+    if doubled := [name for name in names if names.count(name) > 1]:
+        raise refused(path, f"has {len(doubled)} columns {doubled[0]!r}", "Leave one of them.")
     lines = [number for number, _ in numbered]
     if len(lines) != len(rows):
         raise FlexplantError(f"{str(path)!r} has a cell of several lines. Close its quotes.")
