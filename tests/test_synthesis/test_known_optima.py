@@ -77,16 +77,13 @@ def test_sampled_by_the_bilinear_map(method):
 
 
 # the infimum is approached only as the Lyapunov matrices grow without bound (the optimal loop
-# cancels modes): gamma, and the bound for moderate ones, lie a little above it
+# cancels modes): gamma lies a little above it
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("zero", "pole", "over"),
-    [(2.0, -1.0, 5e-4), (0.3, -0.1, 5e-3), (3.0, 1.0, 2e-4), (0.5, 2.0, 2e-4)],
-)
-def test_sensitivity_against_a_zero_and_a_pole(zero, pole, over):
+@pytest.mark.parametrize(("zero", "pole"), [(2.0, -1.0), (0.3, -0.1), (3.0, 1.0), (0.5, 2.0)])
+def test_sensitivity_against_a_zero_and_a_pole(zero, pole):
     parts, best = oracle.sensitivity_problem(zero, pole, False)
-    found = judged(*named(*parts, 1, 1), Lmi(back_off=1e-3), best, over=over, high=1e-2)
-    assert found.gamma <= 1.002 * found.lower
+    found = judged(*named(*parts, 1, 1), Lmi(back_off=1e-3), best, low=1e-3, high=6e-3)
+    assert found.gamma <= 1.006 * found.lower
 
 
 @pytest.mark.slow
@@ -95,11 +92,11 @@ def test_without_cost_of_the_effort_at_high_frequency(zero, pole):
     """The infimum is that of the plant without lag, and no controller attains it."""
     parts, best = oracle.sensitivity_problem(zero, pole, True)
     P, u, y = named(*parts, 1, 1)
-    judged(P, u, y, Lmi(), best, over=2e-2, high=0.08)
+    judged(P, u, y, Lmi(), best, high=0.08)
     found = judged(P, u, y, None, best, low=5e-2, over=2e-2)
     assert "D12 has rank 0 of 1" in found.notes[0]
     dual = StateSpace(P.A.T, P.C.T, P.B.T, P.D.T, inputs=P.inputs, outputs=P.outputs)
-    judged(dual, u, y, Lmi(), best, over=2e-2, high=0.08)
+    judged(dual, u, y, Lmi(), best, high=0.08)
     found = judged(dual, u, y, None, best, low=5e-2, over=2e-2)
     assert "D21 has rank 0 of 1" in found.notes[0]
     assert "approached by infinite gain only" in found.notes[1]

@@ -6,8 +6,6 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from flexplant import load
 from flexplant.errors import CertificateError, InfeasibleError, ModelError, SolverError
@@ -16,7 +14,7 @@ from flexplant.lti.preparation import prepared
 from flexplant.synthesis import Lmi, Riccati, design_hinf
 from flexplant.synthesis.controller import certified_norm
 from flexplant.synthesis.lmi import lmi_programs as lmi_programs
-from flexplant.synthesis.lmi.lmi_programs import Plant, dual_bound, smallest_gamma, symmetric_blocks
+from flexplant.synthesis.lmi.lmi_programs import Plant, smallest_gamma, symmetric_blocks
 from oracles_lmi import closed_loop, output_feedback_gamma, state_feedback_gamma, swept_norm
 from shared_data import DATA
 
@@ -94,7 +92,7 @@ def compleib(name):
     return parts, gamma[name]
 
 
-def check(parts, gamma, bound=3e-3):
+def check(parts, gamma):
     """Design, and hold loop, claim and bound against the oracle and the best known gamma."""
     P, u, y = system(parts)
     found = design_hinf(P, Lmi(), u=u, y=y)
@@ -106,8 +104,8 @@ def check(parts, gamma, bound=3e-3):
     assert swept_norm(*loop) <= found.gamma * (1 + 1e-6)
     assert swept_norm(*loop) >= found.gamma * (1 - 1e-2)
     assert found.gamma <= 1.07 * gamma
-    # the gammas of COMPleib are known to 3-4 digits
-    assert (1 - bound) * gamma <= found.lower <= (1 + 1e-4) * gamma
+    # the Riccati equations refute a gamma to 1e-3; those of COMPleib are known to 3-4 digits
+    assert (1 - 1e-3) * gamma <= found.lower <= (1 + 1e-4) * gamma
     return found
 
 
@@ -126,22 +124,21 @@ def test_effort_without_weight_is_the_dual(a):
 @pytest.mark.slow
 @pytest.mark.parametrize("a", [-2.0, -0.5, 0.0, 1.0])
 def test_scalar_output_feedback_equals_the_root_of_its_riccati_equations(a):
-    check(scalar(a, 1.0), output_feedback_gamma(a), bound=1e-5)
+    check(scalar(a, 1.0), output_feedback_gamma(a))
 
 
 @pytest.mark.slow
-# AC4 and HE1: the smallest gamma is only approached as the Lyapunov matrices grow without bound
 @pytest.mark.parametrize(
     "name", [*SMALL[:5], *(pytest.param(name, marks=pytest.mark.slow) for name in SMALL[5:])]
 )
 def test_compleib(name):
-    check(*compleib(name), bound={"AC4": 2e-2, "HE1": 5e-3, "EB1": 1e-4}.get(name, 1e-3))
+    check(*compleib(name))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LARGE)
 def test_compleib_up_to_20_states(name):
-    check(*compleib(name), bound=1e-3)
+    check(*compleib(name))
 
 
 @pytest.mark.slow
@@ -150,7 +147,7 @@ def test_bound_and_riccati_meet_with_feedthrough(seed):
     P, u, y = system(random_parts(seed))
     by_riccati = design_hinf(P, Riccati(back_off=0.0, tolerance=1e-4), u=u, y=y)
     by_lmi = design_hinf(P, Lmi(), u=u, y=y)
-    assert by_lmi.lower == pytest.approx(by_riccati.gamma, rel=1e-3)
+    assert by_lmi.lower == pytest.approx(by_riccati.gamma, rel=1.2e-3)  # bisected to 1e-3
     assert by_lmi.lower <= by_riccati.gamma
     assert by_lmi.gamma <= 1.05 * 1.001 * by_riccati.gamma
 
@@ -238,8 +235,9 @@ def test_sampled_plant_with_rigid_body_and_noise_free_sensor():
 def test_back_off_is_what_the_loop_may_lose():
     P, u, y = system(scalar(-0.5, 1.0))
     tight, loose = (design_hinf(P, Lmi(back_off=b), u=u, y=y) for b in (0.01, 0.3))
-    assert tight.gamma <= 1.0101 * tight.lower
-    assert loose.gamma <= 1.301 * loose.lower
+    best = output_feedback_gamma(-0.5)
+    assert tight.gamma <= 1.0101 * best
+    assert loose.gamma <= 1.301 * best
     assert loose.gamma > tight.gamma
 
 
@@ -309,42 +307,6 @@ def test_every_lmi_is_symmetric_for_any_values(monkeypatch):
     with pytest.raises(SolverError, match="seen"):
         lmi_programs.moderate_controller(p, 1.05, SETTINGS)
     assert seen[2] == (8, 8) and seen[3:] == [(11, 11), (11, 11), (8, 8)]
-
-
-# --- the bound
-
-
-@settings(max_examples=30, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), decades=st.floats(-3, 3))
-def test_no_multipliers_give_a_bound_above_what_is_reached(seed, decades):
-    rng = np.random.default_rng(seed)
-    p = Plant.of(problem(scalar(-0.5, 1.0)))
-    onto_u = np.linalg.svd(np.hstack([p.B2.T, p.D12.T]))[2][1:].T
-    onto_y = np.linalg.svd(np.hstack([p.C2, p.D21]))[2][1:].T
-    multipliers = []
-    for onto, more in ((onto_u, 2), (onto_y, 2)):
-        wide = np.block(
-            [[onto, np.zeros((3, more))], [np.zeros((more, onto.shape[1])), np.eye(more)]]
-        )
-        root = rng.standard_normal((wide.shape[1], 2)) * 10.0 ** (decades * rng.random((1, 2)))
-        multipliers.append(wide @ root @ root.T @ wide.T)
-    # the Lyapunov matrices of a controller that exists: those at 1.2 times the smallest gamma
-    X, Y, gamma = reached()
-    assert dual_bound(p, *multipliers, X, Y) <= gamma * (1 + 1e-9)
-
-
-def reached(slack=1.2):
-    """X, Y and gamma of the scalar problem, feasible by hand: X = Y = gamma / X_riccati.
-
-    At a larger gamma the Riccati solution satisfies its LMI with room to spare.
-    """
-    a = -0.5
-    gamma = slack * output_feedback_gamma(a)
-    c = 1.0 - 1.0 / gamma**2
-    # a little above the Riccati solution, so that the inequality is strict
-    P = (1 + 1e-6) * (a + np.sqrt(a * a + c)) / c
-    assert gamma > P
-    return np.array([[gamma / P]]), np.array([[gamma / P]]), gamma
 
 
 # --- what is refused

@@ -115,10 +115,9 @@ def design_hinf(
     Returns
     -------
     Controller
-        `gamma` is the verified norm, `lower` a bound from below on what any controller reaches
-        (from `Lmi()`: with Lyapunov matrices no larger than those that it found), `certificate`
-        what was checked, `reached` what is reached of each block of the weights, `left_out` the
-        check with the modes left out.
+        `gamma` is the verified norm, `lower` a bound from below on what any controller reaches,
+        `certificate` what was checked, `reached` what is reached of each block of the weights,
+        `left_out` the check with the modes left out.
 
     Raises
     ------

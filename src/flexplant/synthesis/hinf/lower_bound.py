@@ -28,12 +28,12 @@ _LOST = 1e-9
 _UNDAMPED = 1e-6
 
 
-def raised_bound(problem: Prepared, gamma: float, known: float) -> float:
+def raised_bound(problem: Prepared, gamma: float, known: float, close: float = _CLOSE) -> float:
     """Return a known lower bound on what controllers reach, raised where it is far from gamma."""
     # by the zeros on the imaginary axis, then by the Riccati equations
-    if known * (1.0 + _CLOSE) < gamma:
+    if known * (1.0 + close) < gamma:
         known = max(known, zero_bound(problem))
-    if known * (1.0 + _CLOSE) < gamma:
+    if known * (1.0 + close) < gamma:
         known = relaxed_bound(problem, gamma, known)
     return min(known, gamma)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from types import SimpleNamespace
@@ -22,6 +22,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import Progress, interruptible
 from ...tolerances import RANK, TINY, divisor
 from ..controller import SolvedController
+from ..hinf.lower_bound import pointwise_bound, raised_bound
 
 #: A, B, C, D of a controller
 Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
@@ -182,14 +183,10 @@ def half(M: Any) -> Any:
 
 
 class Optimum(NamedTuple):
-    """The smallest gamma and its lower bound, and the plant of that size."""
+    """The smallest gamma, and the plant scaled by it and balanced."""
 
     value: float
-    lower: float
-    #: scaled by value and balanced
     plant: Plant
-    #: in which it was sought
-    scale: float
 
 
 def modelling() -> Any:
@@ -234,15 +231,8 @@ def smallest_gamma(p: Plant, scale: float, settings: dict[str, float]) -> Optimu
     size = cp.trace(X) + cp.trace(Y)
     solve_program(cp.Problem(cp.Minimize(gamma + 1e-9 * size), constraints), settings)
     value = max(float(gamma.value), 1e-12)
-    U = onto_u @ constraints[0].dual_value @ onto_u.T
-    V = onto_y @ constraints[1].dual_value @ onto_y.T
-    lower = dual_bound(p, U, V, X.value, Y.value)
-    return Optimum(
-        value * scale,
-        lower * scale,
-        p.scaled(value).balanced(X.value, Y.value).with_unit_channels(),
-        scale,
-    )
+    states = p.scaled(value).balanced(X.value, Y.value).with_unit_channels()
+    return Optimum(value * scale, states)
 
 
 def moderate_controller(p: Plant, gamma: float, settings: dict[str, float]) -> Matrices:
@@ -268,34 +258,6 @@ def moderate_controller(p: Plant, gamma: float, settings: dict[str, float]) -> M
         settings,
     )
     return reconstructed(p, gamma, X.value, Y.value, B.value, C.value, D.value)
-
-
-def dual_bound(p: Plant, U: FloatArray, V: FloatArray, X: FloatArray, Y: FloatArray) -> float:
-    """Return a lower bound of gamma by weak duality, from the multipliers of the first two LMIs."""
-    # the third is chosen so that the dual equations hold; what is indefinite is paid for by traces
-    n, nw, nz = p.A.shape[0], p.B1.shape[1], p.C1.shape[0]
-    U, V = _positive_part(U)[0], _positive_part(V)[0]
-    total = np.trace(U[n:, n:]) + np.trace(V[n:, n:])
-    if not total > 0:
-        return 0.0
-    U, V = U / total, V / total
-    of_Y = 2 * half(U[:n, :n] @ p.A + U[:n, n : n + nz] @ p.C1)
-    of_X = 2 * half(p.A @ V[:n, :n] + p.B1 @ V[n : n + nw, :n])
-    (of_Y, less_Y), (of_X, less_X) = _positive_part(of_Y), _positive_part(of_X)
-    fixed = (
-        np.sum(p.B1 * U[:n, n + nz :])
-        + np.sum(p.D11 * U[n : n + nz, n + nz :])
-        + np.sum(p.C1.T * V[:n, n + nw :])
-        + np.sum(p.D11.T * V[n : n + nw, n + nw :])
-    )
-    coupling = np.sum(la.svdvals(factor(of_Y).T @ factor(of_X)))
-    paid = less_Y * np.trace(Y) + less_X * np.trace(X)
-    return max(float(2 * fixed + 2 * coupling - paid), 0.0)
-
-
-def _positive_part(M: FloatArray) -> tuple[FloatArray, float]:
-    values, vectors = la.eigh(half(M))
-    return (vectors * np.maximum(values, 0.0)) @ vectors.T, max(0.0, -float(values[0]))
 
 
 def reconstructed(
@@ -422,14 +384,10 @@ def _order(problem: Any) -> int:
     return int(max(variable.shape[0] for variable in problem.variables() if variable.shape))
 
 
-#: gap between value and lower bound at which no other coordinates are tried
-_GAP = 5e-4
-#: times the tolerance with which a bound that stays loose is computed once more
-_COARSER = 10.0
-#: programs from one choice of states
-_ROUNDS = 4
-#: choices of states and tolerance
-_STARTS = 3
+#: relative gap between a value and its lower bound, known to 1e-3, at which the search ends
+_GAP = 5e-3
+#: programs from one choice of states, and choices of states
+_ROUNDS, _STARTS = 4, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -473,9 +431,6 @@ class Lmi(Value):
     def solve(self, problem: Prepared) -> SolvedController:
         """Return the controller of a prepared problem.
 
-        `lower` is a bound by weak duality from multipliers repaired to satisfy their equations;
-        it holds for all controllers whose Lyapunov matrices are no larger than those found.
-
         Raises
         ------
         ModelError
@@ -494,16 +449,16 @@ class Lmi(Value):
                 "Reduce the order first, use Riccati(), or raise Lmi(max_states=...)."
             )
         with Progress(_STARTS * _ROUNDS, "programs of the LMIs", progress=self.progress) as bar:
-            found = self._smallest(Plant.of(problem), bar.advance)
-        settings, failures = self._settings(self.tolerance), []
+            found, lower = self._smallest(problem, bar.advance)
+        failures = []
         for part in self.back_off * _LOOSER:
             try:
-                K = moderate_controller(found.plant, 1.0 + part, settings)
+                K = moderate_controller(found.plant, 1.0 + part, self._settings)
                 norm = verified(problem, K, found.value * (1.0 + part))
             except (FlexplantError, la.LinAlgError) as error:
                 failures.append(f"{100 * part:.3g} % above it: {error}")
                 continue
-            return SolvedController(*K, norm, min(found.lower, norm), {})
+            return SolvedController(*K, norm, min(lower, norm))
         raise SolverError(
             f"the LMIs give gamma = {found.value:.6g} as smallest, but no controller. "
             + " ".join(failures)
@@ -511,60 +466,40 @@ class Lmi(Value):
             "effort where sensors and actuators have none."
         )
 
-    def _settings(self, tolerance: float) -> dict[str, float]:
-        return dict.fromkeys(TOLERANCES, tolerance)
+    @property
+    def _settings(self) -> dict[str, float]:
+        return dict.fromkeys(TOLERANCES, self.tolerance)
 
-    def _smallest(self, plant: Plant, count: Callable[[], None]) -> Optimum:
-        """Return the smallest gamma, from other states and a coarser tolerance while not sure."""
+    def _smallest(self, problem: Prepared, count: Callable[[], None]) -> tuple[Optimum, float]:
+        """Return the smallest gamma, from other states while it is not near its bound, and that."""
+        plant, lower = Plant.of(problem), 0.0
         found: list[Optimum] = []
         failures: list[FlexplantError] = []
         guess = plant.size()
-        # a solver that stops early stops elsewhere with another tolerance: its bounds hold too
-        for start, tolerance in (
-            (lqg_states, self.tolerance),
-            (lambda same: same, self.tolerance),
-            (lqg_states, _COARSER * self.tolerance),
-        ):
-            coarser = tolerance > self.tolerance
-            if coarser and not found:
-                break
-            try:
-                scale = found[-1].value if found and not coarser else guess
-                # what was found before an error stays
-                for one in self._rounds(start(plant), scale, self._settings(tolerance)):
+        for start in (lqg_states, lambda same: same):
+            try:  # what was found before an error stays
+                states, scale = start(plant), found[-1].value if found else guess
+                for number in range(_ROUNDS):
+                    one = smallest_gamma(states.scaled(scale), scale, self._settings)
                     found.append(one)
                     count()
+                    lower = lower or raised_bound(problem, one.value, pointwise_bound(problem), 0.0)
+                    # close, in a scale that resolves it
+                    if one.value - lower <= _GAP * one.value and one.value > 0.03 * scale:
+                        return one, lower
+                    if number and one.value > 0.99 * scale:
+                        break
+                    states, scale = one.plant.scaled(1.0 / one.value), one.value
             except (SolverError, InfeasibleError) as error:
                 failures.append(error)
-            if found and _is_close(_tightest(found)):
-                break
         if not found:
             # a proof of infeasibility says more than a solver that stopped
             raise next((e for e in failures if isinstance(e, InfeasibleError)), failures[-1])
-        best = _tightest(found)
+        best = min(found, key=lambda one: abs(one.value - lower))
         if best.value < _NOTHING * guess:
             raise InfeasibleError(
                 f"there is no smallest gamma: the infimum is 0. {best.value:.3g} is reached, where "
                 f"the plant's own size is {guess:.3g}. u cancels w in z, at no cost. Weight the "
                 "efforts in z, or give the sensors noise in w."
             )
-        return best._replace(lower=min(max(one.lower for one in found), best.value))
-
-    @staticmethod
-    def _rounds(states: Plant, scale: float, settings: dict[str, float]) -> Iterator[Optimum]:
-        """Yield smallest gammas, each in the states and the scale that the one before gives."""
-        for number in range(_ROUNDS):
-            one = smallest_gamma(states.scaled(scale), scale, settings)
-            yield one
-            if _is_close(one) or (number and one.value > 0.99 * scale):
-                return
-            states, scale = one.plant.scaled(1.0 / one.value), one.value
-
-
-def _tightest(found: list[Optimum]) -> Optimum:
-    return min(found, key=lambda one: one.value - one.lower)
-
-
-def _is_close(one: Optimum) -> bool:
-    """Whether the bound is close, in a scale that resolves it."""
-    return one.value - one.lower <= _GAP * one.value and one.value > 0.03 * one.scale
+        return best, lower
