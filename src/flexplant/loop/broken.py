@@ -99,9 +99,8 @@ class BrokenLoop:
         return cache(self._worst)
 
     def _worst(self, at: Side, scaled: bool) -> tuple[float, float]:
-        def size(freq: FloatArray) -> FloatArray:  # a bound of it where it is not high
-            gain = self.gain(freq, at)
-            return scaled_size(inverted(gain)) if scaled else sensitivity_size(gain)
+        def size(freq: FloatArray) -> FloatArray:
+            return largest_sensitivity(self.gain(freq, at), scaled)
 
         if self.measured is not None:
             return highest(size, self.followed, 0)
@@ -123,6 +122,11 @@ def inverted(L: ComplexArray) -> ComplexArray:
         return np.asarray(np.linalg.inv(eye - L))
     except np.linalg.LinAlgError:  # a marginal loop at the frequency of its pole
         return np.asarray(np.linalg.inv(eye - (1.0 - _BESIDE) * L))
+
+
+def largest_sensitivity(L: ComplexArray, scaled: bool) -> FloatArray:
+    """Return the size of ``S = (I - L)^-1``, axes scaled or not; a bound where it is not high."""
+    return scaled_size(inverted(L)) if scaled else sensitivity_size(L)
 
 
 def sensitivity_size(L: ComplexArray) -> FloatArray:

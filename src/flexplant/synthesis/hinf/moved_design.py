@@ -17,6 +17,7 @@ from ...lti.preparation import prepared
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, tick
 from ...plant import StandardPlant
+from ...plant.uncertainty.opening import with_channels
 from ..controller import Controller
 from ..synthesis_plants import PlantRange
 from .lower_bound import pointwise_bound
@@ -152,25 +153,19 @@ class _MotionChannels:
 
     def channels(self, scale: float, size: float) -> StandardPlant:
         """Return the mean plant with a disturbance and an output for each row and column."""
-        g, r, c = self.mean.system, self.rows.size, self.columns.size
-        D = scale * self.scales
-        n, k = g.n_states, r + c
-        into = np.zeros((g.D.shape[0], k))
-        into[self.rows, np.arange(r)] = D[:r]
-        seen = np.zeros((k, g.D.shape[1]))
-        seen[r + np.arange(c), self.columns] = size / D[r:]
-        pushed = np.hstack([np.zeros((n, r)), self.dB * D[r:]])
-        C = np.vstack([size * self.dC / D[:r, None], np.zeros((c, n)), g.C])
+        g, r, c, own = self.mean.system, self.rows.size, self.columns.size, self.mean
+        D, n, k = scale * self.scales, g.n_states, r + c
+        left, right = np.zeros((n + len(g.outputs), k)), np.zeros((k, n + len(g.inputs)))
+        left[n + self.rows, np.arange(r)] = D[:r]
+        left[:n, r:] = self.dB * D[r:]
+        right[:r, :n] = size * self.dC / D[:r, None]
+        right[r + np.arange(c), n + self.columns] = size / D[r:]
         names = [f"moves{i}" for i in range(1, k + 1)]
-        w, z = [f"{one}:d" for one in names], [f"{one}:q" for one in names]
-        system = StateSpace(
-            g.A, np.hstack([pushed, g.B]), C, np.block([[np.zeros((k, k)), seen], [into, g.D]]),
-            g.dt, inputs=[*w, *g.inputs], outputs=[*z, *g.outputs],
-        )  # fmt: skip
-        own = self.mean
+        w, z = ([f"{name}:{side}" for name in names] for side in "wz")
         return StandardPlant.from_statespace(
-            system, w=[*w, *own.w], u=own.u, z=[*z, *own.z], y=own.y
-        )
+            with_channels(g, 0, names, left, right),
+            w=[*w, *own.w], u=own.u, z=[*z, *own.z], y=own.y,
+        )  # fmt: skip
 
     def even(self, K: StateSpace) -> None:
         """Scale each channel so that, in closed loop, w reaches it as it reaches z."""

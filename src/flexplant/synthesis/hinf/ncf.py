@@ -14,7 +14,7 @@ from ...loop import modulus_margin
 from ...lti.balancing import hankel_norm
 from ...lti.discretisation import bilinear, tustin
 from ...lti.frequency import Frf, frequency_response
-from ...lti.interconnection import lft, series
+from ...lti.interconnection import connect, series
 from ...lti.minimal import minimal
 from ...lti.norms import peak_gain
 from ...lti.riccati import control_care, control_dare, solve_care, solve_dare
@@ -179,19 +179,12 @@ def _four_block(G: StateSpace, K: StateSpace) -> StateSpace:
             f"the controller has {len(K.inputs)} inputs and {len(K.outputs)} outputs, the plant "
             f"{p} y and {m} u: pass the K of u = K y for this plant."
         )
-    # [noise at y, force at u, u] -> [u, y, y], y = G (u + force) + noise
-    n, u, y = G.n_states, _names("u", m), _names("y", p)
-    row = np.hstack([np.eye(p), G.D, G.D])
-    P = StateSpace(
-        G.A,
-        np.hstack([np.zeros((n, p)), G.B, G.B]),
-        np.vstack([np.zeros((m, n)), G.C, G.C]),
-        np.vstack([np.hstack([np.zeros((m, p + m)), np.eye(m)]), row, row]),
-        inputs=[*_names("n", p), *_names("d", m), *u],
-        outputs=[*_names("zu", m), *_names("zy", p), *y],
-        dt=G.dt,
-    )
-    return lft(P, K.replace(inputs=y, outputs=u, units={}))
+    # noise adds to y and a force to what u moves; u itself is seen without the force
+    u, moved, y = numbered("u", m), numbered("v", m), numbered("y", p)
+    C, D = np.vstack([K.C, K.C]), np.vstack([K.D, K.D])
+    law = K.replace(C=C, D=D, inputs=y, outputs=[*u, *moved], units={})
+    plant = G.replace(inputs=moved, outputs=y, units={})
+    return connect([plant, law], [*y, *moved], [*u, *y], adding=[*y, *moved])
 
 
 def verified_controller(
@@ -249,8 +242,9 @@ def hidden_mode(G: StateSpace, K: StateSpace) -> AssumptionError:
     )
 
 
-def _names(letter: str, count: int) -> list[str]:
-    return [f"{letter}{i}" for i in range(count)]
+def numbered(kind: str, count: int) -> list[str]:
+    """Return the names of channels of one kind."""
+    return [f"{kind}{i}" for i in range(count)]
 
 
 def power(M: FloatArray, exponent: float) -> FloatArray:

@@ -16,7 +16,7 @@ from ...loop import LoopReport, report_loops
 from ...lti.discretisation import tustin
 from ...lti.filters import lowpass
 from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
-from ...lti.interconnection import loop_poles, series, side_by_side
+from ...lti.interconnection import connect, loop_poles, series, side_by_side
 from ...lti.minimal import minimal
 from ...lti.responses import responses
 from ...lti.statespace import StateSpace, System, as_statespace
@@ -31,6 +31,7 @@ from .ncf import (
     integral_action,
     loop_margin,
     ncf_solutions,
+    numbered,
     power,
     require_model,
     verified_controller,
@@ -312,26 +313,19 @@ def following(shaped: StateSpace, model: StateSpace, weight: float) -> tuple[Sta
 def _two_degrees(g: StateSpace, model: StateSpace, Z: FloatArray, rho: float) -> StateSpace:
     """Return [r; phi; u] -> [u; y; e; rho r; y]."""
     p, m = g.D.shape
-    n, q, zero = g.n_states, model.n_states, np.zeros
     R = np.eye(p) + g.D @ g.D.T
-    root, shake = power(R, 0.5), (g.B @ g.D.T + Z @ g.C.T) @ power(R, -0.5)
-    seen, direct = np.hstack([g.C, zero((p, q))]), np.hstack([zero((p, p)), root, g.D])
-    C = [
-        zero((m, n + q)),
-        seen,
-        np.hstack([rho * g.C, -(rho**2) * model.C]),
-        zero((p, n + q)),
-        seen,
-    ]
-    D = [
-        np.hstack([zero((m, 2 * p)), np.eye(m)]),
-        direct,
-        np.hstack([-(rho**2) * model.D, rho * root, rho * g.D]),
-        np.hstack([rho * np.eye(p), zero((p, p + m))]),
-        direct,
-    ]
-    B = np.block([[zero((n, p)), shake, g.B], [model.B, zero((q, p + m))]])
-    return StateSpace(la.block_diag(g.A, model.A), B, np.vstack(C), np.vstack(D))
+    shake = (g.B @ g.D.T + Z @ g.C.T) @ power(R, -0.5)
+    u, zu = (numbered(kind, m) for kind in ("u", "zu"))
+    r, phi, y, zy, t, e, read = (
+        numbered(kind, p) for kind in ("r", "phi", "y", "zy", "t", "e", "read")
+    )
+    B, D = np.hstack([shake, g.B]), np.hstack([power(R, 0.5), g.D])
+    plant = StateSpace(g.A, B, g.C, D, inputs=[*phi, *u], outputs=y)
+    follow = np.kron([[1.0, 0.0, 0.0], [rho, -(rho**2), 0.0], [0.0, 0.0, rho]], np.eye(p))
+    gains, entering = la.block_diag(np.eye(m), follow), [*u, *y, *t, *r]
+    sums = StateSpace([], [], [], gains, inputs=entering, outputs=[*zu, *zy, *e, *read])
+    known = model.replace(inputs=r, outputs=t, units={})
+    return connect([plant, known, sums], [*r, *phi, *u], [*zu, *zy, *e, *read, *y])
 
 
 def _scaling(shaped: StateSpace, model: StateSpace, K: StateSpace) -> FloatArray:

@@ -14,6 +14,7 @@ from ...errors import AssumptionError, LabelError, ModelError, SolverError, coun
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
 from ...loop.other_machines import growing_modes, modes_in_words
+from ...loop.sensitivity import taken_apart
 from ...lti.interconnection import loop_poles
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
@@ -31,7 +32,6 @@ from .servo_loop import (
     highest_bandwidth,
     observer_system,
     rigid_body,
-    rigid_peak,
     seeing,
     servo_loop,
 )
@@ -322,7 +322,12 @@ class ServoTask:
 
     def rigid_peak(self, axis: Axis) -> float:
         """Return max |S| of the worst axis of the rigid body, stable or not."""
-        return max(rigid_peak(body, axis) for body in self._bodies)
+        act = axis.law.system
+        loops = (
+            taken_apart((one, act.replace(inputs=one.outputs, outputs=one.inputs)))
+            for one in self._bodies
+        )
+        return max(loop.worst("u", False)[0] for loop in loops)
 
     def largest(self, peak: float) -> float:
         """Return the largest bandwidth that holds a peak of |S| at u."""

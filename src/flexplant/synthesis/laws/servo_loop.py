@@ -12,15 +12,15 @@ import numpy as np
 from ...checks import ComplexArray, FloatArray, frozen
 from ...errors import AssumptionError, LabelError, counted
 from ...loop.blocks import as_block
-from ...loop.broken import inverted, scaled_size, sensitivity_size
-from ...lti.frequency_sweep import highest, resonance_grid
-from ...lti.responses import responder, responses
+from ...loop.broken import inverted, largest_sensitivity
+from ...lti.frequency_sweep import resonance_grid
+from ...lti.responses import responses
 from ...lti.sampling import held_exactly
 from ...lti.statespace import StateSpace
 from ...plant import Foreign, Poi, StandardPlant
 from ...plant.realisation import natural
 from ...plant.rigid_motion import rigid_gain
-from ...tolerances import SAME, divisor
+from ...tolerances import divisor
 from .controller_elements import LowPass, Notch, Pid
 from .law import Law
 
@@ -57,9 +57,8 @@ class ServoLoop:
     def peak(self, axis: Axis) -> tuple[float, float]:
         """Return max_f sigma_max(S_u) over the grid and its frequency [Hz]."""
         # of an unstable loop too, so check that
-        L = self.gain(axis)
         mixed = len({self.plant.units.get(name) for name in self.plant.u}) > 1
-        size = scaled_size(inverted(L)) if mixed else sensitivity_size(L)
+        size = largest_sensitivity(self.gain(axis), mixed)
         top = int(np.argmax(size))
         return float(size[top]), float(self.freq[top])
 
@@ -199,8 +198,6 @@ def highest_bandwidth(freq: Sequence[float], holds: Callable[[float], bool]) -> 
 _LEAD = 4.0
 #: gain at a notch's centre, and damping ratio of its poles
 _DEPTH, _WIDTH = 0.05, 0.3
-#: of a logarithmic grid, refined where |S| of the rigid body is largest
-_POINTS = 300
 
 
 @dataclass(frozen=True)
@@ -241,14 +238,3 @@ def rigid_body(rate: float, delay: float, suspension: float) -> StateSpace:
         blocks=[2],
     )
     return held_exactly(body, rate, delay=delay)
-
-
-def rigid_peak(body: StateSpace, axis: Axis) -> float:
-    """Return max |S| of one motion of the rigid body, stable or not."""
-    respond = responder(body)
-
-    def size(freq: FloatArray) -> FloatArray:
-        return np.asarray(1.0 / np.abs(1.0 - respond(freq)[0, 0] * axis.law.at(freq)))
-
-    freq = np.geomspace(1e-2 * axis.bandwidth, 0.5 * axis.rate * (1.0 - SAME), _POINTS)
-    return highest(size, freq, 1)[0]

@@ -19,6 +19,7 @@ from ...errors import (
     counted,
 )
 from ...lti.discretisation import tustin
+from ...lti.filters import zpk
 from ...lti.frequency_sweep import largest_gains, resonance_grid
 from ...lti.interconnection import lft, series, side_by_side
 from ...lti.preparation import prepared
@@ -280,7 +281,7 @@ def fitted_magnitude(omega: FloatArray, size: FloatArray, order: int) -> StateSp
         start = np.concatenate([[goal.mean()], corners[::2], corners[1::2]])
         best = least_squares(error, start, max_nfev=200)
         a, b = np.exp(best.x[1 : count + 1]), np.exp(best.x[count + 1 :])
-        found = _scaled_series(float(np.exp(best.x[0])), a, b)
+        found = zpk(-a, -b, float(np.exp(best.x[0])))
         if np.std(best.fun) < _CLOSE:
             break
     return found
@@ -289,17 +290,7 @@ def fitted_magnitude(omega: FloatArray, size: FloatArray, order: int) -> StateSp
 def inverse(g: StateSpace) -> StateSpace:
     """Return the inverse of a filter of one input and output with feedthrough."""
     d = 1.0 / g.D[0, 0]
-    return g.replace(A=g.A - d * g.B @ g.C, B=d * g.B, C=-d * g.C, D=[[d]])
-
-
-def _scaled_series(k: float, a: FloatArray, b: FloatArray) -> StateSpace:
-    """Return the factors in series, the gain in the last."""
-    g = StateSpace([], [], [], [[k]])
-    for zero, pole in zip(a, b, strict=True):
-        root = np.sqrt(abs(zero - pole)) or 1.0
-        one = StateSpace([[-pole]], [[root]], [[(zero - pole) / root]], [[1.0]])
-        g = one * g
-    return g
+    return g.replace(A=g.A - d * g.B @ g.C, B=d * g.B, C=-d * g.C, D=[[d]], blocks=None)
 
 
 def _by_mode_channels(

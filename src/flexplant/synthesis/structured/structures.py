@@ -9,7 +9,6 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-import scipy.linalg as la
 
 from ...checks import (
     FloatArray,
@@ -32,7 +31,7 @@ from ...lti.riccati import control_care, solve_care
 from ...lti.statespace import StateSpace, System
 from ...plant import StandardPlant
 from ..hinf.hinf_design import design_hinf
-from ..laws.law import Law, LawElement, SingleElement, chained
+from ..laws.law import Law, LawElement, SingleElement, chained, decoupled
 from ..laws.loop_design import axes_of, checked_laws
 from .judges import Matrices
 
@@ -400,10 +399,7 @@ class TunedLaws(Value):
             return [part(i, tuple(own.tolist())) for i, own in enumerate(split)]
 
         def matrices(theta: FloatArray) -> Matrices:
-            A, B, C, D = (
-                la.block_diag(*each) for each in zip(*(K for _, K in found(theta)), strict=True)
-            )
-            return Matrices(A, -B @ after, before @ C, -before @ D @ after)
+            return Matrices(*decoupled((K for _, K in found(theta)), before, after))
 
         def allows(theta: FloatArray) -> bool:
             return all(corner <= highest for law, _ in found(theta) for corner in _corners(law))
