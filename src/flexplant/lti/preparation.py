@@ -19,6 +19,7 @@ from ..errors import ModelError
 from ..tolerances import ROUNDING, divisor
 from .discretisation import bilinear, image_freq, tustin
 from .equations import bordered_scale, mean_speed, state_scale
+from .joining import Matrices
 from .modal import modal_form
 from .statespace import StateSpace
 
@@ -99,20 +100,7 @@ class Prepared(Value):
 
     def restored(self, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> StateSpace:
         """Return the controller of the original plant from that of the scaled problem."""
-        # the plant's own D22 is subtracted: u = K (y - D22 u)
-        inner = np.eye(D.shape[0]) + D @ self.D22
-        if la.svdvals(inner)[-1] < ROUNDING * (1.0 + float(np.linalg.norm(D @ self.D22))):
-            raise ModelError(
-                "the controller and the feedthrough from u to y (D22, as of accelerometers) make "
-                "an algebraic loop that has no solution. Give u a sample of delay or a low-pass."
-            )
-        loop = np.linalg.inv(inner)
-        A, B, C, D = (
-            A - B @ self.D22 @ loop @ C,
-            B @ (np.eye(B.shape[1]) - self.D22 @ loop @ D),
-            loop @ C,
-            loop @ D,
-        )
+        A, B, C, D = less_feedthrough((A, B, C, D), self.D22)
         controller = StateSpace(
             self.speed * A,
             np.sqrt(self.speed) * B @ self.y_scale,
@@ -123,6 +111,19 @@ class Prepared(Value):
             dt=self.dt if self.direct else 0.0,
         )
         return tustin(controller, 1.0 / self.dt) if self.dt and not self.direct else controller
+
+
+def less_feedthrough(K: Matrices, D22: FloatArray) -> Matrices:
+    """Return A, B, C, D of the controller ``u = K (y - D22 u)``: of a plant with feedthrough."""
+    A, B, C, D = K
+    inner = np.eye(D.shape[0]) + D @ D22
+    if la.svdvals(inner)[-1] < ROUNDING * (1.0 + float(np.linalg.norm(D @ D22))):
+        raise ModelError(
+            "the controller and the feedthrough from u to y (D22, as of accelerometers) make "
+            "an algebraic loop that has no solution. Give u a sample of delay or a low-pass."
+        )
+    loop = np.linalg.inv(inner)
+    return A - B @ D22 @ loop @ C, B @ (np.eye(B.shape[1]) - D22 @ loop @ D), loop @ C, loop @ D
 
 
 def prepared(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from functools import partial
+from collections.abc import Mapping
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -160,15 +160,18 @@ class _StageTask:
         self.tried: dict[float, float] = {}
         self.failures: dict[float, FlexplantError] = {}
         self.best: _StageTry | None = None
-        known = self.plant.uncertain(frequency=self.ranges, modes=list(self.ranges))
-        loop_plant = self.plant if self.whole is None else self.whole
+        self.known = self.plant.uncertain(frequency=self.ranges, modes=list(self.ranges))
+        self.loop_plant = self.plant if self.whole is None else self.whole
         #: what was not measured damped by two deviations less, and the ranges of its frequencies
-        self.damped_less = damped_less(known, loop_plant)
-        #: machines on which a loop must hold, made when they are first needed; the same for all
-        self.machines = _Drawn(
-            draws_with_left_out(known, loop_plant, generator(0), _DRAWS, shapes=_SHAPES)
-            or iter(known.sample(0, _DRAWS))
+        self.damped_less = damped_less(self.known, self.loop_plant)
+
+    @cached_property
+    def machines(self) -> list[StandardPlant]:
+        """Machines on which a loop must hold, the same for all."""
+        drawn = draws_with_left_out(
+            self.known, self.loop_plant, generator(0), _DRAWS, shapes=_SHAPES
         )
+        return list(drawn or self.known.sample(0, _DRAWS))
 
     def holds(self, bandwidth: float) -> bool:
         """Design for a bandwidth of the weights, and return whether the loop holds."""
@@ -324,16 +327,3 @@ class _StageTry(NamedTuple):
     #: what was verified of it, where other methods than `Riccati` found it
     found: Controller | None = None
     drawn: float = 0.0
-
-
-class _Drawn:
-    """What an iterator gives, kept for the next time."""
-
-    def __init__(self, source: Iterator[StandardPlant]) -> None:
-        self.source, self.known = source, list[StandardPlant]()
-
-    def __iter__(self) -> Iterator[StandardPlant]:
-        yield from self.known
-        for one in self.source:
-            self.known.append(one)
-            yield one

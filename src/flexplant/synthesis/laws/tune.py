@@ -425,7 +425,7 @@ class JointSearch:
         lowest = min(float(room.min()) for room in rooms)
         for _ in range(_STEPS):
             program = self._program(x, gains, rooms, couplings)
-            step, expected = program.step(program.room, radius)
+            step, expected = program.step(program.at(rooms), radius)
             if radius < _SMALLEST or expected < _SMALLEST:
                 break
             for last in (False, True):
@@ -476,8 +476,7 @@ class JointSearch:
         bound = la.block_diag(*sides)
         slack = np.maximum(np.concatenate(most) - bound @ x, 0.0)
         bounds = (np.concatenate(low) - x, np.concatenate(high) - x, bound, slack)
-        program = _Program(np.vstack(slopes), places, np.empty(0), bounds, self._places)
-        return program._replace(room=program.at(rooms))
+        return _Program(np.vstack(slopes), places, bounds, self._places)
 
     def _by_numbers(self, x: FloatArray, some: Coupling, slopes: ComplexArray) -> FloatArray:
         """Return the derivatives by the numbers from those by the laws, by differences."""
@@ -506,7 +505,6 @@ class _Program(NamedTuple):
 
     slopes: FloatArray
     places: list[tuple[int, int, IntArray]]
-    room: FloatArray
     bounds: tuple[FloatArray, ...]
     bandwidths: IntArray
 
@@ -523,7 +521,7 @@ class _Program(NamedTuple):
         step, gain = linear_step(
             self.slopes, room, self.bounds, radius, aim=self.bandwidths, penalty=_PENALTY
         )
-        return step, gain - _PENALTY * float(min(self.room.min(initial=np.inf), 0.0))
+        return step, gain - _PENALTY * float(min(room.min(initial=np.inf), 0.0))
 
 
 def _same_winding(one: Coupling, before: ComplexArray, after: ComplexArray) -> bool:

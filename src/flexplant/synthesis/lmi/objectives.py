@@ -14,6 +14,7 @@ import numpy as np
 from ...checks import FloatArray, Value, between, checked, name_list, positive
 from ...errors import SolverError, require_known
 from ...lti.norms import h2_norm, peak_gain
+from ...lti.preparation import less_feedthrough
 from ...lti.responses import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
@@ -524,21 +525,9 @@ class ObjectivePrograms:
         v = self.variables()
         program = v.cp.Problem(v.cp.Minimize(size(v)), self.program(v, 1.0, bound, rate))
         self._solve(program)
-        A, B, C, D = v.controller()
         g = self.given
-        D22 = g.system.D[len(g.z) :, len(g.w) :]
-        loop = np.linalg.inv(np.eye(D.shape[0]) + D @ D22)  # u = K (y - D22 u)
-        return StateSpace(
-            A - B @ D22 @ loop @ C,
-            B @ (np.eye(B.shape[1]) - D22 @ loop @ D),
-            loop @ C,
-            loop @ D,
-            g.dt,
-            inputs=g.y,
-            outputs=g.u,
-            name="lmi",
-            units=g.units,
-        )
+        K = less_feedthrough(v.controller(), g.system.D[len(g.z) :, len(g.w) :])
+        return StateSpace(*K, g.dt, inputs=g.y, outputs=g.u, name="lmi", units=g.units)
 
     def _solve(self, program: Any) -> None:
         """Solve a program, less accurately where it stops before its tolerance."""
