@@ -14,6 +14,7 @@ import flexplant as fx
 from flexplant.errors import CertificateError, ModelError
 from flexplant.lti.preparation import prepared
 from flexplant.synthesis import FixedOrder, PoleRegion
+from mutants import LINES, SOURCE
 
 
 @cache
@@ -365,3 +366,9 @@ def test_an_unstable_loop_at_one_of_the_positions_has_no_norm():
                          inputs=plant.y, outputs=plant.u)  # fmt: skip
     with pytest.raises(CertificateError, match="not stable"):
         moved._position_norm(plant, idle)
+
+
+def test_the_lines_that_mutants_change_are_there():
+    """Each once: a line that moves takes its mutant with it (``python tests/mutants.py``)."""
+    found = {line[:2]: (SOURCE / line[0]).read_text("utf-8").count(line[1]) for line in LINES}
+    assert not {line: count for line, count in found.items() if count != 1}

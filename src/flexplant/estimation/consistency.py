@@ -197,10 +197,6 @@ def consistency(
     ------
     ModelError
         When there are fewer than 200 samples with all innovations, or the kinds are wrong.
-    LabelError
-        When a channel of `truth` is no motion of a POI.
-    ShapeError
-        When it has another length than the estimate.
 
     References
     ----------

@@ -510,8 +510,6 @@ def errors_on_machines(
 
     Raises
     ------
-    ModelError
-        When there are no estimators or machines, or they are no such values.
     LabelError
         When the motion is none of a POI, or a machine lacks a channel.
     AssumptionError

@@ -391,8 +391,6 @@ def check_gain(plant: StandardPlant, gain: FloatArray, covariance: FloatArray) -
 
     Raises
     ------
-    ShapeError
-        When sizes do not match.
     CertificateError
         When the error is not stable or the difference exceeds 1e-6.
 

@@ -137,8 +137,6 @@ def invertibility(plant: StandardPlant | System, inputs: Sequence[str]) -> Inver
     ------
     AssumptionError
         When the plant is continuous, or has no sensor or POI.
-    LabelError
-        When a name is no disturbance of w.
     ModelError
         When the plant is weighted.
 
@@ -260,8 +258,6 @@ def check_bias(plant: StandardPlant | System, inputs: Sequence[str]) -> None:
     AssumptionError
         When a force, or a combination of them, is not seen, or a rigid-body motion is not; or the
         plant is continuous.
-    LabelError
-        When a name is no disturbance of w.
     ModelError
         When the plant is weighted.
 

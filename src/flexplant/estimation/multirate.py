@@ -176,8 +176,6 @@ def design_multirate(
     ------
     AssumptionError
         As `design_kalman`.
-    LabelError
-        When a sensor is unknown.
     ModelError, ShapeError
         When intervals are not whole numbers, an offset is not below its interval, or the period or
         the number of measurements in it is too large.

@@ -126,8 +126,6 @@ def design_input_estimator(
         sensors (the ranks and zeros are named), or a POI sees an input that is known late.
     ModelError
         When the plant is weighted, its noise is not known, or the method is none.
-    LabelError
-        When a name is no disturbance of w.
     SolverError
         When no stable filter exists for another reason.
     CertificateError

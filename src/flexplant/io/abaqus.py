@@ -74,8 +74,6 @@ def read_abaqus(
         elements), degrees of freedom that are no displacement, or nodes in transformed systems.
     LabelError
         When a node has no coordinates in `inp`.
-    ShapeError
-        When `dofs` has another number of rows.
 
     Notes
     -----

@@ -46,8 +46,6 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     ------
     LabelError
         When a name holds the arrow ' <- ', or units name no channel.
-    ModelError
-        When it is no Frf.
     OSError
         When the file cannot be written.
 
@@ -227,8 +225,6 @@ def read_frf_npz(
         When sizes do not match, or which axis is frequency is not clear.
     ModelError
         When frequencies do not increase, or entries are not finite.
-    LabelError
-        When an array or the quantity is unknown.
 
     Examples
     --------

@@ -48,8 +48,6 @@ def read_matlab(
         When it is no MATLAB file, or h5py is missing.
     ModelError
         When a variable is missing, or entries are no finite real numbers.
-    ShapeError
-        When sizes differ.
 
     Examples
     --------

@@ -53,8 +53,6 @@ def write_mat(
 
     Raises
     ------
-    ModelError
-        When it is none of these.
     LabelError
         When a name is no name of a MATLAB variable.
     OSError

@@ -71,8 +71,6 @@ def read_matrix_market(
         line is named.
     ModelError
         When a matrix is complex, skew-symmetric or a pattern without numbers.
-    ShapeError
-        When sizes differ.
 
     Notes
     -----

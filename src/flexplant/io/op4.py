@@ -429,8 +429,6 @@ def read_op4(
     ------
     FlexplantError
         When the file is cut off, damaged, or no OUTPUT4 file; the byte or line is named.
-    LabelError
-        When there is no matrix of such a name.
     ModelError
         When which matrix is meant is not clear, or it is complex.
 

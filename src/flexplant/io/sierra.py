@@ -78,8 +78,6 @@ def read_exodus_modes(
     ModelError
         When modes are near zero and `rigid_below` does not say what they are, or the shapes are
         not mass-normalised with `M`.
-    LabelError
-        When `times` or `variables` name what is not known.
 
     Notes
     -----

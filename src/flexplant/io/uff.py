@@ -79,8 +79,6 @@ def read_frf_uff(
         over different frequencies; the pairs are listed.
     ModelError
         When units or quantities are not clear, or zero frequency would be integrated.
-    LabelError
-        When `quantity` is another word.
 
     Notes
     -----
@@ -175,8 +173,6 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
     ------
     FlexplantError
         When pyuff is missing, the file is damaged or holds no modes, or modes at other nodes.
-    LabelError
-        When a mode that is named is not there.
     ModelError
         When a mode has zero frequency (a rigid-body mode), or a pole is not stable.
 
@@ -245,8 +241,6 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
         When pyuff is missing, the file is damaged, or holds no nodes.
     ModelError
         When nodes are given, or move, in a coordinate system of their own (dataset 2420).
-    LabelError
-        When a direction is unknown or a node appears twice.
 
     Examples
     --------

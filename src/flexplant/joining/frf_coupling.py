@@ -180,8 +180,6 @@ def uncoupled(
 
     Raises
     ------
-    LabelError
-        When a channel at a joint is missing.
     ModelError
         When frequencies or quantities differ, or nothing is left.
 

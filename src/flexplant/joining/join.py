@@ -98,8 +98,6 @@ def joined(
 
     Raises
     ------
-    LabelError
-        When a component, a place or an axis is not there.
     ModelError
         When a rigid joint would hold the machine against the ground, a component is none, a spring
         is so stiff that the digits of its components are lost, or full matrices would be too large.

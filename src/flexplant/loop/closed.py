@@ -361,8 +361,6 @@ class ClosedLoop(Value):
 
         Raises
         ------
-        LabelError
-            When there is no such channel.
         AssumptionError, ModelError
             When the loop is not stable, or white noise reaches an output directly; when the noise
             of the plant is not known, or the variance is infinite.

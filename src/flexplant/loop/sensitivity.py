@@ -50,8 +50,6 @@ def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u",
     ------
     LabelError
         When channels of plant and controller do not match.
-    ModelError, ShapeError
-        When `freq` is not an array of positive frequencies.
 
     Examples
     --------

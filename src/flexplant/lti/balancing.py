@@ -214,8 +214,6 @@ def hankel_values(sys: System) -> FloatArray:
 
     Raises
     ------
-    ModelError
-        When `sys` is no system.
     SolverError
         When the system is not strictly stable: its Gramians are infinite.
 
@@ -314,8 +312,6 @@ def norm_report(sys: System) -> NormReport:
 
     Raises
     ------
-    ModelError
-        When `sys` is no system.
     SolverError
         When a norm cannot be computed.
 

@@ -47,8 +47,6 @@ def discretized(
     ModelError
         When `sys` is sampled already, rate or delay is not positive, or plausible in another unit
         only: the slowest mode lies far above half the rate, or a delay is next to nothing.
-    LabelError
-        When `delayed` names an unknown input.
 
     Warns
     -----

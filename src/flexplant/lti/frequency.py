@@ -389,8 +389,6 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         ------
         ModelError
             When the own quantity is not known, or zero frequency would be integrated.
-        LabelError
-            When `quantity` is another word.
         """
         if not isinstance(quantity, str) or quantity not in ORDERS:
             raise unknown_label("quantity", quantity, ORDERS)

@@ -28,8 +28,6 @@ def append(*systems: System) -> StateSpace:
     ------
     LabelError
         When two share a channel name: rename one.
-    ModelError
-        When sampling times differ.
 
     Examples
     --------
@@ -218,8 +216,6 @@ def feedback(forward: System, back: System | None = None, *, sign: int = -1) -> 
 
     Raises
     ------
-    ShapeError
-        When the numbers of channels do not match.
     ModelError
         When the loop is ill-posed.
 

@@ -51,10 +51,6 @@ def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
 
     Raises
     ------
-    ShapeError
-        When the sizes differ.
-    ModelError
-        When entries are not finite or Q is not symmetric.
     SolverError
         When A is not strictly stable, so that the series does not end, or the residual is bad.
 

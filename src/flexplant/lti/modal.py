@@ -293,8 +293,6 @@ def split_stable(sys: System) -> Split:
 
     Raises
     ------
-    ModelError
-        When `sys` is no system.
     SolverError
         When the two parts share a pole to working precision.
 

@@ -88,8 +88,6 @@ def peak_gain(sys: System, *, progress: bool | None = None) -> tuple[float, floa
 
     Raises
     ------
-    ModelError
-        When `sys` is no system.
     SolverError
         When the level set does not settle (not seen so far).
 
@@ -127,8 +125,6 @@ def linf_norm(sys: System) -> float:
 
     Raises
     ------
-    ModelError
-        When `sys` is no system.
     SolverError
         When the level set does not settle.
 
@@ -204,8 +200,6 @@ def h2_norm(sys: System) -> float:
 
     Raises
     ------
-    ModelError
-        When `sys` is no system.
     SolverError
         When a Gramian is too badly conditioned for its residual.
     CertificateError

@@ -101,8 +101,6 @@ def solve_modes(
         rigid body, or it has a zero-energy motion that is not a rigid-body one.
     SolverError
         When the answer fails its check.
-    LabelError
-        When a place is unknown.
 
     Warns
     -----

@@ -126,8 +126,6 @@ def score_sensors(
     ModelError
         When the plant is not sampled or has no structure, a layout is empty or something is no
         sensor.
-    LabelError
-        When a name or a place is unknown, or a sensor is twice in a layout.
     AssumptionError
         When the criterion has no meaning on this plant, whatever the sensors.
     CertificateError
@@ -312,8 +310,6 @@ def device_worth(
 
     Raises
     ------
-    ModelError
-        When the plant or the placement is not what is needed.
     AssumptionError
         When the devices miss a rigid-body mode even together.
 
@@ -422,10 +418,6 @@ def sensor_map(
     ------
     ModelError, AssumptionError, CertificateError
         As `score_sensors`; or when no point satisfies the constraints.
-    ShapeError
-        When the points are not (n, 3).
-    LabelError
-        When a point is off the structure or the direction is unknown.
 
     Examples
     --------

@@ -81,10 +81,6 @@ def place_sensors(
 
     Raises
     ------
-    ModelError
-        When the plant, a candidate, count or method is not what is needed.
-    LabelError
-        When a name or a place is unknown or doubled.
     AssumptionError
         When even all candidates miss a rigid-body mode, which is named, or the criterion has no
         meaning on this plant.

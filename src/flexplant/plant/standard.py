@@ -408,8 +408,6 @@ def assemble_plant(
     ------
     LabelError
         When a place is not on the structure, or an actuator and a sensor have the same name.
-    ModelError
-        When the model or the ports have another type, or a side is empty.
 
     Warns
     -----

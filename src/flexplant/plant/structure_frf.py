@@ -149,8 +149,6 @@ def frequency_response(
     ModelError
         When a response is infinite at one of the frequencies, a side of the ports is empty, or
         arguments do not go together.
-    LabelError
-        When a place is not on the structure.
     SolverError
         When a direct solution is spoilt by rounding.
 

@@ -129,8 +129,6 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
     ModelError
         When there are no springs, the model is of another kind, or a suspension mode of Modes
         would be overdamped; of complex ones also when one would be unstable.
-    LabelError
-        When a place is not on the structure.
 
     Examples
     --------

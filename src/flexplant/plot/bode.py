@@ -68,8 +68,6 @@ def bode(
     ------
     ModelError
         When there is nothing to draw, or more channels than can be read.
-    LabelError
-        When a channel is unknown.
 
     Examples
     --------

@@ -127,8 +127,6 @@ def spectra(
     ------
     ModelError
         When there is nothing that has a spectrum, or no channel is named.
-    LabelError
-        When there is no such channel.
 
     Examples
     --------
@@ -204,8 +202,6 @@ def exposures(
         When `run` is no Response, or an exposure is not within it or shorter than the window.
     LabelError
         When the channel is unknown, or the run has no error.
-    ShapeError
-        When `exposures` are no pairs.
 
     Examples
     --------

@@ -191,10 +191,6 @@ def estimate(
     ------
     ModelError
         When it is no Estimate, or the truth or the width is no number.
-    ShapeError
-        When the truth has another length.
-    LabelError
-        When there is no such channel.
 
     Examples
     --------

@@ -84,8 +84,6 @@ def nyquist(
     ------
     ModelError
         When there is nothing to draw, or one of several channels is not chosen.
-    LabelError
-        When the channel is unknown.
 
     Examples
     --------
@@ -301,8 +299,6 @@ def sensitivity(
     ------
     ModelError
         When one of them is none of these, or the weight has several channels.
-    ShapeError
-        When frequencies and sizes are not of one length.
 
     Examples
     --------

@@ -78,8 +78,6 @@ def response(
 
     Raises
     ------
-    LabelError
-        When a channel is unknown.
     ModelError
         When `run` is no Response, nothing of it is within `span`, or channels of several units
         shall go into one axes.
@@ -221,8 +219,6 @@ def step(
     ------
     ModelError
         When one is no system, there is nothing to draw, or more channels than can be read.
-    LabelError
-        When a channel is unknown.
 
     Examples
     --------

@@ -378,8 +378,6 @@ def layout(
 
     Raises
     ------
-    LabelError
-        When a DOF is unknown.
     ModelError
         When a solid has so many nodes that no picture could show them, or is to be drawn on axes of
         two dimensions.

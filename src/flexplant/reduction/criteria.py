@@ -263,10 +263,6 @@ def select_dofs(
 
     Raises
     ------
-    LabelError
-        When a label is unknown or twice in `required`.
-    ShapeError
-        When `count` does not fit.
     ModelError
         When `count` is no whole number, or no candidates distinguish them.
 

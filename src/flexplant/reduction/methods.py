@@ -350,8 +350,6 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
     ModelError
         When the method needs another kind of structure, cannot invert what it must, or the modes
         are complex.
-    LabelError
-        When a DOF is unknown.
 
     References
     ----------

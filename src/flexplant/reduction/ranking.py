@@ -110,8 +110,6 @@ def rank_modes(
     ------
     ModelError
         When the modes are complex or an elastic one is undamped.
-    LabelError
-        When a place is unknown.
 
     References
     ----------

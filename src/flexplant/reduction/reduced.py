@@ -398,8 +398,6 @@ class ReducedModel(Value):
         ------
         ModelError
             When `full` is of another kind or another size, or the band is none.
-        LabelError
-            When a place is unknown.
         """
         refuse_unstable(self, "a comparison of responses")
         with Progress(0, "quality"):

@@ -124,8 +124,6 @@ def rms_along(
     ------
     AssumptionError
         When the loop is not stable: at the beginning, or over the trajectory that repeats.
-    LabelError
-        When a position is unknown.
     ModelError
         When nothing moves, or a port that moves has dynamics of its own.
 
@@ -282,8 +280,6 @@ def filters_along(
     ------
     AssumptionError
         When no steady filter exists: a rigid-body mode is not excited or not seen.
-    LabelError
-        When a position is unknown.
     ModelError
         When nothing moves, a port that moves has dynamics of its own, or two positions move.
     SolverError

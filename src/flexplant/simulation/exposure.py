@@ -101,10 +101,6 @@ def exposure_errors(
     ModelError
         When `run` is no Response, has no error, or an exposure is not within it or shorter than
         the window.
-    LabelError
-        When a channel is unknown.
-    ShapeError
-        When `exposures` are no pairs.
 
     Examples
     --------
@@ -165,8 +161,6 @@ def settling_time(
 
     Raises
     ------
-    LabelError
-        When there is no such channel.
     ModelError
         When a limit is not positive, nothing is left after `after`, or the window does not fit.
 

@@ -98,8 +98,6 @@ def learn_feedforward(
 
     Raises
     ------
-    LabelError
-        When a term is unknown.
     ModelError
         When `trial` does not return a Response with the error of the POI, the gains depend on the
         place, or a number is out of range.

@@ -48,8 +48,6 @@ class Response(Value, Mapping[str, FloatArray]):
 
     Raises
     ------
-    ShapeError
-        When sizes differ.
     ModelError
         When time is not equidistant or entries are not finite.
 

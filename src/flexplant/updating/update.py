@@ -122,8 +122,6 @@ def update(
         When the measured eigenvalues do not depend on a parameter or cannot distinguish some (S is
         singular), the matrices are indefinite at `start`, or the FEModel refuses the answer (a
         damper came out negative: give it bounds).
-    LabelError
-        When a mode number or a place is unknown.
     SolverError
         When no part of a step keeps the model physical, or no start leads anywhere.
 

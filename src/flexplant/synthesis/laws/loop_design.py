@@ -175,8 +175,6 @@ def design_loops(
 
     Raises
     ------
-    LabelError
-        When an axis has no law, or a name is unknown.
     ModelError, ShapeError
         When plant, transformations, laws and rate do not go together.
     AssumptionError

@@ -155,8 +155,6 @@ def robust_stability(
     CertificateError
         When a machine is unstable for which stability was proven, or sampled machines are too far
         from affine in their Deltas.
-    ModelError
-        When `uncertain` is no uncertain plant.
     SolverError
         When intervals do not cover the frequency axis.
 
