@@ -413,6 +413,17 @@ def between(value: Any, name: str, low: float, high: float, hint: str, *, ends: 
     return number
 
 
+def below_half_rate(freq: Any, name: str, rate: float) -> float:
+    """Return a positive frequency [Hz], which must lie below half the rate [Hz] (0: continuous)."""
+    number = positive(freq, name)
+    if rate and number >= 0.5 * rate:
+        raise ModelError(
+            f"{name} is at {number:g} Hz, not below half the rate, {0.5 * rate:g} Hz: sampled, it "
+            "would be another frequency. Leave it out, lower it, or raise the rate."
+        )
+    return number
+
+
 def positive_array(
     value: Any,
     name: str,
@@ -445,13 +456,21 @@ def members(values: Any, kind: Any, name: str, hint: str, *, least: int = 1) -> 
 
 
 def mapping(
-    value: Any, name: str, hint: str, *, least: int = 0, error: type[FlexplantError] = ModelError
+    value: Any,
+    name: str,
+    hint: str,
+    *,
+    least: int = 0,
+    kind: Any = object,
+    error: type[FlexplantError] = ModelError,
 ) -> dict[Any, Any]:
-    """Return a mapping of so many entries at least as a dict."""
+    """Return a mapping of so many entries at least, all of a class, as a dict."""
     if not isinstance(value, Mapping) or len(value) < least:
         filled = f" with {least} or more entries" if least else ""
         raise error(f"{name} must be a mapping{filled}, got {short(value)}. {hint}")
-    return dict(value)
+    return {
+        key: instance(one, kind, f"{key!r} of {name}", hint, error) for key, one in value.items()
+    }
 
 
 def element_mask(value: Any, name: str) -> npt.NDArray[np.bool_]:

@@ -212,6 +212,18 @@ def _similar_names(name: str, listed: list[str]) -> list[str]:
     return list(dict.fromkeys([*get_close_matches(name, listed, n=3, cutoff=0.6), *within]))[:4]
 
 
+def only_one(kind: str, names: Iterable[str], given: Any, how: str) -> str:
+    """Return the one of some names that is given, or the only one; LabelError where it is open."""
+    known = list(names)
+    if given is not None:
+        require_known(kind, [given], known)
+    elif len(known) != 1:
+        listed = f" ({some_names(known)})" if known else ""
+        named = repr(known[0]) if known and how.endswith("=") else ""
+        raise LabelError(f"there are {counted(len(known), kind)}{listed}: say which, {how}{named}.")
+    return known[0] if given is None else str(given)
+
+
 def require_known(
     kind: str, names: Iterable[object], known: Iterable[str], owner: str = ""
 ) -> None:

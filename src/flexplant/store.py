@@ -29,7 +29,8 @@ _HEADER = "__flexplant__"
 
 def checked(check: Callable[..., Any], *, unit: str = "", **rules: Any) -> dict[str, Any]:
     """Return the metadata of a field of a Value: ``check(value, name=..., **rules)`` returns it."""
-    # `name`, in messages, is the field's unless the rules have another; a default None passes
+    # `name`, in messages, is the field's unless the rules have another; a default None passes;
+    # a `shape` may name fields: as many entries are due there as these have
     return {"check": (check, rules), "unit": unit}
 
 
@@ -99,7 +100,11 @@ class Value(metaclass=_Kind):
             given = values[field.name]
             if "check" in field.metadata and (given is not None or field.default is not None):
                 check, rules = field.metadata["check"]
-                values[field.name] = check(given, **{"name": field.name} | rules)
+                rules = {"name": field.name} | rules
+                if "shape" in rules:
+                    sizes = (len(values[n]) if isinstance(n, str) else n for n in rules["shape"])
+                    rules["shape"] = tuple(sizes)
+                values[field.name] = check(given, **rules)
         self._set(**values)
 
     def _set(self, **values: Any) -> None:
@@ -111,11 +116,16 @@ class Value(metaclass=_Kind):
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
-        """Return the kind with its fields and their units; None and empty ones are left out."""
+        """Return the kind with its fields and their units.
+
+        None, what is empty, and words and flags that are the default are left out.
+        """
         shown = []
         for field in fields(self):  # type: ignore[arg-type]
-            text, unit = _field_text(getattr(self, field.name)), field.metadata.get("unit")
-            if text not in ("None", "''", "[]", "{}"):
+            value, unit = getattr(self, field.name), field.metadata.get("unit")
+            usual = isinstance(value, bool | str) and value == field.default
+            text = _field_text(value)
+            if not usual and text not in ("None", "''", "[]", "{}"):
                 shown.append(f"{field.name}={text}{' ' + unit if unit else ''}")
         return f"{type(self).__name__}({', '.join(shown)})"
 

@@ -78,7 +78,7 @@ def test_the_kalman_filter_is_better():
 def test_a_continuous_plant_has_gains_but_no_rms():
     estimator = design_static(assemble_plant(modes(), ports(z=CENTRE)))
     np.testing.assert_allclose(estimator.gain[0], 0.25, atol=1e-9)
-    with pytest.raises(AssumptionError, match="sampled plant"):
+    with pytest.raises(AssumptionError, match="plant is continuous"):
         estimator.rms("die")
 
 

@@ -124,11 +124,11 @@ def test_other_channels_may_be_named(loops, found):
 
 
 def test_wrong_use_is_refused(loops, found):
-    with pytest.raises(ModelError, match="mapping of names"):
+    with pytest.raises(ModelError, match="loops must be a mapping"):
         compare_loops(loops["servo"])
-    with pytest.raises(ModelError, match="mapping of names"):
+    with pytest.raises(ModelError, match="loops must be a mapping"):
         compare_loops({})
-    with pytest.raises(ModelError, match="need closed loops"):
+    with pytest.raises(ModelError, match="must be of type ClosedLoop"):
         compare_loops({"servo": servo()})
     with pytest.raises(LabelError, match="'servo' has no 'die:ref' in w or no 'die:rx'"):
         compare_loops(loops, reference="die:ref", error="die:rx")

@@ -148,7 +148,7 @@ def test_several_references_must_be_named():
         reference_errors(plant)
     with pytest.raises(LabelError, match=r"die, edge.*poi='die'"):
         stage_weights(plant, 30.0)
-    with pytest.raises(LabelError, match="no POI with a reference 'dye'"):
+    with pytest.raises(LabelError, match="no followed POI 'dye'"):
         reference_errors(plant, poi="dye")
     block = reference_errors(plant, poi="edge")
     assert block.inputs[-1] == "edge:ref"

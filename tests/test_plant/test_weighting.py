@@ -82,7 +82,7 @@ def test_a_plant_says_what_was_done_to_it():
     for altered, words in ((mean, "read through a block"), (both, "weighted and read through"),
                            (plant.weighted(z={"die:z": 2.0}), "weighted")):  # fmt: skip
         assert words in repr(altered).splitlines()[0]
-        with pytest.raises(ModelError, match=f"the plant is {words}.*sample plant.unweighted"):
+        with pytest.raises(ModelError, match=f"the plant is {words}.*Use plant.unweighted"):
             altered.discretized(RATE)
     assert "weighted" not in repr(mean)
     # w is physical still, and the noise of the two sensors is that of their mean
@@ -107,7 +107,7 @@ def test_refusals():
         plant.weighted(w={"amp9": 1.0})
     with pytest.raises(ModelError, match=r"has dt 0.01 s, the plant 0.0001 s.*continuous system"):
         plant.weighted(z={"die:z": tustin(lowpass(10.0), 100.0)})
-    with pytest.raises(ModelError, match=r"one input and one output.*one by one"):
+    with pytest.raises(ModelError, match=r"one input and one output.*Select a channel"):
         plant.weighted(z={"die:z": StateSpace([], [], [], np.eye(2))})
     with pytest.raises(ModelError, match="left out: keep at least one"):
         plant.weighted(z=dict.fromkeys(plant.z))

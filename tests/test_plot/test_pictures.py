@@ -294,7 +294,7 @@ def test_predictions_beside_what_was_found():
     np.testing.assert_allclose(diamonds[0].get_xdata(), [2.0, 6.0])
     assert ax.get_xlabel() == "rms error of die:z [nm]"
     for wrong in ([1.0], [], {}):
-        with pytest.raises(ModelError, match="mapping of designs"):
+        with pytest.raises(ModelError, match="rows must be a mapping"):
             fx.plot.predictions(wrong)
     with pytest.raises(ShapeError, match="hopeful"):
         fx.plot.predictions({"hopeful": [(1.0, 2.0)]})

@@ -45,9 +45,9 @@ def test_errors_are_those_of_the_run(made, tmp_path):
 
 def test_wrong_use_is_refused(made):
     designs, run = made
-    with pytest.raises(ModelError, match="mapping of names"):
+    with pytest.raises(ModelError, match="designs must be a mapping"):
         reading_along([designs["static"]])
-    with pytest.raises(ModelError, match="need estimators"):
+    with pytest.raises(ModelError, match="must be of type Estimator"):
         reading_along({"block": StateSpace([], [], [], [[1.0]])})
     with pytest.raises(LabelError, match=r"'other\|die:hat'.*reading_along"):
         compare_estimators({"other": designs["static"]}, run, "die:z")

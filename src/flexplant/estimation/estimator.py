@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, positive, real_array, short
-from ..errors import LabelError, ModelError, ShapeError, counted, require_known
+from ..checks import FloatArray, positive, real_array
+from ..errors import ModelError, ShapeError, counted, only_one, require_known
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from .error import PoiFilter
@@ -311,12 +311,7 @@ def moving_sight(
     # so are the covariances of the modes left out there
     pois = {poi.name: poi for poi in plant.assembled.ports.z}
     if not isinstance(path, Mapping):
-        if len(pois) != 1:
-            raise LabelError(
-                f"the plant has the POIs {', '.join(pois)}: name those that move, "
-                f"path={{name: points}}, got {short(path)}."
-            )
-        path = {next(iter(pois)): path}
+        path = {only_one("POI", pois, None, "path={name: points}"): path}
     nz = model.C1.shape[0]
     c = np.repeat(np.hstack([model.C1, model.N])[None], count, axis=0)
     D1 = np.repeat(model.D1[None], count, axis=0)

@@ -14,6 +14,7 @@ from ..errors import AssumptionError, require_known
 from ..lti.equations import state_scale
 from ..lti.statespace import System
 from ..plant import StandardPlant
+from ..plant.partition import require_sampled
 from ..tolerances import SPLIT, TINY, divisor
 from .estimator_channels import checked_plant
 from .filter_model import FilterModel, filter_model
@@ -154,11 +155,7 @@ def invertibility(plant: StandardPlant | System, inputs: Sequence[str]) -> Inver
 
 def unknown_names(plant: StandardPlant, inputs: Sequence[str]) -> tuple[str, ...]:
     """Return the names of unknown inputs, each a disturbance of w."""
-    if not plant.dt:
-        raise AssumptionError(
-            "the plant is continuous, unknown inputs are held over samples: use "
-            "plant.discretized(rate, delay=1)."
-        )
+    require_sampled(plant, "unknown inputs are held over samples")
     names = name_list(inputs, "unknown inputs")
     check_names(names, "unknown inputs")
     forces = [w for w in plant.w if w not in plant.y and not w.endswith(":noise")]

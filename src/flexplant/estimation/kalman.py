@@ -8,12 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..checks import FloatArray
-from ..errors import AssumptionError, CertificateError, ModelError, SolverError
+from ..errors import CertificateError, ModelError, SolverError
 from ..lti.lyapunov import dual_variances
 from ..lti.riccati import riccati_root, solve_dare
 from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
+from ..plant.partition import require_sampled
 from ..plant.realisation import Structure
 from .error import error_variances
 from .estimator import KalmanEstimator
@@ -99,11 +100,7 @@ def design_kalman(
     '1.88 nm'
     """
     plant = checked_plant(plant)
-    if not plant.dt:
-        raise AssumptionError(
-            "the plant is continuous, this filter runs at samples: use "
-            "plant.discretized(rate, delay=1)."
-        )
+    require_sampled(plant, "this filter runs at samples")
     check_noises(plant)
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")
     whole = None if larger is plant else larger_plant(plant, larger)

@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import FloatArray, Value, checked, positive_array, whole
-from ..errors import AssumptionError, FlexplantError, ModelError, aligned, require_known
+from ..errors import AssumptionError, FlexplantError, aligned, require_known
 from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
+from ..plant.partition import require_plain, require_sampled
 from ..plant.realisation import Structure
 from ..plant.rigid_motion import rigid_rows
 from .error import error_variances
@@ -265,10 +266,7 @@ class StaticEstimator(Value):
         has no variance then), SolverError when an elastic mode is not damped.
         """
         row = row_of(poi_channels(self.plant), channel)
-        if not self.plant.dt:
-            raise AssumptionError(
-                "the rms needs a sampled plant: design_static(plant.discretized(rate))."
-            )
+        require_sampled(self.plant, "an rms is of samples")
         plant = self.larger or self.plant
         if on is not None:
             plant = same_pois(self.plant, on)
@@ -318,11 +316,7 @@ def design_static(
     array([[0.5, 0.5]])
     """
     plant = checked_plant(plant)
-    if plant.is_weighted:
-        raise ModelError(
-            f"the plant is {plant.alteration}: what a sensor sees of the rigid body is known of "
-            "sensors only. Use plant.unweighted."
-        )
+    require_plain(plant, "what is seen of the rigid body is known of sensors only")
     ports = plant.assembled.ports
     motions = plant.rigid_motions
     orders = {s.name: s.order for s in ports.y}

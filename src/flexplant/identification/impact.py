@@ -58,10 +58,6 @@ class Blow(Value):
     experiment: int = 0
     reason: str = ""
 
-    def __repr__(self) -> str:
-        why = f": {self.reason}" if self.reason else ""
-        return f"<Blow: {self.input} at {self.time:.4g} s, {self.peak:.3g}{why}>"
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ImpactTest(Value):

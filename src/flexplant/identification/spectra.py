@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, Value, positive, real_array, signal_names
+from ..checks import ComplexArray, FloatArray, Value, checked, positive, real_array, signal_names
 from ..errors import ModelError, ShapeError, require_known, warn
 from ..lti.frequency import ORDERS, Frf
 from ..lti.measured_lines import checked_overlap, checked_window
@@ -19,19 +19,9 @@ from ..tolerances import ROUNDING, TINY
 class SpectralMethod(Value):
     """Averages of windowed, overlapping segments (Welch); the base of H1, H2 and Hv."""
 
-    segment: float | None = None
-    overlap: float = 0.5
-    window: str | tuple[Any, ...] = "hann"
-
-    def __post_init__(self) -> None:
-        overlap, window = checked_overlap(self.overlap), checked_window(self.window)
-        if self.segment is not None:
-            positive(self.segment, "segment")
-        self._set(overlap=overlap, window=window)
-
-    def __repr__(self) -> str:
-        length = "an eighth of the record" if self.segment is None else f"{self.segment:g} s"
-        return f"{type(self).__name__}(segments of {length}, window {self.window!r})"
+    segment: float | None = field(default=None, metadata=checked(positive, unit="s"))
+    overlap: float = field(default=0.5, metadata=checked(checked_overlap))
+    window: str | tuple[Any, ...] = field(default="hann", metadata=checked(checked_window))
 
 
 class H1Estimator(SpectralMethod):

@@ -175,9 +175,6 @@ class PlacedShape(Interpolation):
     pose: Pose
     C: sp.csc_array
 
-    def __repr__(self) -> str:
-        return f"<PlacedShape of {self.own!r}>"
-
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) of all DOFs in the motion `direction` at a point of it."""
         return np.asarray(self.rows(np.asarray(xyz, dtype=np.float64)[None], direction)[0])
@@ -242,9 +239,6 @@ class JoinedShape(Interpolation):
     parts: tuple[DofSet, ...]
     expansion: sp.csc_array | None = None
     motions: FloatArray | None = None
-
-    def __repr__(self) -> str:
-        return f"<JoinedShape of {', '.join(self.names)}>"
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) of the DOFs in the motion `direction` at a point.

@@ -24,6 +24,7 @@ from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..lti.responses import responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..plant.partition import require_plain
 from ..tolerances import divisor
 
 #: relative: the variance by the two Lyapunov equations, and by the integral of the spectrum
@@ -441,11 +442,9 @@ def stationary_row(
     plant: StandardPlant, monitored: StateSpace, problem: object, channel: str
 ) -> int:
     """Return the row of an output of a closed loop that has a stationary state."""
-    if plant.is_weighted:
-        raise AssumptionError(
-            "the plant is weighted, so its z and w are not physical signals: close the loop "
-            "around plant.unweighted with the same blocks."
-        )
+    require_plain(
+        plant, "its z and w are no physical signals, close the loop anew", AssumptionError
+    )
     given: object = channel
     instance(given, str, "a channel", "Pass its name: 'die:error'.", LabelError)
     row = int(monitored.output_index([channel])[0])

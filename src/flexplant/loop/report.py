@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, Value, instance, short, whole
+from ..checks import ComplexArray, FloatArray, Value, instance, mapping, whole
 from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label
 from ..lti.frequency_sweep import climbed_grid, crossings, highest
 from ..lti.measured_lines import FEWEST, low_slope
@@ -436,14 +436,8 @@ def compare_loops(
     >>> {name: row.stable for name, row in fx.compare_loops(loops).rows.items()}
     {'10 Hz': True, '20 Hz': True}
     """
-    if not isinstance(loops, Mapping) or not loops:
-        raise ModelError(
-            f"need a mapping of names to closed loops, got {short(loops)}. Type "
-            "{'servo': close_loop(plant, observer, servo)}."
-        )
-    wrong = [loop for loop in loops.values() if not isinstance(loop, ClosedLoop)]
-    if wrong:
-        raise ModelError(f"need closed loops, got {short(wrong[0])}. Use close_loop(plant, ...).")
+    hint = "Pass {'servo': close_loop(plant, observer, servo)}."
+    mapping(loops, "loops", hint, least=1, kind=ClosedLoop)
     pair = _reference_pair(next(iter(loops.values())), reference, error)
     for name, loop in loops.items():
         if pair and (pair[0] not in loop.plant.w or pair[1] not in loop.plant.z):

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import FloatArray, Value, function, instance, members, real_array
-from ..errors import AssumptionError, LabelError, ModelError, counted, require_known
+from ..errors import AssumptionError, LabelError, ModelError, counted, only_one
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from .blocks import with_known
@@ -197,14 +197,7 @@ def schedule_loops(
     instance(plant, StandardPlant, "plant", "Pass an assembled plant with positions.")
     function(design, "design", "Pass a function of a plant that returns its blocks.")
     known = [one.name for one in plant.assembled.ports.positions]
-    if position is None:
-        if len(known) != 1:
-            raise LabelError(
-                f"the plant has {counted(len(known), 'position')} ({', '.join(known) or 'none'}): "
-                "say which one schedules, position=."
-            )
-        position = known[0]
-    require_known("position", [position], known)
+    position = only_one("position", known, position, "position=")
     values = real_array(places, "places", (None,))
     loops = []
     for x in values.tolist():

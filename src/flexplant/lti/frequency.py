@@ -15,12 +15,12 @@ from ..checks import (
     ComplexArray,
     FloatArray,
     Value,
+    checked,
     complex_array,
     known_units,
     name_list,
     positive,
     positive_array,
-    real_array,
     rebuild,
     short,
     signal_names,
@@ -185,18 +185,18 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     #: arrays leave `2.0 * frf` with a numpy number to this class
     __array_ufunc__ = None
 
-    freq: FloatArray
-    data: ComplexArray
+    freq: FloatArray = field(metadata=checked(positive_array, shape=(None,), zero=True))
+    data: ComplexArray = field(metadata=checked(complex_array, shape=(None, None, "freq")))
     inputs: Sequence[str] = ()
     outputs: Sequence[str] = ()
     quantity: str | None = None
     coherence: FloatArray | None = None
     variance: FloatArray | None = None
     correlation: ComplexArray | None = None
-    resolution: float | None = None
-    window: str | tuple[Any, ...] | None = None
-    overlap: float = 0.0
-    freedom: float | None = None
+    resolution: float | None = field(default=None, metadata=checked(positive))
+    window: str | tuple[Any, ...] | None = field(default=None, metadata=checked(checked_window))
+    overlap: float = field(default=0.0, metadata=checked(checked_overlap))
+    freedom: float | None = field(default=None, metadata=checked(positive))
     units: Mapping[str, str] = field(default_factory=dict)
 
     if TYPE_CHECKING:  # what comes in is anything array-like
@@ -219,49 +219,29 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        freq = checked_freq(self.freq)
-        if np.any(np.diff(freq) <= 0):
-            raise ModelError("freq must increase strictly: sort the measurement and merge doubles.")
-        data = complex_array(self.data, "data")
-        if data.ndim != 3 or data.shape[2] != freq.size:
-            raise ShapeError(
-                f"data must have shape (n_out, n_in, {freq.size}) like freq, got {data.shape}."
-            )
-        coherence = self.coherence
+        super().__post_init__()
+        sampled_freq(self.freq, 0.0)
+        shape = self.data.shape
+        coherence, variance = self.coherence, self.variance
         if coherence is not None:
-            coherence = real_array(coherence, "coherence", data.shape)
-            if coherence.size and (coherence.min() < 0 or coherence.max() > 1 + SAME):
+            coherence = positive_array(coherence, "coherence", shape, zero=True)
+            if coherence.max(initial=0.0) > 1 + SAME:
                 raise ModelError("coherence must lie between 0 and 1.")
-        variance = self.variance
         if variance is not None:
             why = "It is E|error|^2."
-            variance = positive_array(variance, "variance", data.shape, zero=True, hint=why)
-        correlation = self.correlation
-        if correlation is not None:
-            correlation = checked_correlation(correlation, data.shape)
-        window, resolution = self.window, self.resolution
-        if resolution is not None:
-            resolution = positive(resolution, "resolution")
-        elif window is not None:
+            variance = positive_array(variance, "variance", shape, zero=True, hint=why)
+        if self.correlation is not None:
+            self._set(correlation=checked_correlation(self.correlation, shape))
+        if self.window is not None and self.resolution is None:
             raise ModelError(
-                f"window={window!r} says little without the length of its segments: give "
+                f"window={self.window!r} says little without the length of its segments: give "
                 "resolution= too, the inverse of that length [Hz]."
             )
-        inputs = signal_names(self.inputs, data.shape[1], "u", "inputs")
-        outputs = signal_names(self.outputs, data.shape[0], "y", "outputs")
+        inputs = signal_names(self.inputs, shape[1], "u", "inputs")
+        outputs = signal_names(self.outputs, shape[0], "y", "outputs")
+        units = known_units(self.units, (*inputs, *outputs))
         self._set(
-            freq=freq,
-            data=data,
-            inputs=inputs,
-            outputs=outputs,
-            units=known_units(self.units, (*inputs, *outputs)),
-            coherence=coherence,
-            variance=variance,
-            correlation=correlation,
-            resolution=resolution,
-            window=None if window is None else checked_window(window),
-            overlap=checked_overlap(self.overlap),
-            freedom=None if self.freedom is None else positive(self.freedom, "freedom"),
+            inputs=inputs, outputs=outputs, units=units, coherence=coherence, variance=variance
         )
 
     def __repr__(self) -> str:

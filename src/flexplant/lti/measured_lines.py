@@ -37,7 +37,7 @@ def checked_correlation(value: Any, shape: tuple[int, ...]) -> ComplexArray:
     return correlation
 
 
-def checked_window(window: Any) -> str | tuple[Any, ...]:
+def checked_window(window: Any, name: str = "window") -> str | tuple[Any, ...]:
     """Return a window that `scipy.signal.get_window` takes."""
     from scipy.signal import get_window  # costs a third of a second that few need
 
@@ -45,13 +45,13 @@ def checked_window(window: Any) -> str | tuple[Any, ...]:
     try:
         get_window(window, 16)
     except (ValueError, TypeError, IndexError) as error:
-        raise ModelError(f"window {window!r} is not one of scipy.signal: {error}") from error
+        raise ModelError(f"{name} {window!r} is not one of scipy.signal: {error}") from error
     return window  # type: ignore[no-any-return]
 
 
-def checked_overlap(overlap: Any) -> float:
+def checked_overlap(overlap: Any, name: str = "overlap") -> float:
     """Return an overlap below 0.95."""
-    return between(overlap, "overlap", 0.0, 0.95, "More brings nothing new: try 0.5.", ends="[")
+    return between(overlap, name, 0.0, 0.95, "More brings nothing new: try 0.5.", ends="[")
 
 
 def line_correlation(

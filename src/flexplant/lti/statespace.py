@@ -24,7 +24,7 @@ from ..checks import (
     short,
     signal_names,
 )
-from ..errors import ModelError, ShapeError, counted
+from ..errors import FlexplantError, ModelError, ShapeError, counted
 from ..tolerances import divisor
 from .joining import (
     Channels,
@@ -436,6 +436,17 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
             )
         return inner
     return StateSpace.from_control(sys)
+
+
+def single_channel(given: Any, name: str, error: type[FlexplantError] = ModelError) -> StateSpace:
+    """Return a system of one input and one output."""
+    g = as_statespace(given)
+    if g.D.shape != (1, 1):
+        raise error(
+            f"{name} must have one input and one output, got {g!r}. Select a channel of it: "
+            "sys['output', 'input']."
+        )
+    return g
 
 
 def direct_gain(D: Any, B: Any, C: Any) -> FloatArray:

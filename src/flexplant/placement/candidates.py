@@ -11,6 +11,7 @@ import numpy as np
 from ..checks import FloatArray, Value, several, short
 from ..errors import LabelError, ModelError, require_known
 from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
+from ..plant.partition import require_plain, require_sampled
 from ..plant.scheduling import port_at, require_positions
 from ..structure import Disc, Rectangle
 
@@ -65,15 +66,8 @@ def sides_of(ports: Iterable[Port]) -> Any:
 def sampled_plant(given: Any) -> StandardPlant:
     """Return a plant that is sampled and not weighted."""
     plant: StandardPlant = standard_plant(given)
-    if plant.is_weighted:
-        raise ModelError(
-            f"the plant is {plant.alteration}, placement needs the one before: plant.unweighted."
-        )
-    if not plant.dt:
-        raise ModelError(
-            "the plant is continuous, scores are of the sampled one: use "
-            "plant.discretized(rate, delay=1)."
-        )
+    require_plain(plant, "sensors and actuators are placed on a structure")
+    require_sampled(plant, "scores are of samples", ModelError)
     return plant
 
 

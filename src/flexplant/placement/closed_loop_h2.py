@@ -30,7 +30,6 @@ from .poi_variance import (
     factors_of,
     measured_rows,
     plain,
-    poi_arguments,
     poi_rows,
     pushed,
     pushed_columns,
@@ -46,10 +45,6 @@ class MotionAndEffort(Criterion):
     poi: Named = field(default=None, metadata=checked(checked_names, name="POI"))
     axes: Named = field(default=None, metadata=checked(checked_names, name="axis"))
     effort: float = field(default=1e-9, kw_only=True, metadata=checked(positive))
-
-    def __repr__(self) -> str:
-        given = [*poi_arguments(self.poi, self.axes), f"effort={self.effort:g}"]
-        return f"{type(self).__name__}({', '.join(given)})"
 
     def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
         """Raise AssumptionError when w does not excite or the axes miss a rigid-body mode."""

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..checks import FloatArray, checked, flag, instance, one_of, positive, short
-from ..errors import AssumptionError, LabelError, ModelError, counted, require_known
+from ..errors import AssumptionError, LabelError, ModelError, only_one, require_known
 from ..estimation import Filter, FixedLag, KalmanEstimator, Predictor, design_kalman
 from ..estimation.estimator_channels import sensors
 from ..lti.sampling import held_exactly
@@ -76,13 +76,9 @@ def channels_by_poi(plant: StandardPlant) -> dict[str, dict[str, str]]:
 def factors_of(plant: StandardPlant, poi: Named, axes: Named, *, every: bool) -> dict[str, float]:
     """Return {z channel: factor}, the factor of the POI times that of the axis."""
     known = channels_by_poi(plant)
-    if poi is None and len(known) != 1:
-        raise LabelError(
-            f"the plant has {counted(len(known), 'POI')} ({', '.join(known)}): say which count, "
-            f"such as PoiVariance({next(iter(known), 'die')!r}), or all of them in a list."
-        )
+    poi = only_one("POI", known, None, "by name, or all in a list") if poi is None else poi
     found: dict[str, float] = {}
-    for name, weight in _axis_factors(poi if poi is not None else tuple(known)).items():
+    for name, weight in _axis_factors(poi).items():
         require_known("POI", [name], known)
         own = known[name]
         usual = tuple(own) if every else tuple(own)[:1]
@@ -226,14 +222,6 @@ class PoiVariance(Criterion):
                 "larger= gives modes left out, own_modes=True (and a predictor or lag) leaves "
                 "them: pass one."
             )
-
-    def __repr__(self) -> str:
-        given = poi_arguments(self.poi, self.axes)
-        given += [f"measure={self.measure!r}"] if self.measure != "sum" else []
-        given += [f"lag={self.lag!r}"] if self.lag is not None else []
-        given += ["larger=..."] if self.larger is not None else []
-        given += ["own_modes=True"] if self.own_modes else []
-        return f"PoiVariance({', '.join(given)})"
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return the variance [m^2] on a sampled plant, by its certified Kalman filter."""

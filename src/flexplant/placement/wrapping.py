@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
@@ -362,9 +362,6 @@ class OverMachines(Several):
 
     machines: Sequence[StandardPlant] = field(metadata=checked(_checked_machines))
 
-    def __repr__(self) -> str:
-        return f"OverMachines({self.criterion!r}, {len(self.machines)} machines, {self.measure!r})"
-
     def plants(
         self, plant: StandardPlant, candidates: Sequence[Port]
     ) -> Iterator[tuple[StandardPlant, Sequence[Port]]]:
@@ -407,10 +404,6 @@ class OverPositions(Several):
     """
 
     points: Any = 5
-
-    def __repr__(self) -> str:
-        given = dict(self.points) if isinstance(self.points, Mapping) else self.points
-        return f"OverPositions({self.criterion!r}, {given!r:.60}, {self.measure!r})"
 
     def check(self, plant: StandardPlant, candidates: Sequence[Port]) -> None:
         """Check the criterion at every position, and that the candidates suffice there."""

@@ -13,13 +13,13 @@ from ..errors import ModelError, counted, require_known
 from ..lti.discretisation import check_latency, check_rate, light_modes, tustin
 from ..lti.interconnection import among, append, series
 from ..lti.sampling import acting, held_exactly, sample_and_hold
-from ..lti.statespace import StateSpace, System, as_statespace
+from ..lti.statespace import StateSpace, System, as_statespace, single_channel
 from ..modes import Modes
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..structure.rigid import SPANNED, Structure
 from ..tolerances import ROUNDING, SAME
-from .partition import Assembled, Foreign, Partition, Weighted
+from .partition import Assembled, Foreign, Partition, Weighted, require_plain
 from .port import QUANTITIES, ForcePort, Seen, SensorPort
 from .ports import Poi, Ports
 from .realisation import ModalRealisation, natural, plant_modes
@@ -338,11 +338,9 @@ def sampled(plant: P, rate: float, delay: float) -> P:
         raise ModelError(
             f"the plant is sampled already (dt {plant.dt:g} s). Start from plant.continuous."
         )
-    if plant.is_weighted:
-        raise ModelError(
-            f"the plant is {plant.alteration}: sample plant.unweighted, then do so again with "
-            "sampled weights and blocks (continuous ones would be distorted by the hold)."
-        )
+    require_plain(
+        plant, "continuous weights would be distorted by the hold, weight it once sampled"
+    )
     check_rate(_elastic_frequencies(plant), rate, delay)
     for name, late in (plant.assembled.ports.latencies if plant.is_assembled else {}).items():
         check_latency(name, late, rate)
@@ -426,11 +424,7 @@ def rebuilt(
 ) -> P:
     """Return a plant with other ports or of other modes, sampled like the old one."""
     # ports that are among its own are rows and columns of it
-    if plant.is_weighted:
-        raise ModelError(
-            f"other ports or modes are for a plant as it was made, this one is {plant.alteration}: "
-            "use plant.unweighted."
-        )
+    require_plain(plant, "other ports or modes are for a plant as it was made")
     own = plant.assembled
     if isinstance(ports, Ports) and realisation is None:
         found = with_ports_of(own, ports)
@@ -511,13 +505,7 @@ def measured_through(plant: P, block: System) -> P:
 
 
 def _weight(plant: Partition, weight: Any, name: str) -> StateSpace:
-    sys = as_statespace(weight)
-    if len(sys.inputs) != 1 or len(sys.outputs) != 1:
-        raise ModelError(
-            f"the weight of {name!r} must have one input and one output, got {sys!r}. "
-            "Weight channels one by one."
-        )
-    sys = at_rate(sys, name, plant.dt)
+    sys = at_rate(single_channel(weight, f"the weight of {name!r}"), name, plant.dt)
     states = [f"{name}|{state}" for state in sys.states]
     return sys.replace(inputs=[name], outputs=[name], states=states)
 

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import FloatArray, Value, function, instance, number, real_array
-from ..errors import AssumptionError, LabelError, ModelError, unknown_label
+from ..errors import AssumptionError, LabelError, ModelError, only_one, unknown_label
 from .assumptions import WEAK, mode_visibility
 from .building import P, rebuilt, wired
 from .forces import Actuator, Disturbance
-from .partition import Partition
+from .partition import Partition, require_plain
 from .ports import Poi, Ports, Sensor
 from .rigid_body import rigid_body_of
 from .rigid_motion import Decoupling, decouple, rigid_parts
@@ -60,13 +60,7 @@ class Along(Value):
 def moved_ports(ports: Ports, places: Any) -> Ports:
     """Return ports with some of them elsewhere; one POI, or {name: place} of any ports."""
     if not isinstance(places, Mapping):
-        if len(ports.z) != 1:
-            raise LabelError(
-                f"the plant has {len(ports.z)} POIs "
-                f"({', '.join(port.name for port in ports.z) or 'none'}): say which moves, "
-                "at({name: point})."
-            )
-        places = {ports.z[0].name: places}
+        places = {only_one("POI", [p.name for p in ports.z], None, "at({name: point})"): places}
     for name in places:
         _port(ports, name)
 
@@ -123,8 +117,7 @@ def _is_row(port: Any) -> bool:
 
 def along(plant: Partition, name: str, points: npt.ArrayLike) -> Along:
     """Return what depends on the place of a POI or a force, at many points at once."""
-    if plant.is_weighted:
-        raise ModelError(f"the plant is {plant.alteration}: a port moves on plant.unweighted.")
+    require_plain(plant, "ports move on a structure")
     places = real_array(points, "points", (None, 3))
     port = _port(plant.assembled.ports, name)
     if isinstance(port, Poi):

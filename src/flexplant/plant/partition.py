@@ -9,7 +9,15 @@ from typing import Any, Self, TypeAlias, TypeGuard
 import numpy as np
 
 from ..checks import FloatArray, IntArray, Value, mapping, name_list, positive, real_array, short
-from ..errors import LabelError, ModelError, counted, require_known, unknown_label
+from ..errors import (
+    AssumptionError,
+    FlexplantError,
+    LabelError,
+    ModelError,
+    counted,
+    require_known,
+    unknown_label,
+)
 from ..labels import DIRECTIONS
 from ..lti.statespace import StateSpace, System, as_statespace
 from .ports import Ports
@@ -455,8 +463,7 @@ class Partition(Value):
     @property
     def sensor_noise_factor(self) -> FloatArray:
         """F (ny, sensors), F F' the covariance of a sample of y."""
-        if not self.dt:
-            raise ModelError("sensor noise per sample needs a sampled plant: discretized(rate).")
+        require_sampled(self, "sensors have a noise of each sample", ModelError)
         asd = [self.asd.get(f"{name}:noise", 0.0) for name in self.unweighted.y]
         return np.asarray(self.reading_gain * (np.array(asd) * np.sqrt(0.5 / self.dt)))
 
@@ -493,6 +500,20 @@ class Partition(Value):
 
 #: what to type for a system whose names do not show its channels
 TYPE_THIS = "StandardPlant.from_statespace(sys, w=[...], u=[...], z=[...], y=[...], asd={...})"
+
+
+def require_plain(plant: Partition, why: str, error: type[FlexplantError] = ModelError) -> None:
+    """Refuse a plant that is weighted or seen through a block."""
+    if plant.is_weighted:
+        raise error(f"the plant is {plant.alteration}: {why}. Use plant.unweighted.")
+
+
+def require_sampled(
+    plant: Partition, why: str, error: type[FlexplantError] = AssumptionError
+) -> None:
+    """Refuse a continuous plant."""
+    if not plant.dt:
+        raise error(f"the plant is continuous: {why}. Use plant.discretized(rate, delay=1).")
 
 
 def sides(g: StateSpace) -> tuple[list[str], list[str], list[str], list[str]]:

@@ -11,7 +11,7 @@ import numpy as np
 from ..checks import FloatArray, Value, check_names, flag, positive, real_array, short
 from ..errors import LabelError, ModelError, require_known, unknown_label
 from ..labels import DIRECTIONS, Place
-from ..lti.statespace import StateSpace, as_statespace
+from ..lti.statespace import StateSpace, single_channel
 from .realisation import ModalRealisation
 from .scheduling import checked_moves
 
@@ -337,12 +337,7 @@ def checked_filter(name: str, what: str, given: Any) -> StateSpace | None:
             f"the {what} of {name!r} is a filter, got {kind}, which is a spectrum: noise and its "
             f"filter. It makes the port itself: {kind}(...).force(name, at), .rigid or .floor."
         )
-    sys = as_statespace(given)
-    if len(sys.inputs) != 1 or len(sys.outputs) != 1:
-        raise ModelError(
-            f"the {what} of {name!r} needs one input and one output, got {sys!r}. "
-            "Select a channel of it: sys['output', 'input']."
-        )
+    sys = single_channel(given, f"the {what} of {name!r}")
     if sys.n_states and sys.dt:
         raise ModelError(
             f"the {what} of {name!r} is sampled (dt {sys.dt:g} s), but belongs to the machine: "

@@ -211,10 +211,6 @@ class Reference(Value):
             check_names(axes, f"axes of the reference of {poi!r}")
             self._set(axes=axes)
 
-    def __repr__(self) -> str:
-        axes = "" if self.axes is None else f", axes={self.axes}"
-        return f"Reference(poi={self.poi!r}{axes})"
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ports(Value):

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..checks import ComplexArray, FloatArray, instance, positive, real_array, whole
+from ..checks import ComplexArray, FloatArray, checked, instance, positive, real_array, whole
 from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf
 from ..lti.frequency import frequency_response as system_response
@@ -27,6 +27,9 @@ from ..structure import Damping, FEModel
 from .building import port_rows
 from .ports import Ports
 from .realisation import Structure, none, plant_modes
+
+#: fields: a number at each frequency of the check
+_CHECKED = checked(real_array, shape=("check_freq",))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,19 +61,11 @@ class StructureFrf(Frf):
     """
 
     route: str = ""
-    check_freq: FloatArray = field(default_factory=none)
-    error: FloatArray = field(default_factory=none)
-    error_there: FloatArray = field(default_factory=none)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks = real_array(self.check_freq, "check_freq", (None,))
-        self._set(
-            route=str(self.route),
-            check_freq=checks,
-            error=real_array(self.error, "error", checks.shape),
-            error_there=real_array(self.error_there, "error_there", checks.shape),
-        )
+    check_freq: FloatArray = field(
+        default_factory=none, metadata=checked(real_array, shape=(None,))
+    )
+    error: FloatArray = field(default_factory=none, metadata=_CHECKED)
+    error_there: FloatArray = field(default_factory=none, metadata=_CHECKED)
 
     def __repr__(self) -> str:
         lines = [super().__repr__()[:-1], f"by {self.route}"]

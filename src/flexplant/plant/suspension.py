@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value, members, number, positive
+from ..checks import ComplexArray, FloatArray, Value, checked, members, number, positive
 from ..errors import ModelError, counted
 from ..labels import Place
 from ..modes import Modes, normal_form
@@ -54,17 +54,14 @@ class GroundSpring(Value):
     """
 
     at: Place
-    stiffness: float
-    damping: float = 0.0
+    stiffness: float = field(metadata=checked(number, name="stiffness of a ground spring"))
+    damping: float = field(default=0.0, metadata=checked(positive, zero=True))
     direction: str = "z"
 
     def __post_init__(self) -> None:
-        self._set(
-            at=checked_place("a ground spring", self.at),
-            direction=port_direction("a ground spring", self.direction),
-            stiffness=number(self.stiffness, "stiffness of a ground spring"),
-            damping=positive(self.damping, "damping of a ground spring", zero=True),
-        )
+        super().__post_init__()
+        own = "a ground spring"
+        self._set(at=checked_place(own, self.at), direction=port_direction(own, self.direction))
         if not self.stiffness:
             raise ModelError(
                 "the stiffness of a ground spring is 0: it holds nothing. Leave it out, or give it "

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import Value, positive
-from ..errors import AssumptionError, LabelError, ModelError, require_known
+from ..errors import AssumptionError, ModelError, only_one
 from ..lti.discretisation import tustin
 from ..lti.filters import inverse_sensitivity, leadlag
 from ..lti.interconnection import connect, series, side_by_side
@@ -65,7 +65,8 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     motions, ports = plant.rigid_motions, plant.assembled.ports
     if not ports.references:
         raise AssumptionError("the plant has no reference: add Reference(...) to the ports.")
-    followed = ports.poi(_only_poi([r.poi for r in ports.references], poi, "POI with a reference"))
+    known = [reference.poi for reference in ports.references]
+    followed = ports.poi(only_one("followed POI", known, poi, "poi="))
     sensors = [s.name for s in ports.y if s.order == 0]
     if not sensors:
         kinds = ", ".join(sorted({s.quantity for s in ports.y})) or "none"
@@ -90,19 +91,6 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
         name="reference errors",
         units=plant.units | {f"{n}:error": plant.units[n] for n in sensors if n in plant.units},
     )  # fmt: skip
-
-
-def _only_poi(names: list[str], poi: str | None, kind: str) -> str:
-    """Return the POI that is meant: the one named, or the only one."""
-    if poi is None:
-        if len(names) > 1:
-            raise LabelError(
-                f"there are {len(names)} of the kind {kind}: {', '.join(names)}. Say which is "
-                f"meant: poi={names[0]!r}."
-            )
-        return names[0]
-    require_known(kind, [poi], names)
-    return poi
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -199,7 +187,7 @@ def stage_weights(
     sensed = positive(noise, "noise")
     if not ports.z or not ports.u or not ports.y:
         raise AssumptionError("stage weights need a POI, actuators and sensors in the ports.")
-    scale = ports.poi(_only_poi([port.name for port in ports.z], poi, "POI"))
+    scale = ports.poi(only_one("POI", [port.name for port in ports.z], poi, "poi="))
     first = scale.channel(scale.axes[0])
     push = np.linalg.norm(rigid_gain(plant, motions, [first], [port.name for port in ports.u]))
     crossing = _HEADROOM * positive(bandwidth, "bandwidth")

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from ..checks import FloatArray, between, instance, name_list, positive, real_array, short
+from ..checks import FloatArray, between, instance, mapping, name_list, positive, real_array
 from ..errors import ModelError, ShapeError
 from ..estimation import Consistency, Estimate, LagReport
 from ..estimation.estimator_channels import row_of
@@ -79,12 +79,11 @@ def predictions(
     if isinstance(rows, Sequence) and all(isinstance(c, EstimatorComparison) for c in rows):
         title = f" of {rows[0].channel}" if rows else ""
         rows = {name: [case[name] for case in rows] for name in (rows[0].names if rows else ())}
-    if not isinstance(rows, Mapping) or not rows:
-        raise ModelError(
-            f"need a mapping of designs to errors, got {short(rows)}. Type "
-            "[comparison] or {'updated': [(predicted, found, lower, upper)]}."
-        )
-    tables = {name: real_array(row, f"errors of {name!r}", (None, 4)) for name, row in rows.items()}
+    hint = "Pass [comparison] or {'updated': [(predicted, found, lower, upper)]}."
+    given = mapping(rows, "rows", hint, least=1)
+    tables = {
+        name: real_array(row, f"errors of {name!r}", (None, 4)) for name, row in given.items()
+    }
     if any(np.any(table[:, :2] <= 0) for table in tables.values()):
         raise ModelError("errors must be positive: they are drawn on a logarithmic axis.")
     ax = axes(ax, figsize=(7.0, 3.6))

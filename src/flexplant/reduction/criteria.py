@@ -34,9 +34,6 @@ class SelectionCriterion(Value):
     True
     """
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}()"
-
     @abstractmethod
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
         """Return which rows of the pool (p, k) to take beside the required ones (q, k)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +15,7 @@ from ..checks import (
     FloatArray,
     IntArray,
     Value,
+    checked,
     complex_array,
     name_list,
     positive,
@@ -36,6 +37,11 @@ from .ranking import ErrorBound
 _DEFINITE = 1e-14
 #: how the names of coordinates begin that hold the static compliance of what was left out
 STATIC = "static "
+
+
+#: fields: a matrix of the coordinates, and columns over them
+_SQUARE = checked(real_array, shape=("coordinates", "coordinates"))
+_COLUMNS = checked(real_array, shape=("coordinates", None))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -94,22 +100,22 @@ class ReducedModel(Value):
     array([ 1.,  0., -1.])
     """
 
-    M: FloatArray
-    D: FloatArray
-    K: FloatArray
-    T: FloatArray
+    M: FloatArray = field(metadata=_SQUARE)
+    D: FloatArray = field(metadata=_SQUARE)
+    K: FloatArray = field(metadata=_SQUARE)
+    T: FloatArray = field(metadata=checked(real_array, shape=("full_dofs", "coordinates")))
     dofs: DofSet
     full_dofs: DofSet
-    rigid_body: FloatArray
+    rigid_body: FloatArray = field(metadata=_COLUMNS)
     method: str = ""
-    condition: float = 1.0
+    condition: float = field(default=1.0, metadata=checked(positive))
     coordinates: Iterable[str] = ()
     condition_of: str = "phi_kk"
     bound: ErrorBound | None = None
     truncated: Modes | None = None
     n_vectors: int = 0
-    static_at: Iterable[str] = ()
-    joint_motions: FloatArray | None = None
+    static_at: Iterable[str] = field(default=(), metadata=checked(name_list))
+    joint_motions: FloatArray | None = field(default=None, metadata=_COLUMNS)
     joining: Value | None = None
 
     def __post_init__(self) -> None:
@@ -119,23 +125,12 @@ class ReducedModel(Value):
                 f"the coordinates {list(names[:3])} ... must be unique and begin with the physical "
                 f"DOFs {list(self.dofs.labels[:3])} ...: rows of T are found by them."
             )
-        k, n = len(names), len(self.full_dofs)
-        self._set(
-            M=real_array(self.M, "M", (k, k)),
-            D=real_array(self.D, "D", (k, k)),
-            K=real_array(self.K, "K", (k, k)),
-            T=real_array(self.T, "T", (n, k)),
-            rigid_body=real_array(self.rigid_body, "rigid_body", (k, None)),
-            condition=positive(self.condition, "condition"),
-            coordinates=names,
-            static_at=name_list(self.static_at, "static_at"),
-        )
-        if self.joint_motions is not None:
-            self._set(joint_motions=real_array(self.joint_motions, "joint_motions", (k, None)))
+        self._set(coordinates=names)
+        super().__post_init__()
         if self.truncated is not None and self.truncated.dofs.labels != self.full_dofs.labels:
             raise ModelError(
                 f"the truncated modes are over {len(self.truncated.dofs)} DOFs that are not the "
-                f"{n} of full_dofs, in this order. Take both from the same Modes."
+                f"{len(self.full_dofs)} of full_dofs, in this order. Take both from the same Modes."
             )
 
     def __repr__(self) -> str:

@@ -7,7 +7,7 @@ those of the present position. They differ in the gain by which innovations corr
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -16,8 +16,10 @@ import numpy as np
 from ..checks import (
     FloatArray,
     Value,
+    checked,
     flag,
     instance,
+    name_list,
     positive,
     real_array,
     sizes_of,
@@ -67,16 +69,10 @@ class RmsAlong(Value):
         Of the channels.
     """
 
-    time: FloatArray
-    rms: FloatArray
-    names: tuple[str, ...]
+    time: FloatArray = field(metadata=checked(real_array, shape=(None,)))
+    rms: FloatArray = field(metadata=checked(real_array, shape=("names", "time")))
+    names: tuple[str, ...] = field(metadata=checked(name_list))
     units: Mapping[str, str]
-
-    def __post_init__(self) -> None:
-        names = tuple(self.names)
-        time = real_array(self.time, "time", (None,))
-        rms = real_array(self.rms, "rms", (len(names), time.size))
-        self._set(time=time, rms=rms, names=names, units=dict(self.units))
 
     def __repr__(self) -> str:
         largest = dict(zip(self.names, self.rms.max(axis=1).tolist(), strict=True))
@@ -216,18 +212,12 @@ class FiltersAlong(Value):
         Of the motions.
     """
 
-    time: FloatArray
-    names: tuple[str, ...]
-    exact: FloatArray
-    scheduled: FloatArray
-    frozen: FloatArray
+    time: FloatArray = field(metadata=checked(real_array, shape=(None,)))
+    names: tuple[str, ...] = field(metadata=checked(name_list))
+    exact: FloatArray = field(metadata=checked(real_array, shape=("names", "time")))
+    scheduled: FloatArray = field(metadata=checked(real_array, shape=("names", "time")))
+    frozen: FloatArray = field(metadata=checked(real_array, shape=("names", "time")))
     units: Mapping[str, str]
-
-    def __post_init__(self) -> None:
-        names, time = tuple(self.names), real_array(self.time, "time", (None,))
-        shape = (len(names), time.size)
-        own = {gain: real_array(getattr(self, gain), gain, shape) for gain in GAINS}
-        self._set(names=names, time=time, units=dict(self.units), **own)
 
     def __repr__(self) -> str:
         count = counted(self.time.size, "sample")

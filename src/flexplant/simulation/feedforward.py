@@ -20,12 +20,21 @@ from ..checks import (
     short,
     whole,
 )
-from ..errors import AssumptionError, CertificateError, LabelError, ModelError, counted, warn
+from ..errors import (
+    AssumptionError,
+    CertificateError,
+    LabelError,
+    ModelError,
+    counted,
+    only_one,
+    warn,
+)
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import DERIVATIVES, force_name
 from ..lti.responses import responder
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, decouple, standard_plant
+from ..plant.partition import require_plain, require_sampled
 from ..tolerances import divisor
 from .motion import SetPoint
 from .simulate import simulate
@@ -218,16 +227,9 @@ def known_forces(plant: StandardPlant) -> StateSpace:
 def tracked(plant: Any, reference: str | None) -> tuple[StandardPlant, Poi, str, str]:
     """Return the plant, the POI and the axis that a reference is for, and its channel."""
     plant = standard_plant(plant)
-    if plant.is_weighted:
-        raise ModelError("the plant is weighted: design the feedforward on plant.unweighted.")
+    require_plain(plant, "feedforward acts on a machine")
     found = {p.derived(axis, "ref"): (p, axis) for p, axis in plant.assembled.ports.followed}
-    if reference is None and len(found) == 1:
-        reference = next(iter(found))
-    if not isinstance(reference, str) or reference not in found:
-        raise LabelError(
-            f"need one of the plant's references {list(found)}, got {short(reference)}. Pass "
-            "reference=name; Ports(references=[Reference(poi)]) adds one."
-        )
+    reference = only_one("reference", found, reference, "reference=")
     return plant, *found[reference], reference
 
 
@@ -422,8 +424,7 @@ def inverse_forces(
     instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
     plant, poi, axis, name = tracked(loop.plant, reference)
     instance(move, SetPoint, "move", "Use setpoint(...) or scan(...).")
-    if not plant.dt:
-        raise ModelError("the inverse is of a sampled loop: use plant.discretized(rate, delay=).")
+    require_sampled(plant, "the inverse is of samples", ModelError)
     steps = round(positive(duration, "duration") / plant.dt)
     reach = 2.0 * np.pi * positive(bandwidth, "bandwidth") * plant.dt
     T, axes = force_axes(plant, poi)

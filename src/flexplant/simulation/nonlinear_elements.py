@@ -79,11 +79,6 @@ class Saturation(Value):
         if self.limit == np.inf and self.rate is None and self.least is None:
             raise ModelError("a Saturation without limits does nothing: give limit, rate or both.")
 
-    def __repr__(self) -> str:
-        rate = "" if self.rate is None else f", rate {self.rate:g}/s"
-        least = "" if self.least is None else f", least {self.least:g}"
-        return f"<Saturation: limit {self.limit:g}{least}{rate}>"
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Quantiser(Value):

@@ -22,12 +22,13 @@ from ..checks import (
     short,
     whole,
 )
-from ..errors import AssumptionError, LabelError, ModelError, require_known, warn
+from ..errors import AssumptionError, ModelError, only_one, require_known, warn
 from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.blocks import DERIVATIVES, references, with_known
 from ..loop.budget import white_noise
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant
+from ..plant.partition import require_plain, require_sampled
 from ..tolerances import SAME, TYPED
 from .motion import SetPoint
 from .moving_machine import MovingMachine, trajectory, unscheduled
@@ -256,16 +257,8 @@ def _positions(plant: StandardPlant, moving: Any) -> dict[str, Any]:
 
 def _check_sampled(loop: ClosedLoop) -> None:
     plant = loop.plant
-    if not plant.dt:
-        raise AssumptionError(
-            "simulate runs sampled loops, this one is continuous: close the loop around "
-            "plant.discretized(rate, delay=) with blocks designed on it."
-        )
-    if plant.is_weighted:
-        raise AssumptionError(
-            f"the plant is {plant.alteration}, so that its channels are not those of the machine: "
-            "close the loop around plant.unweighted with the same blocks."
-        )
+    require_sampled(plant, "simulate runs sampled loops, with blocks designed at their rate")
+    require_plain(plant, "its channels are not those of the machine", AssumptionError)
     D = plant.system.select(plant.y, loop.driven).D
     if np.any(D):
         i, j = np.argwhere(D)[0]
@@ -308,16 +301,7 @@ def _known_inputs(
     if reference is None:
         reference = {}
     elif not isinstance(reference, Mapping):
-        if len(own) != 1:
-            raise LabelError(
-                f"the plant has {len(own)} references {own}: "
-                + (
-                    f"say which one is meant, reference={{{own[0]!r}: signal}}."
-                    if own
-                    else "Ports(references=[Reference(poi)]) adds one."
-                )
-            )
-        reference = {own[0]: reference}
+        reference = {only_one("reference", own, None, "reference={name: signal}"): reference}
     if disturbance is not None and not isinstance(disturbance, Mapping):
         raise ModelError(
             f"disturbance must be a mapping, got {short(disturbance)}: say which channel of w is "

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray, Value, checked, in_unit, instance, positive, short
-from ..errors import AssumptionError, LabelError, ModelError, aligned, counted, require_known
+from ..errors import AssumptionError, ModelError, aligned, only_one, require_known
 from ..loop import ClosedLoop, bandwidth
 from .exposure import exposure_errors, settling_time
 from .response import Response
@@ -184,16 +184,10 @@ class Specification(Value):
 
     def _watched(self, loop: ClosedLoop) -> str:
         """Return the channel that is meant: the one named, or the only error."""
-        errors = [name for name in loop.plant.z if name.endswith(":error")]
         if self.channel is not None:
             return self.channel
-        if len(errors) != 1:
-            raise LabelError(
-                f"the loop has {counted(len(errors), 'error channel')}"
-                f"{': ' + ', '.join(errors) if errors else ''}. Say which channel of z or of the "
-                "run is specified: Specification(..., channel='y1')."
-            )
-        return errors[0]
+        errors = [name for name in loop.plant.z if name.endswith(":error")]
+        return only_one("error channel", errors, None, "Specification(..., channel='y1')")
 
     def _of_loop(self, loop: ClosedLoop) -> list[tuple[str, str, float, float, bool]]:
         rows = []

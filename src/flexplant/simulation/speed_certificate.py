@@ -8,7 +8,7 @@ loop is stable along every path that is no faster. P is linear between nodes.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from math import comb
 from typing import NamedTuple
@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import FloatArray, Value, positive, real_array, whole
-from ..errors import AssumptionError, LabelError, counted, require_known
+from ..checks import FloatArray, Value, checked, positive, real_array, whole
+from ..errors import AssumptionError, only_one
 from ..loop import ClosedLoop, ScheduledLoop
 from ..lti.equations import symmetrised
 from ..lti.lyapunov import solve_stein
@@ -62,16 +62,10 @@ class SpeedCertificate(Value):
     """
 
     position: str
-    speed: float
-    nodes: FloatArray
-    P: FloatArray
+    speed: float = field(metadata=checked(positive))
+    nodes: FloatArray = field(metadata=checked(real_array, shape=(None,)))
+    P: FloatArray = field(metadata=checked(real_array, shape=("nodes", None, None)))
     attempts: tuple[tuple[float, float | None], ...]
-
-    def __post_init__(self) -> None:
-        nodes = real_array(self.nodes, "nodes", (None,))
-        P = real_array(self.P, "P", (nodes.size, None, None))
-        tried = tuple((float(v), failed) for v, failed in self.attempts)
-        self._set(nodes=nodes, P=P, attempts=tried, speed=positive(self.speed, "speed"))
 
     def __repr__(self) -> str:
         low, high = self.nodes[0], self.nodes[-1]
@@ -203,15 +197,7 @@ class _Motion:
         known = [one.name for one in known_positions(own.plant, "a speed is proven of")]
         if schedule is not None and position is None:
             position = schedule.position
-        if position is None:
-            if len(known) != 1:
-                raise LabelError(
-                    f"the plant has {counted(len(known), 'position')} ({', '.join(known)}): say "
-                    "which one moves, position=."
-                )
-            position = known[0]
-        require_known("position", [position], known)
-        return cls(own, schedule, position)
+        return cls(own, schedule, only_one("position", known, position, "position="))
 
     @property
     def _ports(self) -> Ports:

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import FloatArray, Value, instance, positive, seed_sequence, short
+from ..checks import FloatArray, Value, instance, mapping, positive, seed_sequence, short
 from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label, warn
 from ..estimation import KalmanEstimator, StaticEstimator
 from ..estimation.estimator_channels import estimates, poi_channels, row_of
@@ -354,7 +354,7 @@ def reading_along(designs: Mapping[str, Estimator]) -> tuple[StateSpace, ...]:
     >>> [output for block in fx.reading_along(designs) for output in block.outputs]
     ['static|die:hat', 'filter|die:hat']
     """
-    _check_estimators(designs)
+    mapping(designs, "designs", "Pass {'updated': design_kalman(plant)}.", least=1, kind=Estimator)
     return tuple(
         design.system.renamed(outputs={hat: f"{name}|{hat}" for hat in design.system.outputs})
         for name, design in designs.items()
@@ -407,7 +407,8 @@ def compare_estimators(
     >>> bool(found["filter"][1] < found["static"][1])  # measured
     True
     """
-    _check_estimators(designs)
+    hint = "Pass {'updated': design_kalman(plant)}."
+    mapping(designs, "designs", hint, least=1, kind=Estimator)
     instance(run, Response, "run", "Pass what simulate returned.")
     rows = []
     for name, design in designs.items():
@@ -423,16 +424,3 @@ def compare_estimators(
         seen = run.replace(data=error[..., None, :], names=["error"], units={})
         rows.append((design.rms(channel), *seen.rms_interval("error", start=start, level=level)))
     return EstimatorComparison(channel, tuple(designs), np.array(rows), level)
-
-
-def _check_estimators(designs: Mapping[str, Estimator]) -> None:
-    if not isinstance(designs, Mapping) or not designs:
-        raise ModelError(
-            f"need a mapping of names to estimators, got {short(designs)}. Type "
-            "{'updated': design_kalman(plant)}."
-        )
-    wrong = [found for found in designs.values() if not isinstance(found, Estimator)]
-    if wrong:
-        raise ModelError(
-            f"need estimators, got {short(wrong[0])}. Use design_kalman or design_static."
-        )

@@ -26,6 +26,14 @@ _BOUND_LIMIT = 10_000
 _BOUND_STEPS, _BOUND_CHANCE = 180, 1e-9
 
 
+def not_definite(who: str) -> SolverError:
+    """Return the error of a factorisation that needs a positive definite matrix."""
+    return SolverError(
+        f"{who} met a pivot that is not positive: the matrix is indefinite or singular. Look for a "
+        "sign, or for DOFs without stiffness or mass."
+    )
+
+
 def diagonal_lu(matrix: Any, singular: str) -> Any:
     """Return the SuperLU factorisation of a symmetric sparse matrix, real or complex."""
     # pivots are taken from the diagonal where they are not zero, so that solutions need a
@@ -250,10 +258,7 @@ def eliminated(
         kept = block.copy(order="F") if signed else block
         _, info = potrf(block, lower=1, overwrite_a=1, clean=0)
         if info and not signed:
-            raise SolverError(
-                "a sparse Cholesky factorisation met a pivot that is not positive: the matrix is "
-                "indefinite or singular. Look for a sign, or for DOFs without stiffness or mass."
-            )
+            raise not_definite("a sparse Cholesky factorisation")
         pivots = _SignedPivots(kept) if info else Pivots(block)
         del kept
         if front.rows.size:

@@ -7,7 +7,7 @@ import ctypes.util
 import os
 import weakref
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray, Value, one_of
+from ..checks import FloatArray, Value, checked, one_of
 from ..errors import SolverError
+from .factor import not_definite
 
 _ORDERS = ("default", "best", "amd", "metis", "nesdis")
 
@@ -46,13 +47,7 @@ class Cholmod(Value):
     Cholmod()
     """
 
-    order: str = "default"
-
-    def __post_init__(self) -> None:
-        one_of(self.order, "order", _ORDERS)
-
-    def __repr__(self) -> str:
-        return f"Cholmod({'' if self.order == 'default' else f'order={self.order!r}'})"
+    order: str = field(default="default", metadata=checked(one_of, choices=_ORDERS))
 
     def factored(self, matrix: Any) -> CholmodCholesky:
         """Return the factor of a sparse symmetric positive definite matrix."""
@@ -75,10 +70,7 @@ class CholmodCholesky:
                     sp.csc_matrix(lower), ordering_method=method.order, mode="supernodal"
                 )
         except cholmod.CholmodNotPositiveDefiniteError as error:
-            raise SolverError(
-                "CHOLMOD met a pivot that is not positive: the matrix is indefinite or singular. "
-                "Look for a sign, or for DOFs without stiffness or mass."
-            ) from error
+            raise not_definite("CHOLMOD") from error
         except cholmod.CholmodError as error:
             raise SolverError(
                 f"CHOLMOD failed: {error}. Leave out factor= to use the library's own factor."
@@ -134,9 +126,6 @@ class Pardiso(Value):
     """
 
     library: str | None = None
-
-    def __repr__(self) -> str:
-        return f"Pardiso({'' if self.library is None else repr(self.library)})"
 
     def factored(self, matrix: Any) -> PardisoCholesky:
         """Return the factor of a sparse symmetric positive definite matrix."""
@@ -194,10 +183,7 @@ class PardisoCholesky:
             self._memory.ctypes.data_as(ctypes.c_void_p), *arguments, ctypes.byref(error)
         )
         if error.value == -4:
-            raise SolverError(
-                "PARDISO met a pivot that is not positive: the matrix is indefinite or singular. "
-                "Look for a sign, or for DOFs without stiffness or mass."
-            )
+            raise not_definite("PARDISO")
         if error.value:
             raise SolverError(
                 f"PARDISO failed with error {error.value} (see MKL's documentation; -2 is too "

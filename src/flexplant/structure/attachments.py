@@ -21,7 +21,7 @@ from ..checks import (
     positive,
     real_array,
 )
-from ..errors import LabelError, ModelError, counted
+from ..errors import LabelError, ModelError
 from ..labels import DofSet, Interpolation, Place, checked_direction
 
 
@@ -197,9 +197,6 @@ class HeldShape(Interpolation):
 
     free: Interpolation
     rows_left: IntArray
-
-    def __repr__(self) -> str:
-        return f"<HeldShape of {counted(np.size(self.rows_left), 'DOF')} in {self.free!r}>"
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) of the DOFs that are left in a motion at a point."""

@@ -13,17 +13,17 @@ from ..checks import (
     FloatArray,
     Matrix,
     Value,
+    between,
     checked,
     complex_array,
     flag,
-    number,
     positive,
     real_array,
     several,
     short,
     whole,
 )
-from ..errors import ModelError, ShapeError, counted
+from ..errors import ModelError, ShapeError
 from ..labels import DofSet
 from ..sparse.symmetric import dense
 from ..tolerances import ROUNDING, divisor
@@ -67,6 +67,10 @@ class Damping(Value):
         return self.zeta(omega)
 
 
+#: field: one ratio of many modes
+_OTHERS = checked(between, low=0.0, high=1.0, hint="1 % is 0.01. Check per cent.", ends="[")
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ModalDamping(Damping):
     """A damping ratio for all modes, or one for each: Z in equation (5) of the paper.
@@ -93,29 +97,23 @@ class ModalDamping(Damping):
     """
 
     ratio: float | Sequence[float] | FloatArray
-    others: float | None = field(default=None, kw_only=True)
-    rigid: float = field(default=0.0, kw_only=True)
+    others: float | None = field(default=None, kw_only=True, metadata=_OTHERS)
+    rigid: float = field(default=0.0, kw_only=True, metadata=checked(positive, zero=True))
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         ratio = real_array(self.ratio, "ratio")
         if ratio.ndim > 1:
             raise ShapeError(
                 f"ratio must be a number or one per mode, got shape {ratio.shape}. Flatten it."
             )
-        others = self.others
-        if others is not None:
-            others = float(_ratios(number(others, "others"), "others"))
-        if others is not None and ratio.ndim == 0:
+        if self.others is not None and ratio.ndim == 0:
             raise ModelError(
                 "others goes with one ratio for each of the first modes: a single ratio is that of "
                 "all modes already. Leave others out, or pass an array."
             )
         ratio = _ratios(ratio, "damping ratios")
-        self._set(
-            ratio=float(ratio) if ratio.ndim == 0 else ratio,
-            others=others,
-            rigid=positive(self.rigid, "rigid", zero=True),
-        )
+        self._set(ratio=ratio if ratio.ndim else float(ratio))
 
     @classmethod
     def from_measured(
@@ -173,15 +171,6 @@ class ModalDamping(Damping):
         ratio[np.array(listed, dtype=np.int64) - 1] = -values.real / np.abs(values)
         return cls(ratio, others=others)
 
-    def __repr__(self) -> str:
-        if isinstance(self.ratio, float):
-            return f"<ModalDamping {self.ratio:g}>"
-        low, high = np.min(self.ratio, initial=1.0), np.max(self.ratio, initial=0.0)
-        more = "" if self.others is None else f", others {self.others:g}"
-        return (
-            f"<ModalDamping of {counted(np.size(self.ratio), 'mode')}, {low:g} to {high:g}{more}>"
-        )
-
     def zeta(self, omega: FloatArray) -> FloatArray:
         """Return the damping ratios (k,) of modes at `omega` [rad/s]; 0 for rigid-body modes."""
         omega = real_array(omega, "omega", (None,))
@@ -227,8 +216,8 @@ class Rayleigh(Damping):
     array([0.  , 0.01])
     """
 
-    alpha: float = field(metadata=checked(positive, zero=True))
-    beta: float = field(metadata=checked(positive, zero=True))
+    alpha: float = field(metadata=checked(positive, zero=True, unit="1/s"))
+    beta: float = field(metadata=checked(positive, zero=True, unit="s"))
     rigid: bool = field(default=False, kw_only=True, metadata=checked(flag))
 
     @classmethod
@@ -283,9 +272,6 @@ class Rayleigh(Damping):
         else:
             found = nnls(terms / scale, ratio)[0] / scale
         return cls(float(found[0]), float(found[1]))
-
-    def __repr__(self) -> str:
-        return f"<Rayleigh alpha {self.alpha:g} 1/s, beta {self.beta:g} s>"
 
     def zeta(self, omega: FloatArray) -> FloatArray:
         """Return the damping ratios (k,) of modes at `omega` [rad/s]; 0 for rigid-body modes."""

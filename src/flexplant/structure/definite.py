@@ -57,6 +57,26 @@ def why_indefinite(matrix: Matrix, name: str) -> str:
     )
 
 
+def square(given: Any, name: str) -> sp.csc_array:
+    """Return a square sparse matrix with finite real entries, without stored zeros."""
+    stored: Any = given
+    if not sp.issparse(given):
+        array = real_array(given, name)
+        if array.ndim != 2 or array.shape[0] != array.shape[1]:
+            raise ShapeError(
+                f"{name} must be square, got shape {array.shape}. Pass an (n, n) array."
+            )
+        return sp.csc_array(array)
+    listed: Any = stored.tocoo()
+    if listed.ndim != 2 or listed.shape[0] != listed.shape[1]:
+        raise ShapeError(f"{name} must be square, got shape {listed.shape}. Pass an (n, n) array.")
+    data: FloatArray = real_array(listed.data, f"stored entries of {name}")
+    matrix: Any = sp.csc_array((data, (listed.row, listed.col)), shape=listed.shape)
+    matrix.sum_duplicates()
+    matrix.eliminate_zeros()
+    return cast("sp.csc_array", matrix)
+
+
 def symmetric_matrix(given: Any, name: str, n: int) -> Matrix:
     """Return a finite symmetric (n, n) matrix, dense or sparse."""
     value, matrix = given, cast(Any, None)

@@ -14,6 +14,8 @@ from ..checks import (
     FloatArray,
     IntArray,
     Value,
+    checked,
+    floats_of,
     number,
     positive,
     real_array,
@@ -28,6 +30,10 @@ from .element_matrices import Grid, beam_mass, beam_rotary, beam_stiffness
 
 #: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre
 Field: TypeAlias = float | Sequence[Any] | FloatArray | Callable[..., float]
+
+#: fields: a place in x and y, a size, and one that may be zero
+_PLACE = checked(floats_of, count=2, unit="m")
+_SIZE, _OR_ZERO = checked(positive), checked(positive, zero=True)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,20 +52,16 @@ class Rectangle(Value):
     array([ True, False])
     """
 
-    lower: Sequence[float]
-    upper: Sequence[float]
+    lower: Sequence[float] = field(metadata=_PLACE)
+    upper: Sequence[float] = field(metadata=_PLACE)
 
     def __post_init__(self) -> None:
-        lower, upper = real_array(self.lower, "lower", (2,)), real_array(self.upper, "upper", (2,))
-        if np.any(upper <= lower):
+        super().__post_init__()
+        if np.any(np.array(self.upper) <= self.lower):
             raise ModelError(
                 f"a rectangle's upper corner must be above its lower one in x and y, got "
-                f"{lower.tolist()} and {upper.tolist()}. Swap them, or give it a width."
+                f"{self.lower} and {self.upper}. Swap them, or give it a width."
             )
-        self._set(lower=tuple(lower.tolist()), upper=tuple(upper.tolist()))
-
-    def __repr__(self) -> str:
-        return f"<Rectangle {self.lower} to {self.upper} m>"
 
     def holds(self, centres: FloatArray) -> Any:
         """Return which of the points (p, 2) are inside."""
@@ -84,17 +86,8 @@ class Disc(Value):
     array([ True, False])
     """
 
-    centre: Sequence[float]
-    radius: float
-
-    def __post_init__(self) -> None:
-        self._set(
-            centre=tuple(real_array(self.centre, "centre", (2,)).tolist()),
-            radius=positive(self.radius, "radius"),
-        )
-
-    def __repr__(self) -> str:
-        return f"<Disc of radius {self.radius:g} m about {self.centre} m>"
+    centre: Sequence[float] = field(metadata=_PLACE)
+    radius: float = field(metadata=checked(positive, unit="m"))
 
     def holds(self, centres: FloatArray) -> Any:
         """Return which of the points (p, 2) are inside."""
@@ -354,29 +347,26 @@ class Rib(Value):
     >>> rib = fx.Rib((0.0, 0.3), (0.6, 0.3), width=0.01, height=0.03)
     """
 
-    start: Sequence[float]
-    end: Sequence[float]
-    width: float | None = field(default=None, kw_only=True)
-    height: float | None = field(default=None, kw_only=True)
-    area: float | None = field(default=None, kw_only=True)
-    inertia: float | None = field(default=None, kw_only=True)
-    torsion: float | None = field(default=None, kw_only=True)
-    polar: float | None = field(default=None, kw_only=True)
-    eccentricity: float | None = field(default=None, kw_only=True)
-    density: float | None = field(default=None, kw_only=True)
-    youngs_modulus: float | None = field(default=None, kw_only=True)
-    poisson_ratio: float | None = field(default=None, kw_only=True)
+    start: Sequence[float] = field(metadata=_PLACE)
+    end: Sequence[float] = field(metadata=_PLACE)
+    width: float | None = field(default=None, kw_only=True, metadata=_SIZE)
+    height: float | None = field(default=None, kw_only=True, metadata=_SIZE)
+    area: float | None = field(default=None, kw_only=True, metadata=_SIZE)
+    inertia: float | None = field(default=None, kw_only=True, metadata=_OR_ZERO)
+    torsion: float | None = field(default=None, kw_only=True, metadata=_OR_ZERO)
+    polar: float | None = field(default=None, kw_only=True, metadata=_OR_ZERO)
+    eccentricity: float | None = field(default=None, kw_only=True, metadata=_OR_ZERO)
+    density: float | None = field(default=None, kw_only=True, metadata=_SIZE)
+    youngs_modulus: float | None = field(default=None, kw_only=True, metadata=_SIZE)
+    poisson_ratio: float | None = field(default=None, kw_only=True, metadata=checked(number))
 
     def __post_init__(self) -> None:
-        start, end = real_array(self.start, "start", (2,)), real_array(self.end, "end", (2,))
-        if np.count_nonzero(start != end) != 1:
+        super().__post_init__()
+        if (self.start[0] == self.end[0]) == (self.start[1] == self.end[1]):
             raise ModelError(
-                f"a rib runs along x or along y, got {start.tolist()} to {end.tolist()}. Make an "
-                "oblique one of steps, or of a mesh of your own."
+                f"a rib runs along x or along y, got {self.start} to {self.end}. Make an oblique "
+                "one of steps, or of a mesh of your own."
             )
-        for name in ("width", "height", "area", "inertia", "torsion", "polar"):
-            if getattr(self, name) is not None:
-                number(getattr(self, name), name)
         box = (self.width, self.height)
         free = (self.area, self.inertia, self.torsion, self.polar)
         if (None in box or any(n is not None for n in free)) and (
@@ -386,27 +376,12 @@ class Rib(Value):
                 "a rib needs its section: width and height, or area and inertia (with torsion and "
                 f"polar), got {self._given()}. Give one of the two, complete."
             )
-        for name, value in self._given().items():
-            if name != "poisson_ratio":
-                zero = name in ("torsion", "eccentricity", "polar", "inertia")
-                self._set(**{name: positive(value, f"{name} of a rib", zero=zero)})
-        nu = self.poisson_ratio
-        if nu is not None and not -1 < float(real_array(nu, "poisson_ratio", ())) < 0.5:
-            raise ModelError(
-                f"poisson_ratio must be above -1 and below 0.5, got {nu:g}. Metals have about 0.3."
-            )
-        self._set(start=tuple(start.tolist()), end=tuple(end.tolist()))
+        if self.poisson_ratio is not None:
+            poisson_of(self.poisson_ratio, (), (), None)
 
     def _given(self) -> dict[str, Any]:
         fields = self._fields()
         return {n: v for n, v in fields.items() if v is not None and n not in ("start", "end")}
-
-    def __repr__(self) -> str:
-        if self.width is not None:
-            section = f"{self.width:g} x {self.height:g} m"
-        else:
-            section = f"area {self.area:g} m^2, inertia {self.inertia:g} m^4"
-        return f"<Rib {self.start} to {self.end} m, {section}>"
 
     def section(self, thickness: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
         """Return area, inertia, torsion and polar inertia about the plate's middle plane."""

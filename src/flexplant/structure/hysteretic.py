@@ -15,20 +15,36 @@ from ..checks import (
     Matrix,
     Value,
     between,
+    checked,
     element_mask,
     function,
     instance,
+    mapping,
+    members,
     real_array,
     short,
 )
-from ..errors import ModelError, ShapeError, counted
+from ..errors import ModelError, ShapeError
 from ..labels import DofSet
 from ..tolerances import divisor
 from .attachments import Spring, added_matrices
 from .damping import Damping
+from .definite import square
 
 #: part of the strain energy of a mode that regions may have beyond all of it, by rounding
 _BEYOND = 1e-6
+
+
+_REGIONS = "Pass {'pads': (0.3, K_pads)}."
+
+
+def checked_loss_factor(value: Any, name: str) -> float:
+    """Return a loss factor in [0, 2)."""
+    why = (
+        "The equivalent damping ratio is half of it, and from 1 on there is no oscillation left: "
+        "give 0.02 for 2 %."
+    )
+    return between(value, name, 0.0, 2.0, why, ends="[")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,21 +97,14 @@ class Hysteretic(Damping):
     array([0.1499, 0.0046])
     """
 
-    loss_factor: float
+    loss_factor: float = field(metadata=checked(checked_loss_factor))
     regions: Mapping[
         str, LossRegion | tuple[float, Matrix] | tuple[float, Spring | Iterable[Spring]]
-    ] = field(default_factory=dict, kw_only=True)
+    ] = field(default_factory=dict, kw_only=True, metadata=checked(mapping, hint=_REGIONS))
 
     def __post_init__(self) -> None:
-        given = instance(self.regions, Mapping, "regions", "Pass {'pads': (0.3, K_pads)}.")
-        self._set(
-            loss_factor=checked_loss_factor(self.loss_factor),
-            regions={str(name): _region(name, part) for name, part in given.items()},
-        )
-
-    def __repr__(self) -> str:
-        parts = "".join(f", {name} {part.loss_factor:g}" for name, part in self._regions.items())
-        return f"<Hysteretic, loss factor {self.loss_factor:g}{parts}>"
+        super().__post_init__()
+        self._set(regions={str(name): _region(name, part) for name, part in self.regions.items()})
 
     @property
     def _regions(self) -> Mapping[str, LossRegion]:
@@ -282,34 +291,20 @@ class LossRegion(Value):
     <LossRegion: loss factor 0.3, 1 spring>
     """
 
-    loss_factor: float
+    loss_factor: float = field(metadata=checked(checked_loss_factor))
     stiffness: Matrix | Spring | Iterable[Spring]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         given: Any = self.stiffness
         if isinstance(given, Spring):
             given = (given,)
-        elif sp.issparse(self.stiffness):
-            real_array(given.data, "stored entries of a region's stiffness")
-        elif isinstance(given, np.ndarray):
-            given = real_array(given, "stiffness of a region", (None, None))
-            given = real_array(given, "stiffness of a region", (len(given), len(given)))
+        elif sp.issparse(given) or isinstance(given, np.ndarray):
+            square(given, "stiffness of a region")
         else:
             hint = "Give a part of K, or Spring(...) in [...]."
-            given = tuple(instance(given, Iterable, "stiffness of a region", hint))
-            for spring in given:
-                instance(spring, Spring, "the stiffness of a region", hint)
-            if not given:
-                raise ModelError(f"a region holds no spring: it would do nothing. {hint}")
-        self._set(loss_factor=checked_loss_factor(self.loss_factor), stiffness=given)
-
-    def __repr__(self) -> str:
-        given: Any = self.stiffness
-        if isinstance(given, tuple):
-            what = f"{len(given)} spring{'s' * (len(given) != 1)}"
-        else:
-            what = f"a matrix of {counted(given.shape[0], 'DOF')}"
-        return f"<LossRegion: loss factor {self.loss_factor:g}, {what}>"
+            given = members(given, Spring, "stiffness of a region", hint)
+        self._set(stiffness=given)
 
     @classmethod
     def of_elements(
@@ -364,12 +359,3 @@ class LossRegion(Value):
                 f"{len(dofs)} DOFs: give a part of its K, over the same DOFs."
             )
         return sp.csc_array(given)
-
-
-def checked_loss_factor(value: Any) -> float:
-    """Return a loss factor in [0, 2)."""
-    why = (
-        "The equivalent damping ratio is half of it, and from 1 on there is no oscillation left: "
-        "give 0.02 for 2 %."
-    )
-    return between(value, "loss_factor", 0.0, 2.0, why, ends="[")

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, Value, instance, positive, real_array
+from ..checks import FloatArray, IntArray, Value, checked, instance, positive, real_array
 from ..dof_columns import direction_names
-from ..errors import LabelError, ModelError, counted
+from ..errors import LabelError, ModelError
 from ..labels import DIRECTIONS, DofSet, Interpolation
 from ..tolerances import TINY
 from .model import FEModel
@@ -108,17 +108,9 @@ class ScatteredShape(Interpolation):
     1.0
     """
 
-    xyz: FloatArray
-    directions: tuple[str, ...]
-    margin: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._set(directions=direction_names(self.directions))
-        self._set(xyz=real_array(self.xyz, "xyz", (len(self.directions), 3)))
-
-    def __repr__(self) -> str:
-        nodes = np.unique(self.xyz, axis=0).shape[0]
-        return f"<ScatteredShape between {counted(nodes, 'node')}, margin {self.margin:g} m>"
+    xyz: FloatArray = field(metadata=checked(real_array, shape=("directions", 3)))
+    directions: tuple[str, ...] = field(metadata=checked(direction_names))
+    margin: float = field(default=0.0, metadata=checked(positive, zero=True, unit="m"))
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) of all DOFs in the motion `direction` at a point.

@@ -5,28 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import (
-    FloatArray,
-    IntArray,
-    Value,
-    flag,
-    instance,
-    name_list,
-    one_of,
-    real_array,
-    whole,
-)
+from ..checks import IntArray, Value, flag, instance, name_list, one_of, real_array, whole
 from ..dof_columns import at_nodes, node_numbers
 from ..errors import LabelError, ModelError, ShapeError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
 from ..tolerances import TYPED
-from .definite import SEMIDEFINITE, are_swapped
+from .definite import SEMIDEFINITE, are_swapped, square
 from .model import FEModel
 from .singular_mass import empty_rows, held_rows, inertial
 from .units import units
@@ -421,26 +411,6 @@ def cosines(dofs: DofSet, rotations: Any) -> Any:
                 values.append((matrix - np.eye(3)).ravel())
     entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
     return sp.csc_array(entries, shape=(len(dofs), len(dofs)))
-
-
-def square(given: Any, name: str) -> sp.csc_array:
-    """Return a square sparse matrix with finite real entries, without stored zeros."""
-    stored: Any = given
-    if not sp.issparse(given):
-        array = real_array(given, name)
-        if array.ndim != 2 or array.shape[0] != array.shape[1]:
-            raise ShapeError(
-                f"{name} must be square, got shape {array.shape}. Pass an (n, n) array."
-            )
-        return sp.csc_array(array)
-    listed: Any = stored.tocoo()
-    if listed.ndim != 2 or listed.shape[0] != listed.shape[1]:
-        raise ShapeError(f"{name} must be square, got shape {listed.shape}. Pass an (n, n) array.")
-    data: FloatArray = real_array(listed.data, f"stored entries of {name}")
-    matrix: Any = sp.csc_array((data, (listed.row, listed.col)), shape=listed.shape)
-    matrix.sum_duplicates()
-    matrix.eliminate_zeros()
-    return cast("sp.csc_array", matrix)
 
 
 def completed(given: Any, name: str) -> tuple[sp.csc_array, str | None]:

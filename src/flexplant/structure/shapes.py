@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray, real_array
-from ..errors import LabelError, counted
+from ..errors import LabelError
 from ..labels import Interpolation
 from ..tolerances import SAME
 from .element_matrices import (
@@ -101,11 +101,6 @@ class PlateShape(GridShape):
     elements: tuple[int, int]
     present: Any = None
 
-    def __repr__(self) -> str:
-        (lx, ly), (nx, ny) = self.size, self.elements
-        holes = "" if self.present is None else f", {np.count_nonzero(~self.present)} missing"
-        return f"<PlateShape {lx:g} x {ly:g} m, {nx} x {ny} elements{holes}>"
-
     def _layout(self) -> tuple[tuple[int, ...], Any, int]:
         return self.elements, self.present, 3
 
@@ -194,9 +189,6 @@ class BeamShape(GridShape):
     length: float
     elements: int
 
-    def __repr__(self) -> str:
-        return f"<BeamShape {self.length:g} m, {counted(self.elements, 'element')}>"
-
     def _layout(self) -> tuple[tuple[int, ...], Any, int]:
         return (self.elements,), None, 2
 
@@ -247,10 +239,6 @@ class BlockShape(GridShape):
     size: tuple[float, float, float]
     elements: tuple[int, int, int]
     present: Any = None
-
-    def __repr__(self) -> str:
-        size, counts = (" x ".join(f"{n:g}" for n in part) for part in (self.size, self.elements))
-        return f"<BlockShape {size} m, {counts} elements>"
 
     def _layout(self) -> tuple[tuple[int, ...], Any, int]:
         return self.elements, self.present, 3

@@ -9,7 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, Value, generator, instance, positive, several, whole
+from ..checks import (
+    ComplexArray,
+    FloatArray,
+    Value,
+    below_half_rate,
+    generator,
+    instance,
+    positive,
+    several,
+    whole,
+)
 from ..errors import ModelError, unknown_label
 from ..estimation import design_static
 from ..identification import MeasuredModes
@@ -128,12 +138,7 @@ class WaferStage(Value):
             if mode not in known:
                 raise unknown_label("elastic mode", mode, map(str, known))
             pole = own[mode - 1 - self._n_rigid]
-            if (freq := abs(pole) / (2.0 * np.pi)) >= 0.5 * self.rate:
-                raise ModelError(
-                    f"mode {mode} at {freq:.4g} Hz is not below half the rate, {0.5 * self.rate:g} "
-                    "Hz: no measurement of this machine shows it. Choose lower modes, or raise "
-                    "the rate."
-                )
+            below_half_rate(abs(pole) / (2.0 * np.pi), f"mode {mode}", self.rate)
             found.append(pole)
         exact = np.array(found, dtype=np.complex128)
         if not positive(deviation, "deviation", zero=True):

@@ -18,7 +18,7 @@ from ...structure.rigid import orthonormalised
 from ...updating import UpdateResult
 from ...updating.parameters import Parameter
 from ..building import P, rebuilt, sampled
-from ..partition import Partition
+from ..partition import Partition, require_plain
 from ..port import ForcePort
 from ..realisation import MODAL, ModalRealisation, plant_modes
 from .neglected import NeglectedModes
@@ -60,10 +60,7 @@ class Delta(Value):
 
 def modal_realisation(plant: Partition) -> ModalRealisation:
     """Return the modes of a plant, each of which has its own frequency and damping."""
-    if plant.is_weighted:
-        raise ModelError(
-            f"the plant is {plant.alteration}: uncertain modes are those of plant.unweighted."
-        )
+    require_plain(plant, "uncertain modes are those of a structure")
     realisation = plant.assembled.realisation
     if plant.form != MODAL:
         raise ModelError(

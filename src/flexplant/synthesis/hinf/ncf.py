@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...certificates import stability, stability_name
-from ...checks import FloatArray, positive
+from ...checks import FloatArray, below_half_rate, positive
 from ...errors import AssumptionError, CertificateError, ModelError, SolverError
 from ...loop import modulus_margin
 from ...lti.balancing import hankel_norm
@@ -295,16 +295,6 @@ def require_model(plant: object) -> None:
         )
 
 
-def below_half_rate(freq: float, name: str, dt: float) -> float:
-    """Return a frequency [Hz] that a sampled loop can have."""
-    if dt and positive(freq, name) >= 0.5 / dt:
-        raise ModelError(
-            f"{name} must be below half the rate, {0.5 / dt:g} Hz, got {freq:g} Hz. Lower it (to a "
-            "tenth of the rate or less), or raise the rate."
-        )
-    return positive(freq, name)
-
-
 def integral_action(shaped: StateSpace, bandwidth: float) -> StateSpace:
     """Return ``k_i (1 + w / (10 s))`` for each channel, of gain 1 with the plant's at bandwidth."""
     count = len(shaped.inputs)
@@ -313,7 +303,7 @@ def integral_action(shaped: StateSpace, bandwidth: float) -> StateSpace:
             f"bandwidth needs as many y as u, got {len(shaped.outputs)} and {count}: pass before= "
             "and after= that decouple."
         )
-    below_half_rate(bandwidth, "bandwidth", shaped.dt)
+    below_half_rate(bandwidth, "bandwidth", 1.0 / shaped.dt if shaped.dt else 0.0)
     gains = np.abs(frequency_response(shaped, np.array([bandwidth])).data[:, :, 0].diagonal())
     if not np.all(gains > 0):
         raise ModelError(

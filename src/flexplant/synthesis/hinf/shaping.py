@@ -155,12 +155,12 @@ def shape_loop(
     rho = positive(weight, "weight")
     require_model(plant)
     axes = axes_of(plant, before, after, None, 0.0, True)
-    dt = axes.plant.dt
-    below_half_rate(target, "bandwidth", dt)
+    rate = 1.0 / axes.plant.dt if axes.plant.dt else 0.0
+    below_half_rate(target, "bandwidth", rate)
     if rolloff is not None:
-        below_half_rate(rolloff, "rolloff", dt)
+        below_half_rate(rolloff, "rolloff", rate)
     if isinstance(model, int | float | np.number):
-        below_half_rate(positive(model, "model"), "model", dt)
+        below_half_rate(model, "model", rate)
     _unusual(target, rolloff, None if model is None else rho)
     T_ref = None if model is None else _model(model, axes)
     freq = target
@@ -176,7 +176,7 @@ def shape_loop(
         if reached and abs(min(reached) / target - 1.0) <= _NEAR:
             break
         freq *= target / min(reached) if reached else 2.0
-        if dt and freq >= 0.5 / dt:
+        if rate and freq >= 0.5 * rate:
             break
     if not reached or abs(min(reached) / target - 1.0) > _NEAR:
         raise SolverError(

@@ -11,7 +11,7 @@ import numpy as np
 from ...checks import Value, checked, number, positive, short, whole
 from ...errors import ModelError, ShapeError, counted
 from ...lti.discretisation import bilinear
-from ...lti.statespace import StateSpace, as_statespace
+from ...lti.statespace import StateSpace, as_statespace, single_channel
 from ..controller import Controller
 from ..hinf.shaping import ShapedLoop
 from .law import BlockSection, Section, SingleElement
@@ -36,9 +36,9 @@ class Pid(SingleElement):
     """
 
     p: float = field(metadata=checked(number))
-    i: float = field(default=0.0, metadata=checked(number))
-    d: float = field(default=0.0, metadata=checked(number))
-    pole: float | None = field(default=None, metadata=checked(positive))
+    i: float = field(default=0.0, metadata=checked(number, unit="/s"))
+    d: float = field(default=0.0, metadata=checked(number, unit="s"))
+    pole: float | None = field(default=None, metadata=checked(positive, unit="Hz"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -97,13 +97,6 @@ class Pid(SingleElement):
         found = {"gain": -high * fast, "integrator": -slow / (2.0 * np.pi)}
         return found | {"zero": -float(fast) / (2.0 * np.pi), "pole": self.pole}
 
-    def __repr__(self) -> str:
-        units = {"p": "", "i": " /s", "d": " s"}
-        gains = {name: getattr(self, name) for name in units}
-        parts = [f"{name} {gain:.4g}{units[name]}" for name, gain in gains.items() if gain]
-        pole = "" if self.pole is None else f" pole {self.pole:g} Hz"
-        return f"Pid {' '.join(parts) or 'p 0'}{pole}"
-
     @property
     def section(self) -> Section:
         """Its transfer function."""
@@ -140,11 +133,8 @@ class Lead(SingleElement):
     Lead 50 Hz ratio 9
     """
 
-    freq: float = field(metadata=checked(positive))
+    freq: float = field(metadata=checked(positive, unit="Hz"))
     ratio: float = field(default=9.0, metadata=checked(positive))
-
-    def __repr__(self) -> str:
-        return f"Lead {self.freq:g} Hz ratio {self.ratio:g}"
 
     @property
     def section(self) -> Section:
@@ -175,11 +165,8 @@ class Lag(SingleElement):
     Lag 5 Hz ratio 10
     """
 
-    freq: float = field(metadata=checked(positive))
+    freq: float = field(metadata=checked(positive, unit="Hz"))
     ratio: float = field(default=10.0, metadata=checked(positive))
-
-    def __repr__(self) -> str:
-        return f"Lag {self.freq:.4g} Hz ratio {self.ratio:g}"
 
     @property
     def section(self) -> Section:
@@ -204,10 +191,7 @@ class Integrator(SingleElement):
     Integrator 5 Hz
     """
 
-    freq: float = field(metadata=checked(positive))
-
-    def __repr__(self) -> str:
-        return f"Integrator {self.freq:.4g} Hz"
+    freq: float = field(metadata=checked(positive, unit="Hz"))
 
     @property
     def section(self) -> Section:
@@ -239,14 +223,10 @@ class Notch(SingleElement):
     Notch 130 Hz depth 0.1 width 0.2
     """
 
-    freq: float = field(metadata=checked(positive))
+    freq: float = field(metadata=checked(positive, unit="Hz"))
     depth: float = field(default=0.05, metadata=checked(positive, zero=True))
     width: float = field(default=0.3, metadata=checked(positive))
     skew: float = field(default=1.0, metadata=checked(positive))
-
-    def __repr__(self) -> str:
-        skew = f" skew {self.skew:g}" if self.skew != 1.0 else ""
-        return f"Notch {self.freq:.4g} Hz depth {self.depth:g} width {self.width:g}{skew}"
 
     @property
     def section(self) -> Section:
@@ -275,12 +255,9 @@ class LowPass(SingleElement):
     LowPass 400 Hz order 2
     """
 
-    freq: float = field(metadata=checked(positive))
+    freq: float = field(metadata=checked(positive, unit="Hz"))
     order: int = field(default=2, metadata=checked(whole, maximum=2))
     damping: float = field(default=float(np.sqrt(0.5)), metadata=checked(positive))
-
-    def __repr__(self) -> str:
-        return f"LowPass {self.freq:g} Hz order {self.order}"
 
     @property
     def section(self) -> Section:
@@ -313,14 +290,8 @@ class FixedBlock(SingleElement):
     label: str = "block"
 
     def __post_init__(self) -> None:
-        g = as_statespace(self.block)
-        if (len(g.outputs), len(g.inputs)) != (1, 1):
-            raise ShapeError(
-                "a block of a law has one input and one output, got "
-                f"{counted(len(g.inputs), 'input')} and {counted(len(g.outputs), 'output')}. Pass "
-                "one channel: system['out', 'in']."
-            )
-        self._set(block=g, label=str(self.label))
+        block = single_channel(self.block, "a block of a law", ShapeError)
+        self._set(block=block, label=str(self.label))
 
     @classmethod
     def of(cls, given: Any, *, label: str = "") -> FixedBlock:

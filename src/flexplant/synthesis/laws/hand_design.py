@@ -9,7 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import Value, checked, flag, instance, number, positive, real_array, short, whole
+from ...checks import (
+    Value,
+    checked,
+    flag,
+    instance,
+    mapping,
+    number,
+    positive,
+    real_array,
+    short,
+    whole,
+)
 from ...errors import AssumptionError, LabelError, ModelError, ShapeError, require_known
 from ...fingerprint import fingerprint
 from ...loop.blocks import DERIVATIVES
@@ -163,11 +174,8 @@ class LoopDesign(Value):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        axes: Any = self.axes
-        if not isinstance(axes, Mapping) or not axes:
-            raise ModelError(f"axes is a mapping {{axis: ShapedAxis}}, got {short(axes)}.")
         found = {}
-        for name, axis in axes.items():
+        for name, axis in mapping(self.axes, "axes", "Pass {axis: ShapedAxis}.", least=1).items():
             given: Any = axis
             if isinstance(axis, LawElement | list | tuple):
                 given = ShapedAxis(axis)  # type: ignore[arg-type]

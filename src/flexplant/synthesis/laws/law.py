@@ -11,7 +11,17 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...checks import ComplexArray, FloatArray, Value, flag, instance, positive, real_array, short
+from ...checks import (
+    ComplexArray,
+    FloatArray,
+    Value,
+    below_half_rate,
+    flag,
+    instance,
+    positive,
+    real_array,
+    short,
+)
 from ...errors import ModelError
 from ...lti.frequency import sampled_freq
 from ...lti.joining import Matrices, block_matrix, cascaded, trapezoidal
@@ -214,12 +224,8 @@ class Law(LawElement):
                     f"mean nothing there. Sample the law at {factor.own_rate:g} Hz, or take the "
                     "block before it was sampled."
                 )
-            centre = factor.section.centre / (2.0 * np.pi)
-            if rate and centre >= 0.5 * rate:
-                raise ModelError(
-                    f"{factor} lies at {centre:g} Hz, not below half the rate, {0.5 * rate:g} Hz: "
-                    "sampled, it would act at another frequency. Leave it out, or raise the rate."
-                )
+            if centre := factor.section.centre:
+                below_half_rate(centre / (2.0 * np.pi), str(factor), rate)
         gain = float(real_array(self.gain, "gain", ()))
         self._set(
             factors=factors, gain=gain, rate=rate, prewarped=flag(self.prewarped, "prewarped")

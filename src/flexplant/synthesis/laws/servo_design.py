@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import between, positive, real_array
-from ...errors import AssumptionError, LabelError, ModelError, SolverError, counted, warn
+from ...checks import below_half_rate, between, positive, real_array
+from ...errors import AssumptionError, ModelError, SolverError, only_one, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
 from ...loop.other_machines import growing_modes, modes_in_words
@@ -19,6 +19,7 @@ from ...lti.interconnection import loop_poles
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import Poi, StandardPlant, larger_plant, standard_plant
+from ...plant.partition import require_plain, require_sampled
 from ...plant.rigid_motion import require_weak
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import SAME
@@ -260,7 +261,7 @@ class ServoTask:
         rolloff = min(8.0 * bandwidth, 0.4 * self.rate) if self.rolloff is None else self.rolloff
         slow = 0.1 * bandwidth if self.integrator is None else self.integrator
         for name, freq in (("rolloff", rolloff), ("integrator", slow)):
-            _below_nyquist(freq, name, self.rate)
+            below_half_rate(freq, name, self.rate)
         return Axis(bandwidth, float(rolloff), float(slow), self.notches or (), self.rate)
 
     @property
@@ -395,13 +396,10 @@ def servo_task(
     """Return the task of a servo; parameters as for `design_servo`."""
     plant = standard_plant(given)
     port = _poi(plant, poi)
-    if not plant.dt:
-        raise AssumptionError(
-            "a servo is designed at its sampling rate: pass plant.discretized(rate, delay=...)."
-        )
+    require_sampled(plant, "a servo is designed at its sampling rate")
     centres = None if notches is None else real_array(notches, "notches", (None,)).tolist()
     for freq in centres or ():
-        _below_nyquist(freq, "notch", 1.0 / plant.dt)
+        below_half_rate(freq, "notch", 1.0 / plant.dt)
     return ServoTask(
         plant,
         port,
@@ -413,30 +411,12 @@ def servo_task(
     )
 
 
-def _below_nyquist(freq: float, name: str, rate: float) -> None:
-    if positive(freq, name) >= 0.5 * rate:
-        raise ModelError(
-            f"{name} {freq:g} Hz is not below half the rate, {0.5 * rate:g} Hz: sampled, it would "
-            "act at another frequency. Leave it out, lower it, or raise the rate."
-        )
-
-
 def _poi(plant: StandardPlant, name: str | None) -> Poi:
-    if plant.is_weighted:
-        raise ModelError(
-            f"the plant is {plant.alteration}: a servo acts on physical channels. Use "
-            "plant.unweighted."
-        )
+    require_plain(plant, "a servo acts on physical channels")
     ports = plant.assembled.ports
     if not ports.z:
         raise AssumptionError(
             "a servo needs a plant with a POI, assembled from a structure: "
             "assemble_plant(model, ports)."
         )
-    if name is None and len(ports.z) > 1:
-        names = ", ".join(poi.name for poi in ports.z)
-        raise LabelError(
-            f"the plant has {counted(len(ports.z), 'POI')} ({names}): say which one the servo "
-            f"moves, such as poi={ports.z[0].name!r}."
-        )
-    return ports.poi(name if name is not None else ports.z[0].name)
+    return ports.poi(only_one("POI", [poi.name for poi in ports.z], name, "poi="))

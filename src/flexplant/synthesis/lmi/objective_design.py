@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...checks import positive, short, whole
+from ...checks import below_half_rate, positive, short, whole
 from ...errors import CertificateError, InfeasibleError, ModelError, SolverError, attempted
 from ...lti.equations import mean_speed, state_scale
 from ...lti.interconnection import lft
@@ -147,11 +147,8 @@ def _check_specifications(plant: StandardPlant, minimize: Any, subject_to: Any, 
         raise ModelError(f"subject_to must be a list of specifications, got {short(subject_to)}.")
     for one in (minimize, *subject_to):
         if isinstance(one, PoleRegion):
-            if plant.dt and one.bandwidth is not None and one.bandwidth >= 0.5 / plant.dt:
-                raise ModelError(
-                    f"bandwidth {one.bandwidth:g} Hz of poles is not below half the rate, "
-                    f"{0.5 / plant.dt:g} Hz: no sampled pole is faster. Lower it, or leave it out."
-                )
+            if plant.dt and one.bandwidth is not None:
+                below_half_rate(one.bandwidth, "bandwidth of poles", 1.0 / plant.dt)
             continue
         if not isinstance(one, _KINDS) or (one is not minimize and one.below is None):
             raise ModelError(

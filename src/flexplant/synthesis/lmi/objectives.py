@@ -46,11 +46,6 @@ class _ChannelNorm(Value):
     z: tuple[str, ...] | None = field(default=None, metadata=checked(name_list))
     below: float | None = field(default=None, metadata=checked(positive))
 
-    def __repr__(self) -> str:
-        sides = f"w={list(self.w or ['all'])}, z={list(self.z or ['all'])}"
-        bound = "" if self.below is None else f", below={self.below:g}"
-        return f"{type(self).__name__}({sides}{bound})"
-
     def chosen(self, plant: StandardPlant) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return the names of w and z, all where none were given."""
         for side in "wz":

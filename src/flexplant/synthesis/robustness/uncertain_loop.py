@@ -15,7 +15,7 @@ from ...loop import ClosedLoop, close_loop
 from ...lti.discretisation import bilinear, image_freq, tustin
 from ...lti.interconnection import lft, series, side_by_side
 from ...lti.responses import Responder, responder
-from ...lti.statespace import StateSpace, as_statespace
+from ...lti.statespace import StateSpace, as_statespace, single_channel
 from ...plant import StandardPlant
 from ...plant.building import at_rate
 from ...plant.uncertainty.delta_channels import DeltaChannels, delta_channels
@@ -236,15 +236,10 @@ def weighted_names(given: Any, side: str) -> tuple[list[str], dict[str, Any]]:
 
 def _checked_weights(given: Mapping[str, Any], dt: float) -> dict[str, StateSpace]:
     """Return weights as systems of the loop's sampling time."""
-    found = {}
-    for name, weight in given.items():
-        one = as_statespace(weight)
-        if one.D.shape != (1, 1):
-            raise ModelError(
-                f"the weight of {name!r} must have one input and one output, got {one!r}."
-            )
-        found[name] = at_rate(one, name, dt)
-    return found
+    return {
+        name: at_rate(single_channel(weight, f"the weight of {name!r}"), name, dt)
+        for name, weight in given.items()
+    }
 
 
 def _with_weights(

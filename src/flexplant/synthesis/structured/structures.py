@@ -131,11 +131,6 @@ class FixedOrder(Value):
                 raise ModelError("a pattern is that of a static gain: leave order out, or it.")
             self._set(pattern=real_array(self.pattern, "pattern", (None, None)) != 0)
 
-    def __repr__(self) -> str:
-        free = "" if self.pattern is None else f", {int(self.pattern.sum())} entries free"
-        rolls = "" if self.direct else ", direct=False"
-        return f"FixedOrder({self.order}{free}{rolls})"
-
     def family(self, plant: StandardPlant, prepared: Prepared) -> _Entries:
         """Return the structure made ready for a plant."""
         nu, ny = len(plant.u), len(plant.y)
