@@ -113,7 +113,7 @@ def node_numbers(nodes: Any) -> IntArray:
     return np.asarray(whole, dtype=np.int64)
 
 
-def direction_names(directions: Any) -> tuple[str, ...]:
+def direction_names(directions: Any, name: str = "directions") -> tuple[str, ...]:
     """Return directions as a tuple of str; LabelError for a single one."""
     if isinstance(directions, str):
         raise LabelError(

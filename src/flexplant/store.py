@@ -175,7 +175,9 @@ def _field_text(value: Any) -> str:
         return f"{value:g}"
     if sp.issparse(value) or (isinstance(value, np.ndarray) and not 0 < value.size <= 6):
         return f"array {value.shape}" if value.size else "[]"  # type: ignore[union-attr]
-    if isinstance(value, tuple):
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, tuple | list):
         listed = [_field_text(part) for part in value]
         if len(listed) > 4:
             listed[3:-1] = [f"... {len(listed) - 4} more ..."]

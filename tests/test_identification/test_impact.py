@@ -120,7 +120,7 @@ def test_doubles_overloads_and_cut_blows_are_left_out_with_their_reasons():
     assert reasons[1.43] == "a blow came 0.0302 s before"
     assert "limit of its range" in reasons[4.0]
     assert reasons[6.6] == "the record ends 0.4 s after it"
-    assert "refused <Blow: 1:z at 6.6 s" in repr(test)
+    assert "refused Blow(input='1:z', time=6.6" in repr(test)
     with pytest.raises(ModelError, match=r"1:z has no blow.*range"):
         impact_frf({"1:z": force}, y, RATE, segment=1.0, limits={"1:z": 100.0})
 

@@ -182,4 +182,4 @@ def test_saves_and_loads(tmp_path):
     assert isinstance(again.interpolation, ScatteredShape)
     point = (0.123, 0.234, 0.0)
     np.testing.assert_array_equal(again.row(point), dofs.row(point))
-    assert repr(again.interpolation) == "<ScatteredShape between 81 nodes, margin 0 m>"
+    assert repr(again.interpolation).startswith("ScatteredShape(xyz=array (")

@@ -160,7 +160,7 @@ def test_wrong_elements(options, error, message):
 
 
 def test_values_refuse_what_limits_nothing():
-    assert repr(Saturation(2.0, rate=3.0)) == "<Saturation: limit 2, rate 3/s>"
+    assert repr(Saturation(2.0, rate=3.0)) == "Saturation(limit=2, rate=3)"
     for wrong in (lambda: Saturation(), lambda: Saturation(-1.0), lambda: Quantiser(0.0)):
         with pytest.raises(
             ModelError, match=r"without limits|limit must be positive|step must be positive"

@@ -47,7 +47,7 @@ def test_wrong_use_is_refused(made):
     designs, run = made
     with pytest.raises(ModelError, match="designs must be a mapping"):
         reading_along([designs["static"]])
-    with pytest.raises(ModelError, match="must be of type Estimator"):
+    with pytest.raises(ModelError, match="must be of type KalmanEstimator or"):
         reading_along({"block": StateSpace([], [], [], [[1.0]])})
     with pytest.raises(LabelError, match=r"'other\|die:hat'.*reading_along"):
         compare_estimators({"other": designs["static"]}, run, "die:z")

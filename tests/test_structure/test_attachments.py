@@ -276,7 +276,7 @@ def test_they_travel(tmp_path):
     part.save(tmp_path / "part.npz")
     assert load(tmp_path / "part.npz") == part or repr(load(tmp_path / "part.npz")) == repr(part)
     assert repr(part) == "PointMass(at=(0.0, 0.0, 0.0), mass=1.0, inertia=(0.0, 0.0, 0.0))"
-    assert repr(model.dofs.interpolation).startswith("<HeldShape of 2 DOFs in <ScatteredShape")
+    assert repr(model.dofs.interpolation).startswith("HeldShape(free=ScatteredShape(xyz=")
 
 
 def test_bad_box():

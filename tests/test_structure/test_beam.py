@@ -86,7 +86,7 @@ def test_reprs():
     assert (
         repr(make_beam()) == "<FEModel 'beam': 50 DOFs, sparse, 2 rigid-body motions, D not given>"
     )
-    assert repr(BeamShape(1.3, 4)) == "<BeamShape 1.3 m, 4 elements>"
+    assert repr(BeamShape(1.3, 4)) == "BeamShape(length=1.3, elements=4)"
 
 
 @pytest.mark.parametrize(

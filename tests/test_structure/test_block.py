@@ -158,5 +158,5 @@ def test_pieces_that_touch_at_an_edge_only_are_refused():
 def test_reprs():
     assert (
         repr(make_block().dofs.interpolation)
-        == "<BlockShape 0.4 x 0.3 x 0.1 m, 4 x 3 x 1 elements>"
+        == "BlockShape(size=[0.4, 0.3, 0.1], elements=[4, 3, 1])"
     )

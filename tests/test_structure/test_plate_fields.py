@@ -125,7 +125,10 @@ def test_functions_of_the_centre_and_arrays_are_the_same():
         elements=(4, 3), size=(0.8, 0.5), holes=lambda x, y: missing[int(x / 0.2), int(y * 6)]
     )
     assert three.dofs.labels == one.dofs.labels
-    assert repr(three.dofs.interpolation) == "<PlateShape 0.8 x 0.5 m, 4 x 3 elements, 2 missing>"
+    assert (
+        repr(three.dofs.interpolation)
+        == "PlateShape(size=[0.8, 0.5], thickness=0.0272, elements=[4, 3], present=array (3, 4))"
+    )
 
 
 @pytest.mark.slow
@@ -280,7 +283,7 @@ def test_a_plate_of_ribs_alone_is_a_beam():
         ({"height": None}, ModelError, "needs its section"),
         ({"area": 1e-4}, ModelError, "needs its section"),
         ({"width": None, "height": None, "area": 1e-4}, ModelError, "needs its section"),
-        ({"width": -1}, ModelError, "width of a rib"),
+        ({"width": -1}, ModelError, "width must be positive"),
         ({"density": 0}, ModelError, "density"),
         ({"poisson_ratio": 0.6}, ModelError, "poisson_ratio"),
         ({"start": (0,)}, ShapeError, "start"),
@@ -331,8 +334,11 @@ def test_bad_holes():
 
 
 def test_reprs():
-    assert repr(RIBS[0]) == "<Rib (0.0, 0.3) to (0.6, 0.3) m, 0.01 x 0.03 m>"
-    assert repr(RIBS[1]).endswith("area 0.0002 m^2, inertia 3e-09 m^4>")
-    assert repr(Disc((0, 0), 0.1)) == "<Disc of radius 0.1 m about (0.0, 0.0) m>"
-    assert repr(Rectangle((0, 0), (1, 2))) == "<Rectangle (0.0, 0.0) to (1.0, 2.0) m>"
-    assert repr(PlateShape((1, 1), 0.1, (2, 2))) == "<PlateShape 1 x 1 m, 2 x 2 elements>"
+    assert repr(RIBS[0]) == "Rib(start=[0, 0.3] m, end=[0.6, 0.3] m, width=0.01, height=0.03)"
+    assert repr(RIBS[1]).endswith("youngs_modulus=2e+11, poisson_ratio=0.25)")
+    assert repr(Disc((0, 0), 0.1)) == "Disc(centre=[0, 0] m, radius=0.1 m)"
+    assert repr(Rectangle((0, 0), (1, 2))) == "Rectangle(lower=[0, 0] m, upper=[1, 2] m)"
+    assert (
+        repr(PlateShape((1, 1), 0.1, (2, 2)))
+        == "PlateShape(size=[1, 1], thickness=0.1, elements=[2, 2])"
+    )

@@ -36,7 +36,7 @@ def test_elements_follow_their_formulas():
     ):
         np.testing.assert_allclose(response(element), wanted, rtol=1e-12)
         np.testing.assert_allclose(element.law.response(FREQ), wanted, rtol=1e-12)
-    assert repr(fx.Notch(40.0, skew=1.3)).endswith("skew 1.3")
+    assert repr(fx.Notch(40.0, skew=1.3)).endswith("skew=1.3)")
 
 
 def test_a_pid_by_its_corners_and_back():
@@ -149,7 +149,7 @@ def test_wrong_designs_are_refused(design, frf):
         ShapedAxis(["Pid"])
     with pytest.raises(LabelError, match="the axes are z"):
         LoopDesign({"z": ShapedAxis()}, after=design.after)
-    with pytest.raises(ModelError, match=r"axis 'z': .*LowPass 3000 Hz.* lies at 3000 Hz"):
+    with pytest.raises(ModelError, match=r"axis 'z': .*LowPass.freq=3000 Hz.* is at 3000 Hz"):
         _ = design.with_axis("z", ShapedAxis([LowPass(3e3)])).laws
     with pytest.raises(LabelError, match="axis"):
         design.with_axis("x", ShapedAxis())

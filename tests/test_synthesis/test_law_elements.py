@@ -59,7 +59,10 @@ def test_products_multiply():
     wanted = (3.0 + 1.0 / S) * Notch(80.0).law.response(FREQ) / (S / w(400) + 1)
     np.testing.assert_allclose(law.response(FREQ), wanted, rtol=1e-12)
     assert (law.gain, len(law.factors), law.system.n_states) == (1.0, 3, 4)
-    assert repr(law) == "Pid p 3 i 1 /s * Notch 80 Hz depth 0.05 width 0.3 * LowPass 400 Hz order 1"
+    assert repr(law) == (
+        "Pid(p=3, i=1 /s, d=0 s) * Notch(freq=80 Hz, depth=0.05, width=0.3, skew=1) * "
+        "LowPass(freq=400 Hz, order=1, damping=0.707107)"
+    )
 
 
 def test_sampled_by_tustin_what_has_a_frequency_stays_there():

@@ -49,7 +49,7 @@ class Blow(Value):
     Examples
     --------
     >>> Blow("1:z", 2.0, 180.0, reason="another blow follows after 0.04 s")
-    <Blow: 1:z at 2 s, 180: another blow follows after 0.04 s>
+    Blow(input='1:z', time=2, peak=180, experiment=0, reason='another blow follows after 0.04 s')
     """
 
     input: str

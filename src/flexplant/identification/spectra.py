@@ -63,7 +63,7 @@ class H2Estimator(SpectralMethod):
     Examples
     --------
     >>> H2Estimator(segment=0.1)
-    H2Estimator(segments of 0.1 s, window 'hann')
+    H2Estimator(segment=0.1 s, overlap=0.5)
     """
 
 
@@ -80,7 +80,7 @@ class HvEstimator(SpectralMethod):
     Examples
     --------
     >>> HvEstimator(segment=0.1)
-    HvEstimator(segments of 0.1 s, window 'hann')
+    HvEstimator(segment=0.1 s, overlap=0.5)
     """
 
 

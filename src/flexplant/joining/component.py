@@ -167,8 +167,8 @@ class PlacedShape(Interpolation):
     >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
     >>> joint, shift = fx.Joint("left/3:z", "right/1:z"), fx.Pose(shift=(0.2, 0.0, 0.0))
     >>> machine = fx.joined({"left": beam, "right": beam}, joint, placed={"right": shift})
-    >>> machine.dofs.interpolation.parts[1].interpolation
-    <PlacedShape of <BeamShape 0.2 m, 2 elements>>
+    >>> machine.dofs.interpolation.parts[1].interpolation.own
+    BeamShape(length=0.2, elements=2)
     """
 
     own: Interpolation
@@ -231,8 +231,8 @@ class JoinedShape(Interpolation):
     >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
     >>> joint, shift = fx.Joint("left/3:z", "right/1:z"), fx.Pose(shift=(0.2, 0.0, 0.0))
     >>> machine = fx.joined({"left": beam, "right": beam}, joint, placed={"right": shift})
-    >>> machine.dofs.interpolation, machine.dofs.nearest((0.4, 0.0, 0.0), "z")
-    (<JoinedShape of left, right>, 'right/3:z')
+    >>> machine.dofs.interpolation.names, machine.dofs.nearest((0.4, 0.0, 0.0), "z")
+    (('left', 'right'), 'right/3:z')
     """
 
     names: tuple[str, ...]

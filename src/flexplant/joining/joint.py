@@ -222,6 +222,10 @@ class Patch(Value):
             weights=weights,
         )
 
+    def __repr__(self) -> str:
+        where = "in a box" if self.nodes is None else f"{len(tuple(self.nodes))} nodes"
+        return f"<Patch of {self.component}, {where}>"
+
     def rows(self, dofs: DofSet) -> IntArray:
         """Return the rows (m,) of the displacements of its nodes among the component's DOFs."""
         inner = [name for name in dofs.components if self.component.endswith(f"/{name}")]

@@ -188,7 +188,7 @@ def in_words(value: float, unit: str) -> str:
     return f"{with_unit(float(np.sqrt(max(value, 0.0))), unit)} rms"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Wrapping(Criterion):
     """A criterion of the values of another one, or of a callable; the base of them.
 

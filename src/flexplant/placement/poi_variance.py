@@ -49,17 +49,6 @@ def checked_names(given: Any, name: str) -> tuple[str, ...] | Mapping[str, float
     return found
 
 
-def poi_arguments(poi: Named, axes: Named) -> list[str]:
-    """Return POIs and their axes as arguments, for a repr."""
-
-    def said(named: Any) -> str:
-        alone = isinstance(named, tuple) and len(named) == 1
-        return repr(named[0] if alone else dict(named) if isinstance(named, Mapping) else named)
-
-    parts = [] if poi is None else [said(poi)]
-    return parts if axes is None else [*parts, f"axes={said(axes)}"]
-
-
 def channels_by_poi(plant: StandardPlant) -> dict[str, dict[str, str]]:
     """Return {POI: {axis: z channel}}; of a plant made elsewhere by the channels' names."""
     if plant.is_assembled:
@@ -203,7 +192,7 @@ class PoiVariance(Criterion):
     Examples
     --------
     >>> PoiVariance("die", {"z": 1.0, "rx": 0.013})
-    PoiVariance('die', axes={'z': 1.0, 'rx': 0.013})
+    PoiVariance(poi=['die'], axes={'z': 1.0, 'rx': 0.013})
     """
 
     sides = "y"

@@ -76,7 +76,7 @@ class LeftOutModes(Criterion):
     --------
     >>> import flexplant as fx
     >>> fx.placement.LeftOutModes(of="sensors")
-    LeftOutModes(of='sensors')
+    LeftOutModes()
     """
 
     scale: ClassVar[float] = 1e-6
@@ -400,7 +400,7 @@ class OverPositions(Several):
     --------
     >>> import flexplant as fx
     >>> fx.placement.OverPositions(fx.PoiVariance("die"), {"x": [-0.1, 0.0, 0.1]})
-    OverPositions(PoiVariance('die'), {'x': [-0.1, 0.0, 0.1]}, 'worst')
+    OverPositions(criterion=PoiVariance(poi=['die']), points={'x': [-0.1, 0.0, 0.1]})
     """
 
     points: Any = 5

@@ -175,7 +175,7 @@ class Poi(Value):
 _KINDS = {"w": "disturbance", "u": "Actuator", "z": "Poi", "y": "Sensor", "references": "Reference"}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Reference(Value):
     """Set-points for the axes of a POI.
 
@@ -195,7 +195,7 @@ class Reference(Value):
     >>> fx.Reference("die")  # adds die:ref to w and y, and die:error to z
     Reference(poi='die')
     >>> fx.Reference("wafer", axes=("x", "y", "rz"))
-    Reference(poi='wafer', axes=('x', 'y', 'rz'))
+    Reference(poi='wafer', axes=['x', 'y', 'rz'])
     """
 
     home: ClassVar = "references"

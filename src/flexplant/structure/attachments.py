@@ -192,7 +192,7 @@ class HeldShape(Interpolation):
     >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
     >>> held = beam.fixed(["1:z", "1:ry"])
     >>> held.dofs.interpolation
-    <HeldShape of 4 DOFs in <BeamShape 0.2 m, 2 elements>>
+    HeldShape(free=BeamShape(length=0.2, elements=2), rows_left=[2, 3, 4, 5])
     """
 
     free: Interpolation

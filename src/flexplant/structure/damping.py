@@ -244,7 +244,7 @@ class Rayleigh(Damping):
         --------
         >>> law = Rayleigh.fitted([100.0, 1000.0], [0.01, 0.02])
         >>> law, law.zeta([200 * np.pi, 2000 * np.pi])
-        (<Rayleigh alpha 10.1546 1/s, beta 6.10898e-06 s>, array([0.01, 0.02]))
+        (Rayleigh(alpha=10.1546 1/s, beta=6.10898e-06 s), array([0.01, 0.02]))
         """
         from scipy.optimize import nnls
 

@@ -287,8 +287,8 @@ class LossRegion(Value):
     Examples
     --------
     >>> import flexplant as fx
-    >>> LossRegion(0.3, fx.Spring("1:x", 5e4))
-    <LossRegion: loss factor 0.3, 1 spring>
+    >>> LossRegion(0.3, fx.Spring("1:x", 5e4)).loss_factor
+    0.3
     """
 
     loss_factor: float = field(metadata=checked(checked_loss_factor))
@@ -336,7 +336,7 @@ class LossRegion(Value):
         ...                               density=2702, youngs_modulus=E, poisson_ratio=0.35)
         >>> LossRegion.of_elements(0.1, build, [[True, False], [False, False]],
         ...                        youngs_modulus=70e9)
-        <LossRegion: loss factor 0.1, a matrix of 27 DOFs>
+        LossRegion(loss_factor=0.1, stiffness=array (27, 27))
         """
         mask = element_mask(elements, "elements")
         function(build, "build", "It takes the modulus of each element and returns a model.")

@@ -183,7 +183,7 @@ class BeamShape(GridShape):
     --------
     >>> import flexplant as fx
     >>> fx.structure.BeamShape(2.0, 4)
-    <BeamShape 2 m, 4 elements>
+    BeamShape(length=2, elements=4)
     """
 
     length: float

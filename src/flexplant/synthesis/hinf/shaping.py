@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...certificates import stability_name
-from ...checks import ComplexArray, FloatArray, Value, positive
+from ...checks import ComplexArray, FloatArray, Value, below_half_rate, positive
 from ...errors import CertificateError, ModelError, SolverError, warn
 from ...loop import LoopReport, report_loops
 from ...lti.discretisation import tustin
@@ -26,7 +26,6 @@ from ..controller import Controller, with_left_out
 from ..laws.loop_design import Axes, axes_of, connected
 from .hinf_design import design_hinf
 from .ncf import (
-    below_half_rate,
     continuous,
     integral_action,
     loop_margin,

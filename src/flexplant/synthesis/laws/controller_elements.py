@@ -32,7 +32,7 @@ class Pid(SingleElement):
     --------
     >>> import flexplant as fx
     >>> fx.Pid(2.0, i=1.0, d=0.1, pole=100.0)
-    Pid p 2 i 1 /s d 0.1 s pole 100 Hz
+    Pid(p=2, i=1 /s, d=0.1 s, pole=100 Hz)
     """
 
     p: float = field(metadata=checked(number))
@@ -130,7 +130,7 @@ class Lead(SingleElement):
     --------
     >>> import flexplant as fx
     >>> fx.Lead(50.0)  # most phase at 50 Hz
-    Lead 50 Hz ratio 9
+    Lead(freq=50 Hz, ratio=9)
     """
 
     freq: float = field(metadata=checked(positive, unit="Hz"))
@@ -162,7 +162,7 @@ class Lag(SingleElement):
     --------
     >>> import flexplant as fx
     >>> fx.synthesis.Lag(5.0)
-    Lag 5 Hz ratio 10
+    Lag(freq=5 Hz, ratio=10)
     """
 
     freq: float = field(metadata=checked(positive, unit="Hz"))
@@ -188,7 +188,7 @@ class Integrator(SingleElement):
     --------
     >>> import flexplant as fx
     >>> fx.synthesis.Integrator(5.0)
-    Integrator 5 Hz
+    Integrator(freq=5 Hz)
     """
 
     freq: float = field(metadata=checked(positive, unit="Hz"))
@@ -220,7 +220,7 @@ class Notch(SingleElement):
     --------
     >>> import flexplant as fx
     >>> fx.Notch(130.0, depth=0.1, width=0.2)
-    Notch 130 Hz depth 0.1 width 0.2
+    Notch(freq=130 Hz, depth=0.1, width=0.2, skew=1)
     """
 
     freq: float = field(metadata=checked(positive, unit="Hz"))
@@ -252,7 +252,7 @@ class LowPass(SingleElement):
     --------
     >>> import flexplant as fx
     >>> fx.LowPass(400.0)
-    LowPass 400 Hz order 2
+    LowPass(freq=400 Hz, order=2, damping=0.707107)
     """
 
     freq: float = field(metadata=checked(positive, unit="Hz"))

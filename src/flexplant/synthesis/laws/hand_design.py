@@ -57,7 +57,7 @@ class ShapedAxis(Value):
     >>> import flexplant as fx
     >>> axis = fx.synthesis.ShapedAxis([fx.Pid(2.0), fx.Notch(130.0)], on=[True, False])
     >>> axis.law
-    Pid p 2
+    Pid(p=2, i=0 /s, d=0 s)
     """
 
     elements: tuple[SingleElement, ...] = ()

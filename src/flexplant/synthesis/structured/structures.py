@@ -112,7 +112,7 @@ class FixedOrder(Value):
     --------
     >>> import flexplant as fx
     >>> fx.synthesis.FixedOrder(2)
-    FixedOrder(2)
+    FixedOrder(order=2)
     """
 
     order: int = field(default=0, metadata=checked(whole, minimum=0))
