@@ -26,6 +26,10 @@ Suspended = TypeVar("Suspended", FEModel, ReducedModel, Modes)
 _SLACK = 1e-9
 
 
+#: field: a damper, none at all included
+_DAMPING = checked(positive, name="damping of a ground spring", zero=True)
+
+
 @dataclass(frozen=True, eq=False)
 class GroundSpring(Value):
     """A spring and a damper between a place of the structure and the ground.
@@ -55,7 +59,7 @@ class GroundSpring(Value):
 
     at: Place
     stiffness: float = field(metadata=checked(number, name="stiffness of a ground spring"))
-    damping: float = field(default=0.0, metadata=checked(positive, zero=True))
+    damping: float = field(default=0.0, metadata=_DAMPING)
     direction: str = "z"
 
     def __post_init__(self) -> None:
