@@ -65,15 +65,16 @@ def test_eigenvalues_and_eigenvectors_are_computed_once(monkeypatch):
             return plain(A, *rest, **options)
 
         monkeypatch.setattr(owner, name, counted)
-    loop = close_loop(stage(), observer(), servo())
+    one = observer()  # with a second state, for a matrix of one needs no eigenvectors
+    grown = {"A": [[0.3, 0.1], [0.0, 0.2]], "B": np.vstack([one.B, one.B]), "C": [[1.0, 0.0]]}
+    loop = close_loop(stage(), one.replace(**grown, states=()), servo())
     assert loop.is_stable
     assert loop.system.is_stable
     assert loop.spectral_radius < 1 < 1 / loop.modulus_margin
     assert "stable" in repr(loop)
     loop.frequency_response([1.0, 10.0])
     compare_loops({"servo": loop})
-    blocks = [block.n_states for block in loop.blocks]
-    assert sizes == {"eigvals": [loop.monitored.n_states], "eig": blocks}
+    assert sizes == {"eigvals": [loop.monitored.n_states], "eig": [2]}
 
 
 def test_it_reads_as_a_table_and_survives_a_file(found, tmp_path):

@@ -41,7 +41,7 @@ from ..loop.budget import check_stationary, source_variances, sources
 from ..lti.equations import accumulated, scale_of, shifted_columns, stein, sylvester
 from ..lti.joining import equal_matrices
 from ..lti.lyapunov import difference_of, dual_variances, solve_stein, stein_root
-from ..lti.modal import ModalMap
+from ..lti.modal_map import ModalMap
 from ..lti.sampling import uncoupled_pairs
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
@@ -295,17 +295,17 @@ def _plant_modes(block: FloatArray, above: FloatArray) -> ModalMap | None:
     if pairs is None:
         return None
     # states of one size: those of a mode are its omega q and dq/dt
-    values, vectors = np.linalg.eig(pairs.astype(np.complex128))
-    if values.size and np.max(np.linalg.cond(vectors)) > _DEFECTIVE:
+    found = ModalMap.of_pairs(pairs)
+    if len(pairs) and np.max(np.linalg.cond(found.T)) > _DEFECTIVE:
         return None
-    return ModalMap(values.reshape(-1), vectors, np.linalg.inv(vectors))
+    return found
 
 
 def _primal(joint: _Joint) -> FloatArray:
     """Return ``E X E'`` with ``X = A X A' + noise noise'``."""
     modes, A, coupling, driven, noise = joint.parts
     values, n = modes.poles, joint.n_elastic
-    inner = (driven @ driven.conj().T) / (1 - np.outer(values, values.conj()))
+    inner = modes.gramian(driven, sampled=True)
     entering = coupling @ inner
     cross = shifted_columns(A, values.conj(), entering * values.conj() + noise @ driven.conj().T)
     half = A @ cross @ coupling.conj().T

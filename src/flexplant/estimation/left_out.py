@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from ..checks import ComplexArray, FloatArray, IntArray, Value
 from ..errors import ModelError, counted, warn
 from ..labels import DofSet
-from ..lti.modal import ModalMap
+from ..lti.modal_map import ModalMap
 from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..modes.matching import assigned
@@ -148,8 +148,7 @@ def _mode_blocks(realisation: ModalRealisation, ports: Ports) -> _Blocks:
     n = g.n_states // 2 - r
     A, B, C = g.A[2 * r :, 2 * r :], g.B[2 * r :], g.C[:, 2 * r :]
     if realisation.coupling is None:
-        values, T = np.linalg.eig(realisation.pairs[r:].astype(np.complex128))
-        own = ModalMap(values.reshape(-1), T, np.linalg.inv(T))
+        own = ModalMap.of_pairs(realisation.pairs[r:])
     else:
         values, T = np.linalg.eig(A.astype(np.complex128))
         # conjugate pairs side by side, then the poles of overdamped modes

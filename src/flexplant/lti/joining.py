@@ -193,13 +193,14 @@ def is_block_diagonal(g: Any) -> bool:
 def diagonal_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[FloatArray, IntArray]:
     """Return 1 x 1 and 2 x 2 diagonal blocks as (b, 2, 2), and the states of each (b, 2; -1: none).
 
-    What a block of one state does not have is zero.
+    A block of one state has its pole twice: nothing drives the second.
     """
     sizes = np.asarray(blocks)
     starts = np.cumsum(sizes) - sizes
     slots = np.stack([starts, np.where(sizes == 2, starts + 1, -1)], axis=1)
     real = slots >= 0
     pairs = A[slots[:, :, None], slots[:, None, :]] * (real[:, :, None] & real[:, None, :])
+    pairs[sizes == 1, 1, 1] = pairs[sizes == 1, 0, 0]
     return pairs, slots
 
 

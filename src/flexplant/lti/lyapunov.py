@@ -25,6 +25,7 @@ from .equations import (
     symmetrised,
 )
 from .joining import bilinear_matrices, diagonal_blocks, is_block_diagonal
+from .modal_map import ModalMap
 from .statespace import StateSpace, System, as_statespace
 
 
@@ -193,22 +194,26 @@ def _gramian(g: StateSpace, A: FloatArray, B: FloatArray) -> FloatArray:
     return solve_stein(A, B @ B.T) if g.dt else solve_lyapunov(A, B @ B.T)
 
 
+#: least square of a pair's frequency, beside that of its decay: a damping ratio of 0.95
+_SWINGING = 0.1
+
+
 def _modal_gramian(
     A: FloatArray, B: FloatArray, blocks: Sequence[int], discrete: bool
 ) -> FloatArray:
     """Solve block by block: ``A_i X_ij + X_ij A_j' + B_i B_j' = 0``, all pairs (i, j) at once."""
-    # 1 x 1 blocks are padded to 2 x 2 with a decoupled stable state that nothing drives
     pairs, slots = diagonal_blocks(A, blocks)
     real, b = slots >= 0, len(slots)
-    pairs[~real[:, 1], 1, 1] = 0.0 if discrete else -1.0
     drive = (B[slots] * real[:, :, None]).reshape(2 * b, -1)
-    W = drive @ drive.T
-    half_gap = 0.5 * (pairs[:, 0, 0] - pairs[:, 1, 1])
-    swing = -(half_gap**2 + pairs[:, 0, 1] * pairs[:, 1, 0])
-    if not discrete and np.all(swing > 0):
-        padded = _of_oscillators(pairs, swing, W)
+    gap = 0.25 * (pairs[:, 0, 0] - pairs[:, 1, 1]) ** 2
+    # nearly double poles have poor eigenvectors, real ones of unlike size would lose digits
+    if np.all(gap + pairs[:, 0, 1] * pairs[:, 1, 0] < -_SWINGING * gap):
+        own = ModalMap.of_pairs(pairs)
+        modal = own.gramian(own.driven(drive), sampled=discrete)
+        padded = own.back(own.back(modal).conj().T).real
     else:
-        eye, right = np.eye(2), W.reshape(b, 2, b, 2).transpose(0, 2, 1, 3).reshape(b, b, 4, 1)
+        eye, W = np.eye(2), drive @ drive.T
+        right = W.reshape(b, 2, b, 2).transpose(0, 2, 1, 3).reshape(b, b, 4, 1)
         if discrete:
             kron = np.eye(4) - np.einsum("iab,jcd->ijacbd", pairs, pairs).reshape(b, b, 4, 4)
         else:
@@ -218,31 +223,6 @@ def _modal_gramian(
         padded = X.transpose(0, 2, 1, 3).reshape(2 * b, 2 * b)
     keep = np.flatnonzero(real.reshape(-1))
     return symmetrised(padded[np.ix_(keep, keep)])
-
-
-def _of_oscillators(pairs: FloatArray, swing: FloatArray, W: FloatArray) -> FloatArray:
-    """Solve ``A X + X A' + W = 0`` for A of (b, 2, 2) blocks that oscillate, by Cayley-Hamilton."""
-    # with t and d the sum of the traces and the difference of the determinants of two blocks,
-    # `(t A_i + d I) X_ij = -A_i W_ij - W_ij adj(A_j)'`. Pairs of real poles, of unlike size, would
-    # lose digits. `swing` (b,) are the squares of the frequencies
-    (a, e), (c, g) = pairs.transpose(1, 2, 0)  # [[a, e], [c, g]]
-    half, det = 0.5 * (a + g), a * g - c * e
-    t = 2.0 * (half[:, None] + half)
-    d = det - det[:, None]
-    w00, w01, w10, w11 = W[::2, ::2], W[::2, 1::2], W[1::2, ::2], W[1::2, 1::2]
-    ai, ei, ci, gi = (one[:, None] for one in (a, e, c, g))
-    # A_i W + W adj(A_j)', with adj(A)' = [[g, -c], [-e, a]]
-    r00 = ai * w00 + ei * w10 + w00 * g - w01 * e
-    r01 = ai * w01 + ei * w11 - w00 * c + w01 * a
-    r10 = ci * w00 + gi * w10 + w10 * g - w11 * e
-    r11 = ci * w01 + gi * w11 - w10 * c + w11 * a
-    size = (d + t * half[:, None]) ** 2 + t * t * swing[:, None]  # its determinant
-    X: FloatArray = np.empty_like(W)
-    m00, m01, m10, m11 = t * ai + d, t * ei, t * ci, t * gi + d
-    X[::2, ::2], X[::2, 1::2] = m01 * r10 - m11 * r00, m01 * r11 - m11 * r01
-    X[1::2, ::2], X[1::2, 1::2] = m10 * r00 - m00 * r10, m10 * r01 - m00 * r11
-    X /= np.repeat(np.repeat(size, 2, axis=0), 2, axis=1)
-    return X
 
 
 #: largest residual beside the terms of the equation: rounding leaves 1e-13 of some hundred states

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, positive
+from ..checks import ComplexArray, FloatArray, Value, positive
 from ..errors import SolverError, counted
 from .equations import state_scale
 from .joining import block_eigenvalues, is_block_diagonal
@@ -214,36 +213,6 @@ def _balance(B: FloatArray, C: FloatArray, blocks: list[int]) -> FloatArray:
     both = (drive > 0) & (seen > 0)
     ratio = np.where(both, drive, 1.0) / np.where(both, seen, 1.0)
     return np.repeat(np.exp2(np.round(0.5 * np.log2(ratio))), blocks)
-
-
-class ModalMap(NamedTuple):
-    """Poles (n,) of A, its eigenvectors T and T^-1: full, or (b, 2, 2) of uncoupled pairs."""
-
-    poles: ComplexArray
-    T: ComplexArray
-    inverse: ComplexArray
-
-    def seen(self, rows: FloatArray) -> ComplexArray:
-        """Return ``rows T``: how outputs (p, n) see the modes."""
-        if self.T.ndim == 2:
-            return np.asarray(rows @ self.T)
-        split = rows.reshape(len(rows), len(self.T), 2)
-        return np.asarray(np.einsum("pbi,bij->pbj", split, self.T).reshape(rows.shape))
-
-    def driven(self, columns: FloatArray) -> ComplexArray:
-        """Return ``T^-1 columns``: how inputs (n, m) drive the modes."""
-        if self.inverse.ndim == 2:
-            return np.asarray(self.inverse @ columns)
-        split = columns.reshape(len(self.T), 2, columns.shape[1])
-        return np.asarray(np.einsum("bij,bjm->bim", self.inverse, split).reshape(columns.shape))
-
-    def shapes(self, chosen: IntArray) -> ComplexArray:
-        """Return some columns of T."""
-        if self.T.ndim == 2:
-            return self.T[:, chosen]
-        found = np.zeros((len(self.T), 2, chosen.size), dtype=np.complex128)
-        found[chosen // 2, :, np.arange(chosen.size)] = self.T[chosen // 2, :, chosen % 2]
-        return np.asarray(found.reshape(2 * len(self.T), chosen.size))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

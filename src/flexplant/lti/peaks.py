@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray
 from ..tolerances import divisor
-from .responses import ModalPairs, diagonal_form, modal_pairs
+from .modal_map import block_form, diagonal_form
 from .statespace import StateSpace
 
 #: peaks that are climbed: how many, and their least part of the largest gain seen
@@ -293,11 +293,12 @@ def residues(g: StateSpace) -> tuple[Residues | None, ComplexArray | None]:
     # were computed
     if g.n_states * g.D.size > LARGEST:
         return None, None
-    pairs = modal_pairs(g)
-    poles, found, known = _of_blocks(pairs) if pairs is not None else _of_eigenvectors(g)
-    if found is None or (g.dt and np.any(poles == -1.0)):
+    closed = block_form(g)
+    poles, left, right = closed or diagonal_form(g.A, g.B, g.C)
+    known = None if closed else poles
+    if left is None or right is None or (g.dt and np.any(poles == -1.0)):
         return None, known
-    through = g.D
+    found, through = left.T[:, :, None] * right[:, None, :], g.D
     if g.dt:
         through = through - np.sum(found / (1.0 + poles)[:, None, None], axis=0).real
         found = found * (2.0 / (1.0 + poles) ** 2)[:, None, None]
@@ -308,30 +309,3 @@ def residues(g: StateSpace) -> tuple[Residues | None, ComplexArray | None]:
     flat = found.reshape(poles.size, g.D.size).T
     parts = np.hstack([flat.real, flat.imag])
     return Residues(poles, parts, np.linalg.norm(flat, axis=0), through), known
-
-
-_Found: TypeAlias = tuple[ComplexArray, ComplexArray | None, ComplexArray | None]
-
-
-def _of_blocks(pairs: ModalPairs) -> _Found:
-    """Return poles p and residues ``C (N + (p - m) I) B / (2 (p - m))`` of each block."""
-    root = np.sqrt(pairs.q.astype(np.complex128))
-    plain = ~np.any(pairs.N, axis=(1, 2))  # of one state, or a multiple of the identity
-    if not np.all(root[~plain]):
-        return root, None, None  # defective
-    C, N, B = pairs.C.swapaxes(1, 2), pairs.N, pairs.B
-    moving, fixed = 0.5 * (C @ B), C @ (N @ B) * (0.5 / np.where(plain, 1.0, root))[:, None, None]
-    fixed[plain] = moving[plain]
-    return (
-        np.concatenate([pairs.mean + root, pairs.mean - root]),
-        np.concatenate([moving + fixed, moving - fixed]),
-        None,
-    )
-
-
-def _of_eigenvectors(g: StateSpace) -> _Found:
-    """Return poles and residues of any A, no residues where its eigenvectors are poor."""
-    poles, left, right = diagonal_form(g.A, g.B, g.C)
-    if left is None or right is None:
-        return poles, None, poles
-    return poles, left.T[:, :, None] * right[:, None, :], poles

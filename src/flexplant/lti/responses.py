@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -12,8 +12,9 @@ from scipy.sparse import csgraph
 from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..parallel import one_thread
-from .equations import scaled_schur, state_scale
-from .joining import diagonal_blocks, is_block_diagonal, uncoupled_run
+from .equations import scaled_schur
+from .joining import diagonal_blocks, uncoupled_run
+from .modal_map import diagonal_form
 from .statespace import StateSpace
 
 #: so many complex numbers are less than 128 kB
@@ -134,17 +135,9 @@ class ModalPairs(NamedTuple):
     C: FloatArray  # (b, 2, p)
 
 
-def modal_pairs(g: StateSpace) -> ModalPairs | None:
-    """Return the blocks of a block-diagonal A, None for another."""
-    if not is_block_diagonal(g):
-        return None
-    return _modal_pairs(g)
-
-
-def _modal_pairs(g: StateSpace | Part) -> ModalPairs:
+def _modal_pairs(g: Part) -> ModalPairs:
     pairs, slots = diagonal_blocks(g.A, g.blocks or ())
     real = slots >= 0
-    pairs[~real[:, 1], 1, 1] = pairs[~real[:, 1], 0, 0]
     mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
     N = pairs.copy()
     N[:, 0, 0] = 0.5 * (pairs[:, 0, 0] - pairs[:, 1, 1])
@@ -246,8 +239,6 @@ CHUNK = 400_000
 MODAL_CHUNK, PARTS = 19_200, 7
 #: rows of a back substitution that are solved together
 ROWS = 32
-#: largest condition of eigenvectors whose residues are used
-POOR = 1e5
 
 #: adds ``C (s I - A)^-1 B`` (p, m, n_s) to its second argument, and says whether it is finite for
 #: certain: large arrays are not read again
@@ -302,30 +293,6 @@ def dense_solver(g: Part) -> tuple[Solver, int, int]:
         return False
 
     return add, *sizes
-
-
-class Diagonal(NamedTuple):
-    """``C (s I - A)^-1 B = left (s I - diag(poles))^-1 right``; without where V is poor."""
-
-    poles: ComplexArray
-    left: ComplexArray | None = None
-    right: ComplexArray | None = None
-
-
-def diagonal_form(A: FloatArray, B: FloatArray, C: FloatArray) -> Diagonal:
-    """Return a system in the eigenvectors of A, its poles alone where these are ill-conditioned."""
-    d = state_scale(A, B, C)
-    found: Any = np.linalg.eig(A * d / d[:, None])
-    poles, V = (np.asarray(part, dtype=np.complex128) for part in found)
-    try:
-        inverse = np.linalg.inv(V)
-    except np.linalg.LinAlgError:
-        return Diagonal(poles)
-    with np.errstate(over="ignore"):  # of defective poles
-        condition = np.linalg.norm(V) * np.linalg.norm(inverse)
-    if not condition < POOR:
-        return Diagonal(poles)
-    return Diagonal(poles, (C * d) @ V, inverse @ (B / d[:, None]))
 
 
 def _by_poles(A: FloatArray, Bs: list[FloatArray], Cs: list[FloatArray]) -> _Gains | None:

@@ -241,8 +241,6 @@ class Flow:
             return
         pairs, slots = diagonal_blocks(A[h:end, h:end], own)
         self.pairs, self.h, self.t = pairs, h, n - end
-        alone = slots[:, 1] < 0
-        pairs[alone, 1, 1] = pairs[alone, 0, 0]
         #: the two states of each mode; what one of one state lacks is behind all others
         self.at_modes = at = np.where(slots < 0, n, slots + h)
         wide = np.pad(A, ((0, 1), (0, 1)))
