@@ -4,17 +4,19 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from flexplant import load
 from flexplant.errors import ModelError
 from flexplant.estimation import design_kalman
 from flexplant.labels import Place
 from flexplant.loop import close_loop
-from flexplant.lti import StateSpace, lowpass
+from flexplant.lti import StateSpace, h2_norm, lowpass
 from flexplant.placement import PoiVariance, score_sensors
-from flexplant.plant import ForcePort, Seen, Sensor, SensorPort, assemble_plant
+from flexplant.plant import ForcePort, NarrowBand, Seen, Sensor, SensorPort, assemble_plant
 from flexplant.reduction import ModalTruncation, reduce
 from flexplant.simulation import simulate
+from flexplant.synthesis import design_servo
 from stages import CORNERS, INSET, NOISE, RATE, Z8, full, ports, reduced, sampled, some_modes
 
 OMEGA = 1j * 2 * np.pi * np.array([3.0, 70.0, 451.0, 900.0])
@@ -72,6 +74,31 @@ class Pair(ForcePort):
     def push(self, realisation):
         """Return the difference of two loads."""
         return realisation.row(self.at, "z") - realisation.row(self.against, "z")
+
+
+@dataclass(frozen=True, eq=False)
+class Fan(ForcePort):
+    """A periodic force: harmonics of a speed [Hz] of given rms [N], each a narrow band of noise."""
+
+    name: str
+    at: Place
+    speed: float
+    rms: tuple[float, ...]
+    asd: float = 1.0
+
+    @property
+    def filter(self):
+        """The bands beside each other, driven by one white noise."""
+        bands = [NarrowBand(rms, k * self.speed, 0.05) for k, rms in enumerate(self.rms, 1)]
+        parts = [(band.shape, band.asd) for band in bands]
+        A = block_diag(*(g.A for g, _ in parts))
+        B = np.vstack([size * g.B for g, size in parts])
+        states = [f"{self.name}|{i}" for i in range(len(A))]
+        return StateSpace(A, B, np.hstack([g.C for g, _ in parts]), [[0.0]], states=states)
+
+    def push(self, realisation):
+        """Return the load of a unit force."""
+        return realisation.row(self.at, "z")
 
 
 def with_sensor(*more):
@@ -187,3 +214,26 @@ def test_sides_are_kept():
         with_sensor(Pair("pair", Z8, CORNERS[0]))
     with pytest.raises(ModelError, match=r"Ports\.w holds disturbances, got Stretch.*in y"):
         ports(w=[STRETCH])
+
+
+@pytest.mark.slow
+def test_a_periodic_force():
+    """Two harmonics of a fan: run, budget, spectrum and filter ask the port for its noise."""
+    base, speed, rms = ports(), 45.0, (0.04, 0.02)
+    fan = Fan("fan", INSET[0], speed, rms)
+    few = reduce(some_modes(attached=False), ModalTruncation(12))
+    plant = sampled(few, base.replace(w=[*base.w, fan]))
+    assert h2_norm(fan.filter) / np.sqrt(2) == pytest.approx(np.hypot(*rms), rel=0.05)
+    with_fan, without = (design_kalman(one, larger=one) for one in (plant, plant.with_ports(base)))
+    assert with_fan.rms("die") > 1.001 * without.rms("die")
+    assert with_fan.system.n_states == without.system.n_states + 2 * len(rms)
+    loop = close_loop(plant, with_fan, design_servo(plant, bandwidth=20.0, observer=with_fan))
+    own = loop.budget("die:error")
+    share = own.variances[own.names.index("fan")] / own.variances.sum()
+    assert 0.1 < share < 1.0
+    quiet = close_loop(plant.with_ports(base), *loop.blocks)
+    lines = [speed, 1.4 * speed, 2.0 * speed]
+    more, less = (one.psd("die:error", lines).psd for one in (loop, quiet))
+    assert np.all((more / less > 2.0) == [True, False, True])
+    run = simulate(loop, duration=4.0, rng=1)
+    assert run.rms("die:error", start=0.5) == pytest.approx(loop.rms("die:error"), rel=0.2)
