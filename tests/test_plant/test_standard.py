@@ -398,3 +398,23 @@ def test_other_ports_are_assembled(plant):
         expected = assemble_plant(some_modes(), other).discretized(RATE, delay=1)
         assert np.array_equal(found.system.C, expected.system.C)
         assert np.allclose(found.process_noise, expected.process_noise, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_other_densities_are_those_of_ports(held):
+    """The noise of each sample follows asd: a louder, a silent and a held disturbance, and none."""
+    own = ports()
+    own = own.replace(w=[own.w[0].replace(held=held), *own.w[1:]])
+    plant = assemble_plant(some_modes(), own).discretized(RATE, delay=1.3)
+    levels = (3e-3, 2e-4, 1e-3, 0.0)
+    loud = [port.replace(asd=level) for port, level in zip(own.w, levels, strict=True)]
+    wanted = plant.with_ports(own.replace(w=loud))
+    names = [port.name for port in own.w]
+    found = plant.replace(asd={**plant.asd, **dict(zip(names, levels, strict=True))})
+    size = np.sqrt(np.diagonal(wanted.process_noise))
+    np.testing.assert_allclose(found.process_noise, wanted.process_noise, rtol=0.0,
+                               atol=1e-9 * np.max(np.outer(size, size)))  # fmt: skip
+    quieter = found.replace(asd={"y1:noise": 1e-9})
+    assert not quieter.process_noise.any()
+    assert quieter.noise_factor.shape[0] == plant.system.n_states
+    assert plant.replace(asd=plant.asd).noise_factor is plant.noise_factor

@@ -353,7 +353,7 @@ def sampled(plant: P, rate: float, delay: float) -> P:
         [0.0 if name in held else plant.asd.get(name, 0.0) for name in origin.physical.inputs]
     )
     physical, factor = _held(origin, rate, delay, asd)
-    sizes = np.array([plant.asd[name] for name in held]) * np.sqrt(0.5 * rate)
+    sizes = np.array([plant.asd.get(name, 0.0) for name in held]) * np.sqrt(0.5 * rate)
     factor = np.hstack([factor, physical.B[:, physical.input_index(held)] * sizes])
     known = {"noise_factor": factor, "delay": float(delay), "continuous": plant}
     return wired(type(plant), origin.replace(physical=physical, **known))

@@ -178,6 +178,26 @@ class Partition(Value):
         asd = {name: positive(a, f"asd of {name!r}", zero=True) for name, a in self.asd.items()}
         self._set(asd=asd)
 
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed, checked like a new one.
+
+        Of a sampled plant of a structure the noise of each sample follows `asd`.
+        """
+        asd = changes.get("asd")
+        if asd is not None and self.dt and "origin" not in changes and self.is_assembled:
+            quiet = {f"{name}:noise" for name in self.y}
+            new, old = (
+                {n: a for n, a in d.items() if a and n not in quiet} for d in (asd, self.asd)
+            )
+            if new != old and not self.is_weighted:
+                factor = 0.0 * self.noise_factor
+                if new:
+                    loud = {n: a for n, a in new.items() if n in self.continuous.w}
+                    before: Any = self.continuous.replace(asd=loud)
+                    factor = before.discretized(1.0 / self.dt, delay=self.delay).noise_factor
+                changes["origin"] = self.assembled.replace(noise_factor=factor)
+        return super().replace(**changes)
+
     def __repr__(self) -> str:
         kind = f"dt {self.dt:g} s, delay {self.delay:g}" if self.dt else "continuous"
         named = f" {self.system.name!r}" if self.system.name else ""
@@ -442,7 +462,7 @@ class Partition(Value):
         """H (ny, r): what the noises of `noise_factor` add to y in the same sample."""
         found = np.zeros((len(self.y), self.noise_factor.shape[1]))
         if held := self.held:
-            sizes = np.array([self.asd[name] for name in held]) * np.sqrt(0.5 / self.dt)
+            sizes = np.array([self.asd.get(name, 0.0) for name in held]) * np.sqrt(0.5 / self.dt)
             columns = [self.w.index(name) for name in held]
             found[:, -len(held) :] = self.D21[:, columns] * sizes
         return found
