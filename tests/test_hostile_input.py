@@ -71,6 +71,10 @@ def test_arguments_that_are_not_taken_answer_with_those_that_are():
         fx.Pid(kp=1.0)
     with pytest.raises(TypeError, match=r"'poles'. Close matches: pole, p\."):
         fx.Pid(1.0).replace(poles=2.0)
+    with pytest.raises(TypeError, match=r"fixed takes no argument 'dofs'.* It takes labels\."):
+        fx.chain(masses=[1.0], stiffnesses=[]).fixed(dofs=["1:x"])
+    with pytest.raises(TypeError, match=r"'zeta'.* It takes poles, modes, others\."):
+        fx.ModalDamping.from_measured(zeta=0.01)
     with pytest.raises(TypeError, match="missing 1 required"):
         fx.Pid()
     assert list(inspect.signature(fx.Pid).parameters) == ["p", "i", "d", "pole"]

@@ -77,7 +77,8 @@ def explanation(
     taken = signature(called).parameters
     unknown = [name for name in named if name not in taken]
     if unknown and not any(p.kind is p.VAR_KEYWORD for p in taken.values()):
-        return unknown_keyword(called.__name__, unknown[0], taken)
+        own = [name for name in taken if name not in ("self", "cls")]
+        return unknown_keyword(called.__name__, unknown[0], own)
     outward = [(one, _annotated_arguments(one, *of)) for one, *of in reversed(inner)]
     for strict in (False, True):
         for one, given in outward:

@@ -99,11 +99,12 @@ def condense_massless(
     T = np.zeros((n, m.size))
     T[m, np.arange(m.size)] = 1.0
     T[s] = -np.linalg.solve(pivot, forces[:, m]) / weight[:, None]
-    parts = [None if A is None else T.T @ np.asarray(A @ T) for A in (K, M, D)]
-    K_m, M_m, D_m = (None if A is None else 0.5 * (A + A.T) for A in parts)
-    if K_m is None or M_m is None:
-        raise ModelError("K and M are both needed to condense.")
-    return K_m, M_m, D_m, m
+
+    def reduced(A: Any) -> FloatArray:
+        part = T.T @ np.asarray(A @ T)
+        return np.asarray(0.5 * (part + part.T))
+
+    return reduced(K), reduced(M), None if D is None else reduced(D), m
 
 
 class Inertial(NamedTuple):

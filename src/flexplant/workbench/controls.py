@@ -171,10 +171,7 @@ def with_new(axis: ShapedAxis, element: SingleElement) -> ShapedAxis:
 
 def removed(axis: ShapedAxis, at: int) -> ShapedAxis:
     """Return an axis without one of its elements."""
-    keep = [i for i in range(len(axis.elements)) if i != at]
-    return axis.replace(
-        elements=tuple(axis.elements[i] for i in keep), on=tuple(axis.on[i] for i in keep)
-    )
+    return _picked(axis, [i for i in range(len(axis.elements)) if i != at])
 
 
 def swap(axis: ShapedAxis, at: int, by: int) -> ShapedAxis:
@@ -184,6 +181,10 @@ def swap(axis: ShapedAxis, at: int, by: int) -> ShapedAxis:
         return axis
     order = list(range(len(axis.elements)))
     order[at], order[to] = order[to], order[at]
+    return _picked(axis, order)
+
+
+def _picked(axis: ShapedAxis, order: list[int]) -> ShapedAxis:
     return axis.replace(
         elements=tuple(axis.elements[i] for i in order), on=tuple(axis.on[i] for i in order)
     )

@@ -359,11 +359,8 @@ class Page:
 
         design = self.design
         try:
-            loop = self._evaluator.loop(self.machine, design, self.axis)
-            fleet = [
-                loop if m is self.machine else self._evaluator.loop(m, design, self.axis)
-                for m in self.bench.machines
-            ]
+            loop, machines = self._of(self.machine, design), self.bench.machines
+            fleet = [loop if m is self.machine else self._of(m, design) for m in machines]
         except (FlexplantError, np.linalg.LinAlgError) as problem:
             self.refuse(str(problem))
             return
@@ -391,7 +388,7 @@ class Page:
         """Draw the model beside a measurement."""
         model = self.bench.model
         if model is not None and model is not self.machine and self.machine.is_measured:
-            self.views.show_beside("model", self._evaluator.loop(model, design, self.axis))
+            self.views.show_beside("model", self._of(model, design))
 
     def _draw_fleet(self) -> None:
         if len(self.fleet) < 2:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..checks import Value, checked, positive
+from ..tolerances import TINY
 from .evaluation import AxisLoop
 
 
@@ -76,7 +77,7 @@ class LoopLimits(Value):
         met = None if stable is None else bool(stable and peak <= self.peak)
         decibel = 20.0 * np.log10([self.peak, peak])
         yield Judged("peak of |S|", f"at most {decibel[0]:.3g} dB", f"{decibel[1]:.3g} dB", met)
-        gain = min(margins.gain_margin, 1.0 / (margins.gain_reduction or 1e-300))
+        gain = min(margins.gain_margin, 1.0 / (margins.gain_reduction or TINY))
         yield from at_least("gain margin", self.gain_margin, gain, "")
         yield from at_least("phase margin", self.phase_margin, margins.phase_margin, " deg")
         yield from at_least("bandwidth", self.bandwidth, loop.bandwidth, " Hz")
@@ -87,7 +88,7 @@ class LoopLimits(Value):
         elif self.suppressed is not None and self.below is not None:
             worst = float(np.abs(loop.S[low]).max(initial=0.0))
             met = None if stable is None else bool(stable and worst <= self.suppressed)
-            level = 20.0 * np.log10([self.suppressed, max(worst, 1e-300)])
+            level = 20.0 * np.log10([self.suppressed, max(worst, TINY)])
             yield Judged(
                 f"|S| to {self.below:.4g} Hz",
                 f"at most {level[0]:.3g} dB",

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..checks import FloatArray
 from ..synthesis import Notch, ShapedAxis
+from ..tolerances import TINY
 from .controls import name_of, with_element
 from .evaluation import DEVIATIONS, AxisLoop
 from .verdict import LoopLimits
@@ -31,7 +32,7 @@ _EDGE = 60.0
 
 def magnitude_db(value: Any) -> FloatArray:
     """Return magnitudes in dB."""
-    return np.asarray(20.0 * np.log10(np.maximum(np.abs(value), 1e-300)))
+    return np.asarray(20.0 * np.log10(np.maximum(np.abs(value), TINY)))
 
 
 def thinned(freq: FloatArray, values: FloatArray, points: int = _PALE) -> tuple[Any, Any]:
@@ -297,7 +298,7 @@ class Views:
         for figure, gain in {"magnitude": L, "S": loop.S, "KS": loop.KS, "PS": loop.PS}.items():
             self._put(f"{figure} {name}", x=f, y=magnitude_db(gain))
         self._put(f"phase {name}", x=f, y=_wrapped(L))
-        near = L * np.minimum(1.0, _EDGE / np.maximum(np.abs(L), 1e-300))
+        near = L * np.minimum(1.0, _EDGE / np.maximum(np.abs(L), TINY))
         if name == "main":  # on the wrong side of -1
             color = RED if loop.is_stable is False else BLUE
             self._drawn["nyquist main"].glyph.line_color = color
