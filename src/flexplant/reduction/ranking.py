@@ -81,7 +81,7 @@ class ModeRanking(Value):
         """Return the most important modes as text, with the channels each matters most to."""
         rows = []
         top = float(self.total.max(initial=0.0)) or 1.0
-        for i in np.argsort(-self.total, kind="stable")[:most]:
+        for i in np.argsort(-self.total, kind="stable")[: whole(most, "most")]:
             out, into = np.unravel_index(int(np.argmax(self.values[i])), self.values[i].shape)
             sizes = f"{self.total[i]:.3g}", f"{self.peak[i]:.3g}", f"{self.total[i] / top:.2%}"
             channel = f"{self.inputs[into]} -> {self.outputs[out]}"

@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg as la
-import scipy.sparse as sp
 
 from ..checks import FloatArray, Matrix
 from ..errors import ModelError, ShapeError, attempted, warn
 from ..modes import solve_modes
 from ..modes.dynamic_basis import static_shapes
 from ..modes.normal_form import RIGID_DRAG
-from ..modes.sparse_modes import counted_modes
 from ..reduction import ReducedModel
 from ..sparse.symmetric import beyond
 from ..structure.attachments import matrix_sum
@@ -156,8 +154,6 @@ def _impossible(
 WIDER = 4
 #: DOFs from which an FEModel is updated in such a basis, and from which it is too large for that
 LARGE, TOO_LARGE = 300, 20_000
-#: DOFs from which few modes (one of so many) are found faster by Lanczos than densely
-SPARSE, FEW = 600, 10
 #: bases of a large FEModel until its estimate moves no more
 MOST_ROUNDS = 10
 
@@ -272,24 +268,10 @@ class FullBasis:
         """Return the shapes of a changed model that take part."""
         n = model.n_dof
         if self.reduced is not None:
-            return _lowest_modes(model, min(WIDER * self.reduced.n_dof, n))[1]
+            return np.real(solve_modes(model, count=min(WIDER * self.reduced.n_dof, n)).phi)
         highest = max((number for r in self.residuals for number in compared_modes(r)), default=6)
         top = WIDER * max(residual.top for residual in self.residuals)
-        omega, phi = _lowest_modes(model, min(WIDER * highest, n))
-        if omega.size < n and omega[-1] < top:
-            _, phi = _lowest_modes(model, n, top)
-        return phi
-
-
-def _lowest_modes(model: FEModel, count: int, top: float = np.inf) -> tuple[FloatArray, FloatArray]:
-    """Return omega and shapes of the lowest modes, up to `top` [rad/s]."""
-    r = model.rigid_body.shape[1]
-    sparse = sp.issparse(model.K) and sp.issparse(model.M) and not model.n_unstable
-    few = model.n_dof > SPARSE and FEW * count < model.n_dof
-    if sparse and few and np.isinf(top) and count > r:
-        squares, phi, _ = counted_modes(model, count - r)
-        omega = np.concatenate([np.zeros(r), np.sqrt(squares)])
-        return omega, np.hstack([model.rigid_body, phi])
-    below = None if np.isinf(top) else top / (2 * np.pi)
-    modes = solve_modes(model, count=None if below else count, below=below)
-    return modes.omega, np.real(modes.phi)
+        modes = solve_modes(model, count=min(WIDER * highest, n))
+        if modes.n_modes < n and modes.omega[-1] < top:
+            modes = solve_modes(model, below=top / (2 * np.pi))
+        return np.real(modes.phi)
