@@ -82,7 +82,7 @@ LINES = [
      "float(self.ratio)"),
     ("synthesis/aftercare/order.py", "(1.0 - loss) * before.margin",
      "0.0 * before.margin"),
-    ("synthesis/synthesis_plants.py", "(1.0 - part) * getattr(a",
+    ("synthesis/hinf/moved_design.py", "(1.0 - part) * getattr(a",
      "1.0 * getattr(a"),
     ("synthesis/structured/judges.py", "own = 2.0 *",
      "own = 1.0 *"),

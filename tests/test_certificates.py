@@ -12,8 +12,8 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import CertificateError, ModelError
-from flexplant.lti.preparation import prepared
 from flexplant.synthesis import FixedOrder, PoleRegion
+from flexplant.synthesis.preparation import prepared
 from mutants import LINES, SOURCE
 
 

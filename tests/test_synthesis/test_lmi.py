@@ -10,11 +10,11 @@ import pytest
 from flexplant import load
 from flexplant.errors import CertificateError, InfeasibleError, ModelError, SolverError
 from flexplant.lti import StateSpace, lft
-from flexplant.lti.preparation import prepared
 from flexplant.synthesis import Lmi, Riccati, design_hinf
 from flexplant.synthesis.controller import certified_norm
 from flexplant.synthesis.lmi import lmi_programs as lmi_programs
 from flexplant.synthesis.lmi.lmi_programs import Plant, smallest_gamma, symmetric_blocks
+from flexplant.synthesis.preparation import prepared
 from oracles_lmi import closed_loop, output_feedback_gamma, state_feedback_gamma, swept_norm
 from shared_data import DATA
 

@@ -5,7 +5,6 @@ import pytest
 import scipy.linalg as la
 
 from flexplant.lti import StateSpace
-from flexplant.lti.preparation import prepared
 from flexplant.synthesis import Lmi, design_hinf
 from flexplant.synthesis.hinf.lower_bound import (
     full_information,
@@ -13,6 +12,7 @@ from flexplant.synthesis.hinf.lower_bound import (
     relaxed_bound,
     zero_bound,
 )
+from flexplant.synthesis.preparation import prepared
 from oracles_lmi import output_feedback_gamma, state_feedback_gamma
 
 

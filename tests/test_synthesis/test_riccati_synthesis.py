@@ -19,9 +19,9 @@ from flexplant.errors import (
     SolverError,
 )
 from flexplant.lti import StateSpace, hinf_norm, lft, tustin
-from flexplant.lti.preparation import prepared
 from flexplant.synthesis import Lmi, Riccati, design_hinf
 from flexplant.synthesis.controller import certified_norm
+from flexplant.synthesis.preparation import prepared
 from oracles_synthesis import (
     brute_norm,
     closed_loop,

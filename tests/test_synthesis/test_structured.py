@@ -10,7 +10,6 @@ from test_spill_over import many, small
 import oracles_synthesis as oracle
 from flexplant.errors import InfeasibleError, LabelError, ModelError, ShapeError
 from flexplant.lti import StateSpace, discretized
-from flexplant.lti.preparation import prepared
 from flexplant.plant import StandardPlant, reference_errors, stage_weights
 from flexplant.synthesis import (
     FixedOrder,
@@ -25,6 +24,7 @@ from flexplant.synthesis import (
     design_loops,
     design_structured,
 )
+from flexplant.synthesis.preparation import prepared
 from flexplant.synthesis.structured.nonsmooth import Pieces, bfgs, decrease_left, downhill, minimax
 from flexplant.synthesis.structured.structured_design import _StructureSearch
 from flexplant.synthesis.structured.structures import ControllerFamily

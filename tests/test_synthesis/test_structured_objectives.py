@@ -7,10 +7,10 @@ from test_structured import law, machine, named
 
 from flexplant.errors import AssumptionError, CertificateError, ModelError
 from flexplant.lti import StateSpace, discretized, lft
-from flexplant.lti.preparation import prepared
 from flexplant.plant import StandardPlant
 from flexplant.synthesis import H2, FixedOrder, Hinf, PeakGain, TunedLaws, design_h2
 from flexplant.synthesis import design_structured as design
+from flexplant.synthesis.preparation import prepared
 from flexplant.synthesis.structured.judges import H2Judge, PeakJudge, problem_on
 
 

@@ -1,13 +1,13 @@
 """Controllers over a range of positions, judged where they were not designed."""
 
-import numpy as np
 import pytest
 from test_structured import judged, law, machine
 
 from flexplant.errors import ModelError
 from flexplant.lti import StateSpace
+from flexplant.plant import StandardPlant
 from flexplant.synthesis import TunedLaws, design_structured
-from flexplant.synthesis.synthesis_plants import system_at
+from flexplant.synthesis.hinf.moved_design import PlantRange
 
 
 def moving(places=(0.0, 0.5, 1.0)):
@@ -43,5 +43,6 @@ def test_plants_of_several_machines_are_no_range():
 def test_between_two_places_matrices_are_linear():
     one = StateSpace([[-1.0]], [[1.0]], [[2.0]], [[0.0]])
     two = StateSpace([[-3.0]], [[5.0]], [[4.0]], [[8.0]])
-    found = system_at([one, two], np.array([0.0, 4.0]), 1.0)
+    plants = [StandardPlant.from_statespace(g, u=g.inputs, y=g.outputs) for g in (one, two)]
+    found = PlantRange.of({4.0: plants[1], 0.0: plants[0]}).at(1.0).system
     assert [getattr(found, m).item() for m in "ABCD"] == [-1.5, 2.0, 2.5, 2.0]

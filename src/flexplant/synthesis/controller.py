@@ -16,11 +16,11 @@ from ..errors import CertificateError, FlexplantWarning, counted, warn
 from ..loop import ClosedLoop, ModeTolerances, SpillOver, close_loop
 from ..lti.frequency_sweep import highest, largest_gains, resonance_grid
 from ..lti.norms import peak_gain
-from ..lti.preparation import Prepared
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant, larger_plant
 from ..structure import FEModel
+from .preparation import Prepared
 
 
 @dataclass(frozen=True, eq=False, repr=False)

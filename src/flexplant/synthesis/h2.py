@@ -12,15 +12,14 @@ from ..checks import FloatArray
 from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
 from ..lti.interconnection import lft
 from ..lti.norms import h2_norm
-from ..lti.preparation import Prepared, prepared
 from ..lti.riccati import control_care, control_dare, solve_care, solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from .controller import Controller, SolvedController, required_stability, with_left_out
 from .hinf.singular import made_regular, missing_ranks
+from .preparation import Prepared, posed, prepared, require_reach
 from .structured.judges import require_finite_h2
-from .synthesis_plants import posed, require_reach
 
 #: the H2 norm by the closed loop's Gramians and by the formula of the least cost agree to this
 AGREEMENT = 1e-5

@@ -21,7 +21,6 @@ from ...errors import (
 )
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
-from ...lti.preparation import Prepared, departure_from_normal, prepared
 from ...lti.responses import remembered, responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
@@ -36,7 +35,7 @@ from ..controller import (
     with_left_out,
 )
 from ..lmi.lmi_programs import Lmi
-from ..synthesis_plants import posed, require_reach
+from ..preparation import Prepared, departure_from_normal, posed, prepared, require_reach
 from .hinf_riccati import Riccati, require_shown
 from .lower_bound import pointwise_bound, raised_bound
 from .mode_channels import ModeChannel, mode_channels, rebalanced, tolerated, with_mode_channels

@@ -15,13 +15,12 @@ from ...errors import AssumptionError, FlexplantError, InfeasibleError, ModelErr
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
-from ...lti.preparation import Prepared
 from ...lti.responses import responses
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
 from ...tolerances import ROUNDING, SPLIT
 from ..controller import SolvedController
-from ..synthesis_plants import beyond_rounding
+from ..preparation import Prepared, beyond_rounding
 from .lower_bound import is_indefinite, parrott
 from .singular import LEVELS, Regularised, made_regular, missing_ranks, require_ranks
 

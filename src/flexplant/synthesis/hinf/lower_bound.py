@@ -13,10 +13,10 @@ from ...errors import SolverError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.frequency_sweep import highest, resonance_grid
 from ...lti.joining import axis_zeros
-from ...lti.preparation import Prepared
 from ...lti.responses import responses
 from ...lti.statespace import StateSpace
 from ...tolerances import divisor
+from ..preparation import Prepared
 
 #: points of the sweep, and times that it is refined
 _POINTS, _REFINEMENTS = 200, 2

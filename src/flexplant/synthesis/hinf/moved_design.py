@@ -1,25 +1,26 @@
-"""One H-infinity controller for all positions of a machine that moves."""
+"""The plants of a machine that moves, and one H-infinity controller for all its positions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ...checks import FloatArray
-from ...errors import CertificateError, FlexplantError, SolverError, attempted, counted
+from ...checks import FloatArray, mapping, number
+from ...errors import CertificateError, FlexplantError, ModelError, SolverError, attempted, counted
 from ...lti.frequency import frequency_response
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
-from ...lti.preparation import prepared
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, tick
-from ...plant import StandardPlant
+from ...plant import StandardPlant, standard_plant
 from ...plant.uncertainty.opening import with_channels
+from ...tolerances import SAME
 from ..controller import Controller
-from ..synthesis_plants import PlantRange
+from ..preparation import prepared
 from .lower_bound import pointwise_bound
 
 #: size of the channels beside the whole motion, where the search begins: they are for complex
@@ -31,6 +32,77 @@ _STEPS = 4
 _DESIGNS, _MOST = "designs over the positions", 5 + 4 * _STEPS
 #: rows and columns that change by less, relative to the largest, do not move
 _STILL = 1e-9
+
+
+@dataclass(frozen=True)
+class PlantRange:
+    """Plants of one machine at several positions: same channels, rate and states."""
+
+    places: FloatArray
+    plants: list[StandardPlant]
+
+    @classmethod
+    def of(cls, given: Mapping[float, Any]) -> PlantRange:
+        """Return the plants of a mapping {position: plant}."""
+        hint = "Pass {0.0: plant, 0.1: other}, the same model with its ports at each position."
+        entries = mapping(given, "plant", hint, least=1)
+        known = {number(x, "a position"): standard_plant(one) for x, one in entries.items()}
+        if len(known) < len(entries):
+            raise ModelError(f"positions of plant must differ, got {list(entries)}. {hint}")
+        places = np.array(sorted(known))
+        found = cls(places, [known[x] for x in places.tolist()])
+        first = found.plants[0]
+        for x, one in zip(places, found.plants, strict=True):
+            same = all(getattr(one, side) == getattr(first, side) for side in "wuzy")
+            if not same or not np.isclose(one.dt, first.dt, rtol=SAME, atol=0.0):
+                raise ModelError(
+                    f"the plant at {x:g} has other channels or another rate than that at "
+                    f"{places[0]:g}: no controller could move from one to the other. Assemble all "
+                    "with the same names and rate."
+                )
+            if one.system.n_states != first.system.n_states:
+                raise ModelError(
+                    f"the plant at {x:g} has {one.system.n_states} states, that at {places[0]:g} "
+                    f"has {first.system.n_states}: where only ports move the model is one. "
+                    "Assemble all of the same modes."
+                )
+        return found
+
+    def at(self, x: float) -> StandardPlant:
+        """Return the plant at a position, its matrices linear between those given."""
+        known = np.flatnonzero(self.places == x)
+        if known.size:
+            return self.plants[int(known[0])]
+        i = int(np.clip(np.searchsorted(self.places, x) - 1, 0, len(self.places) - 2))
+        (before, after), (a, b) = self.places[i : i + 2], [p.system for p in self.plants[i : i + 2]]
+        part = (x - before) / (after - before)
+        mixed = {m: (1.0 - part) * getattr(a, m) + part * getattr(b, m) for m in "ABCD"}
+        sides = {side: getattr(self.plants[0], side) for side in "wuzy"}
+        return StandardPlant.from_statespace(a.replace(**mixed, blocks=None), **sides)
+
+    def certified(
+        self, norm_of: Callable[[StandardPlant], float], norms: Sequence[float]
+    ) -> dict[str, float]:
+        """Return the norm at each position, the worst one, and the worst half way between two."""
+        found = {f"norm at {x:.6g}": norm for x, norm in zip(self.places, norms, strict=True)}
+        found["worst position"] = float(self.places[int(np.argmax(norms))])
+        worst = (0.0, np.nan)
+        for x in self.middles.tolist():
+            try:
+                worst = max(worst, (norm_of(self.at(x)), x))
+            except CertificateError as error:
+                raise CertificateError(
+                    f"at {x:.6g}, between the positions designed for: {error} Give plants at more "
+                    "positions."
+                ) from error
+        if self.middles.size:
+            found |= {"norm between positions": worst[0], "worst position between": worst[1]}
+        return found
+
+    @property
+    def middles(self) -> FloatArray:
+        """The positions half way between those given."""
+        return np.asarray(0.5 * (self.places[1:] + self.places[:-1]))
 
 
 def over_positions(

@@ -13,9 +13,9 @@ from ...checks import FloatArray
 from ...errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
-from ...lti.preparation import Prepared, normalised
 from ...lti.statespace import StateSpace
 from ..controller import SolvedController
+from ..preparation import Prepared, normalised
 
 #: a direction of D12 or D21 that is smaller is missing (in a prepared problem the others are 1)
 _RANK = 0.5

@@ -16,13 +16,13 @@ from ...checks import FloatArray, Value, checked, positive, whole
 from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError, counted
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
-from ...lti.preparation import Prepared
 from ...lti.riccati import control_care, control_dare, solve_care, solve_dare
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, interruptible
 from ...tolerances import RANK, TINY, divisor
 from ..controller import SolvedController
 from ..hinf.lower_bound import pointwise_bound, raised_bound
+from ..preparation import Prepared
 
 #: A, B, C, D of a controller
 Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]

@@ -12,7 +12,6 @@ from ...errors import CertificateError, InfeasibleError, ModelError, SolverError
 from ...lti.equations import mean_speed, state_scale
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
-from ...lti.preparation import prepared
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
@@ -21,8 +20,8 @@ from ..controller import Controller, with_left_out
 from ..h2 import design_h2
 from ..hinf.hinf_design import design_hinf
 from ..hinf.hinf_riccati import Riccati
+from ..preparation import prepared, require_stabilisable
 from ..structured.judges import require_finite_h2
-from ..synthesis_plants import require_stabilisable
 from .lmi_programs import Plant, lqg_balanced
 from .objectives import H2, Hinf, ObjectivePrograms, PeakGain, PoleRegion
 

@@ -14,11 +14,11 @@ import numpy as np
 from ...checks import FloatArray, Value, between, checked, name_list, positive
 from ...errors import SolverError, require_known
 from ...lti.norms import h2_norm, peak_gain
-from ...lti.preparation import less_feedthrough
 from ...lti.responses import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
 from ...tolerances import TINY
+from ..preparation import less_feedthrough
 from ..structured.judges import GainJudge, H2Judge, Judge, PeakJudge, problem_on, require_finite_h2
 from .lmi_programs import (
     TOLERANCES,

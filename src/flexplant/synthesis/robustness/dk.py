@@ -22,7 +22,6 @@ from ...lti.discretisation import tustin
 from ...lti.filters import zpk
 from ...lti.frequency_sweep import largest_gains, resonance_grid
 from ...lti.interconnection import lft, series, side_by_side
-from ...lti.preparation import prepared
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
@@ -39,6 +38,7 @@ from ..hinf.mode_channels import (
     rebalanced,
     with_mode_channels,
 )
+from ..preparation import prepared
 from .mu import Cover
 from .uncertain_loop import (
     UncertainLoop,

@@ -15,11 +15,11 @@ from ...errors import AssumptionError
 from ...lti.frequency_sweep import climbed_grid, local_maxima, resonance_grid
 from ...lti.lyapunov import solve_lyapunov
 from ...lti.norms import peak_gain
-from ...lti.preparation import Prepared, prepared
 from ...lti.responses import responses
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
 from ...tolerances import ROUNDING, TINY
+from ..preparation import Prepared, prepared
 from .nonsmooth import Pieces
 
 #: a loop counts as stable with this decay, in the scaled unit of time

@@ -12,7 +12,6 @@ from ...certificates import stability_name
 from ...checks import MOST, FloatArray, Rng, generator, short, whole
 from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError
 from ...lti.interconnection import lft
-from ...lti.preparation import Prepared, prepared
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
@@ -25,8 +24,9 @@ from ..controller import (
     required_stability,
     with_left_out,
 )
+from ..hinf.moved_design import PlantRange
 from ..lmi.objectives import H2, Hinf
-from ..synthesis_plants import PlantRange, posed, require_reach
+from ..preparation import Prepared, posed, prepared, require_reach
 from .judges import DECAY, GainJudge, Judge, LoopObjective, Matrices, ScaledLoop
 from .nonsmooth import Pieces, bfgs, decrease_left, minimax
 from .structures import ControllerFamily, ControllerStructure, as_system

@@ -26,13 +26,13 @@ from ...errors import ModelError, ShapeError, attempted, counted, require_known
 from ...lti.balancing import balanced
 from ...lti.discretisation import bilinear, tustin
 from ...lti.joining import Matrices as LawMatrices
-from ...lti.preparation import Prepared
 from ...lti.riccati import control_care, solve_care
 from ...lti.statespace import StateSpace, System
 from ...plant import StandardPlant
 from ..hinf.hinf_design import design_hinf
 from ..laws.law import Law, LawElement, SingleElement, chained, decoupled
 from ..laws.loop_design import axes_of, checked_laws
+from ..preparation import Prepared
 from .judges import Matrices
 
 #: steps of a derivative by differences of fourth order, and their weights

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from flexplant.errors import ModelError
 from flexplant.lti import StateSpace
-from flexplant.lti.preparation import prepared
+from flexplant.synthesis.preparation import prepared
 from oracles_synthesis import closed_loop, gains, split, stability
 
 U, Y = ("u1", "u2"), ("y1", "y2")
