@@ -94,7 +94,9 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     """
     own, others_own = plant.assembled, larger.assembled
     small, big, ports = own.realisation, others_own.realisation, own.ports
-    kept, all_modes = _mode_blocks(small, ports), _mode_blocks(big, others_own.ports)
+    bare = structure_system(small, ports)
+    kept = _mode_blocks(small, bare)
+    all_modes = _mode_blocks(big, structure_system(big, others_own.ports))
     kept_omega, kept_static = kept.omega, kept.static
     genuine = np.setdiff1d(np.arange(kept_omega.size), _of_vectors(small))
     if genuine.size > all_modes.omega.size:
@@ -118,7 +120,8 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     read = plant.reading_gain[np.ix_(
         [plant.y.index(name) for name in sensors(plant)], [y.index(port.name) for port in ports.y]
     )]  # fmt: skip
-    quiet = _quiet(_with_flexibility(plant, flexibility), plant, plant.n_rigid + stand_ins)
+    fresh = _with_flexibility(plant, bare, flexibility)
+    quiet = _quiet(fresh, plant, plant.n_rigid + stand_ins)
     return LeftOut(
         others + big.n_rigid + 1,
         read @ covariance[nz:, nz:] @ read.T,
@@ -143,8 +146,9 @@ class _Blocks:
         return np.asarray(np.sqrt(np.abs(np.prod(self.poles, axis=1))))
 
 
-def _mode_blocks(realisation: ModalRealisation, ports: Ports) -> _Blocks:
-    g, r = structure_system(realisation, ports), realisation.n_rigid
+def _mode_blocks(realisation: ModalRealisation, g: StateSpace) -> _Blocks:
+    """Return the elastic modes of a structure that is g between its ports."""
+    r = realisation.n_rigid
     n = g.n_states // 2 - r
     A, B, C = g.A[2 * r :, 2 * r :], g.B[2 * r :], g.C[:, 2 * r :]
     if realisation.coupling is None:
@@ -232,10 +236,11 @@ def _siso_response(part: StateSpace | None, at: ComplexArray) -> ComplexArray:
     return np.array([part.evaluated(s)[0, 0] for s in at])
 
 
-def _with_flexibility(plant: StandardPlant, flexibility: FloatArray) -> StandardPlant:
-    """Return a plant whose motions (p, m) also answer forces at once, sampled alike."""
+def _with_flexibility(
+    plant: StandardPlant, bare: StateSpace, flexibility: FloatArray
+) -> StandardPlant:
+    """Return a plant whose structure's motions (p, m) also answer forces at once, sampled alike."""
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
-    bare = structure_system(realisation, ports)
     physical = with_filters(bare.replace(D=bare.D + flexibility), realisation, ports)
     direct = [p for p in ports.u if p.asd > 0 and (p.filter is None or np.any(p.filter.D))]
     if direct:  # white noise has no value at an instant that a compliance could follow

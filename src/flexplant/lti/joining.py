@@ -222,6 +222,14 @@ def uncoupled_run(A: FloatArray, blocks: Sequence[int]) -> tuple[int, int, Seque
     return begin, end, sizes[np.searchsorted(starts, begin) : last + 1].tolist()
 
 
+def block_diagonal(pairs: FloatArray) -> FloatArray:
+    """Return the (2 b, 2 b) matrix with the (b, 2, 2) blocks on its diagonal."""
+    b = pairs.shape[0]
+    matrix = np.zeros((b, 2, b, 2))
+    matrix[np.arange(b), :, np.arange(b), :] = pairs
+    return matrix.reshape(2 * b, 2 * b)
+
+
 def checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:
     """Return block sizes as a tuple; ShapeError unless A is block upper triangular with them."""
     hint = "Pass whole numbers, or blocks=None."

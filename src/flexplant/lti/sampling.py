@@ -323,14 +323,6 @@ def uncoupled_pairs(A: FloatArray) -> FloatArray | None:
     return pairs if np.count_nonzero(A) == np.count_nonzero(pairs) else None
 
 
-def block_diagonal(pairs: FloatArray) -> FloatArray:
-    """Return the (2 b, 2 b) matrix with the (b, 2, 2) blocks on its diagonal."""
-    b = pairs.shape[0]
-    matrix = np.zeros((b, 2, b, 2))
-    matrix[np.arange(b), :, np.arange(b), :] = pairs
-    return matrix.reshape(2 * b, 2 * b)
-
-
 def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
     """Return ``e^(A h)`` and ``int_0^h e^(A s) ds`` of (b, 2, 2) blocks, both (b, 2, 2)."""
     # with m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so

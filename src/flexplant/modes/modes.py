@@ -24,6 +24,7 @@ from ..labels import DofSet, Place
 from ..structure.definite import signed_square
 from ..structure.rigid import Placed, relative_miss
 from .matching import pair_modes
+from .normal_form import pole_pairs
 
 #: places at which shapes of two meshes are compared, at most
 _PLACES = 300
@@ -531,13 +532,3 @@ class Modes(Placed, Value):
         """
         motion: FloatArray | ComplexArray = self.dofs.row(place, direction) @ self.phi
         return motion
-
-
-def pole_pairs(omega: FloatArray, zeta: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return both poles (k,) of modes ``p'' + 2 zeta |omega| p' + omega |omega| p = 0``."""
-    # the first is that in the upper half plane, or the one that grows
-    size, unstable = np.abs(omega), omega < 0
-    root = np.sqrt((zeta**2 - np.where(unstable, -1.0, 1.0)).astype(np.complex128))
-    root = np.where(root.imag < 0, root.conj(), root)
-    first, second = size * (-zeta + root), size * (-zeta - root)
-    return first.astype(np.complex128), second.astype(np.complex128)

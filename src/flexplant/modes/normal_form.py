@@ -283,6 +283,16 @@ def _first_frequency(omega: FloatArray) -> float:
     return float(above[0]) if above.size else 0.0
 
 
+def pole_pairs(omega: FloatArray, zeta: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+    """Return both poles (k,) of modes ``p'' + 2 zeta |omega| p' + omega |omega| p = 0``."""
+    # the first is that in the upper half plane, or the one that grows
+    size, unstable = np.abs(omega), omega < 0
+    root = np.sqrt((zeta**2 - np.where(unstable, -1.0, 1.0)).astype(np.complex128))
+    root = np.where(root.imag < 0, root.conj(), root)
+    first, second = size * (-zeta + root), size * (-zeta - root)
+    return first.astype(np.complex128), second.astype(np.complex128)
+
+
 #: eigenvalues closer than this (relative) have no eigenvectors of their own
 _CLUSTER = 1e-7
 #: what modes may leave, relative

@@ -12,7 +12,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, Value
 from ..errors import AssumptionError, unknown_label
-from ..lti.sampling import block_diagonal
+from ..lti.joining import block_diagonal
 from ..tolerances import SAME, TINY
 from .partition import Partition
 from .reach_and_sight import Assumption, full_ranks, no_zeros, reach_and_sight, response_at

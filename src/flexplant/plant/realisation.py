@@ -12,13 +12,11 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray, Value, checked, instance, positive
 from ..errors import ModelError, SolverError, warn
 from ..labels import Place
-from ..lti.sampling import block_diagonal
+from ..lti.joining import block_diagonal
 from ..modes import Modes, NormalForm
-from ..modes.modes import pole_pairs
-from ..modes.normal_form import PROPORTIONAL, RealForm, modal, real_form
+from ..modes.normal_form import PROPORTIONAL, RealForm, modal, pole_pairs, real_form
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..structure.definite import signed_square
 from ..structure.rigid import Structure as Structure
 from ..tolerances import SAME, TINY
 
@@ -251,7 +249,7 @@ def _real(
     scale = np.where(size > 0, size, size[rigid:].min(initial=np.inf) if size[rigid:].size else 1.0)
     pairs = np.zeros((b, 2, 2))
     pairs[:, 0, 1] = scale
-    pairs[:, 1, 0] = -signed_square(omega) / scale
+    pairs[:, 1, 0] = -omega * size / scale
     pairs[:, 1, 1] = -2.0 * zeta * size
     inputs, outputs = np.zeros((n, b, 2)), np.zeros((n, b, 2))
     inputs[:, :, 1] = phi

@@ -11,7 +11,7 @@ from ..checks import FloatArray, IntArray, Value, checked, name_list, positive, 
 from ..errors import ModelError, aligned, counted
 from ..labels import Place
 from ..lti.balancing import hankel_values
-from ..lti.sampling import block_diagonal
+from ..lti.joining import block_diagonal
 from ..lti.statespace import StateSpace
 from ..modes.modes import Modes
 from ..modes.statics import labels_of, places

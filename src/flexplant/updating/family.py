@@ -535,15 +535,6 @@ def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntAr
     return found
 
 
-def measured_pairs(
-    psi: ComplexArray, psi_poles: ComplexArray, X: ComplexArray, poles: ComplexArray
-) -> IntArray:
-    """Return for each measured mode the column of the model's, one to one."""
-    # minimises the sum of `1 - MAC + |ln(f_j / f_i)|` over the pairs
-    far = np.abs(np.log(np.abs(poles) / np.abs(psi_poles)[:, None]))
-    return assigned(far - mac_matrix(psi, X))
-
-
 def _match_cluster(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:
     """Return the new modes of a cluster in the order of its old ones."""
     s, new = old.size, np.sort(new)

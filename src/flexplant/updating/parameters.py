@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import FloatArray, Matrix, Value, real_array, short, with_deviation
-from ..errors import LabelError, ModelError, require_known
+from ..checks import FloatArray, Matrix, Value, instance, real_array, short, with_deviation
+from ..errors import LabelError, ModelError, ShapeError, require_known
 from ..labels import DIRECTIONS, Place
 from ..reduction import ReducedModel
 from ..structure import FEModel
@@ -267,3 +267,32 @@ def checked_prior(value: Any, name: str) -> tuple[float, float] | None:
             "that is known exactly belongs to the model."
         )
     return mean, std
+
+
+def checked_parameters(parameters: Any) -> tuple[Parameter, ...]:
+    """Return the parameters as a tuple, checked."""
+    listed = tuple(parameters) if isinstance(parameters, Sequence) else (parameters,)
+    if not listed:
+        raise ModelError("parameters is empty: there is nothing to update.")
+    for parameter in listed:
+        instance(parameter, Parameter, "a parameter", "Pass [AddedMass('41:z')], say.")
+    names = [parameter.name for parameter in listed]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise LabelError(
+            f"{twice} appear more than once: only their sum could be seen. Drop all but one."
+        )
+    return listed
+
+
+def checked_values(values: Any, parameters: Sequence[Parameter], name: str) -> FloatArray:
+    """Return one value for each parameter, zeros when none are given."""
+    if values is None:
+        return np.zeros(len(parameters))
+    array = real_array(values, name)
+    if array.shape != (len(parameters),):
+        raise ShapeError(
+            f"{name} needs one value for each of {', '.join(p.name for p in parameters)}, got "
+            f"shape {array.shape}. Pass a list."
+        )
+    return array

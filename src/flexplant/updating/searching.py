@@ -22,13 +22,12 @@ from ..tolerances import TINY, divisor
 from .changed_model import changed_model
 from .family import Point
 from .judgement.goodness import chance, chi_square, is_bad
-from .parameters import PointParameter
+from .parameters import PointParameter, checked_values
 from .residuals.frf_residual import FrfResidual
 from .residuals.modal_residuals import Eigenvalues, ModeShapes
 from .residuals.residual import Residual
 from .search import Objective, SearchEnd, TrustRegion
 from .search.objective import SearchPlan, Trail
-from .sensitivities import checked_values
 from .update_result import Starts
 
 #: the end of a search, or why there is none

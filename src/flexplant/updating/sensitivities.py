@@ -9,11 +9,11 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value, instance, real_array, several, short
-from ..errors import LabelError, ModelError, ShapeError, counted
+from ..checks import ComplexArray, FloatArray, Value, several, short
+from ..errors import LabelError, ModelError, counted
 from ..tolerances import divisor
 from .family import Eigen, Family, Point, repeated_groups
-from .parameters import Parameter
+from .parameters import Parameter, checked_parameters, checked_values
 from .residuals.modal_residuals import BoundEigenvalues
 
 #: what turns exactly repeated modes to the vectors in which a change of parameters splits them; and
@@ -161,35 +161,6 @@ def mode_columns(modes: Any, eigen: Eigen) -> list[int]:
                 "slope. Leave it out, or start from a spring that is not zero (start=)."
             )
     return [int(number) - first for number in modes]
-
-
-def checked_parameters(parameters: Any) -> tuple[Parameter, ...]:
-    """Return the parameters as a tuple, checked."""
-    listed = tuple(parameters) if isinstance(parameters, Sequence) else (parameters,)
-    if not listed:
-        raise ModelError("parameters is empty: there is nothing to update.")
-    for parameter in listed:
-        instance(parameter, Parameter, "a parameter", "Pass [AddedMass('41:z')], say.")
-    names = [parameter.name for parameter in listed]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise LabelError(
-            f"{twice} appear more than once: only their sum could be seen. Drop all but one."
-        )
-    return listed
-
-
-def checked_values(values: Any, parameters: Sequence[Parameter], name: str) -> FloatArray:
-    """Return one value for each parameter, zeros when none are given."""
-    if values is None:
-        return np.zeros(len(parameters))
-    array = real_array(values, name)
-    if array.shape != (len(parameters),):
-        raise ShapeError(
-            f"{name} needs one value for each of {', '.join(p.name for p in parameters)}, got "
-            f"shape {array.shape}. Pass a list."
-        )
-    return array
 
 
 #: a parameter's effect below this share of what it could have is rounding

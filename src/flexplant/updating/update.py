@@ -15,13 +15,12 @@ from ..tolerances import TINY
 from .changed_model import MOST_ROUNDS, FullBasis, changed_model, is_large
 from .discrepancy import weigh_discrepancy
 from .judgement.goodness import chi_square, covariance, is_bad, worst
-from .parameters import Parameter
+from .parameters import Parameter, checked_parameters, checked_values
 from .residuals.modal_residuals import Eigenvalues
 from .residuals.residual import Residual
 from .search import Objective, SearchEnd, Secured, TrustRegion, UpdateMethod, checked_residuals
 from .search.objective import ITERATIONS, Defect, SearchPlan, unit_changes
 from .searching import all_starts, check_units, from_one_start, from_starts, summary
-from .sensitivities import checked_parameters, checked_values
 from .update_result import History, UpdateResult
 
 #: a parameter this close to its bound, relative to their distance, is at it

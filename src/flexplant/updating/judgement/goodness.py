@@ -14,9 +14,8 @@ from ...checks import FloatArray, Value
 from ...errors import counted
 from ...tolerances import TINY, divisor
 from ..family import Point, repeated_groups
-from ..parameters import Parameter
+from ..parameters import Parameter, checked_parameters, checked_values
 from ..search import Objective, checked_residuals
-from ..sensitivities import checked_parameters, checked_values
 
 #: a chi-square that noise exceeds more rarely than this is no noise
 CHANCE = 1e-4

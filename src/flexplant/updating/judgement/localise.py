@@ -14,9 +14,8 @@ from ...errors import ModelError, aligned, require_known, some_names, warn
 from ...parallel import Progress
 from ...structure.model import FEModel
 from ..changed_model import FullBasis
-from ..parameters import Parameter
+from ..parameters import Parameter, checked_parameters
 from ..search import Objective, checked_residuals
-from ..sensitivities import checked_parameters
 from .goodness import chance, is_bad
 from .subsets import Subsets
 

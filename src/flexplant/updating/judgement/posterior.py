@@ -11,9 +11,8 @@ import numpy as np
 from ...checks import FloatArray, Rng, Value, between, generator
 from ...errors import ModelError
 from ...parallel import Progress
-from ..parameters import Parameter
+from ..parameters import Parameter, checked_parameters
 from ..search import Objective, checked_residuals
-from ..sensitivities import checked_parameters
 from ..update_result import UpdateResult
 
 #: stretch of the moves

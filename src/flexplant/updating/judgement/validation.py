@@ -15,13 +15,12 @@ from ...identification import MeasuredModes
 from ...modes import matching
 from ...sparse.symmetric import dense
 from ..family import Point
-from ..parameters import Parameter
+from ..parameters import Parameter, checked_parameters
 from ..residuals.frf_residual import FrfResidual
 from ..residuals.modal_residuals import ModeShapes
 from ..residuals.residual import Residual
 from ..search import Objective, checked_residuals
 from ..search.objective import UpdateMethod, compared_modes
-from ..sensitivities import checked_parameters
 from ..update import update
 from ..update_result import UpdateResult
 from .goodness import chance, is_bad

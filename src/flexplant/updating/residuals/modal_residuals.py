@@ -23,9 +23,9 @@ from ...checks import (
 from ...errors import LabelError, ModelError, ShapeError, counted, require_known
 from ...identification import MeasuredModes
 from ...labels import DIRECTIONS, Place
-from ...modes.matching import clusters
+from ...modes.matching import assigned, clusters, mac_matrix
 from ...tolerances import SAME, TYPED
-from ..family import CLUSTER, Family, Point, measured_pairs
+from ..family import CLUSTER, Family, Point
 from ..parameters import named_place
 from .residual import Bound, Kind, Residual, channel_places, place_rows, split_parts
 
@@ -364,9 +364,9 @@ class BoundShapes(Bound):
         if not self.assign:
             return point
         eigen = point.eigen
-        columns = measured_pairs(
-            self.psi.astype(complex), self.poles, self.rows @ eigen.X, eigen.poles
-        )
+        # one to one, the sum of `1 - MAC + |ln(f_j / f_i)|` over the pairs being least
+        far = np.abs(np.log(np.abs(eigen.poles) / np.abs(self.poles)[:, None]))
+        columns = assigned(far - mac_matrix(self.psi.astype(complex), self.rows @ eigen.X))
         labels = point.labels.copy()
         for i, column in enumerate(columns.tolist()):
             here = np.flatnonzero(labels == self.numbers[i])
