@@ -10,8 +10,8 @@ import oracles_structure as oracle
 from flexplant import DofSet, load
 from flexplant.errors import ModelError, ShapeError, SolverError
 from flexplant.sparse.factor import is_positive_definite, negative_pivots, symmetric_lu
+from flexplant.sparse.symmetric import orthonormalised
 from flexplant.structure import FEModel, ModalDamping, Rayleigh
-from flexplant.structure.rigid import orthonormalised
 from plates import make_plate
 
 CHAIN = DofSet([1, 2, 3], ["x"] * 3, [[0, 0, 0], [1, 0, 0], [2, 0, 0]])

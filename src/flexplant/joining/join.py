@@ -18,9 +18,9 @@ from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
 from ..modes.statics import static_response
 from ..reduction import ReducedModel
-from ..sparse.symmetric import dense
+from ..sparse.symmetric import dense, orthonormalised
 from ..structure import FEModel
-from ..structure.rigid import SPANNED, orthonormalised, rigid_body_basis
+from ..structure.rigid import SPANNED, rigid_body_basis
 from ..tolerances import TINY, divisor
 from .component import Component, JoinedShape, Model, Pose, components_of
 from .frf_coupling import joined_frfs

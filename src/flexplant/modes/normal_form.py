@@ -12,9 +12,8 @@ import scipy.sparse as sp
 
 from ..checks import ComplexArray, FloatArray, IntArray, Matrix, Value, real_array, whole
 from ..errors import ModelError, SolverError, counted
-from ..sparse.symmetric import dense
+from ..sparse.symmetric import dense, orthonormalised
 from ..structure.definite import elastic_modes, signed_square
-from ..structure.rigid import orthonormalised
 from ..tolerances import SAME, divisor
 from .matching import runs
 

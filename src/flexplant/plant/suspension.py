@@ -15,8 +15,9 @@ from ..labels import Place
 from ..modes import Modes, normal_form
 from ..modes.matching import runs
 from ..reduction import ReducedModel
+from ..sparse.symmetric import orthonormalised
 from ..structure import Damper, FEModel, Spring
-from ..structure.rigid import SPANNED, orthonormalised
+from ..structure.rigid import SPANNED
 from ..tolerances import divisor
 from .port import checked_place, port_direction
 from .realisation import realise

@@ -27,9 +27,10 @@ from ..modes.modes import Modes, calibrated_matrices, measured_poles
 from ..modes.normal_form import normal_form
 from ..modes.solve import leaving_overdamped
 from ..parallel import Progress
+from ..sparse.symmetric import orthonormalised
 from ..structure import FEModel
 from ..structure.definite import refuse_unstable, unstable_stiffness
-from ..structure.rigid import SPANNED, orthonormalised, relative_miss, rigid_motions
+from ..structure.rigid import SPANNED, relative_miss, rigid_motions
 from .judging import ReductionQuality, quality_of
 from .ranking import ErrorBound
 

@@ -10,7 +10,8 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..checks import FloatArray, IntArray, Matrix
-from ..tolerances import divisor
+from ..errors import ModelError
+from ..tolerances import SAME, divisor
 
 #: stored zeros are left out for products where fewer entries than this part are none
 _FULL = 0.8
@@ -77,6 +78,15 @@ def without_zeros(matrix: Any) -> Any:
     kept = given.copy()
     kept.eliminate_zeros()
     return kept
+
+
+def matrix_sum(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:
+    """Return the sum of two matrices, sparse where the first one is, of which any may be None."""
+    if matrix is None or change is None:
+        return change if matrix is None else matrix
+    if sp.issparse(matrix):
+        return sp.csc_array(matrix + sp.csc_array(change))
+    return np.asarray(matrix + change, dtype=np.float64)
 
 
 def diagonal(matrix: Matrix) -> FloatArray:
@@ -200,3 +210,41 @@ def beyond(M: Any, V: FloatArray, part: FloatArray, *, dependent: float = _DEPEN
     new = new - V @ (V.T @ np.asarray(M @ new))
     factor = la.cholesky(new.T @ np.asarray(M @ new), lower=True)
     return np.asarray(la.solve_triangular(factor, new.T, lower=True).T)
+
+
+def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -> FloatArray:
+    """Return the M-orthonormal vectors of a basis, in order, by Gram-Schmidt done twice."""
+    done = np.zeros((basis.shape[0], 0))
+    loaded = np.zeros((basis.shape[0], 0))  # M done, for as few products with M as possible
+    for i in range(basis.shape[1]):
+        vector = basis[:, i]
+        length = _mass_norm(M, vector) if vector.any() else 0.0
+        if length:
+            for _ in range(2):
+                vector = vector - done @ (loaded.T @ vector)
+        left = _mass_norm(M, vector) if length else 0.0
+        if left <= SAME * length:
+            if dependent == "drop":
+                continue
+            raise ModelError(
+                f"vector {i + 1} of a basis depends on those before it "
+                f"(M-norm {left:.3g} of {length:.3g} is left): give independent vectors."
+            )
+        vector = vector / left
+        # once more, now that rounding of the normalisation shows
+        vector = vector - done @ (loaded.T @ vector)
+        forces = np.asarray(M @ vector)
+        size = np.sqrt(vector @ forces)
+        done = np.column_stack([done, vector / size])
+        loaded = np.column_stack([loaded, forces / size])
+    return done
+
+
+def _mass_norm(M: Matrix, vector: FloatArray) -> float:
+    square = float(vector @ np.asarray(M @ vector))
+    if square < 0:
+        raise ModelError(
+            f"M is not positive definite: a motion has the inertia {square:.3g}. Look for a sign, "
+            "or for a negative added mass that is larger than what it is added to."
+        )
+    return float(np.sqrt(square))

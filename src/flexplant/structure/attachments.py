@@ -12,7 +12,6 @@ import scipy.sparse as sp
 from ..checks import (
     FloatArray,
     IntArray,
-    Matrix,
     Value,
     checked,
     floats_of,
@@ -233,15 +232,6 @@ def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.c
         spread = sp.hstack(columns, format="csc")
         found[name] = sp.csc_array(spread @ sp.diags_array(signs[name]) @ spread.T)
     return found
-
-
-def matrix_sum(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:
-    """Return the sum of two matrices, sparse where the first one is, of which any may be None."""
-    if matrix is None or change is None:
-        return change if matrix is None else matrix
-    if sp.issparse(matrix):
-        return sp.csc_array(matrix + sp.csc_array(change))
-    return np.asarray(matrix + change, dtype=np.float64)
 
 
 def _stretch(part: Spring | Damper, dofs: DofSet) -> FloatArray:

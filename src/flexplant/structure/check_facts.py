@@ -12,12 +12,12 @@ from ..checks import FloatArray, IntArray
 from ..errors import ModelError, SolverError
 from ..sparse.factor import is_positive_definite
 from ..sparse.lowest import Lowest, lowest_modes
-from ..sparse.symmetric import PRECISION, ZERO, by_rows, diagonal, unit_diagonal
+from ..sparse.symmetric import PRECISION, ZERO, by_rows, diagonal, orthonormalised, unit_diagonal
 from ..tolerances import SAME, divisor
 from .definite import are_rigid, are_swapped, unstable_stiffness
 from .matrices import FEMatrices
 from .model import FEModel
-from .rigid import RigidMass, farness, orthonormalised, pieces, rigid_mass, rigid_motions, unheld
+from .rigid import RigidMass, farness, pieces, rigid_mass, rigid_motions, unheld
 from .singular_mass import empty_rows, massless_dofs, null_motions
 from .zero_energy import ZeroEnergy, loss, nonrigid, own_motions, shown_digits, zero_energy
 

@@ -15,8 +15,8 @@ from ..checks import FloatArray, Matrix, Value, frozen, instance, real_array
 from ..errors import ModelError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
-from ..sparse.symmetric import with_pattern_of
-from .attachments import HeldShape, Part, added_matrices, matrix_sum
+from ..sparse.symmetric import matrix_sum, orthonormalised, with_pattern_of
+from .attachments import HeldShape, Part, added_matrices
 from .damping import Damping, Rayleigh, damping_matrix
 from .definite import (
     MatrixLike,
@@ -27,7 +27,7 @@ from .definite import (
     unstable_stiffness,
     without_inertia,
 )
-from .rigid import Placed, body_motions, force_parts, orthonormalised, rigid_body_basis
+from .rigid import Placed, body_motions, force_parts, rigid_body_basis
 from .units import units
 from .zero_energy import digits_of, endangered, held_by_rounding
 

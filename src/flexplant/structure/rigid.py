@@ -12,11 +12,11 @@ import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
 from ..checks import FloatArray, IntArray, Matrix, real_array
-from ..errors import ModelError, SolverError
+from ..errors import SolverError
 from ..labels import DIRECTIONS, DofSet, Place
 from ..sparse.lowest import definite_solver
-from ..sparse.symmetric import PRECISION, ZERO, Absolute, by_rows, diagonal
-from ..tolerances import SAME, divisor
+from ..sparse.symmetric import PRECISION, ZERO, Absolute, by_rows, diagonal, orthonormalised
+from ..tolerances import divisor
 
 #: times the usual rounding of a row: a force larger than this is of a spring
 _OUTLIER = 30.0
@@ -357,44 +357,6 @@ def _null_vectors(
         if whole.shape[1] >= null.shape[1]:
             break
     return whole
-
-
-def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -> FloatArray:
-    """Return the M-orthonormal vectors of a basis, in order, by Gram-Schmidt done twice."""
-    done = np.zeros((basis.shape[0], 0))
-    loaded = np.zeros((basis.shape[0], 0))  # M done, for as few products with M as possible
-    for i in range(basis.shape[1]):
-        vector = basis[:, i]
-        length = _mass_norm(M, vector) if vector.any() else 0.0
-        if length:
-            for _ in range(2):
-                vector = vector - done @ (loaded.T @ vector)
-        left = _mass_norm(M, vector) if length else 0.0
-        if left <= SAME * length:
-            if dependent == "drop":
-                continue
-            raise ModelError(
-                f"vector {i + 1} of the rigid-body basis depends on those before it "
-                f"(M-norm {left:.3g} of {length:.3g} is left): give independent vectors."
-            )
-        vector = vector / left
-        # once more, now that rounding of the normalisation shows
-        vector = vector - done @ (loaded.T @ vector)
-        forces = np.asarray(M @ vector)
-        size = np.sqrt(vector @ forces)
-        done = np.column_stack([done, vector / size])
-        loaded = np.column_stack([loaded, forces / size])
-    return done
-
-
-def _mass_norm(M: Matrix, vector: FloatArray) -> float:
-    square = float(vector @ np.asarray(M @ vector))
-    if square < 0:
-        raise ModelError(
-            f"M is not positive definite: a rigid-body motion has the inertia {square:.3g}. Look "
-            "for a sign, or for a negative added mass that is larger than what it is added to."
-        )
-    return float(np.sqrt(square))
 
 
 @dataclass(frozen=True)

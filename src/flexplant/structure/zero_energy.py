@@ -13,9 +13,9 @@ from ..checks import FloatArray, IntArray, real_array
 from ..errors import ModelError, SolverError, attempted
 from ..labels import DIRECTIONS, DofSet
 from ..sparse.lowest import Lowest, lowest_modes
-from ..sparse.symmetric import PRECISION, ZERO, dense, diagonal
+from ..sparse.symmetric import PRECISION, ZERO, dense, diagonal, orthonormalised
 from ..tolerances import divisor
-from .rigid import ASIDE, bodies, farness, force_free, free_motions, orthonormalised, rigid_motions
+from .rigid import ASIDE, bodies, farness, force_free, free_motions, rigid_motions
 
 #: a motion is in the space of others when less than this part of it is left over
 _LEFT = 1e-6

@@ -14,11 +14,9 @@ from ..modes import solve_modes
 from ..modes.dynamic_basis import static_shapes
 from ..modes.normal_form import RIGID_DRAG
 from ..reduction import ReducedModel
-from ..sparse.symmetric import beyond
-from ..structure.attachments import matrix_sum
+from ..sparse.symmetric import beyond, matrix_sum, orthonormalised
 from ..structure.definite import why_indefinite
 from ..structure.model import FEModel
-from ..structure.rigid import orthonormalised
 from .family import Family, Point, pair
 from .parameters import Parameter, PointParameter
 from .residuals.residual import Residual

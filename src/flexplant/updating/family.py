@@ -16,9 +16,8 @@ from scipy.sparse.csgraph import connected_components
 from ..checks import ComplexArray, FloatArray, IntArray
 from ..errors import ModelError
 from ..modes.matching import assigned, clusters, in_span, mac_matrix
-from ..sparse.symmetric import dense
+from ..sparse.symmetric import dense, orthonormalised
 from ..structure.definite import elastic_modes, refuse_unstable
-from ..structure.rigid import orthonormalised
 from .parameters import Parameter
 
 #: modes whose eigenvalues differ by less than this, relatively, count as exactly repeated

@@ -13,8 +13,7 @@ import scipy.sparse as sp
 from ...checks import MOST_DRAWS, FloatArray, Value, generator, mapping, number, whole
 from ...errors import FlexplantWarning, ModelError, counted, require_known
 from ...lti.statespace import StateSpace, as_statespace
-from ...sparse.symmetric import dense
-from ...structure.rigid import orthonormalised
+from ...sparse.symmetric import dense, orthonormalised
 from ...updating import UpdateResult
 from ...updating.parameters import Parameter
 from ..building import P, rebuilt, sampled
