@@ -196,6 +196,19 @@ def test_indefinite_r_discrete():
     assert np.abs(la.eigvals(A - sol.gain @ C)).max() < 1
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_that_the_outputs_show_in_full_leaves_the_mirrored_zeros(seed):
+    """D square: Q - S R^-1 S' is rounding, the poles are the zeros of w -> y, all made stable."""
+    rng = np.random.default_rng(seed)
+    A, B, C, D = (rng.normal(size=shape) for shape in ((8, 8), (8, 2), (2, 8), (2, 2)))
+    zeros = la.eigvals(A - B @ np.linalg.solve(D, C))
+    assert np.any(zeros.real > 0)
+    found = solve_care(A, C, Q=B @ B.T, R=D @ D.T, S=B @ D.T)
+    mirrored = np.where(zeros.real > 0, -zeros.conj(), zeros)
+    poles, wanted = np.sort_complex(found.poles), np.sort_complex(mirrored)
+    np.testing.assert_allclose(poles, wanted, rtol=1e-6)
+
+
 def test_hamiltonian_with_axis_eigenvalues_is_refused():
     # gamma below the smallest possible one: eigenvalues of the Hamiltonian on the axis
     A, B, C = np.array([[-1.0]]), np.array([[1.0, 0.0]]), np.array([[1.0]])
