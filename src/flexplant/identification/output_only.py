@@ -141,7 +141,9 @@ def identify_output_only(
             bases.append(la.svd((parts * mean - one) / (parts - 1)))
         best: tuple[OrderPoles, FloatArray, Any] | None = None
         for result in results:
-            found = _those(result, chosen)
+            away = np.abs(chosen[:, None] - result.poles) / np.abs(chosen)[:, None]
+            like = assigned(away, most=SAME)
+            found = result.select(np.sort(like[like >= 0]))
             if found.poles.size <= (0 if best is None else best[2].size):
                 continue
             again = (
@@ -195,13 +197,6 @@ def _order_poles(
     chosen = np.flatnonzero(right)[np.argsort(freq[right], kind="stable")]
     shapes = shapes[:, chosen] / np.linalg.norm(shapes[:, chosen], axis=0)
     return OrderPoles(order, poles[chosen], shapes, np.ones((1, chosen.size), complex))
-
-
-def _those(result: OrderPoles, chosen: ComplexArray) -> OrderPoles:
-    """Return those poles of an order that are near chosen ones, one for each."""
-    moved = np.abs(chosen[:, None] - result.poles) / np.abs(chosen)[:, None]
-    near = np.unique([int(np.argmin(row)) for row in moved if row.size and row.min() < SAME])
-    return result.select(near.astype(np.int64))
 
 
 def _jackknife(found: OrderPoles, again: list[OrderPoles]) -> tuple[FloatArray, Any]:

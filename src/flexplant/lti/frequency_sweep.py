@@ -23,8 +23,9 @@ UNDAMPED = 1e-12
 NARROWEST = 1e-8
 #: local maxima that are climbed at most, and the part of the highest that each has at least
 _PEAKS, _HIGH = 6, 0.5
-#: a bracket and its inner points; a maximum that gains less than this part is found
+#: a bracket, inner points of its halves and of all of it; a maximum that gains less is found
 _ASIDE, _EIGHTHS, _GAIN = np.array([-1, 0, 1]), np.arange(1, 8) / 8.0, 1e-9
+_SIXTEENTHS = np.arange(1, 16) / 16.0
 #: relative accuracy of the frequencies of crossings: margins there are right to nine digits
 _ACCURATE = 1e-12
 #: around a resonance, in units of its half-power half-width: for a curve that is drawn through
@@ -184,20 +185,15 @@ def _tops(values: FloatArray) -> IntArray:
     return np.asarray(tops[values[tops] >= _HIGH * values.max(initial=0.0)])
 
 
-def _between(grid: FloatArray, tops: IntArray, parts: int = 8) -> FloatArray:
-    """Return new frequencies between the neighbours of some points."""
-    left, right = grid[np.maximum(tops - 1, 0)], grid[np.minimum(tops + 1, grid.size - 1)]
-    share = np.arange(1, 2 * parts) / (2 * parts)
-    return np.setdiff1d((left[:, None] + (right - left)[:, None] * share).ravel(), grid)
-
-
 def climbed_grid(
     find: Callable[[FloatArray], FloatArray], grid: FloatArray, rounds: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return frequencies and values of a function of them, refined where it is highest."""
     values = find(grid)
     for _ in range(rounds):
-        fresh = _between(grid, _tops(values))
+        left, _, right = np.clip(_tops(values) + _ASIDE[:, None], 0, grid.size - 1)
+        inside = grid[left] + (grid[right] - grid[left]) * _SIXTEENTHS[:, None]
+        fresh = np.setdiff1d(inside, grid)
         both = np.concatenate([grid, fresh])
         order = np.argsort(both)
         grid, values = both[order], np.concatenate([values, find(fresh)])[order]

@@ -93,7 +93,8 @@ def pair_modes(
     score = alike.copy()
     for members in spans:
         if members.size > 1:
-            score[members] = _span_share(gram[np.ix_(members, members)], cross[members], other_size)
+            inside = _orthonormal_map(gram[np.ix_(members, members)]).conj().T @ cross[members]
+            score[members] = np.sum(np.abs(inside) ** 2, axis=0) / other_size
     partner = _by_shape(freq, other_freq, score, n_rigid)
     rows = np.arange(freq.size)
     mac = np.where(partner >= 0, alike[rows, partner], 0.0)
@@ -123,12 +124,6 @@ def _by_shape(
         found = assigned(_FREQUENCY * np.minimum(np.abs(np.log(ratio)), 1.0) - score[r:, r:])
         partner[r:] = np.where(found >= 0, found + r, -1)
     return partner
-
-
-def _span_share(gram: Any, cross: Any, other_size: FloatArray) -> FloatArray:
-    """Return how much of each of the other model's shapes lies in the span of a cluster (k,)."""
-    inside = _orthonormal_map(gram).conj().T @ cross
-    return np.asarray(np.sum(np.abs(inside) ** 2, axis=0) / other_size)
 
 
 def _orthonormal_map(gram: Any) -> Any:
