@@ -39,12 +39,6 @@ class ScheduledLoop(Value):
     ------
     LabelError, ModelError
         When controllers differ in channels or states, or places do not increase.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> fx.loop.ScheduledLoop.__name__
-    'ScheduledLoop'
     """
 
     position: str

@@ -181,7 +181,8 @@ class Partition(Value):
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed, checked like a new one.
 
-        Of a sampled plant of a structure the noise of each sample follows `asd`.
+        Of a sampled plant of a structure the noise of each sample follows `asd`. Its ports keep
+        their densities, which other ports and placement take: change those, `with_ports`, for them.
         """
         asd = changes.get("asd")
         if asd is not None and self.dt and "origin" not in changes and self.is_assembled:
