@@ -71,7 +71,7 @@ def main(dofs: int = 100_000) -> dict[str, Any]:
     took("reduction")
     plant = fx.assemble_plant(rom, PORTS).discretized(RATE, delay=1)
     observer = fx.design_kalman(plant)
-    servo = fx.design_servo(plant, bandwidth=50.0, observer=observer)
+    servo = fx.design_servo(plant, bandwidth=25.0, observer=observer)
     loop = fx.close_loop(plant, observer, servo)
     took("loop")
     return {"model": model, "modes": modes, "rom": rom, "loop": loop, "seconds": seconds}

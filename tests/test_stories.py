@@ -126,7 +126,7 @@ def test_million_dofs_with_fewer(example):
     # Ritz bounds from above; a mesh of 32 x 32 elements is converged to 1e-3
     np.testing.assert_allclose(error, [-0.0014, -0.0097, -0.0065, -0.0064, -0.0064], atol=1e-4)
     assert result["modes"].n_rigid == 3
-    assert result["loop"].is_stable
+    assert result["loop"].modulus_margin > 0.5
     said = story.table(result)
     assert said.startswith("3267 DOFs")
     assert "none missing" in said
