@@ -60,7 +60,7 @@ def test_a_story_is_its_text_pictures_and_cells():
     assert "``python examples/wafer_stage.py`` draws" in site.story(path, [])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_site(tmp_path):
     pytest.importorskip("pdoc")
     command = [sys.executable, "-m", "flexplant.documentation", str(tmp_path)]

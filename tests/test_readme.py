@@ -94,7 +94,7 @@ tip = fx.Poi("tip", at=[1.0, 0, 0], axes=["x"])
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_its_scripts_pass_strict_type_checks(tmp_path):
     """Lists where arrays are held, one name or several; dask's own functions have no types.
 

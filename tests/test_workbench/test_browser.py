@@ -72,6 +72,7 @@ def overflow(page):
     return page.evaluate("document.documentElement.scrollWidth - window.innerWidth")
 
 
+@pytest.mark.long
 def test_a_loop_is_shaped_in_a_browser(browser, served, plant, tmp_path):
     """Slid, typed, a notch on a mode of 0.1 %, dragged, exported, compiled, reloaded."""
     tab = Tab(browser, served.url)
@@ -216,6 +217,7 @@ def handle_of(page, freq):
     return [float(v) for v in found]
 
 
+@pytest.mark.long
 def test_two_tabs_and_a_closed_one(browser, served):
     one, two = Tab(browser, served.url), Tab(browser, served.url, 800)
     before = two.figure("crossover")
@@ -288,6 +290,7 @@ def test_from_the_shell_until_ctrl_c(tmp_path):
             process.kill()
 
 
+@pytest.mark.long
 def test_a_fleet_of_coupled_axes(browser):
     """Its verdict in words, another axis, another machine, in a narrow window."""
     first = coupled(2, count=600)
