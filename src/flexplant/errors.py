@@ -106,11 +106,12 @@ def some_names(names: Sequence[str], most: int = 6) -> str:
 
 def aligned(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """Return a table: names (the first column, and what has no head) flush left, others right."""
-    cells = [tuple(head), *map(tuple, rows)]
-    wide = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    side = ["<" if not i or not name else ">" for i, name in enumerate(head)]
-    form = "  ".join(f"{{:{at}{width}}}" for at, width in zip(side, wide, strict=True))
-    return [form.format(*row).rstrip() for row in cells]
+    columns = list(zip(head, *rows, strict=True))
+    columns = [column for column in columns if any(column[1:])] or columns  # none of empty cells
+    sides = ["<" if not i or not column[0] else ">" for i, column in enumerate(columns)]
+    wide = [max(map(len, column)) for column in columns]
+    form = "  ".join(f"{{:{side}{width}}}" for side, width in zip(sides, wide, strict=True))
+    return [form.format(*row).rstrip() for row in zip(*columns, strict=True)]
 
 
 def short(value: Any) -> str:

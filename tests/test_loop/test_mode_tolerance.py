@@ -138,6 +138,7 @@ def test_what_is_known_of_a_mode_stands_beside_its_tolerance():
         beside = loop().mode_tolerances(known=plant().uncertain(frequency={mode: 0.01}))
     assert beside.critical == (mode,)
     assert "known to" in repr(beside) and "!" in repr(beside)
+    assert "known to" not in repr(found)  # a column of nothing is left out
     np.testing.assert_array_equal(beside.stable, found.stable)
     assert loop().mode_tolerances(known=1e-7).critical == ()
     assert str(mode) in found.summary and "leads to" in found.summary

@@ -383,7 +383,7 @@ class ModeTolerances(Value):
         rows = []
         for i in np.argsort(self.least, kind="stable")[:_SHOWN]:
             row = [_percent(ends, self.limit[i]) for ends in (self.within[i], self.stable[i])]
-            own = "?" if self.known is None else f"{100 * self.known[i]:.2g} %"
+            own = "" if self.known is None else f"{100 * self.known[i]:.2g} %"
             mark = "!" if self.modes[i] in self.critical else ""
             rows.append((str(self.modes[i]), f"{self.freq[i]:.5g}", *row, own, mark))
         lines += [f"  {line}" for line in aligned(head, rows)]
