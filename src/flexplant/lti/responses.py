@@ -122,37 +122,20 @@ def _solver(g: Part) -> tuple[Solver, int, int]:
     return _among_others(g, first, end, blocks), CHUNK // (m + 2), PARTS
 
 
-class ModalPairs(NamedTuple):
-    """Blocks ``m I + N`` (b of them) with ``N^2 = q I`` (Cayley-Hamilton), and their B and C.
-
-    m is half the trace: the poles are m +- q^(1/2), as exact as the block. Of one state: N = 0.
-    """
-
-    mean: FloatArray
-    N: FloatArray
-    q: FloatArray
-    B: FloatArray  # (b, 2, m)
-    C: FloatArray  # (b, 2, p)
-
-
-def _modal_pairs(g: Part) -> ModalPairs:
+def _modal(g: Part) -> Solver:
+    """Block-diagonal A: one real matrix product of residues and scalar functions of frequency."""
+    # blocks m I + N with N^2 = q I (Cayley-Hamilton), m half the trace:
+    # `(s I - A)^-1 = ((s - m) I + N) / ((s - m)^2 - q)`: no cancellation near s = m,
+    # which matters for slow modes of a sampled system. Complex numbers are pairs of real columns,
+    # so that no complex product is formed
     pairs, slots = diagonal_blocks(g.A, g.blocks or ())
-    real = slots >= 0
     mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
     N = pairs.copy()
     N[:, 0, 0] = 0.5 * (pairs[:, 0, 0] - pairs[:, 1, 1])
     N[:, 1, 1] = -N[:, 0, 0]
     q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
-    C = (g.C[:, slots] * real).transpose(1, 2, 0)
-    return ModalPairs(mean, N, q, g.B[slots] * real[:, :, None], C)
-
-
-def _modal(g: Part) -> Solver:
-    """Block-diagonal A: one real matrix product of residues and scalar functions of frequency."""
-    # `(s I - A)^-1 = ((s - m) I + N) / ((s - m)^2 - q)` of each block: no cancellation near s = m,
-    # which matters for slow modes of a sampled system. Complex numbers are pairs of real columns,
-    # so that no complex product is formed
-    mean, N, q, B, C = _modal_pairs(g)
+    real = slots >= 0
+    B, C = g.B[slots] * real[:, :, None], (g.C[:, slots] * real).transpose(1, 2, 0)
     split, swing = np.sqrt(np.maximum(q, 0.0)), np.sqrt(np.maximum(-q, 0.0))
     channels = len(g.C) * g.B.shape[1]
     with_s = np.einsum("bip,bim->pmb", C, B).reshape(channels, -1)

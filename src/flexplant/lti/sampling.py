@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,10 @@ def held_exactly(
     late = positive(delay, "delay", zero=True) / positive(rate, "rate")
     some = range(len(g.inputs)) if delayed is None else g.input_index(delayed)
     return sample_and_hold(g, rate, dict.fromkeys([g.inputs[i] for i in some], late))[0]
+
+
+#: `e^(A t)` and `int_0^t e^(A s) ds B` of a time [s]
+HeldFlow: TypeAlias = Callable[[float], tuple[FloatArray, FloatArray]]
 
 
 class Late(NamedTuple):
@@ -73,7 +77,7 @@ def sample_and_hold(
     n, first = g.n_states, layout.first
     states = slice(first, first + n)
     units = state_scale(g.A, g.B, g.C) if n else np.ones(0)
-    held = HeldFlow(g, units)
+    held = _held_flow(g, units)
     A = np.zeros((layout.size, layout.size))
     B = np.zeros((layout.size, len(g.inputs)))
     C = np.zeros((len(g.outputs), layout.size))
@@ -159,16 +163,16 @@ class _Layout:
 
 def _flow_at(held: HeldFlow, inputs: Late, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return E(t), and the effects of the new and the old sample of each input."""
-    E, whole = held.at(t)
+    E, whole = held(t)
     new, old = whole.copy(), np.zeros_like(whole)
     for f in np.unique(inputs.fraction[inputs.fraction > 0]):
         columns = inputs.fraction == f
         if t <= f:
             new[:, columns], old[:, columns] = 0.0, whole[:, columns]
             continue
-        rest, late = held.at(t - float(f))
+        rest, late = held(t - float(f))
         new[:, columns] = late[:, columns]
-        old[:, columns] = rest @ held.at(float(f))[1][:, columns]
+        old[:, columns] = rest @ held(float(f))[1][:, columns]
     return E, new, old
 
 
@@ -285,23 +289,22 @@ class Flow:
         return accumulated_noise(self.at, force, time, self.rate)
 
 
-class HeldFlow:
-    """``e^(A t)`` and ``int_0^t e^(A s) ds B``: held inputs are states that stand still."""
+def _held_flow(g: StateSpace, units: FloatArray) -> HeldFlow:
+    """Return ``e^(A t)`` and ``int_0^t e^(A s) ds B`` of t: held inputs are states at rest."""
+    n, m = g.B.shape
+    grown = np.pad(g.A, (0, m))
+    grown[:n, n:] = g.B
+    # inputs no larger than the rates: large units would make expm square too often
+    rate = float(np.abs(g.A * units / units[:, None]).max(initial=TINY))
+    drive = float(np.abs(g.B / units[:, None]).max(initial=rate))
+    both = np.append(units, np.full(m, np.exp2(np.floor(np.log2(rate / drive)))))
+    flow = Flow(grown, None if g.blocks is None else [*g.blocks, *[1] * m], both)
 
-    def __init__(self, g: StateSpace, units: FloatArray) -> None:
-        self.n, m = g.B.shape
-        grown = np.pad(g.A, (0, m))
-        grown[: self.n, self.n :] = g.B
-        # inputs no larger than the rates: large units would make expm square too often
-        rate = float(np.abs(g.A * units / units[:, None]).max(initial=TINY))
-        drive = float(np.abs(g.B / units[:, None]).max(initial=rate))
-        both = np.append(units, np.full(m, np.exp2(np.floor(np.log2(max(rate, TINY) / drive)))))
-        self.flow = Flow(grown, None if g.blocks is None else [*g.blocks, *[1] * m], both)
+    def at(time: float) -> tuple[FloatArray, FloatArray]:
+        E = flow.at(time)
+        return E[:n, :n], E[:n, n:]
 
-    def at(self, time: float) -> tuple[FloatArray, FloatArray]:
-        """Return both at one time."""
-        E = self.flow.at(time)
-        return E[: self.n, : self.n], E[: self.n, self.n :]
+    return at
 
 
 def acting(direct: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
