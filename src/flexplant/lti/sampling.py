@@ -14,7 +14,7 @@ from ..checks import FloatArray, IntArray, positive
 from ..errors import AssumptionError
 from ..tolerances import SAME, TINY, divisor
 from .equations import state_scale
-from .joining import diagonal_blocks, uncoupled_run
+from .joining import block_eigenvalues, diagonal_blocks, uncoupled_run
 from .lyapunov import compressed
 from .statespace import StateSpace
 
@@ -243,6 +243,8 @@ class Flow:
         if not self.modal:
             self.reached = acting(A != 0)
             return
+        if end - h == n:  # the norm of a block is up to twice its pole
+            self.rate = float(np.abs(block_eigenvalues(A, own)).max())
         pairs, slots = diagonal_blocks(A[h:end, h:end], own)
         self.pairs, self.h, self.t = pairs, h, n - end
         #: the two states of each mode; what one of one state lacks is behind all others
