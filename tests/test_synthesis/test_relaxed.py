@@ -7,7 +7,7 @@ import scipy.linalg as la
 from flexplant.lti import StateSpace
 from flexplant.synthesis import Lmi, design_hinf
 from flexplant.synthesis.hinf.lower_bound import (
-    full_information,
+    FullInformation,
     pointwise_bound,
     relaxed_bound,
     zero_bound,
@@ -83,13 +83,14 @@ def test_many_states():
 def test_what_is_reduced():
     """A chain of lags to the cost: each becomes the input of the one before it."""
     A, B, C, D = behind_lags(1.0, 1.0, 4)
-    found = full_information(A, B[:, :2], B[:, 2:], C[:2], D[:2, :2], D[:2, 2:])
+    parts = A, B[:, :2], B[:, 2:], C[:2], D[:2, :2], D[:2, 2:], np.eye(len(A))
+    found = FullInformation(*parts).regular()
     np.testing.assert_allclose(found.A, [[1.0]], atol=1e-12)
     assert abs(found.D12[0, 0]) < 1e-12 < abs(found.D12[1, 0])
     assert abs(found.B2[0, 0]) == pytest.approx(abs(found.D12[1, 0]))
     np.testing.assert_allclose(np.abs(found.T[:, 0]), np.eye(5)[0], atol=1e-12)
     # u that moves nothing and costs nothing is no input at all
-    none = full_information(A, B[:, :2], 0 * B[:, 2:], C[:2], D[:2, :2], D[:2, 2:])
+    none = FullInformation(*parts)._replace(B2=0 * parts[2]).regular()
     assert none.B2.shape[1] == 0 and none.A.shape == A.shape
 
 

@@ -21,7 +21,7 @@ from ...parallel import Progress
 from ...tolerances import ROUNDING, SPLIT
 from ..controller import SolvedController
 from ..preparation import Prepared, beyond_rounding
-from .lower_bound import is_indefinite, parrott
+from .lower_bound import are_coupled, both_sides, parrott
 from .singular import LEVELS, Regularised, made_regular, missing_ranks, require_ranks
 
 #: distances from the smallest gamma: 5 % of it cost 3 to 5 % of rms and 0.02 of margin; near it
@@ -146,7 +146,7 @@ class Riccati(Value):
         """Return the smallest gamma that bisection reached from 1, and the largest refuted one."""
         # reached: what the equations promise of a step is seen at the resonances of its loop
         high = 1.0
-        low = tried = min(_direct_bound(problem), high)
+        low = tried = min(high, max(one.direct for one in both_sides(problem)))
         for _ in range(_BISECTION):
             if high <= tried * (1.0 + self.tolerance) or high < _NOTHING:
                 break
@@ -213,13 +213,6 @@ def _open_size(problem: Prepared) -> float:
     return way + float(np.linalg.norm(problem.D11))
 
 
-def _direct_bound(problem: Prepared) -> float:
-    """Return the bound that the feedthrough alone puts on gamma (Glover and Doyle, (i))."""
-    D, m2, p2 = problem.D11, problem.B2.shape[1], problem.C2.shape[0]
-    parts = (D[: D.shape[0] - m2], D[:, : D.shape[1] - p2])
-    return max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts)
-
-
 def _bound_at(problem: Prepared, omega: float) -> float:
     """Return a lower bound of gamma at one frequency, 0 at an undamped pole."""
     try:
@@ -260,8 +253,9 @@ def _attempt(problem: Prepared, gamma: float) -> _Attempt:
     """Return the central controller for gamma, or why there is none."""
     # refuted means proved, not that the numerics failed: X or Y is indefinite, or rho(X Y) >
     # gamma^2
+    known, dual = both_sides(problem)
     try:
-        X, F, Y, H = riccati_solutions(problem, gamma)
+        (X, F), (Y, Ht) = known.solution(gamma), dual.solution(gamma)
     except OnAxisError as found:
         # these frequencies are witnesses: the bound there is gamma
         return _Attempt(
@@ -269,33 +263,12 @@ def _attempt(problem: Prepared, gamma: float) -> _Attempt:
         )
     except (la.LinAlgError, ValueError, SolverError):
         return _Attempt(None)
-    coupling = float(np.max(la.eigvals(X @ Y).real, initial=0.0))
-    speed = float(np.linalg.norm(problem.A)) or 1.0
-    sizes = (float(np.linalg.norm(part)) ** 2 / speed for part in (problem.C1, problem.B1))
-    # as accurate as X and Y are
-    if any(map(is_indefinite, (X, Y), sizes)) or coupling > gamma**2 * (1.0 + 1e-5):
+    if known.refutes(X) or dual.refutes(Y) or are_coupled(X, Y, gamma):
         return _Attempt(None, True)
     try:
-        return _Attempt(central(problem, gamma, X, F, Y, H))
+        return _Attempt(central(problem, gamma, X, F, Y, Ht.T))
     except (la.LinAlgError, FlexplantError):
         return _Attempt(None)
-
-
-# The formulas of Glover and Doyle: for prepared problems, D12 = [0; I] and D21 = [0, I]
-
-
-def riccati_solutions(
-    p: Prepared, gamma: float
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return X, F, Y, H of Glover and Doyle's two Riccati equations."""
-    m1, m2, p1, p2 = p.B1.shape[1], p.B2.shape[1], p.C1.shape[0], p.C2.shape[0]
-    B, C = np.hstack([p.B1, p.B2]), np.vstack([p.C1, p.C2])
-    row, column = np.hstack([p.D11, p.D12]), np.vstack([p.D11, p.D21])
-    R = row.T @ row - la.block_diag(gamma**2 * np.eye(m1), np.zeros((m2, m2)))
-    Rt = column @ column.T - la.block_diag(gamma**2 * np.eye(p1), np.zeros((p2, p2)))
-    X, F = stabilising(p.A, B, p.C1.T @ p.C1, R, p.C1.T @ row)
-    Y, Ht = stabilising(p.A.T, C.T, p.B1 @ p.B1.T, Rt, p.B1 @ column.T)
-    return X, F, Y, Ht.T
 
 
 def central(

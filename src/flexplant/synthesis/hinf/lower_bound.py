@@ -60,22 +60,13 @@ def pointwise_bound(problem: Prepared) -> float:
 
 def zero_bound(p: Prepared) -> float:
     """Return what no controller undercuts at the zeros of u -> z, and of w -> y, on the axis."""
-    return max(_bound_at_zeros(*side) for side in _sides(p))
+    return max(map(_bound_at_zeros, both_sides(p)))
 
 
-def _sides(p: Prepared) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
-    """Return A, B1, B2, C1, D11 and D12 of a problem, and those of its dual: what y is for u."""
-    return (
-        (p.A, p.B1, p.B2, p.C1, p.D11, p.D12),
-        (p.A.T, p.C1.T, p.C2.T, p.B1.T, p.D11.T, p.D21.T),
-    )
-
-
-def _bound_at_zeros(
-    A: FloatArray, B1: FloatArray, B2: FloatArray, C: FloatArray, D11: FloatArray, D12: FloatArray
-) -> float:
+def _bound_at_zeros(side: FullInformation) -> float:
     """Return the largest ``|x' B1 + z' D11| / |z|`` with ``[x' z'] [A - s I, B2; C, D12] = 0``."""
     # z' z(s) = (x' B1 + z' D11) w(s) in any stable loop: x' times the equation of motion added
+    A, B1, B2, C, D11, D12, _ = side
     n, outputs = A.shape[0], C.shape[0]
     # the pencil of fewer outputs than inputs loses rank where its transpose does
     tall = outputs >= B2.shape[1]
@@ -126,10 +117,9 @@ _WIDTH = 1e-3
 
 
 class FullInformation(NamedTuple):
-    """``x1' = A x1 + B1 w + B2 v``, ``z = C x1 + D11 w + D12 v``, D12 of full rank; x1 = T' x.
+    """``x1' = A x1 + B1 w + B2 v``, ``z = C x1 + D11 w + D12 v``, all states known; x1 = T' x.
 
-    Of a problem in which u moves some states at no cost: these are chosen freely, among the inputs
-    v. Whatever a controller does to the plant can be done here, so that no norm is larger.
+    Whatever a controller does to the plant can be done here, so that no norm is larger.
     """
 
     A: FloatArray
@@ -146,45 +136,59 @@ class FullInformation(NamedTuple):
         beyond = self.D11 - self.D12 @ np.linalg.lstsq(self.D12, self.D11, rcond=None)[0]
         return float(np.linalg.norm(beyond, 2)) if beyond.size else 0.0
 
+    def solution(self, gamma: float) -> tuple[FloatArray, FloatArray]:
+        """Return X and its gain: the sup over w of the inf over v of |z|^2 - |gamma w|^2 is x' X x.
+
+        D12 has full rank.
+        """
+        D, m1 = np.hstack([self.D11, self.D12]), self.D11.shape[1]
+        R = D.T @ D - la.block_diag(gamma**2 * np.eye(m1), np.zeros((len(D.T) - m1,) * 2))
+        B = np.hstack([self.B1, self.B2])
+        return stabilising(self.A, B, self.C.T @ self.C, R, self.C.T @ D)
+
     def value(self, gamma: float) -> FloatArray | None:
-        """Return X (n, n) of the game's value ``x' X x``, None where gamma is refuted."""
-        # the sup over w of the inf over v of `|z|^2 - gamma^2 |w|^2`, by a Riccati equation
+        """Return X (n, n) of x, None where gamma is refuted."""
         if gamma <= self.direct:
             return None
-        D = np.hstack([self.D11, self.D12])
-        m1 = self.D11.shape[1]
-        R = D.T @ D - la.block_diag(gamma**2 * np.eye(m1), np.zeros((len(D.T) - m1,) * 2))
-        X, _ = stabilising(
-            self.A, np.hstack([self.B1, self.B2]), self.C.T @ self.C, R, self.C.T @ D
-        )
-        speed = float(np.linalg.norm(self.A)) or 1.0
-        if is_indefinite(X, float(np.linalg.norm(self.C)) ** 2 / speed):
-            return None
-        return np.asarray(self.T @ X @ self.T.T)
+        X, _ = self.solution(gamma)
+        return None if self.refutes(X) else np.asarray(self.T @ X @ self.T.T)
+
+    def refutes(self, X: FloatArray) -> bool:
+        """Return whether a solution has a negative eigenvalue beyond rounding."""
+        values = la.eigvalsh(X) if X.size else np.zeros(1)
+        size = float(np.linalg.norm(self.C)) ** 2 / (float(np.linalg.norm(self.A)) or 1.0)
+        # an accurate X to 1e-6 of its size (the residual), and beyond what its equation rounds
+        return bool(values[0] < -1e-5 * max(values[-1], -values[0]) and values[0] < -1e-9 * size)
+
+    def regular(self) -> FullInformation:
+        """Return the problem in which D12 has full rank."""
+        # directions of u that z does not contain move some states at any speed at no cost: these
+        # states become inputs, with their columns of A and C; and again, until none is free
+        A, B1, B2, C, D11, D12, T = self
+        while B2.shape[1]:
+            sizes = np.linalg.norm(np.vstack([B2, D12]), axis=0)
+            B2, D12 = B2 / divisor(sizes), D12 / divisor(sizes)
+            _, values, turn = la.svd(D12, full_matrices=True)
+            rank = int(np.count_nonzero(values > _RANK))
+            if rank == D12.shape[1]:
+                break
+            free = B2 @ turn[rank:].T
+            basis, moved, _ = la.svd(free, full_matrices=True)
+            count = int(np.count_nonzero(moved > _RANK * max(np.max(moved, initial=0.0), 1.0)))
+            left, fast = basis[:, count:], basis[:, :count]
+            B2 = left.T @ np.hstack([A @ fast, B2 @ turn[:rank].T])
+            D12 = np.hstack([C @ fast, D12 @ turn[:rank].T])
+            A, B1, C, T = left.T @ A @ left, left.T @ B1, C @ left, T @ left
+        return FullInformation(A, B1, B2, C, D11, D12, T)
 
 
-def full_information(
-    A: FloatArray, B1: FloatArray, B2: FloatArray, C: FloatArray, D11: FloatArray, D12: FloatArray
-) -> FullInformation:
-    """Return the problem of a plant with all states known, in which D12 has full rank."""
-    # directions of u that z does not contain move some states at any speed at no cost: these states
-    # become inputs, with their columns of A and C; and again, until no direction is free
-    T = np.eye(A.shape[0])
-    while B2.shape[1]:
-        sizes = np.linalg.norm(np.vstack([B2, D12]), axis=0)
-        B2, D12 = B2 / divisor(sizes), D12 / divisor(sizes)
-        _, values, turn = la.svd(D12, full_matrices=True)
-        rank = int(np.count_nonzero(values > _RANK))
-        if rank == D12.shape[1]:
-            break
-        free = B2 @ turn[rank:].T
-        basis, moved, _ = la.svd(free, full_matrices=True)
-        count = int(np.count_nonzero(moved > _RANK * max(np.max(moved, initial=0.0), 1.0)))
-        left, fast = basis[:, count:], basis[:, :count]
-        B2 = left.T @ np.hstack([A @ fast, B2 @ turn[:rank].T])
-        D12 = np.hstack([C @ fast, D12 @ turn[:rank].T])
-        A, B1, C, T = left.T @ A @ left, left.T @ B1, C @ left, T @ left
-    return FullInformation(A, B1, B2, C, D11, D12, T)
+def both_sides(p: Prepared) -> tuple[FullInformation, FullInformation]:
+    """Return a problem with all states known, and its dual: what y is for u."""
+    T = np.eye(p.A.shape[0])
+    return (
+        FullInformation(p.A, p.B1, p.B2, p.C1, p.D11, p.D12, T),
+        FullInformation(p.A.T, p.C1.T, p.C2.T, p.B1.T, p.D11.T, p.D21.T, T),
+    )
 
 
 def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
@@ -193,7 +197,7 @@ def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
     # Their Riccati equations have solutions X and Y with rho(X Y) < gamma^2, which are at least the
     # values of the same problem with all states known and free states as inputs, and of its dual.
     # [Stoorvogel1992]_ (the two quadratic matrix inequalities of singular problems)
-    sides = [full_information(*side) for side in _sides(p)]
+    sides = [side.regular() for side in both_sides(p)]
     low = max(known, *(one.direct for one in sides))
     high = gamma
     for part in _PARTS:
@@ -224,12 +228,10 @@ def _refuted(sides: Sequence[FullInformation], gamma: float) -> bool:
         values.append(X)
     if len(values) < 2:
         return False
-    coupling = float(np.max(la.eigvals(values[0] @ values[1]).real, initial=0.0))
-    return coupling > gamma**2 * (1.0 + _BEYOND)
+    return are_coupled(values[0], values[1], gamma)
 
 
-def is_indefinite(X: FloatArray, size: float) -> bool:
-    """Return whether X has a negative eigenvalue beyond rounding; size is what X comes from."""
-    values = la.eigvalsh(X) if X.size else np.zeros(1)
-    # an accurate X to 1e-6 of its size (the residual), and beyond what its equation rounds
-    return bool(values[0] < -1e-5 * max(values[-1], -values[0]) and values[0] < -1e-9 * size)
+def are_coupled(X: FloatArray, Y: FloatArray, gamma: float) -> bool:
+    """Return whether rho(X Y) is above gamma^2, as far as X and Y are accurate."""
+    rho = float(np.max(la.eigvals(X @ Y).real, initial=0.0))
+    return rho > gamma**2 * (1.0 + _BEYOND)

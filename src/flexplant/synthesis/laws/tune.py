@@ -13,6 +13,7 @@ import scipy.linalg as la
 from ...checks import ComplexArray, FloatArray, IntArray, between, whole
 from ...errors import SolverError, warn
 from ...loop import in_axes
+from ...loop.broken import inverted
 from ...lti.frequency import Frf
 from ...lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ...lti.interconnection import loop_poles, series
@@ -303,7 +304,7 @@ class Coupling(NamedTuple):
         return Coupling(self.freq[rows], *parts, self.of)
 
     def _inverse(self, C: ComplexArray) -> ComplexArray:
-        return np.asarray(np.linalg.inv(np.eye(C.shape[1]) + self.inner * C[:, None, :]))
+        return inverted(-self.inner * C[:, None, :])
 
     def _sides(self, S: ComplexArray, C: ComplexArray) -> list[ComplexArray]:
         """Return S at u and y, ``I - before C S after G`` and ``I - G before C S after``."""
