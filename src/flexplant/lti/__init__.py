@@ -52,7 +52,6 @@ from .balancing import balanced as balanced
 from .balancing import hankel_norm as hankel_norm
 from .balancing import hankel_values as hankel_values
 from .balancing import norm_report as norm_report
-from .discretisation import discretized as discretized
 from .discretisation import tustin as tustin
 from .filters import highpass as highpass
 from .filters import inverse_sensitivity as inverse_sensitivity
@@ -90,6 +89,7 @@ from .riccati import control_care as control_care
 from .riccati import control_dare as control_dare
 from .riccati import solve_care as solve_care
 from .riccati import solve_dare as solve_dare
+from .sampling import discretized as discretized
 from .statespace import StateSpace as StateSpace
 from .statespace import as_statespace as as_statespace
 

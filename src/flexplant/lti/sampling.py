@@ -1,4 +1,4 @@
-"""Zero-order hold of systems whose channels have delays of their own: exact, noise included."""
+"""Zero-order hold: exact, with delays of channels and noise, at a rate that is judged."""
 
 from __future__ import annotations
 
@@ -10,13 +10,68 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..checks import FloatArray, IntArray, positive
-from ..errors import AssumptionError
+from ..checks import ComplexArray, FloatArray, IntArray, positive
+from ..errors import AssumptionError, ModelError, warn
 from ..tolerances import SAME, TINY, divisor
 from .equations import state_scale
 from .joining import block_eigenvalues, diagonal_blocks, uncoupled_run
 from .lyapunov import compressed
-from .statespace import StateSpace
+from .statespace import StateSpace, System, as_statespace
+
+
+def discretized(
+    sys: System, rate: float, *, delay: float = 0.0, delayed: Iterable[str] | None = None
+) -> StateSpace:
+    """Return the zero-order-hold equivalent at a rate, with the inputs delayed.
+
+    ``x[k+1] = e^(A h) x[k] + (int_0^h e^(A s) ds) B u[k - delay]``, h = 1 / rate; exact, also for
+    delays that are no multiple of h. Where A is block diagonal each block is done in closed form.
+
+    Parameters
+    ----------
+    sys : StateSpace
+        A continuous system.
+    rate : float [Hz]
+    delay : float [samples]
+        From the sampling of an input to its arrival; its integer part adds that many states per
+        delayed input, a fraction one more.
+    delayed : iterable of str, optional
+        The inputs that are delayed; all when not given.
+
+    Returns
+    -------
+    StateSpace
+        With dt = 1 / rate; states of `sys` first, then the delay lines `u1:delay1`, ...
+
+    Raises
+    ------
+    ModelError
+        When `sys` is sampled already, rate or delay is not positive, or plausible in another unit
+        only: the slowest mode lies far above half the rate, or a delay is next to nothing.
+
+    Warns
+    -----
+    FlexplantWarning
+        When all modes lie above half the rate.
+
+    References
+    ----------
+    [Franklin1998]_, section 4.3.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.discretized(fx.lti.tf([1.0], [1.0, 1.0]), rate=10.0).poles().real.round(6)  # exp(-0.1)
+    array([0.904837])
+    """
+    g = as_statespace(sys)
+    if g.dt and g.n_states:
+        raise ModelError(
+            f"{g!r} is sampled already: a rate cannot be changed exactly without the continuous "
+            "model. Discretise that one."
+        )
+    check_rate(light_modes(g.poles()), rate, delay)
+    return held_exactly(g, rate, delay=delay, delayed=delayed)
 
 
 def held_exactly(
@@ -415,3 +470,65 @@ def accumulated_noise(
     for k in range(doublings):
         G = compressed(np.hstack([G, at(piece * 2**k) @ G]))
     return G
+
+
+#: times half the rate: where even the lowest mode lies above this, the rate is in another unit
+_OTHER_UNIT = 10.0
+#: samples: a delay between 0 and this changes nothing that can be measured
+_NO_DELAY = 0.01
+#: samples: a delay beyond this is in another unit, of a loop, an actuator or a sensor
+_LONGEST = 1000.0
+#: damping ratio up to which a pole is a mode, not a filter
+_LIGHT = 0.3
+
+
+def check_rate(modes: FloatArray, rate: float, delay: float) -> None:
+    """Judge a sampling rate [Hz] by the elastic modes [Hz] of a system, and a delay by the rate."""
+    rate, delay = positive(rate, "rate"), positive(delay, "delay", zero=True)
+    if 0 < delay < _NO_DELAY:
+        raise ModelError(
+            f"delay={delay:g} is in samples, which here means {delay / rate:.3g} s and changes "
+            f"nothing. If {delay:g} s is meant, it is delay={delay * rate:.4g} at {rate:g} Hz."
+        )
+    if delay > _LONGEST:
+        raise ModelError(
+            f"delay={delay:g} is in samples, which here means {delay / rate:.3g} s: no loop runs "
+            f"that late. If {delay:g} us are meant, it is delay={1e-6 * delay * rate:.4g} at "
+            f"{rate:g} Hz."
+        )
+    if not modes.size or modes.min() <= 0.5 * rate:
+        return
+    said = (
+        f"all {modes.size} elastic modes, {modes.min():.4g} Hz and above, lie above "
+        f"half the sampling rate ({0.5 * rate:g} Hz): in its samples they look like slow ones. The "
+        "rate is in Hz"
+    )
+    if modes.min() > 0.5 * _OTHER_UNIT * rate:
+        raise ModelError(f"{said}{_meant(rate, float(modes.min()))}.")
+    said = f"{said}, the model in SI units: are both?"
+    warn(said)
+
+
+def _meant(rate: float, lowest: float) -> str:
+    """Return which other unit would bring the lowest mode below half the rate."""
+    if rate < 1 and 2 * lowest <= 1 / rate:
+        return f"; {rate:g} s as a sampling period is rate={1 / rate:g}"
+    if 2 * lowest <= 1e3 * rate:
+        return f"; {rate:g} kHz is rate={1e3 * rate:g}"
+    return ""
+
+
+def check_latency(name: str, latency: float, rate: float) -> None:
+    """Raise ModelError when the latency [s] of a port is more than 1000 samples."""
+    if latency * rate > _LONGEST:
+        raise ModelError(
+            f"the latency of {name!r} is {latency:g} s, {latency * rate:.4g} samples at {rate:g} "
+            f"Hz: latencies are in seconds. If {latency:g} samples are meant, it is "
+            f"latency={latency / rate:.4g}."
+        )
+
+
+def light_modes(poles: ComplexArray) -> FloatArray:
+    """Return the frequencies [Hz] of the lightly damped pairs among continuous poles [rad/s]."""
+    size = np.abs(poles)
+    return np.asarray(size[(poles.imag > 0) & (-poles.real < _LIGHT * size)] / (2.0 * np.pi))

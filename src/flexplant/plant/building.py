@@ -10,9 +10,16 @@ import numpy.typing as npt
 
 from ..checks import FloatArray, Value, instance, positive
 from ..errors import ModelError, counted, require_known
-from ..lti.discretisation import check_latency, check_rate, light_modes, tustin
+from ..lti.discretisation import tustin
 from ..lti.interconnection import among, append, series
-from ..lti.sampling import acting, held_exactly, sample_and_hold
+from ..lti.sampling import (
+    acting,
+    check_latency,
+    check_rate,
+    held_exactly,
+    light_modes,
+    sample_and_hold,
+)
 from ..lti.statespace import StateSpace, System, as_statespace, single_channel
 from ..modes import Modes
 from ..reduction import ReducedModel

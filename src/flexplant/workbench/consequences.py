@@ -17,8 +17,9 @@ import numpy as np
 from ..checks import FloatArray
 from ..errors import AssumptionError, FlexplantError, SolverError
 from ..loop import ClosedLoop, LoopReport, close_loop, report_loops
-from ..lti.discretisation import Recursion, discretized
+from ..lti.discretisation import Recursion
 from ..lti.interconnection import feedback, series
+from ..lti.sampling import discretized
 from ..parallel import bars_of_thread
 from ..plant import StandardPlant
 from ..simulation import simulate

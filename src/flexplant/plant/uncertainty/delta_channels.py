@@ -10,9 +10,10 @@ import scipy.linalg as la
 
 from ...checks import FloatArray
 from ...errors import CertificateError, ModelError
-from ...lti.discretisation import bilinear, discretized, tustin
+from ...lti.discretisation import bilinear, tustin
 from ...lti.equations import state_scale
 from ...lti.interconnection import lft
+from ...lti.sampling import discretized
 from ...lti.statespace import StateSpace
 from ...tolerances import TINY, divisor
 from .neglected import NeglectedModes, with_neglected
