@@ -396,10 +396,8 @@ def broken_bandwidth(parts: BrokenLoop) -> float:
 def first_crossing(
     freq: FloatArray, size: FloatArray, find: Callable[[FloatArray], FloatArray] | None
 ) -> float:
-    """Return where a size first rises to 1 from below [Hz], infinite where it stays below.
-
-    Between two points where it can be found there.
-    """
+    """Return where a size first rises to 1 from below [Hz], infinite where it stays below."""
+    # between two points where it can be found there
     beyond = np.flatnonzero((size >= 1.0) & np.logical_or.accumulate(size < 1.0))
     if not beyond.size:
         return float("inf")

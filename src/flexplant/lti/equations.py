@@ -251,10 +251,8 @@ def stabilising(
 def stable_subspace(
     A: FloatArray, G: FloatArray, Q: FloatArray, d: FloatArray, whole: FloatArray
 ) -> FloatArray:
-    """Return X of ``A'X + X A - X G X + Q = 0``, A - G X stable, by Laub's method [Laub1979]_.
-
-    From the stable subspace of the Hamiltonian, states x = d x_scaled. Q is a part of `whole`.
-    """
+    """Return X of ``A'X + X A - X G X + Q = 0``, A - G X stable, by Laub's method [Laub1979]_."""
+    # from the stable subspace of the Hamiltonian, states x = d x_scaled. Q is a part of `whole`
     # units of the states, and one of the adjoint states: still Hamiltonian
     parts = (A * d / d[:, None], G / d / d[:, None], Q * d * d[:, None], whole * d * d[:, None])
     inner, reach, cost, own = (float(np.linalg.norm(part)) for part in parts)

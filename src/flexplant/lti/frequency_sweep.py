@@ -206,10 +206,8 @@ def highest(
     rounds: int,
     values: FloatArray | None = None,
 ) -> tuple[float, float]:
-    """Return the largest value of a function of frequency, and its frequency [Hz].
-
-    `values` on the grid where these are known.
-    """
+    """Return the largest value of a function of frequency, and its frequency [Hz]."""
+    # `values` on the grid where these are known
     # brackets around the highest maxima are divided, until a parabola gains no more
     values = find(grid) if values is None else values
     ends = np.clip(_tops(values)[:, None] + _ASIDE, 0, grid.size - 1)
