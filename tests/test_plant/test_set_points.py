@@ -94,7 +94,7 @@ def test_feedforward_is_of_the_axis_that_is_named(plant, loop):
     arm = DIE[1] - L / 2  # the die, that stays where it is, is not the centre of gravity
     assert gains["rx"] == pytest.approx(MASS * L**2 / 12, rel=2e-3)
     assert gains["z"] == pytest.approx(-MASS * arm, rel=2e-3)
-    with pytest.raises(LabelError, match=r"one of the plant's references \['die:ref', 'die:rx"):
+    with pytest.raises(LabelError, match=r"there are 3 references \(die:ref, die:rx:ref"):
         fx.design_feedforward(plant)
     forced = fx.close_loop(plant, *loop.blocks, known_forces(plant))
     move = fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.05)
