@@ -431,7 +431,9 @@ def invariant_zeros(g: Any) -> ComplexArray:
     # input directly are states, and states of the rest. What is left is a regular pencil, whose
     # eigenvalues are the zeros; those at infinity have left with the compressed states.
     # [EmamiNaeiniVanDooren1982]_
-    A, B, C, D = _even(*_scaled_matrices(g))
+    A, B, C, D = _scaled_matrices(g)
+    d = state_scale(A, B, C) if A.size else np.ones(0)
+    A, B, C = A * d / d[:, None], B / d[:, None], C * d
     A, B, C, D = _full_rank_part(A, B, C, D)
     A, C, B, D = (part.T for part in _full_rank_part(A.T, C.T, B.T, D.T))
     n, m = B.shape
@@ -472,13 +474,6 @@ def _row_space(matrix: FloatArray, limit: float) -> tuple[FloatArray, int]:
         return np.eye(matrix.shape[0]), 0
     left, values, _ = np.linalg.svd(matrix)
     return left, int(np.sum(values > limit))
-
-
-def _even(
-    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    d = state_scale(A, B, C) if A.size else np.ones(0)
-    return A * d / d[:, None], B / d[:, None], C * d, D
 
 
 def axis_zeros(g: Any) -> ComplexArray:

@@ -218,15 +218,10 @@ def signed_square(omega: FloatArray) -> FloatArray:
     return np.asarray(omega * np.abs(omega))
 
 
-def rigid_shares(M: Any, motions: FloatArray, phi: FloatArray) -> FloatArray:
-    """Return the parts (k,) of the kinetic energy of M-orthonormal shapes in rigid-body motions."""
-    part = np.asarray(by_rows(M) @ motions).T @ phi
-    return np.asarray(np.sum(part**2, axis=0))
-
-
 def are_rigid(M: Any, motions: FloatArray, phi: FloatArray) -> np.ndarray:
     """Return which shapes (k,) are rigid-body motions but for 1 % of their kinetic energy."""
-    return np.asarray(rigid_shares(M, motions, phi) > _RIGID)
+    part = np.asarray(by_rows(M) @ motions).T @ phi
+    return np.asarray(np.sum(part**2, axis=0) > _RIGID)
 
 
 def unstable_stiffness(K: Any, motions: FloatArray) -> FloatArray:
