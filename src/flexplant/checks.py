@@ -28,6 +28,8 @@ IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 #: what seeds chance
 Rng: TypeAlias = int | np.random.SeedSequence | np.random.Generator | None
+#: lengths along the axes; None is any
+Shape: TypeAlias = tuple[int | None, ...]
 #: a (n, n) matrix, dense or sparse
 Matrix: TypeAlias = FloatArray | sp.csc_array
 #: draws, runs or machines in one call
@@ -59,7 +61,7 @@ def known_units(units: Any, names: Iterable[str]) -> dict[str, str]:
 def real_array(
     value: Any,
     name: str,
-    shape: tuple[int | None, ...] | None = None,
+    shape: Shape | None = None,
     *,
     limit: float = TOO_LARGE,
     copy: bool = True,
@@ -104,9 +106,7 @@ def _no_finite(array: npt.NDArray[Any], name: str, *, masked: bool) -> ModelErro
     )
 
 
-def complex_array(
-    value: Any, name: str, shape: tuple[int | None, ...] | None = None
-) -> ComplexArray:
+def complex_array(value: Any, name: str, shape: Shape | None = None) -> ComplexArray:
     """Return `value` as a finite complex128 array of the given shape (None: any length)."""
     array = _array_of(value, name)
     if np.iscomplexobj(array):
@@ -122,7 +122,12 @@ def complex_array(
     return np.array(parts, dtype=np.complex128)
 
 
-def floats(value: Any, name: str, shape: tuple[int | None, ...] | None = None) -> FloatArray:
+def real_or_complex(value: Any, name: str, shape: Shape | None = None) -> FloatArray | ComplexArray:
+    """Return `value` as a finite array of a shape, complex where it is given so."""
+    return (complex_array if np.iscomplexobj(value) else real_array)(value, name, shape)
+
+
+def floats(value: Any, name: str, shape: Shape | None = None) -> FloatArray:
     """Return real numbers as float64, of any shape, finite or not; masked entries are NaN."""
     # an array of float64 comes back itself, not a copy
     if type(value) is np.ndarray and value.dtype == np.float64:
@@ -169,12 +174,12 @@ def _holds_none(array: npt.NDArray[Any]) -> bool:
     return any(item is None or isinstance(item, str | bytes) for item in array.ravel())
 
 
-def _no_numbers(value: Any, name: str, shape: tuple[int | None, ...] | None) -> ModelError:
+def _no_numbers(value: Any, name: str, shape: Shape | None) -> ModelError:
     form = "be one number" if shape == () else "hold numbers"
     return ModelError(f"{name} must {form}, got {short(value)}. Pass numbers, in SI units.")
 
 
-def _shape_text(shape: tuple[int | None, ...]) -> str:
+def _shape_text(shape: Shape) -> str:
     """Return in words what a shape requires."""
     if not shape:
         return "be one number"
@@ -424,10 +429,21 @@ def below_half_rate(freq: Any, name: str, rate: float) -> float:
     return number
 
 
+def frequency_band(
+    band: Any, name: str = "band", least: float = 0.0, most: float = np.inf
+) -> tuple[float, float]:
+    """Return (low, high) [Hz], rising, of which some lies between two frequencies."""
+    low, high = real_array(band, name, (2,)).tolist()
+    if not 0 <= low < high or high < least or low > most:
+        where = f"{name} must be (low, high) in Hz, within {least:g} .. {most:g}"
+        raise ModelError(f"{where}, got ({low:g}, {high:g}). Give the lower end first.")
+    return low, high
+
+
 def positive_array(
     value: Any,
     name: str,
-    shape: tuple[int | None, ...] | None = None,
+    shape: Shape | None = None,
     *,
     hint: str = "Check its sign and its unit (SI).",
     zero: bool = False,
@@ -439,6 +455,18 @@ def positive_array(
         must = "must not be negative" if zero else "must be positive"
         raise ModelError(f"{name} {must}, got {least:g}. {hint}")
     return array
+
+
+def spread_array(value: Any, name: str, shape: tuple[int, ...]) -> FloatArray:
+    """Return positive numbers of a shape; one number, or fewer axes, is spread over it."""
+    given = positive_array(value, name)
+    try:
+        return np.broadcast_to(given, shape).copy()
+    except ValueError:
+        raise ShapeError(
+            f"{name} of shape {given.shape} does not spread to the data: {shape}. Pass one number, "
+            "or one for each."
+        ) from None
 
 
 def members(values: Any, kind: Any, name: str, hint: str, *, least: int = 1) -> tuple[Any, ...]:

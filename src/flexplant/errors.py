@@ -29,6 +29,22 @@ from typing import Any
 
 import numpy as np
 
+__all__ = [
+    "AssumptionError",
+    "CertificateError",
+    "FlexplantError",
+    "FlexplantWarning",
+    "InfeasibleError",
+    "LabelError",
+    "ModelError",
+    "ShapeError",
+    "SolverError",
+]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 class FlexplantError(Exception):
     """Base of all errors of this package.
@@ -226,10 +242,10 @@ def only_one(kind: str, names: Iterable[str], given: Any, how: str) -> str:
 
 
 def require_known(
-    kind: str, names: Iterable[object], known: Iterable[str], owner: str = ""
+    kind: str, names: Iterable[object], known: Iterable[object], owner: str = ""
 ) -> None:
     """Raise the LabelError of `unknown_label` for the first of some names that is not known."""
     listed = list(known)
     for name in names:
         if not isinstance(name, Hashable) or name not in listed:
-            raise unknown_label(kind, name, listed, owner)
+            raise unknown_label(kind, name, map(str, listed), owner)

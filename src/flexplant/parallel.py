@@ -154,7 +154,7 @@ def _send(
     keep: Callable[[int, Result], None],
 ) -> None:
     """Compute calls, each of which takes so many seconds, in chunks on an executor."""
-    size = max(1, round(CHUNK / max(seconds, 1e-9)))
+    size = max(1, round(CHUNK / max(seconds, 1e-9)))  # clocks have no finer tick
     chunks = [calls[i : i + size] for i in range(0, len(calls), size)]
     out = {i: (function, [call for _, call in chunk]) for i, chunk in enumerate(chunks)}
     for i, found in survived(_chunk, out, executor):
@@ -257,7 +257,7 @@ def _pooled(
                     del out[future]
                     again.add(number)
                     waiting.append(number)
-                sleep(CHUNK)  # its client forgets what it had, also what is sent too soon
+                sleep(CHUNK)  # its client drops what it had, also what is sent too soon
             for future in sorted(done & out.keys(), key=lambda one: out[one]):
                 number = out.pop(future)
                 error = future.exception()
@@ -499,6 +499,7 @@ class Progress:
         own = self.done - self._known
         if not self._total or own <= 0:
             return 0.0
+        # not done yet
         return max((monotonic() - self._begin) * (self._total - self.done) / own, 1e-9)
 
     def _say(self) -> None:

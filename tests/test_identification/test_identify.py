@@ -530,7 +530,7 @@ def test_bad_choices_are_refused():
         diagram.select(freq=[])
     with pytest.raises(ModelError, match="presence"):
         diagram.automatic(presence=1.5)
-    with pytest.raises(ShapeError, match="belong together"):
+    with pytest.raises(ShapeError, match="participation must have shape"):
         PoleSelection([-1 + 10j], [[1.0, 2.0]])
     with pytest.raises(ModelError, match="positive imaginary"):
         PoleSelection([-1 - 10j], [[1.0]])

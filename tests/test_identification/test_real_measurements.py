@@ -362,7 +362,7 @@ def test_default_orders_are_those_that_the_lines_afford():
 
 @pytest.mark.slow
 def test_a_costly_refinement_is_said_and_the_first_answer_is_near_it(monkeypatch, capsys):
-    monkeypatch.setattr("flexplant.identification.identification_stages.CHEAP", 10.0)
+    monkeypatch.setattr("flexplant.identification.identification_stages.UNASKED", 10.0)
     frf, truth = roving(0.0, 1)
     first = identify_modes(frf)
     assert not first.refined

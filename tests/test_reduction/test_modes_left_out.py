@@ -78,5 +78,5 @@ def test_refusals():
     with pytest.raises(ModelError, match="truncated modes are over"):
         model.replace(truncated=other)
     turned = model.truncated.replace(phi=model.truncated.phi + 0j)
-    with pytest.raises(ModelError, match="truncated modes are complex"):
+    with pytest.raises(ModelError, match="modes are complex"):
         model.replace(truncated=turned).completed()

@@ -265,7 +265,7 @@ def test_refusals(plate):
         model.quality(make_plate(elements=(3, 3)), band=BAND)
     with pytest.raises(ModelError, match="made of"):
         model.quality("plate", band=BAND)
-    with pytest.raises(ModelError, match="rising"):
+    with pytest.raises(ModelError, match="lower end first"):
         model.quality(plate, band=(5.0, 1.0))
     with pytest.raises(ModelError, match="whole number"):
         model.quality(plate, band=BAND, count="a")

@@ -79,7 +79,7 @@ def test_motions_between_nodes_are_those_of_one_polynomial():
     assert plate.dofs.row(at, "ry") @ w == pytest.approx(-2 - 10 * at[0] * at[1])
     with pytest.raises(LabelError, match="off the plate"):
         plate.dofs.row((0.7, 0.1, 0.0), "z")
-    with pytest.raises(LabelError, match="moves along"):
+    with pytest.raises(LabelError, match=r"no motion .x. in a plate"):
         plate.dofs.row(at, "x")
 
 
@@ -331,7 +331,7 @@ def test_a_second_size_is_its_own_machine():
     np.testing.assert_allclose(found, drawn, rtol=0.02)
     assert np.abs(found / drawn - 1.0).max() > 1e-3
     assert np.all(found > 1.2 * machine().poles(range(4, 10)).freq)
-    with pytest.raises(ModelError, match="two lengths"):
+    with pytest.raises(fx.ShapeError, match="size must "):
         fx.testbeds.wafer_stage(size=0.5)
     with pytest.raises(ModelError, match="thickness"):
         fx.testbeds.wafer_stage(thickness=0.0)

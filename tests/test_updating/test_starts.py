@@ -140,7 +140,7 @@ def test_a_start_from_which_no_end_is_found_is_said():
 def test_a_jump_of_the_cost_is_no_minimum():
     """Linear from there chi-square is 11.7 for 5 degrees of freedom, but no step goes there."""
     model, unknowns, data, truth = problem(307)
-    with pytest.warns(FlexplantWarning, match="no step lowers the error as its slopes promise"):
+    with pytest.warns(FlexplantWarning, match="no step lowers the error as its slopes predict"):
         alone = update(model, unknowns, [data], starts=1)
     assert not alone.converged
     fit = update(model, unknowns, [data])

@@ -58,7 +58,7 @@ _FOLLOWED = 1e-2
 #: condition of a sampled mode's eigenvectors above which its block is not diagonalised
 _DEFECTIVE = 1e6
 #: modulus of a sampled pole from which a mode counts as undamped
-_ON_CIRCLE = 1.0 - 1e-12
+ON_CIRCLE = 1.0 - 1e-12
 #: ``1 - |lambda|^2`` up to which it counts as hardly damped: it rings for 1e8 samples
 _HARDLY = 2e-8
 #: share of a variance from which such modes are named
@@ -258,7 +258,7 @@ def moving_parts(plant: StandardPlant) -> tuple[IntArray, IntArray]:
     if plant.is_assembled:
         states = plant.modal_states.reshape(-1, 2)
         blocks = g.A[states[:, :, None], states[:, None, :]]
-        undamped = np.abs(np.linalg.eigvals(blocks)).max(axis=1) >= _ON_CIRCLE
+        undamped = np.abs(np.linalg.eigvals(blocks)).max(axis=1) >= ON_CIRCLE
         undamped[: plant.n_rigid] = True
         kept = states[undamped].reshape(-1)
     reached = np.any(factor != 0, axis=1)
@@ -310,13 +310,13 @@ def _primal(joint: _Joint) -> FloatArray:
     cross = shifted_columns(A, values.conj(), entering * values.conj() + noise @ driven.conj().T)
     half = A @ cross @ coupling.conj().T
     entered = np.real(entering @ coupling.conj().T) + noise @ noise.T
-    own = _stein_solution(A, entered + np.real(half + half.conj().T), _state_sizes(joint))
+    own = _stein_solution(A, entered + np.real(half + half.conj().T), _observer_state_sizes(joint))
     see, keep = modes.seen(joint.E[:, :n]), joint.E[:, n:]
     total = np.sum((see @ inner + 2 * keep @ cross) * see.conj(), axis=1).real
     return np.asarray(total + np.sum((keep @ own) * keep, axis=1))
 
 
-def _state_sizes(joint: _Joint) -> FloatArray:
+def _observer_state_sizes(joint: _Joint) -> FloatArray:
     """Return the sizes of the observer's states by the sensor noise alone, powers of two."""
     # of all states alike, also of those that the POIs do not see: the dual's are their inverses
     A, noise = joint.A[joint.n_elastic :, joint.n_elastic :], joint.noise[joint.n_elastic :]
@@ -334,7 +334,7 @@ def _gain_trace(joint: _Joint) -> FloatArray:
     modes, A, coupling, driven, noise = joint.parts
     values, n = modes.poles, joint.n_elastic
     see, keep = modes.seen(joint.E[:, :n]), joint.E[:, n:]
-    sizes = 1.0 / _state_sizes(joint)
+    sizes = 1.0 / _observer_state_sizes(joint)
     own = np.array([_stein_solution(A.T, np.outer(row, row), sizes) for row in keep])
     right = A.T @ own @ coupling + keep[:, :, None] * see[:, None, :]
     # the columns of all rows side by side, by one Schur form

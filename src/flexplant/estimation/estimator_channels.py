@@ -182,7 +182,7 @@ def _time(records: Any, known: list[str], count: int, dt: float) -> FloatArray:
         return np.asarray(dt * np.arange(count))
     time = real_array(given, "time", (count,))
     steps = np.diff(time)
-    if steps.size and np.max(np.abs(steps - dt)) > 1e-3 * dt:
+    if steps.size and np.max(np.abs(steps - dt)) > 1e-3 * dt:  # clocks of recorders
         k = int(np.argmax(np.abs(steps - dt)))
         raise ModelError(
             f"the record goes from {time[k]:.9g} to {time[k + 1]:.9g} s in one sample, the samples "

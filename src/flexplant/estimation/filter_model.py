@@ -10,10 +10,12 @@ import numpy as np
 
 from ..certificates import Certificate
 from ..checks import FloatArray, IntArray, Value, real_array
-from ..errors import AssumptionError, CertificateError, ModelError, ShapeError, SolverError
+from ..errors import CertificateError, ModelError, ShapeError, SolverError
 from ..lti.lyapunov import difference_of, solve_stein, square_root
+from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..plant.partition import require_noise
 from ..tolerances import SAME
 from .estimator_channels import estimates, poi_channels, sensors
 from .left_out import LeftOut
@@ -164,13 +166,7 @@ def check_noises(plant: StandardPlant) -> None:
     """Raise AssumptionError for a sensor without noise, or one that white noise reaches at once."""
     _ = plant.noise_factor  # raises where it is not known
     read, own = sensors(plant), plant.sensor_noise.diagonal()
-    silent = [name for name in read if own[plant.y.index(name)] <= 0]
-    if silent:
-        raise AssumptionError(
-            f"sensors {', '.join(silent)} have no noise (asd 0): the filter would trust them "
-            "without limit and differentiate them. Give Sensor(..., asd=) what the data sheet "
-            "says, in m/sqrt(Hz)."
-        )
+    require_noise({name: own[plant.y.index(name)] for name in read})
     inner = plant.system
     loud = [
         name
@@ -180,12 +176,7 @@ def check_noises(plant: StandardPlant) -> None:
     direct = inner.D[np.ix_(inner.output_index(read), inner.input_index(loud))]
     if np.any(direct):
         row, column = (int(i) for i in np.argwhere(direct)[0])
-        raise AssumptionError(
-            f"white noise of {loud[column]!r} reaches {read[row]!r} at once (an "
-            "acceleration sensor, say), so a sample of it would have infinite variance. Measure "
-            "displacement or velocity, shape the disturbance, or let it be held over each sample: "
-            "Disturbance(..., held=True)."
-        )
+        raise reaches_at_once(loud[column], read[row])
 
 
 class Sight(NamedTuple):

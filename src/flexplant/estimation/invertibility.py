@@ -214,7 +214,7 @@ def _zeros(A: FloatArray, G: FloatArray, C: FloatArray, F: FloatArray, delay: in
     found: list[complex] = []
     for value in la.eigvals(inner):
         size_of = abs(value)
-        if size_of < 1 - 1e-5 or value.imag < -1e-9:
+        if size_of < 1 - 1e-5 or value.imag < -1e-9:  # well inside, or a conjugate
             continue
         near = 1.0 if abs(value - 1) < 1e-4 else value  # Jordan blocks come out at the root
         if abs(near) < 1 - _LIMIT or any(abs(near - other) < SPLIT for other in found):

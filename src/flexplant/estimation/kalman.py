@@ -111,13 +111,13 @@ def design_kalman(
         return observer.replace(
             certificate=certificate.replace(left_out=None if larger is None else 0)
         )
-    honest = error_variances(read_alike(plant, whole), observer.system)
+    complete = error_variances(read_alike(plant, whole), observer.system)
     certificate = certificate.replace(
-        difference=max(certificate.difference, honest.difference),
+        difference=max(certificate.difference, complete.difference),
         left_out=int(found.modes.size),
-        unresolved=unresolved_share(plant, whole, found.modes, observer.system, honest.values),
+        unresolved=unresolved_share(plant, whole, found.modes, observer.system, complete.values),
     )
-    return observer.replace(certificate=certificate, variances=honest.values)
+    return observer.replace(certificate=certificate, variances=complete.values)
 
 
 def redesigned(

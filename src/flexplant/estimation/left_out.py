@@ -26,7 +26,7 @@ from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
 from ..structure import FEModel
-from ..tolerances import TINY, divisor
+from ..tolerances import SAME, TINY, divisor
 from .error import error_variances
 from .estimator_channels import poi_channels, read_alike, sensors
 
@@ -270,8 +270,6 @@ _MOVES = ("x", "y", "z")
 _NONE = np.zeros(0, dtype=np.int64)
 #: where a realisation keeps the nodes per wavelength of its modes
 _KEPT = "_nodes"
-#: relative: nodes whose extent is less are in a plane, or on a line
-_FLAT = 1e-9
 #: an edge is of the mesh up to this length beside the mean at its ends: elements of 1 to 3
 _LONG = 2.0
 
@@ -290,7 +288,7 @@ def nodes_per_wavelength(
     count = np.count_nonzero(np.isin(dofs.directions, _MOVES))
     i, j = _mass_coupling(model) if isinstance(model, FEModel) else (_NONE, _NONE)
     if not i.size:  # masses are lumped, or not known
-        i, j = _side_by_side(dofs)
+        i, j = _neighbouring_translations(dofs)
     if not i.size or 4 * i.size > count * (count - 1):
         return None
     apart = np.sum((shapes[i] - shapes[j]) ** 2, axis=(0, 2))
@@ -317,7 +315,7 @@ def _mass_coupling(model: FEModel) -> tuple[IntArray, IntArray]:
     return M.row[pair].astype(np.int64), M.col[pair].astype(np.int64)
 
 
-def _side_by_side(dofs: DofSet) -> tuple[IntArray, IntArray]:
+def _neighbouring_translations(dofs: DofSet) -> tuple[IntArray, IntArray]:
     """Return the translations of nodes that a Delaunay triangulation joins, of one component."""
     owner = np.zeros(len(dofs), np.int64) if dofs.component_of is None else dofs.component_of
     kinds, found = np.array(dofs.directions), [np.zeros((2, 0), np.int64)]
@@ -333,7 +331,7 @@ def _neighbours(xyz: FloatArray) -> IntArray:
     """Return pairs (2, e) of nodes side by side on a line, in a plane or in space."""
     offset = xyz - xyz.mean(axis=0) if len(xyz) else xyz
     _, size, axes = np.linalg.svd(offset, full_matrices=False)
-    flat = offset @ axes[size > _FLAT * np.max(size, initial=0.0)].T
+    flat = offset @ axes[size > SAME * np.max(size, initial=0.0)].T
     if len(flat) <= flat.shape[1] + 1 or not flat.size:
         return np.zeros((2, 0), np.int64)
     if flat.shape[1] == 1:

@@ -286,6 +286,7 @@ def explained_by_change(
 
     def change(x: FloatArray) -> ModeChange:
         moved = freq + sign * (band.at - band.seen) * x[0]
+        # a step may pass zero
         return ModeChange(mode, float(np.log(max(moved, 1e-3 * freq) / freq)), float(x[1]))
 
     def cost(x: FloatArray) -> float:

@@ -130,7 +130,7 @@ def estimate_noise(
         if not first.size:
             begin = _least_squares(spectrum)
             first = np.sqrt(begin)
-            begin = np.clip(begin, 1e-3, _HIGH)
+            begin = np.clip(begin, 1e-3, _HIGH)  # none of them is absent
         else:
             begin = np.ones(len(channels))
         found = _scored(spectrum, begin, np.minimum(_LOW / ratios**2, 1.0))
@@ -313,9 +313,9 @@ def _scored(spectrum: _LevelSpectrum, start: FloatArray, lowest: FloatArray) -> 
             better = (-np.inf, slope, information)
         if better[0] >= value - SETTLED * abs(value):
             log_t, (value, slope, information) = trial, better
-            damping = max(0.1 * damping, 1e-12)
+            damping = max(0.1 * damping, 1e-12)  # from here on it grows again in few steps
         else:
-            damping = max(10 * damping, 1e-3)
+            damping = max(10 * damping, 1e-3)  # from here on it shortens a step
     raise SolverError(
         f"the likelihood of the noise levels did not settle in {_STEPS} steps: the spectrum of the "
         "innovations is far from any that these channels make. Judge the record with "

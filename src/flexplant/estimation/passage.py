@@ -13,6 +13,7 @@ from ..checks import BoolArray, FloatArray, IntArray
 from ..lti.discretisation import Recursion
 from ..lti.equations import sylvester
 from ..lti.lyapunov import solve_stein
+from .error import ON_CIRCLE
 from .estimator_channels import Recorded
 from .filter_model import FilterGains, FilterModel, Sight, Steady, filter_gains, innovation_root
 
@@ -419,10 +420,6 @@ class Unknowns:
         return KnownParameters(value, X, V[rank:].T)
 
 
-#: modulus of a sampled pole from which a mode has no stationary motion
-_ON_CIRCLE = 1.0 - 1e-12
-
-
 class Start(NamedTuple):
     """A first state ``x = Z delta + x'``: delta (r,) quite unknown, x' of covariance P."""
 
@@ -464,6 +461,6 @@ def kept_states(A: FloatArray) -> IntArray:
     for part in range(count):
         states = np.flatnonzero(owner == part)
         radius = np.max(np.abs(np.linalg.eigvals(A[np.ix_(states, states)])))
-        if radius >= _ON_CIRCLE:
+        if radius >= ON_CIRCLE:
             kept.append(states)
     return np.sort(np.concatenate(kept)) if kept else np.zeros(0, dtype=np.int64)

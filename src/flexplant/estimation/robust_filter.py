@@ -459,7 +459,7 @@ def _best_gains(
         )
     steepness = 0.0
     for width in _WIDTHS:
-        limits: Any = {"maxiter": steps, "gtol": 1e-5}
+        limits: Any = {"maxiter": steps, "gtol": 1e-5}  # of the logarithm of a variance
         with np.errstate(all="ignore"):
             result = minimize(
                 smooth, x, args=(width, best[0][0]), jac=True, method="BFGS", options=limits

@@ -21,12 +21,14 @@ from ..checks import (
     IntArray,
     Value,
     between,
+    checked,
+    complex_array,
     real_array,
     several,
     short,
     whole,
 )
-from ..errors import ModelError, ShapeError, SolverError, counted
+from ..errors import ModelError, SolverError, counted
 from ..modes.matching import assigned, in_span
 from ..tolerances import TINY
 from .line_weights import PreparedLines
@@ -58,22 +60,13 @@ class PoleSelection(Value):
     1
     """
 
-    poles: ComplexArray
-    participation: ComplexArray
+    poles: ComplexArray = field(metadata=checked(complex_array, shape=(None,)))
+    participation: ComplexArray = field(metadata=checked(complex_array, shape=(None, "poles")))
 
     def __post_init__(self) -> None:
-        poles = np.array(self.poles, dtype=np.complex128)
-        participation = np.array(self.participation, dtype=np.complex128)
-        if poles.ndim != 1 or participation.ndim != 2 or participation.shape[1:] != poles.shape:
-            raise ShapeError(
-                f"poles (m,) and participation (n_in, m) belong together, got {poles.shape} and "
-                f"{participation.shape}."
-            )
-        if not (np.all(np.isfinite(poles)) and np.all(np.isfinite(participation))):
-            raise ModelError("poles and participation must be finite.")
-        if np.any(poles.imag <= 0) or not np.all(np.any(participation, axis=0)):
+        super().__post_init__()
+        if np.any(self.poles.imag <= 0) or not np.all(np.any(self.participation, axis=0)):
             raise ModelError("poles need positive imaginary parts, and some participation each.")
-        self._set(poles=poles, participation=participation)
 
     def __len__(self) -> int:
         return int(self.poles.size)
@@ -400,7 +393,7 @@ POLES = 100
 
 def affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
     """Return the orders, by default as many as the lines afford; ModelError for too high ones."""
-    parts = _windows(ready)
+    parts = _line_windows(ready)
     fewest = min(seen.stop - seen.start for _, seen in parts)
     if orders is None:
         # four orders at least are compared, which twenty lines afford
@@ -435,7 +428,7 @@ LINES, OVERLAP = 400, 0.25
 MARGIN = 0.04
 
 
-def _windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
+def _line_windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
     """Return the lines of parts of about 400, cut where responses are weakest, and those used."""
     import scipy.ndimage as ndi
 
@@ -463,7 +456,7 @@ def diagram_of(
     low, high = float(ready.freq[0]), float(ready.freq[-1])
     edge, band, first = MARGIN * (high - low), np.array([low, high]), 0
     found = []
-    for own, seen in _windows(ready):
+    for own, seen in _line_windows(ready):
         freq = ready.freq[seen]
         moments = _moments_in(ready, seen, orders[-1])
         inside = partial(_in_band, low=freq[0], high=freq[-1], max_zeta=max_zeta)
@@ -493,7 +486,7 @@ def weighted_by_remainder(ready: PreparedLines, order: int) -> PreparedLines:
     n_out, n_in, n_freq = ready.data.shape
     for _ in range(2):
         error: FloatArray = np.zeros(ready.data.shape)
-        parts = _windows(now)
+        parts = _line_windows(now)
         for own, seen in parts:
             fitted: ComplexArray = _moments_in(now, seen, order).response(order, now.freq[own])
             error[:, :, own] = np.abs(now.data[:, :, own] - fitted) ** 2

@@ -35,12 +35,12 @@ from .pole_test import (
     UPPER,
     dropped,
     fewer_terms,
+    gain_due_of_own_poles,
+    gain_due_of_pole,
     improved,
     merged,
     missed_poles,
     more_terms,
-    own_price,
-    pole_price,
     relocated,
     shared,
     split_proposals,
@@ -143,7 +143,7 @@ def _needless(fit: Fit, steps: int, alone: bool, compare: bool) -> tuple[int, st
     def is_shared(place: int) -> bool:
         # true where there is no fit without it
         with attempted("a fit without one of its poles", SolverError):
-            least = pole_price(fit.lines) * max(1.0, fit.misfit)
+            least = gain_due_of_pole(fit.lines) * max(1.0, fit.misfit)
             return shared(_without(fit, place, steps), fit, least)
         return True
 
@@ -209,7 +209,7 @@ REGION, FLANK = 20, 5
 STANDS_OUT = 20.0
 #: values of the FRF times (poles times references) squared, the products of a step of the fit, up
 #: to which it is made without a request: some seconds altogether
-CHEAP = 5e7
+UNASKED = 5e7
 #: products that a refinement without a request may take in all, a minute or two
 BUDGET = 5e10
 #: multiplications of a whole fit and of a first answer for those of a step, on average
@@ -298,7 +298,7 @@ def identified(
     begin = _Begin(start) if start is not None else _begin(task, ready, listed)
     refine = False if begin.at_peaks else task.refine
     work = ready.data.size * (len(begin.poles) * ready.data.shape[1]) ** 2
-    costly = work > CHEAP
+    costly = work > UNASKED
     with Progress(
         STAGES,
         f"modes, {work:.1e} operations a step" if costly else "modes",
@@ -403,7 +403,7 @@ def _answered(
         fit = refined(lines, fit.poles, fit.participation, steps=task.steps, fine=True)
     if compare:
         excess = fit.cost - lines.freedom(fit.m)
-        apart = disagreement(fit, own_price(fit), excess)
+        apart = disagreement(fit, gain_due_of_own_poles(fit), excess)
         if apart is not None:
             reported, others = steady(fit, reported, apart)
             fit = Fit(lines, apart.poles, fit.participation, fit.pivots)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray, IntArray, Value, between, instance, positive
-from ..errors import ModelError, ShapeError, SolverError, counted, unknown_label
+from ..errors import ModelError, ShapeError, SolverError, counted, require_known
 from ..lti.frequency import Frf
 from ..tolerances import TINY
 from .line_weights import mains_multiple
@@ -433,7 +433,5 @@ def _full_scale(limits: Any, inputs: tuple[str, ...], outputs: tuple[str, ...]) 
         return {}
     if not isinstance(limits, Mapping):
         raise ShapeError("limits is a mapping {channel: full scale}, such as {'force': 500.0}.")
-    for name in limits:
-        if name not in (*inputs, *outputs):
-            raise unknown_label("channel", name, [*inputs, *outputs])
+    require_known("channel", limits, [*inputs, *outputs])
     return {name: positive(value, f"limits[{name!r}]") for name, value in limits.items()}

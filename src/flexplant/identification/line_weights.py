@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import BoolArray, ComplexArray, FloatArray, instance, real_array
+from ..checks import BoolArray, ComplexArray, FloatArray, frequency_band, instance
 from ..errors import ModelError
 from ..lti.frequency import Frf
 
@@ -233,10 +233,4 @@ def checked_band(band: Any, freq: FloatArray) -> tuple[float, float]:
         raise ModelError("the Frf has no frequencies.")
     if band is None:
         return float(freq[0]), float(freq[-1])
-    low, high = real_array(band, "band", (2,)).tolist()
-    if not 0 <= low < high or high < freq[0] or low > freq[-1]:
-        raise ModelError(
-            f"band must be (low, high) in Hz within {freq[0]:g} .. {freq[-1]:g}, got "
-            f"({low:g}, {high:g})."
-        )
-    return low, high
+    return frequency_band(band, "band", float(freq[0]), float(freq[-1]))

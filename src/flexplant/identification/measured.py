@@ -27,7 +27,7 @@ from ..checks import (
 from ..errors import LabelError, ModelError, ShapeError, counted, some_names
 from ..modes import Modes
 from ..modes.matching import assigned, in_span
-from ..tolerances import SAME
+from ..tolerances import SAME, SPLIT
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -307,8 +307,6 @@ def _checked_shapes(
 
 #: modes of a model nearer than this share are one family, whose shapes are known as a span only
 FAMILY = 5e-3
-#: and nearer than this one frequency, which only rounding splits
-EQUAL = 1e-6
 
 
 def numbered(
@@ -414,7 +412,7 @@ def _sort_families(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -
         for number in [pairs[i] for i in family]:
             # the lowest free one of the modes of its frequency
             taken.discard(number)
-            equal = np.flatnonzero(np.abs(omega / omega[number - 1] - 1.0) <= EQUAL) + 1
+            equal = np.flatnonzero(np.abs(omega / omega[number - 1] - 1.0) <= SPLIT) + 1
             numbers.append(next(int(n) for n in equal if n not in taken))
             taken.add(numbers[-1])
         pairs.update(zip(sorted(family, key=lambda i: float(freq[i])), numbers, strict=True))

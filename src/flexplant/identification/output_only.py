@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, positive, real_array, whole
+from ..checks import ComplexArray, FloatArray, below_half_rate, frequency_band, positive, whole
 from ..errors import ModelError, SolverError
 from ..modes.matching import assigned, mac_matrix
 from ..parallel import Progress, tick
@@ -108,12 +108,9 @@ def identify_output_only(
     """
     y, names = signals(outputs, "outputs", "y")
     step = 1.0 / positive(rate, "rate")
-    low, high = real_array(band, "band", (2,)).tolist()
-    if not 0 < low < high < rate / 2:
-        raise ModelError(
-            f"band must be (low, high) in Hz between 0 and half the rate, {rate / 2:g} Hz, got "
-            f"{band!r:.60}."
-        )
+    low, high = frequency_band(band)
+    positive(low, "the lower end of band")
+    below_half_rate(high, "the upper end of band", rate)
     listed = checked_orders(range(4, 41, 2) if orders is None else orders)
     wanted = max(2.0, PERIODS * rate / low / 2)
     count = int(np.ceil(wanted)) if lags is None else whole(lags, "lags", minimum=2)

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, Value, generator, positive, real_array, whole
+from ..checks import (
+    ComplexArray,
+    FloatArray,
+    Value,
+    checked,
+    frequency_band,
+    generator,
+    positive,
+    whole,
+)
 from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf
 from ..tolerances import TINY, TYPED
@@ -45,14 +54,9 @@ class Periodic(Value):
     array([2., 2., 2.])
     """
 
-    period: float
-    discard: int = 1
-    band: tuple[float, float] | None = None
-
-    def __post_init__(self) -> None:
-        positive(self.period, "period")
-        whole(self.discard, "discard", minimum=0)
-        _check_band(self.band)
+    period: float = field(metadata=checked(positive, unit="s"))
+    discard: int = field(default=1, metadata=checked(whole, minimum=0))
+    band: tuple[float, float] | None = field(default=None, metadata=checked(frequency_band))
 
 
 def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
@@ -258,7 +262,8 @@ def multisine(
     count = whole(count, "count", maximum=1000)
     periods = whole(periods, "periods", maximum=MOST_SAMPLES)
     random = generator(rng)
-    _check_band(band)
+    if band is not None:
+        frequency_band(band)
     exact = positive(period, "period") * positive(rate, "rate")
     samples = round(exact)
     if abs(samples - exact) > TYPED * exact or samples < 4:
@@ -284,14 +289,6 @@ def multisine(
 
 #: samples of a signal that memory holds
 MOST_SAMPLES = 10**9
-
-
-def _check_band(band: Any) -> None:
-    if band is None:
-        return
-    low, high = real_array(band, "band", (2,)).tolist()
-    if not 0 <= low < high:
-        raise ModelError(f"band must be (low, high) in Hz, got {band!r}.")
 
 
 #: power of the inputs' lines over what lies between them below which they are not periodic

@@ -22,7 +22,7 @@ ALARM = 1e-9
 
 def supported(lines: Lines, poles: ComplexArray, part: ComplexArray) -> Fit:
     """Leave out, one by one, poles that noise alone may explain; SolverError when none is left."""
-    least = pole_price(lines)
+    least = gain_due_of_pole(lines)
     fit = pivoted(lines, poles, part)
     kept = list(range(poles.size))
     now = fit.cost_of(kept) if kept else 0.0
@@ -64,10 +64,10 @@ def corroborated(lines: Lines, less: ComplexArray, more: ComplexArray) -> bool:
     )
     gain = before - after
     unit = max(1.0, float(np.sum(after)) / (2 * lines.data.size))
-    return float(np.sum(np.sort(gain)[:-2])) > unit * price(lines, 4, CHANCE)
+    return float(np.sum(np.sort(gain)[:-2])) > unit * gain_due(lines, 4, CHANCE)
 
 
-def price(lines: Lines, count: int, chance: float) -> float:
+def gain_due(lines: Lines, count: int, chance: float) -> float:
     """Return by how much noise lowers the cost with so many numbers more: a chi-square quantile."""
     # errors that neighbouring lines share have `inflation` times the power of independent ones
     from scipy.special import chdtri
@@ -75,12 +75,12 @@ def price(lines: Lines, count: int, chance: float) -> float:
     return lines.inflation * float(chdtri(count, chance))
 
 
-def pole_price(lines: Lines) -> float:
+def gain_due_of_pole(lines: Lines) -> float:
     """Return by how much a pole must lower the cost, wherever in the band it is."""
     # its pole, shape and participation are 2 (n_out + n_in) numbers. One kept in vain costs little;
     # one left out biases its neighbours by up to the root of this
     n_out, n_in, n_freq = lines.data.shape
-    return price(lines, 2 * (n_out + n_in), CHANCE / n_freq)
+    return gain_due(lines, 2 * (n_out + n_in), CHANCE / n_freq)
 
 
 #: half the distance at which a pole is taken apart, in parts of its damping
@@ -167,7 +167,7 @@ def shared(fit: Fit, more: Fit, least: float) -> bool:
     outputs do not agree on the poles, also that of fits with poles of their own at each.
     """
     lines, new = fit.lines, newest_pole(fit, more)
-    least = max(least, pole_price(lines) * coherence(more, more.poles[new]))
+    least = max(least, gain_due_of_pole(lines) * coherence(more, more.poles[new]))
     if fit.cost - more.cost < least:
         return False
     if len(lines.parts) == 1:
@@ -175,7 +175,7 @@ def shared(fit: Fit, more: Fit, least: float) -> bool:
     if "own" not in vars(fit) and _proven(fit, more, least):
         return True
     apart = own_cost(fit)
-    return fit.cost - apart < own_price(fit) or apart - own_cost(more) > least
+    return fit.cost - apart < gain_due_of_own_poles(fit) or apart - own_cost(more) > least
 
 
 def _proven(fit: Fit, more: Fit, least: float) -> bool:
@@ -203,10 +203,10 @@ def newest_pole(fit: Fit, more: Fit) -> int:
     return int(np.argmax(away))
 
 
-def own_price(fit: Fit) -> float:
+def gain_due_of_own_poles(fit: Fit) -> float:
     """Return by how much poles of their own at each output must lower the cost."""
     count = 2 * fit.m * (len(fit.lines.parts) - 1)
-    return max(1.0, fit.misfit) * price(fit.lines, max(1, count), ALARM)
+    return max(1.0, fit.misfit) * gain_due(fit.lines, max(1, count), ALARM)
 
 
 def unwindowed(fit: Fit) -> Proposals:
@@ -238,7 +238,7 @@ def _refit_terms(fit: Fit, upper: int, chance: float) -> Trial:
     other = replace(lines, upper=upper)
     gain = fit.cost - Fit(other, fit.poles, fit.participation).cost
     channels = lines.data.shape[0] * lines.data.shape[1]
-    least = np.sign(count) * max(1.0, fit.misfit) * price(lines, channels * abs(count), chance)
+    least = np.sign(count) * max(1.0, fit.misfit) * gain_due(lines, channels * abs(count), chance)
     return Trial(other, fit.poles, fit.participation, gain, least)
 
 
@@ -272,7 +272,7 @@ def split_proposals(fit: Fit) -> Proposals:
 
 def _more_poles(fit: Fit, poles: ComplexArray, part: ComplexArray) -> Trial:
     """Return the trial of a fit with a pole more."""
-    least = pole_price(fit.lines) * max(1.0, fit.misfit)
+    least = gain_due_of_pole(fit.lines) * max(1.0, fit.misfit)
     return Trial(fit.lines, poles, part, fit.cost - Fit(fit.lines, poles, part).cost, least)
 
 
@@ -297,7 +297,7 @@ def relocated(fit: Fit) -> Proposals:
     for k, pole in enumerate(fit.poles):
         if fit.m == 1 or -pole.real > 0.05 * abs(pole):
             continue
-        if Fit(fit.lines, *fit.rest(k)).cost - fit.cost > WEAK * pole_price(fit.lines):
+        if Fit(fit.lines, *fit.rest(k)).cost - fit.cost > WEAK * gain_due_of_pole(fit.lines):
             continue
         trials = []
         for shift in np.arange(-7.0, 7.1, 0.7):

@@ -23,7 +23,7 @@ from .mat_matrices import mat_variables
 
 #: what a file holds one or several of
 MatValue: TypeAlias = StateSpace | StandardPlant | ReducedModel | Frf
-_LONGEST = 63
+_LONGEST = 63  # characters of a name in MATLAB
 
 
 def write_mat(

@@ -242,8 +242,6 @@ FORMATS.append(
 )
 
 
-#: lines whose digits are counted
-_SAMPLE = 4000
 #: characters of a line at most; lines of cards have 80
 _LINE = 4096
 _FORMAT = re.compile(r"\(?\s*(?:\d+P\s*,?\s*)?(\d*)\s*([IEFDG])\s*(\d+)", re.IGNORECASE)

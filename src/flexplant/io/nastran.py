@@ -396,7 +396,7 @@ def _letters(record: bytes, size: int) -> str:
 
 #: approach (real eigenvalues) and table (eigenvectors, real numbers, mode by mode)
 _APPROACH, _TABLE = 2, 7
-_IDENT = 146
+_IDENT = 146  # words of the record before the numbers
 #: what a table of GEOM1 begins with: kind of card, words of an entry
 _CARDS = {4501: ("GRID", 8), 2101: ("CORD2R", 13), 2001: ("CORD2C", 13), 2201: ("CORD2S", 13)}
 

@@ -179,26 +179,26 @@ def _strings(words: _Words, first: Any, end: Any, big: bool, per: int, name: str
     # the strings of a column are a chain; those of all columns are followed at once
     size, integer = words.integer, np.dtype(f"{words.order}i{words.integer}")
     head = 2 * size if big else size
-    alive = np.arange(first.size)
+    unfinished = np.arange(first.size)
     at = first.copy()
     found = []
-    while alive.size:
-        here = at[alive]
-        if np.any(here + head > end[alive]):
-            raise _broken(words.path, int(here[np.argmax(here + head > end[alive])]), name)
+    while unfinished.size:
+        here = at[unfinished]
+        if np.any(here + head > end[unfinished]):
+            raise _broken(words.path, int(here[np.argmax(here + head > end[unfinished])]), name)
         numbers = _gather(words.content, here, head).view(integer).astype(np.int64)
         if big:
             length, row = numbers.reshape(-1, 2).T - np.array([[1], [0]])
         else:
             length, row = (numbers >> 16) - 1, numbers & 0xFFFF
-        wrong = (length < 1) | (length > (end[alive] - here - head) // size)
+        wrong = (length < 1) | (length > (end[unfinished] - here - head) // size)
         bytes_ = np.where(wrong, 0, length) * size  # no product wraps
         wrong |= bytes_ % per != 0
         if np.any(wrong):
             raise _broken(words.path, int(here[np.argmax(wrong)]), name)
-        found.append((here + head, bytes_ // per, row, alive))
-        at[alive] = here + head + bytes_
-        alive = alive[at[alive] < end[alive]]
+        found.append((here + head, bytes_ // per, row, unfinished))
+        at[unfinished] = here + head + bytes_
+        unfinished = unfinished[at[unfinished] < end[unfinished]]
     if not found:
         return tuple(np.zeros(0, dtype=np.int64) for _ in range(4))
     return tuple(np.concatenate(part) for part in zip(*found, strict=True))

@@ -14,6 +14,7 @@ from ..checks import ComplexArray, FloatArray, IntArray, short
 from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS
 from ..lti.frequency import ORDERS, Frf
+from ..structure.units import GRAVITY, LENGTHS, POUND
 from ..tolerances import SAME
 from .assembled import extra_module
 from .files import GLOBAL, ONCE, damaged, file_path, parsing, refused, spaced_numbers, unread
@@ -173,7 +174,7 @@ def common_frequencies(records: list[dict[str, Any]], path: str) -> FloatArray:
             raise refused(path, what, "Export it in Hz.")
         own = np.asarray(part["x"], dtype=np.float64)
         step = float(np.ptp(first)) / max(first.size - 1, 1)
-        if own.size != first.size or np.max(np.abs(own - first)) > 1e-3 * step:
+        if own.size != first.size or np.max(np.abs(own - first)) > 1e-3 * step:  # single precision
             two = [
                 f"{_channel_of(one, 'rsp')[0]} <- u {_channel_of(one, 'ref')[0]} ({x.size} from "
                 f"{x[0]:g} to {x[-1]:g} Hz)"
@@ -208,10 +209,10 @@ def coherence_of(
 
 #: specific data types of dataset 58
 KINDS = {8: "displacement", 11: "velocity", 12: "acceleration"}
-_LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "cm": 1e-2, "in": 0.0254, "ft": 0.3048}
+#: what one of a named unit is in SI
+_LENGTHS = {**LENGTHS, "nm": 1e-9}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6}
-_GRAVITY = 9.80665
-_FORCES = {"n": 1.0, "kn": 1e3, "mn": 1e-3, "lbf": 4.4482216152605, "nm": 1.0, "n*m": 1.0}
+_FORCES = {"n": 1.0, "kn": 1e3, "mn": 1e-3, "lbf": POUND * GRAVITY, "nm": 1.0, "n*m": 1.0}
 _SECONDS = re.compile(r"\(?s(?:ec)?(?:\^|\*\*)?2?\)?")
 
 
@@ -238,6 +239,7 @@ def record_scale(
     to_length, to_force = 1 / float(factors["length"]), 1 / float(factors["force"])
     named_length = to_length if not above else length
     named_force = to_force if not below else force
+    # factors are printed with four digits or more
     if abs(named_length / to_length - 1) > 1e-3 or abs(named_force / to_force - 1) > 1e-3:
         raise ModelError(
             f"{path!r}: the axes say {above!r} per {below!r}, dataset 164 (units) factors "
@@ -259,7 +261,7 @@ def _motion(label: str, quantity: str | None) -> float | None:
     if any(not _SECONDS.fullmatch(item.lower()) for item in rest):
         return None
     if first == "g" and quantity in ("acceleration", None) and not rest:
-        return _GRAVITY
+        return GRAVITY
     return (_LENGTHS | _ANGLES).get(first.replace("µ", "u").replace("\xb5", "u"))
 
 

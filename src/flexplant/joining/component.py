@@ -17,6 +17,7 @@ from ..errors import LabelError, ModelError, require_known
 from ..labels import DIRECTIONS, DofSet, Interpolation
 from ..reduction import ReducedModel
 from ..structure import FEModel
+from ..tolerances import SAME
 
 #: either kind of model that can be joined
 Model = FEModel | ReducedModel
@@ -145,10 +146,6 @@ def _placed_reduced(model: ReducedModel, full: DofSet, C: Any, pose: Pose) -> Re
     )
 
 
-#: rows of one place on two components that differ by less are one motion
-_SAME = 1e-9
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class PlacedShape(Interpolation):
     """The shapes of a component that was turned and shifted.
@@ -259,7 +256,7 @@ class JoinedShape(Interpolation):
             )
         rows = list(found.values())
         seen = rows if self.motions is None else [row @ self.motions for row in rows]
-        if any(np.abs(one - seen[0]).max() > _SAME * np.abs(seen[0]).max() for one in seen[1:]):
+        if any(np.abs(one - seen[0]).max() > SAME * np.abs(seen[0]).max() for one in seen[1:]):
             one, other = list(found)[:2]
             raise LabelError(
                 f"the point {tuple(np.asarray(xyz).tolist())} is on {one!r} and on {other!r}, "

@@ -21,7 +21,7 @@ from ..reduction import ReducedModel
 from ..sparse.symmetric import dense, orthonormalised
 from ..structure import FEModel
 from ..structure.rigid import SPANNED, rigid_body_basis
-from ..tolerances import TINY, divisor
+from ..tolerances import SAME, TINY, divisor
 from .component import Component, JoinedShape, Model, Pose, components_of
 from .frf_coupling import joined_frfs
 from .joint import Joint, Patch, split_end
@@ -158,8 +158,6 @@ _LIMIT = 1e-7
 _MADE = 1e-8
 #: the part of the largest entry of a motion that counts for the rounding of each
 _ENTRY = 1e-3
-#: a stretch below this part of the largest is none
-_NONE = 1e-9
 
 
 class JoinedMachine:
@@ -344,12 +342,12 @@ class JoinedMachine:
             whole = np.vstack(mixes) * scale[:, None]
             stretch = np.asarray(rows @ motions)
             most = np.asarray(abs(rows) @ np.abs(motions)).max(axis=1, initial=0.0)
-            stretch[np.abs(stretch) <= _NONE * most[:, None]] = 0.0  # rounding of what cancels
+            stretch[np.abs(stretch) <= SAME * most[:, None]] = 0.0  # rounding of what cancels
             size = np.linalg.norm(stretch, axis=1)
-            allowed = la.null_space(stretch / divisor(size)[:, None], rcond=_NONE)
+            allowed = la.null_space(stretch / divisor(size)[:, None], rcond=SAME)
             beside = np.linalg.norm(whole - allowed @ (allowed.T @ whole), axis=0)
             size = np.linalg.norm(whole, axis=0)
-            clean = (missed < SPANNED) & (size > 0) & (beside <= _NONE * size)
+            clean = (missed < SPANNED) & (size > 0) & (beside <= SAME * size)
             candidates = motions[self.done.kept] @ np.hstack([whole[:, clean], allowed])
             found.append(orthonormalised(self.matrices["M"], candidates, dependent="drop"))
         return np.hstack(found)

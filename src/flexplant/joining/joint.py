@@ -23,6 +23,7 @@ from ..dof_columns import node_numbers
 from ..errors import LabelError, ModelError, require_known
 from ..labels import DIRECTIONS, DofSet
 from ..structure.rigid import rigid_motions
+from ..tolerances import SAME
 
 #: an end: "stage/41:z", "stage/41" (a node), ("stage", (x, y, z)) or a Patch
 End: TypeAlias = "str | tuple[str, Sequence[float]] | Patch"
@@ -279,8 +280,6 @@ def mean_motions(
     return by_node, A, [name for name, there in zip(DIRECTIONS, made, strict=True) if there]
 
 
-#: lever arms below this part of the machine's size are none
-_NO_ARM = 1e-9
 #: up to this part, a node without rotations turns as the nodes next to it do
 _SHORT_ARM, _NEIGHBOURS = 1e-4, 12
 
@@ -363,12 +362,12 @@ class JointEnd:
             )
         found = self._rows[axis]
         arm = point - self.point
-        if DIRECTIONS.index(axis) >= 3 or self.label or np.abs(arm).max() <= _NO_ARM * self._size:
+        if DIRECTIONS.index(axis) >= 3 or self.label or np.abs(arm).max() <= SAME * self._size:
             return found
         along = np.eye(3)[DIRECTIONS.index(axis)]
         for k, turn in enumerate(("rx", "ry", "rz")):
             share = float(np.cross(np.eye(3)[k], arm) @ along)
-            if abs(share) <= _NO_ARM * self._size:
+            if abs(share) <= SAME * self._size:
                 continue
             turned = self._rows.get(turn)
             if turned is None and self.is_near(point):

@@ -225,9 +225,10 @@ def _log_scaling(S: ComplexArray) -> FloatArray:
     for _ in range(_SWEEPS if n > 1 else 0):
         for i in range(n):
             row, column = power[:, i].sum(axis=1), power[:, :, i].sum(axis=1)
-            one_way = np.minimum(row, column) <= least * 1e-6
+            one_way = np.minimum(row, column) <= least * 1e-6  # acts, and nothing acts on it
             step = 0.25 * np.log((column + TINY) / (row + TINY))
             step = np.where(one_way, np.clip(step, -_LARGEST, _LARGEST), step)
+            # no loop at all: sums of squares
             step = np.where(np.maximum(row, column) <= 1e-290, 0.0, step)
             log[:, i] += step
             power[:, i] *= np.exp(2.0 * step)[:, None]
@@ -244,5 +245,6 @@ def _optimised(S: ComplexArray, log: FloatArray, size: FloatArray) -> FloatArray
             weight = (sigma / sigma[:, :1]) ** (2 * power)
             rows = np.einsum("kis,ks->ki", np.abs(left) ** 2, weight)
             columns = np.einsum("ksi,ks->ki", np.abs(right) ** 2, weight)
+            # of singular vectors, of length one
             log = log + np.log((columns + 1e-12) / (rows + 1e-12)) / (4.0 * power)
     return size

@@ -17,11 +17,11 @@ from ..errors import (
     ModelError,
     aligned,
     require_known,
-    unknown_label,
 )
 from ..lti.frequency_sweep import resonance_grid
 from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..lti.responses import responder
+from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..plant.partition import require_plain
@@ -193,8 +193,7 @@ def _residue(residue: Any, channel: str, start: float, dt: float) -> FloatArray:
             "it around plant.discretized(rate)."
         )
     if isinstance(residue, Mapping):
-        if channel not in residue:
-            raise unknown_label("channel", channel, list(residue), "the run of the residue")
+        require_known("channel", [channel], residue, "the run of the residue")
         residue = residue[channel]
     elif isinstance(residue, str | bytes):
         raise ModelError(
@@ -215,7 +214,7 @@ def _residue(residue: Any, channel: str, start: float, dt: float) -> FloatArray:
 Densities = Callable[[FloatArray], FloatArray]
 #: intervals are halved until the error of each source's integral is below this part of it
 TOLERANCE = 1e-8
-ROUNDS = 40
+ROUNDS = 40  # an interval of 1e-12 of the first has no error left
 #: edges over all frequencies, as a picture of the stairs needs them; half-widths beside resonances
 _STAIRS, _BESIDE = 150, (0.0, 3.0, 20.0)
 #: frequencies at a time
@@ -376,11 +375,7 @@ def white_names(plant: StandardPlant) -> tuple[list[str], list[str]]:
     direct = plant.system.select(inputs=white).D
     if np.any(direct):
         i, j = np.argwhere(direct)[0]
-        raise AssumptionError(
-            f"white noise {white[j]!r} reaches {plant.system.outputs[i]!r} directly: a sample of "
-            "it would have infinite variance. Give the disturbance a coloured spectrum, let it "
-            "be held over each sample (held=True), or sense a displacement or velocity."
-        )
+        raise reaches_at_once(white[j], plant.system.outputs[i])
     return white, sensors
 
 

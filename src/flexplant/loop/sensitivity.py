@@ -10,7 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import ComplexArray, FloatArray, short
-from ..errors import AssumptionError, LabelError, ModelError, ShapeError, unknown_label
+from ..errors import (
+    AssumptionError,
+    LabelError,
+    ModelError,
+    ShapeError,
+    require_known,
+    unknown_label,
+)
 from ..lti.frequency import Frf, frequency_response, sampled_freq
 from ..lti.frequency_sweep import crossings
 from ..lti.interconnection import loop_poles
@@ -176,9 +183,7 @@ def taken_apart(loop: Loop) -> BrokenLoop:
     if isinstance(plant, Frf):
         return _measured_loop(plant, controller, _quantities(loop[1]))
     if isinstance(plant, StandardPlant):
-        unread = [name for name in controller.inputs if name not in plant.y]
-        if unread:
-            raise unknown_label("y for the controller", unread[0], plant.y, "the plant")
+        require_known("y for the controller", controller.inputs, plant.y, "the plant")
         driven = [name for name in controller.outputs if name in plant.u]
         fed = movable_outputs(plant.system.select(plant.y, driven))
         read = [name for name in controller.inputs if name in fed]

@@ -10,11 +10,9 @@ import numpy as np
 
 from ..checks import FloatArray, between, positive
 from ..errors import ModelError
+from ..tolerances import ROUNDING
 from .joining import bilinear_matrices, trapezoidal
 from .statespace import StateSpace, System, as_statespace
-
-#: distance of a pole from where a map is singular, relative to it, that counts as none
-_SAME = 1e-12
 
 
 def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSpace:
@@ -69,7 +67,7 @@ def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSp
 def _has_pole_at(place: float, A: FloatArray) -> bool:
     """Return whether an eigenvalue lies there; a condition number would see the states' units."""
     distance = np.abs(np.linalg.eigvals(A) - place)
-    return bool(np.min(distance, initial=np.inf) <= _SAME * abs(place))
+    return bool(np.min(distance, initial=np.inf) <= ROUNDING * abs(place))
 
 
 def image_freq(omega: Any, dt: float) -> Any:

@@ -25,7 +25,7 @@ from ..checks import (
     short,
     signal_names,
 )
-from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
+from ..errors import LabelError, ModelError, ShapeError, counted, require_known
 from ..parallel import Progress, expect
 from ..tolerances import SAME
 from .frequency_sweep import checked_freq as checked_freq
@@ -45,8 +45,8 @@ def _reciprocal(frf: Any) -> Any:
     """Return 1/G, from the output to the input of G; its variance is ``var G / |G|^4``."""
     if frf.data.shape[:2] != (1, 1):
         raise ShapeError(
-            f"the quotient needs a response of one input and one output, got {_sides(frf)}. Select "
-            "one pair, or solve line by line: numpy.linalg.solve over data."
+            f"the quotient needs a response of one input and one output, got {_io_text(frf)}. "
+            "Select one pair, or solve line by line: numpy.linalg.solve over data."
         )
     if not np.all(frf.data):
         zero = float(frf.freq[~frf.data[0, 0].astype(bool)][0])
@@ -111,7 +111,7 @@ def _optional_sum(a: FloatArray | None, b: FloatArray | None) -> FloatArray | No
     return b if a is None else a if b is None else a + b
 
 
-def _sides(one: Any) -> str:
+def _io_text(one: Any) -> str:
     return f"{short_list(one.inputs)} -> {short_list(one.outputs)}"
 
 
@@ -248,7 +248,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         span = f"{self.freq[0]:.4g} .. {self.freq[-1]:.4g} Hz" if self.freq.size else ""
         units = {self.unit(*channel) for channel in self}
         unit = units.pop() if len(units) == 1 else None
-        sides = _sides(self) + (f" [{unit}]" if unit is not None else "")
+        sides = _io_text(self) + (f" [{unit}]" if unit is not None else "")
         return f"<{type(self).__name__}: {sides}, {self.freq.size} frequencies {span}>"
 
     def __getitem__(self, key: tuple[str, str]) -> ComplexArray:
@@ -281,8 +281,8 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         one, two = self, _operand(other, self)
         if (tuple(one.inputs), tuple(one.outputs)) != (tuple(two.inputs), tuple(two.outputs)):
             raise LabelError(
-                f"a sum needs the same channels, got {_sides(one)} and {_sides(two)}. Select or "
-                "rename them first."
+                f"a sum needs the same channels, got {_io_text(one)} and {_io_text(two)}. "
+                "Select or rename them first."
             )
         variance = _optional_sum(one.variance, two.variance)
         quantity = one.quantity if two.quantity in (None, one.quantity) else None
@@ -370,8 +370,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         ModelError
             When the own quantity is not known, or zero frequency would be integrated.
         """
-        if not isinstance(quantity, str) or quantity not in ORDERS:
-            raise unknown_label("quantity", quantity, ORDERS)
+        require_known("quantity", [quantity], ORDERS)
         if self.quantity not in ORDERS:
             raise ModelError(
                 f"the quantity of this Frf is {self.quantity!r}: state what was measured, "

@@ -79,7 +79,7 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     moving = size[(size > ROUNDING * size.max(initial=0.0)) & (size < top)]
     low, high = (0.1 * moving.min(), 10 * moving.max()) if moving.size else (0.01, 100.0)
     high = min(high, top)
-    low = min(low, 1e-3 * high)
+    low = min(low, 1e-3 * high)  # three decades at least
     freq = [np.geomspace(low, high, 200)]
     zeta = np.abs(poles.real) / np.maximum(np.abs(poles), TINY)
     undamped: list[float] = []
@@ -162,7 +162,7 @@ def resonance_grid(
     if not size_seen.size:
         size_seen = np.array([0.01 * nyquist if dt else 1.0])
     high = nyquist if dt else 100.0 * float(size_seen.max())
-    low = min(1e-3 * float(size_seen.min()), 0.01 * high)
+    low = min(1e-3 * float(size_seen.min()), 0.01 * high)  # well below the slowest pole
     base = np.geomspace(low, high, points)
     swing = s.imag > 0
     centre, width = s.imag[swing] / (2 * np.pi), np.abs(s.real[swing]) / (2 * np.pi)

@@ -502,6 +502,7 @@ def axis_zeros(g: Any) -> ComplexArray:
     on = np.append(on, 1.0 if g.dt else 0.0)
     found: list[complex] = []
     for zero in np.sort_complex(on):
+        # in units of the scaled system
         if any(abs(zero - other) < SPLIT * max(abs(zero), 1e-3) for other in found):
             continue
         whole = np.block([[A - zero * np.eye(n), B], [C, D]])

@@ -324,7 +324,7 @@ def eigenvalues_with_error(
     )
 
 
-LEVELS = 30
+LEVELS = 30  # each squares the error: what needs more is rounding
 #: how far above the largest gain of the feedthrough a level set is not lost in rounding
 CLEAR = 1e-7
 #: of the sweep before the level sets, which are the judge

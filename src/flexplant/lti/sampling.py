@@ -237,17 +237,22 @@ def _acting_sample(D: FloatArray, inputs: Late, t: float) -> tuple[FloatArray, F
     return new, D - new
 
 
+def reaches_at_once(noise: str, output: str) -> AssumptionError:
+    """Return the error of white noise of which a sensor takes single samples."""
+    return AssumptionError(
+        f"white noise of {noise!r} reaches {output!r} at once (an acceleration, say), so that a "
+        "sample of it would have infinite variance. Measure displacement or velocity, give the "
+        "sensor dynamics that roll off, or shape the noise or hold it over each sample (held=True)."
+    )
+
+
 def _check_noise(g: StateSpace, asd: FloatArray, outputs: Late) -> None:
     loud = np.flatnonzero(asd > 0)
     late = np.flatnonzero(outputs.length > 0)
     direct = np.argwhere(g.D[np.ix_(late, loud)])
     if direct.size:
         output, name = g.outputs[late[direct[0][0]]], g.inputs[loud[direct[0][1]]]
-        raise AssumptionError(
-            f"white noise of {name!r} reaches {output!r} at once, so that a sample of it would "
-            "have infinite variance. Give the sensor dynamics that roll off (an anti-alias "
-            "filter), or shape the noise."
-        )
+        raise reaches_at_once(name, output)
 
 
 def _sampled_noise(

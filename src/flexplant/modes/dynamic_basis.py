@@ -12,6 +12,7 @@ import scipy.sparse as sp
 
 from ..checks import ComplexArray, FloatArray
 from ..errors import ModelError, SolverError
+from ..lti.frequency_sweep import FLOOR
 from ..sparse.factor import DENSE_LIMIT, ComplexSymmetricFactor
 from ..sparse.symmetric import beyond, dense
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping, Rayleigh
@@ -263,6 +264,7 @@ class DynamicBasis:
 def _couples(C: FloatArray) -> bool:
     """Return whether a matrix of losses couples coordinates."""
     own = np.diag(C)
+    # beside zeros of the diagonal
     size = np.sqrt(np.abs(np.outer(own, own))) + 1e-3 * np.abs(C).max(initial=0)
     return bool(np.any(np.abs(C - np.diag(own)) > _COUPLED * size))
 
@@ -327,8 +329,6 @@ def _dense_complex(matrix: Any) -> ComplexArray:
     return np.asarray(full, dtype=np.complex128)
 
 
-#: channels this far below the others of their row and column are zero by symmetry
-_FLOOR = 1e-6
 #: relative: next to a resonance, still within its peak
 _BESIDE = 1e-6
 #: error let pass relative to the response at a frequency, at antiresonances too
@@ -421,7 +421,7 @@ def _direct_check(
     at: FloatArray, found: ComplexArray, wanted: ComplexArray, whole: ComplexArray
 ) -> DirectCheck:
     peak = np.maximum(np.abs(whole).max(axis=0), np.abs(wanted).max(axis=0))
-    floor = _FLOOR * np.sqrt(np.outer(peak.max(axis=1), peak.max(axis=0)))
+    floor = FLOOR * np.sqrt(np.outer(peak.max(axis=1), peak.max(axis=0)))
     absent, peak = peak <= floor, np.maximum(peak, floor)
     peak[peak == 0] = 1.0
     gap = np.abs(found - wanted)

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, IntArray
-from ..tolerances import TINY, divisor
+from ..tolerances import ROUNDING, TINY, divisor
 
 #: shapes below this part of the largest one of their span are none: rounding
 _NONE = 1e-9
@@ -22,8 +22,6 @@ PARTNER = 0.5
 _SEEN = 1e-3
 #: MAC beyond which two modes of one model have the same shape as far as it is known
 ALIKE = 0.9
-#: eigenvalues of inner products below this part of the largest are none
-_RANK = 1e-12
 #: part of the MAC that a frequency ratio of e counts for: it decides where shapes do not
 _FREQUENCY = 0.1
 
@@ -129,7 +127,7 @@ def _by_shape(
 def _orthonormal_map(gram: Any) -> Any:
     """Return T with ``T^H G T = I`` on the span of shapes with inner products G, of its rank."""
     values, vectors = la.eigh(gram)
-    kept = values > _RANK * values[-1]
+    kept = values > ROUNDING * values[-1]
     return vectors[:, kept] / np.sqrt(values[kept])
 
 

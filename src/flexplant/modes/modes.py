@@ -14,12 +14,14 @@ from ..checks import (
     FloatArray,
     IntArray,
     Value,
+    checked,
     instance,
     positions,
     positive,
     real_array,
+    real_or_complex,
 )
-from ..errors import ModelError, ShapeError, SolverError, counted, unknown_label
+from ..errors import ModelError, ShapeError, SolverError, counted, require_known
 from ..labels import DofSet, Place
 from ..structure.definite import signed_square
 from ..structure.rigid import Placed, relative_miss
@@ -76,13 +78,20 @@ class MeshError(Value):
         return f"<MeshError: {counted(self.modes.size, 'mode')}, {ends}>"
 
 
+def require_real(modes: Any, why: str) -> None:
+    """Refuse complex Modes."""
+    if np.iscomplexobj(modes.phi):
+        raise ModelError(
+            f"these modes are complex, the damping couples them: {why}. Solve with "
+            "damping=ModalDamping(...)."
+        )
+
+
 def mesh_error(coarse: Any, finer: Any, order: float) -> MeshError:
     """Return the errors of Modes by those of a finer mesh, paired by their shapes."""
     p = positive(order, "order")
-    if np.iscomplexobj(coarse.phi) or np.iscomplexobj(finer.phi):
-        raise ModelError(
-            "complex modes of two meshes are not compared: solve with damping=ModalDamping(...)."
-        )
+    for modes in (coarse, finer):
+        require_real(modes, "those of two meshes are not compared")
     nodes = [np.unique(modes.dofs.xyz, axis=0) for modes in (coarse, finer)]
     extent = np.ptp(nodes[0], axis=0)
     dimensions = int(np.count_nonzero(extent > 1e-6 * extent.max()))
@@ -141,9 +150,7 @@ def measured_poles(measured: Any, known: range) -> tuple[IntArray, ComplexArray]
             f"{type(measured).__name__}" + (" without numbers" if poles is not None else "") + ". "
             "Pass MeasuredModes(poles, modes=[...]), or flexplant.numbered(measured, model)."
         )
-    for number in numbers:
-        if number not in known:
-            raise unknown_label("elastic mode", number, map(str, known))
+    require_known("elastic mode", numbers, known)
     return np.asarray(numbers, dtype=np.int64) - 1, np.asarray(poles, dtype=np.complex128)
 
 
@@ -200,6 +207,10 @@ _TRUNCATED = 1e-9
 
 def _nothing() -> FloatArray:
     return np.zeros(0)
+
+
+#: field: a number of each attachment vector
+_OF_VECTORS = checked(real_array, shape=("vector_dofs",))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -269,14 +280,16 @@ class Modes(Placed, Value):
     array([ 0.7071, -0.7071])
     """
 
-    omega: FloatArray
-    zeta: FloatArray
-    phi: FloatArray | ComplexArray
+    omega: FloatArray = field(metadata=checked(real_array, shape=(None,)))
+    zeta: FloatArray = field(metadata=checked(real_array, shape=("omega",)))
+    phi: FloatArray | ComplexArray = field(
+        metadata=checked(real_or_complex, shape=("dofs", "omega"))
+    )
     dofs: DofSet
     n_rigid: int = 0
     vectors: FloatArray = field(default_factory=_nothing)
-    vector_omega: FloatArray = field(default_factory=_nothing)
-    vector_zeta: FloatArray = field(default_factory=_nothing)
+    vector_omega: FloatArray = field(default_factory=_nothing, metadata=_OF_VECTORS)
+    vector_zeta: FloatArray = field(default_factory=_nothing, metadata=_OF_VECTORS)
     vector_dofs: Sequence[str] = ()
     residual: FloatArray = field(default_factory=_nothing)
     rounding: FloatArray = field(default_factory=_nothing)
@@ -284,8 +297,10 @@ class Modes(Placed, Value):
     notes: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        omega = real_array(self.omega, "omega", (None,))
-        k, n = omega.size, len(self.dofs)
+        dofs = self.vector_dofs
+        self._set(vector_dofs=(dofs,) if isinstance(dofs, str) else tuple(map(str, dofs)))
+        super().__post_init__()
+        omega, k = self.omega, len(self.omega)
         if not 0 <= self.n_rigid <= k or np.any(omega[: self.n_rigid] != 0):
             raise ModelError(
                 f"n_rigid is {self.n_rigid}, but the first frequencies of {k} are "
@@ -297,26 +312,14 @@ class Modes(Placed, Value):
                 "elastic modes need frequencies above 0: rigid-body modes, at 0, come first, then "
                 "unstable ones, with negative frequencies."
             )
-        places = (self.vector_dofs,) if isinstance(self.vector_dofs, str) else self.vector_dofs
-        m = len(places)
-        phi: FloatArray | ComplexArray = real_array(np.real(self.phi), "phi", (n, k))
-        if np.iscomplexobj(self.phi):
-            phi = phi + 1j * real_array(np.imag(self.phi), "the imaginary part of phi", (n, k))
-        if m and np.iscomplexobj(phi):
+        n, m = len(self.dofs), len(self.vector_dofs)
+        if m and np.iscomplexobj(self.phi):
             raise ModelError("attachment vectors go with real modes only.")
-        given = (self.vectors, self.vector_omega, self.vector_zeta)
-        if not m and any(np.size(part) for part in given):
+        if not m and np.size(self.vectors):
             raise ShapeError("vectors are given, but no vector_dofs that name them.")
-        vectors, vector_omega, vector_zeta = given if m else (np.zeros((n, 0)), *given[1:])
         self._set(
-            omega=omega,
-            zeta=real_array(self.zeta, "zeta", (k,)),
-            phi=phi,
             n_rigid=int(self.n_rigid),
-            vectors=real_array(vectors, "vectors", (n, m)),
-            vector_omega=real_array(vector_omega, "vector_omega", (m,)),
-            vector_zeta=real_array(vector_zeta, "vector_zeta", (m,)),
-            vector_dofs=tuple(str(place) for place in places),
+            vectors=real_array(self.vectors if m else np.zeros((n, 0)), "vectors", (n, m)),
             residual=real_array(self.residual, "residual", (k if np.size(self.residual) else 0,)),
             rounding=real_array(self.rounding, "rounding", (k if np.size(self.rounding) else 0,)),
             certificate={
@@ -450,11 +453,7 @@ class Modes(Placed, Value):
         ModelError, LabelError
             When it has no numbers, one is not of an elastic mode here, or the modes are complex.
         """
-        if np.iscomplexobj(self.phi):
-            raise ModelError(
-                "complex modes are coupled by their damping: a pole of one is not of one alone. "
-                "Solve with damping=ModalDamping(...), or calibrate the reduced model."
-            )
+        require_real(self, "a pole is not of one of them alone (a reduced model can be calibrated)")
         known = range(self.n_rigid + self.n_unstable + 1, self.n_modes + 1)
         places, poles = measured_poles(measured, known)
         omega, zeta = self.omega.copy(), self.zeta.copy()

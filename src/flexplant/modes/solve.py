@@ -155,7 +155,7 @@ def solve_modes(
         held = float(rounding_of(model.K, model.rigid_body).max())
         certificate["rigid_rounding"] = float(np.sqrt(held) / (2 * np.pi))
     if damping is None and model.D is not None and not _is_proportional(model, omega, phi):
-        return _complex_modes(model, phi, kept, top, names, factor)
+        return _coupled_modes(model, phi, kept, top, names, factor)
     inside = np.flatnonzero(signed_square(omega) <= top)[:kept]
     if inside.size < omega.size:
         omega, phi, residual = omega[inside], phi[:, inside], residual[inside]
@@ -305,7 +305,7 @@ def _is_proportional(model: FEModel, omega: FloatArray, phi: FloatArray) -> bool
     return bool(np.all(coupling <= PROPORTIONAL * largest))
 
 
-def _complex_modes(
+def _coupled_modes(
     model: FEModel,
     phi: FloatArray,
     count: int,
@@ -532,8 +532,6 @@ def _rest(
 
 #: DOFs at which dampers act, at most, and their forces, at most: more of them are a material's
 _TOUCHED, _FORCES = 600, 200
-#: relative: a damper below this is none
-_NONE = 1e-12
 
 
 def damper_forces(model: FEModel) -> FloatArray:
@@ -547,7 +545,7 @@ def damper_forces(model: FEModel) -> FloatArray:
     if touched.size > _TOUCHED:
         return none
     values, vectors = la.eigh(rows[touched][:, touched].toarray())
-    kept = np.flatnonzero(values > _NONE * values.max(initial=0.0))
+    kept = np.flatnonzero(values > ROUNDING * values.max(initial=0.0))
     if kept.size > _FORCES:
         return none
     forces = np.zeros((model.n_dof, kept.size))

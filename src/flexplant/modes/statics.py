@@ -140,7 +140,7 @@ class CountingFactor:
 
 
 def counting_factor(model: FEModel, square: float) -> CountingFactor | None:
-    """Return the factor at omega^2 = `square` of a bulky stable model; None: it does not pay."""
+    """Return the factor at omega^2 = `square` of a bulky stable model; None: it saves nothing."""
     order = dissection_of(model)
     if not order.is_costly or model.n_unstable:
         return None

@@ -14,6 +14,7 @@ from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
 from ..plant.partition import require_plain, require_sampled
 from ..plant.scheduling import port_at, require_positions
 from ..structure import Disc, Rectangle
+from ..tolerances import TYPED
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +135,6 @@ def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> d
 
 
 Zone = Rectangle | Disc
-#: places closer than this part of the largest distance between candidates are the same
-_SAME = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +154,7 @@ class Places:
     def same(self) -> float:
         """Points closer than this [m] are the same."""
         every = np.vstack([*self.points, *self.pois])
-        return _SAME * float(np.max(np.ptp(every, axis=0), initial=0.0))
+        return TYPED * float(np.max(np.ptp(every, axis=0), initial=0.0))
 
     def index(self, names: Sequence[str], what: str) -> list[int]:
         """Return the places of candidates by name."""

@@ -16,6 +16,7 @@ from ..checks import (
     Value,
     checked,
     mapping,
+    members,
     name_list,
     number,
     one_of,
@@ -506,16 +507,5 @@ def all_of(constraints: Any, side: str) -> tuple[Constraint, ...]:
 def constraints_of(constraints: Any) -> tuple[Constraint, ...]:
     """Return a constraint, or several, as a tuple."""
     given = (constraints,) if isinstance(constraints, Constraint) else constraints
-    if isinstance(given, str) or not isinstance(given, Sequence):
-        raise ModelError(
-            "constraints are a list of placement.Excluded(...), placement.MinimumDistance(...) and "
-            f"others, got {short(given)}. Put them in a list."
-        )
-    for item in given:
-        if not isinstance(item, Constraint):
-            raise ModelError(
-                "a constraint is placement.Excluded(...), placement.MinimumDistance(...) or "
-                f"another, got {short(item)}. Write placement.Excluded(Disc((0.3, 0.3), "
-                "radius=0.05)), say."
-            )
-    return tuple(given)
+    hint = "Write [placement.Excluded(Disc((0.3, 0.3), radius=0.05))], say."
+    return members(given, Constraint, "constraints", hint, least=0)

@@ -294,7 +294,7 @@ class Convex(Scorer, ABC):
             best = max(best, found)
             for step in _HALVES:
                 moved = weights + step * (least - weights)
-                lower = self.cost(0.999 * moved + 0.001 * centre)
+                lower = self.cost(0.999 * moved + 0.001 * centre)  # inside, where it has a slope
                 if lower < cost:
                     break
             if not lower < cost - _GAP * abs(cost) and np.isfinite(cost):

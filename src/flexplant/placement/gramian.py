@@ -12,14 +12,12 @@ from ..checks import FloatArray, IntArray, checked, one_of
 from ..errors import AssumptionError, ModelError
 from ..plant import SensorPort, StandardPlant
 from ..plant.realisation import ModalRealisation
-from ..tolerances import TINY, divisor
+from ..tolerances import RANK, TINY, divisor
 from .candidates import Port
 from .convex import Below, Branch, Convex, ascended, safe
 from .criterion import Criterion, Scorer, by_size
 
 MEASURES = ("trace", "log det", "least")
-#: what rounding leaves of an eigenvalue of zero, beside the largest
-_NOTHING = 1e-13
 #: steps to the largest log det, and the gap at which they stop [nats]
 _STEPS, _CLOSE = 300, 1e-3
 #: what rounding may have added to a log det [nats]
@@ -43,7 +41,7 @@ class SummedWorth(Scorer):
         kept = list(required)
         free = np.sort(np.delete(self.worth, kept))[::-1]
         used = np.concatenate([self.worth[kept], free[: count - len(kept)]])
-        return -float(used.sum() + 1e-14 * np.abs(used).sum())
+        return -float(used.sum() + 1e-14 * np.abs(used).sum())  # rounding of the sum
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +133,7 @@ class LogDetOfSum(SummedMatrices, Convex):
         except np.linalg.LinAlgError:
             pass
         values = np.linalg.eigvalsh(total)
-        singular = values[:, 0] <= _NOTHING * values[:, -1]
+        singular = values[:, 0] <= RANK * values[:, -1]
         with np.errstate(divide="ignore", invalid="ignore"):
             found = -np.sum(np.log(np.maximum(values, 0.0)), axis=1)
         return np.asarray(np.where(singular, np.inf, found))

@@ -9,14 +9,15 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..checks import FloatArray, checked, flag, instance, one_of, positive, short
-from ..errors import AssumptionError, LabelError, ModelError, only_one, require_known
+from ..errors import LabelError, ModelError, only_one, require_known
 from ..estimation import Filter, FixedLag, KalmanEstimator, Predictor, design_kalman
 from ..estimation.estimator_channels import sensors
-from ..lti.sampling import held_exactly
+from ..lti.sampling import held_exactly, reaches_at_once
 from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..plant import Actuator, StandardPlant, larger_plant
 from ..plant.building import direct_effect
+from ..plant.partition import require_noise
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from .candidates import Port, with_side
@@ -239,12 +240,7 @@ class PoiVariance(Criterion):
         noise = plant.sensor_noise.diagonal()
         sizes = {name: noise[i] for i, name in enumerate(plant.y)}
         sizes |= {p.name: p.asd for p in candidates if hasattr(p, "asd")}
-        silent = [sensor.name for sensor in candidates if sizes[sensor.name] <= 0]
-        if silent:
-            raise AssumptionError(
-                f"sensors {', '.join(silent[:6])} have no noise (asd 0): the filter would trust "
-                "them without limit. Give Sensor(..., asd=) what the data sheet says."
-            )
+        require_noise({sensor.name: sizes[sensor.name] for sensor in candidates})
         if plant.is_assembled:
             _check_direct(plant, candidates)
 
@@ -327,8 +323,4 @@ def _check_direct(plant: StandardPlant, candidates: Sequence[Any]) -> None:
     for sensor in candidates:
         seen = sensor.see(realisation)
         if loud and np.any(direct_effect(realisation.model, seen, sensor.order, push, ground)):
-            raise AssumptionError(
-                f"white noise of a disturbance reaches {sensor.name!r} at once "
-                "(an acceleration, say), so a sample of it would have infinite variance. "
-                "Measure displacement or velocity, or shape the disturbance."
-            )
+            raise reaches_at_once("a disturbance", sensor.name)

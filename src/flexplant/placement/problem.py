@@ -15,6 +15,7 @@ import numpy as np
 from ..checks import FloatArray, IntArray, Value
 from ..errors import AssumptionError, CertificateError, counted
 from ..plant import Actuator, Assumption, SensorPort, StandardPlant, assemble_plant
+from ..plant.reach_and_sight import ABSENT
 from ..tolerances import SETTLED, divisor
 from ..work import Work
 from .candidates import Port, Side, sampled_plant, side_of, with_side
@@ -118,10 +119,6 @@ def layouts_of(
     return replace(layouts, scorer=criterion.scorer(plainly.whole, candidates))
 
 
-#: a rigid-body motion weaker than this beside the strongest counts as absent (as in plant.check)
-WEAK = 1e-8
-
-
 @dataclass(frozen=True, eq=False)
 class RigidPart:
     """Rows (N, r) of candidates in rigid-body modes, of unit size or zero.
@@ -160,7 +157,7 @@ class RigidPart:
 
         def missed(chosen: IntArray) -> IntArray:
             values = np.linalg.svd(self.rows[chosen], compute_uv=False)
-            strong = (values > WEAK * values[:, :1]) & (values > 0)
+            strong = (values > ABSENT * values[:, :1]) & (values > 0)
             return np.asarray(wanted - np.count_nonzero(strong, axis=1))
 
         return by_size(sets, missed).astype(np.int64)
@@ -407,7 +404,7 @@ class Problem:
             sizes = np.linalg.norm(left, axis=1) * (1.0 if weights is None else weights)
             sizes[chosen] = sizes[shut] = 0.0
             pick = int(np.argmax(sizes))
-            if np.linalg.norm(left[pick]) < WEAK:
+            if np.linalg.norm(left[pick]) < ABSENT:
                 break
             chosen.append(pick)
             left = _rows_without(left, left[pick])
@@ -463,7 +460,7 @@ class Search(Value):
 
 def _rows_without(rows: FloatArray, row: FloatArray) -> FloatArray:
     size = float(np.linalg.norm(row))
-    if size < WEAK:
+    if size < ABSENT:
         return rows
     unit = row / size
     return rows - np.outer(rows @ unit, unit)

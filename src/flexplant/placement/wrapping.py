@@ -79,7 +79,7 @@ class LeftOutModes(Criterion):
     LeftOutModes()
     """
 
-    scale: ClassVar[float] = 1e-6
+    scale: ClassVar[float] = 1e-6  # micrometres beside metres
     larger: Any = None
     of: str = field(default="sensors", kw_only=True, metadata=checked(one_of, choices=SIDES))
 

@@ -92,9 +92,9 @@ def with_filters(structure: StateSpace, realisation: ModalRealisation, ports: Po
     if any(np.any(port.ground) for port in ports.forces):
         system = _with_ground(structure, before, after, port_rows(realisation, ports))
     if before:
-        system = series(_side_by_side(before, structure.inputs), system)
+        system = series(_filters_of_channels(before, structure.inputs), system)
     if after:
-        system = series(system, _side_by_side(after, structure.outputs))
+        system = series(system, _filters_of_channels(after, structure.outputs))
     noisy = [name.rpartition(":")[0] for name in ports.input_noises]
     if not noisy:
         return system
@@ -110,7 +110,7 @@ def _named_filters(ports: Iterable[ForcePort | SensorPort]) -> dict[str, StateSp
     return {n: g.replace(inputs=[n], outputs=[n]) for n, g in found.items() if g is not None}
 
 
-def _side_by_side(filters: Mapping[str, StateSpace], names: Iterable[str]) -> StateSpace:
+def _filters_of_channels(filters: Mapping[str, StateSpace], names: Iterable[str]) -> StateSpace:
     """Return the filters of channels as one; a channel without a filter passes through."""
     one = as_statespace(1.0)
     return append(*(filters.get(n) or one.replace(inputs=[n], outputs=[n]) for n in names))

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..checks import FloatArray, Value, between, checked, positive, real_array
-from ..errors import unknown_label
+from ..errors import require_known
 from ..labels import Place
 from ..lti.statespace import StateSpace
 from ..structure.rigid import turned_about
@@ -396,8 +396,7 @@ class RigidForce(ForcePort):
     def push(self, realisation: ModalRealisation) -> FloatArray:
         """Return the load (n,) over the model's DOFs of a unit force."""
         body = rigid_body_of(realisation)
-        if self.direction not in body.axes:
-            raise unknown_label("rigid-body axis of the machine", self.direction, body.axes)
+        require_known("rigid-body axis of the machine", [self.direction], body.axes)
         row = body.axes.index(self.direction)
         load = inertia_load(realisation, self.direction, body.centre)
         return np.asarray(-load / body.mass[row, row])

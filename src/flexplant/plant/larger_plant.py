@@ -147,6 +147,7 @@ def draws_with_left_out(
     deltas, covariance = list(uncertain.deltas), uncertain.covariance
     deviation = np.sqrt(np.diag(covariance))
     root = np.linalg.cholesky(
+        # regular, where one repeats others
         covariance / np.outer(deviation, deviation) + 1e-9 * np.eye(deviation.size)
     )
 

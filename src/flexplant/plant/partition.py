@@ -16,6 +16,7 @@ from ..errors import (
     ModelError,
     counted,
     require_known,
+    some_names,
     unknown_label,
 )
 from ..labels import DIRECTIONS
@@ -535,6 +536,15 @@ def require_sampled(
     """Refuse a continuous plant."""
     if not plant.dt:
         raise error(f"the plant is continuous: {why}. Use plant.discretized(rate, delay=1).")
+
+
+def require_noise(sizes: Mapping[str, float]) -> None:
+    """Refuse sensors whose noise has no size."""
+    if silent := [name for name, size in sizes.items() if not size > 0]:
+        raise AssumptionError(
+            f"sensors {some_names(silent)} have no noise (asd 0): filters would trust them without "
+            "limit and differentiate them. Give Sensor(..., asd=) what the data sheet says."
+        )
 
 
 def sides(g: StateSpace) -> tuple[list[str], list[str], list[str], list[str]]:

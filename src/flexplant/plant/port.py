@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from ..checks import FloatArray, Value, check_names, flag, positive, real_array, short
-from ..errors import LabelError, ModelError, require_known, unknown_label
+from ..errors import LabelError, ModelError, require_known
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace, single_channel
 from .realisation import ModalRealisation
@@ -297,8 +297,7 @@ def checked_choice(name: str, absolute: Any) -> bool | None:
 
 def port_direction(name: str, direction: str) -> str:
     """Return one of the six directions, or raise LabelError."""
-    if not isinstance(direction, str) or direction not in DIRECTIONS:
-        raise unknown_label(f"direction of {name!r}", direction, DIRECTIONS)
+    require_known(f"direction of {name!r}", [direction], DIRECTIONS)
     return direction
 
 

@@ -19,7 +19,7 @@ from .partition import Partition
 from .rigid_motion import body_of, rigid_modes
 
 #: a motion weaker than this beside the strongest one counts as absent
-_ABSENT = 1e-8
+ABSENT = 1e-8
 #: a pole closer to the stability limit than this, relative to its size, counts as on it
 _AXIS = 1e-9
 #: findings of one kind that are written out
@@ -137,7 +137,7 @@ def _persistent(g: StateSpace) -> list[_Pole]:
             continue
         shifted = g.A - (pole if pole.imag else pole.real) * np.eye(g.n_states)
         left, sizes, right = la.svd(shifted)
-        count = max(int(np.count_nonzero(sizes <= _ABSENT * size)), 1)
+        count = max(int(np.count_nonzero(sizes <= ABSENT * size)), 1)
         count = min(count, _most(g, complex(pole), near))
         found.append(_Pole(complex(pole), left[:, -count:], right[-count:].conj().T))
     return found
@@ -276,7 +276,7 @@ def _null_combinations(matrix: ComplexArray | FloatArray) -> ComplexArray:
     if not scaled.size:
         return np.eye(matrix.shape[0], dtype=np.complex128)
     U, s, _ = la.svd(scaled, full_matrices=True)
-    return np.asarray(U[:, np.count_nonzero(s > _ABSENT * s[0]) :])
+    return np.asarray(U[:, np.count_nonzero(s > ABSENT * s[0]) :])
 
 
 def _axes_in_words(plant: Partition, combinations: FloatArray) -> list[str]:
@@ -370,7 +370,7 @@ def _frequency(plant: Partition, zero: complex) -> str:
     own = np.sqrt(np.abs(np.linalg.det(plant.modal_blocks)))
     if own.size:
         nearest = int(np.argmin(np.abs(own - omega)))
-        if abs(own[nearest] - omega) < 1e-4 * omega:
+        if abs(own[nearest] - omega) < 1e-4 * omega:  # one mode, filters beside it
             return f"{text} (mode {nearest + 1})"
     return text
 

@@ -11,9 +11,8 @@ import numpy as np
 from ..checks import FloatArray, Value, instance, number, real_array, short, whole
 from ..errors import LabelError, ModelError, require_known
 from ..labels import Place
+from ..tolerances import SAME
 
-#: relative to a range: a position this little beyond its end is rounding
-_BEYOND = 1e-9
 #: points of a position that a mapping of them does not name
 _POINTS = 21
 
@@ -73,7 +72,7 @@ class Position(Value):
         """Return a value of it as a float; ModelError when it lies outside the range."""
         found = number(value, f"position {self.name!r}")
         low, high = self.range
-        spare = _BEYOND * (high - low)
+        spare = SAME * (high - low)
         if not low - spare <= found <= high + spare:
             raise ModelError(
                 f"position {self.name!r} is {found:g}, outside its range from {low:g} to {high:g}: "
@@ -143,7 +142,7 @@ class PlaceTable(Value):
     def covers(self, position: Position) -> bool:
         """Return whether its values span the range of a position."""
         values, (low, high) = np.asarray(self.grid[position.name]), position.range
-        spare = _BEYOND * (high - low)
+        spare = SAME * (high - low)
         return bool(values[0] <= low + spare and values[-1] >= high - spare)
 
 

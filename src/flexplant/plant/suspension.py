@@ -18,13 +18,11 @@ from ..reduction import ReducedModel
 from ..sparse.symmetric import orthonormalised
 from ..structure import Damper, FEModel, Spring
 from ..structure.rigid import SPANNED
-from ..tolerances import divisor
+from ..tolerances import SAME, divisor
 from .port import checked_place, port_direction
 from .realisation import realise
 
 Suspended = TypeVar("Suspended", FEModel, ReducedModel, Modes)
-#: relative: a rigid-body motion that stretches a spring by less than this does not
-_SLACK = 1e-9
 
 
 #: field: a damper, none at all included
@@ -99,9 +97,9 @@ class _Springs(NamedTuple):
             return np.zeros((0, 0))
         stretch = self.rows @ rigid
         most = np.abs(self.rows).sum(axis=1, keepdims=True) * np.abs(rigid).max()
-        stretch[np.abs(stretch) <= _SLACK * most] = 0.0  # a spring on the axis of a hinge
+        stretch[np.abs(stretch) <= SAME * most] = 0.0  # a spring on the axis of a hinge
         size = np.linalg.norm(stretch, axis=1, keepdims=True)
-        return np.asarray(la.null_space(stretch / divisor(size), rcond=_SLACK))
+        return np.asarray(la.null_space(stretch / divisor(size), rcond=SAME))
 
 
 def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) -> Suspended:

@@ -12,6 +12,7 @@ from matplotlib.ticker import MultipleLocator
 from ..checks import ComplexArray, FloatArray, name_list, real_array, short
 from ..errors import ModelError, require_known, unknown_label
 from ..lti.frequency import Frf
+from ..tolerances import ROUNDING
 from ._axes import (
     GREY,
     STYLES,
@@ -132,10 +133,6 @@ def _whole_turns(ax: Axes) -> None:
     ax.yaxis.set_major_locator(MultipleLocator(step))
 
 
-#: singular values smaller than this part of the largest one are rounding
-_ROUNDING = 1e-12
-
-
 def singular_values(
     systems: Any, *, freq: FloatArray | None = None, ax: Axes | None = None
 ) -> Axes:
@@ -167,7 +164,7 @@ def singular_values(
     drawn = curves(systems, freq)
     for curve in drawn:
         values = singular(curve.response)
-        rank = int(np.max(np.sum(values > _ROUNDING * values[:, :1], axis=1), initial=1))
+        rank = int(np.max(np.sum(values > ROUNDING * values[:, :1], axis=1), initial=1))
         largest, smallest = (decibel(np.asarray(values[:, k])) for k in (0, rank - 1))
         ax.semilogx(curve.response.freq, largest, label=curve.label or None, **curve.line)
         if rank > 1:

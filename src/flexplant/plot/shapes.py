@@ -20,7 +20,7 @@ from ..errors import ModelError, counted
 from ..labels import DofSet
 from ..modes import Modes
 from ..plant import Ports
-from ..tolerances import divisor
+from ..tolerances import TYPED, divisor
 from ._axes import (
     BLACK,
     GREY,
@@ -229,8 +229,6 @@ Shape: TypeAlias = Any
 MOST = 30_000
 #: edges longer than this many times the distance between nodes join what is not connected
 _REACH = 2.5
-#: relative: nodes are on a line, or in a plane, up to this
-_FLAT = 1e-6
 #: share of the hull that a surface has at least: with less, the nodes are too irregular to judge
 _WHOLE = 0.6
 #: cosine of the angle between faces, below which their edge is one of the body
@@ -291,7 +289,7 @@ def _dimension(xyz: FloatArray) -> int:
     if len(xyz) < 2:
         return 0
     sizes = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
-    return int(np.count_nonzero(sizes > _FLAT * sizes[0]))
+    return int(np.count_nonzero(sizes > TYPED * sizes[0]))
 
 
 def _flat_axes(xyz: FloatArray) -> FloatArray:
@@ -337,7 +335,7 @@ def _outline(xyz: FloatArray, triangles: IntArray) -> IntArray:
     a, b, c = (xyz[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     area = np.linalg.norm(normal, axis=1, keepdims=True)
-    known = np.flatnonzero(area[:, 0] > _FLAT * area.max())
+    known = np.flatnonzero(area[:, 0] > TYPED * area.max())
     normal = normal / divisor(area)
     sides = np.sort(np.vstack([triangles[known][:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
     order = np.lexsort(sides.T)

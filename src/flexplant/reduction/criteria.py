@@ -109,11 +109,11 @@ class EffectiveIndependence(SelectionCriterion):
         vectors, size, _ = la.svd(both, full_matrices=False)
         rows = np.array(vectors[:, size > _UNSEEN * size[0]])
         wanted = max(count, min(rows.shape[1] - fixed, p))
-        alive = np.arange(fixed + p)
-        while alive.size > fixed + wanted:
-            drops = min(_REFRESH, alive.size - fixed - wanted)
-            alive = np.delete(alive, _dropped_rows(rows[alive], fixed, drops))
-        left = alive[fixed:] - fixed
+        remaining = np.arange(fixed + p)
+        while remaining.size > fixed + wanted:
+            drops = min(_REFRESH, remaining.size - fixed - wanted)
+            remaining = np.delete(remaining, _dropped_rows(rows[remaining], fixed, drops))
+        left = remaining[fixed:] - fixed
         if wanted > count:
             left = left[PivotedQr().chosen(required, pool[left], count)]
         return [int(i) for i in left]

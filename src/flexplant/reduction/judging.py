@@ -8,7 +8,17 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, positive, real_array, short, whole
+from ..checks import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    Value,
+    frequency_band,
+    positive,
+    real_array,
+    short,
+    whole,
+)
 from ..errors import ModelError, aligned, counted
 from ..labels import Place
 from ..lti.frequency_sweep import climbed_grid
@@ -44,9 +54,7 @@ def quality_of(
             f"a reduced model is compared with the FEModel or Modes it was made of, got {what}: "
             "pass that."
         )
-    low, high = real_array(band, "band", (2,)).tolist()
-    if not 0 <= low < high:
-        raise ModelError(f"band must be two rising frequencies [Hz], got {[low, high]}.")
+    low, high = frequency_band(band)
     pushed, watched = _judged_places(reduced, inputs, outputs)
     own: Modes = reduced.replace(D=np.zeros_like(reduced.D)).modes()
     if reduced.is_physical:

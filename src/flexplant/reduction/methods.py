@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from ..checks import FloatArray, Matrix, Value, checked, instance, name_list
 from ..errors import LabelError, ModelError, ShapeError, SolverError, attempted, counted, some_names
 from ..labels import DofSet, Place
-from ..modes.modes import Modes
+from ..modes.modes import Modes, require_real
 from ..modes.solve import solve_modes
 from ..modes.statics import places
 from ..parallel import Progress
@@ -238,12 +238,7 @@ class DesiredDofs(ReductionMethod):
             truncated = modes.select(range(len(labels), modes.n_modes))
             modes = modes.select(range(len(labels)))
         k = modes.n_modes + modes.n_vectors
-        if np.iscomplexobj(modes.phi):
-            raise ModelError(
-                "these modes are complex (the damping is not proportional), and equation (5) has "
-                "no diagonal form. Solve with damping=ModalDamping(...), reduce, and add the "
-                "dampers to the reduced model; or reduce(model, Serep(dofs)), which keeps D."
-            )
+        require_real(modes, "(5) has no diagonal form: add dampers later, or keep D by Serep(dofs)")
         if len(labels) != k:
             advice = f"Name {counted(k - len(labels), 'more DOF')} or keep fewer modes"
             if len(labels) > k:

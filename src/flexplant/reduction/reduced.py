@@ -23,7 +23,7 @@ from ..checks import (
 )
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
-from ..modes.modes import Modes, calibrated_matrices, measured_poles
+from ..modes.modes import Modes, calibrated_matrices, measured_poles, require_real
 from ..modes.normal_form import normal_form
 from ..modes.solve import leaving_overdamped
 from ..parallel import Progress
@@ -306,11 +306,7 @@ class ReducedModel(Value):
         more = self.truncated
         if more is None:
             return self
-        if np.iscomplexobj(more.phi):
-            raise ModelError(
-                "the truncated modes are complex, they cannot stand beside real coordinates. "
-                "Solve with damping=ModalDamping(...)."
-            )
+        require_real(more, "truncated ones cannot stand beside real coordinates")
         names = tuple(self.coordinates)
         kept = [i for i, name in enumerate(names) if not name.startswith(STATIC)]
         block = np.ix_(kept, kept)

@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ..checks import FloatArray, checked, whole
 from ..errors import ModelError, counted
 from ..labels import Place
-from ..modes.modes import Modes
+from ..modes.modes import Modes, require_real
 from ..modes.solve import solve_modes
 from ..modes.statics import attachment_vectors, labels_of, places, static_response
 from ..structure import FEModel, ModalDamping
@@ -220,11 +220,7 @@ def truncated(
     method: str,
 ) -> ReducedModel:
     """Return some of the modes, with the static compliance of the others in the same modes."""
-    if np.iscomplexobj(modes.phi):
-        raise ModelError(
-            "these modes are complex, and equation (5) has no diagonal form: solve with "
-            "damping=ModalDamping(...), or give the FEModel, whose D is projected."
-        )
+    require_real(modes, "(5) has no diagonal form (an FEModel may be given, its D is projected)")
     columns = kept_columns(numbers, modes)
     basis, omega, zeta = np.real(modes.basis), modes.basis_omega, modes.basis_zeta
     others = np.setdiff1d(np.arange(omega.size), columns)

@@ -33,6 +33,7 @@ from ..lti.lyapunov import solve_stein
 from ..lti.riccati import solve_dare
 from ..parallel import one_thread
 from ..plant import StandardPlant
+from ..plant.partition import require_noise
 from ..tolerances import SAME
 from .moving_machine import (
     MovingMachine,
@@ -109,7 +110,7 @@ def rms_along(
     duration : float [s]
         Of the trajectory.
     repeats : bool
-        Whether the trajectory repeats for ever: the variance is then the periodic one,
+        Whether the trajectory repeats without end: the variance is then the periodic one,
         ``P[0] = P[duration]``. Else the machine has stood at the beginning for a long time.
 
     Returns
@@ -180,7 +181,7 @@ def _standing(machine: MovingMachine) -> FloatArray:
 
 
 def _periodic(machine: MovingMachine, steps: int) -> FloatArray:
-    """Return the covariance at the beginning of a trajectory that repeats for ever."""
+    """Return the covariance at the beginning of a trajectory that repeats without end."""
     Phi = np.eye(machine.plant.system.n_states + machine.loop.controller.n_states)
     P = np.zeros_like(Phi)
     for k, sample in enumerate(machine.each(steps)):
@@ -311,7 +312,7 @@ def filters_along(
             rms, P = filters.run(P, gain)
             if np.all(np.abs(rms - before) <= _SETTLED * rms):
                 break
-            # a steady gain may be unstable on the way: its errors then grow for ever
+            # a steady gain may be unstable on the way: its errors then grow without bound
             if gain is not None and np.any(rms > _DIVERGED * found["exact"]):
                 break
         else:
@@ -342,8 +343,8 @@ class _Filters:
         self.names = [poi.channel(axis) for poi in ports.z for axis in poi.axes]
         self.z = [plant.z.index(name) for name in self.names]
         self.R = plant.sensor_noise[np.ix_(rows, rows)]
-        if not np.all(np.diag(self.R) > 0):
-            raise ModelError("a filter needs noise of every sensor: Sensor(..., asd=...).")
+        names = [sensor.name for sensor in ports.y]
+        require_noise(dict(zip(names, np.diag(self.R).tolist(), strict=True)))
         self.moved = list(self.machine.path.paths)
         self.count = whole(positions, "positions", minimum=2)
 
@@ -417,7 +418,7 @@ class _Filters:
             P, shown = ahead, sample.C[self.z]
             rms[:, k] = np.sqrt(np.einsum("ij,jk,ik->i", shown, after, shown))
             if np.any(rms[:, k] > _LOST * rms[:, 0]):
-                rms[:, k:] = rms[:, k : k + 1]  # grows for ever: soon beyond all numbers
+                rms[:, k:] = rms[:, k : k + 1]  # grows without bound: soon beyond all numbers
                 break
         return rms, P
 

@@ -121,7 +121,7 @@ def exposure_errors(
     count = shortest if window is None else _fitting(window, run.dt, shortest, where)
     values = np.zeros((len(names), 4))
     for i, name in enumerate(names):
-        both = [_windows(run[name][..., part], count, window is None) for part in parts]
+        both = [_window_moments(run[name][..., part], count, window is None) for part in parts]
         for j in (0, 1):
             sizes = np.abs(np.concatenate([pair[j].ravel() for pair in both]))
             values[i, 2 * j : 2 * j + 2] = sizes.max(), np.quantile(sizes, SHARE)
@@ -178,7 +178,7 @@ def settling_time(
     part = _exposure_slices(run, after, None)[0]
     most = part.stop - part.start
     count = _fitting(window, run.dt, most, f"the {most} samples after {after:g} s")
-    average, deviation = _windows(run[channel][..., part], count, False)
+    average, deviation = _window_moments(run[channel][..., part], count, False)
     outside = (np.abs(average) > limit[0]) | (deviation > limit[1])
     late = outside.shape[-1] - np.argmax(outside[..., ::-1], axis=-1)
     steps = np.where(np.any(outside, axis=-1), late, 0).astype(np.float64)
@@ -248,7 +248,7 @@ def _exposure_slices(run: Response, start: Any, exposures: Any) -> list[slice]:
     return [slice(int(begin), int(end)) for begin, end in edges]
 
 
-def _windows(signal: FloatArray, count: int, whole: bool) -> tuple[FloatArray, FloatArray]:
+def _window_moments(signal: FloatArray, count: int, whole: bool) -> tuple[FloatArray, FloatArray]:
     """Return MA and MSD of all windows of `count` samples that lie within a stretch."""
     unit = signal_unit(signal)
     # an offset would cost digits of the deviation: it is removed first

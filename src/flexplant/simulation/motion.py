@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ..checks import FloatArray, Value, instance, positive, real_array
 from ..errors import ModelError, counted
+from ..tolerances import RANK
 
 #: [samples] a time this close to the grid is on it
 ON_GRID = 1e-6
@@ -161,10 +162,6 @@ class SetPoint(Value):
         return constant_snap(self.states.T, np.where(self.from_end, 0.0, self.lengths))
 
 
-#: relative: bounds may be exceeded by rounding alone
-_ROUNDING = 1e-13
-
-
 class Phase(NamedTuple):
     """A stretch of time in which the highest derivative is constant.
 
@@ -222,7 +219,7 @@ def on_grid(distance: float, bounds: tuple[float, ...], rate: float) -> tuple[fl
         widths = np.cumprod([1.0, *w[::-1]])
         ticks = [bound / rate**m for m, bound in enumerate(bounds, start=1)]
         needed = max(distance / (bound * v) for bound, v in zip(ticks, widths, strict=True))
-        last = max(np.ceil(needed * (1.0 - _ROUNDING) - b[-1]), 0.0 if first else 1.0)
+        last = max(np.ceil(needed * (1.0 - RANK) - b[-1]), 0.0 if first else 1.0)
         total, volume = 2.0 * b[-1] + last, float(widths[-1]) * (b[-1] + last)
         if best is None or (total, -volume) < best:
             best, chosen = (total, -volume), (*(float(n) for n in first), float(last))

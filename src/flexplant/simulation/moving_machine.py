@@ -25,13 +25,12 @@ from ..plant.scheduling import Position
 from ..tolerances import SAME
 from .motion import SetPoint
 from .nonlinear_elements import Acting
+from .runs import NO_NOISE
 
 #: nodes of Gauss's rule in a sample, beyond one for each radian of the fastest mode
 _NODES = 12
 #: samples of a stretch, and runs side by side
 _STRETCH, _ABREAST = 128, 16
-#: part of the largest noise that is rounding: its square is that of a covariance
-_NO_NOISE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -384,7 +383,7 @@ class _Rule:
         parts = np.einsum("q,qj,qbcd->qbcjd", np.sqrt(weight), share, flow)
         full = parts.reshape(weight.size, -1)
         U, s, V = np.linalg.svd(full, full_matrices=False)
-        kept = int(np.count_nonzero(s > _NO_NOISE * s.max(initial=0.0)))
+        kept = int(np.count_nonzero(s > NO_NOISE * s.max(initial=0.0)))
         found = (s[:kept, None] * V[:kept]).reshape(kept, len(self.pairs), 2, 6)
         ordered = found.transpose(1, 2, 0, 3).reshape(len(self.pairs), 2 * kept, 6)
         return U[:, :kept], np.ascontiguousarray(ordered)

@@ -201,7 +201,7 @@ def _split_matrix(g: StateSpace) -> tuple[FloatArray, FloatArray, IntArray, Floa
 
 
 #: part of a state's largest noise that is rounding: its square is that of a covariance
-_NO_NOISE = 1e-8
+NO_NOISE = 1e-8
 #: states of a plant from which on this is not searched for: it would take longer than a run
 _MANY = 256
 #: samples that are drawn and mixed at a time: they stay in the cache
@@ -227,7 +227,7 @@ class Drawn:
             size = np.linalg.norm(noise.factor, axis=1)
             unit = noise.factor / divisor(size)[:, None]
             U, s, V = np.linalg.svd(unit, full_matrices=False)
-            kept = int(np.count_nonzero(s > _NO_NOISE * s.max(initial=0.0)))
+            kept = int(np.count_nonzero(s > NO_NOISE * s.max(initial=0.0)))
             self.factor = size[:, None] * U[:, :kept] * s[:kept]
             self.mix = np.ascontiguousarray(V[:kept].T)
         self.buffer = np.empty((_CHUNK, self.mix.shape[0] + self.columns.size))

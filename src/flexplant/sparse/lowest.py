@@ -40,7 +40,7 @@ VALUE = 1e-6
 STEPS = "modes, steps of Lanczos"
 #: steps between two restarts, with a large block
 _STEPS, _FEW_STEPS = 12, 6
-_RESTARTS = 60
+_RESTARTS = 60  # then M and K are called badly conditioned
 #: a block with directions this much shorter than others is orthonormalised again
 _LOST = 1e-3
 #: what one orthogonalisation may take away, relative, for rounding to leave nothing of it

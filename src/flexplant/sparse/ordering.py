@@ -66,7 +66,7 @@ class Dissection:
 
     @property
     def is_costly(self) -> bool:
-        """Whether single precision pays: a factorisation costs far more than solutions with it."""
+        """Whether single precision is faster: factors cost far more than solutions with them."""
         # so it is for bulky structures, whose modes are also not lost in its rounding
         return self.multiplications > _COSTLY * self.n_factor
 

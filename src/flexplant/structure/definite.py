@@ -23,13 +23,11 @@ from ..sparse.symmetric import (
     soft_group,
     unit_diagonal,
 )
-from ..tolerances import TYPED
+from ..tolerances import SAME, TYPED
 from .zero_energy import most_moved, nonrigid
 
 #: what becomes a matrix of a structure
 MatrixLike: TypeAlias = npt.ArrayLike | sp.sparray | sp.spmatrix
-#: relative to the diagonal: entries of a symmetric matrix differ by less from their mirror images
-_SYMMETRY_TOLERANCE = 1e-9
 #: relative to the diagonal: K and D may have eigenvalues this far below zero
 SEMIDEFINITE = 1e-9
 #: part of its largest possible energy that a rigid translation has at most in K, least in M
@@ -96,7 +94,7 @@ def symmetric_matrix(given: Any, name: str, n: int) -> Matrix:
     scaled, _ = unit_diagonal(matrix)
     skew: Any = abs(scaled - scaled.T)
     worst = float(skew.max()) if n else 0.0
-    if worst > _SYMMETRY_TOLERANCE:
+    if worst > SAME:
         i, j = (int(k) for k in np.unravel_index(skew.argmax(), (n, n)))
         raise ModelError(
             f"{name} is not symmetric: entry ({i}, {j}) is {matrix[i, j]:.6g} and ({j}, {i}) is "

@@ -26,6 +26,7 @@ from ..checks import (
 )
 from ..errors import ModelError, ShapeError
 from ..labels import DofSet, Interpolation, node_dofs
+from ..tolerances import TYPED
 from .element_matrices import Grid, beam_mass, beam_rotary, beam_stiffness
 
 #: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre
@@ -286,10 +287,6 @@ def dofs_of(
     return node_dofs(grid.nodes + 1, directions, xyz, shape)
 
 
-#: of an element: a rib's ends are this close to nodes
-_ON_NODE = 1e-6
-
-
 class Skin(NamedTuple):
     """Thickness and material of a plate: numbers, or arrays (ny, nx)."""
 
@@ -461,7 +458,7 @@ def _edges(
     counts = np.array(grid.counts)
     place = np.array([rib.start, rib.end]) / np.array(lengths) * counts
     nodes = np.round(place).astype(int)
-    if np.abs(place - nodes).max() > _ON_NODE or np.any(nodes < 0) or np.any(nodes > counts):
+    if np.abs(place - nodes).max() > TYPED or np.any(nodes < 0) or np.any(nodes > counts):
         steps = (np.array(lengths) / counts).tolist()
         raise ModelError(
             f"{rib!r} does not run from node to node: the nodes are at multiples of "

@@ -14,7 +14,7 @@ from ..errors import ModelError, counted, some_names
 from ..labels import DIRECTIONS, DofSet
 from ..parallel import Progress
 from ..sparse.symmetric import diagonal
-from ..tolerances import TYPED
+from ..tolerances import SAME, TYPED
 from .check_facts import Facts, facts
 from .matrices import FEMatrices
 from .model import FEModel
@@ -232,8 +232,6 @@ def _rounding_warning(found: Facts, digits: int) -> str | None:
 #: verdict, subject, finding, next step
 Line: TypeAlias = tuple[str, str, str, str]
 
-#: relative to the diagonal: entries differ by less from their mirror images
-_SYMMETRY = 1e-9
 #: a diagonal that exceeds all it couples to by this much is a penalty
 _PENALTY = 1e6
 
@@ -245,7 +243,7 @@ def widest_dofs(found: Facts, motion: FloatArray) -> tuple[str, ...]:
 
 def _matrix_lines(found: Facts) -> Iterator[Line]:
     """Return the lines on symmetry and definiteness."""
-    wrong = {name: skew for name, skew in found.skew.items() if skew[0] > _SYMMETRY}
+    wrong = {name: skew for name, skew in found.skew.items() if skew[0] > SAME}
     for name, (size, i, j) in wrong.items():
         matrix: Any = getattr(found.given, name)
         yield (
@@ -453,7 +451,7 @@ def _free_and_held(found: Facts, motions: ZeroEnergy) -> str:
     if combined > 0:
         alone = [f"free in {free}"] if free else []
         if found.given.located and found.given.dofs is not None:
-            alone += [f"free {way}" for way in _free_axes(motions, found.given.dofs)]
+            alone += [f"free {way}" for way in _combined_motions(motions, found.given.dofs)]
             return f"{', and '.join(alone)}; else grounded in {held}{absent}"
         alone.append(f"free in {counted(combined, 'combination')} of {held}")
         return f"{', and '.join(alone)} (each by itself is held){absent}"
@@ -525,7 +523,7 @@ def _scale_lines(found: Facts) -> Iterator[Line]:
 _SMALL = 1e-6
 
 
-def _free_axes(motions: ZeroEnergy, dofs: DofSet) -> list[str]:
+def _combined_motions(motions: ZeroEnergy, dofs: DofSet) -> list[str]:
     """Return in words the free motions that are combinations of x to rz, one by one."""
     # a motion `t + w x (r - r_0)` turns about the axis along w through `r_0 + w x t / |w|^2`, and
     # moves along it by `t . w / |w|` per radian

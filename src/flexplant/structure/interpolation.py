@@ -10,16 +10,14 @@ import numpy as np
 
 from ..checks import FloatArray, IntArray, Value, checked, instance, positive, real_array
 from ..dof_columns import direction_names
-from ..errors import LabelError, ModelError
+from ..errors import LabelError, ModelError, require_known
 from ..labels import DIRECTIONS, DofSet, Interpolation
-from ..tolerances import TINY
+from ..tolerances import SAME, TINY
 from .model import FEModel
 
 #: up to this many nodes one smooth interpolant serves everywhere; beyond, the nearest nodes do
 _GLOBAL = 600
 _NEIGHBOURS = 80
-#: relative to the extent of the nodes: closer than this is the same place
-_SAME = 1e-9
 #: rotation of the material = half the curl: (sign, displacement, derivative along axis)
 _CURL = {
     "rx": ((1.0, "z", 1), (-1.0, "y", 2)),
@@ -125,8 +123,7 @@ class ScatteredShape(Interpolation):
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
         """Return the weights (p, n) at many points (p, 3), as `row` does one by one."""
         places = real_array(points, "points", (None, 3))
-        if not isinstance(direction, str) or direction not in DIRECTIONS:
-            raise LabelError(f"no motion {direction!r}: use one of {', '.join(DIRECTIONS)}.")
+        require_known("motion", [direction], DIRECTIONS)
         if direction in self.directions:
             return self._field(direction).values(places)
         terms = [
@@ -162,13 +159,14 @@ class _Field:
         self.centre = self.nodes.mean(axis=0)
         _, size, axes = np.linalg.svd(self.nodes - self.centre, full_matrices=False)
         self.extent = float(np.ptp(self.nodes, axis=0).max())
-        self.axes = axes[size > _SAME * max(size[0], TINY)]  # (d, 3): line, plane or solid
+        self.axes = axes[size > SAME * max(size[0], TINY)]  # (d, 3): line, plane or solid
         self.flat = (self.nodes - self.centre) @ self.axes.T
         self.tree = KDTree(self.nodes)
         if not self.extent:
             raise LabelError(
                 f"all DOFs {direction!r} are at one node: nothing to interpolate. Use labels."
             )
+        # of the distance of nodes: a slope
         self.step = 1e-3 * self.extent / max(rows.size ** (1 / self.axes.shape[0]), 2.0)
         self.all = self._interpolant(np.arange(rows.size)) if rows.size <= _GLOBAL else None
 
@@ -181,7 +179,7 @@ class _Field:
         self._check(points)
         found = self._weights(points, lambda at, here: here(at), axis=None)
         distance, nearest = self.tree.query(points)
-        for i in np.flatnonzero(distance <= _SAME * self.extent):
+        for i in np.flatnonzero(distance <= SAME * self.extent):
             found[i] = 0.0
             found[i, self.rows[np.asarray(nearest)[i]]] = 1.0
         return found
@@ -242,7 +240,7 @@ class _Field:
         outside = np.max(flat @ self._walls[:, :-1].T + self._walls[:, -1], axis=1)
         miss = np.maximum(beside, outside)
         worst = int(np.argmax(miss))
-        if miss[worst] > self.margin + _SAME * self.extent:
+        if miss[worst] > self.margin + SAME * self.extent:
             low, high = self.nodes.min(axis=0), self.nodes.max(axis=0)
             raise LabelError(
                 f"the point {tuple(points[worst].tolist())} is {miss[worst]:.3g} m outside the "

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray, real_array
-from ..errors import LabelError
+from ..errors import LabelError, require_known
 from ..labels import Interpolation
 from ..tolerances import SAME
 from .element_matrices import (
@@ -110,10 +110,7 @@ class PlateShape(GridShape):
         Between elements z is continuous; the slope across an edge is not (the element is
         non-conforming), and the element on the side of larger coordinates is taken.
         """
-        if not isinstance(direction, str) or direction not in ("z", "rx", "ry"):
-            raise LabelError(
-                f"a plate in bending has no motion {direction!r}: use one of z, rx, ry."
-            )
+        require_known("motion", [direction], ("z", "rx", "ry"), "a plate in bending")
         point = real_array(xyz, "xyz", (3,))
         slack = SAME * max(self.size)
         if not _is_inside(point[:2], self.size, slack):
@@ -200,8 +197,7 @@ class BeamShape(GridShape):
         LabelError
             When the point is not on the axis of the beam, or the direction is not z or ry.
         """
-        if direction not in ("z", "ry"):
-            raise LabelError(f"a beam in bending has no motion {direction!r}: use one of z, ry.")
+        require_known("motion", [direction], ("z", "ry"), "a beam in bending")
         point = real_array(xyz, "xyz", (3,))
         slack = SAME * self.length
         if not _is_inside(point[:1], (self.length,), slack) or np.abs(point[1:]).max() > slack:
@@ -249,10 +245,7 @@ class BlockShape(GridShape):
         Rotations rx, ry, rz are half the curl of the displacements; they step between elements, and
         the element on the side of larger coordinates is taken.
         """
-        if not isinstance(direction, str) or direction not in _BLOCK_MOTIONS:
-            raise LabelError(
-                f"a solid has no motion {direction!r}: use one of {', '.join(_BLOCK_MOTIONS)}."
-            )
+        require_known("motion", [direction], _BLOCK_MOTIONS, "a solid")
         point = real_array(xyz, "xyz", (3,))
 
         def off(what: str) -> LabelError:

@@ -14,6 +14,7 @@ from ..checks import FloatArray, IntArray
 from ..errors import ModelError, SolverError, counted
 from ..sparse.factor import is_positive_definite, symmetric_lu
 from ..sparse.symmetric import dense, diagonal, unit_diagonal
+from ..tolerances import ROUNDING
 
 #: relative to a unit diagonal: an eigenvalue of M below this is none
 _SINGULAR = 1e-11
@@ -163,8 +164,6 @@ def inertial(
 _COLUMNS = 256
 #: that many DOFs next to massless ones fill a block that no longer fits the memory comfortably
 _TOO_MANY = 10_000
-#: a pivot below this part of its diagonal is a zero that rounding hides
-_ZERO_PIVOT = 1e-12
 
 
 def empty_rows(matrix: Any) -> Any:
@@ -211,8 +210,8 @@ def condensed(
     except SolverError:
         lu = None
     pivots = scaled.diagonal() if lu is None else np.abs(lu.U.diagonal())[lu.perm_c]
-    if lu is None or pivots.min() < _ZERO_PIVOT:
-        loose = names(s[pivots < _ZERO_PIVOT][:6]) or names(s[:6])
+    if lu is None or pivots.min() < ROUNDING:
+        loose = names(s[pivots < ROUNDING][:6]) or names(s[:6])
         raise ModelError(
             f"massless DOFs have a motion without stiffness, {', '.join(loose)} among them: where "
             "they are does not follow from the others. Hold them: without([...])."

@@ -26,17 +26,17 @@ LENGTHS: Mapping[str, float] = {
     "in": 0.0254,
     "ft": 0.3048,
 }
-_POUND = 0.45359237
-_GRAVITY = 9.80665
+#: [kg], [m/s^2]: by definition
+POUND, GRAVITY = 0.45359237, 9.80665
 MASSES: Mapping[str, float] = {
     "kg": 1.0,
     "t": 1e3,
     "g": 1e-3,
     "mg": 1e-6,
-    "lb": _POUND,
+    "lb": POUND,
     # lbf s^2/ft and lbf s^2/in: what makes pound-force consistent with feet and inches
-    "slug": _POUND * _GRAVITY / 0.3048,
-    "slinch": _POUND * _GRAVITY / 0.0254,
+    "slug": POUND * GRAVITY / 0.3048,
+    "slinch": POUND * GRAVITY / 0.0254,
 }
 TIMES: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 

@@ -189,6 +189,7 @@ def _length_factor(K: Any, dofs: DofSet, motions: FloatArray, free: Any) -> floa
         # rounding of forces that cancel between stiff elements
         if rest < 1e-6 * np.linalg.norm(by_turning) and factor > 0:
             factors.append(factor)
+    # one factor, and not 1
     if not factors or np.ptp(factors) > 1e-3 * factors[0] or abs(factors[0] - 1) < 1e-3:
         return None
     return float(np.mean(factors))

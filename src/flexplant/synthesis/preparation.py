@@ -245,8 +245,6 @@ def _balanced(
 
 #: relative: poles so small are zero, real parts above this are not stable
 _ZERO, _STABLE = 1e-6, -1e-10
-#: relative: a singular value of Hautus' matrix that is zero
-_MISSED = 1e-12
 #: |z| of poles that are delays; e-folds of a mode during them that leave nothing to be gained
 _NILPOTENT, _TOO_LONG = 0.5, 15.0
 
@@ -310,7 +308,7 @@ def require_reach(problem: Prepared) -> None:
         ):
             reach = size * gain / max(float(np.linalg.norm(gain, 2)), TINY)
             pencil = np.hstack([matrix - pole * np.eye(A.shape[0]), reach])
-            if np.linalg.svd(pencil, compute_uv=False)[-1] < _MISSED * size:
+            if np.linalg.svd(pencil, compute_uv=False)[-1] < ROUNDING * size:
                 raise AssumptionError(
                     _delay_effect(problem, float(pole.real))
                     or f"{text} a mode of the plant or of a weight that is not stable "

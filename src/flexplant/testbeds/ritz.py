@@ -12,16 +12,15 @@ from numpy.polynomial import legendre
 
 from ..checks import FloatArray
 from ..dof_columns import Interpolation
-from ..errors import LabelError
-from ..labels import DofSet, node_dofs
+from ..errors import LabelError, require_known
+from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..sparse.symmetric import dense
 from ..structure import FEModel
+from ..tolerances import SAME
 
 #: order in each direction: of the paper's plate the first twenty frequencies to 2e-6 and forty, to
 #: 7 kHz, to 1e-3; one of 15 takes twice as long in every loop
 ORDER = 13
-#: relative: a point so far outside still lies on the edge
-EDGE = 1e-9
 #: derivatives in (x, y) of the deflection and their sign: rx = dz/dy, ry = -dz/dx
 _MOTIONS = {"z": (0, 0, 1.0), "rx": (0, 1, 1.0), "ry": (1, 0, -1.0)}
 
@@ -39,13 +38,9 @@ class PolynomialShape(Interpolation):
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
         """Return the weights (p, n^2) at many points (p, 3)."""
-        if direction not in _MOTIONS:
-            raise LabelError(
-                f"this plate moves along {', '.join(_MOTIONS)}, got {direction!r}: its middle "
-                "plane does not stretch. Choose one of them."
-            )
+        require_known("motion", [direction], _MOTIONS, "a plate in bending")
         places = np.asarray(points)[:, :2] / self.size
-        off = np.any((places < -EDGE) | (places > 1.0 + EDGE), axis=1)
+        off = np.any((places < -SAME) | (places > 1.0 + SAME), axis=1)
         if np.any(off):
             raise LabelError(
                 f"the point {tuple(np.asarray(points)[off][0].tolist())} is off the plate of "
@@ -138,12 +133,9 @@ class SolidShape(Interpolation):
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) of all displacements in a motion; rotations are half the curl."""
-        if direction.removeprefix("r") not in _AXES:
-            raise LabelError(
-                f"a solid has no motion {direction!r}: use one of x, y, z, rx, ry, rz."
-            )
+        require_known("motion", [direction], DIRECTIONS, "a solid")
         place = np.asarray(xyz) / self.size
-        if np.any(place < -EDGE) or np.any(place > 1.0 + EDGE):
+        if np.any(place < -SAME) or np.any(place > 1.0 + SAME):
             raise LabelError(
                 f"the point {tuple(np.asarray(xyz).tolist())} is outside the block of {self.size} "
                 "m. Choose one in it."

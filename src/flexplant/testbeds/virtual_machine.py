@@ -20,7 +20,7 @@ from ..checks import (
     several,
     whole,
 )
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError, require_known
 from ..estimation import design_static
 from ..identification import MeasuredModes
 from ..identification.periodic import frf_of_periods, line_spectra, offsets
@@ -134,9 +134,8 @@ class WaferStage(Value):
         found = []
         listed = modes if several(modes) else [modes]
         numbers = tuple(whole(mode, "mode") for mode in listed)
+        require_known("elastic mode", numbers, known)
         for mode in numbers:
-            if mode not in known:
-                raise unknown_label("elastic mode", mode, map(str, known))
             pole = own[mode - 1 - self._n_rigid]
             below_half_rate(abs(pole) / (2.0 * np.pi), f"mode {mode}", self.rate)
             found.append(pole)

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import FloatArray, positive, real_array, short, whole
-from ..errors import ModelError
+from ..checks import FloatArray, positive, positive_array, whole
 from ..modes import solve_modes
 from ..plant import (
     Actuator,
@@ -102,12 +101,6 @@ def wafer_stage(
         late = positive(LATENCY if delay is None else delay, "delay", zero=True)
         seed = whole(individual, "individual", minimum=0)
         return WaferStage(_individual(drawing, damping, mass_at, seed), fast, late, STEP, drawing)
-    given = tuple(elements) if isinstance(elements, tuple | list) else ()
-    if len(given) != 2:
-        raise ModelError(
-            f"elements are two whole numbers (nx, ny), got {short(elements)}. Try (8, 8)."
-        )
-    elements = (whole(given[0], "elements along x"), whole(given[1], "elements along y"))
     late = positive(1.0 if delay is None else delay, "delay", zero=True)
     bare = kirchhoff_plate(elements=elements, name="wafer stage", **drawing)
     truth = _with_masses(bare.with_damping(ModalDamping(damping)), mass_at)
@@ -116,11 +109,8 @@ def wafer_stage(
 
 def _plate_drawing(size: Any, thickness: Any) -> Mapping[str, Any]:
     """Return the drawing of a plate of this size."""
-    sides = tuple(size) if isinstance(size, Sequence) and not isinstance(size, str) else ()
-    if len(sides) != 2:
-        raise ModelError(f"size is two lengths (x, y) in m, got {short(size)}. Try (0.6, 0.6).")
-    x, y = (positive(side, "size") for side in sides)
-    return {**DRAWING, "size": (x, y), "thickness": positive(thickness, "thickness")}
+    sides = tuple(positive_array(size, "size", (2,)).tolist())
+    return {**DRAWING, "size": sides, "thickness": positive(thickness, "thickness")}
 
 
 def waves(random: np.random.Generator, sides: Sequence[float]) -> Callable[..., FloatArray]:
@@ -221,9 +211,7 @@ def magnet_stage(
     """
     mass = positive(added_mass, "added_mass", zero=True)
     late = positive(LATENCY if delay is None else delay, "delay", zero=True)
-    sides = tuple(real_array(size, "size", (3,)).tolist())
-    if not all(side > 0.0 for side in sides):
-        raise ModelError(f"size is three lengths (x, y, z) in m, got {sides}. Try {BLOCK['size']}.")
+    sides = tuple(positive_array(size, "size", (3,)).tolist())
     drawing = {**BLOCK, "size": sides}
     random = np.random.default_rng([whole(individual, "individual", minimum=0), 32])
     block = ritz_block(stiffer=waves(random, sides), **drawing)

@@ -18,14 +18,11 @@ from ..errors import ModelError
 from ..modes.matching import assigned, clusters, in_span, mac_matrix
 from ..sparse.symmetric import dense, orthonormalised
 from ..structure.definite import elastic_modes, refuse_unstable
+from ..tolerances import RANK, SAME
 from .parameters import Parameter
 
 #: modes whose eigenvalues differ by less than this, relatively, count as exactly repeated
 REPEATED = 1e-8
-#: share of a spring's deflection below which a rigid-body motion leaves it alone
-HELD = 1e-9
-#: coupling of modes by damping, relative to the diagonal, below which it is none
-UNCOUPLED = 1e-13
 
 
 @dataclass(frozen=True)
@@ -169,7 +166,7 @@ class Family:
         if not r or not active:
             return np.eye(r)
         _, sizes, right = la.svd(np.vstack(active))
-        return np.asarray(right[int(np.sum(sizes > HELD)) :].T, dtype=np.float64)
+        return np.asarray(right[int(np.sum(sizes > SAME)) :].T, dtype=np.float64)
 
     def at(self, p: FloatArray) -> Eigen:
         """Return the oscillating modes at the parameters `p`."""
@@ -328,7 +325,7 @@ def _oscillating(omega: FloatArray, D: FloatArray, r: int) -> tuple[ComplexArray
     k = omega.size
     e = k - r
     size = np.abs(D)
-    if np.sum(size) - np.trace(size) <= UNCOUPLED * np.max(size, initial=0.0):
+    if np.sum(size) - np.trace(size) <= RANK * np.max(size, initial=0.0):
         half = np.diag(D) / 2
         root = np.sqrt(np.maximum(omega**2 - half**2, 0.0))
         # rigid-body modes come out at the root of rounding of the highest one

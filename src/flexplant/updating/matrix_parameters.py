@@ -30,10 +30,9 @@ from ..sparse.factor import DENSE_LIMIT
 from ..sparse.symmetric import dense
 from ..structure import FEModel, ModalDamping
 from ..structure.definite import elastic_modes
+from ..tolerances import SAME
 from .parameters import MAKES, Derivatives, Parameter, checked_bounds, checked_text
 
-#: entries of a symmetric matrix differ by less than this, relatively, from their mirror images
-SYMMETRIC = 1e-9
 #: the damping matrix of one mode is full; beyond this many DOFs it would not fit the memory
 DENSE_DAMPING_LIMIT = 5000
 
@@ -333,7 +332,7 @@ def _checked_matrix(value: Any, name: str) -> Matrix | None:
     largest = float(abs(matrix).max()) if matrix.shape[0] else 0.0
     if largest == 0:
         return None
-    if float(abs(matrix - matrix.T).max()) > SYMMETRIC * largest:
+    if float(abs(matrix - matrix.T).max()) > SAME * largest:
         raise ModelError(
             f"{name} is not symmetric: reciprocity would not hold. Symmetrise it, "
             "0.5 * (A + A.T), when the difference is only rounding."

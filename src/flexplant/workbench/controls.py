@@ -66,7 +66,7 @@ def _numeric(name: str, label: str, unit: str, low: float, high: float) -> Field
     )
 
 
-def _corner(name: str, label: str, unit: str, low: float, high: float) -> Field:
+def _corner_field(name: str, label: str, unit: str, low: float, high: float) -> Field:
     """Return a number of a Pid by its corners."""
 
     def read(element: Pid) -> float:
@@ -98,21 +98,19 @@ def _poles_damping(element: Notch, value: float) -> Notch:
 
 def fields_of(element: SingleElement, top: float) -> tuple[Field, ...]:
     """Return the numbers of an element; `top` is the highest frequency of a slider [Hz]."""
-    low = 1e-4 * top
+    low = 1e-4 * top  # four decades on a slider
     freq = _numeric("freq", "frequency", "Hz", low, top)
     if isinstance(element, Pid):
         corners = element.as_corners()
         if corners is None:  # complex zeros: as gains
             free = (_numeric(n, n, u, 1e-6, 1e9) for n, u in (("p", ""), ("i", "/s"), ("d", "s")))
             return (*free, *([_numeric("pole", "pole", "Hz", low, top)] if element.pole else []))
-        some = [_corner("integrator", "integrator", "Hz", low, top)]
+        some = [_corner_field("integrator", "integrator", "Hz", low, top)]
         if corners["zero"] is not None:
-            some += [
-                _corner("zero", "zero", "Hz", low, top), _corner("pole", "pole", "Hz", low, top)
-            ]  # fmt: skip
-        return (
-            (*some, _corner("gain", "gain", "", 1e-3, 1e3)) if corners["gain"] != 1.0 else (*some,)
-        )
+            some += [_corner_field(name, name, "Hz", low, top) for name in ("zero", "pole")]
+        if corners["gain"] != 1.0:
+            some.append(_corner_field("gain", "gain", "", 1e-3, 1e3))
+        return tuple(some)
     if isinstance(element, Lead):
         return freq, _numeric("ratio", "pole / zero", "", 1.0, 100.0)
     if isinstance(element, Lag):

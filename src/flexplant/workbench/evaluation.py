@@ -69,7 +69,7 @@ class BenchMachine:
         if self.is_measured:
             return np.asarray(self.axes.plant.freq)
         grid = resonance_grid(self.axes.plant.poles(), self.axes.plant.dt, points=_POINTS)
-        return np.asarray(grid[grid > 1e-5 * grid[-1]])
+        return np.asarray(grid[grid > 1e-5 * grid[-1]])  # what a picture shows
 
     @cached_property
     def G(self) -> ComplexArray:

@@ -268,6 +268,7 @@ class Views:
         self._put("S T", x=f, y=magnitude_db(loop.T))
         if loop.deviation is not None:
             wide = DEVIATIONS * np.abs(loop.C) * loop.deviation
+            # down by 60 dB
             high, low = np.abs(L) + wide, np.maximum(np.abs(L) - wide, 1e-3 * np.abs(L))
             self._put("band", x=f, low=magnitude_db(low), high=magnitude_db(high))
         i = loop.machine.axes.names.index(loop.name)
@@ -440,6 +441,7 @@ class Gestures:
         element: Any = axis.elements[self.at].replace(freq=float(f"{event.x:.4g}"))
         if isinstance(element, Notch):  # up and down: its depth
             depth = element.depth * 10.0 ** ((event.y - self._height) / 20.0)
+            # as its slider
             element = element.replace(depth=float(f"{min(max(depth, 1e-3), 10.0):.3g}"))
         self._height = event.y
         self.page.change_axis(with_element(axis, self.at, element), ("drag", self.at), True)

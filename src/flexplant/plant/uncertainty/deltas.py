@@ -60,9 +60,7 @@ def correlated_deltas(
     """Return Deltas of modes as uncertain as they are, correlated, half-widths two deviations."""
     own = [number for number in source.modes if number in realisation.elastic]
     chosen = tuple(own if modes is None else modes)
-    for number in chosen:
-        if number not in source.modes:
-            raise unknown_label("elastic mode", number, map(str, source.modes))
+    require_known("elastic mode", chosen, source.modes)
     at = np.array([source.modes.index(number) for number in chosen], dtype=np.int64)
     _check_poles(realisation, chosen, source.poles[at], _SAME_MODEL, "fit")
     both = np.stack([at, at + len(source.modes)], axis=1).ravel()
@@ -192,9 +190,7 @@ def _measured_poles(measured: MeasuredModes, modes: Sequence[int] | None) -> _Po
             "MeasuredModes(poles, modes=[...], covariance=...)."
         )
     chosen = tuple(measured.modes if modes is None else modes)
-    for number in chosen:
-        if number not in measured.modes:
-            raise unknown_label("measured mode", number, map(str, measured.modes))
+    require_known("measured mode", chosen, measured.modes)
     at = [measured.modes.index(number) for number in chosen]
     both = [*at, *(i + len(measured) for i in at)]
     return _Poles(chosen, measured.poles[at], measured.covariance[np.ix_(both, both)])

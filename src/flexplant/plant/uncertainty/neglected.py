@@ -16,7 +16,7 @@ from ...lti.frequency import frequency_response
 from ...lti.interconnection import among, side_by_side
 from ...lti.modal import part_of
 from ...lti.statespace import StateSpace, System
-from ...tolerances import TINY
+from ...tolerances import ROUNDING, TINY
 from ..building import sampled_like, with_modes_of
 from ..partition import Partition, is_plant
 from ..realisation import Structure
@@ -30,8 +30,6 @@ _MARGIN = 1.05
 _SAME_BODY = 1e-6
 #: offsets from a resonance, in its half widths, at which the bound is checked besides
 _BESIDE = np.array([0.0, 0.5, -0.5, 2.0, -2.0, 8.0, -8.0])
-#: part of a channel's largest response below which a row or column of the difference is rounding
-_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -238,7 +236,7 @@ def _distinct(small: StateSpace, big: StateSpace) -> tuple[Pair, dict[str, str]]
     probe = _resonance_grid(_upper_poles(small, big))[1::7]
     gap = _deviation((small, big), probe)
     size = np.abs(_bilinear_response(big, probe))
-    moved = np.abs(gap).max(axis=2) > _ROUNDING * size.max(axis=2).max(initial=0.0)
+    moved = np.abs(gap).max(axis=2) > ROUNDING * size.max(axis=2).max(initial=0.0)
     rows, columns = np.flatnonzero(moved.any(axis=1)), np.flatnonzero(moved.any(axis=0))
     kept: list[int] = []
     mirrored: dict[str, str] = {}

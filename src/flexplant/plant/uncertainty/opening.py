@@ -423,10 +423,6 @@ def _require_exact(
         )
 
 
-#: relative: eigenvalues of a parameter's matrix below this are rounding
-_RANK = 1e-12
-
-
 @dataclass(frozen=True, eq=False)
 class _Load(ForcePort):
     """A force along a vector over the model's DOFs."""
@@ -475,7 +471,7 @@ def _parameter_channels(
             if order == 1:
                 whole = elastic_part(model, realisation, whole)
             values, vectors = np.linalg.eigh(0.5 * (whole + whole.T))
-            for i in np.flatnonzero(np.abs(values) > _RANK * np.abs(values).max()).tolist():
+            for i in np.flatnonzero(np.abs(values) > ROUNDING * np.abs(values).max()).tolist():
                 name = f"{parameter.name}:{len(loads) + 1}"
                 size = np.sqrt(scale * abs(values[i]))
                 loads.append(_Load(f"{name}:w", -np.sign(values[i]) * size * vectors[:, i]))

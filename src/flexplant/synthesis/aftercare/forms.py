@@ -402,7 +402,7 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
 
 def back_gain(K: StateSpace, recovery: float | None) -> FloatArray:
     """Return L (n, nu): the states move by ``L (applied - commanded)``, with stable A - L C."""
-    L = _hanus(K) if recovery is None else _observer(K, positive(recovery, "recovery"))
+    L = _hanus(K) if recovery is None else _command_filter_gain(K, positive(recovery, "recovery"))
     A = K.A - L @ K.C
     poles = np.linalg.eigvals(A) if K.n_states else np.zeros(0)
     size = np.abs(poles)
@@ -429,7 +429,7 @@ def _hanus(K: StateSpace) -> FloatArray:
     return np.asarray(K.B @ np.linalg.pinv(K.D))
 
 
-def _observer(K: StateSpace, recovery: float) -> FloatArray:
+def _command_filter_gain(K: StateSpace, recovery: float) -> FloatArray:
     """Return the gain of a filter that reads the command, its poles shifted by the recovery time.
 
     With ``A + I / T`` in place of A (sampled: A e^(dt / T)) its stable loop decays with T.

@@ -230,7 +230,7 @@ def _shaped_controller(
         return K, 1.0 / certificate["margin"], least, certificate
     K, gamma = following(shaped, model, rho)
     margin, stability = loop_margin(shaped, K.select(inputs=K.inputs[len(shaped.outputs) :]))
-    if not margin >= (1.0 - 1e-3) / gamma:
+    if not margin >= (1.0 - 1e-3) / gamma:  # as of every norm that is verified
         raise CertificateError(
             f"the loop of the shaped plant has the margin {margin:.6g} where {1.0 / gamma:.6g} was "
             "claimed: the shaped plant is too badly conditioned to trust. Bring its gains at u "

@@ -466,7 +466,7 @@ _LEADS = tuple((a, b) for a in (2.0, 3.0, 4.2, 6.0, 10.0) for b in (4.0, 8.0, 20
 _TAILS = (3.0, 7.0, 20.0)
 #: notches at the highest modes: how far above the mode as a factor, depth and width
 _NOTCHES = ((1.0, 0.05, 0.3), (1.1, 0.4, 0.4))
-_MODES = 3
+_MODES = 3  # with such notches, at most
 #: bandwidths; points on which they are tried, and to either side of each mode
 _TRIALS, _GRID_POINTS, _AROUND = 50, 300, 10
 #: starts that are kept in all, and with the same notches, so far apart

@@ -333,7 +333,9 @@ class ServoTask:
     def largest(self, peak: float) -> float:
         """Return the largest bandwidth that holds a peak of |S| at u."""
         slowest = max(
-            3.0 * float(np.abs(self.plant.rigid_motions.freq).max()) * (1 + SAME), 2e-4 * self.rate
+            # slower loops lose digits
+            3.0 * float(np.abs(self.plant.rigid_motions.freq).max()) * (1 + SAME),
+            2e-4 * self.rate,
         )
         best: tuple[float, float, float] = (np.inf, np.nan, np.nan)
 

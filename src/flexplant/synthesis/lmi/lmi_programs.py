@@ -137,7 +137,7 @@ class Plant(NamedTuple):
         shifted = (1.3 + 0.7j) * np.eye(self.A.shape[0]) - self.A
         gain = float(np.linalg.norm(self.C1 @ np.linalg.solve(shifted, self.B1) + self.D11, 2))
         bound = float(np.linalg.norm(self.C1) * np.linalg.norm(self.B1))
-        return max(gain, 1e-3 * bound) or 1.0
+        return max(gain, 1e-3 * bound) or 1.0  # the largest it can be, and no zero
 
 
 def lqg_states(p: Plant) -> Plant:
@@ -230,7 +230,7 @@ def smallest_gamma(p: Plant, scale: float, settings: dict[str, float]) -> Optimu
     # the little trace picks one of the many X and Y, and keeps them finite
     size = cp.trace(X) + cp.trace(Y)
     solve_program(cp.Problem(cp.Minimize(gamma + 1e-9 * size), constraints), settings)
-    value = max(float(gamma.value), 1e-12)
+    value = max(float(gamma.value), 1e-12)  # it may end below zero
     states = p.scaled(value).balanced(X.value, Y.value).with_unit_channels()
     return Optimum(value * scale, states)
 

@@ -176,9 +176,11 @@ class PoleRegion(Value):
         if slow.real > -self.decay * (1 - 1e-3) - (1e-9 if not self.decay else 0.0):
             return f"{slow:.4g} rad/s decays slower than {self.decay:g} rad/s"
         ratio = -poles.real / np.maximum(np.abs(poles), TINY)
+        # as of bounds on norms
         if self.damping is not None and ratio.min() < self.damping * (1 - 1e-3):
             return f"{poles[np.argmin(ratio)]:.4g} rad/s has the damping {ratio.min():.4g}"
         size = np.abs(poles) / (2 * np.pi)
+        # as of bounds on norms
         if self.bandwidth is not None and size.max() > self.bandwidth * (1 + 1e-3):
             return f"a pole lies at {size.max():.4g} Hz"
         return ""
@@ -205,7 +207,7 @@ def impulse_integral(closed: StateSpace, *, points: int = 4000) -> float:
             x = step @ x
             total += np.abs(closed.C @ x)
         found = float((np.abs(closed.D) + total * (end / count)).max())
-        if abs(found - last) < 1e-4 * found or count >= 400_000:
+        if abs(found - last) < 1e-4 * found or count >= 400_000:  # seconds
             break
         last, count = found, 2 * count
     return found
@@ -512,7 +514,7 @@ class ObjectivePrograms:
         little = 1e-7 * (cp.trace(v.X) + cp.trace(v.Y))
         program = cp.Problem(cp.Minimize(level + little), self.program(v, level, unit, rate))
         self._solve(program)
-        found = max(float(level.value), 1e-12)
+        found = max(float(level.value), 1e-12)  # it may end below zero
         return float(unit * (np.sqrt(found) if isinstance(self.minimize, H2) else found))
 
     def controller(self, bound: float, rate: float) -> StateSpace:

@@ -480,7 +480,7 @@ def _corner_gain(
                 gain = _perturbed_gain(gains, where, moved)
                 if gain > best:
                     best, one = gain, moved
-        if best <= before * (1.0 + 1e-4):
+        if best <= before * (1.0 + 1e-4):  # no gain is known better
             break
     return best, one
 

@@ -27,7 +27,7 @@ from .uncertainty_blocks import (
 #: steps of a power iteration; change at which it has settled
 _STEPS, _SETTLED = 60, 1e-6
 #: multiples of the smallest size that are tried for instability; relative accuracy of the smallest
-_LADDER = np.array([1.0, 1.005, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 100.0])
+_MULTIPLES = np.array([1.0, 1.005, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 100.0])
 _FINE = 1e-4
 #: phases of complex blocks that are tried
 _PHASES = 25
@@ -122,11 +122,11 @@ def smallest_multiple(
     """Return the multiple t between two sizes at which ``t Delta`` makes M's loop unstable."""
     # the loop's eigenvalues decide: on the size before it is stable, on this one it is not
     delta = realised_delta(found, blocks)
-    ladder = least * _LADDER
-    if most < ladder[-1]:  # one loop decides whether this perturbation is worse than the best
-        ladder = np.array([most])
+    sizes = least * _MULTIPLES
+    if most < sizes[-1]:  # one loop decides whether this perturbation is worse than the best
+        sizes = np.array([most])
     stable, unstable = 0.0, np.inf
-    for t in ladder:
+    for t in sizes:
         if _abscissa(M, delta, t)[0] >= 0:
             unstable = float(t)
             break
@@ -224,7 +224,7 @@ def smallest_with_block(
                 moved[i] = value
                 if value != q[i] and (found := first(moved)) < best:
                     best, q = found, moved
-        if not best < before * (1.0 - 1e-4):
+        if not best < before * (1.0 - 1e-4):  # found to that accuracy
             break
     if not np.isfinite(best):
         return None

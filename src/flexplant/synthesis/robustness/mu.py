@@ -48,7 +48,7 @@ INTERVALS = "intervals of frequency"
 _INTERVALS, _LARGE = 3000, 260
 #: sampling within an interval, in half widths of the resonances, and for the rest of it
 _BESIDE = np.array([0.0, 0.15, 0.4, 0.8, 1.5, 3.0, 6.0])
-_POINTS = 24
+_POINTS = 24  # evenly, and by the logarithm
 #: growth of the heights over an interval that is tried at once, the last if need be
 _GROWTH = (3.0, 1.3, 1.03)
 
@@ -363,7 +363,7 @@ class Cover:
         inside = self.poles.imag[(self.poles.imag > gap.low) & (self.poles.imag < gap.high)]
         if gap.low == 0.0 and not inside.size:
             return 0.5 * gap.high if any(one == 0.0 for one, _ in self.found) else 0.0
-        middle = np.sqrt(max(gap.low, 1e-3 * gap.high) * gap.high)
+        middle = np.sqrt(max(gap.low, 1e-3 * gap.high) * gap.high)  # in the middle of a logarithm
         if inside.size and gap.high > 1.05 * gap.low:
             return float(inside[np.argmin(np.abs(np.log(np.maximum(inside, TINY) / middle)))])
         return 0.5 * (gap.low + gap.high)

@@ -149,6 +149,7 @@ def _sampled(W: StateSpace, low: float, high: float) -> FloatArray:
     inside = own[(own > low) & (own < end)]
     points = np.concatenate([np.linspace(low, end, _POINTS), inside])
     if end > 2 * low:
+        # four decades
         points = np.concatenate([points, np.geomspace(max(low, 1e-4 * end), end, 4 * _POINTS)])
     return np.unique(points / (2 * np.pi))
 

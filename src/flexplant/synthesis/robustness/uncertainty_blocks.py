@@ -301,7 +301,7 @@ def realised_delta(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
             continue
         number = complex(next(scalars))
         parts += [_all_pass(number.real if p.block.real else number, found.omega)] * p.block.size
-    return _side_by_side(parts)
+    return _block_diagonal_system(parts)
 
 
 def _all_pass(number: complex, omega: float) -> StateSpace:
@@ -318,14 +318,14 @@ def _all_pass(number: complex, omega: float) -> StateSpace:
     return StateSpace([[-p]], [[root]], [[-sign * root]], [[sign * size]])
 
 
-def _side_by_side(parts: Sequence[StateSpace]) -> StateSpace:
+def _block_diagonal_system(parts: Sequence[StateSpace]) -> StateSpace:
     A, B, C, D = (block_matrix([getattr(g, name) for g in parts]) for name in "ABCD")
     return StateSpace(A, B, C, D)
 
 
 def _rank_one(a: ComplexArray, b: ComplexArray, omega: float) -> StateSpace:
     """Return ``b(s) a(s)'`` with the values b and conj(a) at omega."""
-    into = _side_by_side([_all_pass(complex(v), omega) for v in a.conj()])
-    out = _side_by_side([_all_pass(complex(v), omega) for v in b])
+    into = _block_diagonal_system([_all_pass(complex(v), omega) for v in a.conj()])
+    out = _block_diagonal_system([_all_pass(complex(v), omega) for v in b])
     one = series(into, as_statespace(np.ones((len(b), len(a)))))
     return series(one, out)

@@ -177,7 +177,7 @@ def _descended(
             break
         t = 1.0 / (1.0 + decrement) if decrement > _CENTRED else 1.0
         # shorter steps are rounding of x
-        while t > 1e-10 and not (new := merit(x + t * step)) < value:
+        while t > 1e-10 and not (new := merit(x + t * step)) < value:  # a step of rounding
             t *= 0.5
         if t <= 1e-10:
             break

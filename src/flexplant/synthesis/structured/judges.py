@@ -420,6 +420,7 @@ class PeakJudge(_SmoothJudge):
         decades = np.log10(end * fast) + 3.0
         t = np.union1d(
             np.linspace(0.0, end, even),
+            # before the fastest pole acts
             np.geomspace(1e-3 / fast, end, int(_DECADE * max(decades, 1.0))),
         )
         t = np.union1d(t, _crossings(t, poles, residues))

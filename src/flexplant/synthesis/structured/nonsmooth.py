@@ -15,8 +15,8 @@ Function: TypeAlias = Callable[[FloatArray], tuple[float, FloatArray]]
 
 #: weak Wolfe conditions, and steps of their bisection
 _ARMIJO, _WOLFE, _BISECTIONS = 1e-4, 0.9, 30
-#: so many steps that gain less than this together end a search (parameters that run to infinity
-#: gain little for ever)
+#: so many steps that gain less than this together end a search (less and less is
+#: gained where parameters grow without bound)
 _STALLED, _GAIN = 8, 1e-4
 #: the first step, beside the size of the parameters
 _FIRST = 0.3
@@ -152,7 +152,7 @@ def minimax(
         step, weights, decrease = model.step(mu)
         if decrease <= _SETTLED:
             far = float(np.linalg.norm(step)) >= max(1.0, float(np.linalg.norm(x)))
-            if refused or far or mu <= 1e-3 * model.size:
+            if refused or far or mu <= 1e-3 * model.size:  # hardly damped
                 break
             mu *= 1e-2
             continue

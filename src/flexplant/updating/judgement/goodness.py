@@ -309,6 +309,7 @@ def _missing_modes(
     clear = np.where(felt & (along > CANCELS * parts), along, 0.0)
     found = {}
     for name in poor:
+        # takes part
         own = np.abs(lost[:, names.index(name)]) > 1e-3 * np.abs(lost).max(axis=1, initial=0.0)
         share = np.max(clear[:, own], axis=1, initial=0.0)
         order = np.argsort(-share, kind="stable")[:NAMED]

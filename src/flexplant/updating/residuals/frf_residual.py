@@ -9,8 +9,17 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...checks import ComplexArray, FloatArray, flag, instance, positive, positive_array, short
-from ...errors import ModelError, ShapeError, counted, require_known, warn
+from ...checks import (
+    ComplexArray,
+    FloatArray,
+    flag,
+    instance,
+    one_of,
+    positive,
+    short,
+    spread_array,
+)
+from ...errors import ModelError, counted, require_known, warn
 from ...labels import DIRECTIONS, Place
 from ...lti import Frf
 from ...lti.frequency import ORDERS
@@ -86,20 +95,12 @@ class FrfResidual(Residual):
     def __post_init__(self) -> None:
         frf = self.measured
         instance(frf, Frf, "frf", "Pass Frf(freq, data, ...).")
-        if (frf.quantity or "displacement") not in ORDERS:
-            raise ModelError(f"quantity {frf.quantity!r} is none of {', '.join(ORDERS)}.")
+        one_of(frf.quantity or "displacement", "quantity", ORDERS)
         variance = self.variance
         if variance is None:
             variance = _fair(frf)
         if variance is not None:
-            given = positive_array(variance, "variance")
-            try:
-                variance = np.broadcast_to(given, frf.data.shape).copy()
-            except ValueError:
-                raise ShapeError(
-                    f"variance of shape {given.shape} does not spread to the data's "
-                    f"{frf.data.shape}."
-                ) from None
+            variance = spread_array(variance, "variance", frf.data.shape)
         require_known("direction", [self.direction], DIRECTIONS)
         channel_places([*frf.outputs, *frf.inputs], self.places)
         lines = _checked_lines(self.lines, frf, variance)

@@ -17,7 +17,9 @@ from ...checks import (
     positive,
     positive_array,
     real_array,
+    real_or_complex,
     short,
+    spread_array,
     whole,
 )
 from ...errors import LabelError, ModelError, ShapeError, counted, require_known
@@ -274,18 +276,15 @@ class ModeShapes(_ModalResidual):
         require_known("direction", [self.direction], DIRECTIONS)
         at, given = _measured_shapes(self)
         shape = (len(at), len(self.measured))
-        real = real_array(np.real(given), "shapes", shape)
-        imag = real_array(np.imag(given), "the imaginary part of shapes", shape)
+        shapes: Any = real_or_complex(given, "shapes", shape)
         if len(at) < 2:
             raise ShapeError("shapes need two places at least: the scale of one is not known.")
-        shapes: Any = real + 1j * imag if np.iscomplexobj(given) else real
         empty = np.flatnonzero(np.all(shapes == 0, axis=0))
         if empty.size:
             raise ModelError(f"the shape of mode {numbers[empty[0]]} is zero.")
         std = self.std
         if std is not None:
-            std = np.broadcast_to(real_array(std, "std"), shape).copy() if np.ndim(std) < 2 else std
-            std = positive_array(std, "std", shape)
+            std = spread_array(std, "std", shape)
         covariance = self.covariance
         if covariance is None and self.shapes is None and std is None:
             covariance = getattr(self.measured, "shape_covariance", None)
@@ -464,7 +463,7 @@ def _whitening(psi: Any, residual: ModeShapes) -> list[Any]:
             size = float(np.trace(known).real) / shape.size
             # noise along the shape is scale, which is free: any amount of it changes nothing
             along = np.outer(shape, shape.conj()) / float(np.vdot(shape, shape).real)
-            known = known + size * (along + 1e-10 * np.eye(shape.size))
+            known = known + size * (along + 1e-10 * np.eye(shape.size))  # singular without
             try:
                 factor = la.cholesky(known / part, lower=True)
             except la.LinAlgError:

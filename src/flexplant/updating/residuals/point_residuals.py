@@ -9,7 +9,15 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import ComplexArray, FloatArray, positive, positive_array, real_array
+from ...checks import (
+    ComplexArray,
+    FloatArray,
+    below_half_rate,
+    complex_array,
+    positive,
+    real_array,
+    spread_array,
+)
 from ...errors import ModelError, ShapeError, counted, require_known
 from ...labels import DIRECTIONS, Place
 from ...modes.matching import assigned
@@ -80,27 +88,17 @@ class Antiresonances(_PointResidual):
     hold: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        real = real_array(np.real(self.zeros), "zeros", (None,))
-        imag = real_array(np.imag(self.zeros), "the imaginary part of zeros", (None,))
-        if not real.size:
+        zeros = complex_array(self.zeros, "zeros", (None,))
+        if not zeros.size:
             raise ShapeError("zeros is empty: leave the residual out.")
-        if np.any(imag == 0):
+        if np.any(zeros.imag == 0):
             raise ModelError("zeros must have an imaginary part: an antiresonance oscillates.")
-        std = self.std
-        if std is not None:
-            given = positive_array(std, "std")
-            std = (
-                np.full(real.shape, given) if not given.ndim else real_array(std, "std", real.shape)
-            )
-        self._set(zeros=real + 1j * np.abs(imag), std=std)
+        std = None if self.std is None else spread_array(self.std, "std", zeros.shape)
+        self._set(zeros=zeros.real + 1j * np.abs(zeros.imag), std=std)
         self._check_places()
         if self.hold is not None:
             rate = positive(self.hold, "hold")
-            if np.abs(imag).max() >= np.pi * rate:
-                raise ModelError(
-                    f"zeros at up to {np.abs(imag).max() / (2 * np.pi):g} Hz and a hold at "
-                    f"{rate:g} Hz do not go together. Choose those below half the rate."
-                )
+            below_half_rate(np.abs(zeros.imag).max() / (2 * np.pi), "one of zeros", rate)
             self._set(hold=rate)
 
     def __repr__(self) -> str:

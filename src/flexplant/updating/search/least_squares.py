@@ -14,6 +14,7 @@ from ...checks import FloatArray, between, checked, one_of, positive, whole
 from ...errors import ModelError, SolverError, counted
 from ...tolerances import divisor
 from ..family import Point
+from ..sensitivities import SINGULAR, UNSEEN
 from .objective import Objective, SearchEnd, Trail, UpdateMethod, unit_changes
 
 Loss: TypeAlias = Literal["linear", "huber", "soft_l1", "cauchy"]
@@ -25,12 +26,12 @@ EDGE = (
     "mode is lost (bounds= keep a parameter to what is possible)"
 )
 
-#: why a search ends at a jump of the cost, and the part of the cost that slopes promise there
+#: why a search ends at a jump of the cost, and the part of the cost by which it should fall there
 STUCK = (
-    "no step lowers the error as its slopes promise: other modes are paired on the other side, "
+    "no step lowers the error as its slopes predict: other modes are paired on the other side, "
     "say (begin elsewhere, start=)"
 )
-PROMISED = 1e-2
+PREDICTED = 1e-2
 
 
 class _ImpossibleError(Exception):
@@ -172,12 +173,12 @@ class TrustRegion(UpdateMethod):
 
 
 def _is_stuck(answer: Any, size: FloatArray, tolerance: float) -> bool:
-    """Return whether slopes promise a lower cost, though every step was refused."""
-    # at a minimum they promise next to nothing; at a jump of the cost they do
+    """Return whether slopes predict a lower cost, though every step was refused."""
+    # at a minimum they predict next to nothing; at a jump of the cost they do
     J = answer.jac[:, answer.active_mask == 0]
     Q = la.qr(J / divisor(np.linalg.norm(J, axis=0)), mode="economic")[0]
     change = Q @ (Q.T @ answer.fun)
-    if np.sum(change**2) <= PROMISED * np.sum(answer.fun**2):
+    if np.sum(change**2) <= PREDICTED * np.sum(answer.fun**2):
         return False
     return bool(np.max(np.abs(change[: size.size]) / size) > tolerance)
 
@@ -209,10 +210,6 @@ def _data_loss(name: Loss, rows: int) -> Callable[[FloatArray], FloatArray]:
 
 #: what rounding leaves of an eigenvalue, relatively; the error may rise by as much
 ROUNDING = 1e-11
-#: a parameter's effect below this share of what it could have is none
-UNSEEN = 1e-9
-#: singular values of S, its columns of length one, below which parameters cannot be distinguished
-SINGULAR = 1e-7
 EXACT, STEP = "residual below the tolerance", "step below the tolerance"
 
 

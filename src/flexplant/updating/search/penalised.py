@@ -90,10 +90,10 @@ class Tikhonov(PenalisedMethod):
             change = float(np.linalg.norm((one.p - start) / unit))
             curve.append((np.log(max(one.trail.error[-1], TINY)) / 2, np.log(max(change, TINY))))
             found.append(one)
-        return found[_corner(np.array(curve))]
+        return found[_sharpest_bend(np.array(curve))]
 
 
-def _corner(curve: FloatArray) -> int:
+def _sharpest_bend(curve: FloatArray) -> int:
     """Return the point of an L-curve (m, 2) with the largest curvature, of three points each."""
     before, after = np.diff(curve, axis=0)[:-1], np.diff(curve, axis=0)[1:]
     area = before[:, 1] * after[:, 0] - before[:, 0] * after[:, 1]
@@ -167,6 +167,7 @@ class Lasso(PenalisedMethod):
                 best = (score, key, found)
 
         largest = float(np.abs((J * unit).T @ r).max())
+        # from one change to all
         for size in np.geomspace(0.9 * largest, 1e-3 * largest, PATH).tolist():
             # the path only has to say which parameters change; these are fitted anew
             found = _sparse(objective, start, unit, size, PATH_STEPS, 1e-4)
@@ -268,6 +269,7 @@ def _sparse(
         point = objective.at(p, refer=True)
         r = objective.values(point)
         trail.add(objective, p, fraction)
+        # the accuracy of its convex solver
         if np.abs(step / unit).max() < max(tolerance, 1e-6) * max(1.0, float(np.abs(aim).max())):
             return SearchEnd(p, total(r, p), trail, True, "step below the tolerance")
     return SearchEnd(p, total(r, p), trail, False, "max_iterations reached")
