@@ -405,7 +405,7 @@ def test_what_counts_as_a_next_step():
 @pytest.mark.slow
 def test_the_rate_of_these_tests_is_the_stages():
     assert plant().dt == 1 / RATE
-    with pytest.raises(FlexplantError, match=r"mode 70 at .* not below half the rate, 1000 Hz"):
+    with pytest.raises(FlexplantError, match=r"mode 70 is at .* not below half the rate, 1000 Hz"):
         wafer_stage(elements=(8, 8), rate=2000.0).poles([70])
 
 
