@@ -294,9 +294,9 @@ class ModeTolerances(Value):
     >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
     >>> fx.close_loop(plant, observer, servo).mode_tolerances()
     <ModeTolerances of 2 modes: no frequency of a mode off by 5 % does harm
-      mode       Hz   |S| at u of 2.86       unstable
-         2   100.66         ->5 +>5 %        ->5 +>5 %
-         3   174.35         ->5 +>5 %        ->5 +>5 %>
+      mode      Hz  |S| at u of 2.86   unstable
+      2     100.66         ->5 +>5 %  ->5 +>5 %
+      3     174.35         ->5 +>5 %  ->5 +>5 %>
     """
 
     modes: IntArray
