@@ -186,7 +186,7 @@ def test_what_does_not_go_together_is_refused():
 def test_what_is_rarely_meant_is_said():
     """A model above half the rate is refused; a low roll-off, a heavy weight are warned of."""
     sampled = discretized(BODY, 200.0)
-    with pytest.raises(ModelError, match="model must be below half the rate, 100 Hz, got 150"):
+    with pytest.raises(ModelError, match="model is at 150 Hz, not below half the rate, 100 Hz"):
         shape_loop(sampled, bandwidth=1.0, model=150.0)
     with pytest.warns(FlexplantWarning, match="not above twice the bandwidth"):
         shape_loop(BODY, bandwidth=1.0, rolloff=1.9)
