@@ -322,3 +322,21 @@ def test_predicted_within_five_percent_on_machines_of_another_mesh(kind, zeta, l
     error = estimator.rms("die", on=truth)
     assert estimator.rms("die") == pytest.approx(error, rel=0.05, abs=0)
     assert error < 1.02 * design_kalman(estimator.plant).rms("die", on=truth)
+
+
+def test_densities_changed_afterwards_are_those_of_modes_left_out_too():
+    """`plant.replace(asd=)` and ports of that density: one error of the filter, larger or not."""
+    modes = solve_modes(chain(masses=[1.0] * 4, stiffnesses=[4e5] * 3), count=4,
+                        damping=ModalDamping(0.01))  # fmt: skip
+    own = three_masses().assembled.ports
+    loud = own.replace(w=[port.replace(asd=30.0 * port.asd) for port in own.w])
+
+    def made(given, used):
+        return assemble_plant(given, used).discretized(2e3, delay=1)
+
+    few, asd = modes.select([0, 1, 2]), made(modes, loud).asd
+    wanted = design_kalman(made(few, loud), larger=made(modes, loud)).rms("die:x")
+    plant, whole = (made(given, own).replace(asd=asd) for given in (few, modes))
+    for larger in (whole, modes):
+        assert design_kalman(plant, larger=larger).rms("die:x") == pytest.approx(wanted, rel=1e-9)
+    assert design_kalman(made(few, own), larger=modes).rms("die:x") < 0.5 * wanted

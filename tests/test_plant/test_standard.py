@@ -414,6 +414,21 @@ def test_other_densities_are_those_of_ports(held):
     size = np.sqrt(np.diagonal(wanted.process_noise))
     np.testing.assert_allclose(found.process_noise, wanted.process_noise, rtol=0.0,
                                atol=1e-9 * np.max(np.outer(size, size)))  # fmt: skip
+    # so does what is made of it: fewer ports, another place, other modes, the sampled plant itself
+    some, there = own.replace(w=loud, y=own.y[:1]), (0.1, 0.1, 0.0)
+    pairs = [
+        (found.with_ports(own.replace(y=own.y[:1])), plant.with_ports(some)),
+        (found.at({own.z[0].name: there}), wanted.at({own.z[0].name: there})),
+        (found.uncertain(frequency=0.01).sample(0, 1)[0],
+         wanted.uncertain(frequency=0.01).sample(0, 1)[0]),
+        (found.continuous.replace(asd=found.asd).discretized(RATE, delay=1.3), wanted),
+    ]  # fmt: skip
+    for one, other in pairs:
+        assert dict(one.asd) == {**other.asd, **{n: one.asd[n] for n in one.asd if not one.asd[n]}}
+        np.testing.assert_allclose(one.process_noise, other.process_noise, rtol=0.0,
+                                   atol=1e-9 * np.max(np.outer(size, size)))  # fmt: skip
+    with pytest.raises(ModelError, match="must be a Mapping"):
+        plant.replace(asd=5)
     quieter = found.replace(asd={"y1:noise": 1e-9})
     assert not quieter.process_noise.any()
     assert quieter.noise_factor.shape[0] == plant.system.n_states

@@ -19,7 +19,7 @@ from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..modes.matching import assigned
 from ..plant import StandardPlant
-from ..plant.building import sampled_like, structure_system, wired, with_filters
+from ..plant.building import loud_like, sampled_like, structure_system, wired, with_filters
 from ..plant.partition import Assembled
 from ..plant.ports import Ports
 from ..plant.realisation import ModalRealisation
@@ -114,7 +114,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     # an acceleration has no static part: what modes answer at once they take back at rest
     moving = [i for i, sensor in enumerate(ports.y) if sensor.order == 2]
     flexibility[[len(flexibility) - len(ports.y) + i for i in moving]] = 0.0
-    covariance = _motion_covariance(all_modes, others, others_own.ports)
+    covariance = _motion_covariance(all_modes, others, larger)
     nz = covariance.shape[0] - len(ports.y)
     y = plant.unweighted.y
     read = plant.reading_gain[np.ix_(
@@ -205,8 +205,9 @@ def _may_follow(plant: StandardPlant, ports: Ports) -> FloatArray:
     )
 
 
-def _motion_covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> FloatArray:
-    """Return the stationary covariance of the motions of some modes."""
+def _motion_covariance(blocks: _Blocks, chosen: IntArray, plant: StandardPlant) -> FloatArray:
+    """Return the stationary covariance of the motions of some modes of a plant."""
+    ports = plant.assembled.ports
     poles = blocks.poles[chosen].reshape(-1)
     if np.any(poles.real >= 0):
         raise ModelError(
@@ -216,11 +217,12 @@ def _motion_covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> Float
     omega = np.asarray(1j * np.repeat(blocks.omega[chosen], 2), dtype=np.complex128)
     drive = blocks.push[chosen].reshape(poles.size, -1)
     # the root of the two-sided density at each mode's frequency; of actuators their input noise
-    density = [
-        port.asd / np.sqrt(2.0) * np.abs(_siso_response(port.filter, omega))
+    levels = [
+        plant.asd.get(port.name, plant.asd.get(f"{port.name}:disturbance", 0.0)) / np.sqrt(2.0)
         for port in ports.forces
     ]
-    drive = drive * np.array(density).reshape(-1, poles.size).T
+    shaped = [np.abs(_siso_response(port.filter, omega)) for port in ports.forces]
+    drive = drive * (np.array(levels)[:, None] * np.reshape(shaped, (-1, poles.size))).T
     see = blocks.see[:, chosen].reshape(-1, poles.size).copy()
     turn = np.where(poles.imag >= 0, omega, -omega)
     first = see.shape[0] - len(ports.y)
@@ -242,14 +244,16 @@ def _with_flexibility(
     """Return a plant whose structure's motions (p, m) also answer forces at once, sampled alike."""
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
     physical = with_filters(bare.replace(D=bare.D + flexibility), realisation, ports)
-    direct = [p for p in ports.u if p.asd > 0 and (p.filter is None or np.any(p.filter.D))]
+    noisy = [port for port in ports.u if f"{port.name}:disturbance" in ports.input_noises]
+    direct = [port for port in noisy if port.filter is None or np.any(port.filter.D)]
     if direct:  # white noise has no value at an instant that a compliance could follow
         columns = physical.input_index([f"{port.name}:disturbance" for port in direct])
         without = with_filters(bare, realisation, ports)
         B, D = np.array(physical.B), np.array(physical.D)
         B[:, columns], D[:, columns] = without.B[:, columns], without.D[:, columns]
         physical = physical.replace(B=B, D=D)
-    return sampled_like(plant, wired(StandardPlant, Assembled(ports, realisation, physical)))
+    fresh = wired(StandardPlant, Assembled(ports, realisation, physical))
+    return sampled_like(plant, loud_like(plant, fresh))
 
 
 def _quiet(fresh: StandardPlant, plant: StandardPlant, modes: IntArray) -> StandardPlant:

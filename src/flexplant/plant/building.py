@@ -308,7 +308,7 @@ def wired(cls: type[P], origin: Assembled) -> P:
     """Return the plant of an origin: what is static is added to its physical system."""
     physical, ports = origin.physical, origin.ports
     actuators = [a.name for a in ports.u]
-    noises = {f"{s.name}:noise": s.asd for s in ports.y if s.asd > 0}
+    noises = [f"{s.name}:noise" for s in ports.y if s.asd > 0]
     refs, errors = (
         [poi.derived(axis, kind) for poi, axis in ports.followed] for kind in ("ref", "error")
     )
@@ -327,8 +327,7 @@ def wired(cls: type[P], origin: Assembled) -> P:
         outputs=[*physical.outputs, *errors],
     )
     system = among(shown, inputs, outputs, dict.fromkeys(pairs, 1.0)).replace(units=ports.units)
-    asd = {d.name: d.asd for d in ports.w if d.asd > 0} | ports.input_noises | noises
-    return cls(system, tuple(w), tuple(actuators), tuple(z), tuple(y), asd, origin)
+    return cls(system, tuple(w), tuple(actuators), tuple(z), tuple(y), ports.densities, origin)
 
 
 def continuous_plant(cls: type[P], realisation: ModalRealisation, ports: Ports) -> P:
@@ -363,7 +362,9 @@ def sampled(plant: P, rate: float, delay: float) -> P:
     sizes = np.array([plant.asd.get(name, 0.0) for name in held]) * np.sqrt(0.5 * rate)
     factor = np.hstack([factor, physical.B[:, physical.input_index(held)] * sizes])
     known = {"noise_factor": factor, "delay": float(delay), "continuous": plant}
-    return wired(type(plant), origin.replace(physical=physical, **known))
+    found = wired(type(plant), origin.replace(physical=physical, **known))
+    own = {name: level for name, level in plant.asd.items() if name in found.w}
+    return found if own == found.asd else found.replace(asd=own, origin=found.origin)
 
 
 def sampled_motions(
@@ -426,6 +427,25 @@ def sampled_like(nominal: Any, plant: P) -> P:
     return sampled(plant, 1.0 / nominal.dt, nominal.delay) if nominal.dt else plant
 
 
+def changed_densities(plant: Partition) -> dict[str, float]:
+    """Return the densities of a plant's noise that are not those of its ports."""
+    own, now = plant.assembled.ports.densities, plant.asd
+    names = [*now, *(name for name in own if name not in now)]
+    return {n: now.get(n, 0.0) for n in names if now.get(n, 0.0) != own.get(n, 0.0)}
+
+
+def loud_like(plant: Partition, fresh: P) -> P:
+    """Return a continuous plant with the densities that were changed in another one."""
+    # not of ports that have a new density of their own
+    own = plant.assembled.ports.densities
+    kept = {
+        name: level
+        for name, level in changed_densities(plant).items()
+        if name in fresh.w and fresh.asd.get(name, 0.0) == own.get(name, 0.0)
+    }
+    return fresh.replace(asd={**fresh.asd, **kept}) if kept else fresh
+
+
 def rebuilt(
     plant: P, *, ports: Ports | None = None, realisation: ModalRealisation | None = None
 ) -> P:
@@ -433,7 +453,7 @@ def rebuilt(
     # ports that are among its own are rows and columns of it
     require_plain(plant, "other ports or modes are for a plant as it was made")
     own = plant.assembled
-    if isinstance(ports, Ports) and realisation is None:
+    if isinstance(ports, Ports) and realisation is None and not changed_densities(plant):
         found = with_ports_of(own, ports)
         if found is not None:
             before = own.continuous
@@ -444,7 +464,7 @@ def rebuilt(
     else:
         modes = own.realisation if realisation is None else realisation
         fresh = continuous_plant(type(plant), modes, own.ports if ports is None else ports)
-    return sampled_like(plant, fresh)
+    return sampled_like(plant, loud_like(plant, fresh))
 
 
 def with_modes_of(plant: P, larger: object) -> P:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ..checks import FloatArray, Value, function, instance, number, real_array
 from ..errors import AssumptionError, LabelError, ModelError, only_one, unknown_label
 from .assumptions import WEAK, mode_visibility
-from .building import P, rebuilt, wired
+from .building import P, changed_densities, rebuilt, wired
 from .forces import Actuator, Disturbance
 from .partition import Partition, require_plain
 from .ports import Poi, Ports, Sensor
@@ -86,7 +86,8 @@ def seen_elsewhere(plant: P, ports: Ports) -> P | None:
     pairs = [pair for old, new in sides for pair in zip(old, new, strict=True)]
     moves = [new for old, new in pairs if getattr(old, "at", None) != getattr(new, "at", None)]
     grounds = any(np.any(port.ground) for port in ports.w)
-    if not moves or grounds or own.realisation.static_outputs.size or not all(map(_is_row, moves)):
+    more = grounds or own.realisation.static_outputs.size or changed_densities(plant)
+    if not moves or more or not all(map(_is_row, moves)):
         return None
     rows: dict[str, FloatArray] = {}
     for port in moves:

@@ -182,11 +182,11 @@ class Partition(Value):
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed, checked like a new one.
 
-        Of a sampled plant of a structure the noise of each sample follows `asd`. Its ports keep
-        their densities, which other ports and placement take: change those, `with_ports`, for them.
+        The noise of each sample follows `asd`, and so do plants that are made of this one: at
+        other places, of other modes, with other ports that have the same densities as its own.
         """
         asd = changes.get("asd")
-        if asd is not None and self.dt and "origin" not in changes and self.is_assembled:
+        if isinstance(asd, Mapping) and self.dt and "origin" not in changes and self.is_assembled:
             quiet = {f"{name}:noise" for name in self.y}
             new, old = (
                 {n: a for n, a in d.items() if a and n not in quiet} for d in (asd, self.asd)

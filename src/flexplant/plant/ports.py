@@ -401,6 +401,12 @@ class Ports(Value):
         """Densities of the white noise at the amplifiers' inputs, by channel `u1:disturbance`."""
         return {f"{port.name}:disturbance": port.asd for port in self.u if port.asd > 0}
 
+    @property
+    def densities(self) -> dict[str, float]:
+        """Densities asd of the white noises, by channel of w."""
+        noises = {f"{port.name}:noise": port.asd for port in self.y if port.asd > 0}
+        return {port.name: port.asd for port in self.w if port.asd > 0} | self.input_noises | noises
+
     def with_pade(self, order: int = 2) -> Ports:
         """Return the ports with every latency as an all-pass filter, for continuous designs.
 

@@ -430,11 +430,8 @@ def _noise_without(plant: StandardPlant, moving: set[str]) -> WhiteNoise:
     noise = white_noise(plant)
     if not moving or not noise.factor.size:
         return noise
-    ports = plant.assembled.ports
-    w, u = (
-        [p.replace(asd=0.0) if p.name in moving else p for p in side] for side in (ports.w, ports.u)
-    )
-    return noise._replace(factor=continuous_factor(plant.with_ports(ports.replace(w=w, u=u))))
+    still = {n: a for n, a in plant.asd.items() if n.removesuffix(":disturbance") not in moving}
+    return noise._replace(factor=continuous_factor(plant.replace(asd=still)))
 
 
 def _require_plain(plant: StandardPlant, moves: list[Any]) -> None:
