@@ -49,6 +49,8 @@
    model spaces, Biometrika 95, 2008.
 .. [Chu2004] Chu, Fan, Lin, Wang, Structure-preserving algorithms for periodic discrete-time
    algebraic Riccati equations, Int. J. Control 77, 2004.
+.. [Chu2005] Chu, Fan, Lin, A structure-preserving doubling algorithm for continuous-time algebraic
+   Riccati equations, Linear Algebra Appl. 396, 2005.
 .. [CraigBampton1968] Craig, Bampton, Coupling of substructures for dynamic analyses, AIAA J. 6,
    1968.
 .. [CraigKurdila2006] Craig, Kurdila, Fundamentals of Structural Dynamics, 2nd ed., Wiley, 2006.

@@ -338,3 +338,19 @@ def test_an_indefinite_equation_is_corrected_until_its_residual_is_small(monkeyp
     assert found == [6]
     assert np.linalg.norm(rest) < 1e-10 * np.linalg.norm(A.T @ X)
     assert np.linalg.eigvals(A + B @ F).real.max() < 0.0
+
+
+@pytest.mark.parametrize(("size", "noise"), [(1e-9, 1e6), (1.0, 1e36)])
+def test_a_filter_as_slow_as_one_likes(size, noise):
+    """Of a free mass, in closed form: (q c^2 / r)^(1/4) may be 1e-12 of anything else."""
+    found = solve_care([[0, 1], [0, 0]], [[size, 0]], Q=np.diag([0.0, size**2]), R=[[noise]])
+    speed = (size**4 / noise) ** 0.25
+    np.testing.assert_allclose(np.abs(found.poles), speed, rtol=1e-6)
+    root = np.sqrt(noise) * size  # P22 = sqrt(2) speed P12, P12 = size sqrt(r) / c
+    np.testing.assert_allclose(found.P[0, 1], root / size, rtol=1e-6)
+
+
+def test_a_slow_walk_beside_fast_poles():
+    A, Q = np.diag([0.0, -1e3, -1e4]), np.diag([1e-14, 1.0, 1.0])
+    found = solve_care(A, [[1.0, 1.0, 1.0]], Q=Q, R=[[1e3]])
+    assert np.abs(found.poles).min() == pytest.approx(np.sqrt(1e-14 / 1e3), rel=1e-4)

@@ -9,7 +9,7 @@ import scipy.linalg as la
 
 from ..checks import ComplexArray, FloatArray, real_array
 from ..errors import ModelError, SolverError
-from ..tolerances import SPLIT, divisor
+from ..tolerances import SPLIT, TINY, divisor
 
 
 def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
@@ -269,6 +269,39 @@ def stable_subspace(
         raise OnAxisError(np.unique(np.abs(values.imag[on_axis if np.any(on_axis) else near])))
     top, bottom = np.split(vectors[:, : d.size] * scale[:, None], 2)
     return symmetrised(np.linalg.solve(top.T, bottom.T).T)
+
+
+#: relative to the mean speed of the closed loop: shifts of the Cayley transform, tried in turn
+#: until its condition leaves half of the digits to Newton's steps
+SHIFTS, WELL = (1.0, 1.7, 0.6, 3.1, 0.33), 1e8
+
+
+def cayley(A: FloatArray, G: FloatArray, Q: FloatArray) -> tuple[FloatArray, ...]:
+    """Return A, G, Q of the discrete equation with the solution of a continuous one [Chu2005]_."""
+    moduli, unit = np.abs(la.eigvals(np.block([[A, -G], [-Q, -A.T]]))), np.eye(len(A))
+    # a rigid-body mode does not say how fast the closed loop is
+    typical = np.exp(np.mean(np.log(np.maximum(moduli, SPLIT * np.max(moduli, initial=TINY)))))
+    found: dict[float, tuple[FloatArray, ...]] = {}
+    for shift in (np.array(SHIFTS) * typical).tolist():
+        moved = A - shift * unit
+        try:
+            inner = moved + G @ np.linalg.solve(moved.T, Q)
+            condition = float(np.linalg.cond(moved) * np.linalg.cond(inner))
+            inverse, back = np.linalg.inv(inner), np.linalg.inv(moved)
+        except np.linalg.LinAlgError:
+            continue  # a pole lies at the shift: the next one misses it
+        if not np.isfinite(condition):
+            continue
+        spread, cost = np.linalg.solve(moved, G) @ inverse.T, inverse.T @ Q @ back
+        twice = 2 * shift
+        found[condition] = (
+            unit + twice * inverse, twice * symmetrised(spread), twice * symmetrised(cost)
+        )  # fmt: skip
+        if condition < WELL:
+            break
+    if not found:
+        raise SolverError("no shift makes its Cayley transform regular: it has no solution.")
+    return found[min(found)]
 
 
 @np.errstate(over="ignore", invalid="ignore")

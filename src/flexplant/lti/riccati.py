@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
@@ -25,6 +25,7 @@ from ..tolerances import RANK, SPLIT, divisor
 from .equations import (
     OnAxisError,
     accumulated,
+    cayley,
     doubled,
     doubled_riccati,
     lyapunov,
@@ -343,11 +344,16 @@ def _residual(p: RiccatiProblem, P: FloatArray, K: FloatArray) -> tuple[FloatArr
     return residual, relative(residual, float(np.linalg.norm(p.A)) * size, float(la.norm(p.Q)))
 
 
-def _state_sizes(p: RiccatiProblem) -> FloatArray:
+def _sizes(p: RiccatiProblem) -> FloatArray:
     """Return sizes of the states for which noise and information are even."""
     if not p.discrete:
         return 1.0 / state_scale(p.A.T, p.C.T, np.sqrt(np.abs(p.whole.diagonal()))[None, :])
-    states, information = accumulated(p.A, p.Q), accumulated(p.A.T, p.G)
+    return _even_sizes(p.A.T, p.G, p.Q)
+
+
+def _even_sizes(A: FloatArray, G: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return those of the states of a discrete equation in control form."""
+    states, information = accumulated(A.T, Q), accumulated(A, G)
     return scale_of(
         np.where(
             (states > 0) & (information > 0),
@@ -355,6 +361,29 @@ def _state_sizes(p: RiccatiProblem) -> FloatArray:
             np.where(states > 0, states, 1.0 / divisor(information)),
         )
     )
+
+
+def _discrete(p: RiccatiProblem) -> tuple[FloatArray, ...]:
+    """Return A, G, Q of the discrete equation (control form) of the same solution."""
+    return (p.A.T, p.G, p.Q) if p.discrete else cayley(p.A.T, p.G, p.Q)
+
+
+#: a first P in states x / d, d, and the number of doublings
+_Start: TypeAlias = tuple[FloatArray, FloatArray, int]
+
+
+def _by_subspace(p: RiccatiProblem) -> _Start:
+    """Start the continuous equation from the stable subspace of its Hamiltonian."""
+    d = _sizes(p)
+    q = p.scaled(d)
+    return stable_subspace(q.A.T, q.G, q.Q, np.ones(d.size), q.whole), d, 0
+
+
+def _by_doubling(p: RiccatiProblem) -> _Start:
+    """Start from the doubling of the discrete equation, of a continuous one's Cayley transform."""
+    d = _even_sizes(*_discrete(p))
+    P, doublings = doubled_riccati(*_discrete(p.scaled(d)))
+    return P, d, doublings
 
 
 @one_thread()
@@ -365,34 +394,41 @@ def _solve_riccati(problem: RiccatiProblem) -> RiccatiSolution:
     if not n:
         empty = np.zeros((0, problem.C.shape[0]))
         return RiccatiSolution(np.zeros((0, 0)), empty, np.zeros(0, dtype=np.complex128), 0.0, 0)
+    # the subspace solves unstable modes that no noise moves; the doubling poles 1e-12 of the
+    # fastest, which the Schur form of all states puts on the axis
+    refusals: list[Exception] = []
+    for way in (_by_doubling,) if problem.discrete else (_by_subspace, _by_doubling):
+        try:
+            return _solution(problem, *way(problem))
+        except (SolverError, OnAxisError, np.linalg.LinAlgError) as error:
+            refusals.append(error)
     equation = f"{'discrete' if problem.discrete else 'continuous'} Riccati equation"
-    d, doublings = _state_sizes(problem), 0
+    reason = _defect(problem.scaled(_sizes(problem))) or refusals[0]
+    raise SolverError(f"{equation}: {reason}") from refusals[0]
+
+
+def _solution(
+    problem: RiccatiProblem, P: FloatArray, d: FloatArray, doublings: int
+) -> RiccatiSolution:
+    """Return the solution that Newton's steps find from a start, checked."""
     first = problem.scaled(d)
-    try:
-        if first.discrete:
-            P, doublings = doubled_riccati(first.A.T, first.G, first.Q)
-        else:
-            P = stable_subspace(first.A.T, first.G, first.Q, np.ones(n), first.whole)
-        # to unit variances: there residual and correction are relative
-        unit = scale_of(np.abs(P.diagonal()))
-        d, P = d * unit, P / unit / unit[:, None]
-        scaled = problem.scaled(d)
-        P, K, residual, steps = _newton(scaled, P)
-    except (SolverError, OnAxisError, np.linalg.LinAlgError) as error:
-        raise SolverError(f"{equation}: {_defect(first) or error}") from error
+    # to unit variances: there residual and correction are relative
+    unit = scale_of(np.abs(P.diagonal()))
+    d, P = d * unit, P / unit / unit[:, None]
+    scaled = problem.scaled(d)
+    P, K, residual, steps = _newton(scaled, P)
     poles = np.asarray(la.eigvals(scaled.A - K @ scaled.C), dtype=np.complex128)
     stable = np.max(_growth(first, poles)) < 0.0
     if not stable or not residual <= RESIDUAL:
-        reason = _defect(first) or (
+        raise SolverError(
             f"the residual is {residual:.1e} of P (allowed {RESIDUAL:.0e}), the closed loop is "
             f"{'' if stable else 'not '}strictly stable. The problem is too badly "
             "conditioned for double precision."
         )
-        raise SolverError(f"{equation}: {reason}")
     # noise that misses a rigid-body mode but for rounding gives a slow, meaningless loop
     size = 1.0 if first.discrete else float(np.max(np.abs(poles)))
     if np.max(_growth(first, poles)) > -SLOW * size and (reason := _defect(first)):
-        raise SolverError(f"{equation}: {reason}")
+        raise SolverError(reason)
     gain = ((K + scaled.gain) * d[:, None]) @ problem.whitening
     return RiccatiSolution(P * d * d[:, None], gain, poles, residual, doublings + steps)
 
