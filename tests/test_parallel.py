@@ -229,7 +229,7 @@ def loaded(g):
         (responses, "points", lambda g: flexplant.frequency_response(g.replace(blocks=None), [1])),
         (norms, "_proved", flexplant.hinf_norm),
         (h2_norms, "controllability_gramian", flexplant.h2_norm),
-        (doubling, "doubled_riccati", lambda g: control_care(g.A, g.B, Q=np.eye(2), R=np.eye(1))),
+        (doubling, "stable_subspace", lambda g: control_care(g.A, g.B, Q=np.eye(2), R=np.eye(1))),
         (lyapunov, "symmetric", lambda g: solve_lyapunov(g.A, np.eye(2))),
         (lyapunov, "symmetric", lambda g: solve_stein(0.1 * g.A, np.eye(2))),
         (lyapunov, "is_block_diagonal", controllability_gramian),

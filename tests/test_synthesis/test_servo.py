@@ -193,7 +193,7 @@ def test_one_of_several_pois_and_no_reference():
     gain = rigid_gain(Z8, INSET)
     K = at(servo.system, 50.0, servo.system.inputs)
     np.testing.assert_allclose(gain @ K / -pid(50.0, 50.0), np.eye(3), atol=1e-5)
-    with pytest.raises(LabelError, match=r"2 POIs \(die, edge\): say which .* poi='die'"):
+    with pytest.raises(LabelError, match=r"2 POIs \(die, edge\): say which, poi='die'"):
         design_servo(plant, bandwidth=50.0)
     with pytest.raises(LabelError, match="no POI 'dye'"):
         design_servo(plant, bandwidth=50.0, poi="dye")

@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg as la
 
 import flexplant as fx
-from flexplant.errors import InfeasibleError, LabelError, ModelError
+from flexplant.errors import InfeasibleError, LabelError, ModelError, ShapeError
 from flexplant.sparse.symmetric import dense
 from flexplant.testbeds.ritz import ritz_plate
 from stages import RATE, ports
@@ -331,7 +331,7 @@ def test_a_second_size_is_its_own_machine():
     np.testing.assert_allclose(found, drawn, rtol=0.02)
     assert np.abs(found / drawn - 1.0).max() > 1e-3
     assert np.all(found > 1.2 * machine().poles(range(4, 10)).freq)
-    with pytest.raises(fx.ShapeError, match="size must "):
+    with pytest.raises(ShapeError, match="size must "):
         fx.testbeds.wafer_stage(size=0.5)
     with pytest.raises(ModelError, match="thickness"):
         fx.testbeds.wafer_stage(thickness=0.0)

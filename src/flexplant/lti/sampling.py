@@ -131,7 +131,8 @@ def sample_and_hold(
     layout = _Layout(g, inputs, outputs)
     n, first = g.n_states, layout.first
     states = slice(first, first + n)
-    units = state_scale(g.A, g.B, g.C) if n else np.ones(0)
+    alone = not n or uncoupled_pairs(g.A) is not None  # in closed form in any units
+    units = np.ones(n) if alone else state_scale(g.A, g.B, g.C)
     held = _held_flow(g, units)
     A = np.zeros((layout.size, layout.size))
     B = np.zeros((layout.size, len(g.inputs)))
@@ -165,7 +166,7 @@ def sample_and_hold(
     if g.blocks is not None:
         blocks = [*[1] * first, *g.blocks, *[1] * (layout.size - first - n)]
     system = g.replace(A=A, B=B, C=C, D=D, dt=h, states=layout.names, blocks=blocks)
-    return system, _sampled_noise(g, Flow(g.A, g.blocks, units), loud, h, layout, outputs)
+    return system, _sampled_noise(g, units, loud, h, layout, outputs)
 
 
 class _Layout:
@@ -256,13 +257,14 @@ def _check_noise(g: StateSpace, asd: FloatArray, outputs: Late) -> None:
 
 
 def _sampled_noise(
-    g: StateSpace, flow: Flow, asd: FloatArray, h: float, layout: _Layout, outputs: Late
+    g: StateSpace, units: FloatArray, asd: FloatArray, h: float, layout: _Layout, outputs: Late
 ) -> FloatArray:
     """Return G (N, r), ``G G'`` the covariance that white inputs add in one sample."""
     # piece by piece between the instants at which late outputs are taken
     loud = np.flatnonzero(asd)
     if not loud.size or not g.n_states:
         return np.zeros((layout.size, 0))
+    flow = Flow(g.A, g.blocks, units)
     force = g.B[:, loud] * (np.asarray(asd)[loud] / np.sqrt(2.0))
     # late outputs by the instant within the sample at which they are taken
     taken: dict[float, list[int]] = {}
