@@ -65,7 +65,7 @@ def model() -> fx.StandardPlant:
 # %% Designs: at the centre, and at eleven positions
 def design(plant: fx.StandardPlant) -> tuple[Any, Any]:
     """Return the observer and the servo of a position."""
-    return (fx.design_kalman(plant), fx.design_servo(plant, bandwidth=BANDWIDTH, notches=NOTCHES))
+    return fx.design_kalman(plant), fx.design_servo(plant, bandwidth=BANDWIDTH, notches=NOTCHES)
 
 
 def main() -> dict[str, Any]:

@@ -414,7 +414,8 @@ def between(value: Any, name: str, low: float, high: float, hint: str, *, ends: 
     above = number >= low if "[" in ends else number > low
     if not above or not (number <= high if "]" in ends else number < high):
         where = f"be above {low:g}" if np.isinf(high) else f"lie between {low:g} and {high:g}"
-        raise ModelError(f"{name} must {where}, got {number:g}. {hint}")
+        bound = " (the bound itself is excluded)" if number in (low, high) else ""
+        raise ModelError(f"{name} must {where}, got {number:g}{bound}. {hint}")
     return number
 
 

@@ -167,6 +167,8 @@ def test_refusals():
             discretized(g, RATE, delay=bad)
     with pytest.raises(LabelError, match="'c'"):
         discretized(g, RATE, delay=1, delayed=["c"])
+    with pytest.raises(LabelError, match="more than once"):
+        discretized(g, RATE, delay=1, delayed=["b", "b"])
     with pytest.raises(ModelError, match=r"sampled already.*continuous"):
         discretized(discretized(g, RATE), RATE)
     with pytest.raises(ModelError, match="StateSpace"):

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, IntArray, positive
+from ..checks import ComplexArray, FloatArray, IntArray, check_names, positive
 from ..errors import AssumptionError, ModelError, warn
 from ..tolerances import SAME, TINY, divisor
 from .equations import state_scale
@@ -80,7 +80,9 @@ def held_exactly(
     """Return the zero-order-hold equivalent of a continuous system; see `discretized`."""
     late = positive(delay, "delay", zero=True) / positive(rate, "rate")
     some = range(len(g.inputs)) if delayed is None else g.input_index(delayed)
-    return sample_and_hold(g, rate, dict.fromkeys([g.inputs[i] for i in some], late))[0]
+    names = [g.inputs[i] for i in some]
+    check_names(names, "inputs that are delayed")
+    return sample_and_hold(g, rate, dict.fromkeys(names, late))[0]
 
 
 #: `e^(A t)` and `int_0^t e^(A s) ds B` of a time [s]
