@@ -192,7 +192,7 @@ class Partition(Value):
                 {n: a for n, a in d.items() if a and n not in quiet} for d in (asd, self.asd)
             )
             if new != old and not self.is_weighted:
-                factor = 0.0 * self.noise_factor
+                factor = np.zeros((len(self.noise_factor), len(self.held)))
                 if new:
                     loud = {n: a for n, a in new.items() if n in self.continuous.w}
                     before: Any = self.continuous.replace(asd=loud)
