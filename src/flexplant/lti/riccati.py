@@ -136,7 +136,8 @@ def solve_care(
     """Return the stabilising solution of the continuous filter Riccati equation.
 
     ``0 = A P + P A' - (P C' + S) R^-1 (P C' + S)' + Q``, by the stable subspace of the Hamiltonian
-    in scaled states, then Newton steps as for `solve_dare`.
+    in scaled states; where that has eigenvalues on the axis but for rounding (poles 1e-12 of the
+    fastest), by a Cayley transform to the doubling of `solve_dare`. Newton steps follow.
 
     Parameters
     ----------
@@ -155,7 +156,7 @@ def solve_care(
 
     References
     ----------
-    [Laub1979]_.
+    [Laub1979]_, [Chu2005]_.
 
     Examples
     --------

@@ -221,7 +221,7 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
     _wide(ax)
     # a drawn root is on the right of the imaginary axis, or on it
     if any(np.any(np.asarray(line.get_ydata()) <= 0.0) for line in ax.get_lines()):
-        ax.set_yscale("symlog", linthresh=1e-4)  # below it, nothing is told apart
+        ax.set_yscale("symlog", linthresh=1e-4)  # smaller values cannot be distinguished
         ax.axhline(0.0, color="0.3", linewidth=0.9)
     else:
         ax.set_yscale("log")
