@@ -17,8 +17,17 @@ def op2(
     systems=True,
     geometry=True,
     subcases=1,
+    double=False,
+    cards=None,
+    into=None,
+    keys=None,
 ):
-    """Nodes {id: place}, {id: system} that they move in, values (k, nodes, 6), modal data (k,)."""
+    """Nodes {id: place}, {id: system} that they move in, values (k, nodes, 6), modal data (k,).
+
+    `cards` are coordinate systems (card, number, base, nine numbers) in the place of system 5, and
+    `into` is {id: system} in which places are given. `double` writes geometry in double precision,
+    and `keys` changes the third word of a card's key.
+    """
 
     def words(*items):
         parts = [
@@ -49,13 +58,37 @@ def op2(
             parts += [data(words(0)), data(body), key(-number)]
         return b"".join(parts) + data(words(0)) + key(0)
 
+    real = np.dtype(f"{order}f{8 if double else size}")
+
+    def reals(values):
+        return np.asarray(values, real).tobytes()
+
+    def card(name):
+        number, short, plain, wide = {
+            "GRID": (4501, 45, 1, 1120001),
+            "CORD2R": (2101, 21, 8, 2220008),
+            "CORD2C": (2001, 20, 9, 2220009),
+            "CORD2S": (2201, 22, 10, 2220010),
+        }[name]
+        return words(number, short, (keys or {}).get(name, wide if double else plain))
+
     content = data(words(1, 2, 26)) + data(b"NASTRAN FORT TAPE ID CODE - ".ljust(7 * size))
     content += data(letters("TEST")) + key(-1) + key(0)
     if geometry:
-        grids = [words(i, 0, *map(float, p), moves.get(i, 0), 0, 0) for i, p in xyz.items()]
-        points = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0)
-        cards = [words(2101, 21, 8) + words(5, 1, 2, 0, *points)] if systems else []
-        content += table("GEOM1", *cards, words(4501, 45, 1) + b"".join(grids), words(65535, 0, 0))
+        grids = [
+            words(i, (into or {}).get(i, 0)) + reals(place) + words(moves.get(i, 0), 0, 0)
+            for i, place in xyz.items()
+        ]
+        if cards is None:
+            upright = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0)
+            cards = [("CORD2R", 5, 0, upright)] if systems else []
+        kinds = {"CORD2R": 1, "CORD2C": 2, "CORD2S": 3}
+        written = [
+            card(name) + words(number, kinds[name], 2, base) + reals(points)
+            for name, number, base, points in cards
+        ]
+        nodes = card("GRID") + b"".join(grids)
+        content += table("GEOM1", *written, nodes, words(65535, 0, 0))
     if lama:
         rows = [
             words(i, i, float(v), float(abs(v) ** 0.5), 0.0, float(m), float(v * m))

@@ -55,6 +55,82 @@ def test_every_kind_of_words(tmp_path, order, size):
     np.testing.assert_allclose(plain.dofs.xyz[6], [0.5e-3, 0.25e-3, 0], rtol=1e-6)
 
 
+#: sizes of the three coordinates, angles in degrees
+SIZES = {"CORD2R": (1, 1, 1), "CORD2C": (1, 180, 1), "CORD2S": (1, 90, 180)}
+
+
+def random_geometry(rng):
+    """Systems of all kinds in each other, and nodes {id: (system, place, system of motions)}."""
+    systems, coordinates = [], [SIZES["CORD2R"]]
+    for number in range(1, 7):
+        kind = ("CORD2R", "CORD2C", "CORD2S")[number % 3]
+        base = int(rng.integers(0, number)) if number > 1 else 0
+        points = rng.uniform(0.2, 1.0, (3, 3)) * coordinates[base]
+        coordinates.append(SIZES[kind])
+        systems.append((kind, number, base, points))
+    nodes = {}
+    for node in range(11, 19):
+        inside, moves = (int(i) for i in rng.integers(0, 7, 2))
+        nodes[node] = (inside, rng.uniform(0.2, 1.0, 3) * coordinates[inside], moves)
+    return systems, nodes
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("double", [False, True])
+def test_places_and_local_directions_by_another_program(tmp_path, order, double):
+    """Rigid motions that pyyeti forms in local directions are rigid again in basic ones."""
+    n2p, pd = pytest.importorskip("pyyeti.nastran.n2p"), pytest.importorskip("pandas")
+    path = tmp_path / "run.op2"
+    for seed in range(10):
+        systems, nodes = random_geometry(np.random.default_rng(seed))
+        known, table = {}, None
+        for kind, number, base, points in systems:
+            head = [number, ("CORD2R", "CORD2C", "CORD2S").index(kind) + 1, base]
+            n2p.mkusetcoordinfo(np.vstack([head, points]), None, known)
+        for node, (inside, place, moves) in nodes.items():
+            one = n2p.addgrid(None, node, "b", inside, place, moves, known)
+            table = one if table is None else pd.concat([table, one])
+        rigid = n2p.rbgeom_uset(table)
+        xyz = table.loc[(slice(None), 1), "x":"z"].to_numpy()
+        content = op2(
+            {node: place for node, (_, place, _) in nodes.items()},
+            {node: moves for node, (_, _, moves) in nodes.items()},
+            rigid.T.reshape(6, len(nodes), 6),
+            np.arange(1.0, 7.0) ** 2,
+            np.ones(6),
+            order=order,
+            into={node: inside for node, (inside, _, _) in nodes.items()},
+            cards=systems,
+            double=double,
+        )
+        path.write_bytes(content)
+        modes = read_modes(path, zeta=0.01)
+        exact = 1e-13 if double else 2e-5
+        np.testing.assert_allclose(modes.dofs.xyz[::6], xyz, rtol=exact, atol=exact)
+        expected = n2p.rbgeom(xyz)
+        np.testing.assert_allclose(modes.phi, expected, atol=2e-5)
+
+
+def test_geometry_of_an_unknown_layout_is_named(tmp_path):
+    path = tmp_path / "run.op2"
+    for card, key in (("GRID", 4501), ("CORD2R", 2101)):
+        for wrong in (0, 9, 1120002, 2220008 + 1):
+            content = op2(XYZ, {9: 5}, VALUES, EIGENVALUES, MASSES, keys={card: wrong})
+            path.write_bytes(content)
+            with pytest.raises(
+                ModelError, match=rf"{card} cards with the key \({key}, .*{wrong}\)"
+            ):
+                read_modes(path, zeta=0.01, rigid_below=0.1)
+    # a layout of 4-byte words in a file of 8-byte ones
+    path.write_bytes(op2(XYZ, {}, VALUES, EIGENVALUES, MASSES, size=8, keys={"GRID": 1120001}))
+    with pytest.raises(ModelError, match="words of 8 bytes"):
+        read_modes(path, zeta=0.01, rigid_below=0.1)
+    # cards of another layout than their key says
+    path.write_bytes(op2(XYZ, {}, VALUES, EIGENVALUES, MASSES, keys={"GRID": 1120001}))
+    with pytest.raises(FlexplantError, match="GRID cards of 44 bytes in a record of 64"):
+        read_modes(path, zeta=0.01, rigid_below=0.1)
+
+
 @pytest.mark.parametrize(("mode", "mass"), [(1, 0.0), (2, -1.0), (2, np.inf), (3, np.nan)])
 def test_masses_that_none_has_are_refused(tmp_path, mode, mass):
     masses = MASSES.copy()

@@ -16,7 +16,7 @@ from ..errors import FlexplantError, LabelError, ModelError, counted, require_kn
 from ..labels import DIRECTIONS, node_dofs
 from ..tolerances import ROUNDING
 from .fe_modes import MODE_READERS, FileShapes
-from .files import USUAL, damaged, decimal, defined_twice, file_path
+from .files import USUAL, damaged, decimal, defined_twice, file_path, unread
 from .tables import read_nodes_table
 
 _KINDS = ("GRID", "GRDSET", "CORD2R", "CORD2C", "CORD2S")
@@ -397,8 +397,19 @@ def _letters(record: bytes, size: int) -> str:
 #: approach (real eigenvalues) and table (eigenvectors, real numbers, mode by mode)
 _APPROACH, _TABLE = 2, 7
 _IDENT = 146  # words of the record before the numbers
-#: what a table of GEOM1 begins with: kind of card, words of an entry
-_CARDS = {4501: ("GRID", 8), 2101: ("CORD2R", 13), 2001: ("CORD2C", 13), 2201: ("CORD2S", 13)}
+#: cards of nodes and of coordinate systems in GEOM1 by the three words that a record begins with,
+#: and the bytes of their real numbers; None: of the words of the file
+_CARDS = {
+    (4501, 45, 1): ("GRID", None),
+    (2101, 21, 8): ("CORD2R", None),
+    (2001, 20, 9): ("CORD2C", None),
+    (2201, 22, 10): ("CORD2S", None),
+    (4501, 45, 1120001): ("GRID", 8),
+    (2101, 21, 2220008): ("CORD2R", 8),
+    (2001, 20, 2220009): ("CORD2C", 8),
+    (2201, 22, 2220010): ("CORD2S", 8),
+}
+_NUMBERED = {key[0]: kind for key, (kind, _) in _CARDS.items()}
 
 
 def read_op2_shapes(path: Path, nodes: Path | None) -> FileShapes:
@@ -474,30 +485,48 @@ def _geometry_nodes(found: list[Block], path: str) -> Nodes | None:
     """Return the nodes of the tables GEOM1, None where there are none."""
     grids: dict[int, list[Any]] = {}
     systems: dict[int, tuple[str, list[str]]] = {}
-    for block in found:
+    records = [(block, record) for block in found for record in block.records]
+    for block, record in records:
         if not block.name.startswith("GEOM1"):
             continue
-        for record in block.records:
-            head = block.integers(record[: 3 * block.size])
-            kind, count = _CARDS.get(int(head[0]) if head.size else 0, ("", 0))
-            if not kind:
-                continue
-            body = record[3 * block.size :]
-            entries = len(body) // (count * block.size) * count
-            whole = block.integers(body)[:entries].reshape(-1, count).tolist()
-            real = block.reals(body)[:entries].reshape(-1, count).tolist()
-            for integers, numbers in zip(whole, real, strict=True):
-                if kind == "GRID":
-                    node, into, *_ = integers
-                    entry = [into, numbers[2:5], integers[5]]
-                    if grids.setdefault(node, entry) != entry:  # superelements repeat their nodes
-                        first, again = (f"{g[1]} of system {g[0]}" for g in (grids[node], entry))
-                        what = f"{path!r}: GRID {node}"
-                        raise defined_twice(what, first, again, "Write one run to it.")
-                else:
-                    texts = [repr(number) for number in numbers[4:]]
-                    systems[integers[0]] = (kind, [str(integers[0]), str(integers[3]), *texts])
+        kind, entries = _card_entries(block, record, path)
+        if kind != "GRID":
+            for number, base, points in entries:
+                systems[number] = (kind, [str(number), str(base), *map(repr, points)])
+            continue
+        for node, into, place, moves in entries:
+            entry = [into, place, moves]
+            if grids.setdefault(node, entry) != entry:  # superelements repeat their nodes
+                first, again = (f"{g[1]} of system {g[0]}" for g in (grids[node], entry))
+                raise defined_twice(f"{path!r}: GRID {node}", first, again, "Write one run to it.")
     return basic_nodes(grids, systems, path) if grids else None
+
+
+def _card_entries(block: Block, record: bytes, path: str) -> tuple[str, list[Any]]:
+    """Return the kind of card of a record of GEOM1 and its entries; of other cards no entries."""
+    key = tuple(block.integers(record[: 3 * block.size]).tolist())
+    if not key or key[0] not in _NUMBERED:
+        return "", []
+    kind, wide = _CARDS.get(key, ("", None))
+    if not kind or wide == block.size:
+        what = f"holds {_NUMBERED[key[0]]} cards with the key {key} in words of {block.size} bytes"
+        do = "Give the bulk data of the run: nodes='run.bdf'."
+        raise unread(path, f"{what}, whose layout is not known here", do)
+    whole, real = f"{block.order}i{block.size}", f"{block.order}f{wide or block.size}"
+    if kind == "GRID":
+        fields = [("node", whole), ("into", whole), ("place", real, 3), ("moves", whole)]
+        fields += [("held", whole), ("superelement", whole)]
+        read = ["node", "into", "place", "moves"]
+    else:
+        fields = [("number", whole), ("kind", whole, 2), ("base", whole), ("points", real, 9)]
+        read = ["number", "base", "points"]
+    layout = np.dtype(fields)
+    body = record[3 * block.size :]
+    if len(body) % layout.itemsize:
+        due = f"{kind} cards of {layout.itemsize} bytes in a record of {len(body)}"
+        raise damaged(path, f"{block.name}: {due}")
+    table = np.frombuffer(body, layout)
+    return kind, list(zip(*(table[name].tolist() for name in read), strict=True))
 
 
 MODE_READERS[".op2"] = read_op2_shapes
