@@ -103,7 +103,7 @@ reaches (`Controller.reached`).
 
 **design_kalman.** The noise model is that of `simulate`: `plant.process_noise` per sample into x
 and `plant.sensor_noise` on a sample of y; delays of u are known exactly. The Riccati equation is
-solved scaled inside, in any units (`flexplant.lti.solve_dare`), and in square roots where noise is
+solved scaled inside, in any units (`flexplant.lti.filter_dare`), and in square roots where noise is
 so little that P has too few digits ([Hewer1971]_, by QR factors). Modes left out add no states.
 Their motion under the disturbances is noise with covariances R_t at the sensors, V_t at the POIs
 and N_t between them, and they follow u by their static compliance::

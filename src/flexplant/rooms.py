@@ -63,7 +63,7 @@ _THEIRS = {
     "loop.sensitivity": "loopsens", "discretized": "c2d sample_system",
     "h2_norm (or hinf_norm)": "norm", "peak_gain": "getPeakGain", "minimal": "minreal",
     "balanced": "balred balreal", "modal_form": "canon", "lti.solve_lyapunov": "lyap",
-    "lti.solve_stein": "dlyap", "lti.solve_care": "care icare", "lti.solve_dare": "dare idare",
+    "lti.solve_stein": "dlyap", "lti.control_care": "care icare", "lti.control_dare": "dare idare",
     "plant.mixed_sensitivity": "augw", "plant.mixed_sensitivity, then design_hinf": "mixsyn",
     "design_hinf": "hinfsyn", "design_h2": "h2syn lqg", "design_h2 (or placement.PoiLqr)": "lqr",
     "design_kalman": "kalman lqe", "design_ncf": "ncfsyn", "ncf_margin": "ncfmargin",

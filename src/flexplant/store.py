@@ -12,9 +12,11 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
 from html import escape
+from importlib import import_module
 from inspect import Signature, signature
 from itertools import groupby
 from pathlib import Path
+from pkgutil import iter_modules
 from types import FunctionType, MappingProxyType
 from typing import IO, TYPE_CHECKING, Any, ClassVar, Self, cast
 
@@ -271,7 +273,13 @@ def load(path: str | Path) -> Any:
     Raises
     ------
     FlexplantError
-        When the file was not written by flexplant.
+        When the file was not written by flexplant, or holds a kind of value of another module
+        that is not imported yet.
+
+    Notes
+    -----
+    The file names the module of each value. Where the session has not used that room of flexplant
+    yet, it is imported, and no other; modules that are not flexplant's are never imported.
 
     Examples
     --------
@@ -323,7 +331,8 @@ def _encode(item: Any, arrays: dict[str, Any]) -> Any:
         return {"sparse": parts, "shape": list(coo.shape)}
     if isinstance(item, Value):
         fields = {name: _encode(part, arrays) for name, part in item._fields().items()}
-        return {"value": type(item).__name__, "fields": fields}
+        kind = type(item)
+        return {"value": kind.__name__, "module": kind.__module__, "fields": fields}
     if isinstance(item, Mapping):
         return {"mapping": [[_encode(k, arrays), _encode(v, arrays)] for k, v in item.items()]}
     if isinstance(item, tuple):
@@ -332,6 +341,26 @@ def _encode(item: Any, arrays: dict[str, Any]) -> Any:
         return [_encode(part, arrays) for part in item]
     raise FlexplantError(
         f"cannot save a {type(item).__name__}: files hold values, arrays, numbers and names only."
+    )
+
+
+def _kind(name: str, module: str) -> type[Value]:
+    """Return the kind of that name; rooms are imported until it is known, its own room first."""
+    package, *below = module.split(".")
+    if package == __package__:
+        rooms = [found.name for found in iter_modules(sys.modules[package].__path__)]
+        for room in sorted(rooms, key=lambda room: [room] != below[:1]):
+            if name in Value.registry:
+                break
+            import_module(f"{package}.{room}")
+    if name in Value.registry:
+        return Value.registry[name]
+    raise FlexplantError(
+        f"the file holds a {name!r}, which this version of flexplant lacks. Load it with the "
+        "version that wrote it."
+        if package == __package__
+        else f"the file holds a {name!r} of the module {module!r}, which this session lacks. "
+        "Import that module, then load the file again."
     )
 
 
@@ -360,11 +389,7 @@ def _decode(item: Any, arrays: Mapping[str, Any]) -> Any:
     if not isinstance(item, dict):
         return item
     if "value" in item:
-        cls = Value.registry.get(item["value"])
-        if cls is None:
-            raise FlexplantError(
-                f"the file holds a {item['value']!r}, which this version of flexplant lacks."
-            )
+        cls = _kind(item["value"], item.get("module", __package__))
         return _rebuilt(cls, {name: _decode(part, arrays) for name, part in item["fields"].items()})
     if "array" in item:
         return arrays[item["array"]]

@@ -10,7 +10,7 @@ from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeErro
 from flexplant.estimation import Filter, FixedLag, Predictor, Smoother, design_kalman, design_static
 from flexplant.estimation.estimate import estimated
 from flexplant.estimation.passage import Walk
-from flexplant.lti import solve_dare
+from flexplant.lti import filter_dare
 from machines import stage
 from oracles_estimation import batch, error_covariance
 
@@ -103,7 +103,7 @@ def test_noises_of_process_and_sensors_may_be_correlated(lag):
     with pytest.raises(ModelError, match="root is no factor"):
         model.replace(S=S)
     model = model.replace(S=S, root=None)
-    solved = solve_dare(model.A, model.C2, Q=model.Q, R=model.R, S=S)
+    solved = filter_dare(model.A, model.C2, Q=model.Q, R=model.R, S=S)
     y, u, _ = run(model, 40, seed=10)
     y[12:15, 0] = np.nan
     method, later = LAGS[lag]

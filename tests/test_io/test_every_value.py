@@ -1,12 +1,15 @@
 """Every public value goes through a file: all fields equal, arrays read-only, facts the same."""
 
+import os
 import pickle
 import re
+import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
-from inspect import get_annotations
+from inspect import get_annotations, isabstract
+from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -16,7 +19,7 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant import estimation, load, lti, placement, structure, synthesis
 from flexplant import plant as plants
-from flexplant.checks import Value
+from flexplant.checks import Value, rebuild
 from flexplant.errors import FlexplantError
 from flexplant.estimation import LeftOut
 from flexplant.loop import close_loop
@@ -25,6 +28,7 @@ from flexplant.reduction import select_dofs
 from flexplant.simulation import LearnedFeedforward, error_map, exposure_errors
 from flexplant.updating import eigenvalue_sensitivities
 from stages import CORNERS, RATE, Z8, full, ports, reduced, some_modes
+from test_layers import LEVEL
 
 
 def all_values(base=Value):
@@ -104,7 +108,7 @@ def made():
     small = fx.assemble_plant(some_modes(count=8, attached=False), ports()).discretized(RATE)
     sensors = fx.place_sensors(small, candidates=candidates, count=4)
     g = fx.StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]])
-    solution = fx.lti.solve_care(np.array([[-1.0]]), np.eye(1), Q=np.eye(1), R=np.eye(1))
+    solution = fx.lti.filter_care(np.array([[-1.0]]), np.eye(1), Q=np.eye(1), R=np.eye(1))
     yield from (fe, modes, rom, fx.DesiredDofs(rom.dofs.labels), select_dofs(modes, 25))
     yield from (normal_form(rom.M, rom.D, rom.K, rom.rigid_body), fx.ModalDamping(0.01))
     yield fx.sparse.Pardiso()
@@ -382,6 +386,101 @@ def test_goes_through_a_file(name, tmp_path):
     in_notebook = "".join(ET.fromstring(value._repr_html_()).itertext())  # well-formed, complete
     assert re.sub(r"\W", "", in_notebook) == re.sub(r"\W", "", repr(value))
     same(value, pickle.loads(pickle.dumps(value)), name)
+
+
+#: loads files one after the other in a process that imported nothing else, and saves them again
+READER = """
+import sys
+import flexplant as fx
+rooms = lambda: {name.split(".")[1] for name in sys.modules if name.startswith("flexplant.")}
+assert not rooms()
+for path in sys.argv[1:]:
+    before = rooms()
+    value = fx.load(path)
+    print(type(value).__name__, *sorted(rooms() - before))
+    value.save(path + ".again")
+"""
+
+
+def read_elsewhere(*paths):
+    """Load files in a new process; return [type, room that was imported, ...] of each."""
+    home = str(Path(fx.__file__).parents[1])
+    said = subprocess.run(
+        [sys.executable, "-c", READER, *map(str, paths)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": home},
+    )
+    assert not said.returncode, said.stdout.splitlines()[-1:] + said.stderr.splitlines()[-1:]
+    return [line.split() for line in said.stdout.splitlines()]
+
+
+def check_elsewhere(values, folder):
+    """Values come back to the bit; return by which of them each room was imported."""
+    # in the order of the rooms: no room was imported by an earlier file
+    level = {cls: LEVEL[cls.__module__.split(".")[1]] for cls in values}
+    kinds = sorted(values, key=level.__getitem__)
+    for cls in kinds:
+        values[cls].save(folder / cls.__name__)
+    read = read_elsewhere(*(folder / cls.__name__ for cls in kinds))
+    for cls, (name, *_) in zip(kinds, read, strict=True):
+        assert name == cls.__name__
+        one, two = (np.load(folder / f"{name}{end}") for end in ("", ".again"))
+        assert one.files == two.files
+        assert all(one[part].tobytes() == two[part].tobytes() for part in one.files), name
+    return {room: cls for cls, (_, *rooms) in zip(kinds, read, strict=True) for room in rooms}
+
+
+def test_every_kind_loads_in_a_new_process(tmp_path):
+    """Also kinds that no room shows; each room is imported by the first file that needs it."""
+    kinds = [cls for cls in all_values() if is_dataclass(cls) and not isabstract(cls)]
+    blank = {cls: rebuild(cls, {field.name: None for field in fields(cls)}) for cls in kinds}
+    assert len(blank) > 250
+    by = check_elsewhere(blank, tmp_path)
+    shown = {cls.__module__.split(".")[1] for cls in kinds} - {"labels"}
+    assert all(by[room].__module__.split(".")[1] == room for room in shown)
+    assert not {"plot", "documentation"} & set(by)  # what no value needs
+
+
+@pytest.mark.slow
+def test_every_value_loads_in_a_new_process(tmp_path):
+    """All public values with what they hold, as users get them."""
+    every = {cls: zoo()[cls.__name__] for cls in all_values() if cls.__name__ in zoo()}
+    assert {cls.__name__ for cls in every} >= set(NAMES)
+    check_elsewhere(every, tmp_path)
+
+
+def rewritten(path, old, new):
+    """Change the text of a file's header."""
+    with np.load(path) as file:
+        parts = dict(file)
+    text = str(parts["__flexplant__"])
+    assert old in text
+    parts["__flexplant__"] = np.array(text.replace(old, new))
+    with path.open("wb") as file:
+        np.savez(file, **parts)
+
+
+def test_files_import_little_and_nothing_of_others(tmp_path):
+    """A system needs no plant; files that name no module, or one that is gone, load too."""
+    g, forward = fx.lti.tf([1.0], [1.0, 1.0]), fx.Specification(noise=1e-6)
+    g.save(tmp_path / "system")
+    assert "plant" not in read_elsewhere(tmp_path / "system")[0]
+    module = type(forward).__module__
+    for new in ("", ', "module": "flexplant.gone.by"'):
+        forward.save(tmp_path / "old")
+        rewritten(tmp_path / "old", f', "module": "{module}"', new)
+        assert read_elsewhere(tmp_path / "old")[0][0] == "Specification"
+    g.save(tmp_path / "other")
+    rewritten(tmp_path / "other", type(g).__module__, "antigravity")
+    rewritten(tmp_path / "other", "StateSpace", "Balloon")
+    with pytest.raises(FlexplantError, match=r"'Balloon' of the module 'antigravity'.* Import"):
+        load(tmp_path / "other")
+    assert "antigravity" not in sys.modules
+    rewritten(tmp_path / "other", "antigravity", "flexplant.lti")
+    with pytest.raises(FlexplantError, match="'Balloon', which this version of flexplant lacks"):
+        load(tmp_path / "other")
 
 
 @pytest.mark.slow

@@ -17,6 +17,8 @@ from flexplant.lti import (
     hankel_values,
     hinf_norm,
     linf_norm,
+    minimal,
+    modal_form,
     norm_report,
     split_stable,
     tf,
@@ -293,3 +295,20 @@ def test_light_damping_is_not_called_marginal():
         assert hinf_norm(g.replace(blocks=None)) == pytest.approx(hinf_norm(g), rel=1e-6, abs=0)
     slow = StateSpace(np.diag([-1e-4, -1e5]), np.ones((2, 1)), np.ones((1, 2)), [[0.0]])
     assert hinf_norm(slow) == pytest.approx(1e4, rel=1e-8)
+
+
+@pytest.mark.parametrize("dt", [0.0, 1e-3])
+def test_nothing_is_printed_where_no_state_is_stable(capfd, dt):
+    """LAPACK complains on the screen about matrices without rows."""
+    free = StateSpace([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]])
+    free = discretized(free, 1 / dt) if dt else free
+    gain = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[2.0]], dt)
+    with pytest.raises(ModelError, match="a whole number from 2"):
+        balanced(free, order=1)
+    assert balanced(free, order=2).system.n_states == 2
+    assert balanced(gain, order=0).system.D == 2
+    assert hankel_values(gain).size == 0
+    for g in (free, gain):
+        assert minimal(g).n_states == modal_form(g).system.n_states == g.n_states
+    assert norm_report(gain).linf == 2
+    assert capfd.readouterr() == ("", "")

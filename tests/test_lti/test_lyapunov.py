@@ -48,6 +48,44 @@ def test_lyapunov_is_the_linear_system(seed):
     np.testing.assert_array_equal(X, X.T)
 
 
+@pytest.mark.parametrize("shape", [np.triu, np.tril, np.asarray])
+@pytest.mark.parametrize("diagonal", [0.0, 1e-27, 1e-12])
+def test_stein_of_a_right_side_with_a_small_diagonal(shape, diagonal):
+    """Some or all diagonal entries of Q are rounding, in any units of the states."""
+    rng = np.random.default_rng(5)
+    for _ in range(100):
+        n = int(rng.integers(2, 7))
+        A = shape(rng.standard_normal((n, n)))
+        A *= 0.95 / np.abs(la.eigvals(A)).max()
+        Q = rng.standard_normal((n, n))
+        Q += Q.T
+        small = np.flatnonzero(rng.random(n) < rng.choice([0.3, 1.0]))
+        Q[small, small] = diagonal * rng.standard_normal(small.size)
+        d = 2.0 ** rng.integers(-30, 30, n)
+        X = solve_stein(A * d[:, None] / d, Q * d * d[:, None]) / d / d[:, None]
+        expected = stein(A, Q)
+        np.testing.assert_allclose(X, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+def test_a_wrong_entry_of_a_stein_solution_is_found(monkeypatch):
+    """Each entry is held against its own terms: one that is off by 1e-8 of them is refused."""
+    rng = np.random.default_rng(6)
+    A = np.triu(rng.standard_normal((4, 4)))
+    A *= 0.9 / np.abs(la.eigvals(A)).max()
+    Q = rng.standard_normal((4, 4))
+    Q += Q.T
+    Q[3, 3] = 1e-27
+    right = equations.stein
+    for i, j in np.ndindex(4, 4):
+        change = np.zeros((4, 4))
+        change[i, j] = 1e-7
+        monkeypatch.setattr(
+            lyapunov_module, "stein", lambda A, Q, by=change: right(A, Q) * (1.0 + by)
+        )
+        with pytest.raises(SolverError, match="residual"):
+            solve_stein(A, Q)
+
+
 def test_scalar_values():
     assert solve_stein(np.array([[0.5]]), np.array([[3.0]]))[0, 0] == pytest.approx(
         4.0, rel=1e-15, abs=0

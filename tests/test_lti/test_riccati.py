@@ -6,8 +6,10 @@ import scipy.linalg as la
 from hypothesis import given
 from hypothesis import strategies as st
 
+import flexplant
 from flexplant.errors import ModelError, ShapeError, SolverError
-from flexplant.lti import control_care, control_dare, equations, solve_care, solve_dare
+from flexplant.lti import control_care, control_dare, equations, filter_care, filter_dare
+from flexplant.rooms import OURS
 from oracles_lti import double_integrator_dare, riccati_recursion, stein
 from shared_data import DATA
 
@@ -47,7 +49,7 @@ def machine(n_rigid, n_elastic, *, zeta=1e-3, rate=1e4, force=1e-3, noise=1e-10,
 @pytest.mark.parametrize(("h", "q", "r"), [(1.0, 1.0, 1.0), (1e-4, 1e-8, 1e-20), (1e-3, 4.0, 1e-9)])
 def test_double_integrator_in_closed_form(h, q, r):
     A, g = np.array([[1, h], [0, 1]]), np.array([[h**2 / 2], [h]])
-    sol = solve_dare(A, np.array([[1.0, 0.0]]), Q=g @ g.T * q, R=np.array([[r]]))
+    sol = filter_dare(A, np.array([[1.0, 0.0]]), Q=g @ g.T * q, R=np.array([[r]]))
     alpha, beta, p11, p12 = double_integrator_dare(h, q, r)
     assert sol.P[0, 0] == pytest.approx(p11, rel=1e-9, abs=0)
     assert sol.P[0, 1] == pytest.approx(p12, rel=1e-9, abs=0)
@@ -58,7 +60,8 @@ def test_double_integrator_in_closed_form(h, q, r):
 def test_equals_scipy_on_benign_problems(seed):
     A, C, Q, R, rng = benign(seed)
     S = 0.1 * rng.standard_normal((6, 2))
-    sol = solve_dare(A, C, Q=Q, R=R, S=S)
+    Q = Q + S @ np.linalg.solve(R, S.T)  # the joint covariance is not indefinite
+    sol = filter_dare(A, C, Q=Q, R=R, S=S)
     # SciPy 1.16.0 to 1.16.2 take s without e for a problem with a singular e
     P = la.solve_discrete_are(A.T, C.T, Q, R, e=np.eye(len(A)), s=S)
     np.testing.assert_allclose(sol.P, P, rtol=0, atol=1e-8 * np.abs(P).max())
@@ -75,7 +78,8 @@ def test_equals_scipy_on_benign_problems(seed):
 def test_continuous_equals_scipy_on_benign_problems(seed):
     A, C, Q, R, rng = benign(seed)
     S = 0.1 * rng.standard_normal((6, 2))
-    sol = solve_care(A, C, Q=Q, R=R, S=S)
+    Q = Q + S @ np.linalg.solve(R, S.T)  # the joint covariance is not indefinite
+    sol = filter_care(A, C, Q=Q, R=R, S=S)
     P = la.solve_continuous_are(A.T, C.T, Q, R, e=np.eye(len(A)), s=S)
     np.testing.assert_allclose(sol.P, P, rtol=0, atol=1e-8 * np.abs(P).max())
     np.testing.assert_allclose(sol.gain, (P @ C.T + S) @ np.linalg.inv(R), atol=1e-7)
@@ -102,7 +106,7 @@ def test_control_forms_are_the_duals(seed):
 def test_equals_the_recursion_in_extended_precision_in_si_units():
     # one rigid body and two modes at 0.1 %: 1e-10 m, 1e-3 N; recursion from P = Q
     A, C, Q, R = machine(1, 2, inputs=2)
-    sol = solve_dare(A, C, Q=Q, R=R)
+    sol = filter_dare(A, C, Q=Q, R=R)
     assert sol.spectral_radius < 0.998  # 20 000 steps decay to 1e-17
     P = riccati_recursion(A, C, Q, R, 20_000)
     scale = np.sqrt(np.diag(P))
@@ -116,7 +120,7 @@ def test_equals_the_recursion_in_extended_precision_in_si_units():
 @pytest.mark.parametrize("noise", [1e-12, 1e-10, 1e-8])
 def test_machines_in_si_units(n_rigid, force, noise):
     A, C, Q, R = machine(n_rigid, 15, force=force, noise=noise)
-    sol = solve_dare(A, C, Q=Q, R=R)
+    sol = filter_dare(A, C, Q=Q, R=R)
     closed = A - sol.gain @ C
     assert np.abs(la.eigvals(closed)).max() < 1
     # the gain's own covariance, as one linear system in scaled states
@@ -130,7 +134,7 @@ def test_machines_in_si_units(n_rigid, force, noise):
 
 def test_gain_of_a_machine_has_the_covariance_of_its_own_stein_equation():
     A, C, Q, R = machine(3, 4)
-    sol = solve_dare(A, C, Q=Q, R=R)
+    sol = filter_dare(A, C, Q=Q, R=R)
     d = np.sqrt(np.diag(sol.P))
     closed = (A - sol.gain @ C) * d / d[:, None]
     P = stein(closed, (Q + sol.gain @ R @ sol.gain.T) / d / d[:, None])
@@ -142,8 +146,8 @@ def test_gain_of_a_machine_has_the_covariance_of_its_own_stein_equation():
 def test_units_of_states_and_noise_do_not_matter(powers, joint):
     A, C, Q, R = machine(3, 4)
     d = 2.0 ** np.array(powers)
-    plain = solve_dare(A, C, Q=Q, R=R)
-    moved = solve_dare(
+    plain = filter_dare(A, C, Q=Q, R=R)
+    moved = filter_dare(
         A * d[:, None] / d, C / d, Q=Q * d * d[:, None] * 2.0**joint, R=R * 2.0**joint
     )
     scale = np.sqrt(np.diag(plain.P))
@@ -162,7 +166,7 @@ def test_continuous_machine_in_si_units():
     A[1::2, 1::2] = -2e-3 * np.diag(omega)
     B[1::2], C[:, ::2] = rng.standard_normal((23, 4)) / 5, rng.standard_normal((4, 23)) / 5
     Q, R = B @ B.T * 5e-7, np.eye(4) * 5e-21
-    sol = solve_care(A, C, Q=Q, R=R)
+    sol = filter_care(A, C, Q=Q, R=R)
     assert la.eigvals(A - sol.gain @ C).real.max() < 0
     d = np.sqrt(np.diag(sol.P))
     As, Ps, Cs = A * d / d[:, None], sol.P / d / d[:, None], C * d
@@ -189,7 +193,7 @@ def test_indefinite_r_discrete():
     A, C, Q, _, _ = benign(3, n=5, p=3)
     A = 0.7 * A
     R = np.diag([-500.0, 1.0, 2.0])
-    sol = solve_dare(A, C, Q=Q, R=R)
+    sol = filter_dare(A, C, Q=Q, R=R)
     P = sol.P
     right = A @ P @ A.T + Q - A @ P @ C.T @ np.linalg.solve(C @ P @ C.T + R, C @ P @ A.T)
     np.testing.assert_allclose(right, P, atol=1e-11 * np.abs(P).max())
@@ -203,7 +207,7 @@ def test_noise_that_the_outputs_show_in_full_leaves_the_mirrored_zeros(seed):
     A, B, C, D = (rng.normal(size=shape) for shape in ((8, 8), (8, 2), (2, 8), (2, 2)))
     zeros = la.eigvals(A - B @ np.linalg.solve(D, C))
     assert np.any(zeros.real > 0)
-    found = solve_care(A, C, Q=B @ B.T, R=D @ D.T, S=B @ D.T)
+    found = filter_care(A, C, Q=B @ B.T, R=D @ D.T, S=B @ D.T)
     mirrored = np.where(zeros.real > 0, -zeros.conj(), zeros)
     poles, wanted = np.sort_complex(found.poles), np.sort_complex(mirrored)
     np.testing.assert_allclose(poles, wanted, rtol=1e-6)
@@ -223,10 +227,10 @@ def test_noise_that_misses_a_rigid_body_mode_is_named():
     B[1::2, 0] = [0.3, 0.2, -0.4, 1, 1, 1, 1]
     one = B @ B.T * 1e-12
     with pytest.raises(SolverError, match=r"2 mode\(s\) of A at 1.* not excited"):
-        solve_dare(A, C, Q=one, R=R)
+        filter_dare(A, C, Q=one, R=R)
     Q[0:2] = Q[:, 0:2] = 0.0
     with pytest.raises(SolverError, match=r"1 mode\(s\) of A at 1.* not excited"):
-        solve_dare(A, C, Q=Q, R=R)
+        filter_dare(A, C, Q=Q, R=R)
 
 
 def test_two_rigid_body_modes_excited_as_one_but_for_rounding_are_refused():
@@ -237,17 +241,17 @@ def test_two_rigid_body_modes_excited_as_one_but_for_rounding_are_refused():
         Q = B @ B.T * 1e-12
         if refused:
             with pytest.raises(SolverError, match="not excited"):
-                solve_dare(A, C, Q=Q, R=R)
+                filter_dare(A, C, Q=Q, R=R)
         else:
-            assert solve_dare(A, C, Q=Q, R=R).spectral_radius < 1
+            assert filter_dare(A, C, Q=Q, R=R).spectral_radius < 1
 
 
 def test_outputs_that_miss_a_rigid_body_mode_are_named():
     A, C, Q, R = machine(3, 4)
     with pytest.raises(SolverError, match=r"cannot be seen"):
-        solve_dare(A, C[:2], Q=Q, R=R[:2, :2])
+        filter_dare(A, C[:2], Q=Q, R=R[:2, :2])
     with pytest.raises(SolverError, match=r"cannot be seen"):
-        solve_care(np.diag([1.0, -1.0]), np.array([[0.0, 1.0]]), Q=np.eye(2), R=np.eye(1))
+        filter_care(np.diag([1.0, -1.0]), np.array([[0.0, 1.0]]), Q=np.eye(2), R=np.eye(1))
 
 
 def test_compleib_problems_equal_scipy_or_have_no_solution():
@@ -277,13 +281,13 @@ def test_delay_states_have_no_error():
     n = A.shape[0]
     A = np.block([[A, np.ones((n, 1))], [np.zeros((1, n + 1))]])
     C, Q = np.hstack([C, np.zeros((6, 1))]), la.block_diag(Q, 0.0)
-    sol = solve_dare(A, C, Q=Q, R=R)
+    sol = filter_dare(A, C, Q=Q, R=R)
     assert not sol.P[n].any()
     assert not sol.gain[n].any()
 
 
 def test_empty_problem_and_repr():
-    sol = solve_dare(np.zeros((0, 0)), np.zeros((2, 0)), Q=np.zeros((0, 0)), R=np.eye(2))
+    sol = filter_dare(np.zeros((0, 0)), np.zeros((2, 0)), Q=np.zeros((0, 0)), R=np.eye(2))
     assert sol.P.shape == (0, 0)
     assert repr(sol) == "<RiccatiSolution: 0 states, residual 0.0e+00, 0 iterations>"
 
@@ -291,7 +295,7 @@ def test_empty_problem_and_repr():
 EYE = np.eye(2)
 
 
-@pytest.mark.parametrize("solve", [solve_dare, solve_care, control_dare, control_care])
+@pytest.mark.parametrize("solve", [filter_dare, filter_care, control_dare, control_care])
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
@@ -343,7 +347,7 @@ def test_an_indefinite_equation_is_corrected_until_its_residual_is_small(monkeyp
 @pytest.mark.parametrize(("size", "noise"), [(1e-9, 1e6), (1.0, 1e36)])
 def test_a_filter_as_slow_as_one_likes(size, noise):
     """Of a free mass, in closed form: (q c^2 / r)^(1/4) may be 1e-12 of anything else."""
-    found = solve_care([[0, 1], [0, 0]], [[size, 0]], Q=np.diag([0.0, size**2]), R=[[noise]])
+    found = filter_care([[0, 1], [0, 0]], [[size, 0]], Q=np.diag([0.0, size**2]), R=[[noise]])
     speed = (size**4 / noise) ** 0.25
     np.testing.assert_allclose(np.abs(found.poles), speed, rtol=1e-6)
     root = np.sqrt(noise) * size  # P22 = sqrt(2) speed P12, P12 = size sqrt(r) / c
@@ -352,5 +356,31 @@ def test_a_filter_as_slow_as_one_likes(size, noise):
 
 def test_a_slow_walk_beside_fast_poles():
     A, Q = np.diag([0.0, -1e3, -1e4]), np.diag([1e-14, 1.0, 1.0])
-    found = solve_care(A, [[1.0, 1.0, 1.0]], Q=Q, R=[[1e3]])
+    found = filter_care(A, [[1.0, 1.0, 1.0]], Q=Q, R=[[1e3]])
     assert np.abs(found.poles).min() == pytest.approx(np.sqrt(1e-14 / 1e3), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "oracle"),
+    [
+        ("care", la.solve_continuous_are),
+        ("icare", la.solve_continuous_are),
+        ("dare", la.solve_discrete_are),
+        ("idare", la.solve_discrete_are),
+    ],
+)
+@pytest.mark.parametrize("square", [False, True])
+def test_names_of_others_lead_to_the_same_equation(name, oracle, square):
+    """With a square B the dual equation has an answer too, which is another one."""
+    room, ours = OURS[name].split(".")
+    assert f"``{name.removeprefix('i')}``" in getattr(flexplant, room).__doc__
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        n = int(rng.integers(2, 6))
+        A, B = rng.standard_normal((n, n)), rng.standard_normal((n, n if square else 1))
+        Q, R = np.eye(n), np.eye(B.shape[1])
+        found = getattr(getattr(flexplant, room), ours)(A, B, Q=Q, R=R)
+        expected = oracle(A, B, Q, R)
+        np.testing.assert_allclose(found.P, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+        (row,) = [row for row in flexplant.lti.__doc__.splitlines() if "``care``" in row]
+        assert f"`fx.{OURS[name]}`" in row

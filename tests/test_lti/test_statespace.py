@@ -12,7 +12,7 @@ from flexplant import load
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.lti import StateSpace, as_statespace
 from oracles_lti import gain_at
-from systems_lti import same, system
+from systems_lti import machine, same, system
 
 
 @pytest.mark.parametrize("dt", [0.0, 1e-4])
@@ -150,3 +150,44 @@ def test_bad_input(change, error, message):
 def test_a_static_gain_of_nothing_is_refused():
     with pytest.raises(ShapeError, match="rows and columns"):
         as_statespace([])
+
+
+def triangular_system(rng, channels):
+    """A block upper triangular system of random blocks, with an invertible D."""
+    sizes = rng.integers(1, 3, rng.integers(1, 5))
+    n = sizes.sum()
+    owner = np.repeat(np.arange(sizes.size), sizes)
+    A = rng.standard_normal((n, n)) * (owner[:, None] <= owner)
+    B, C = rng.standard_normal((n, channels)), rng.standard_normal((channels, n))
+    D = rng.standard_normal((channels, channels)) + 3 * np.eye(channels)
+    return StateSpace(A, B, C, D, float(rng.choice([0.0, 0.1])), blocks=sizes)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3])
+def test_inverses_of_systems_with_blocks(channels):
+    """1 / (1 + L), 1 / L: any number of blocks and channels, continuous and sampled."""
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        L = triangular_system(rng, channels)
+        eye = np.eye(channels)
+        for found, direct in ((1 / L, 0 * eye), (2.0 / (eye + L), eye)):
+            for s in (0.3 + 2j, -1.7 + 0.4j):
+                gain = gain_at(L.A, L.B, L.C, L.D, s) + direct
+                scale = 1.0 if not direct.any() else 2.0
+                answer = np.asarray(found(s)).reshape(channels, channels)
+                np.testing.assert_allclose(answer @ gain, scale * eye, atol=1e-9)
+        np.testing.assert_allclose(
+            np.sort_complex(found.poles()),
+            np.sort_complex(la.eigvals(L.A - L.B @ np.linalg.solve(L.D + eye, L.C))),
+            atol=1e-6,
+        )
+
+
+def test_the_sensitivity_of_a_machine_is_one_over_one_plus_its_loop():
+    """The form that the help of the room teaches, on 24 modes."""
+    L = machine(m=1, p=1)
+    S = 1 / (1 + 10.0 * L)
+    for f in (1.0, 245.0, 1000.0):
+        s = 2j * np.pi * f
+        gain = 1 / (1 + 10.0 * gain_at(L.A, L.B, L.C, L.D, s)[0, 0])
+        assert S(s) == pytest.approx(gain, rel=1e-6)

@@ -10,7 +10,7 @@ import numpy as np
 from ..checks import FloatArray
 from ..errors import CertificateError, ModelError, SolverError
 from ..lti.lyapunov import dual_variances
-from ..lti.riccati import riccati_root, solve_dare
+from ..lti.riccati import filter_dare, riccati_root
 from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
@@ -171,7 +171,7 @@ def filter_design(model: FilterModel) -> FilterDesign:
 
 def _design_by_covariance(model: FilterModel) -> FilterDesign:
     """Return the gains by the Riccati equation of P."""
-    solution = solve_dare(model.A, model.C2, Q=model.Q, R=model.R, S=model.S)
+    solution = filter_dare(model.A, model.C2, Q=model.Q, R=model.R, S=model.S)
     P = solution.P
     innovation = model.innovation(P)
     gain = weigh(P @ model.C2.T, innovation)

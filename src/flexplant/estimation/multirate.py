@@ -12,7 +12,7 @@ import numpy as np
 from ..certificates import Certificate
 from ..checks import FloatArray, Value, instance, real_array, short, sizes_of, whole
 from ..errors import CertificateError, LabelError, ModelError, ShapeError, counted, require_known
-from ..lti.riccati import solve_dare
+from ..lti.riccati import filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
@@ -203,7 +203,7 @@ def design_multirate(
     measured = _reading_times(model.sensors, every)
     period = len(measured)
     C, Q, R, S, A = _lifted(model, measured)
-    solution = solve_dare(A, C, Q=Q, R=R, S=S)
+    solution = filter_dare(A, C, Q=Q, R=R, S=S)
     P = solution.P
     gains, predictors, variances = [], [], []
     moved = np.eye(len(P))

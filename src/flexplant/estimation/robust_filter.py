@@ -15,7 +15,7 @@ from ..errors import AssumptionError, CertificateError, ModelError, SolverError,
 from ..lti.equations import powers, scale_of, stein_sum, sylvester
 from ..lti.lyapunov import solve_stein
 from ..lti.norms import hinf_norm
-from ..lti.riccati import solve_dare
+from ..lti.riccati import filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import Progress, one_thread, tick
 from ..plant import StandardPlant, UncertainPlant
@@ -240,7 +240,7 @@ def _central_gains(m: FilterModel, gamma: float) -> Gains | None:
     weight = la.block_diag(m.R, -(gamma**2) * np.eye(nz))
     cross = np.hstack([m.S, np.zeros((len(m.A), nz))])
     try:
-        P = solve_dare(m.A, rows, Q=m.Q, R=weight, S=cross).P
+        P = filter_dare(m.A, rows, Q=m.Q, R=weight, S=cross).P
     except SolverError:
         return None
     unit = np.sqrt(np.maximum(np.abs(P.diagonal()), TINY))

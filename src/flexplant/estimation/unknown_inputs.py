@@ -14,7 +14,7 @@ from ..certificates import Certificate
 from ..checks import FloatArray, Value, checked, instance, positive, sizes_of
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError, counted
 from ..lti.lyapunov import solve_stein
-from ..lti.riccati import solve_dare
+from ..lti.riccati import filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
@@ -215,7 +215,7 @@ def _initial_covariance(m: FilterModel, d: InputEntry, late: bool) -> FloatArray
     left = _weighted_inverse(F, spread)
     size = _LARGE * np.sum((left @ spread) * left, axis=1)
     G, H = d.G * size, d.H * size
-    return solve_dare(m.A, m.C2, Q=m.Q + G @ d.G.T, R=m.R + H @ d.H.T, S=m.S + G @ d.H.T).P
+    return filter_dare(m.A, m.C2, Q=m.Q + G @ d.G.T, R=m.R + H @ d.H.T, S=m.S + G @ d.H.T).P
 
 
 class _InputGains(NamedTuple):

@@ -42,7 +42,8 @@ goes back. Their names (``fx.c2d``) raise an error that says ours.
 | ``getPeakGain`` | `fx.peak_gain` |
 | ``minreal``, ``balred``, ``canon(sys, "modal")`` | `fx.minimal`, `fx.balanced`, `fx.modal_form` |
 | ``lyap``, ``dlyap`` | `fx.lti.solve_lyapunov`, `fx.lti.solve_stein` |
-| ``care``, ``dare`` | `fx.lti.solve_care`, `fx.lti.solve_dare` |
+| ``care``, ``dare`` | `fx.lti.control_care`, `fx.lti.control_dare` |
+| their duals, of a Kalman filter | `fx.lti.filter_care`, `fx.lti.filter_dare` |
 """
 
 from ..rooms import public_names as _public_names
@@ -87,8 +88,8 @@ from .norms import peak_gain as peak_gain
 from .riccati import RiccatiSolution as RiccatiSolution
 from .riccati import control_care as control_care
 from .riccati import control_dare as control_dare
-from .riccati import solve_care as solve_care
-from .riccati import solve_dare as solve_dare
+from .riccati import filter_care as filter_care
+from .riccati import filter_dare as filter_dare
 from .sampling import discretized as discretized
 from .statespace import StateSpace as StateSpace
 from .statespace import as_statespace as as_statespace

@@ -48,20 +48,28 @@ def bordered_scale(A: FloatArray, drive: FloatArray, sight: FloatArray) -> Float
 
 def even_scale(A: FloatArray) -> FloatArray:
     """Return d (n,), powers of two, for which ``A d / d[:, None]`` has even rows and columns."""
-    # gebal itself: scipy's matrix_balance reads scales above 2^63 as permutations, with a warning
-    return np.asarray(la.lapack.dgebal(A, scale=1, permute=0)[3])
+    return _gebal(A)[1]
 
 
 def balanced_matrix(A: FloatArray) -> FloatArray:
     """Return A with even rows and columns (LAPACK's gebal): the same eigenvalues."""
-    return np.asarray(la.lapack.dgebal(A, scale=1, permute=0)[0])
+    return np.asarray(_gebal(A)[0].real)
+
+
+def _gebal(A: FloatArray | ComplexArray) -> tuple[FloatArray | ComplexArray, FloatArray]:
+    """Return A with even rows and columns, and the powers of two that make it so."""
+    if not A.size:  # LAPACK prints a complaint about a matrix without rows
+        return A, np.ones(0)
+    # scipy's matrix_balance reads scales above 2^63 as permutations, with a warning
+    gebal: Any = la.get_lapack_funcs("gebal", (A,))
+    balanced, _, _, scale, _ = gebal(A, scale=1, permute=0)
+    return balanced, np.asarray(scale)
 
 
 def axis_frequencies(hamiltonian: FloatArray | ComplexArray) -> FloatArray:
     """Return the imaginary parts of the eigenvalues that lie, or nearly lie, on the axis."""
     # those that only seem to do no harm: what they stand for is computed there
-    gebal: Any = la.get_lapack_funcs("gebal", (hamiltonian,))
-    balanced = gebal(hamiltonian, scale=1, permute=0)[0]
+    balanced = _gebal(hamiltonian)[0]
     values: ComplexArray = np.asarray(la.eigvals(balanced), dtype=np.complex128)
     return values.imag[np.abs(values.real) <= _NEARLY * np.linalg.norm(balanced)]
 

@@ -33,10 +33,10 @@ from .statespace import StateSpace, System, as_statespace
 def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Return X of the Stein (discrete Lyapunov) equation ``X = A X A' + Q``.
 
-    By doubling (squared Smith): ``X <- X + A X A'``, ``A <- A A``; states are scaled inside. Entry
-    (i, j) of the residual is at most 1e-10 ``(t_i t_j)^(1/2)``, t the diagonal of
-    ``|A| |X| |A'| + |Q|``, the terms before they cancel: a state that large terms drive and hardly
-    move has no digits left relative to X alone.
+    By doubling (squared Smith): ``X <- X + A X A'``, ``A <- A A``; states are scaled inside. With
+    ``T = |A| |X| |A'| + |Q|``, the terms before they cancel, entry (i, j) of the residual is at
+    most 1e-10 times ``T_ij + (T_ii T_jj)^(1/2)``. The first is the larger where Q is not definite
+    and has a diagonal entry that is small compared with its row; the second bounds it otherwise.
 
     Parameters
     ----------
@@ -72,8 +72,9 @@ def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     As, Qs = A * d / d[:, None], Q / d / d[:, None]
     X = stein(As, Qs)
     residual = np.abs(As @ X @ As.T + Qs - X)
-    terms = np.sum(np.abs(As) @ np.abs(X) * np.abs(As), axis=1) + np.abs(Qs.diagonal())
-    _check(float(np.max(residual * reciprocal(np.sqrt(np.outer(terms, terms))))), "X = A X A' + Q")
+    terms = np.abs(As) @ np.abs(X) @ np.abs(As.T) + np.abs(Qs)
+    size = np.sqrt(terms.diagonal())
+    _check(float(np.max(residual * reciprocal(terms + np.outer(size, size)))), "X = A X A' + Q")
     return X * d * d[:, None]
 
 

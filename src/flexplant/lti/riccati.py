@@ -81,7 +81,7 @@ class RiccatiSolution(Value):
         return float(np.max(self.poles.real, initial=-np.inf))
 
 
-def solve_dare(
+def filter_dare(
     A: FloatArray, C: FloatArray, *, Q: FloatArray, R: FloatArray, S: FloatArray | None = None
 ) -> RiccatiSolution:
     """Return the stabilising solution of the discrete filter Riccati equation.
@@ -124,25 +124,25 @@ def solve_dare(
     --------
     >>> import numpy as np
     >>> one = np.eye(1)
-    >>> print(f"{solve_dare(one, one, Q=one, R=one).P[0, 0]:.12f}")  # the golden ratio
+    >>> print(f"{filter_dare(one, one, Q=one, R=one).P[0, 0]:.12f}")  # the golden ratio
     1.618033988750
     """
     return _solve_riccati(_riccati_problem(A, C, Q, R, S, discrete=True))
 
 
-def solve_care(
+def filter_care(
     A: FloatArray, C: FloatArray, *, Q: FloatArray, R: FloatArray, S: FloatArray | None = None
 ) -> RiccatiSolution:
     """Return the stabilising solution of the continuous filter Riccati equation.
 
     ``0 = A P + P A' - (P C' + S) R^-1 (P C' + S)' + Q``, by the stable subspace of the Hamiltonian
     in scaled states; where that has eigenvalues on the axis but for rounding (poles 1e-12 of the
-    fastest), by a Cayley transform to the doubling of `solve_dare`. Newton steps follow.
+    fastest), by a Cayley transform to the doubling of `filter_dare`. Newton steps follow.
 
     Parameters
     ----------
     A, C, Q, R, S : arrays
-        As in `solve_dare`; Q and R intensities instead of covariances.
+        As in `filter_dare`; Q and R intensities instead of covariances.
 
     Returns
     -------
@@ -152,7 +152,7 @@ def solve_care(
     Raises
     ------
     ShapeError, ModelError, SolverError
-        As `solve_dare`.
+        As `filter_dare`.
 
     References
     ----------
@@ -161,7 +161,7 @@ def solve_care(
     Examples
     --------
     >>> import flexplant as fx
-    >>> found = fx.lti.solve_care([[0.0]], [[1.0]], Q=[[4.0]], R=[[1.0]])
+    >>> found = fx.lti.filter_care([[0.0]], [[1.0]], Q=[[4.0]], R=[[1.0]])
     >>> found.P.round(9), found.poles.real.round(9)  # p^2 = 4
     (array([[2.]]), array([-2.]))
     """
@@ -173,7 +173,7 @@ def control_dare(
 ) -> RiccatiSolution:
     """Return X of ``X = A' X A - (A' X B + S) (B' X B + R)^-1 (A' X B + S)' + Q``.
 
-    The dual of `solve_dare`: `gain` is F with u = -F x, closed loop A - B F.
+    The dual of `filter_dare`: `gain` is F with u = -F x, closed loop A - B F.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def control_dare(
     Raises
     ------
     ShapeError, ModelError, SolverError
-        As `solve_dare`.
+        As `filter_dare`.
 
     Examples
     --------
@@ -204,7 +204,7 @@ def control_dare(
     >>> fx.lti.control_dare([[1.0]], [[1.0]], Q=[[2.0]], R=[[1.0]]).P.round(9)  # p^2 = 2 p + 2
     array([[2.73205081]])
     """
-    return _dual(solve_dare, A, B, Q=Q, R=R, S=S)
+    return _dual(filter_dare, A, B, Q=Q, R=R, S=S)
 
 
 def control_care(
@@ -212,7 +212,7 @@ def control_care(
 ) -> RiccatiSolution:
     """Return X of ``0 = A' X + X A - (X B + S) R^-1 (X B + S)' + Q``.
 
-    The dual of `solve_care`: `gain` is F with u = -F x, closed loop A - B F.
+    The dual of `filter_care`: `gain` is F with u = -F x, closed loop A - B F.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def control_care(
     Raises
     ------
     ShapeError, ModelError, SolverError
-        As `solve_dare`.
+        As `filter_dare`.
 
     Examples
     --------
@@ -229,7 +229,7 @@ def control_care(
     >>> fx.lti.control_care([[0.0]], [[1.0]], Q=[[4.0]], R=[[1.0]]).P.round(9)
     array([[2.]])
     """
-    return _dual(solve_care, A, B, Q=Q, R=R, S=S)
+    return _dual(filter_care, A, B, Q=Q, R=R, S=S)
 
 
 def _dual(
@@ -562,7 +562,7 @@ def _noisier(A: FloatArray, C: FloatArray, G: FloatArray, H: FloatArray) -> Ricc
     reach = np.diag(R) + np.sum(moved**2, axis=1)
     for factor in 10.0 ** (2 * np.arange(*DECADES)):
         try:
-            return solve_dare(A, C, Q=G @ G.T, R=R + factor * np.diag(reach), S=G @ H.T)
+            return filter_dare(A, C, Q=G @ G.T, R=R + factor * np.diag(reach), S=G @ H.T)
         except (SolverError, ModelError, np.linalg.LinAlgError) as error:  # R may be singular
             why = error
     raise SolverError(f"with much noisier sensors no filter was found either: {why}")

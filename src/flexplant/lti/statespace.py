@@ -267,7 +267,13 @@ class StateSpace(Value):
         inverse = np.linalg.inv(D)
         B, C = self.B @ inverse, -inverse @ self.C
         found = self.replace(
-            A=self.A - B @ self.C, B=B, C=C, D=inverse, inputs=self.outputs, outputs=self.inputs
+            A=self.A - B @ self.C,
+            B=B,
+            C=C,
+            D=inverse,
+            inputs=self.outputs,
+            outputs=self.inputs,
+            blocks=None,  # D couples them
         )
         return found * other
 

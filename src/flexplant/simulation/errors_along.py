@@ -30,7 +30,7 @@ from ..errors import AssumptionError, ModelError, SolverError, counted, require_
 from ..loop import ClosedLoop, ScheduledLoop
 from ..lti.equations import symmetrised
 from ..lti.lyapunov import solve_stein
-from ..lti.riccati import solve_dare
+from ..lti.riccati import filter_dare
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..plant.partition import require_noise
@@ -358,7 +358,7 @@ class _Filters:
     def steady(self, values: Mapping[str, FloatArray] | None = None) -> FloatArray:
         """Return the covariance of the steady filter, by default where the trajectory begins."""
         sample = self._sample(self.machine.path.at(np.zeros(1)) if values is None else values)
-        return solve_dare(sample.A, sample.C[self.y], Q=sample.G @ sample.G.T, R=self.R).P
+        return filter_dare(sample.A, sample.C[self.y], Q=sample.G @ sample.G.T, R=self.R).P
 
     def frozen(self) -> Callable[[int], FloatArray]:
         """Return the steady gain where the plant stands."""

@@ -12,7 +12,7 @@ from ..checks import FloatArray
 from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
 from ..lti.interconnection import lft
 from ..lti.norms import h2_norm
-from ..lti.riccati import control_care, control_dare, solve_care, solve_dare
+from ..lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
@@ -131,7 +131,7 @@ def _optimal_controller(p: Prepared) -> SolvedController:
 def _solve_regular(p: Prepared) -> SolvedController:
     """Return the optimal controller of a regular prepared problem."""
     solve_control, solve_filter = (
-        (control_dare, solve_dare) if p.direct else (control_care, solve_care)
+        (control_dare, filter_dare) if p.direct else (control_care, filter_care)
     )
     try:
         control = solve_control(p.A, p.B2, Q=p.C1.T @ p.C1, R=p.D12.T @ p.D12, S=p.C1.T @ p.D12)

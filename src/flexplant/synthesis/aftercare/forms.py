@@ -18,7 +18,7 @@ from ...lti.frequency_sweep import resonance_grid
 from ...lti.minimal import minimal
 from ...lti.modal import modal_form
 from ...lti.norms import eigenvalues_with_error
-from ...lti.riccati import solve_care, solve_dare
+from ...lti.riccati import filter_care, filter_dare
 from ...lti.statespace import StateSpace, as_statespace
 from ...tolerances import RANK, ROUNDING, divisor
 
@@ -447,7 +447,7 @@ def _command_filter_gain(K: StateSpace, recovery: float) -> FloatArray:
     Q = np.diag(scale**2) * 1e-6
     seen = float(np.sum((C * scale) ** 2)) or 1.0
     try:
-        found = (solve_dare if K.dt else solve_care)(A, C, Q=Q, R=1e-2 * seen * np.eye(len(C)))
+        found = (filter_dare if K.dt else filter_care)(A, C, Q=Q, R=1e-2 * seen * np.eye(len(C)))
     except Exception as error:
         raise ModelError(
             f"slow states of the controller cannot be found from its commands: {error} Let fewer "

@@ -17,7 +17,7 @@ from ...lti.frequency import Frf, frequency_response
 from ...lti.interconnection import connect, series
 from ...lti.minimal import minimal
 from ...lti.norms import peak_gain
-from ...lti.riccati import control_care, control_dare, solve_care, solve_dare
+from ...lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import StandardPlant
@@ -260,7 +260,7 @@ def continuous(shaped: StateSpace) -> StateSpace:
 
 def ncf_solutions(g: StateSpace) -> tuple[FloatArray, FloatArray]:
     """Return X and Z of the Riccati equations of control and filtering (the bilinear map's too)."""
-    control, estimate = (control_dare, solve_dare) if g.dt else (control_care, solve_care)
+    control, estimate = (control_dare, filter_dare) if g.dt else (control_care, filter_care)
     R, S = np.eye(len(g.outputs)) + g.D @ g.D.T, np.eye(len(g.inputs)) + g.D.T @ g.D
     try:
         X = control(g.A, g.B, Q=g.C.T @ g.C, R=S, S=g.C.T @ g.D).P

@@ -16,7 +16,7 @@ from ...checks import FloatArray, Value, checked, positive, whole
 from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError, counted
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
-from ...lti.riccati import control_care, control_dare, solve_care, solve_dare
+from ...lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, interruptible
 from ...tolerances import RANK, TINY, divisor
@@ -161,7 +161,7 @@ def lqg_balanced(
     """Return a plant in states balanced by its LQG problem, A less one if it is sampled."""
     # in the unit of frequency of the LQG loop; R and V weigh the effort and the noise of sensors
     solve_control, solve_filter = (
-        (control_dare, solve_dare) if sampled else (control_care, solve_care)
+        (control_dare, filter_dare) if sampled else (control_care, filter_care)
     )
     control, filtered = solve_control(p.A, p.B2, Q=Q, R=R), solve_filter(p.A, p.C2, Q=W, R=V)
     one = float(sampled)

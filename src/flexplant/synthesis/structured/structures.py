@@ -26,7 +26,7 @@ from ...errors import ModelError, ShapeError, attempted, counted, require_known
 from ...lti.balancing import balanced
 from ...lti.discretisation import bilinear, tustin
 from ...lti.joining import Matrices as LawMatrices
-from ...lti.riccati import control_care, solve_care
+from ...lti.riccati import control_care, filter_care
 from ...lti.statespace import StateSpace, System
 from ...plant import StandardPlant
 from ..hinf.hinf_design import design_hinf
@@ -253,7 +253,7 @@ class ObserverGains(Value):
         """Return the structure made ready for a plant."""
         p, n, root = prepared, prepared.A.shape[0], np.sqrt(prepared.speed)
         first = -control_care(p.A, p.B2, Q=np.eye(n), R=np.eye(len(p.u))).gain
-        gain = -solve_care(p.A, p.C2, Q=np.eye(n), R=np.eye(len(p.y))).gain
+        gain = -filter_care(p.A, p.C2, Q=np.eye(n), R=np.eye(len(p.y))).gain
 
         def gains(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
             return theta[: first.size].reshape(-1, n), theta[first.size :].reshape(n, -1)
