@@ -139,11 +139,16 @@ Zone = Rectangle | Disc
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Names of the candidates, the points of each (p, 3) [m] and those of the POIs."""
+    """Names of the candidates, the points of each (p, 3) [m] and those of the POIs.
+
+    Points of negative weight are what a port measures (or pushes) against. A POI is only where it
+    is `mounted`, at its points of positive weight; a candidate is at all of its points.
+    """
 
     names: tuple[str, ...]
     points: tuple[FloatArray, ...]
     pois: tuple[FloatArray, ...]
+    mounted: tuple[FloatArray, ...] = ()
 
     @property
     def total(self) -> int:
@@ -167,14 +172,16 @@ class Places:
         hit = [any(np.any(zone.holds(p[:, :2])) for zone in zones) for p in self.points]
         return np.array(hit, dtype=np.float64)
 
-    def distances(self, others: Sequence[FloatArray]) -> FloatArray:
-        """Return the least distance [m] of each candidate (rows) to each of other points."""
+    def between(self) -> FloatArray:
+        """Return the least distance [m] (N, N) of candidates; several may measure against one."""
         self.require_points()
-        found = [
-            [np.min(np.linalg.norm(p[:, None] - q[None], axis=2)) for q in others]
-            for p in self.points
-        ]
-        return np.array(found, dtype=np.float64).reshape(self.total, len(others))
+        found = _least_distances(self.points, self.mounted)
+        return np.minimum(found, found.T)
+
+    def from_pois(self) -> FloatArray:
+        """Return the least distance [m] (N,) of each candidate to any POI."""
+        self.require_points()
+        return np.asarray(_least_distances(self.points, self.pois).min(axis=1, initial=np.inf))
 
     def require_points(self) -> None:
         """Raise ModelError where it is not known where candidates are."""
@@ -186,22 +193,40 @@ class Places:
             )
 
 
+def _least_distances(some: Sequence[FloatArray], others: Sequence[FloatArray]) -> FloatArray:
+    """Return the least distance [m] of each set of points (rows) to each of other sets."""
+    found = [[np.min(np.linalg.norm(p[:, None] - q[None], axis=2)) for q in others] for p in some]
+    return np.array(found, dtype=np.float64).reshape(len(some), len(others))
+
+
 def candidate_places(plant: StandardPlant, candidates: Sequence[Any]) -> Places:
     """Return where candidates and POIs are; a port with several points is at each of them."""
     # of a plant made elsewhere no places are known
+    names = tuple(port.name for port in candidates)
     if not plant.is_assembled:
-        return Places(tuple(port.name for port in candidates), (), ())
-    dofs = plant.assembled.realisation.model.full_dofs
+        return Places(names, (), ())
+    dofs, pois = plant.assembled.realisation.model.full_dofs, plant.assembled.ports.z
 
     def points(at: Any) -> FloatArray:
         if isinstance(at, str):
             return np.array(dofs.location(at)[None], dtype=np.float64)
-        if isinstance(at, Mapping):
+        if isinstance(at, list):
             return np.vstack([points(place) for place in at])
         return np.array([at], dtype=np.float64)
 
     return Places(
-        tuple(port.name for port in candidates),
-        tuple(points(port.at) for port in candidates),
-        tuple(points(poi.at) for poi in plant.assembled.ports.z),
+        names,
+        tuple(
+            points(list(port.at) if isinstance(port.at, Mapping) else port.at)
+            for port in candidates
+        ),
+        tuple(points(_mounted(poi.at)) for poi in pois),
+        tuple(points(_mounted(port.at)) for port in candidates),
     )
+
+
+def _mounted(at: Any) -> Any:
+    """Return a place, or the places of positive weight among several; all where none is."""
+    if not isinstance(at, Mapping):
+        return at
+    return [place for place, weight in at.items() if weight > 0] or list(at)

@@ -24,7 +24,7 @@ from ..checks import (
     short,
     whole,
 )
-from ..errors import LabelError, ModelError
+from ..errors import LabelError, ModelError, some_names
 from ..structure import Disc
 from ..tolerances import TINY
 from .candidates import Places, Zone
@@ -101,8 +101,10 @@ class LinearRows:
         return np.asarray(found)
 
     def possible(self, branch: Branch) -> bool:
-        """Return whether each row alone leaves a choice of a branch."""
+        """Return whether a branch holds choices, and each row alone leaves one of them."""
         low, high = np.zeros(len(self.A)), np.zeros(len(self.A))
+        if any(count > group.size for group, count in branch.groups):
+            return False
         for group, count in branch.groups:
             part = np.sort(self.A[:, group], axis=1)
             low += part[:, :count].sum(axis=1)
@@ -391,7 +393,9 @@ class OffPoi(Constraint):
     """No candidate on a POI: what is there cannot be measured.
 
     Sensors are never placed on the point of a POI. A radius keeps them off the whole die; a
-    negative one allows all places.
+    negative one allows all places. A POI that is relative to another body,
+    ``at={"tip:x": 1, "frame:x": -1}``, is where its positive weights are: sensors may measure
+    against the frame.
 
     Parameters
     ----------
@@ -414,8 +418,7 @@ class OffPoi(Constraint):
         """Return x_i <= 0 near a POI."""
         if self.radius < 0 or not places.pois:
             return LinearRows.closed(np.zeros(places.total, dtype=bool))
-        near = places.distances(places.pois).min(axis=1)
-        return LinearRows.closed(near <= self.radius + places.same)
+        return LinearRows.closed(places.from_pois() <= self.radius + places.same)
 
     def drawn(self, places: Places) -> tuple[Zone, ...]:
         """Return discs about the POIs."""
@@ -471,7 +474,8 @@ class MinimumDistance(Constraint):
     Parameters
     ----------
     distance : float [m]
-        Between the nearest points of the two.
+        Between the nearest points of the two. Two that measure against the same place may share
+        it: points of negative weight have no distance from each other.
 
     Examples
     --------
@@ -486,7 +490,7 @@ class MinimumDistance(Constraint):
 
     def rows(self, places: Places) -> LinearRows:
         """Return x_i + x_j <= 1 for each pair that is too close."""
-        close = places.distances(places.points) < self.distance - places.same
+        close = places.between() < self.distance - places.same
         first, second = np.nonzero(np.triu(close, 1))
         pairs = np.eye(places.total)[first] + np.eye(places.total)[second]
         return LinearRows(pairs, np.zeros(first.size), np.ones(first.size))
@@ -495,6 +499,16 @@ class MinimumDistance(Constraint):
 def constraint_rows(constraints: Any, places: Places, side: str) -> LinearRows:
     """Return the rows of `all_of` the constraints."""
     return LinearRows.stacked([c.rows(places) for c in all_of(constraints, side)], places.total)
+
+
+def constraints_in_words(constraints: Any, places: Places, side: str) -> str:
+    """Return `all_of` the constraints, each with the candidates that it removes."""
+    parts = []
+    for constraint in all_of(constraints, side):
+        shut = np.flatnonzero(constraint.rows(places).shut(())).tolist()
+        removed = f" (removes {some_names([places.names[i] for i in shut])})" if shut else ""
+        parts.append(f"{constraint!r:.120}{removed}")
+    return ", ".join(parts)
 
 
 def all_of(constraints: Any, side: str) -> tuple[Constraint, ...]:

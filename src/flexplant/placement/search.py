@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray, Rng, Value, checked, instance, name_list, positive, short, whole
-from ..errors import InfeasibleError, LabelError, ModelError, counted, require_known
+from ..errors import InfeasibleError, LabelError, ModelError, counted, require_known, some_names
 from ..fingerprint import fingerprint
 from ..plant import Actuator, StandardPlant
 from ..work import Work
 from .branch_and_bound import Exchange
-from .candidates import Port, candidate_places, known_candidates, sampled_plant, side_of
+from .candidates import Places, Port, candidate_places, known_candidates, sampled_plant, side_of
 from .closed_loop_h2 import Separation
-from .constraints import Budget, Constraint, LinearRows, constraint_rows
+from .constraints import Budget, Constraint, LinearRows, constraint_rows, constraints_in_words
 from .criterion import Criterion, in_words
 from .problem import Found, Placement, Problem, Search, layouts_of
 
@@ -304,7 +304,8 @@ def problem_of(
     side: Any = "".join(wanted)
     layouts = layouts_of(plant, side, ports, criterion)
     layouts.require_any()
-    rows = constraint_rows(constraints, candidate_places(plant, ports), side)
+    places = candidate_places(plant, ports)
+    rows = constraint_rows(constraints, places, side)
     if len(wanted) > 1:
         own = np.array([[side_of(port) == part for port in ports] for part in counts], dtype=float)
         exact = np.array(list(counts.values()), dtype=np.float64)
@@ -313,7 +314,7 @@ def problem_of(
             numbers = (counts["y"], counts["u"])
             layouts = replace(layouts, scorer=replace(layouts.scorer, counts=numbers))
     problem = Problem(layouts, sum(counts.values()), rows.with_partners(kept), rows)
-    _require_start(problem, constraints, [names[i] for i in kept])
+    _require_start(problem, constraints, places, [names[i] for i in kept])
     return problem
 
 
@@ -327,18 +328,18 @@ def _candidate_ports(plant: StandardPlant, side: str, given: Sequence[Any]) -> t
 
 
 def _require_start(
-    problem: Problem, constraints: Sequence[Constraint], required: Sequence[str]
+    problem: Problem, constraints: Sequence[Constraint], places: Places, required: Sequence[str]
 ) -> None:
     """Raise InfeasibleError when there is no choice to begin with."""
     layouts = problem.layouts
     first = problem.start(None) if len(problem.required) <= problem.count else ()
     what = f"no choice of {problem.count} of the {problem.total} candidates"
     if not first and problem.rows.A.size:
-        given = ", ".join(map(repr, constraints)) or "OffPoi()"
-        together = f" together with the required {', '.join(required)}" if required else ""
+        given = constraints_in_words(constraints, places, layouts.side)
+        together = f" together with the required {some_names(required)}" if required else ""
         raise InfeasibleError(
-            f"{what} satisfies the constraints {given:.300}{together:.200}. Relax a constraint, "
-            "require others, or give more candidates."
+            f"{what} satisfies the constraints {given}{together}. Relax one (placement.OffPoi(-1) "
+            "allows sensors on a POI), require others, or give more candidates."
         )
     if layouts.missing(first):
         raise InfeasibleError(
