@@ -12,13 +12,13 @@ from scipy.sparse import csgraph
 
 from ...checks import ComplexArray, FloatArray, positive
 from ...errors import AssumptionError, CertificateError, ModelError
+from ...loop.anti_windup import recovery_gain
 from ...lti.equations import state_scale
 from ...lti.frequency import frequency_response
 from ...lti.frequency_sweep import resonance_grid
 from ...lti.minimal import minimal
 from ...lti.modal import modal_form
 from ...lti.norms import eigenvalues_with_error
-from ...lti.riccati import filter_care, filter_dare
 from ...lti.statespace import StateSpace, as_statespace
 from ...tolerances import RANK, ROUNDING, divisor
 
@@ -352,15 +352,17 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
         x' = (A - L C) x + (B - L D) y + L u_applied,    u = C x + D y
 
     Where u_applied = u it is the controller. Where actuators saturate, its states follow those of
-    a controller that commanded what was applied, with the poles of A - L C: ``L = B D^-1`` (Hanus)
-    makes these the zeros of the controller; with `recovery` L is that of a steady filter.
+    a controller that commanded what was applied, with the poles of A - L C. ``L = B D^-1`` (Hanus)
+    makes these the zeros of the controller. With `recovery`, poles of the controller that decay
+    more slowly, such as integrators, move to that time constant and keep their frequency; the
+    others stay. For a PI controller this is back-calculation with that time.
 
     Parameters
     ----------
     controller : StateSpace or Controller
         From y to u, continuous or sampled.
     recovery : float [s], optional
-        Time constant of the slowest pole of A - L C.
+        Time constant of the slowest poles of A - L C.
 
     Returns
     -------
@@ -402,19 +404,9 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
 
 def back_gain(K: StateSpace, recovery: float | None) -> FloatArray:
     """Return L (n, nu): the states move by ``L (applied - commanded)``, with stable A - L C."""
-    L = _hanus(K) if recovery is None else _command_filter_gain(K, positive(recovery, "recovery"))
-    A = K.A - L @ K.C
-    poles = np.linalg.eigvals(A) if K.n_states else np.zeros(0)
-    size = np.abs(poles)
-    growth = np.max(size - 1.0 if K.dt else poles.real, initial=-np.inf)
-    # Tustin's rule puts zeros at exactly -1, several at once, which rounding moves by its root
-    if not growth < -(1e-7 if K.dt else 1e-9 * np.max(size, initial=0.0)):
-        raise AssumptionError(
-            "the zeros of the controller, which Hanus' form has as poles, are not all stable, or "
-            "not clearly: its states would run off while an actuator saturates. Give a recovery "
-            "time."
-        )
-    return L
+    if recovery is None:
+        return _hanus(K)
+    return recovery_gain(K.A, K.C, positive(recovery, "recovery"), K.dt)
 
 
 def _hanus(K: StateSpace) -> FloatArray:
@@ -426,32 +418,15 @@ def _hanus(K: StateSpace) -> FloatArray:
             f"Hanus' form divides by D, which has rank {rank} for {len(K.outputs)} actuators: a "
             "controller that rolls off has none. Give a recovery time: the observer form."
         )
-    return np.asarray(K.B @ np.linalg.pinv(K.D))
-
-
-def _command_filter_gain(K: StateSpace, recovery: float) -> FloatArray:
-    """Return the gain of a filter that reads the command, its poles shifted by the recovery time.
-
-    With ``A + I / T`` in place of A (sampled: A e^(dt / T)) its stable loop decays with T.
-    """
-    n = K.n_states
-    if not n:
-        return np.zeros((0, len(K.outputs)))
-    size = np.linalg.norm(K.C, axis=1)
-    C = K.C / divisor(size)[:, None]
-    scale = np.linalg.norm(K.B, axis=1)
-    scale = np.where(scale > 0, scale, np.max(scale, initial=1.0))
-    grow = float(np.exp(K.dt / recovery)) if K.dt else 1.0 / recovery
-    A = K.A * grow if K.dt else K.A + grow * np.eye(n)
-    # all states a little, so that each has a stabilising gain
-    Q = np.diag(scale**2) * 1e-6
-    seen = float(np.sum((C * scale) ** 2)) or 1.0
-    try:
-        found = (filter_dare if K.dt else filter_care)(A, C, Q=Q, R=1e-2 * seen * np.eye(len(C)))
-    except Exception as error:
-        raise ModelError(
-            f"slow states of the controller cannot be found from its commands: {error} Let fewer "
-            "integrators drive each actuator, or reduce the controller first."
-        ) from error
-    gain = found.gain / (grow if K.dt else 1.0)
-    return np.asarray(gain / divisor(size))
+    L = np.asarray(K.B @ np.linalg.pinv(K.D))
+    poles = np.linalg.eigvals(K.A - L @ K.C) if K.n_states else np.zeros(0)
+    size = np.abs(poles)
+    growth = np.max(size - 1.0 if K.dt else poles.real, initial=-np.inf)
+    # Tustin's rule puts zeros at exactly -1, several at once, which rounding moves by its root
+    if not growth < -(1e-7 if K.dt else 1e-9 * np.max(size, initial=0.0)):
+        raise AssumptionError(
+            "the zeros of the controller, which Hanus' form has as poles, are not all stable, or "
+            "not clearly: its states would run off while an actuator saturates. Give a recovery "
+            "time."
+        )
+    return L
