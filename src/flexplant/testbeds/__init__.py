@@ -7,6 +7,8 @@ design claims is judged by something else than itself.
   scattered stiffness and damping, sensors with steps, a delay.
 - `magnet_stage`: a stage on magnets of negative stiffness, in six axes.
 - `three_masses`: a sampled standard plant of three masses, for small examples.
+- `gantry`, `dual_stage`, `steering_mirror`, `flexible_joint`, `isolation_table`, `hexapod`,
+  `ball_screw`, `maglev_block`: sampled plants of driven machines with relative drives and sensors.
 - `WaferStage.measure_frf`, ``poles``: measurements; ``run``, ``loop``: a design runs on it.
 
 >>> import flexplant as fx
@@ -22,6 +24,14 @@ A machine of one's own has the same two methods, ``loop(ports, *blocks)`` and ``
 """
 
 from ..rooms import public_names as _public_names
+from .driven_machines import ball_screw as ball_screw
+from .driven_machines import dual_stage as dual_stage
+from .driven_machines import flexible_joint as flexible_joint
+from .driven_machines import gantry as gantry
+from .driven_machines import hexapod as hexapod
+from .driven_machines import isolation_table as isolation_table
+from .driven_machines import maglev_block as maglev_block
+from .driven_machines import steering_mirror as steering_mirror
 from .virtual_machine import WaferStage as WaferStage
 from .virtual_stages import magnet_stage as magnet_stage
 from .virtual_stages import three_masses as three_masses
