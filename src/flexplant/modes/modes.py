@@ -264,6 +264,8 @@ class Modes(Placed, Value):
         stiffness couples these modes).
     notes : sequence of str
         What to know of modes that a file held: what was assumed, changed, and is missing.
+    calibration : MeasuredModes, optional
+        The measured poles that `calibrated` put in.
 
     Raises
     ------
@@ -295,6 +297,7 @@ class Modes(Placed, Value):
     rounding: FloatArray = field(default_factory=_nothing)
     certificate: Mapping[str, float] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    calibration: Value | None = None
 
     def __post_init__(self) -> None:
         dofs = self.vector_dofs
@@ -458,7 +461,9 @@ class Modes(Placed, Value):
         places, poles = measured_poles(measured, known)
         omega, zeta = self.omega.copy(), self.zeta.copy()
         omega[places], zeta[places] = np.abs(poles), -poles.real / np.abs(poles)
-        return self.replace(omega=omega, zeta=zeta, certificate={}, residual=(), rounding=())
+        return self.replace(
+            omega=omega, zeta=zeta, certificate={}, residual=(), rounding=(), calibration=measured
+        )
 
     def mesh_error(self, finer: Modes, *, order: float = 2.0) -> MeshError:
         """Return what the mesh costs in frequency, by Richardson's rule.

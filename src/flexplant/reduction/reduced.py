@@ -87,6 +87,8 @@ class ReducedModel(Value):
         Of a joined machine: motions of its components as rigid bodies that its rigid joints allow.
     joining : Value, optional
         Of a joined machine: how it was joined, with the checks that were made; not after an update.
+    calibration : MeasuredModes, optional
+        The measured poles that `calibrated` put in.
 
     References
     ----------
@@ -118,6 +120,7 @@ class ReducedModel(Value):
     static_at: Iterable[str] = field(default=(), metadata=checked(name_list))
     joint_motions: FloatArray | None = field(default=None, metadata=_COLUMNS)
     joining: Value | None = None
+    calibration: Value | None = None
 
     def __post_init__(self) -> None:
         names = tuple(map(str, self.coordinates)) or self.dofs.labels
@@ -289,7 +292,7 @@ class ReducedModel(Value):
         free = self.rigid_body.shape[1]
         places, poles = measured_poles(measured, range(free + 1, self.n_dof - self.n_vectors + 1))
         D, K = calibrated_matrices(self.M, self.D, self.K, free, places, poles)
-        return self.replace(D=D, K=K, bound=None)
+        return self.replace(D=D, K=K, bound=None, calibration=measured)
 
     def completed(self) -> ReducedModel:
         """Return the model with the modes that were left out, as further coordinates.

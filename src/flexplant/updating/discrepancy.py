@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..checks import ComplexArray, FloatArray, Value, instance
-from ..errors import ModelError, counted
+from ..checks import ComplexArray, FloatArray, IntArray, Value, instance
+from ..errors import ModelError, counted, some_names
+from ..modes.matching import assigned
 from ..modes.modes import MeshError, measured_poles
 from ..tolerances import divisor
 from .family import Point
@@ -201,7 +202,8 @@ _OUTSIDE = 0.05
 _EXACT = 1e-9
 #: deviation of the logarithm of a damping that says nothing
 _SILENT = 1e2
-#: by which relative change of poles parameters may be off before anything is measured
+#: relative change of the pole that a parameter changes most, by which the parameter may be off
+#: before anything is measured
 _WIDE = 1.0
 
 
@@ -250,12 +252,22 @@ class ModalUncertainty(Value):
         """The share of each mode's damping ratio."""
         return dict(zip(self.modes, self.share[len(self.modes) :].tolist(), strict=True))
 
+    @property
+    def undetermined(self) -> tuple[int, ...]:
+        """Modes whose frequencies the measured poles do not determine: off by 100 % or more."""
+        return tuple(mode for mode, share in self.frequency.items() if share >= 1.0)
+
     def __repr__(self) -> str:
         m = len(self.modes)
+        known = self.share[:m] < 1.0
         parts = [
-            f"{name} {100 * part.min():.2g} to {100 * part.max():.2g} %"
+            f"{name} {100 * part[known].min():.2g} to {100 * part[known].max():.2g} %"
             for name, part in (("frequency", self.share[:m]), ("damping", self.share[m:]))
+            if np.any(known)
         ]
+        if open_ones := self.undetermined:
+            names = some_names([str(mode) for mode in open_ones])
+            parts.append(f"not determined by what was measured: modes {names}")
         return f"<ModalUncertainty: {counted(m, 'mode')}, {', '.join(parts)}>"
 
 
@@ -281,20 +293,28 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
     own = found.poles[places]
     both = np.r_[places, m + places]
     S = _relative_changes(found.poles, found.S)
-    ratio = _damping(poles) / divisor(_damping(own))
-    said = np.r_[np.full(ratio.size, True), ratio > ZETA]
-    gap = np.r_[np.log(np.abs(poles / own)), np.log(np.where(ratio > ZETA, ratio, 1.0))]
     # the damping of a model or a measurement without any says nothing
+    damped = np.minimum(_damping(poles), _damping(own)) > ZETA
+    said = np.r_[np.full(damped.size, True), damped]
+    ratio = _damping(poles) / divisor(_damping(own))
+    gap = np.r_[np.log(np.abs(poles / own)), np.log(np.where(damped, ratio, 1.0))]
     known = np.eye(said.size) * _EXACT**2
     if measured.covariance is not None:
         G = _relative_changes(poles, np.hstack([np.eye(poles.size), 1j * np.eye(poles.size)]))
         known += G @ measured.covariance @ G.T
     noise = np.where(np.outer(said, said), known, np.eye(said.size) * _SILENT**2)
+    least = np.where(said, 0.5 * np.diag(known), 0.0)
     grown = growth(np.abs(found.poles), np.abs(poles))
     mean, covariance, dof = _conditioned(S, both, gap, noise, np.r_[grown, np.ones(m)], fit)
-    model = found.poles.copy()
+    # rounding of what is known well must not make a variance negative
+    covariance[both, both] = np.maximum(covariance[both, both], least)
+    model = found.poles
     if calibrated:
-        mean[both], model[places] = 0.0, poles
+        mean[both], model = 0.0, _calibrated_poles(fit, measured, model, places)
+        # a damping that says nothing of the model's is measured all the same
+        silent = both[~said]
+        covariance[silent], covariance[:, silent] = 0.0, 0.0
+        covariance[silent, silent] = np.diag(known)[~said]
     from scipy.special import stdtrit
 
     width = np.repeat(stdtrit(dof, 1 - 0.5 * _OUTSIDE), m)
@@ -308,6 +328,21 @@ def modal_uncertainty(fit: Any, measured: Any, mesh: MeshError | None) -> ModalU
                 share[place] = max(share[place], _MESH * abs(error))
     share[both] = np.maximum(share[both], np.repeat(_DRIFT, places.size))
     return ModalUncertainty(found.modes, share, covariance, model)
+
+
+def _calibrated_poles(
+    fit: Any, measured: Any, poles: ComplexArray, places: IntArray
+) -> ComplexArray:
+    """Return the poles (m,) of the calibrated model, in the order of the modes before."""
+    changed = poles.copy()
+    changed[places] = measured.poles
+    if not hasattr(fit.model, "calibrated"):
+        return changed
+    # where damping couples the modes, the poles of the others move a little
+    every = fit.calibrated(measured).modes().poles
+    every = every[every.imag > 0]
+    gap = np.abs(changed[:, None] - every)
+    return np.asarray(every[assigned(gap / np.abs(changed)[:, None])])
 
 
 def _conditioned(
@@ -329,20 +364,16 @@ def _conditioned(
     s = np.repeat([one.deviation for one in sizes], m)
     alone = all(isinstance(one, Eigenvalues) for one in fit.residuals)
     if alone or fit.covariance is None:
-        length = divisor(np.linalg.norm(S[both], axis=0))
-        parameters = (S * _WIDE / length) @ (S * _WIDE / length).T
+        # of all modes: measured ones may not move with a parameter that others hang on
+        wide = _WIDE * S / divisor(np.abs(S).max(axis=0))
+        parameters = wide @ wide.T
     else:
         parameters = S @ fit.covariance @ S.T
     before = parameters + np.outer(s, s) * (np.diag(grown**2) + shared @ shared.T)
     factor = la.cho_factor(before[np.ix_(both, both)] + noise, lower=True)
     gain = la.cho_solve(factor, before[both]).T
     after = before - gain @ before[both]
-    # rounding of what is known well must not make a variance negative
-    least = np.zeros(2 * m)
-    least[both] = 0.5 * np.diag(noise)
-    after = 0.5 * (after + after.T)
-    after[np.diag_indices(2 * m)] = np.maximum(np.diag(after), least)
-    return gain @ gap, after, np.array([one.dof for one in sizes])
+    return gain @ gap, 0.5 * (after + after.T), np.array([one.dof for one in sizes])
 
 
 def _damping(poles: ComplexArray) -> FloatArray:

@@ -10,6 +10,7 @@ import numpy as np
 from ...checks import ComplexArray, FloatArray, instance, positive, real_array, several
 from ...errors import LabelError, ModelError, require_known, unknown_label
 from ...identification import MeasuredModes
+from ...modes.matching import assigned
 from ...updating import ModalUncertainty, UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters import Parameter
 from ..partition import Partition
@@ -58,18 +59,50 @@ def correlated_deltas(
     deviations: float,
 ) -> Known:
     """Return Deltas of modes as uncertain as they are, correlated, half-widths two deviations."""
-    own = [number for number in source.modes if number in realisation.elastic]
-    chosen = tuple(own if modes is None else modes)
-    require_known("elastic mode", chosen, source.modes)
-    at = np.array([source.modes.index(number) for number in chosen], dtype=np.int64)
+    numbers = _renumbered(realisation, source)
+    known = [number for number in numbers if number]
+    chosen = tuple(sorted(known) if modes is None else modes)
+    require_known("elastic mode", chosen, known)
+    at = np.array([numbers.index(number) for number in chosen], dtype=np.int64)
     _check_poles(realisation, chosen, source.poles[at], _SAME_MODEL, "fit")
-    both = np.stack([at, at + len(source.modes)], axis=1).ravel()
+    both = np.stack([at, at + len(numbers)], axis=1).ravel()
     scale = 0.5 * deviations * source.share[both]
     scale[::2] *= 2.0  # stiffness is omega^2
     scale[1::2] = np.minimum(scale[1::2], _DAMPING)
-    covariance = source.covariance[np.ix_(both, both)]
+    every = _of_modes(chosen, scale)
+    keep = np.flatnonzero([_acts(realisation, delta) for delta in every])
+    covariance = source.covariance[np.ix_(both[keep], both[keep])]
     size = deviations * np.sqrt(np.diag(covariance))
-    return Known(_of_modes(chosen, scale), covariance / np.outer(size, size), chosen)
+    return Known(tuple(every[i] for i in keep), covariance / np.outer(size, size), chosen)
+
+
+def _renumbered(realisation: ModalRealisation, source: ModalUncertainty) -> list[int]:
+    """Return the number in the plant of each mode of a source, 0 where the plant lacks it."""
+    # calibration puts modes in another order where measured frequencies cross
+    elastic = list(realisation.elastic)
+    own = np.linalg.eigvals(realisation.pairs[[number - 1 for number in elastic]])
+    size = np.abs(source.poles)
+    gap = np.abs(size[:, None, None] - np.abs(own)).min(axis=2) / size[:, None]
+    same = np.equal.outer(source.modes, elastic)
+    found = assigned(gap + np.where(same, 0.0, _SAME_MODEL))
+    return [elastic[i] if i >= 0 else 0 for i in found.tolist()]
+
+
+def _acts(realisation: ModalRealisation, delta: Delta) -> bool:
+    """Return whether a Delta is not on the damping of an undamped mode."""
+    return delta.kind != "damping" or bool(np.trace(realisation.pairs[delta.mode - 1]))
+
+
+def calibration_of(plant: Partition) -> Any:
+    """Return the measured poles that the plant was calibrated with, None without any."""
+    found = getattr(plant.model, "calibration", None)
+    if found is None:
+        return None
+    own = np.linalg.eigvals(plant.assembled.realisation.A)
+    poles = found.poles[np.abs(found.poles) <= (1.0 + _SAME_MODEL) * np.abs(own).max()]
+    gap = np.abs(poles[:, None] - own).min(axis=1)
+    # a model that was updated after it was calibrated has other poles
+    return found if np.all(gap <= _SAME_MODEL * np.abs(poles)) else None
 
 
 def stated_deltas(
@@ -86,7 +119,7 @@ def stated_deltas(
         _by_mode(damping, "damping of a mode", chosen),
     )
     every = _of_modes(chosen, np.stack(sizes, axis=1).ravel())
-    deltas = tuple(delta for delta in every if delta.scale > _KNOWN)
+    deltas = tuple(d for d in every if d.scale > _KNOWN and _acts(realisation, d))
     if not deltas:
         raise ModelError("frequency= and damping= are zero: there is nothing uncertain.")
     return deltas
@@ -126,10 +159,12 @@ def _check_poles(
     _require_elastic(realisation, modes)
     for number, pole in zip(modes, poles, strict=True):
         own = np.linalg.eigvals(realisation.pairs[number - 1])
-        if np.min(np.abs(own - pole)) > limit * abs(pole):
+        # by frequency: the plant may have damping where the model that was fitted has none
+        if np.min(np.abs(np.abs(own) - abs(pole))) > limit * abs(pole):
             raise ModelError(
                 f"mode {number} has the pole {pole:.6g} in the {name} and {own[0]:.6g} in the "
-                "plant: they are not of the same model. Assemble the plant from fit.model."
+                "plant: they are not of the same model. Assemble the plant from fit.model, or "
+                "from fit.calibrated(measured)."
             )
 
 

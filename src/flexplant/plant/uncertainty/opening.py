@@ -26,6 +26,7 @@ from ..realisation import ModalRealisation
 from .deltas import (
     Known,
     about_fit,
+    calibration_of,
     check_range,
     checked_fit,
     correlated_deltas,
@@ -104,13 +105,17 @@ def uncertain(
                 f"the modes of this plant are coupled by damping ({plant.form}): its Deltas are "
                 "the parameters of the fit, which act on all modes. Leave modes out."
             )
-        _check_model(plant, fitted.model)
+        put_in = calibration_of(plant)
+        _check_model(plant, fitted.model if put_in is None else fitted.calibrated(put_in))
         return _by_parameters(
             plant, about_fit(fitted, about), covariance, many, neglected, fitted, beside
         )
     realisation = modal_realisation(plant)
-    if fitted is not None and fitted.discrepancy and fitted.fitted_poles is not None:
-        source, fitted = fitted.uncertainty(), None
+    put_in = calibration_of(plant)
+    if fitted is not None and (
+        put_in is not None or (fitted.discrepancy and fitted.fitted_poles is not None)
+    ):
+        source, fitted = fitted.uncertainty(put_in), None
     more: Sequence[Delta] = ()
     if isinstance(source, ModalUncertainty):
         found = correlated_deltas(realisation, source, modes, many)

@@ -328,6 +328,9 @@ class UncertainPlant(Value, Generic[P]):
     def _drawn(self, rng: np.random.Generator) -> P:
         if self.fit is None or self.fit.covariance is None:
             drawn = _normal(rng, self.covariance)
+            for i, delta in enumerate(self.deltas):
+                if delta.kind == "damping":  # of logarithms, so that it stays positive
+                    drawn[i] = np.expm1(delta.scale * drawn[i]) / delta.scale
             names = (delta.name for delta in self.deltas)
             return self.lft(dict(zip(names, drawn.tolist(), strict=True)))
         moved = _normal(rng, self.fit.covariance)
@@ -338,7 +341,7 @@ class UncertainPlant(Value, Generic[P]):
     def _moved(self, change: FloatArray, changes: Sequence[tuple[Delta, float]] = ()) -> P:
         """Return the plant of the model with its parameters, gains and delay changed."""
         realisation = self.plant.assembled.realisation
-        own = self.plant.model if self.fit is None else self.fit.model
+        own = self.plant.model if self.of_matrices or self.fit is None else self.fit.model
         model = _changed_model(realisation, own, self.parameters, change)
         with warnings.catch_warnings():  # the nominal plant has said in which form it is
             warnings.simplefilter("ignore", FlexplantWarning)
