@@ -328,10 +328,8 @@ def test_a_schedule_interpolates_the_outputs(tmp_path):
         write_c({0.0: law(1.0), 1.0: law(2.0)}, tmp_path / "a.c", schedule="y")
 
 
-@pytest.mark.slow
-@compiles
-def test_a_controller_that_follows_its_machine_on_a_path(tmp_path):
-    """The commands of `simulate` along a path, from its readings and positions."""
+def moving_plant(rate, noise, count=5):
+    """A plate whose point of interest and sensors move along x."""
     plate = fx.kirchhoff_plate(
         size=(0.6, 0.6), thickness=0.0272, elements=(4, 4), density=2702, youngs_modulus=70e9,
         poisson_ratio=0.35,
@@ -341,19 +339,74 @@ def test_a_controller_that_follows_its_machine_on_a_path(tmp_path):
         u=[fx.Actuator(f"u{i}", at=p, asd=1e-3) for i, p in enumerate(corners)],
         z=[fx.Poi("die", at=(0.3, 0.3, 0.0), axes=("z", "rx", "ry"), moves={"x": (-1, 0, 0)})],
         y=[
-            fx.Sensor(f"y{i}", at=p, asd=1e-12, moves={"x": (-1, 0, 0)})
+            fx.Sensor(f"y{i}", at=p, asd=noise, moves={"x": (-1, 0, 0)})
             for i, p in enumerate(corners)
         ],
         references=[fx.Reference("die")],
         positions=[fx.plant.Position("x", range=(-0.1, 0.1))],
     )
-    modes = fx.solve_modes(plate, count=5, damping=fx.ModalDamping(0.01))
-    moving = fx.assemble_plant(modes, ports).discretized(4e3, delay=1)
+    modes = fx.solve_modes(plate, count=count, damping=fx.ModalDamping(0.01))
+    return fx.assemble_plant(modes, ports).discretized(rate, delay=1)
 
-    def design(there):
-        return fx.design_kalman(there), fx.design_servo(there, bandwidth=20.0, notches=[])
 
-    schedule = fx.loop.schedule_loops(moving, design, places=np.linspace(-0.1, 0.1, 5))
+def follow(there):
+    """Return an observer and a servo for one place of `moving_plant`."""
+    return fx.design_kalman(there), fx.design_servo(there, bandwidth=20.0, notches=[])
+
+
+@pytest.mark.slow
+@compiles
+@pytest.mark.parametrize(
+    "rate, noise, count", [(4e3, 1e-10, 5), (20e3, 1e-8, 5), (100e3, 1e-10, 7)]
+)
+def test_double_precision_is_not_refused_for_the_rounding_of_a_comparison(
+    tmp_path, rate, noise, count
+):
+    """Two responses of these differ by 4e-8 to 2e-6; the C is the interpolated controller."""
+    schedule = fx.loop.schedule_loops(
+        moving_plant(rate, noise, count), follow, places=[-0.1, 0.0, 0.1]
+    )
+    laws = [one.controller for one in schedule.loops]
+    rng = np.random.default_rng(int(rate))
+    given, place = rng.standard_normal((200, len(laws[0].inputs))), rng.uniform(-0.1, 0.1, 200)
+    state, wanted = np.zeros(laws[0].n_states), []
+    for sample, q in zip(given, place, strict=True):
+        k, share = divmod((q + 0.1) / 0.1, 1.0)
+        A, B, C, D = (
+            (1 - share) * getattr(laws[int(k)], part) + share * getattr(laws[int(k) + 1], part)
+            for part in "ABCD"
+        )
+        wanted.append(C @ state + D @ sample)
+        state = A @ state + B @ sample
+    code = Compiled(tmp_path, schedule)
+    got = np.array([code([*sample, q]) for sample, q in zip(given, place, strict=True)])
+    size = np.abs(wanted).max(axis=0)
+    np.testing.assert_allclose(got / size, np.array(wanted) / size, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("part", ["rest", "B", "C", "D"])
+def test_a_wrong_entry_of_a_schedule_is_found(monkeypatch, part):
+    """The certificate of a form that follows a place, fed entries that are off by 1e-6."""
+    from flexplant.synthesis.aftercare import forms
+
+    right = forms._arranged
+
+    def wrong(*args, **options):
+        form = right(*args, **options)
+        return form._replace(**{part: (1 + 1e-6) * getattr(form, part)})
+
+    monkeypatch.setattr(forms, "_arranged", wrong)
+    law = StateSpace([[0.9, 0.1], [-0.1, 0.9]], [[1.0], [0.5]], [[1.0, 0.2]], [[5.0]], 1e-3)
+    with pytest.raises(CertificateError, match="not copied as they are"):
+        forms.scheduled_form([law, law], driven=1)
+
+
+@pytest.mark.slow
+@compiles
+def test_a_controller_that_follows_its_machine_on_a_path(tmp_path):
+    """The commands of `simulate` along a path, from its readings and positions."""
+    moving = moving_plant(4e3, 1e-12)
+    schedule = fx.loop.schedule_loops(moving, follow, places=np.linspace(-0.1, 0.1, 5))
     move = fx.setpoint(0.1, velocity=0.8, acceleration=20.0, jerk=4e3)
     run = fx.simulate(schedule, duration=0.1, moving={"x": move}, rng=1)
     law = schedule.loops[0].controller

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import zip_longest
 from typing import Any, NamedTuple
 
@@ -116,13 +117,18 @@ def scheduled_form(
     for K in laws:
         K = K.replace(A=K.A * d / d[:, None], B=K.B / d[:, None], C=K.C * d, blocks=None)
         own = _arranged(K, [K.n_states], [slice(driven)], None, paired=0)  # A follows the place
-        found.append(_compared(K, own, single))
+        own = _in_single(own) if single else own
+        found.append(own._replace(error=_difference(K, partial(_entries_response, K, own))))
     error = max(one.error for one in found)
     if error > (most := _SINGLE if single else _DOUBLE):
+        cure = (
+            "Write it in double precision, or reduce the controllers."
+            if single
+            else "Their entries were not copied as they are: report this as a bug."
+        )
         raise CertificateError(
-            f"{'single' if single else 'double'} precision moves the response at a place by "
-            f"{error:.1e} of its largest gain, more than {most:g}. Write it in double precision, "
-            "or reduce the controllers."
+            f"what is written differs from the controller of a place by {error:.1e} of its largest "
+            f"gain, more than {most:g}. {cure}"
         )
     rest, B, start = (np.array([getattr(one, part) for one in found])
                       for part in ("rest", "B", "start"))  # fmt: skip
@@ -189,11 +195,38 @@ def _arranged(
 
 def _compared(K: StateSpace, form: TwoStateForm, single: bool) -> TwoStateForm:
     """Return a form, in single precision if asked, with what its response differs by."""
-    if single:
-        parts = form._asdict().items()
-        less = {name: np.asarray(part, np.float32).astype(np.float64) for name, part in parts}
-        form = form._replace(**less)  # type: ignore[arg-type]
-    return form._replace(error=_difference(K, form))
+    form = _in_single(form) if single else form
+
+    def away(freq: FloatArray) -> ComplexArray:
+        return form.response(freq, K.dt) - frequency_response(K, freq).data
+
+    return form._replace(error=_difference(K, away))
+
+
+def _in_single(form: TwoStateForm) -> TwoStateForm:
+    """Return a form with its numbers rounded to single precision."""
+    parts = form._asdict().items()
+    less = {name: np.asarray(part, np.float32).astype(np.float64) for name, part in parts}
+    return form._replace(**less)  # type: ignore[arg-type]
+
+
+def _entries_response(K: StateSpace, form: TwoStateForm, freq: FloatArray) -> ComplexArray:
+    """Return the response of a form in the states of K less that of K, from their entries.
+
+    ``dG = dD + dC x + C (zI - A)^-1 (dB + dA x)`` with ``x = (zI - A')^-1 B'``, where d is what the
+    form A', B', C', D' differs by. A difference of two responses would be their own rounding, in
+    proportion to the condition of A.
+    """
+    states = [(0, form.change.shape[0] - K.n_states)]  # those that fill up whole lanes
+    A = np.pad(K.A - np.eye(K.n_states), states * 2)
+    B, C = np.pad(K.B, [*states, (0, 0)]), np.pad(K.C, [(0, 0), *states])
+    dA, dB, dC, dD = form.change - A, form.B - B, form.C - C, form.D - K.D
+    found = np.empty((*K.D.shape, freq.size), dtype=np.complex128)
+    for k, move in enumerate(np.expm1(2j * np.pi * freq * K.dt)):  # z - 1
+        z = move * np.eye(len(A))
+        x = np.linalg.solve(z - form.change, form.B)
+        found[:, :, k] = dD + dC @ x + C @ np.linalg.solve(z - A, dB + dA @ x)
+    return found
 
 
 def _at_rest(K: StateSpace, driven: slice) -> FloatArray:
@@ -208,8 +241,8 @@ def _at_rest(K: StateSpace, driven: slice) -> FloatArray:
     return np.asarray(first + free @ more)
 
 
-def _difference(K: StateSpace, form: TwoStateForm) -> float:
-    """Return how much the response of the blocks differs, relative to the channel's largest gain.
+def _difference(K: StateSpace, away: Callable[[FloatArray], ComplexArray]) -> float:
+    """Return how large a difference from the response is, relative to the channel's largest gain.
 
     A channel far below the others of its output and input counts as part of them: it is rounding.
     """
@@ -219,13 +252,12 @@ def _difference(K: StateSpace, form: TwoStateForm) -> float:
     grid = resonance_grid(poles, K.dt, points=60)
     # nearer to poles than this the response is one of rounding: of a double pole at z = 1 in a
     # full A, say, which comes out as two, 1e-8 apart
-    away = np.abs(np.exp(2j * np.pi * grid * K.dt)[:, None] - poles)
-    grid = grid[np.all(moved < _MOVED * away, axis=1)]
-    wanted, got = frequency_response(K, grid).data, form.response(grid, K.dt)
-    size = np.abs(wanted).max(axis=2, initial=0.0)
+    apart = np.abs(np.exp(2j * np.pi * grid * K.dt)[:, None] - poles)
+    grid = grid[np.all(moved < _MOVED * apart, axis=1)]
+    size = np.abs(frequency_response(K, grid).data).max(axis=2, initial=0.0)
     least = _SMALL * np.sqrt(np.outer(size.max(axis=1), size.max(axis=0)))
-    away = np.abs(got - wanted).max(axis=2, initial=0.0)
-    return float(np.max(away / divisor(np.maximum(size, least)), initial=0.0))
+    gap = np.abs(away(grid)).max(axis=2, initial=0.0)
+    return float(np.max(gap / divisor(np.maximum(size, least)), initial=0.0))
 
 
 #: largest difference of the responses, relative to the largest gain of a channel
