@@ -219,8 +219,19 @@ def uff_shapes():
     def column(kind, first):
         return np.array([first, 2.0]) * (1 + 0j if kind == 3 else 1)
 
-    nodes = {"type": 15, "node_nums": [1, 2], "def_cs": [0, 0], "disp_cs": [0, 0], "color": [1, 1]}
+    nodes = {"type": 15, "node_nums": [1, 2], "def_cs": [0, 5], "disp_cs": [6, 5], "color": [1, 1]}
     nodes |= {axis: [0.0, 1.0] for axis in "xyz"}
+    turned = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1], [0.5, 0.25, 0.125]])
+    systems = [
+        {
+            "type": 2420, "CS_sys_labels": [5], "CS_types": [0], "CS_colors": [8],
+            "CS_names": ["a"], "CS_matrices": [turned],
+        },
+        {
+            "type": 18, "cs_num": [6], "cs_type": [0], "ref_cs_num": [5], "cs_name": ["b"],
+            "ref_o": [[0.5, 0, 0]], "x_point": [[0.5, 0, 1]], "xz_point": [[1, 0, 0]],
+        },
+    ]  # fmt: skip
     shapes = [
         {
             "type": 55, "model_type": 1, "analysis_type": kind, "data_ch": 3, "spec_data_type": 8,
@@ -232,7 +243,7 @@ def uff_shapes():
         }
         for kind in (2, 3)
     ]  # fmt: skip
-    return [saved(lambda path: pyuff.UFF(str(path)).write_sets([nodes, *shapes]))]
+    return [saved(lambda path: pyuff.UFF(str(path)).write_sets([*systems, nodes, *shapes]))]
 
 
 def uff_analysis(kind):

@@ -369,18 +369,6 @@ def systems(**changes):
     return fields | changes
 
 
-def test_coordinate_systems_that_are_not_the_global_one_are_refused(tmp_path):
-    """Node 8 is given in system 1, which dataset 2420 defines."""
-    straight = systems()["CS_matrices"][0]
-    path = written(tmp_path, [systems(), nodes(2411)])
-    assert read_nodes_uff(path).xyz[3].tolist() == [2.0, 4.0, 6.0]
-    moved = straight.copy()
-    moved[3] = [0.1, 0.0, 0.0]
-    for changes in ({"CS_types": [1]}, {"CS_matrices": [moved]}):
-        with pytest.raises(ModelError, match="system 1, turned, moved or curved"):
-            read_nodes_uff(written(tmp_path, [systems(**changes), nodes(2411)]))
-
-
 def results(tmp_path, *sets):
     path = written(tmp_path, [units(1e3), nodes(2411, node_nums=[4, 9])], "m.unv")
     path.write_text(path.read_text() + "".join(sets))

@@ -144,7 +144,6 @@ def printed_digits(words: Iterable[bytes]) -> int | None:
 
 #: what to do with a file that says a thing twice, and one in axes of its own
 ONCE = "Export each once (one result set)."
-GLOBAL = "Only global coordinates and directions are read: export these."
 
 
 def file_path(path: Any, name: str = "path") -> Path:

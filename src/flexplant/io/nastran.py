@@ -14,7 +14,15 @@ from ..checks import FloatArray, IntArray
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
 from ..labels import DIRECTIONS, node_dofs
-from ..tolerances import ROUNDING
+from .coordinate_systems import (
+    BASIC,
+    CARTESIAN,
+    CYLINDRICAL,
+    SPHERICAL,
+    System,
+    axes_along,
+    turned_motions,
+)
 from .fe_modes import MODE_READERS, FileShapes
 from .files import USUAL, damaged, decimal, defined_twice, file_path, unread
 from .tables import read_nodes_table
@@ -81,9 +89,9 @@ def basic_nodes(
     xyz, axes = {}, {}
     for node, (into, place, moves) in grids.items():
         point = np.array(place, dtype=np.float64)
-        xyz[node] = known.position(into, point) if into else point
+        xyz[node] = known.system(into).position(point) if into else point
         if moves > 0:
-            axes[node] = known.axes(moves, xyz[node])
+            axes[node] = known.system(moves).axes_at(xyz[node])
     return Nodes(xyz, axes)
 
 
@@ -160,17 +168,18 @@ def _card_fields(line: str) -> tuple[str, list[str]]:
     return head.rstrip("*"), [body[i : i + width].strip() for i in range(0, 64, width)]
 
 
+_POLAR = {"CORD2R": CARTESIAN, "CORD2C": CYLINDRICAL, "CORD2S": SPHERICAL}
+
+
 class _Systems:
     """Coordinate systems, each defined in another one down to the basic one, 0."""
 
     def __init__(self, given: dict[int, tuple[str, list[str]]], path: str) -> None:
         self.given, self.path = given, path
-        self.known: dict[int, tuple[str, FloatArray, FloatArray]] = {
-            0: ("CORD2R", np.zeros(3), np.eye(3))
-        }
+        self.known: dict[int, System] = {0: BASIC}
 
-    def system(self, name: int, above: tuple[int, ...] = ()) -> tuple[str, FloatArray, FloatArray]:
-        """Return the kind, the origin and the axes (columns) of a system."""
+    def system(self, name: int, above: tuple[int, ...] = ()) -> System:
+        """Return a system in the basic one."""
         if name in self.known:
             return self.known[name]
         if name not in self.given:
@@ -183,50 +192,19 @@ class _Systems:
         kind, fields = self.given[name]
         try:
             numbers = [nastran_float(item) for item in fields[2:11]]
-            base = int(fields[1] or 0)
+            number = int(fields[1] or 0)
         except ValueError as error:
             raise FlexplantError(f"{self.path!r}, {kind} {name}: {error}.") from None
-        self.system(base, (*above, name))
-        origin, on_z, in_xz = (self.position(base, np.array(numbers[i : i + 3])) for i in (0, 3, 6))
-        z = on_z - origin
-        y = np.cross(z, in_xz - origin)
-        if not np.linalg.norm(z) or np.linalg.norm(y) < ROUNDING * np.linalg.norm(z):
+        base = self.system(number, (*above, name))
+        origin, on_z, in_xz = (base.position(np.array(numbers[i : i + 3])) for i in (0, 3, 6))
+        axes = axes_along(on_z - origin, in_xz - origin)  # z, x, y
+        if axes is None:
             raise ModelError(
                 f"{self.path!r}: the three points of {kind} {name} lie on a line, which gives no "
                 "axes. Correct the card."
             )
-        z, y = z / np.linalg.norm(z), y / np.linalg.norm(y)
-        self.known[name] = (kind, origin, np.column_stack([np.cross(y, z), y, z]))
+        self.known[name] = System(_POLAR[kind], origin, axes[:, [1, 2, 0]])
         return self.known[name]
-
-    def position(self, name: int, place: FloatArray) -> FloatArray:
-        """Return the basic coordinates of a point of a system (angles in degrees)."""
-        kind, origin, axes = self.system(name)
-        first, second, third = place
-        turn = np.deg2rad(second)
-        if kind == "CORD2C":
-            place = np.array([first * np.cos(turn), first * np.sin(turn), third])
-        elif kind == "CORD2S":
-            around = np.deg2rad(third)
-            ring = first * np.sin(turn)
-            place = np.array([ring * np.cos(around), ring * np.sin(around), first * np.cos(turn)])
-        return np.asarray(origin + axes @ place)
-
-    def axes(self, name: int, xyz: FloatArray) -> FloatArray:
-        """Return the axes (columns) of displacements at a place, which turn with a polar system."""
-        kind, origin, axes = self.system(name)
-        if kind == "CORD2R":
-            return axes
-        x, y, z = axes.T @ (xyz - origin)
-        around = np.arctan2(y, x)
-        radial = np.array([np.cos(around), np.sin(around), 0.0])
-        tangent = np.array([-np.sin(around), np.cos(around), 0.0])
-        if kind == "CORD2C":
-            return np.asarray(axes @ np.column_stack([radial, tangent, [0, 0, 1]]))
-        down = np.arctan2(np.hypot(x, y), z)
-        outward = np.sin(down) * radial + np.cos(down) * np.array([0, 0, 1.0])
-        south = np.cos(down) * radial - np.sin(down) * np.array([0, 0, 1.0])
-        return np.asarray(axes @ np.column_stack([outward, south, tangent]))
 
 
 _LETTERS = {"stiffness": "K", "mass": "M", "damping": "B"}
@@ -278,15 +256,12 @@ def shapes_at(
     if not grid.all():
         scalar = counted(int(np.count_nonzero(~grid)), "scalar point")
         notes = (f"without a place, left out: {scalar}",)
-    ids, values = ids[grid], np.array(values[grid])
+    ids, values = ids[grid], values[grid]
     xyz, axes = _node_places(ids, nodes, path)
-    local_rows = [] if turned else [i for i, node in enumerate(ids.tolist()) if node in axes]
-    for row in local_rows:
-        local = axes[int(ids[row])]
-        for first in (0, 3):
-            values[row, first : first + 3] = local @ values[row, first : first + 3]
-    if local_rows:
-        moved = counted(len(local_rows), "node")
+    local = np.intersect1d(ids, list(axes)) if not turned else ids[:0]
+    if local.size:
+        values = turned_motions(values, ids.tolist(), axes)
+        moved = counted(local.size, "node")
         notes = (*notes, f"{moved} moved in local directions: turned into the basic ones")
     dofs = node_dofs(ids, DIRECTIONS, xyz)
     phi = values.reshape(6 * ids.size, omega.size)

@@ -7,33 +7,33 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, positive
+from ..checks import positive
 from ..dof_columns import at_nodes
-from ..errors import FlexplantError, LabelError, ModelError, require_known
+from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
 from ..identification import MeasuredModes
 from ..labels import DIRECTIONS, DofSet, node_dofs
 from ..lti.frequency import ORDERS, Frf
 from ..structure.units import Units
+from .coordinate_systems import turned_motions
 from .fe_modes import MODE_READERS, FileShapes
-from .files import ELSEWHERE, GLOBAL, ONCE, Elsewhere, damaged, file_path, refused, unread
+from .files import ELSEWHERE, ONCE, Elsewhere, file_path, refused, unread
 from .tables import read_nodes_table
+from .uff_analysis import NORMAL_MODE, AnalysisData, mode_records, responses_of_model
 from .uff_records import (
     KINDS,
-    NORMAL_MODE,
-    AnalysisData,
+    channel_order,
     check_complete,
-    check_systems,
     coherence_of,
     common_frequencies,
+    dataset_types,
     datasets,
     derivative,
-    mode_records,
     paired_records,
     record_scale,
     record_sides,
-    responses_of_model,
     whole_entry,
 )
+from .uff_systems import is_permutation, turning, uff_nodes
 
 #: of dataset 164: numbers divided by them are in SI
 _FACTORS = ("length", "force")
@@ -52,6 +52,11 @@ def read_frf_uff(
     Of dataset 58, text or binary: every record gives one pair; a direction -3 is z with the sign
     turned. In a file without these, of dataset 2414: responses of all nodes of a model to its load
     sets, "load 1", as large as these are.
+
+    Nodes that move in a coordinate system of dataset 18 or 2420 (the displacement system of
+    dataset 15 or 2411) are turned to global directions. System 0 is the global one, and so is
+    system 1 where the file does not define it. Systems of 2420 are Cartesian or cylindrical, those
+    of 18 Cartesian. `read_modes_uff`, `read_modes` and `read_nodes_uff` do the same.
 
     Parameters
     ----------
@@ -78,12 +83,14 @@ def read_frf_uff(
         When pyuff is missing, the file is damaged, pairs are missing or doubled, or records are
         over different frequencies; the pairs are listed.
     ModelError
-        When units or quantities are not clear, or zero frequency would be integrated.
+        When units or quantities are not clear, or zero frequency would be integrated; when a node
+        moves in a system that is not there or not read, or was measured in too few of its local
+        directions to know a global one.
 
     Notes
     -----
     Format: Structural Dynamics Research Laboratory, University of Cincinnati, "Universal File
-    Formats for Modal Analysis Testing", dataset 58.
+    Formats for Modal Analysis Testing", datasets 15, 18, 58, 2411, 2414, 2420.
 
     Examples
     --------
@@ -111,7 +118,8 @@ def read_frf_uff(
     records = [part for part in sets if part["type"] == 58]
     responses = [part for part in records if whole_entry(part, "func_type") == 4]
     if not responses:
-        computed = responses_of_model(file_path(path), factors, quantity, scale)
+        nodes = uff_nodes(path)
+        computed = responses_of_model(file_path(path), factors, quantity, scale, nodes)
         if computed is not None:
             return computed
         kinds = sorted({whole_entry(part, "func_type") for part in records})
@@ -138,13 +146,40 @@ def read_frf_uff(
     measured = (
         [part for part in records if whole_entry(part, "func_type") == 6] if coherence else []
     )
-    return Frf(
+    frf = Frf(
         freq,
         data,
         inputs=inputs,
         outputs=outputs,
         quantity=target,
         coherence=coherence_of(measured, outputs, inputs, freq, str(path)) if measured else None,
+    )
+    return _in_global_directions(frf, path)
+
+
+def _in_global_directions(frf: Frf, path: str | Path) -> Frf:
+    """Return responses of nodes that move in local directions in global ones."""
+    points = [name.removeprefix("u ") for name in frf.inputs]
+    nodes = [name.partition(":")[0] for name in (*frf.outputs, *points)]
+    axes = uff_nodes(path).axes(np.array([int(node) for node in nodes if node.isdigit()]))
+    outputs, left = turning(frf.outputs, axes, str(path))
+    inputs, right = turning(points, axes, str(path))
+    coherence = frf.coherence
+    if coherence is not None:
+        if not (is_permutation(left) and is_permutation(right)):
+            what = "holds coherences of local directions, which global ones do not follow from"
+            raise unread(path, what, "Leave them out: coherence=False.")
+        coherence = np.einsum("ab,bcf,dc->adf", np.rint(left) ** 2, coherence, np.rint(right) ** 2)
+    rows, columns = (
+        np.array(sorted(range(len(names)), key=[channel_order(name) for name in names].__getitem__))
+        for names in (outputs, inputs)
+    )
+    pick = np.ix_(rows, columns)
+    return frf.replace(
+        data=np.einsum("ab,bcf,dc->adf", left, frf.data, right)[pick],
+        outputs=tuple(outputs[i] for i in rows.tolist()),
+        inputs=tuple(f"u {inputs[i]}" for i in columns.tolist()),
+        coherence=None if coherence is None else coherence[pick],
     )
 
 
@@ -174,7 +209,8 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
     FlexplantError
         When pyuff is missing, the file is damaged or holds no modes, or modes at other nodes.
     ModelError
-        When a mode has zero frequency (a rigid-body mode), or a pole is not stable.
+        When a mode has zero frequency (a rigid-body mode), or a pole is not stable; when local
+        directions cannot be turned, as for `read_frf_uff`.
 
     Examples
     --------
@@ -211,13 +247,22 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
             f"modes {rigid} of {str(path)!r} do not oscillate (rigid-body or overdamped): they "
             f"cannot be compared. Leave them out: modes={[n for n in chosen if n not in rigid]}."
         )
-    nodes = parts[chosen[0]].nodes
-    phi = np.array([parts[number].motions.ravel() for number in chosen], dtype=np.complex128).T
+    first = parts[chosen[0]]
+    nodes, axes = first.nodes, uff_nodes(path).axes(first.nodes)
+    motions = np.stack([part.motions for part in parts.values()], axis=2)  # (node, direction, mode)
+    if not first.measured:
+        motions, axes = turned_motions(motions, nodes.tolist(), axes), {}
+    seen = np.tile(np.any(motions, axis=(0, 2)), (nodes.size, 1))
+    for row, node in enumerate(nodes.tolist()):
+        if node in axes and np.any(motions[row]):
+            seen[row] = np.any(motions[row], axis=1)
     labels = [f"{node}:{direction}" for node in nodes.tolist() for direction in DIRECTIONS]
-    seen = np.array([np.any(phi[i::6]) for i in range(6)])
-    keep = np.tile(seen, nodes.size)
-    names = [label for label, kept in zip(labels, keep, strict=True) if kept]
-    return MeasuredModes(poles, shapes=phi[keep], dofs=tuple(names))
+    keep = seen.ravel()
+    local = [label for label, kept in zip(labels, keep, strict=True) if kept]
+    names, turn = turning(local, axes, str(path))
+    columns = [list(parts).index(number) for number in chosen]
+    phi = motions.reshape(keep.size, -1)[keep][:, columns].astype(np.complex128)
+    return MeasuredModes(poles, shapes=turn @ phi, dofs=tuple(names))
 
 
 def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "z")) -> DofSet:
@@ -240,7 +285,8 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
     FlexplantError
         When pyuff is missing, the file is damaged, or holds no nodes.
     ModelError
-        When nodes are given, or move, in a coordinate system of their own (dataset 2420).
+        When a node is given, or moves, in a coordinate system that is not read (`read_frf_uff`), or
+        in local directions where the file holds no results.
 
     Examples
     --------
@@ -254,36 +300,23 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
     >>> dofs.location("41:z").tolist()
     [0.1, 0.2, 0.0]
     """
-    ids, xyz, (length, _) = raw_nodes(path)
-    return node_dofs(ids, directions, xyz / length)
+    nodes = uff_nodes(path)
+    xyz = nodes.xyz()
+    local = nodes.axes()
+    if local and not set(dataset_types(path)) & {55, 58, 2414}:
+        what = f"moves {counted(len(local), 'node')} in local directions, the first {min(local)}"
+        raise unread(
+            path, what, "Results in another file are not turned with them: export both into one."
+        )
+    return node_dofs(nodes.ids, directions, xyz / _unit_factors(path)[0])
 
 
-def raw_nodes(path: str | Path) -> tuple[IntArray, FloatArray, tuple[float, float]]:
-    """Return node numbers (n,), their places (n, 3) and the factors of length and force to SI."""
-    # numbers divided by these factors are in SI; 1 where the file has no dataset 164
-    sets = datasets(path, (15, 2411, 164, 2420))
-    factors = next((part for part in sets if part["type"] == 164), dict.fromkeys(_FACTORS, 1.0))
-    check_systems([part for part in sets if part["type"] == 2420], str(path))
-    parts = [part for part in sets if part["type"] in (15, 2411)]
-    if not parts:
-        raise FlexplantError(f"{str(path)!r} holds no nodes (datasets 15, 2411). Export them.")
-    nodes, places = [], []
-    for part in parts:
-        numbers = np.atleast_1d(part["node_nums"]).astype(np.int64)
-        system = np.atleast_1d(part.get("def_cs", 0)).astype(np.int64)
-        moved = np.atleast_1d(part.get("disp_cs", 0)).astype(np.int64)
-        # 0 and 1 both stand for the global system in files of test software
-        for what, of in (("gives", system), ("moves", moved)):
-            if np.any(of > 1):
-                where = f"{what} node {int(numbers[np.argmax(of > 1)])}"
-                raise unread(path, f"{where} in coordinate system {int(of.max())}", GLOBAL)
-        nodes.append(numbers)
-        axes = [np.atleast_1d(part[axis]) for axis in "xyz"]
-        if any(axis.shape != numbers.shape for axis in axes):
-            raise damaged(path, f"a dataset of {numbers.size} nodes lacks some of their numbers")
-        places.append(np.stack(axes, axis=1))
+def _unit_factors(path: str | Path) -> tuple[float, float]:
+    """Return the factors of length and force: numbers divided by them are in SI."""
+    sets = datasets(path, (164,))
+    factors = sets[0] if sets else dict.fromkeys(_FACTORS, 1.0)
     length, force = (positive(factors[name], f"{name} of dataset 164") for name in _FACTORS)
-    return np.concatenate(nodes), np.concatenate(places), (length, force)
+    return length, force
 
 
 ELSEWHERE.append(
@@ -306,17 +339,20 @@ def read_uff_shapes(path: Path, nodes: Path | None) -> FileShapes:
         )
     ids = parts[0].nodes
     where = path if nodes is None else nodes
-    if where.suffix.lower() in _UNIVERSAL:
-        known, xyz, factors = raw_nodes(where)
-    else:
-        (known, xyz), factors = read_nodes_table(where), (1.0, 1.0)
+    whole = where.suffix.lower() in _UNIVERSAL
+    systems = uff_nodes(where if whole else path)
+    known, xyz = (systems.ids, systems.xyz()) if whole else read_nodes_table(where)
+    length, force = factors = _unit_factors(where) if whole else (1.0, 1.0)
+    axes = systems.axes(ids)
     dofs = node_dofs(ids, DIRECTIONS, at_nodes(ids, np.asarray(known), xyz, str(where)))
+    motions = np.stack([np.real(part.motions) for part in parts], axis=2)
+    moved = f"{counted(len(axes), 'node')} moved in local directions: turned into the global ones"
     zeta, masses = np.array([part.zeta for part in parts]), np.array([part.mass for part in parts])
-    length, force = factors
     return FileShapes(
         2 * np.pi * np.array([part.freq for part in parts]),
-        np.array([np.real(part.motions).ravel() for part in parts]).T,
+        turned_motions(motions, ids.tolist(), axes).reshape(6 * ids.size, -1),
         dofs,
+        notes=(moved,) if axes else (),
         masses=masses if np.any(masses) else None,
         zeta=zeta if np.any(zeta) else None,
         # numbers over factors are in SI, and mass is force over acceleration

@@ -4,35 +4,28 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, IntArray, short
+from ..checks import ComplexArray, FloatArray, short
 from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS
-from ..lti.frequency import ORDERS, Frf
+from ..lti.frequency import ORDERS
 from ..structure.units import GRAVITY, LENGTHS, POUND
-from ..tolerances import SAME
 from .assembled import extra_module
-from .files import GLOBAL, ONCE, damaged, file_path, parsing, refused, spaced_numbers, unread
+from .files import damaged, file_path, parsing, refused, unread
 
 
-def check_systems(parts: list[dict[str, Any]], path: str) -> None:
-    """Raise ModelError when system 0 or 1, which stands for the global one, is another (2420)."""
-    straight = np.vstack([np.eye(3), np.zeros((1, 3))])
-    for part in parts:
-        listed = zip(part["CS_sys_labels"], part["CS_types"], part["CS_matrices"], strict=True)
-        for label, kind, matrix in listed:
-            if label in (0, 1) and (kind or np.abs(np.asarray(matrix) - straight).max() > SAME):
-                what = f"gives nodes in coordinate system {int(label)}, turned, moved or curved"
-                raise unread(path, f"{what} by dataset 2420", GLOBAL)
+def dataset_types(path: str | Path) -> list[int]:
+    """Return the types of all datasets of a file that is whole."""
+    return [int(kind) for kind in _opened(path).get_set_types()]
 
 
-def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
-    """Return the datasets of some kinds, as pyuff reads them."""
+def _opened(path: str | Path) -> Any:
+    """Return the file as pyuff opens it; refuse what is no universal file, or cut off."""
     with file_path(path).open("rb") as file:
         start = file.read(200)
     pyuff = extra_module("pyuff", "uff", "reading universal files")
@@ -40,13 +33,21 @@ def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
         what = f"is no universal file: it begins with {start[:20]!r}, not with -1"
         raise refused(path, what, "Export it as one, .uff or .unv.")
     _check_end(file_path(path))
+    with (
+        warnings.catch_warnings(action="ignore"),  # NumPy's of what pyuff calls
+        parsing(f"{path}", "Export it again."),
+    ):
+        file = pyuff.UFF(str(path))
+        file.get_set_types()
+        return file
+
+
+def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
+    """Return the datasets of some kinds, as pyuff reads them."""
+    file = _opened(path)
     found = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # NumPy's of what pyuff calls
-        with parsing(f"{path}", "Export it again."):
-            file = pyuff.UFF(str(path))
-            types = [int(kind) for kind in file.get_set_types()]
-        for place, kind in enumerate(types):
+    with warnings.catch_warnings(action="ignore"):  # NumPy's of what pyuff calls
+        for place, kind in enumerate(int(kind) for kind in file.get_set_types()):
             if kind not in kinds:
                 continue
             try:
@@ -132,18 +133,19 @@ def paired_records(
     return pairs
 
 
+def channel_order(name: str) -> tuple[Any, ...]:
+    """Return what channels are sorted by: node and direction, then names without them."""
+    node, _, direction = name.removeprefix("u ").partition(":")
+    known = direction in DIRECTIONS and node.isdigit()
+    return (0, int(node), DIRECTIONS.index(direction)) if known else (1, name)
+
+
 def record_sides(pairs: Iterable[tuple[str, str]]) -> tuple[list[str], list[str]]:
     """Return outputs and inputs of pairs, in order of nodes and directions."""
-
-    def place(name: str) -> tuple[Any, ...]:
-        node, _, direction = name.removeprefix("u ").partition(":")
-        known = direction in DIRECTIONS
-        return (0, int(node), DIRECTIONS.index(direction)) if known else (1, name)
-
     listed = list(pairs)
     return (
-        sorted({output for output, _ in listed}, key=place),
-        sorted({name for _, name in listed}, key=place),
+        sorted({output for output, _ in listed}, key=channel_order),
+        sorted({name for _, name in listed}, key=channel_order),
     )
 
 
@@ -265,200 +267,6 @@ def _motion(label: str, quantity: str | None) -> float | None:
     return (_LENGTHS | _ANGLES).get(first.replace("µ", "u").replace("\xb5", "u"))
 
 
-#: of dataset 2414: lines of records 1 to 13
-_HEAD = 13
-#: data characteristics that are motions: 3 or 6 numbers of each node
-_MOTIONS = {2: 3, 3: 6}
-_AT_NODES = 1
-_COMPLEX = (5, 6)
-#: kinds of analysis
-NORMAL_MODE, COMPLEX_MODES, FREQUENCY_RESPONSE = 2, (3, 7), 5
-#: kinds of results
-DISPLACEMENT = 8
-
-
-class AnalysisData(NamedTuple):
-    """Motions of nodes in one result of an analysis."""
-
-    analysis: int
-    result: int
-    load: int
-    mode: int
-    freq: float
-    mass: float
-    viscous: float
-    hysteretic: float
-    eigenvalue: complex
-    nodes: IntArray
-    motions: FloatArray | ComplexArray
-
-    @property
-    def zeta(self) -> float:
-        """The damping ratio of a normal mode."""
-        return self.viscous or self.hysteretic / 2
-
-    @property
-    def pole(self) -> complex:
-        """The pole of a mode [rad/s]."""
-        if self.analysis != NORMAL_MODE:
-            return self.eigenvalue
-        swing = 1j * np.sqrt(max(0.0, 1 - self.zeta**2))
-        return complex(2 * np.pi * self.freq * (swing - self.zeta))
-
-
-def mode_records(path: Path, *, measured: bool) -> list[AnalysisData]:
-    """Return the modes of a file."""
-    of_tests = [_of_55(part, path) for part in datasets(path, (55,))]
-    of_models = [part for part in read_analysis(path) if part.result == DISPLACEMENT]
-    kinds = (NORMAL_MODE, *COMPLEX_MODES)
-    both = [[part for part in parts if part.analysis in kinds] for parts in (of_tests, of_models)]
-    modes = (both[0] or both[1]) if measured else (both[1] or both[0])
-    check_nodes(modes, path)
-    return modes
-
-
-def check_nodes(parts: list[AnalysisData], path: Path) -> None:
-    """Raise FlexplantError when results are at different nodes."""
-    for part in parts:
-        if not np.array_equal(part.nodes, parts[0].nodes):
-            raise FlexplantError(
-                f"{str(path)!r}: mode {part.mode} is at other nodes than mode {parts[0].mode}, or "
-                "its numbers are cut off. Export all at the same nodes."
-            )
-
-
-def _of_55(part: dict[str, Any], path: Path) -> AnalysisData:
-    nodes = np.asarray(part["node_nums"]).astype(np.int64)
-    rows = [np.asarray(part[f"r{i}"]) for i in range(1, 7) if part.get(f"r{i}") is not None]
-    if any(row.size != nodes.size for row in rows):
-        raise damaged(path, "a dataset 55 whose numbers are cut off", "Export it again.")
-
-    def number(name: str) -> float:
-        return float(np.real(part.get(name) or 0.0))
-
-    rows += [np.zeros(nodes.size)] * (6 - len(rows))
-    return AnalysisData(
-        analysis=whole_entry(part, "analysis_type"),
-        result=DISPLACEMENT,
-        load=0,
-        mode=whole_entry(part, "mode_n"),
-        freq=number("freq"),
-        mass=number("modal_m"),
-        viscous=number("modal_damp_vis"),
-        hysteretic=number("modal_damp_his"),
-        eigenvalue=complex(part.get("eig") or 0.0),
-        nodes=nodes,
-        motions=np.stack(rows, axis=1),
-    )
-
-
-def read_analysis(path: Path) -> list[AnalysisData]:
-    """Return all motions at nodes in the datasets 2414 of a file; other results are passed over."""
-    found = [_parse_2414(lines, place, path) for place, lines in _response_blocks(path)]
-    return [part for part in found if part is not None]
-
-
-def _response_blocks(path: Path) -> Iterator[tuple[int, list[bytes]]]:
-    """Yield the place, from 1, and the lines of each dataset 2414."""
-    place = 0
-    lines: list[bytes] | None = None
-    with path.open("rb") as file:
-        for line in file:
-            if line.strip() != b"-1":
-                if lines is not None and (not lines or lines[0].strip() == b"2414"):
-                    lines.append(line)
-                continue
-            if lines is None:
-                place, lines = place + 1, []
-                continue
-            if lines and lines[0].strip() == b"2414":
-                yield place, lines[1:]
-            lines = None
-
-
-def _parse_2414(lines: list[bytes], place: int, path: Path) -> AnalysisData | None:
-    what = f"dataset {place} (type 2414)"
-    head = [_line_numbers(line, path, what) for line in (lines[2:3] + lines[8:_HEAD])]
-    if len(head) < 6 or not head[0].size or head[1].size < 6 or head[2].size < 8:
-        raise damaged(path, f"{what} is cut off", "Export it again.")
-    location, (_, analysis, kind, result, data, count) = head[0][0], head[1][:6].astype(int)
-    if location != _AT_NODES or kind not in _MOTIONS:
-        return None
-    if count != _MOTIONS[kind]:
-        raise damaged(path, f"{what} has {count} numbers of a node", "Export it again.")
-    width = count * (2 if data in _COMPLEX else 1)
-    table = spaced_numbers(b"".join(lines[_HEAD:]))
-    if table is None or not table.size or table.size % (1 + width):
-        raise damaged(path, f"{what} has other numbers than {width} of each node")
-    table = table.reshape(-1, 1 + width)
-    nodes = table[:, 0].astype(np.int64)
-    if np.any(nodes != table[:, 0]) or np.any(nodes < 1) or np.unique(nodes).size < nodes.size:
-        raise damaged(path, f"{what}: node numbers are not whole, positive and different")
-    motions: Any = table[:, 1:]
-    if data in _COMPLEX:
-        motions = motions[:, ::2] + 1j * motions[:, 1::2]
-    real = np.zeros(12)
-    listed = np.concatenate([part[:6] for part in head[4:6]])
-    real[: listed.size] = listed
-    return AnalysisData(
-        analysis=int(analysis),
-        result=int(result),
-        load=int(head[2][4]),
-        mode=int(head[2][5]),
-        freq=float(real[1]),
-        mass=float(real[3]),
-        viscous=float(real[4]),
-        hysteretic=float(real[5]),
-        eigenvalue=complex(real[6], real[7]),
-        nodes=nodes,
-        motions=np.hstack([motions, np.zeros((nodes.size, 6 - count))]),
-    )
-
-
-def _line_numbers(line: bytes, path: Path, what: str) -> FloatArray:
-    found = spaced_numbers(line)
-    if found is None or not np.all(np.isfinite(found)) or np.any(np.abs(found) > 1e15):
-        raise damaged(path, f"{what}: {line[:60]!r} holds other things than numbers")
-    return found
-
-
-def responses_of_model(
-    path: Path, factors: dict[str, Any] | None, quantity: str | None, scale: float | None
-) -> Frf | None:
-    """Return the frequency responses of dataset 2414, None when there are none."""
-    parts = [
-        part
-        for part in read_analysis(path)
-        if part.analysis == FREQUENCY_RESPONSE and part.result in KINDS
-    ]
-    if not parts:
-        return None
-    found = sorted({KINDS[part.result] for part in parts})
-    if len(found) > 1 and quantity not in found:
-        do = f"One Frf is of one quantity: choose, quantity={found[0]!r}."
-        raise unread(path, f"holds responses in {', '.join(found)}", do)
-    kind = quantity if quantity in found else found[0]
-    parts = [part for part in parts if KINDS[part.result] == kind]
-    check_nodes(parts, path)
-    sets = _by_load(parts, path)
-    freq = np.array(list(next(iter(sets.values()))))
-    data = np.array([[part.motions.ravel() for part in lines.values()] for lines in sets.values()])
-    data = np.moveaxis(data.astype(np.complex128), 0, 2)  # (frequency, motion, load)
-    length = scale or (1.0 if factors is None else 1 / float(factors["length"]))
-    motion = np.arange(data.shape[1]) % 6
-    data[:, motion < 3] *= length
-    data = data * derivative(freq, kind, quantity or kind, path)[:, None, None]
-    seen = np.isin(motion, motion[np.any(data, axis=(0, 2))])
-    names = [f"{node}:{axis}" for node in parts[0].nodes.tolist() for axis in DIRECTIONS]
-    return Frf(
-        freq,
-        np.moveaxis(data[:, seen], 0, 2),
-        inputs=[f"load {number}" for number in sets],
-        outputs=[name for name, there in zip(names, seen, strict=True) if there],
-        quantity=quantity or kind,
-    )
-
-
 def derivative(
     freq: FloatArray, kind: str | None, target: str | None, path: str | Path
 ) -> ComplexArray:
@@ -468,20 +276,3 @@ def derivative(
         what = f"holds {kind} at zero frequency, which cannot be integrated to {target}"
         raise unread(path, what, f"Read it as {kind}, or export from above zero.")
     return np.asarray((2j * np.pi * freq) ** order)
-
-
-def _by_load(parts: list[AnalysisData], path: Path) -> dict[int, dict[float, AnalysisData]]:
-    """Return the results of each load set by frequency, ascending."""
-    sets: dict[int, dict[float, AnalysisData]] = {}
-    for part in sorted(parts, key=lambda part: (part.load, part.freq)):
-        lines = sets.setdefault(part.load, {})
-        if part.freq in lines:
-            what = f"holds the response to load set {part.load} at {part.freq:g} Hz twice"
-            raise refused(path, what, ONCE)
-        lines[part.freq] = part
-    first = next(iter(sets.values()))
-    for number, lines in sets.items():
-        if list(lines) != list(first):
-            other = f"has load set {number} at other frequencies than load set {next(iter(sets))}"
-            raise refused(path, other, "Export all alike.")
-    return sets
