@@ -21,12 +21,13 @@ def op2(
     cards=None,
     into=None,
     keys=None,
+    table_code=(2, 7, 8),
 ):
     """Nodes {id: place}, {id: system} that they move in, values (k, nodes, 6), modal data (k,).
 
     `cards` are coordinate systems (card, number, base, nine numbers) in the place of system 5, and
     `into` is {id: system} in which places are given. `double` writes geometry in double precision,
-    and `keys` changes the third word of a card's key.
+    and `keys` changes the third word of a card's key. `table_code` is (approach, table, words).
     """
 
     def words(*items):
@@ -98,7 +99,9 @@ def op2(
     records = []
     for subcase in range(1, subcases + 1):
         for mode, (value, shape) in enumerate(zip(eigenvalues, values, strict=True), 1):
-            records.append(words(21, 7, 0, subcase, mode, float(value), 0.0, 0, 1, 8, *[0] * 136))
+            approach, code, width = table_code
+            ident = (10 * approach + 1, code, 0, subcase, mode, float(value), 0.0, 0, 1, width)
+            records.append(words(*ident, *[0] * 136))
             rows = [words(10 * i + 1, 1, *map(float, v)) for i, v in zip(xyz, shape, strict=True)]
             records.append(b"".join(rows))
     return content + table(name, *records) + key(0)

@@ -1,6 +1,7 @@
 """ANSYS .full files: the sample with its published frequencies, and a stand-in for the reader."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,6 +49,40 @@ class TestSample:
         examples = pytest.importorskip("ansys.mapdl.reader.examples")
         with pytest.raises(FlexplantError, match=r"not a \.full file"):
             fx.io.read_ansys(examples.rstfile)
+
+
+#: words of the headers that begin at byte 420 of the sample files
+NODES, DISTRIBUTED, ALL_NODES = 32, 62, 65
+RST_ALL_NODES = 48
+
+
+def with_words(source, path, words):
+    """A copy of a binary file with other words in its header."""
+    content = bytearray(source.read_bytes())
+    for place, value in words.items():
+        at = 420 + 4 * place
+        content[at : at + 4] = np.array(value, "<i4").tobytes()
+    path.write_bytes(bytes(content))
+    return path
+
+
+@needs(FULL)
+@pytest.mark.slow
+def test_parts_of_a_distributed_run_are_refused(tmp_path):
+    """Each process writes its part; the header counts the nodes of the whole."""
+    examples = pytest.importorskip("ansys.mapdl.reader.examples")
+    part = with_words(FULL, tmp_path / "file0.full", {DISTRIBUTED: 1, ALL_NODES: 640})
+    for read in (fx.io.read_ansys, fx.read_matrices, fx.read_model):
+        with pytest.raises(ModelError, match="part of a distributed run, with 321 of 640 nodes"):
+            read(part)
+    older = with_words(FULL, tmp_path / "file1.full", {DISTRIBUTED: 1})
+    with pytest.raises(ModelError, match="distributed run, with some of the nodes"):
+        fx.read_matrices(older)
+    whole = with_words(FULL, tmp_path / "file.full", {DISTRIBUTED: 1, ALL_NODES: 321})
+    assert fx.read_matrices(whole).n_dof == 900
+    results = with_words(Path(examples.rstfile), tmp_path / "file1.rst", {RST_ALL_NODES: 640})
+    with pytest.raises(ModelError, match="part of a distributed run, with 321 of 640 nodes"):
+        fx.io.read_modes(results, zeta=0.01)
 
 
 def stand_in(monkeypatch, K, M, table, damped=False):

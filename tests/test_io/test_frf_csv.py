@@ -113,3 +113,17 @@ def test_bad_numbers_and_arguments(tmp_path):
         write_frf_csv(path, [1])
     with pytest.raises(LabelError, match="units name 'y9'"):
         write_frf_csv(path, an_frf(), units={"y9": "m"})
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "cp1252"])
+def test_units_in_the_encoding_of_older_programs(tmp_path, encoding):
+    frf = an_frf(inputs=["u1", "Tür"], outputs=["y1", "y2"])
+    write_frf_csv(tmp_path / "frf.csv", frf, units={"y1": "µm/s²", "y2": "m/s²"})
+    text = (tmp_path / "frf.csv").read_bytes().decode("utf-8")
+    (tmp_path / "old.csv").write_bytes(text.encode(encoding))
+    found = read_frf_csv(tmp_path / "old.csv")
+    assert found.inputs == ("u1", "Tür")
+    assert np.array_equal(found.data, frf.data)
+    (tmp_path / "damaged.csv").write_bytes(text.encode("latin-1") + b"\x00\xff")
+    with pytest.raises(FlexplantError, match="no text of UTF-8"):
+        read_frf_csv(tmp_path / "damaged.csv")

@@ -203,6 +203,35 @@ def test_matlab_finds_the_usual_names(tmp_path, version):
     same(fx.read_matrices(path), K, M)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_several_matrices_with_usual_names_must_be_named(tmp_path, seed):
+    """Of one kind two or more are there, at the same depth, with other values."""
+    rng = np.random.default_rng(seed)
+    usual = {
+        "stiffness": ["K", "kaa", "Stiffness", "K0"],
+        "mass": ["M", "maa", "Mass"],
+        "damping": ["D", "baa", "Damping"],
+    }
+    kind = ("stiffness", "mass", "damping")[seed % 3]
+    names = {
+        one: rng.permutation(listed)[: int(rng.integers(2, 4)) if one == kind else 1].tolist()
+        for one, listed in usual.items()
+    }
+    held = {name: np.diag(rng.uniform(1, 2, 3)) for listed in names.values() for name in listed}
+    scipy.io.savemat(tmp_path / "m.mat", held)
+    np.savez(tmp_path / "m.npz", **held)
+    for path in (tmp_path / "m.mat", tmp_path / "m.npz"):
+        with pytest.raises(
+            ModelError, match=rf"any of which may be the {kind}\. Say which"
+        ) as said:
+            fx.read_matrices(path)
+        assert all(repr(name) in str(said.value) for name in names[kind])
+    for name in names[kind]:
+        found = fx.read_matrices(tmp_path / "m.mat", **{kind: name})
+        chosen = {"stiffness": found.K, "mass": found.M, "damping": found.D}[kind]
+        np.testing.assert_array_equal(chosen.toarray(), held[name])
+
+
 def test_matlab_structures_and_chosen_names(tmp_path):
     K, M = pair()
     path = tmp_path / "model.mat"

@@ -284,3 +284,25 @@ def test_superelements_whose_damping_is_a_null_of_one_entry(tmp_path):
 def test_names_in_words_of_eight_bytes():
     names = list(read_op4_matrices(SHARED / "extseout" / "nas2cam_notall6_msc2017.op4"))
     assert names[:4] == ["SE_START", "LAMBDA", "MAA", "KAA"]
+
+
+@pytest.mark.parametrize("usual", [("KAA", "MAA", "BAA"), ("KGG", "MGG", "BGG"), ("K", "M", "B")])
+@pytest.mark.parametrize("doubled", [0, 1, 2])
+def test_a_matrix_that_the_file_holds_twice_must_be_named(op4, tmp_path, usual, doubled):
+    """pyYeti writes them one behind the other; the third of a kind is another than the first."""
+    rng = np.random.default_rng(doubled)
+    names = [*usual, usual[doubled], usual[doubled]]
+    given = [rng.normal(size=(4, 4)) for _ in names]
+    given = [one @ one.T for one in given]
+    path = tmp_path / "run.op4"
+    op4.write(path, [name.lower() for name in names], given)
+    option = ("stiffness", "mass", "damping")[doubled]
+    first, second, third = usual[doubled], f"{usual[doubled]}_2", f"{usual[doubled]}_3"
+    listed = rf"\['{first}', '{second}', '{third}'\], any of which may be the {option}"
+    for read in (read_op4, fx.read_matrices):
+        with pytest.raises(ModelError, match=listed):
+            read(path)
+    for name, place in ((first, doubled), (second, 3), (third, 4)):
+        found = fx.read_matrices(path, **{option: name})
+        chosen = (found.K, found.M, found.D)[doubled]
+        np.testing.assert_allclose(dense(chosen), given[place], rtol=1e-12)

@@ -178,6 +178,42 @@ def test_what_op2_files_lack_is_said(tmp_path):
         fx.read_model(path)
 
 
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ((9, 7, 14), "holds complex mode shapes, no real normal modes"),
+        ((8, 7, 8), "holds shapes of buckling, no real normal modes"),
+        ((1, 1, 8), "static displacements"),
+        ((5, 1, 14), "frequency responses"),
+        ((6, 1, 8), "transient responses"),
+        ((2, 2007, 8), r"form that is not read .*2007, 8"),
+        ((2, 7, 14), r"form that is not read .*7, 14"),
+    ],
+)
+@pytest.mark.parametrize("size", [4, 8])
+def test_other_vectors_are_named(tmp_path, code, said, size):
+    path = tmp_path / "run.op2"
+    path.write_bytes(op2(XYZ, {}, VALUES, EIGENVALUES, MASSES, size=size, table_code=code))
+    with pytest.raises(FlexplantError, match=said):
+        read_modes(path, zeta=0.01)
+
+
+def test_an_op2_file_of_another_dialect_is_said_to_be(tmp_path):
+    """Data blocks without a trailer, whose names are not known."""
+    path = tmp_path / "run.op2"
+    four = np.array(4, "<i4").tobytes()
+
+    def key(number):
+        return four + np.array(number, "<i4").tobytes() + four
+
+    path.write_bytes(key(-1) + key(-2) + key(0))
+    with pytest.raises(FlexplantError, match=r"no table that is known here.*another program"):
+        read_modes(path, zeta=0.01)
+    path.write_bytes(op2(XYZ, {}, VALUES, EIGENVALUES, MASSES, name="STRANGE"))
+    with pytest.raises(FlexplantError, match=r"tables are \['GEOM1', 'LAMA', 'STRANGE'\]"):
+        read_modes(path, zeta=0.01)
+
+
 def test_punched_eigenvectors(tmp_path):
     path = tmp_path / "run.pch"
     path.write_text(punch(VALUES, EIGENVALUES, list(XYZ)))

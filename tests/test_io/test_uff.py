@@ -173,6 +173,27 @@ def test_units_of_the_axes(tmp_path, above, below, factor):
     assert read_frf_uff(path, scale=3.0).data[0, 0] == pytest.approx(3 * one, rel=1e-4)
 
 
+@pytest.mark.parametrize("binary", [0, 1])
+@pytest.mark.parametrize(
+    ("above", "below", "factor"),
+    [("m/s²", "N", 1), ("mm/s²", "N", 1e-3), ("µm/s²", "N", 1e-6), ("m/s²/N", "NONE", 1)],
+)
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8"])
+def test_units_and_names_in_latin_1(tmp_path, binary, above, below, factor, encoding):
+    """As older software writes them, in a dataset that is not the first."""
+    one = np.linspace(1.0, 2.0, 32) * (1 + 1j)
+    labels = {"ordinate_axis_units_lab": "UNIT", "orddenom_axis_units_lab": below}
+    labels |= {"binary": binary, "rsp_ent_name": "TUER", "ref_ent_name": "NONE"}
+    plain = record((2, 3), (2, 3), one, binary=binary)
+    path = written(tmp_path, [nodes(15), plain, record((5, 0), (2, 3), one, **labels)])
+    content = path.read_bytes().replace(b"TUER", "Tür ".encode(encoding))
+    unit = above.encode(encoding)
+    path.write_bytes(content.replace(b"UNIT".ljust(len(unit)), unit))
+    frf = read_frf_uff(path)
+    assert frf.outputs == ("2:z", "Tür")
+    assert frf.data[1, 0] == pytest.approx(factor * one, rel=1e-4)
+
+
 def test_units_of_dataset_164(tmp_path):
     one = DATA[(2, 3), (2, 3)]
     nameless = {"ordinate_axis_units_lab": "NONE", "orddenom_axis_units_lab": "NONE"}

@@ -132,6 +132,12 @@ def read_parsed(function: str, path: Path) -> dict[str, Any]:
             "It is damaged, cut off or another format: write it again."
         )
     content: dict[str, Any] = found
+    if "part" in content:
+        part = content["part"]
+        share = f"{part['nodes']} of {part['of']} nodes" if part["of"] else "some of the nodes"
+        what = f"is a part of a distributed run, with {share}"
+        do = "Run on shared memory (-smp), or write one file for the whole: COMBINE in /AUX2."
+        raise unread(path.name, what, do)
     return content
 
 

@@ -109,6 +109,13 @@ def chosen(
             if known.rsplit(".", 1)[-1].lower() == usual_name and (name or part != "D")
         ]
         own = name if name not in (None, USUAL) else next(iter(usual), None)
+        alike = [known for known in usual if own and known.count(".") == own.count(".")]
+        if own != name and len(alike) > 1:
+            kind = {"K": "stiffness", "M": "mass", "D": "damping"}[part]
+            raise ModelError(
+                f"{source!r} holds {alike}, any of which may be the {kind}. Say which: "
+                f"{kind}={own!r}."
+            )
         if own is not None:
             found[part] = variables[own]
     if "K" not in found:

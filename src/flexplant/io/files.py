@@ -240,12 +240,17 @@ def check_count(size: int, held: int, path: object) -> None:
 
 
 def text_of(path: Path, encoding: str = "utf-8-sig") -> str:
-    """Return the text of a file."""
+    """Return the text of a file: UTF-8, or Latin-1 as older programs write it."""
+    content = path.read_bytes()
     try:
-        return path.read_text(encoding=encoding)
+        text = content.decode(encoding)
     except UnicodeDecodeError as error:
-        what = f"byte {error.start} is no text of UTF-8"
-        raise damaged(path, what, "Is it another format? Save it as plain text, UTF-8.") from None
+        if not is_text(content):
+            what = f"byte {error.start} is no text of UTF-8"
+            do = "Is it another format? Save it as plain text, UTF-8."
+            raise damaged(path, what, do) from None
+        text = content.decode("latin-1")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 #: stands for the matrix that has a usual name, where one is there

@@ -39,8 +39,12 @@ def ansys_full(path: str) -> dict[str, Any]:
     full = reader.read_binary(path)
     if not hasattr(full, "load_km"):
         return {"class": type(full).__name__}
+    head = full._header
+    whole = {"nodes": int(head["nNodes"]), "of": int(head["GlbnNodes"])}
+    if whole["nodes"] < whole["of"] or (head["distKey"] and not whole["of"]):
+        return {"part": whole}
     table, K, M = full.load_km(sort=False)
-    return {"table": table, "K": sound(K), "M": sound(M), "damped": bool(full._header["ptrDMP"])}
+    return {"table": table, "K": sound(K), "M": sound(M), "damped": bool(head["ptrDMP"])}
 
 
 def ansys_mesh(path: str) -> dict[str, Any]:
@@ -60,6 +64,9 @@ def ansys_modes(path: str) -> dict[str, Any]:
 
     _bound_memory(path, 60)
     results = reader.read_binary(path)
+    whole = {"nodes": len(results.mesh.nnum), "of": int(results._resultheader["Glbnnod"])}
+    if whole["nodes"] < whole["of"]:
+        return {"part": whole}
     freq = np.asarray(results.time_values)
     solutions = [results.nodal_solution(step) for step in range(freq.size)]
     if any(not np.array_equal(ids, solutions[0][0]) for ids, _ in solutions):

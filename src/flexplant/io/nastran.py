@@ -24,7 +24,7 @@ from .coordinate_systems import (
     turned_motions,
 )
 from .fe_modes import MODE_READERS, FileShapes
-from .files import USUAL, damaged, decimal, defined_twice, file_path, unread
+from .files import USUAL, damaged, decimal, defined_twice, file_path, refused, unread
 from .tables import read_nodes_table
 
 _KINDS = ("GRID", "GRDSET", "CORD2R", "CORD2C", "CORD2S")
@@ -222,7 +222,10 @@ def named_matrices(
         name = None if said == USUAL else said
         require_known("matrix", () if name is None else (name,), found, repr(path))
         usual = [_LETTERS[what] + ending for ending in endings]
-        there = [one for one in usual if one in found] if name is None else [name]
+        there = [name]
+        if name is None:  # a name that the file holds several times has _2, _3 behind it
+            there = [one for one in usual if one in found]
+            there = [one for one in found if one in there or re.sub(r"_\d+$", "", one) in there]
         if len(there) > 1:
             raise ModelError(
                 f"{path!r} holds {there}, any of which may be the {what}. Say which: "
@@ -393,10 +396,8 @@ def read_op2_shapes(path: Path, nodes: Path | None) -> FileShapes:
     vectors = [block for block in found if block.name.lstrip("B").startswith(("OUG", "OPHIG"))]
     sets = [(block, part) for block in vectors for part in _modes(block, str(path))]
     if not sets:
-        raise FlexplantError(
-            f"{str(path)!r} holds no modes: its tables are {sorted({b.name for b in found})[:12]}. "
-            "Write them in a run of SOL 103 with DISPLACEMENT=ALL and PARAM,POST,-1."
-        )
+        do = "Write them in a run of SOL 103 with DISPLACEMENT=ALL and PARAM,POST,-1."
+        raise refused(path, _instead_of_modes(found, vectors), do)
     if len(sets) > 1:
         listed = [f"{len(part[1])} in {block.name}" for block, part in sets]
         raise ModelError(
@@ -412,6 +413,36 @@ def read_op2_shapes(path: Path, nodes: Path | None) -> FileShapes:
         turned=block.name.startswith("B"),
         masses=_masses(found, numbers, eigenvalues),
         path=str(path),
+    )
+
+
+#: words of the record before the numbers that say what they are, and what these are
+_APPROACHES = {
+    1: "static displacements",
+    5: "frequency responses",
+    6: "transient responses",
+    7: "displacements before buckling",
+    8: "shapes of buckling",
+    9: "complex mode shapes",
+    10: "nonlinear static displacements",
+}
+
+
+def _instead_of_modes(found: list[Block], vectors: list[Block]) -> str:
+    """Return what a file without real normal modes holds."""
+    heads = [block.integers(ident)[:10] for block in vectors for ident in block.records[::2]]
+    heads = [head for head in heads if head.size == 10]
+    kinds = {int(head[0]) // 10 for head in heads}
+    if named := [name for kind, name in _APPROACHES.items() if kind in kinds]:
+        return f"holds {' and '.join(named)}, no real normal modes"
+    if heads:
+        form = {(int(head[1]), int(head[9])) for head in heads}
+        return f"holds modes in a form that is not read (table code, words a node: {sorted(form)})"
+    if found:
+        return f"holds no modes: its tables are {sorted({block.name for block in found})[:12]}"
+    return (
+        "holds no table that is known here: it was written by another program than MSC or NX "
+        "Nastran, or in another form than that of PARAM,POST,-1"
     )
 
 

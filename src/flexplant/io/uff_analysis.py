@@ -56,7 +56,7 @@ class AnalysisData(NamedTuple):
         """The pole of a mode [rad/s]."""
         if self.analysis != NORMAL_MODE:
             return self.eigenvalue
-        swing = 1j * np.sqrt(max(0.0, 1 - self.zeta**2))
+        swing = 1j * np.sqrt(1 - min(abs(self.zeta), 1.0) ** 2)
         return complex(2 * np.pi * self.freq * (swing - self.zeta))
 
 
@@ -84,7 +84,7 @@ def check_nodes(parts: list[AnalysisData], path: Path) -> None:
 def _of_55(part: dict[str, Any], path: Path) -> AnalysisData:
     nodes = np.asarray(part["node_nums"]).astype(np.int64)
     rows = [np.asarray(part[f"r{i}"]) for i in range(1, 7) if part.get(f"r{i}") is not None]
-    if any(row.size != nodes.size for row in rows):
+    if not nodes.size or any(row.size != nodes.size for row in rows):
         raise damaged(path, "a dataset 55 whose numbers are cut off", "Export it again.")
 
     def number(name: str) -> float:

@@ -32,7 +32,7 @@ def _opened(path: str | Path) -> Any:
     if start.split()[:1] != [b"-1"]:
         what = f"is no universal file: it begins with {start[:20]!r}, not with -1"
         raise refused(path, what, "Export it as one, .uff or .unv.")
-    _check_end(file_path(path))
+    _begins(file_path(path))
     with (
         warnings.catch_warnings(action="ignore"),  # NumPy's of what pyuff calls
         parsing(f"{path}", "Export it again."),
@@ -60,15 +60,17 @@ def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
                 raise damaged(path, what, "Export it again.") from None
             if kind == 58:
                 _check_58(part, path, place)
+                if any("\ufffd" in str(value) for value in part.values()):
+                    part |= _latin_texts(file_path(path), place)
             found.append(part)
     return found
 
 
-def _check_end(path: Path) -> None:
-    """Refuse a file that ends within a dataset: pyuff passes over what has no end."""
-    # lines of -1, in columns 5 and 6, begin and end each dataset, right behind the bytes of a
-    # binary one (58b); its type stands in the second line
-    place, inside, kind = 0, False, ""
+def _begins(path: Path) -> list[int]:
+    """Return the byte behind the type of each dataset; refuse a file that ends within one."""
+    # pyuff passes over what has no end. Lines of -1, in columns 5 and 6, begin and end each
+    # dataset, right behind the bytes of a binary one (58b); its type stands in the second line
+    found, inside, kind = list[int](), False, ""
     with path.open("rb") as file:
         for line in file:
             text = line.rstrip()
@@ -76,10 +78,30 @@ def _check_end(path: Path) -> None:
                 continue
             inside = not inside
             kind = file.readline().strip().decode("latin-1").partition(" ")[0] if inside else ""
-            place += inside
+            if inside:
+                found.append(file.tell())
     if inside:
-        which = f"dataset {place} of type {short(kind)}" if kind else f"dataset {place}"
+        which = f"dataset {len(found)} of type {short(kind)}" if kind else f"dataset {len(found)}"
         raise refused(path, f"is cut off: {which} has no end", "Export it, or copy it, again.")
+    return found
+
+
+#: texts of dataset 58: line behind that of its type, first column and last + 1
+_TEXTS = {
+    "rsp_ent_name": (5, 30, 41),
+    "ref_ent_name": (5, 55, 66),
+    "ordinate_axis_units_lab": (8, 46, 67),
+    "orddenom_axis_units_lab": (9, 46, 67),
+}
+
+
+def _latin_texts(path: Path, place: int) -> dict[str, str]:
+    """Return the texts of a dataset 58 in Latin-1: names of channels and units."""
+    begin = _begins(path)[place]
+    with path.open("rb") as file:
+        file.seek(begin)
+        lines = [file.readline().decode("latin-1") for _ in range(12)]
+    return {name: lines[row][a:b].strip() for name, (row, a, b) in _TEXTS.items()}
 
 
 def _check_58(part: dict[str, Any], path: str | Path, place: int) -> None:
