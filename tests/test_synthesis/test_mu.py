@@ -9,6 +9,8 @@ import scipy.linalg as la
 from flexplant.errors import AssumptionError, ModelError, ShapeError
 from flexplant.lti import StateSpace, append, discretized, lft, series
 from flexplant.synthesis import FullBlock, RepeatedScalar, mu
+from flexplant.synthesis.robustness.power_iterations import power_iterations
+from flexplant.synthesis.robustness.uncertainty_blocks import block_places, matrix_of
 
 
 def random_matrix(seed, size):
@@ -48,6 +50,115 @@ def test_extreme_structures():
     real = mu(np.diag([0.5, -2.0, 1.0]), [RepeatedScalar(3)])
     assert real.upper == pytest.approx(2.0, rel=5e-3, abs=0)
     assert mu(1j * np.eye(2), [RepeatedScalar(2)]).upper < 1e-2  # no real delta is singular
+
+
+def largest_at_corners(M, sizes):
+    """The largest real eigenvalue of M Delta, in size, over all signs of the Deltas."""
+    best = 0.0
+    for signs in itertools.product([1.0, -1.0], repeat=len(sizes)):
+        values = la.eigvals(M @ np.diag(np.repeat(signs, sizes)))
+        real = np.abs(values.imag) < 1e-9 * np.abs(values).max()
+        best = max(best, np.abs(values[real].real).max(initial=0.0))
+    return best
+
+
+def test_real_deltas_of_both_signs():
+    """mu of a diagonal matrix is its largest entry, in size."""
+    assert mu([[-3.0]], [RepeatedScalar(1)]).lower == pytest.approx(3.0, rel=1e-9)
+    rng = np.random.default_rng(1)
+    for n in range(1, 13):
+        entries = rng.standard_normal(n)
+        found = mu(np.diag(entries), [RepeatedScalar(1)] * n)
+        assert found.lower == pytest.approx(np.abs(entries).max(), rel=1e-9)
+
+
+@pytest.mark.parametrize(("n", "count"), [(2, 40), (4, 40), (7, 15), (11, 4)])
+def test_real_deltas_of_random_matrices_against_all_corners(n, count):
+    """The determinant is linear in each Delta, so that the smallest one lies at a corner."""
+    for seed in range(count):
+        M = np.random.default_rng(seed).standard_normal((n, n))
+        found = mu(M, [RepeatedScalar(1)] * n)
+        assert found.lower == pytest.approx(largest_at_corners(M, [1] * n), rel=1e-2)
+        assert found.lower <= found.upper
+        size = np.abs(np.diag(found.perturbation))
+        np.testing.assert_allclose(size, 1 / found.lower, rtol=1e-9)
+        assert np.abs(la.eigvals(M @ found.perturbation) - 1).min() < 1e-8
+
+
+def test_real_and_complex_deltas_of_both_signs():
+    """The perturbation makes the loop singular; real ones of other signs do it no sooner."""
+    near = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        blocks = [RepeatedScalar()] * 3 + [FullBlock(2, 2)]
+        M = rng.standard_normal((5, 5)) + 1j * rng.standard_normal((5, 5))
+        found = mu(M, blocks)
+        delta = found.perturbation
+        assert np.abs(la.eigvals(M @ delta) - 1).min() < 1e-6
+        assert np.linalg.norm(delta, 2) == pytest.approx(1 / found.lower, rel=1e-6)
+        assert not delta[:3, :3].imag.any()
+        near.append(found.lower / found.upper)
+        # the mirrored problem has the same bounds
+        turned = mu(-M, blocks)
+        assert turned.lower == pytest.approx(found.lower, rel=0.1)
+    assert np.mean(near) > 0.9
+
+
+def one_power_iteration(M, sizes, rng):
+    """Young and Doyle, one block after the other: (kind, w, z) of each; returns Delta."""
+    unit = lambda v: v / np.linalg.norm(v)  # noqa: E731
+    drawn = rng.standard_normal((2, 2, M.shape[1]))
+    b, w = (unit(x + 1j * y) for x, y in drawn)
+    w_ends, z_ends = (np.cumsum([0, *(one[i] for one in sizes)]) for i in (1, 2))
+    W = [slice(*pair) for pair in itertools.pairwise(w_ends)]
+    Z = [slice(*pair) for pair in itertools.pairwise(z_ends)]
+    q = [1.0 + 0j] * len(sizes)
+
+    def numbers(a, b, w):
+        for i, (kind, *_) in enumerate(sizes):
+            inner = 0.0 if kind == "full" else np.vdot(a[Z[i]], w[W[i]])
+            if kind == "real":
+                size = np.linalg.norm(b[W[i]]) / np.linalg.norm(a[Z[i]])
+                q[i] = np.clip(np.copysign(size, q[i].real) + inner.real, -1, 1) + 0j
+            elif kind == "complex":
+                q[i] = inner / abs(inner)
+
+    for _ in range(60):
+        old = b
+        a = unit(M @ b)
+        numbers(a, b, w)
+        w = unit(M.conj().T @ np.concatenate([
+            a[Z[i]] * np.linalg.norm(w[W[i]]) / np.linalg.norm(a[Z[i]])
+            if kind == "full" else np.conj(q[i]) * w[W[i]] for i, (kind, *_) in enumerate(sizes)
+        ]))  # fmt: skip
+        numbers(a, old, w)
+        b = unit(np.concatenate([
+            w[W[i]] * np.linalg.norm(a[Z[i]]) / np.linalg.norm(w[W[i]])
+            if kind == "full" else q[i] * a[Z[i]] for i, (kind, *_) in enumerate(sizes)
+        ]))  # fmt: skip
+        if np.linalg.norm(b - old) < 1e-6:
+            break
+    return la.block_diag(*(
+        np.outer(unit(w[W[i]]), unit(a[Z[i]]).conj()) if kind == "full" else q[i] * np.eye(size)
+        for i, (kind, size, _) in enumerate(sizes)
+    ))  # fmt: skip
+
+
+def test_starts_together_are_power_iterations_one_by_one():
+    """The first start, whose real Deltas begin positive, among others: the same perturbation."""
+    make = {"real": RepeatedScalar, "complex": lambda n: RepeatedScalar(n, real=False)}
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        kinds = rng.choice(["real", "complex", "full"], rng.integers(1, 6))
+        sizes = [(k, w := int(rng.integers(1, 4)), int(rng.integers(1, 4)) if k == "full" else w)
+                 for k in kinds]  # fmt: skip
+        M = random_matrix(seed, 20)[: sum(s[2] for s in sizes), : sum(s[1] for s in sizes)]
+        blocks = [FullBlock(w, z) if k == "full" else make[k](w) for k, w, z in sizes]
+        where = block_places(blocks)
+        found = power_iterations(M, where, np.random.default_rng(seed), 4)
+        assert len(found) == 4
+        expected = one_power_iteration(M, sizes, np.random.default_rng(seed))
+        np.testing.assert_allclose(matrix_of(found[0], where), expected, atol=1e-6)
 
 
 def test_the_perturbation_is_singular_and_of_the_structure():

@@ -21,8 +21,9 @@ from ...parallel import Progress, one_thread
 from ...plant import StandardPlant, larger_plant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..hinf.mode_channels import mode_channels, tolerated, with_mode_channels
-from .lower import Destabilising, destabilising, power_iteration, smallest_with_block
+from .lower import Destabilising, destabilising, smallest_with_block
 from .mu import INTERVALS, Cover, Covered, sought
+from .power_iterations import power_iterations
 from .uncertain_loop import UncertainLoop, uncertain_loop
 from .uncertainty_blocks import Perturbation, block_places, matrix_of, perturbed
 
@@ -209,8 +210,7 @@ def _worst(
     where, best = block_places(loop.blocks), None
     for omega in omegas:
         gain = loop.system.evaluated(1j * omega) * loop.heights(omega, omega)
-        for _ in range(_STARTS):
-            start = power_iteration(gain, where, rng, omega)
+        for start in power_iterations(gain, where, rng, _STARTS, omega):
             one = smallest_with_block(gain, where, start, 0.99 / upper)
             if one is not None and (best is None or one[0] < best.size):
                 best = Destabilising(one[0], one[1], omega)
@@ -457,9 +457,8 @@ def _candidates(
         gains = np.array([M.evaluated(1j * one) * tall for one in band])
         skewed = gains[0].copy()
         skewed[where[-1].z] /= np.sqrt(found.level)
-        for _ in range(_STARTS):
-            one = power_iteration(skewed, where, rng, omega)
-            results.append(_corner_gain(gains, where, one))
+        starts = power_iterations(skewed, where, rng, _STARTS, omega)
+        results += [_corner_gain(gains, where, one) for one in starts]
     return [one for _, one in sorted(results, key=lambda pair: -pair[0])[:2]]
 
 

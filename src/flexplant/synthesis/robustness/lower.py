@@ -1,4 +1,4 @@
-"""Lower bounds of mu: power iterations give perturbations, eigenvalues of the loop verify them."""
+"""Lower bounds of mu: perturbations of power iterations, judged by eigenvalues of the loop."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import scipy.linalg as la
 from ...checks import ComplexArray, FloatArray
 from ...lti.statespace import StateSpace
 from ...tolerances import SPLIT, TINY
+from .power_iterations import power_iterations
 from .uncertainty_blocks import (
     Block,
     FullBlock,
@@ -24,8 +25,6 @@ from .uncertainty_blocks import (
     realised_delta,
 )
 
-#: steps of a power iteration; change at which it has settled
-_STEPS, _SETTLED = 60, 1e-6
 #: multiples of the smallest size that are tried for instability; relative accuracy of the smallest
 _MULTIPLES = np.array([1.0, 1.005, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 100.0])
 _FINE = 1e-4
@@ -33,79 +32,13 @@ _FINE = 1e-4
 _PHASES = 25
 #: random starts at each frequency
 _RESTARTS = 4
+#: real Deltas of a matrix of which all signs are tried; of more, random corners that are tried, and
+#: how many of these are improved
+_FEW_SIGNS, _CORNERS, _CLIMBED = 10, 128, 12
 #: real Deltas of which all signs are tried, and the loops that are closed for it
 _FEW, _LOOPS = 5, 256
 #: steps towards worse signs of the real Deltas
 _ASCENTS = 6
-
-
-def power_iteration(
-    M: ComplexArray, where: Sequence[Place], rng: np.random.Generator, omega: float = 0.0
-) -> Perturbation:
-    """Return a perturbation of size one for which an eigenvalue of ``M Delta`` is large and real.
-
-    The iteration of Young and Doyle for real and complex blocks together. Real Deltas may come out
-    inside their interval. It need not converge: what it gives is judged by what it does.
-    [Young1990]_; [PackardDoyle1993]_.
-    """
-    drawn = rng.standard_normal((2, 2, M.shape[1]))
-    b, w = (_unit_vector(real + 1j * imag) for real, imag in drawn)
-    q = {i: 1.0 + 0j for i, p in enumerate(where) if isinstance(p.block, RepeatedScalar)}
-    old, a = b, M @ b
-    for _ in range(_STEPS):
-        a = M @ b
-        if not np.any(a):
-            break
-        a = _unit_vector(a)
-        _update_scalars(q, where, a, b, w)
-        w = M.conj().T @ np.concatenate([
-            q[i].conjugate() * w[p.w] if i in q else _along(a[p.z], w[p.w])
-            for i, p in enumerate(where)
-        ])  # fmt: skip
-        if not np.any(w):
-            break
-        w = _unit_vector(w)
-        _update_scalars(q, where, a, old, w)
-        b = np.concatenate([
-            q[i] * a[p.z] if i in q else _along(w[p.w], a[p.z]) for i, p in enumerate(where)
-        ])  # fmt: skip
-        b = _unit_vector(b)
-        if la.norm(b - old) < _SETTLED:
-            break
-        old = b
-    full = [p for p in where if isinstance(p.block, FullBlock)]
-    vectors = [(_unit_vector(a[p.z]), _unit_vector(w[p.w])) for p in full]
-    return Perturbation(tuple(q.values()), tuple(vectors), omega)
-
-
-def _update_scalars(
-    q: dict[int, complex], where: Sequence[Place], a: ComplexArray, b: ComplexArray, w: ComplexArray
-) -> None:
-    """Set the next numbers of the scalar blocks, of real ones on their interval."""
-    for i, p in enumerate(where):
-        if isinstance(p.block, FullBlock):
-            continue
-        inner = complex(np.vdot(a[p.z], w[p.w]))
-        if p.block.real:
-            size = la.norm(b[p.w]) / max(la.norm(a[p.z]), TINY)
-            moved = (size if q[i].real >= 0 else -size) + inner.real
-            q[i] = complex(np.clip(moved, -1.0, 1.0))
-        else:
-            q[i] = inner / (abs(inner) or 1.0)
-
-
-def _along(direction: ComplexArray, like: ComplexArray) -> ComplexArray:
-    """Return a vector of a direction as long as another one."""
-    return np.asarray(direction * (la.norm(like) / max(la.norm(direction), TINY)))
-
-
-def _unit_vector(v: ComplexArray) -> ComplexArray:
-    size = la.norm(v)
-    if not size > 0:
-        v = np.zeros_like(v)
-        v[0] = 1.0
-        return v
-    return np.asarray(v / size)
 
 
 class Destabilising(NamedTuple):
@@ -146,48 +79,168 @@ def smallest_multiple(
 def crossing_multiple(
     M: ComplexArray, where: Sequence[Place], found: Perturbation
 ) -> tuple[float, Perturbation] | None:
+    """Return t and the perturbation with ``det(I - t M Delta) = 0``, its Deltas made worse.
+
+    Complex blocks are turned, then real Deltas moved to the ends that lower t, as long as it falls.
+    """
+    best: tuple[float, Perturbation] | None = None
+    for _ in range(_ASCENTS):
+        one = _crossing_multiple(M, where, found)
+        if one is None or (best is not None and one[0] > best[0] * (1.0 - SPLIT)):
+            break
+        best = one
+        found = _at_worse_ends(M, where, *one)
+        if found.scalars == one[1].scalars:
+            break
+    return best
+
+
+def _at_worse_ends(
+    M: ComplexArray, where: Sequence[Place], t: float, found: Perturbation
+) -> Perturbation:
+    """Return the perturbation with real Deltas at the ends towards which the eigenvalue grows."""
+    if not any(_kinds(where)):
+        return found
+    delta = t * matrix_of(found, where)
+    eigen: Any = la.eig(M @ delta, left=True, right=True)
+    values, left, right = eigen
+    worst = int(np.argmin(np.abs(values - 1.0)))
+    own, r = left[:, worst].conj(), right[:, worst]
+    into = own @ M * np.exp(-1j * np.angle(own @ r))  # sizes do not matter, signs do
+    scalars = [p for p in where if isinstance(p.block, RepeatedScalar)]
+    gains = np.array([into[p.w] @ r[p.z] for p in scalars])
+    real, numbers = np.array(_kinds(where)), np.array(found.scalars)
+    # a phase common to the complex blocks moves too, so that the eigenvalue stays real
+    turned = into @ (delta @ r) - t * np.sum((numbers * gains)[real])
+    turn = turned.imag / turned.real if abs(turned.real) > SPLIT * abs(turned) else 0.0
+    ends = np.sign(gains.real + turn * gains.imag)
+    moved = np.where(real & (ends != 0), ends, numbers)
+    return found._replace(scalars=tuple(moved.tolist()))
+
+
+def _crossing_multiple(
+    M: ComplexArray, where: Sequence[Place], found: Perturbation
+) -> tuple[float, Perturbation] | None:
     """Return t and the perturbation, its complex blocks turned, with ``det(I - t M Delta) = 0``."""
-    # one phase common to all complex blocks is chosen so that an eigenvalue of M Delta is real
+    # one phase common to all complex blocks is chosen so that an eigenvalue of M Delta is real; a
+    # negative one is a positive one of -Delta
     fixed = np.zeros((where[-1].w.stop, where[-1].z.stop), dtype=np.complex128)
     turned = matrix_of(found, where)
     for p in where:
         if isinstance(p.block, RepeatedScalar) and p.block.real:
             fixed[p.w, p.z] = turned[p.w, p.z]
             turned[p.w, p.z] = 0.0
-    if not np.any(turned):
+    best = _real_eigenvalue(M, fixed, turned)
+    if best is None:
         return None
-
-    def eigenvalue(phase: float, near: complex | None) -> complex:
-        values = la.eigvals(M @ (fixed + np.exp(1j * phase) * turned))
-        worst = np.argmax(values.real if near is None else -np.abs(values - near))
-        return complex(values[worst])
-
-    best, values = (0.0, 0.0), list[complex]()
-    phases = np.linspace(-np.pi, np.pi, _PHASES)
-    if np.any(fixed):
-        values = [eigenvalue(phase, None) for phase in phases]
-    else:  # all eigenvalues turn with the phase
-        every = la.eigvals(M @ turned)
-        largest = complex(every[np.argmax(np.abs(every))])
-        best = abs(largest), -float(np.angle(largest))
-    for i in np.flatnonzero(np.diff(np.sign([v.imag for v in values]))).tolist():
-        low, high, value = phases[i], phases[i + 1], values[i]
-        sign = np.sign(value.imag)
-        for _ in range(50):
-            middle = 0.5 * (low + high)
-            value = eigenvalue(middle, value)
-            low, high = (middle, high) if np.sign(value.imag) == sign else (low, middle)
-        if abs(value.imag) < SPLIT * abs(value) and value.real > best[0]:
-            best = value.real, 0.5 * (low + high)
-    if not best[0] > 0:
-        return None
-    turn = np.exp(1j * best[1])
-    kinds = [p.block.real for p in where if isinstance(p.block, RepeatedScalar)]
-    numbers = tuple(
-        number if real else number * turn for real, number in zip(kinds, found.scalars, strict=True)
-    )
+    value, turn = best
+    numbers = [
+        number.real * np.sign(value) if real else number * turn
+        for real, number in zip(_kinds(where), found.scalars, strict=True)
+    ]
     vectors = tuple((a, b * turn) for a, b in found.vectors)
-    return 1.0 / best[0], found._replace(scalars=numbers, vectors=vectors)
+    scalars = tuple(complex(number) for number in numbers)
+    return 1.0 / abs(value), found._replace(scalars=scalars, vectors=vectors)
+
+
+def _kinds(where: Sequence[Place]) -> list[bool]:
+    """Return of each scalar block whether it is real."""
+    return [p.block.real for p in where if isinstance(p.block, RepeatedScalar)]
+
+
+def _real_eigenvalue(
+    M: ComplexArray, fixed: ComplexArray, turned: ComplexArray
+) -> tuple[float, complex] | None:
+    """Return the largest real eigenvalue of ``M (fixed + turn turned)`` and that turn, |turn| = 1.
+
+    With a negative eigenvalue the turn is that of ``-fixed``.
+    """
+    if not np.any(turned):
+        value = _largest_real(np.linalg.eigvals(M @ fixed))
+        return (value, 1.0 + 0j) if value else None
+    if not np.any(fixed):  # all eigenvalues turn with the phase
+        every = np.linalg.eigvals(M @ turned)
+        largest = complex(every[np.argmax(np.abs(every))])
+        size = abs(largest)
+        return (size, largest.conjugate() / size) if size > 0 else None
+    best, phases = (0.0, 1.0 + 0j), np.linspace(-np.pi, np.pi, _PHASES)
+    for sign in (1.0, -1.0):
+        first, second = M @ fixed * sign, M @ turned
+        every = np.linalg.eigvals(first + np.exp(1j * phases)[:, None, None] * second)
+        values = every[np.arange(_PHASES), np.argmax(every.real, axis=1)]
+        for i in np.flatnonzero(np.diff(np.sign(values.imag))).tolist():
+            phase, value = _crossing(first, second, phases[i : i + 2], complex(values[i]))
+            if abs(value.imag) < SPLIT * abs(value) and value.real > abs(best[0]):
+                best = sign * value.real, complex(np.exp(1j * phase))
+    return best if best[0] else None
+
+
+def _crossing(
+    first: ComplexArray, second: ComplexArray, between: FloatArray, value: complex
+) -> tuple[float, complex]:
+    """Return the phase, by bisection, at which an eigenvalue is real, and that eigenvalue."""
+    low, high = between.tolist()
+    sign, phase = np.sign(value.imag), low
+    for _ in range(50):
+        phase = 0.5 * (low + high)
+        every = np.linalg.eigvals(first + np.exp(1j * phase) * second)
+        value = complex(every[np.argmin(np.abs(every - value))])
+        low, high = (phase, high) if np.sign(value.imag) == sign else (low, phase)
+    return phase, value
+
+
+def _largest_real(values: ComplexArray) -> float:
+    """Return the real eigenvalue of the largest size, with its sign; 0 where none is real."""
+    # a double eigenvalue comes out complex by the root of rounding
+    real = np.abs(values.imag) < 1e-8 * np.abs(values).max(initial=TINY)
+    found = np.where(real, values.real, 0.0)
+    return float(found[np.argmax(np.abs(found))]) if found.size else 0.0
+
+
+def worst_corner(
+    M: FloatArray, where: Sequence[Place], starts: Sequence[Perturbation], rng: np.random.Generator
+) -> tuple[float, Perturbation] | None:
+    """Return t and the signs of real Deltas at their ends with ``det(I - t M Delta) = 0``, M real.
+
+    The determinant is linear in each Delta of one channel, so that the smallest is at a corner:
+    all corners of a few Deltas are tried, else one sign after the other is changed from many.
+    """
+    sizes = [p.block.w for p in where]
+    signs = _all_signs(len(where)) if len(where) <= _FEW_SIGNS else np.vstack([
+        np.where(np.array([one.scalars for one in starts]).real < 0, -1.0, 1.0),
+        rng.choice([-1.0, 1.0], (_CORNERS, len(where))),
+    ])  # fmt: skip
+
+    def values(signs: FloatArray) -> FloatArray:
+        every = np.linalg.eigvals(M * np.repeat(signs, sizes, axis=-1)[:, None, :])
+        return np.array([_largest_real(row) for row in every])
+
+    found = values(signs)
+    if len(where) > _FEW_SIGNS:
+        best = np.argsort(-np.abs(found))[:_CLIMBED]
+        signs, found = signs[best], found[best]
+        flips = 1.0 - 2.0 * np.eye(len(where))
+        while True:
+            moved = (signs[:, None] * flips).reshape(-1, len(where))
+            there = values(moved).reshape(len(signs), -1)
+            one = np.argmax(np.abs(there), axis=1)
+            size = np.abs(there[np.arange(len(one)), one])
+            better = size > np.abs(found) * (1.0 + SPLIT)
+            if not better.any():
+                break
+            signs = np.where(better[:, None], signs * flips[one], signs)
+            found = np.where(better, there[np.arange(len(one)), one], found)
+    worst = int(np.argmax(np.abs(found)))
+    if not found[worst]:
+        return None
+    scalars = tuple((signs[worst] * np.sign(found[worst]) + 0j).tolist())
+    return 1.0 / abs(found[worst]), Perturbation(scalars, (), 0.0)
+
+
+def _all_signs(count: int) -> FloatArray:
+    """Return all signs of a number of Deltas (n, count); the opposite ones are left out."""
+    rest = list(itertools.product([1.0, -1.0], repeat=count - 1))
+    return np.array([(1.0, *signs) for signs in rest])
 
 
 def smallest_with_block(
@@ -296,7 +349,7 @@ def destabilising(
     best: Destabilising | None = None
     for omega in omegas:
         gain = M.evaluated(1j * omega)
-        starts = [power_iteration(gain, where, rng, omega) for _ in range(_RESTARTS)]
+        starts = power_iterations(gain, where, rng, _RESTARTS, omega)
         first = Destabilising(0.0, starts[0], omega)
         signs = worse_signs(M, blocks, first, near=1j * omega)
         for start in [*starts, *([] if signs is None else [signs])]:

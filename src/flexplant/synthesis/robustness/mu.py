@@ -7,7 +7,7 @@ point: no peak between frequencies is missed [Lawrence2000]_.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -23,10 +23,12 @@ from ...lti.responses import responder
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread, tick
 from ...tolerances import ROUNDING, TINY
-from .lower import crossing_multiple, destabilising, power_iteration
+from .lower import crossing_multiple, destabilising, worst_corner
+from .power_iterations import power_iterations
 from .uncertainty_blocks import (
     Block,
     Perturbation,
+    Place,
     RepeatedScalar,
     Scalings,
     block_places,
@@ -191,28 +193,25 @@ def _of_matrix(M: ComplexArray, blocks: Sequence[Block], rng: np.random.Generato
     where = block_places(listed)
     upper = float(np.sqrt(upper_level(M, Scalings(listed)).level))
     lower, delta = 0.0, np.zeros(M.shape[::-1], dtype=np.complex128)
-    for _ in range(_STARTS):
-        one = power_iteration(M, where, rng)
-        found = crossing_multiple(M, where, one) or _real_multiple(M, where, one)
+    starts = power_iterations(M, where, rng, _STARTS)
+    for found in _multiples(M, where, starts, rng):
         if found is not None and 1.0 / found[0] > lower:
             lower = 1.0 / found[0]
             delta = np.asarray(found[0] * matrix_of(found[1], where))
         if lower >= _MET * upper:
             break
-    return MuBounds(upper, lower, float("nan"), delta)
+    return MuBounds(upper, min(lower, upper), float("nan"), delta)
 
 
-def _real_multiple(
-    M: ComplexArray, where: Sequence[Any], found: Perturbation
-) -> tuple[float, Perturbation] | None:
-    """Return t with ``det(I - t M Delta) = 0`` for real Deltas: of a real eigenvalue."""
-    if any(not (isinstance(p.block, RepeatedScalar) and p.block.real) for p in where):
-        return None
-    values = np.linalg.eigvals(M @ matrix_of(found, where))
-    # a double eigenvalue comes out complex by the root of rounding
-    real = np.abs(values.imag) < 1e-8 * np.abs(values).max(initial=TINY)
-    best = float(np.max(values.real[real], initial=0.0))
-    return (1.0 / best, found) if best > 0 else None
+def _multiples(
+    M: ComplexArray, where: Sequence[Place], starts: list[Perturbation], rng: np.random.Generator
+) -> Iterator[tuple[float, Perturbation] | None]:
+    """Yield t and perturbations with ``det(I - t M Delta) = 0``."""
+    for one in starts:
+        yield crossing_multiple(M, where, one)
+    real = all(isinstance(p.block, RepeatedScalar) and p.block.real for p in where)
+    if real and not np.any(M.imag):
+        yield worst_corner(M.real, where, starts, rng)
 
 
 class Interval(NamedTuple):
