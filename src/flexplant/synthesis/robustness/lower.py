@@ -156,7 +156,7 @@ def _real_eigenvalue(
     With a negative eigenvalue the turn is that of ``-fixed``.
     """
     if not np.any(turned):
-        value = _largest_real(np.linalg.eigvals(M @ fixed))
+        value = _largest_real(np.asarray(np.linalg.eigvals(M @ fixed), dtype=np.complex128))
         return (value, 1.0 + 0j) if value else None
     if not np.any(fixed):  # all eigenvalues turn with the phase
         every = np.linalg.eigvals(M @ turned)
@@ -169,9 +169,9 @@ def _real_eigenvalue(
         every = np.linalg.eigvals(first + np.exp(1j * phases)[:, None, None] * second)
         values = every[np.arange(_PHASES), np.argmax(every.real, axis=1)]
         for i in np.flatnonzero(np.diff(np.sign(values.imag))).tolist():
-            phase, value = _crossing(first, second, phases[i : i + 2], complex(values[i]))
-            if abs(value.imag) < SPLIT * abs(value) and value.real > abs(best[0]):
-                best = sign * value.real, complex(np.exp(1j * phase))
+            phase, one = _crossing(first, second, phases[i : i + 2], complex(values[i]))
+            if abs(one.imag) < SPLIT * abs(one) and one.real > abs(best[0]):
+                best = sign * one.real, complex(np.exp(1j * phase))
     return best if best[0] else None
 
 
