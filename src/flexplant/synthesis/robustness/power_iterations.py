@@ -15,7 +15,7 @@ from .uncertainty_blocks import Perturbation, Place, RepeatedScalar
 _STEPS, _SETTLED = 60, 1e-6
 
 
-class _Parts(NamedTuple):
+class _Channels(NamedTuple):
     """The channels of the blocks of one kind in vectors (n, channels) of one side."""
 
     channels: IntArray
@@ -33,11 +33,11 @@ class _Parts(NamedTuple):
         return np.asarray(vectors[:, self.channels] * factor[:, self.owner])
 
 
-def _parts(sizes: IntArray, chosen: BoolArray) -> _Parts:
+def _channels_of(sizes: IntArray, chosen: BoolArray) -> _Channels:
     """Return the parts of chosen blocks."""
     channels = np.flatnonzero(np.repeat(chosen, sizes))
     own = sizes[chosen]
-    return _Parts(channels, np.cumsum(own) - own, np.repeat(np.arange(own.size), own))
+    return _Channels(channels, np.cumsum(own) - own, np.repeat(np.arange(own.size), own))
 
 
 class _Structure:
@@ -46,8 +46,8 @@ class _Structure:
     def __init__(self, where: Sequence[Place]) -> None:
         scalar = np.array([isinstance(p.block, RepeatedScalar) for p in where], dtype=bool)
         w, z = (np.array([getattr(p.block, side) for p in where]) for side in "wz")
-        self.w, self.z = _parts(w, scalar), _parts(z, scalar)
-        self.full_w, self.full_z = _parts(w, ~scalar), _parts(z, ~scalar)
+        self.w, self.z = _channels_of(w, scalar), _channels_of(z, scalar)
+        self.full_w, self.full_z = _channels_of(w, ~scalar), _channels_of(z, ~scalar)
         kinds = [p.block.real for p in where if isinstance(p.block, RepeatedScalar)]
         self.real: BoolArray = np.array(kinds, dtype=bool)
 
