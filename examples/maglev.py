@@ -93,11 +93,11 @@ def ports() -> fx.Ports:
 
 
 # %% Observer, controller and error budget, with the POI at one place
-def held(plant: fx.StandardPlant, larger: fx.Modes) -> dict[str, Any]:
+def held(plant: fx.StandardPlant) -> dict[str, Any]:
     """Return the observer, the controller and the loop of a plant."""
-    observer = fx.design_kalman(plant, larger=larger)
-    servo = fx.design_servo(plant, bandwidth=BANDWIDTH, observer=observer, larger=larger)
-    loop = fx.close_loop(plant, observer, servo, larger=larger)
+    observer = fx.design_kalman(plant)
+    servo = fx.design_servo(plant, bandwidth=BANDWIDTH, observer=observer)
+    loop = fx.close_loop(plant, observer, servo)
     return {"observer": observer, "servo": servo, "loop": loop}
 
 
@@ -105,9 +105,9 @@ def main() -> dict[str, Any]:
     """Return what is printed, drawn and pinned by the tests."""
     many = modes(40)
     few = many.select(range(16))  # six on the magnets, ten elastic; the others count as left out
-    plant = fx.assemble_plant(few, ports())
+    plant = fx.assemble_plant(few, ports(), evaluation=many)
     sampled = plant.discretized(RATE, delay=DELAY)
-    path = [held(sampled.at(point), many) for point in PATH]
+    path = [held(sampled.at(point)) for point in PATH]
     middle, corner = path[0]["loop"], path[-1]["observer"].plant
     rigid = decouple(plant)
     machine = fx.testbeds.magnet_stage(rate=RATE, delay=DELAY)
@@ -120,7 +120,7 @@ def main() -> dict[str, Any]:
         "path": path,
         "budgets": {axis: middle.budget(f"die:{axis}") for axis in ("x", "z")},
         # a filter that reads the decoupled motions alone, at the corner
-        "six": fx.design_kalman(corner.through(decouple(corner).to_motions), larger=many),
+        "six": fx.design_kalman(corner.through(decouple(corner).to_motions)),
     }
 
 

@@ -48,7 +48,8 @@ PORTS = fx.Ports(
     y=[fx.Sensor(f"y{i}", at=p, asd=SENSOR) for i, p in enumerate(CORNERS, 1)],
     references=[fx.Reference("die")],
 )
-design = fx.assemble_plant(whole.select(range(12)), PORTS).discretized(RATE, delay=DELAY)
+design = fx.assemble_plant(whole.select(range(12)), PORTS, evaluation=whole)
+design = design.discretized(RATE, delay=DELAY)
 
 
 # %% Where the POI is at each sample
@@ -61,8 +62,8 @@ def path(time: np.ndarray) -> np.ndarray:
 # %% One run, three readings of it
 def main() -> dict[str, Any]:
     """Return the run, the estimates of the motion in z at the POI, and their errors."""
-    observer = fx.design_kalman(design, larger=whole)
-    servo = fx.design_servo(design, bandwidth=30.0, observer=observer, larger=whole)
+    observer = fx.design_kalman(design)
+    servo = fx.design_servo(design, bandwidth=30.0, observer=observer)
     run = machine.run(PORTS, observer, servo, duration=DURATION, moving={"die": path}, rng=11)
     places = path(run.time)
     fixed, along = observer.estimate(run), observer.estimate(run, path=places)

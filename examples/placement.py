@@ -51,15 +51,15 @@ AXES = {"z": 1.0, "rx": 0.013, "ry": 0.013}
 # %% The machine: measured, and what is not known of its modes
 def plants(case: dict[str, Any], rng: int = 1) -> tuple[fx.StandardPlant, list[fx.StandardPlant]]:
     """Return the sampled plant of the measured model, and three machines that it could be too."""
-    small = plant_of(case, "measured")
+    small = plant_of(case, "measured").replace(evaluation=None)  # scored on its own modes
     return small, small.uncertain(frequency=case["off"]).sample(rng, 3)
 
 
 def on_machine(case: dict[str, Any], plant: fx.StandardPlant) -> tuple[float, float]:
     """Return the die's error [m rms] over `AXES` by a plant's sensors: predicted, and measured."""
     full = case["full"]["measured"]
-    design = {"estimate": fx.design_kalman(plant, larger=full)}
-    static = fx.design_static(plant, larger=full)
+    judged = plant.replace(evaluation=full)
+    design, static = {"estimate": fx.design_kalman(judged)}, fx.design_static(judged)
     servo = fx.design_servo(plant, bandwidth=10.0, observer=static)
     blocks = static, servo, *fx.reading_along(design)
     run = case["machine"].run(plant.assembled.ports, *blocks, duration=3.0, rng=1, runs=2)

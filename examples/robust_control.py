@@ -35,7 +35,7 @@ BANDWIDTH, MORE = 60.0, 80.0  # Hz, of the servo and of H-infinity
 def uncertain_plant(case: dict[str, Any]) -> tuple[fx.StandardPlant, Any, Any]:
     """Return the sampled plant of a few modes, and it without and with the modes above."""
     full = case["full"]["measured"]
-    plant = fx.assemble_plant(full.select(range(MODES)), ports())
+    plant = fx.assemble_plant(full.select(range(MODES)), ports(), evaluation=full)
     plant = plant.discretized(RATE, delay=case["machine"].delay)
     moved = set(range(MODES + 1)) - {*UNMOVED}
     off = {mode: part for mode, part in case["off"].items() if mode in moved}
@@ -52,18 +52,18 @@ def peak(loop: fx.ClosedLoop) -> float:
 def study() -> dict[str, Any]:
     """Return the loop, what is proven of it, and the worst machine beside others."""
     case = models(DAMPING)
-    full, machine = case["full"]["measured"], case["machine"]
+    machine = case["machine"]
     plant, alone, uncertain = uncertain_plant(case)
-    static = fx.design_static(plant, larger=full)
-    servo = fx.design_servo(plant, bandwidth=BANDWIDTH, observer=static, larger=full)
+    static = fx.design_static(plant)
+    servo = fx.design_servo(plant, bandwidth=BANDWIDTH, observer=static)
     blocks = static, servo
-    robust = robust_stability(uncertain, *blocks, larger=full)
+    robust = robust_stability(uncertain, *blocks)
     worst = worst_case_gain(uncertain, *blocks, w=["die:ref"], z=["die:error"])
     errors, weights = fx.reference_errors(plant), fx.stage_weights(plant, MORE)
     weighted = plant.through(errors).weighted(z=weights.z, w=weights.w)
     hinf = fx.design_hinf(weighted)
     return {
-        "uncertain": uncertain, "loop": fx.close_loop(plant, *blocks, larger=full),
+        "uncertain": uncertain, "loop": fx.close_loop(plant, *blocks),
         "robust": robust, "worst": worst, "bad": fx.close_loop(worst.machine, *blocks),
         "gains": [peak(fx.close_loop(one, *blocks)) for one in uncertain.sample(5, 10)],
         "machine": machine.loop(ports(), *blocks), "weighted": weighted, "hinf": hinf,

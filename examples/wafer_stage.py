@@ -110,8 +110,8 @@ def study(damping: float) -> dict[str, Any]:
 
 
 def plant_of(case: dict[str, Any], kind: str, force: float = 1e-3) -> fx.StandardPlant:
-    """Return the sampled plant of a model."""
-    plant = fx.assemble_plant(case["models"][kind], ports(force))
+    """Return the sampled plant of a model, judged on 160 modes of a finer mesh."""
+    plant = fx.assemble_plant(case["models"][kind], ports(force), evaluation=case["full"][kind])
     return plant.discretized(RATE, delay=case["machine"].delay)
 
 
@@ -119,14 +119,14 @@ def plant_of(case: dict[str, Any], kind: str, force: float = 1e-3) -> fx.Standar
 def estimation(case: dict[str, Any], force: float, seed: Any) -> dict[str, Any]:
     """Return, for each axis, predicted errors and those of 5 runs of 2 s under a slow servo."""
     nominal, fit = (plant_of(case, kind, force) for kind in ("drawing", "measured"))
-    static = fx.design_static(fit, larger=case["full"]["measured"])
+    static, alone = fx.design_static(fit), fit.replace(evaluation=None)
     designs = {
         "geometry alone": static,
-        "drawing": fx.design_kalman(nominal, larger=case["full"]["drawing"]),
-        "measured, 24 modes": fx.design_kalman(fit),
-        "measured, all modes": fx.design_kalman(fit, larger=case["full"]["measured"]),
+        "drawing": fx.design_kalman(nominal),
+        "measured, 24 modes": fx.design_kalman(alone),
+        "measured, all modes": fx.design_kalman(fit),
     }
-    servo = fx.design_servo(fit, bandwidth=10.0, observer=static)
+    servo = fx.design_servo(alone, bandwidth=10.0, observer=static)
     blocks = static, servo, *fx.reading_along(designs)
     run = case["machine"].run(ports(force), *blocks, duration=3.0, rng=seed, runs=5)
     axes = ("die:z", "die:rx", "die:ry")
@@ -134,23 +134,23 @@ def estimation(case: dict[str, Any], force: float, seed: Any) -> dict[str, Any]:
 
 
 # %% Control: H-infinity of a sure model and of an unsure one, and the best servo that holds
-def hinf(plant: fx.StandardPlant, full: fx.Modes) -> tuple[Any, ...]:
+def hinf(plant: fx.StandardPlant) -> tuple[Any, ...]:
     """Return the errors that the H-infinity controller reads, and the controller."""
     errors, weights = fx.reference_errors(plant), fx.stage_weights(plant, BANDWIDTH)
     weighted = plant.through(errors).weighted(z=weights.z, w=weights.w)
-    return errors, fx.design_hinf(weighted, larger=full)
+    return errors, fx.design_hinf(weighted)
 
 
-def servo(plant: fx.StandardPlant, full: fx.Modes) -> tuple[Any, ...]:
+def servo(plant: fx.StandardPlant) -> tuple[Any, ...]:
     """Return the servo of the largest bandwidth that keeps |S| at u below 6 dB, by geometry."""
-    static = fx.design_static(plant, larger=full)  # a Kalman filter in the loop allows less
-    reach = fx.servo_bandwidth(plant, observer=static, larger=full)
-    return static, fx.design_servo(plant, bandwidth=reach, observer=static, larger=full)
+    static = fx.design_static(plant)  # a Kalman filter in the loop allows less
+    reach = fx.servo_bandwidth(plant, observer=static)
+    return static, fx.design_servo(plant, bandwidth=reach, observer=static)
 
 
-def tolerant(plant: Any, full: Any, off: Any, asked: float | None = None) -> tuple[Any, ...]:
+def tolerant(plant: Any, off: Any, asked: float | None = None) -> tuple[Any, ...]:
     """Return a controller that tolerates these errors of frequencies: as asked, or the fastest."""
-    return (fx.design_stage(plant.uncertain(frequency=off), bandwidth=asked, larger=full),)
+    return (fx.design_stage(plant.uncertain(frequency=off), bandwidth=asked),)
 
 
 def control(case: dict[str, Any], asked: float | None = None) -> dict[str, dict[str, Any]]:
@@ -164,10 +164,10 @@ def control(case: dict[str, Any], asked: float | None = None) -> dict[str, dict[
     ):
         known = (case["off"], asked) if design is tolerant else ()
         with warnings.catch_warnings(action="ignore"):  # one is unstable there: see the claims
-            plant, full = plant_of(case, kind), case["full"][kind]
-            blocks = design(plant, full, *known)
+            plant = plant_of(case, kind)
+            blocks = design(plant, *known)
             loop = case["machine"].loop(ports(), *blocks)
-            model = fx.close_loop(plant, *blocks, larger=full).completed
+            model = fx.close_loop(plant, *blocks).completed
             runs = [fx.simulate(o, reference=move, duration=1.5, rng=7) for o in (loop, model)]
         sizes = [run.exposure("die:error", window=5e-3, start=0.3) for run in runs]
         found[name] = {"model": model, "machine": loop, "run": runs[0], "exposures": sizes}
@@ -178,7 +178,7 @@ def control(case: dict[str, Any], asked: float | None = None) -> dict[str, dict[
 def placement(case: dict[str, Any]) -> fx.placement.SensorMap:
     """Return the predicted error of the die over places of a sensor beside those at the corners."""
     points = [(x, y, 0.0) for y in np.linspace(0, L, 9) for x in np.linspace(0, L, 9)]
-    plant, goal = plant_of(case, "measured"), fx.PoiVariance("die", larger=case["full"]["measured"])
+    plant, goal = plant_of(case, "measured"), fx.PoiVariance("die")
     return fx.sensor_map(plant, points, goal, asd=NOISE, constraints=[fx.placement.OffPoi(0.12)])
 
 

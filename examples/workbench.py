@@ -39,15 +39,15 @@ def measured() -> fx.Frf:
     return machine.measure_frf(PORTS, period=0.4, periods=4, discard=1, amplitude=5.0, rng=3)
 
 
-def drawn() -> tuple[fx.StandardPlant, fx.Modes]:
-    """Return the plant of the drawing with 12 modes, and those that it leaves out."""
+def drawn() -> fx.StandardPlant:
+    """Return the plant of the drawing with 12 modes, judged on 60."""
     plate = fx.kirchhoff_plate(
         size=(L, L), thickness=0.0272, elements=(12, 12), density=2702,
         youngs_modulus=70e9, poisson_ratio=0.35,
     )  # fmt: skip
     modes = fx.solve_modes(plate, count=60, damping=fx.ModalDamping(0.01))
-    plant = fx.assemble_plant(modes.select(range(12)), PORTS)
-    return plant.discretized(RATE, delay=DELAY), modes
+    plant = fx.assemble_plant(modes.select(range(12)), PORTS, evaluation=modes)
+    return plant.discretized(RATE, delay=DELAY)
 
 
 # %% A law for each axis of the rigid body: what sliders set, in a script
@@ -77,12 +77,10 @@ def shaped(frf: fx.Frf, plant: fx.StandardPlant) -> LoopDesign:
 # %% The run
 def main(*, browser: bool = False) -> dict[str, Any]:
     """Return the design, as it was when the page was left, and its loops on both plants."""
-    frf, (plant, modes) = measured(), drawn()
-    bench = fx.workbench(
-        frf, design=shaped(frf, plant), model=plant, larger=modes, open_browser=browser
-    )
+    frf, plant = measured(), drawn()
+    bench = fx.workbench(frf, design=shaped(frf, plant), model=plant, open_browser=browser)
     design = bench.design
-    closed = fx.close_loop(plant, design.controller(), larger=modes)
+    closed = fx.close_loop(plant, design.controller())
     OUT.mkdir(exist_ok=True)
     design.save(OUT / "loops.npz")
     fx.synthesis.write_c(design.controller(), OUT / "loops.c")

@@ -79,5 +79,5 @@ def test_arguments_that_are_not_taken_answer_with_those_that_are():
         fx.Pid()
     assert list(inspect.signature(fx.Pid).parameters) == ["p", "i", "d", "pole"]
     if sys.version_info >= (3, 13):  # of functions the interpreter says it
-        with pytest.raises(TypeError, match="Did you mean 'larger'"):
-            fx.design_kalman(None, largr=None)
+        with pytest.raises(TypeError, match="Did you mean 'evaluation'"):
+            fx.assemble_plant(None, None, evaluaton=None)

@@ -216,8 +216,10 @@ def test_the_argument_at_fault_is_named_and_errors_of_users_are_left():
         fx.balanced(fx.testbeds.three_masses().system, order=float("nan"))
     with pytest.raises(FlexplantError, match=r"dofs of PointMass.added must be a DofSet, got 3"):
         fx.PointMass("1:z", 1.0).added(3)
-    with pytest.raises(TypeError, match=r"design_kalman takes no argument 'largr'.*larger"):
-        fx.design_kalman(None, largr=None)
+    with pytest.raises(
+        TypeError, match=r"assemble_plant takes no argument 'evaluaton'.*evaluation"
+    ):
+        fx.assemble_plant(None, None, evaluaton=None)
 
     def wrong(plant):
         raise ValueError("mine")

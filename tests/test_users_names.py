@@ -41,7 +41,7 @@ class Case:
             references=[fx.Reference(self.die)],
         )
         self.plant = fx.assemble_plant(modes(), self.ports).discretized(2e3, delay=1)
-        self.observer = fx.design_kalman(self.plant, larger=modes())
+        self.observer = fx.design_kalman(self.plant.replace(evaluation=modes()))
         self.servo = fx.design_servo(self.plant, bandwidth=20.0, observer=self.observer)
         self.loop = fx.close_loop(self.plant, self.observer, self.servo)
         self.run = fx.simulate(self.loop, duration=0.6, rng=1)

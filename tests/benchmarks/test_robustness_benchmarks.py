@@ -85,12 +85,13 @@ def test_promised_and_measured(name):
             rate=RATE,
         )
         model, whole, off = models(machine, size, thickness, elements, seed)
-        plant = fx.assemble_plant(model, own).discretized(RATE, delay=machine.delay)
+        plant = fx.assemble_plant(model, own, evaluation=whole)
+        plant = plant.discretized(RATE, delay=machine.delay)
         begin = time.process_time()
         with warnings.catch_warnings(action="ignore"):
-            controller = fx.design_stage(plant.uncertain(frequency=off), larger=whole)
+            controller = fx.design_stage(plant.uncertain(frequency=off))
             spent = time.process_time() - begin
-            promised = fx.close_loop(plant, controller, larger=whole)
+            promised = fx.close_loop(plant, controller)
         loop = machine.loop(own, controller)
         assert loop.is_stable
         reach = fx.compare_loops({"machine": loop}).rows["machine"].bandwidth

@@ -28,20 +28,20 @@ WANTED = 60.0  # Hz, of the controllers that tolerate what is not known
 
 
 def plants(zeta, seed):
-    """One machine, its ports, the plant of its calibrated model, all modes, what is not known."""
+    """One machine, its ports, the plant of its calibrated model, and what is not known."""
     mass = np.random.default_rng(seed).uniform(0.1, 1.0)
     machine = fx.testbeds.wafer_stage(damping=zeta, individual=seed, added_mass=mass, rate=RATE)
     own = ports(SIZE, FORCES)
     model, whole, off = models(machine, SIZE, THICKNESS, ELEMENTS, seed, zeta)
-    plant = fx.assemble_plant(model, own).discretized(RATE, delay=machine.delay)
-    return machine, own, plant, whole, off
+    plant = fx.assemble_plant(model, own, evaluation=whole)
+    return machine, own, plant.discretized(RATE, delay=machine.delay), off
 
 
 def estimated(zeta, seed):
     """Promised and true errors (2, 3) of the estimate at the die, u at rest."""
     with warnings.catch_warnings(action="ignore"):
-        machine, own, plant, whole, _ = plants(zeta, seed)
-        kalman = fx.design_kalman(plant, larger=whole)
+        machine, own, plant, _ = plants(zeta, seed)
+        kalman = fx.design_kalman(plant)
     true = fx.assemble_plant(machine.truth, own).discretized(RATE, delay=machine.delay)
     return np.sqrt([kalman.variances, error_variances(true, kalman.system).values])
 
@@ -50,12 +50,12 @@ def controlled(zeta, seed):
     """Modulus margins (2, 2) of two loops, promised and on the machine; 0 where unstable."""
     margins = []
     with warnings.catch_warnings(action="ignore"):
-        machine, own, plant, whole, off = plants(zeta, seed)
-        static = fx.design_static(plant, larger=whole)
-        servo = fx.design_servo(plant, bandwidth=40.0, observer=static, larger=whole)
-        tolerant = fx.design_stage(plant.uncertain(frequency=off), bandwidth=WANTED, larger=whole)
+        machine, own, plant, off = plants(zeta, seed)
+        static = fx.design_static(plant)
+        servo = fx.design_servo(plant, bandwidth=40.0, observer=static)
+        tolerant = fx.design_stage(plant.uncertain(frequency=off), bandwidth=WANTED)
         for blocks in ((static, servo), (tolerant,)):
-            promised = fx.close_loop(plant, *blocks, larger=whole)
+            promised = fx.close_loop(plant, *blocks)
             both = promised if not promised.is_stable else promised.completed
             pair = both, machine.loop(own, *blocks)
             margins.append([one.modulus_margin if one.is_stable else 0.0 for one in pair])

@@ -55,8 +55,8 @@ def recorded(truth, steps=20000, seed=1, axes=("die:z", "die:rx", "die:ry")):
     return channels | {u: np.zeros(steps) for u in truth.u}, motions
 
 
-def judged(design, truth, larger=None, **options):
-    observer = design_kalman(design, larger=design if larger is None else larger)
+def judged(design, truth, **options):
+    observer = design_kalman(design)
     records, motions = recorded(truth, **options)
     return consistency(observer, observer.estimate(records), truth=motions)
 
@@ -71,7 +71,7 @@ def quiet_plant(chosen):
 def test_a_right_model_passes_as_often_as_stated():
     """One state, 200 records of 1000 samples at 95 %: the share is binomial."""
     design = one_state(0.9)
-    observer, passed = design_kalman(design, larger=design), 0
+    observer, passed = design_kalman(design), 0
     rng = np.random.default_rng(8)
     for _ in range(200):
         x = np.zeros(1000)
@@ -146,7 +146,8 @@ def test_modes_left_out_beside_a_kept_one_are_no_change_of_it(more):
     blind = judged(machine(), plant(count=9 + more))
     assert blind.causes == ("truncation",)
     assert "near mode 9" not in blind.text or "no change of" in blind.text
-    known = judged(machine(), plant(count=9 + more), larger=modes(1e-2, 9 + more))
+    design = machine().replace(evaluation=modes(1e-2, 9 + more))
+    known = judged(design, plant(count=9 + more))
     assert known.causes == ("truncation",)
     assert f"the plant is right, they are coloured by the {more} modes left out" in known.text
     assert "its predicted errors hold" in known.text
@@ -157,14 +158,15 @@ def test_a_folded_mode_beside_a_kept_one_is_named():
     """Modes at 4456 Hz appear at 456 Hz, beside mode 6 at 463 Hz."""
     kept = list(range(9))
     whole, design = [*kept, 28, 29], quiet_plant(kept)
-    observer = design_kalman(design, larger=design)
+    observer = design_kalman(design)
     estimate = observer.estimate(recorded(quiet_plant(whole))[0])
     blind = consistency(observer, estimate)
     assert blind.causes == ("folding",)
     assert "no change of mode 6 (463.1 Hz" in blind.text
-    known = consistency(observer, estimate, larger=modes(3e-3, 40).select(whole))
+    judge = observer.plant.replace(evaluation=modes(3e-3, 40).select(whole))
+    known = consistency(observer.replace(plant=judge), estimate)
     assert known.causes == ("folding",)
-    assert "the plant is right" in known.text and "(4456 Hz in the larger model)" in known.text
+    assert "the plant is right" in known.text and "(4456 Hz in the evaluation model)" in known.text
 
 
 @pytest.mark.slow
@@ -199,7 +201,7 @@ def one_sensor(count):
 )
 def test_one_sensor_shows_whether_a_mode_has_moved_or_is_left_out(kept, mode, kind, amount, cause):
     truth = with_changes(one_sensor(5), [(Delta("change", mode, kind, 1.0), amount)])
-    observer = design_kalman(one_sensor(kept), larger=one_sensor(kept))
+    observer = design_kalman(one_sensor(kept))
     records, _ = recorded(truth, axes=("die:x",))
     found = consistency(observer, observer.estimate(records))
     assert found.causes == (cause,)
@@ -210,7 +212,7 @@ def test_one_sensor_shows_whether_a_mode_has_moved_or_is_left_out(kept, mode, ki
 @pytest.mark.parametrize(("sensor", "size"), [("y1", 20e-9), ("y3", -5e-9), ("y2", 1e-6)])
 def test_an_offset_of_a_sensor_is_named_with_its_size(sensor, size):
     records, _ = recorded(machine())
-    observer = design_kalman(machine(), larger=machine())
+    observer = design_kalman(machine())
     found = consistency(observer, observer.estimate(records | {sensor: records[sensor] + size}))
     assert found.causes == ("offset",)
     value, unit = re.search(rf"{sensor} by (-?[\d.e+]+) (\S*m)", found.text).groups()
@@ -222,7 +224,7 @@ def test_an_offset_of_a_sensor_is_named_with_its_size(sensor, size):
 @pytest.mark.parametrize("count", [1, 30])
 def test_outliers_are_named_and_gated(count):
     records, _ = recorded(machine())
-    observer = design_kalman(machine(), larger=machine())
+    observer = design_kalman(machine())
     rng, bad = np.random.default_rng(3), {name: part.copy() for name, part in records.items()}
     for k in rng.choice(np.arange(200, 19000), count, replace=False):
         bad[f"y{rng.integers(1, 5)}"][k] += rng.choice([-1.0, 1.0]) * rng.uniform(3e-8, 1e-6)
@@ -245,7 +247,7 @@ def test_a_blow_that_a_mode_left_out_rings_from_is_no_outlier():
     k = np.arange(400)
     ringing[8000:8400] = 1e-7 * np.exp(-0.01 * k) * np.sin(2 * np.pi * 0.4 * k)
     bad = {name: part + (ringing if name[0] == "y" else 0.0) for name, part in records.items()}
-    observer = design_kalman(machine(), larger=machine())
+    observer = design_kalman(machine())
     found = consistency(observer, observer.estimate(bad))
     assert not found.holds
     assert "outliers" not in found.causes and "offset" not in found.causes
@@ -253,7 +255,7 @@ def test_a_blow_that_a_mode_left_out_rings_from_is_no_outlier():
 
 def test_the_innovations_on_its_own_plant_have_unit_density():
     """By way of the plant's noises and the open plant, rigid-body modes among it."""
-    observer = design_kalman(machine(), larger=machine())
+    observer = design_kalman(machine())
     freq = np.geomspace(1e-4, 0.499, 300)
     for other in (machine(), None):
         parts = density_of(observer, other, freq)
@@ -284,7 +286,7 @@ def test_statistics_by_direct_sums():
 
 def test_refusals():
     design = one_state(0.9)
-    observer = design_kalman(design, larger=design)
+    observer = design_kalman(design)
     estimate = observer.estimate({"y1": np.zeros(50), "u1": np.zeros(50)}, start=np.zeros(1))
     with pytest.raises(ModelError, match="at least 200 samples"):
         consistency(observer, estimate)
@@ -293,7 +295,7 @@ def test_refusals():
     with pytest.raises(LabelError, match="channel 'y1'"):
         consistency(observer, {})
     records, _ = recorded(machine(), steps=300)
-    observer = design_kalman(machine(), larger=machine())
+    observer = design_kalman(machine())
     with pytest.raises(LabelError, match="POI channel"):
         consistency(observer, observer.estimate(records), truth={"dye": np.zeros(300)})
 
@@ -317,7 +319,7 @@ def test_a_machine_of_another_formulation_that_has_changed_since_it_was_measured
     The calibrated model that is offered has them there.
     """
     plant, whole, machine = calibrated_stage(0.9)
-    observer = design_kalman(plant, larger=whole)
+    observer = design_kalman(plant.replace(evaluation=whole))
     servo = design_servo(plant, bandwidth=20.0, observer=observer)
     move = setpoint(100e-6, velocity=5e-3, acceleration=0.5, jerk=100.0)
     run = machine.run(stage_ports(), observer, servo, duration=1.0, reference=move, rng=3)
@@ -339,7 +341,7 @@ def test_a_machine_of_another_formulation_that_has_changed_since_it_was_measured
 def test_deviations_of_moved_modes_cover_in_closed_loop():
     """Runs with moves and 1 % damping: frequency and decay lie in their intervals."""
     moved = with_changes(machine(), [(Delta("f", 6, "freq", 1.0), 0.05)])
-    observer = design_kalman(machine(), larger=machine())
+    observer = design_kalman(machine())
     servo = design_servo(machine(), bandwidth=25.0, observer=observer)
     loop, z = close_loop(moved, observer, servo), []
     move = setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0)
@@ -356,7 +358,7 @@ def test_deviations_of_moved_modes_cover_in_closed_loop():
 def test_the_report_of_a_loop_names_the_mode_that_moved(tmp_path):
     """A run on a machine whose mode 6 is 2.5 % higher, beside the loop on the model."""
     moved = with_changes(machine(), [(Delta("f", 6, "freq", 1.0), 0.05)])
-    observer = design_kalman(machine(), larger=machine())
+    observer = design_kalman(machine())
     servo = design_servo(machine(), bandwidth=25.0, observer=observer)
     promised, there = (close_loop(P, observer, servo) for P in (machine(), moved))
     run = simulate(there, duration=2.5, rng=3)

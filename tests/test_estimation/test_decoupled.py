@@ -10,9 +10,9 @@ from flexplant.plant import decouple, reference_errors
 from stages import CORNERS, L, ports, reduced, sampled, some_modes
 
 #: meshes are small here: what they do not resolve is the subject of test_mesh
-pytestmark = pytest.mark.filterwarnings("ignore:.*finer mesh as larger=")
+pytestmark = pytest.mark.filterwarnings("ignore:.*evaluation= of a finer mesh")
 
-LARGER = some_modes(count=40, attached=False)
+WHOLE = some_modes(count=40, attached=False)
 
 
 def machine(places):
@@ -27,9 +27,9 @@ def test_as_many_motions_as_sensors_are_the_same_filter():
     motions = decouple(plant).to_motions
     decoupled = plant.through(motions)
     assert decoupled.y == ("cog:z", "cog:rx", "cog:ry")
-    for larger in (plant, LARGER):
-        one = fx.design_kalman(plant, larger=larger)
-        two = fx.design_kalman(decoupled, larger=decoupled if larger is plant else larger)
+    for whole in (None, WHOLE):
+        one = fx.design_kalman(plant.replace(evaluation=whole))
+        two = fx.design_kalman(decoupled.replace(evaluation=whole))
         for name in ("die:z", "die:rx", "die:ry"):
             assert two.rms(name) == pytest.approx(one.rms(name), rel=1e-6, abs=0)
         # its gain is that of the sensors, times what makes sensors of motions
@@ -46,7 +46,7 @@ def test_fewer_motions_than_sensors_against_a_dense_riccati_equation():
     plant = machine([*CORNERS, (L / 2, 0.1, 0.0)])
     T = decouple(plant).to_motions
     decoupled = plant.through(T)
-    found = fx.design_kalman(decoupled, larger=decoupled)
+    found = fx.design_kalman(decoupled)
     scale = 1e9  # measurements in nm
     R = T.D @ np.diag([(i * 1e-11) ** 2 * 1e4 / 2 for i in range(1, 6)]) @ T.D.T * scale**2
     A, C = plant.system.A, T.D @ plant.C2 * scale
@@ -54,7 +54,7 @@ def test_fewer_motions_than_sensors_against_a_dense_riccati_equation():
     after = P - P @ C.T @ np.linalg.solve(C @ P @ C.T + R, C @ P)
     row = plant.C1[plant.z.index("die:z")]
     assert found.rms("die:z") == pytest.approx(np.sqrt(row @ after @ row), rel=1e-5, abs=0)
-    assert found.rms("die:z") > fx.design_kalman(plant, larger=plant).rms("die:z")
+    assert found.rms("die:z") > fx.design_kalman(plant).rms("die:z")
     # it is a block of a loop, behind the decoupling
     loop = fx.close_loop(plant, T, found, idle=plant.u)
     assert {"cog:z", "die:hat"} <= {*loop.watched}

@@ -40,7 +40,7 @@ def test_bias_is_a_state_of_the_filter():
     """The filter resolves the bias to a part of its prior; sensors on one line do not show rx."""
     plant = biased()
     check_bias(plant, ["bias:z", "bias:rx", "bias:ry"])
-    kalman = design_kalman(plant, larger=plant)
+    kalman = design_kalman(plant)
     states = [i for i, name in enumerate(plant.system.states) if name.startswith("bias:")]
     prior = RandomWalk(1e-2).rms ** 2
     assert np.all(np.diag(kalman.covariance)[states] < 1e-2 * prior)
@@ -85,7 +85,7 @@ def test_accelerometers_by_the_textbook():
     """Simon, Optimal State Estimation, section 7.1: correlated process and sensor noise, run
     until it is stationary in states, sensors and noises of unit size."""
     plant = with_accelerometers()
-    kalman = design_kalman(plant, larger=plant)
+    kalman = design_kalman(plant)
     m = filter_model(plant)
     assert np.abs(m.S).max() > 0
     d, s = np.sqrt(np.diag(kalman.predicted_covariance)) + 1e-300, np.sqrt(np.diag(m.R))
@@ -96,7 +96,7 @@ def test_accelerometers_by_the_textbook():
     C1 = m.C1 * d
     np.testing.assert_allclose(kalman.variances, np.diag(C1 @ P @ C1.T), rtol=1e-6)
     without = assemble_plant(modes(1e-2, 8), ports()).discretized(2e3, delay=1)
-    assert kalman.rms("die") < design_kalman(without, larger=without).rms("die")
+    assert kalman.rms("die") < design_kalman(without).rms("die")
     # the correlation is in the error on another plant as well
     assert kalman.rms("die", on=plant) == pytest.approx(kalman.rms("die"), rel=1e-6, abs=0)
 
@@ -114,7 +114,7 @@ def test_accelerometers_without_held_noise_are_refused():
 @pytest.mark.slow
 def test_simulated_accelerometers_give_the_predicted_error():
     plant = with_accelerometers()
-    kalman = design_kalman(plant, larger=plant)
+    kalman = design_kalman(plant)
     loop = close_loop(plant, kalman, design_servo(plant, bandwidth=20.0))
     run = simulate(loop, duration=4.0, rng=3, runs=4)
     # the closed form of the loop counts held noise as the simulation does

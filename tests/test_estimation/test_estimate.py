@@ -115,7 +115,7 @@ def test_noises_of_process_and_sensors_may_be_correlated(lag):
 def test_modes_left_out_are_noise_at_sensors_and_pois_and_a_compliance(lag):
     """Correlated noise of y and z, its share at the POI estimated with it; u with a delay."""
     plant = plate_plant(1e-2, count=5, sensor_asd=1e-10)
-    kalman = design_kalman(plant, modes(1e-2, 9))
+    kalman = design_kalman(plant.replace(evaluation=modes(1e-2, 9)))
     model = kalman.model
     assert np.any(model.N)
     assert np.any(model.C1[:, plant.modal_states.max() + 1 :])  # the compliance under late u
@@ -139,7 +139,7 @@ def test_modes_left_out_are_noise_at_sensors_and_pois_and_a_compliance(lag):
 def test_a_millisecond_recovers_most_of_what_a_smoother_can():
     """On the plate with sensors of 0.1 nm / sqrt(Hz): the rotations, beside the static relation."""
     plant = plate_plant(1e-2, count=10, sensor_asd=1e-12)
-    kalman = design_kalman(plant, modes(1e-2, 24))
+    kalman = design_kalman(plant.replace(evaluation=modes(1e-2, 24)))
     report = kalman.report()
     assert report.names[3:6] == ("0.1 ms", "1 ms", "10 ms")
     assert np.all(report["static relation"] > 1.5 * report["filter"])
@@ -414,7 +414,7 @@ def test_the_report_by_lag_is_that_of_the_estimates():
 def test_a_moving_poi_is_at_each_sample_a_poi_that_stands_there(method, truncated):
     """Start, a gap, blocks, compliance and noise of modes left out: row by row the fixed POI's."""
     plant = plate_plant(2e-2, count=5, sensor_asd=1e-10)
-    kalman = design_kalman(plant, modes(2e-2, 9) if truncated else plant)
+    kalman = design_kalman(plant.replace(evaluation=modes(2e-2, 9) if truncated else plant))
     model = kalman.model
     rng = np.random.default_rng(9)
     y, u = 1e-8 * rng.standard_normal((600, 4)), 10 * rng.standard_normal((600, 4))
@@ -426,7 +426,7 @@ def test_a_moving_poi_is_at_each_sample_a_poi_that_stands_there(method, truncate
         found = kalman.estimate(channels, method, start=start, path=places[which])
         for i, point in enumerate(places):
             there = plant.at(point.tolist())
-            fixed = design_kalman(there, modes(2e-2, 9) if truncated else there)
+            fixed = design_kalman(there.replace(evaluation=modes(2e-2, 9) if truncated else there))
             wanted = fixed.estimate(channels, method, start=start)
             at = np.flatnonzero(which == i)[1:]
             for name in wanted.names:

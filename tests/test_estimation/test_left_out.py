@@ -11,7 +11,7 @@ from flexplant.estimation.error import error_variances
 from flexplant.estimation.left_out import left_out
 from flexplant.lti import lowpass
 from flexplant.modes import solve_modes
-from flexplant.plant import Disturbance, Sensor, assemble_plant, larger_plant
+from flexplant.plant import Disturbance, Sensor, assemble_plant
 from flexplant.reduction import DesiredDofs, ModalTruncation, reduce
 from flexplant.structure import FEModel, ModalDamping, chain, kirchhoff_plate
 from flexplant.testbeds import three_masses
@@ -21,7 +21,7 @@ from stages import CORNERS, INSET, fitted, ports, sampled
 from stages import reduced as stage_model
 
 #: meshes are small here: what they do not resolve is the subject of test_mesh
-pytestmark = pytest.mark.filterwarnings("ignore:.*finer mesh as larger=")
+pytestmark = pytest.mark.filterwarnings("ignore:.*evaluation= of a finer mesh")
 
 LEVELS = (1e-4, 1e-3, 1e-2)
 DAMPINGS = (0.01, 0.001)
@@ -67,13 +67,15 @@ def on_machine(kind, zeta, level):
 
 def filter_of(kind, zeta, level, count=24):
     modes = all_modes(kind, zeta)
-    return design_kalman(sampled(modes.select(range(count)), channels(kind, level)), larger=modes)
+    return design_kalman(
+        sampled(modes.select(range(count)), channels(kind, level)).replace(evaluation=modes)
+    )
 
 
 def test_covariances_are_those_of_the_closed_form():
     modes = solve_modes(make_plate(), damping=ModalDamping(0.01))
     plant = sampled(modes.select(range(24)))
-    found = left_out(plant, larger_plant(plant, modes))
+    found = left_out(plant, plant.replace(evaluation=modes).evaluation_plant)
     assert found.modes.tolist() == list(range(25, modes.n_modes + 1))
     dofs = modes.dofs
     see = np.array([dofs.row((0.3, 0.3, 0.0), axis) for axis in ("z", "rx", "ry")])
@@ -95,16 +97,18 @@ def test_a_filter_far_above_all_modes_changes_no_covariance():
         w = [Disturbance("amp", at="1:x", asd=1.0, shape=shape)]
         channels = three_masses().assembled.ports.replace(w=w)
         plant = assemble_plant(modes.select([0, 1, 2]), channels).discretized(2e3, delay=1)
-        found.append(float(left_out(plant, larger_plant(plant, modes)).pois[0, 0]))
+        found.append(
+            float(left_out(plant, plant.replace(evaluation=modes).evaluation_plant).pois[0, 0])
+        )
     assert found[1] == pytest.approx(found[0], rel=1e-6, abs=0)
 
 
 @pytest.mark.long
-def test_the_prediction_is_the_error_on_the_larger_plant_by_frequency():
+def test_the_prediction_is_the_error_on_the_evaluation_plant_by_frequency():
     """Oracle: the integral of the error's density over all frequencies."""
     modes = all_modes("paper", 0.001).select(range(40))
     plant = sampled(modes.select(range(24)))
-    estimator = design_kalman(plant, larger=modes)
+    estimator = design_kalman(plant.replace(evaluation=modes))
     expected = error_by_frequency(*dictionaries(sampled(modes), estimator.system))
     np.testing.assert_allclose(estimator.variances, expected, rtol=5e-3)
     assert estimator.certificate.left_out == 16
@@ -127,7 +131,7 @@ def test_a_filter_that_knows_nothing_of_them_claims_too_little():
     for level, claim, truth, cured in ((1e-3, 0.305e-9, 1.56e-9, 0.87e-9),
                                        (1e-2, 2.38e-9, 21.5e-9, 8.69e-9)):  # fmt: skip
         plant, whole = sampled(fit.model, ports(level)), sampled(modes, ports(level))
-        blind, knowing = design_kalman(plant), design_kalman(plant, larger=modes)
+        blind, knowing = design_kalman(plant), design_kalman(plant.replace(evaluation=modes))
         assert blind.rms("die") == pytest.approx(claim, rel=0.02, abs=0)
         assert blind.rms("die", on=whole) == pytest.approx(truth, rel=0.02, abs=0)
         assert "truncation is not in these numbers" in repr(blind)
@@ -144,7 +148,7 @@ def test_modes_left_out_as_noise_forgive_what_is_not_known_of_them():
     bare = FEModel(true.M, true.K, dofs=true.dofs)
     modes, channel = solve_modes(bare, damping=ModalDamping(0.001)).select(range(160)), ports(1e-3)
     few, many = (
-        design_kalman(sampled(modes.select(range(count)), channel), larger=modes)
+        design_kalman(sampled(modes.select(range(count)), channel).replace(evaluation=modes))
         for count in (40, 160)
     )
     assert 1e9 * few.rms("die") == pytest.approx(0.774, rel=0.01)
@@ -172,21 +176,27 @@ def test_modes_that_the_reduced_model_knows_are_the_default():
         found = design_kalman(plant)
         assert found.certificate.left_out == 31
         assert found.rms("die") == pytest.approx(
-            design_kalman(plant, larger=real).rms("die"), rel=1e-6, abs=0
+            design_kalman(plant.replace(evaluation=real)).rms("die"), rel=1e-6, abs=0
         )
-        # a reduced model given as the larger one counts what it left out itself
-        given = design_kalman(sampled(real.select(range(9))), larger=reduce(real, method))
+        # a reduced model given as the evaluation model counts what it left out itself
+        given = design_kalman(
+            sampled(real.select(range(9))).replace(evaluation=reduce(real, method))
+        )
         assert given.certificate.left_out == 31
-        # the plant itself as the larger one: nothing is left out
-        alone = design_kalman(plant, larger=plant)
+        # with its own modes as the evaluation model nothing is left out
+        alone = design_kalman(plant.replace(evaluation=plant.model.modes()))
         assert alone.certificate.left_out == 0
         assert "as if no modes were left out" in repr(alone)
+        unjudged = design_kalman(plant.replace(evaluation=None))
+        assert unjudged.certificate.left_out is None
+        assert "not judged on a larger model: truncation is not in" in repr(unjudged)
+        np.testing.assert_allclose(unjudged.variances, alone.variances, rtol=1e-9)
         assert alone.left_out is None
         assert alone.rms("die") < found.rms("die")
         assert design_static(plant).rms("die") == pytest.approx(
             design_static(sampled(real)).rms("die"), rel=1e-9, abs=0
         )
-        bare = design_static(plant, larger=plant).rms("die")
+        bare = design_static(plant.replace(evaluation=None)).rms("die")
         assert bare != pytest.approx(design_static(plant).rms("die"), rel=1e-3, abs=0)
 
 
@@ -217,7 +227,7 @@ def test_a_steady_force_bends_the_modes_left_out_and_the_filter_knows(attached, 
     small = stage_model(0.01) if attached else modes.select(range(24))
     die = ports(die=(0.05, 0.05, 0.0))
     plant, whole = (sampled(model, die, delay=delay) for model in (small, modes))
-    blind, knowing = design_kalman(plant), design_kalman(plant, larger=modes)
+    blind, knowing = design_kalman(plant), design_kalman(plant.replace(evaluation=modes))
     assert steady_error(whole, blind.system) > 1.5e-9
     assert steady_error(whole, knowing.system) < 0.01e-9
 
@@ -243,15 +253,15 @@ def test_filters_delays_and_shapes_act_on_the_modes_left_out(kind):
     """From many times the best possible error to less than twice: dynamics are accounted for."""
     modes = solve_modes(make_plate(elements=(4, 4)), count=30, damping=ModalDamping(0.003))
     plant, whole = (sampled(m, shaped(kind)) for m in (modes.select(range(14)), modes))
-    blind, knowing = design_kalman(plant), design_kalman(plant, larger=modes)
-    best = design_kalman(whole, larger=whole).rms("die")
+    blind, knowing = design_kalman(plant), design_kalman(plant.replace(evaluation=modes))
+    best = design_kalman(whole).rms("die")
     assert knowing.rms("die") < 2.0 * best
     assert blind.rms("die", on=whole) > 1.5 * knowing.rms("die")
     assert knowing.rms("die", on=whole) == pytest.approx(knowing.rms("die"), rel=1e-9, abs=0)
 
 
 @pytest.mark.slow
-def test_damping_that_couples_the_modes_of_the_larger_plant():
+def test_damping_that_couples_the_modes_of_the_evaluation_plant():
     """The dense form: internal damper, one pair of modes overdamped."""
     bare = make_plate(elements=(4, 4)).with_damping(ModalDamping(0.01))
     rows = [bare.dofs.row((x, 0.15, 0.0), "z") for x in (0.15, 0.3, 0.45)]
@@ -261,7 +271,7 @@ def test_damping_that_couples_the_modes_of_the_larger_plant():
         whole = sampled(model)
     plant = sampled(reduce(model, ModalTruncation(16)))
     with pytest.warns(FlexplantWarning, match="of die:ry is from modes that the mesh"):
-        knowing = design_kalman(plant, larger=whole)
+        knowing = design_kalman(plant.replace(evaluation=whole))
     blind = design_kalman(plant)
     assert knowing.rms("die") < blind.rms("die", on=whole)
     assert knowing.certificate.difference < 1e-6
@@ -270,7 +280,7 @@ def test_damping_that_couples_the_modes_of_the_larger_plant():
 def test_mode_by_mode_and_all_at_once_give_the_same_variances(monkeypatch):
     modes = solve_modes(make_plate(elements=(4, 4)), count=30, damping=ModalDamping(0.003))
     whole = sampled(modes)
-    observer = design_kalman(sampled(modes.select(range(12))), larger=modes).system
+    observer = design_kalman(sampled(modes.select(range(12))).replace(evaluation=modes)).system
     fast = error_variances(whole, observer).values
     monkeypatch.setattr("flexplant.estimation.error._plant_modes", lambda *_: None)
     np.testing.assert_allclose(fast, error_variances(whole, observer).values, rtol=1e-8)
@@ -279,7 +289,7 @@ def test_mode_by_mode_and_all_at_once_give_the_same_variances(monkeypatch):
 def test_a_gain_with_one_sign_flipped_has_another_error():
     modes = solve_modes(make_plate(elements=(4, 4)), count=30, damping=ModalDamping(0.01))
     whole = sampled(modes)
-    found = design_kalman(sampled(modes.select(range(12))), larger=modes)
+    found = design_kalman(sampled(modes.select(range(12))).replace(evaluation=modes))
     D = np.array(found.system.D)
     D[0, 0] *= -1
     with pytest.raises(AssumptionError, match="grows without limit"):
@@ -296,11 +306,11 @@ def test_refusals():
     modes = solve_modes(make_plate(elements=(4, 4)), count=30, damping=ModalDamping(0.01))
     plant = sampled(modes.select(range(12)))
     with pytest.raises(ModelError, match="9 elastic modes"):
-        design_kalman(sampled(modes.select(range(20))), larger=modes.select(range(12)))
+        design_kalman(sampled(modes.select(range(20))).replace(evaluation=modes.select(range(12))))
     undamped = modes.replace(zeta=np.where(np.arange(30) < 12, modes.zeta, 0.0))
     with pytest.raises(ModelError, match="no damping"):
-        design_kalman(plant, larger=undamped)
-    found = design_kalman(plant, larger=modes)
+        design_kalman(plant.replace(evaluation=undamped))
+    found = design_kalman(plant.replace(evaluation=modes))
     with pytest.raises(LabelError, match="channel of y"):
         found.rms("die", on=sampled(modes, ports(y=ports().y[:3])))
     with pytest.raises(ModelError, match="sampling time"):
@@ -325,7 +335,7 @@ def test_predicted_within_five_percent_on_machines_of_another_mesh(kind, zeta, l
 
 
 def test_densities_changed_afterwards_are_those_of_modes_left_out_too():
-    """`plant.replace(asd=)` and ports of that density: one error of the filter, larger or not."""
+    """`plant.replace(asd=)` and ports of that density: one error of the filter, judged or not."""
     modes = solve_modes(chain(masses=[1.0] * 4, stiffnesses=[4e5] * 3), count=4,
                         damping=ModalDamping(0.01))  # fmt: skip
     own = three_masses().assembled.ports
@@ -335,8 +345,10 @@ def test_densities_changed_afterwards_are_those_of_modes_left_out_too():
         return assemble_plant(given, used).discretized(2e3, delay=1)
 
     few, asd = modes.select([0, 1, 2]), made(modes, loud).asd
-    wanted = design_kalman(made(few, loud), larger=made(modes, loud)).rms("die:x")
+    wanted = design_kalman(made(few, loud).replace(evaluation=made(modes, loud))).rms("die:x")
     plant, whole = (made(given, own).replace(asd=asd) for given in (few, modes))
-    for larger in (whole, modes):
-        assert design_kalman(plant, larger=larger).rms("die:x") == pytest.approx(wanted, rel=1e-9)
-    assert design_kalman(made(few, own), larger=modes).rms("die:x") < 0.5 * wanted
+    for judge in (whole, modes):
+        assert design_kalman(plant.replace(evaluation=judge)).rms("die:x") == pytest.approx(
+            wanted, rel=1e-9
+        )
+    assert design_kalman(made(few, own).replace(evaluation=modes)).rms("die:x") < 0.5 * wanted

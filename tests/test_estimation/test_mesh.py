@@ -1,4 +1,4 @@
-"""Predicted errors and the mesh of the larger model, beside a plate of a finer mesh."""
+"""Predicted errors and the mesh of the evaluation model, next to a plate of a finer mesh."""
 
 import warnings
 
@@ -75,14 +75,14 @@ def test_modes_have_the_mesh_of_their_model(kind):
 
 
 @pytest.mark.slow
-def test_a_coarse_mesh_is_warned_of_in_every_form_of_the_larger_model():
+def test_a_coarse_mesh_is_warned_of_in_every_form_of_the_evaluation_model():
     coarse = plate(8)
     modes = solve_modes(coarse, count=100)
     small, plant = sampled(reduce(modes, ModalTruncation(24))), sampled(modes.select(range(24)))
     shares = []
-    for given, larger in ((plant, coarse), (plant, modes), (small, None)):
-        with pytest.warns(FlexplantWarning, match="finer mesh as larger="):
-            shares.append(design_kalman(given, larger=larger).certificate.unresolved)
+    for given in (plant.replace(evaluation=coarse), plant.replace(evaluation=modes), small):
+        with pytest.warns(FlexplantWarning, match="evaluation= of a finer mesh"):
+            shares.append(design_kalman(given).certificate.unresolved)
     assert shares == pytest.approx([shares[0]] * 3, abs=0.1)
 
 
@@ -90,12 +90,12 @@ def test_a_coarse_mesh_is_warned_of_in_every_form_of_the_larger_model():
 def test_a_mesh_that_is_too_coarse_is_warned_of_and_one_that_is_fine_is_not():
     truth = sampled(solve_modes(plate(20), count=150))
     coarse, fine = plate(8), plate(12)
-    with pytest.warns(FlexplantWarning, match="finer mesh as larger="):
-        wrong = design_kalman(sampled(solve_modes(coarse, count=24)), larger=coarse)
+    with pytest.warns(FlexplantWarning, match="evaluation= of a finer mesh"):
+        wrong = design_kalman(sampled(solve_modes(coarse, count=24)).replace(evaluation=coarse))
     assert wrong.rms("die") > 1.25 * wrong.rms("die", on=truth)
     assert wrong.certificate.unresolved > 0.5 and "nodes of the mesh" in repr(wrong)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        right = design_kalman(sampled(solve_modes(fine, count=24)), larger=fine)
+        right = design_kalman(sampled(solve_modes(fine, count=24)).replace(evaluation=fine))
     assert right.rms("die") == pytest.approx(right.rms("die", on=truth), rel=0.05, abs=0)
     assert right.certificate.unresolved < 0.15 and "nodes" not in repr(right)

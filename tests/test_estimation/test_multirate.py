@@ -28,7 +28,7 @@ def test_variances_are_those_of_the_recursion_in_the_long_run():
     np.testing.assert_allclose(found.variances, wanted, rtol=1e-6)
     assert found.period == 12
     assert found.certificate.difference < 1e-6
-    fastest, slowest = design_kalman(plant, larger=plant), design_multirate(plant, {"y3": 12})
+    fastest, slowest = design_kalman(plant), design_multirate(plant, {"y3": 12})
     assert fastest.rms("die") < found.rms("die")
     assert min(found.rms("die", k) for k in range(12)) < max(found.rms("die", k) for k in range(12))
     assert slowest.rms("die") > fastest.rms("die")
@@ -36,7 +36,7 @@ def test_variances_are_those_of_the_recursion_in_the_long_run():
 
 def test_all_sensors_in_each_sample_is_the_kalman_filter():
     plant = plate_plant(1e-2, count=8)
-    kalman, found = design_kalman(plant, larger=plant), design_multirate(plant, {"y1": 1})
+    kalman, found = design_kalman(plant), design_multirate(plant, {"y1": 1})
     assert found.rms("die") == pytest.approx(kalman.rms("die"), rel=1e-8, abs=0)
     scale = np.abs(kalman.gain).max()
     np.testing.assert_allclose(found.gains[0], kalman.gain, atol=1e-7 * scale)

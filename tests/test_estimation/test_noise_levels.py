@@ -47,7 +47,7 @@ def test_known_levels_from_50000_samples():
     assert found.slope < 1e-3
     assert found.plant.asd == pytest.approx(dict(found.asd), rel=1e-12)
     # with these levels the record is consistent
-    observer = design_kalman(found.plant, larger=found.plant)
+    observer = design_kalman(found.plant)
     assert consistency(observer, observer.estimate(records)).holds
 
 
@@ -116,7 +116,7 @@ def chain_record(count, rate, seed, duration=4.0):
     own = three_masses().assembled.ports
     sensors = [Sensor("y1", at="1:x", asd=1e-12), Sensor("y2", at=f"{count}:x", asd=3e-12)]
     truth = assemble_plant(every, own.replace(y=sensors)).discretized(rate, delay=1)
-    observer = design_kalman(truth, larger=truth)
+    observer = design_kalman(truth)
     servo = design_servo(truth, bandwidth=20.0, observer=observer)
     run = simulate(close_loop(truth, observer, servo), duration=duration, rng=seed)
     return truth, every, run
@@ -127,11 +127,11 @@ def chain_record(count, rate, seed, duration=4.0):
     ("count", "kept", "rate", "kind"), [(5, 3, 2e3, "modes"), (8, 4, 1e4, "plant")]
 )
 def test_modes_left_out_are_no_noise_of_the_sensors(count, kept, rate, kind):
-    """Given the true densities: without larger= sensors would be 100 times noisier, +- 0.3 %."""
+    """Without an evaluation model sensors would be 100 times noisier, +- 0.3 %."""
     truth, every, run = chain_record(count, rate, seed=1)
     small = every.select(range(kept))
     design = assemble_plant(small, truth.assembled.ports).discretized(rate, delay=1)
-    found = estimate_noise(design, run, larger=every if kind == "modes" else truth)
+    found = estimate_noise(design.replace(evaluation=every if kind == "modes" else truth), run)
     t = found.ratios**2
     stated = 2 * t * list(found.relative.values())
     assert np.all(np.abs(t - 1) < 4 * stated)
@@ -143,7 +143,9 @@ def test_modes_left_out_are_no_noise_of_the_sensors(count, kept, rate, kind):
 
 @pytest.mark.slow
 def test_levels_that_stand_for_modes_left_out_are_warned_of():
-    with pytest.warns(FlexplantWarning, match="do not explain the record.*Pass larger="):
+    with pytest.warns(
+        FlexplantWarning, match="do not explain the record.*Give the plant an evaluation"
+    ):
         blind = estimate_noise(plant(), recorded(plant(count=12))[0])
     assert "a mode left out" in blind.verdict
 

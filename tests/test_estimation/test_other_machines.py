@@ -16,7 +16,7 @@ from oracles_estimation import error_covariance, mean_square_and_its_error
 def observer():
     """Designed on 8 modes at 1 %."""
     plant = plate_plant(1e-2, count=8, sensor_asd=1e-11)
-    return fx.design_kalman(plant, plant)
+    return fx.design_kalman(plant.replace(evaluation=None))
 
 
 @cache
@@ -93,7 +93,9 @@ def test_in_a_closed_loop_a_simulation_has_the_same_error():
 
 def test_an_observer_beside_a_loop_and_what_is_refused():
     kalman, law = observer(), servo()
-    other = fx.design_kalman(kalman.plant.replace(origin=kalman.plant.origin), kalman.plant)
+    other = fx.design_kalman(
+        kalman.plant.replace(origin=kalman.plant.origin).replace(evaluation=kalman.plant)
+    )
     loop = fx.close_loop(machine(), kalman, law)
     assert other.rms("die", on=loop) == pytest.approx(kalman.rms("die", on=loop), rel=1e-9, abs=0)
     loud = fx.design_kalman(plate_plant(1e-2, count=8, sensor_asd=1e-10))
@@ -126,8 +128,8 @@ def scattered(part, count=12):
 
 @pytest.mark.slow
 def test_half_a_percent_of_frequency_doubles_the_error_and_the_table_shows_it():
-    kalman = fx.design_kalman(light(), light())
-    named = {"Kalman": kalman, "static": design_static(light(), light())}
+    kalman = fx.design_kalman(light().replace(evaluation=None))
+    named = {"Kalman": kalman, "static": design_static(light().replace(evaluation=None))}
     table = errors_on_machines(named, scattered(5e-3), "die:rx")
     assert np.median(table["Kalman"]) > 2 * table.nominal[0]
     assert table["static"].max() < 1.1 * table.nominal[1]

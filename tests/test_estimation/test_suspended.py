@@ -18,7 +18,6 @@ from flexplant.plant import (
     Ports,
     Sensor,
     assemble_plant,
-    larger_plant,
     suspend,
 )
 from flexplant.reduction import DesiredDofs, ModalTruncation, reduce, select_dofs
@@ -30,7 +29,7 @@ from stages import ports as square_ports
 from stages import sampled as square_sampled
 
 #: meshes are small here: what they do not resolve is the subject of test_mesh
-pytestmark = pytest.mark.filterwarnings("ignore:.*finer mesh as larger=")
+pytestmark = pytest.mark.filterwarnings("ignore:.*evaluation= of a finer mesh")
 
 WIDE, DEEP, THICK = 0.4, 0.3, 0.02
 EDGES = [(x, y, 0.0) for x in (0.0, WIDE) for y in (0.0, DEEP)]
@@ -103,11 +102,12 @@ def exact(plant, observer):
     return error_in_extended_precision(truth, own | {"D": observer.D[:, columns]})
 
 
-def check(plant, larger):
+def check(plant, whole):
     """Design, and hold the predicted variances against extended precision."""
-    found = design_kalman(plant, larger=larger)
+    plant = plant.replace(evaluation=whole)
+    found = design_kalman(plant)
     assert found.certificate.difference < 1e-7
-    expected = exact(larger_plant(plant, larger), found.system)
+    expected = exact(plant.evaluation_plant, found.system)
     np.testing.assert_allclose(found.variances, expected, rtol=1e-6)
     return found
 
@@ -126,7 +126,9 @@ def test_every_order_passes_and_weak_springs_change_little():
         errors = []
         for modes in (plate_modes(), plate_modes(0.0)):
             plant = plate_plant(modes.select(range(count)))
-            found = [design_kalman(plant, larger=modes.select(range(k))) for k in (40, 100)]
+            found = [
+                design_kalman(plant.replace(evaluation=modes.select(range(k)))) for k in (40, 100)
+            ]
             assert max(one.certificate.difference for one in found) < 1e-9
             errors.append([one.variances for one in found])
         np.testing.assert_allclose(errors[0], errors[1], rtol=1e-3)
@@ -155,7 +157,7 @@ def test_dampers_filters_and_delays(reading):
 @pytest.mark.parametrize("stiffness", [10.0, 4650.0, 1e5])
 @pytest.mark.parametrize("method", ["truncation", "dofs"])
 def test_a_reduced_model_on_springs(stiffness, method):
-    """Its suspension is not quite that of the larger model: what is missed counts."""
+    """Its suspension is not quite that of the evaluation model: what is missed counts."""
     modes = plate_modes(0.0).select(range(40))
     how = ModalTruncation(17) if method == "truncation" else DesiredDofs(select_dofs(
         modes.select(range(17)), 17))  # fmt: skip
@@ -185,7 +187,7 @@ def test_dampers_of_a_suspension_damp_the_modes_left_out_as_well():
 def test_the_certificate_states_the_digits_that_hold(damping):
     """Rounding of the damping that a mode hardly has is in both routes: it is added."""
     plant, truth = suspended_plants(damping)
-    observer = design_kalman(plant, larger=plant).system
+    observer = design_kalman(plant).system
     if damping < 1e-2:
         with pytest.warns(FlexplantWarning, match=r"modes at .* Hz .* fx\.plant\.GroundSpring\("):
             found = error_variances(truth, observer)
@@ -198,4 +200,4 @@ def test_the_certificate_states_the_digits_that_hold(damping):
 def test_a_suspension_without_damping_is_refused_where_the_two_models_differ():
     plant, truth = suspended_plants(damping=1e-10)
     with pytest.raises(AssumptionError, match=r"grows without limit.*fx\.plant\.GroundSpring\("):
-        design_kalman(plant, larger=plant).rms("die:z", on=truth)
+        design_kalman(plant).rms("die:z", on=truth)

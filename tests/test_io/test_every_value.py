@@ -151,7 +151,7 @@ def made():
     yield from (placement.Excluded(disc), placement.Within(disc, at_most=1), placement.OffPoi(0.1))
     yield from (placement.ModalObservability("trace"), placement.ModalControllability())
     loss = placement.AfterLoss(fx.PoiVariance("die", lag=fx.FixedLag(3), measure="max"))
-    yield from (loss, placement.Penalised(loss, placement.LeftOutModes(modes), 0.5))
+    yield from (loss, placement.Penalised(loss, placement.LeftOutModes(), 0.5))
     yield from (placement.SensorIndices("hinf"), placement.ActuatorIndices("hankel"))
     yield from (placement.ModeInformation(), placement.AutoMac(), placement.KineticEnergy(fe))
     yield from (placement.ClosedLoopH2("die"), placement.HinfLevel({"die:z": 1e6}))

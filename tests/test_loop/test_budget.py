@@ -162,7 +162,7 @@ def test_modes_left_out_are_in_where_they_are_known():
     modes, more = some_modes(0.01, 8, attached=False), some_modes(0.01, 24, attached=False)
     plant = sampled(modes)
     blocks = fx.design_static(plant), fx.design_servo(plant, bandwidth=20.0)
-    loop = fx.close_loop(plant, *blocks, larger=more)
+    loop = fx.close_loop(plant.replace(evaluation=more), *blocks)
     whole = fx.close_loop(sampled(more), *blocks)
     found = loop.budget("die:error")
     assert found.left_out == pytest.approx(whole.rms("die:error"), rel=1e-9, abs=0)

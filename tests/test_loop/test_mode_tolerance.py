@@ -244,7 +244,7 @@ def test_modes_left_out_are_off_too_on_machines_drawn():
     """
     few = sampled(some_modes(ZETA, 12, attached=False), ports(asd=1e-2))
     known = few.uncertain(frequency=0.002)
-    short = fx.close_loop(few, *loop().blocks, larger=plant())
+    short = fx.close_loop(few.replace(evaluation=plant()), *loop().blocks)
     found = short.mode_tolerances(known=known, draws=12, rng=3).draws
     stable, g = [], plant().continuous.system
     for own in np.random.default_rng(3).spawn(12):

@@ -200,14 +200,15 @@ def test_screening_finds_what_every_subset_shows():
         z=[Poi("die", at=(0.2, 0.15, 0.0), axes=("z", "rx", "ry"))],
         y=sensors[:3],
     )
-    plant = assemble_plant(few, ports).discretized(4e3, delay=1)
-    goal = PoiVariance("die", larger=many)
-    screen = Screened(OverMachines(PoiVariance("die"), [plant]), keep=12)
+    plant = assemble_plant(few, ports, evaluation=many).discretized(4e3, delay=1)
+    goal = PoiVariance("die")
+    screen = Screened(OverMachines(PoiVariance("die"), [plant.replace(evaluation=None)]), keep=12)
     found = place_sensors(plant, sensors[:7], 4, goal, method=screen)
     every = place_sensors(plant, sensors[:7], 4, goal, method=Exhaustive())
     assert (found.chosen, found.value) == (every.chosen, every.value)
     assert found.evaluations <= 12 < every.evaluations
-    alone = place_sensors(plant, sensors[:7], 4, PoiVariance("die"))
+    own = PoiVariance("die", own_modes=True)
+    alone = place_sensors(plant, sensors[:7], 4, own)
     assert alone.value < found.value
 
 

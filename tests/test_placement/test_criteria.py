@@ -100,28 +100,27 @@ def test_modes_left_out_count_as_in_the_filter():
     """The score of a choice is the claim of the filter on a plant assembled with these sensors."""
     many = some_modes(count=40, attached=False)
     few = many.select(range(12))
-    plant, own = sampled(few), ports().y
-    goal, candidates = PoiVariance("die", larger=many), [*own, Sensor("mid", at=(0.3, 0.0, 0.0))]
+    plant, own = sampled(few).replace(evaluation=many), ports().y
+    goal, candidates = PoiVariance("die"), [*own, Sensor("mid", at=(0.3, 0.0, 0.0))]
     candidates[-1] = candidates[-1].replace(asd=own[0].asd)
     names = [sensor.name for sensor in candidates]
     sets = [names[:3], names[:4], names]
     found = score_sensors(plant, sets, goal, candidates=candidates)
     for layout, value in zip(found.layouts, found.values, strict=True):
         chosen = ports(y=[s for s in candidates if s.name in layout])
-        claim = design_kalman(sampled(few, chosen), larger=many).rms("die")
+        claim = design_kalman(sampled(few, chosen).replace(evaluation=many)).rms("die")
         assert np.sqrt(value) == pytest.approx(claim, rel=1e-9, abs=0.0)
-        on = design_kalman(sampled(few, chosen), larger=many).rms("die", on=sampled(many, chosen))
+        on = design_kalman(sampled(few, chosen).replace(evaluation=many)).rms(
+            "die", on=sampled(many, chosen)
+        )
         assert claim == pytest.approx(on, rel=1e-9, abs=0.0)
     alone = score_sensors(plant, sets, PoiVariance("die", own_modes=True), candidates=candidates)
     assert alone.values[0] < 0.5 * found.values[0]
     # a reduced model's own modes left out count by default, and no bound is claimed
     reduced = reduce(many, ModalTruncation(12))
     default = sampled(reduced)
-    assert PoiVariance("die")(default) == pytest.approx(goal(default), rel=1e-9, abs=0.0)
+    judged = goal(default.replace(evaluation=many))
+    assert goal(default) == pytest.approx(judged, rel=1e-9, abs=0.0)
     search = Exchange(starts=1)
     best = place_sensors(default, candidates, 4, PoiVariance("die"), method=search, rng=1)
     assert best.bound == -np.inf and "no bound" in repr(best)
-    with pytest.raises(ModelError, match="gets a plant of its own: pass a structure"):
-        PoiVariance("die", larger=plant)
-    with pytest.raises(ModelError, match="pass one"):
-        PoiVariance("die", larger=many, own_modes=True)

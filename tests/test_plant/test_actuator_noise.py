@@ -47,8 +47,8 @@ def test_noise_of_amplifiers_is_that_of_doubled_ones_without_their_states():
     rms = [fx.design_kalman(plant).rms("die") for plant in (double, single)]
     assert rms[0] == pytest.approx(rms[1], rel=1e-7, abs=0)
     # the modes left out are moved by it, too
-    larger = some_modes(count=40, attached=False)
-    both = [fx.design_kalman(plant, larger=larger) for plant in (double, single)]
+    whole = some_modes(count=40, attached=False)
+    both = [fx.design_kalman(plant.replace(evaluation=whole)) for plant in (double, single)]
     assert both[0].certificate.left_out == both[1].certificate.left_out > 0
     assert both[0].rms("die") == pytest.approx(both[1].rms("die"), rel=1e-7, abs=0)
     assert both[0].rms("die") > 1.001 * rms[0]
@@ -79,5 +79,5 @@ def test_weights_placement_and_refusals():
         fx.design_kalman(fx.assemble_plant(reduced(), shaken).discretized(RATE, delay=1))
     # and the compliance of modes left out does not answer white noise at once
     late = fx.assemble_plant(reduced(), bare).discretized(RATE, delay=1)
-    found = fx.design_kalman(late, larger=some_modes(count=40, attached=False))
+    found = fx.design_kalman(late.replace(evaluation=some_modes(count=40, attached=False)))
     assert found.certificate.left_out > 0

@@ -224,7 +224,7 @@ def test_a_periodic_force():
     few = reduce(some_modes(attached=False), ModalTruncation(12))
     plant = sampled(few, base.replace(w=[*base.w, fan]))
     assert h2_norm(fan.filter) / np.sqrt(2) == pytest.approx(np.hypot(*rms), rel=0.05)
-    with_fan, without = (design_kalman(one, larger=one) for one in (plant, plant.with_ports(base)))
+    with_fan, without = (design_kalman(one) for one in (plant, plant.with_ports(base)))
     assert with_fan.rms("die") > 1.001 * without.rms("die")
     assert with_fan.system.n_states == without.system.n_states + 2 * len(rms)
     loop = close_loop(plant, with_fan, design_servo(plant, bandwidth=20.0, observer=with_fan))

@@ -22,7 +22,7 @@ from flexplant.plant import (
     assemble_plant,
     neglected_modes,
 )
-from flexplant.plant.larger_plant import damped_less, draws_with_left_out
+from flexplant.plant.drawn_machines import damped_less, draws_with_left_out
 from flexplant.testbeds import wafer_stage
 from flexplant.updating import AddedDamping, AddedMass, Eigenvalues, update
 from oracles_plant import machine, motion_row, undamped, z_row

@@ -1,4 +1,4 @@
-"""MachinePipeline takes what its parts take: delays, larger models, damping of large ones."""
+"""MachinePipeline takes what its parts take: delays, evaluation models, damping of large ones."""
 
 from functools import cache
 
@@ -91,7 +91,7 @@ def test_damping_of_a_model_that_is_large():
     with pytest.raises(ModelError, match="too large for 5002 DOFs"):
         large.with_damping(LAW)
     rows = [
-        pipeline(full=large, damping=LAW, larger=4)(machine(0.1), 1),
+        pipeline(full=large, damping=LAW, evaluation_modes=4)(machine(0.1), 1),
         pipeline(full=fx.solve_modes(large, count=4, damping=LAW))(machine(0.1), 1),
     ]
     for row in rows:

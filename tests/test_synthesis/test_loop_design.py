@@ -85,13 +85,13 @@ def test_modes_left_out_are_checked():
     """Tuned on 12 modes up to 1.3 kHz: the loop reaches those above."""
     P = sampled(small(12), ports(references=[]))
     gentle = Pid.corners(300.0, zero=3.0, pole=50.0) * LowPass(100.0)
-    fine = design_loops(P, gentle, larger=many(), references={"cog:z": "z:ref"})
+    fine = design_loops(P.replace(evaluation=many()), gentle, references={"cog:z": "z:ref"})
     assert fine.system.inputs[-1] == "z:ref"  # which takes no part in the loop
     assert fine.left_out is not None and fine.left_out.is_fine
     fast = tune_loops(P, notches=0)
     with pytest.warns(FlexplantWarning, match="with the modes that the plant left out"):
-        assert not design_loops(P, fast.laws, larger=many()).left_out.is_fine
-    known = tune_loops(P, larger=many(), notches=0)
+        assert not design_loops(P.replace(evaluation=many()), fast.laws).left_out.is_fine
+    known = tune_loops(P.replace(evaluation=many()), notches=0)
     assert known.report.is_stable
     assert min(known.left_out.modulus_margin, known.left_out.without) >= 0.5
 

@@ -107,10 +107,9 @@ def test_the_stage_in_decoupled_axes():
     assert loop.is_stable
     assert loop.modulus_margin > 0.3
     fine = design_ncf(
-        sampled(small(), ports(references=[])),
+        sampled(small(), ports(references=[])).replace(evaluation=many()),
         before=axes.accelerations,
         after=axes.to_motions,
         bandwidth=20.0,
-        larger=many(),
     )
     assert fine.left_out is not None

@@ -192,16 +192,16 @@ def test_where_the_estimate_leans_on_the_model_a_bandwidth_is_found(asd):
 
 @pytest.mark.slow
 def test_modes_left_out_count():
-    """The truth as the larger plant; a higher rate's roll-off reaches its modes less."""
+    """The truth as the evaluation model; a higher rate's roll-off reaches its modes less."""
     plant, static, _ = updated()
-    servo = design_servo(plant, bandwidth=50.0, observer=static, larger=truth())
+    servo = design_servo(plant.replace(evaluation=truth()), bandwidth=50.0, observer=static)
     assert servo.left_out.is_stable
     radius = dense(truth(), static.system, servo.system)
     key = "spectral radius with modes left out"
     assert servo.certificate[key] == pytest.approx(radius, abs=1e-7)
     quick = {"rolloff": 4000.0, "notches": (), "observer": static}
     reach = servo_bandwidth(plant, **quick)
-    with_all = servo_bandwidth(plant, **quick, larger=truth())
+    with_all = servo_bandwidth(plant.replace(evaluation=truth()), **quick)
     assert with_all <= reach * (1 + 1e-9)
 
 

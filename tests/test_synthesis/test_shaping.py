@@ -142,7 +142,7 @@ def dense_radius(plant, K):
 def test_the_stage_with_the_modes_left_out():
     """24 of 60 modes in the design: held at 25 Hz with all of them; eigenvalues of the whole."""
     P = sampled(small(), ports())
-    found = shape_loop(P, bandwidth=25.0, rolloff=400.0, larger=many())
+    found = shape_loop(P.replace(evaluation=many()), bandwidth=25.0, rolloff=400.0)
     assert [one.crossovers[0] for one in found.report.loops] == pytest.approx([25.0] * 3, rel=0.03)
     assert found.controller.left_out.is_fine
     whole = assemble_plant(many(), ports()).discretized(RATE, delay=1)
@@ -163,7 +163,9 @@ def test_the_stage_follows_its_reference():
     row, column = P.z.index("die:z"), P.w.index("die:ref")
     assert gain[row, column, 0] == pytest.approx(1.0, abs=5e-3)
     with pytest.warns(FlexplantWarning, match="with the modes that the plant left out"):
-        shape_loop(sampled(small(12), ports()), bandwidth=120.0, model=100.0, larger=many())
+        shape_loop(
+            sampled(small(12), ports()).replace(evaluation=many()), bandwidth=120.0, model=100.0
+        )
 
 
 @pytest.mark.slow

@@ -250,13 +250,14 @@ def test_the_search_judges_the_modes_left_out():
         references=[fx.Reference("die")],
     )
     plant = fx.assemble_plant(fit.calibrated(poles), own).discretized(RATE, delay=one.delay)
-    uncertain = plant.uncertain(frequency=fit.frequency_uncertainty(poles))
-    fast = fx.design_stage(uncertain, bandwidth=100.0)
+    off = fit.frequency_uncertainty(poles)
+    fast = fx.design_stage(plant.uncertain(frequency=off), bandwidth=100.0)
     assert fx.close_loop(plant, fast).modulus_margin >= 0.4
+    judged = plant.replace(evaluation=whole)
     with pytest.raises(InfeasibleError, match="150 Hz gives a loop"):
-        fx.design_stage(uncertain, bandwidth=100.0, larger=whole)
-    controller = fx.design_stage(uncertain, bandwidth=70.0, larger=whole)
-    promised = fx.close_loop(plant, controller, larger=whole)
+        fx.design_stage(judged.uncertain(frequency=off), bandwidth=100.0)
+    controller = fx.design_stage(judged.uncertain(frequency=off), bandwidth=70.0)
+    promised = fx.close_loop(judged, controller)
     assert promised.modulus_margin > promised.completed.modulus_margin >= 0.4
     loop = one.loop(own, controller)
     assert loop.is_stable
@@ -283,10 +284,9 @@ def test_predicted_errors_are_those_of_unseen_machines():
         fine = fx.kirchhoff_plate(elements=(40, 40), **DRAWN | {"youngs_modulus": modulus})
         loaded = fine.with_parts(fx.PointMass(fine.dofs.nearest((0.3, 0.15, 0.0), "z"), mass))
         full = fx.solve_modes(loaded, count=160, damping=fx.ModalDamping(0.001))
-        plant = fx.assemble_plant(fit.calibrated(measured), ports())
-        design = fx.design_kalman(
-            plant.discretized(RATE, delay=one.delay), larger=full.calibrated(measured)
-        )
+        judge = full.calibrated(measured)
+        plant = fx.assemble_plant(fit.calibrated(measured), ports(), evaluation=judge)
+        design = fx.design_kalman(plant.discretized(RATE, delay=one.delay))
         truth = fx.assemble_plant(one.truth, ports()).discretized(RATE, delay=one.delay)
         off += [design.rms(side, on=truth) / design.rms(side) - 1.0 for side in sides]
     assert np.abs(off).max() < 0.1

@@ -156,10 +156,11 @@ def test_what_a_loop_promises_is_kept_on_the_machine():
     """Margin within 5 %, errors of the die in six axes within 5 %: bricks against polynomials."""
     _, full = drawn()
     one = fx.testbeds.magnet_stage(individual=2)
-    plant = fx.assemble_plant(full.select(range(26)), ports()).discretized(RATE, delay=one.delay)
-    observer = fx.design_kalman(plant, larger=full)
-    servo = fx.design_servo(plant, bandwidth=70.0, observer=observer, larger=full)
-    promised = fx.close_loop(plant, observer, servo, larger=full)
+    plant = fx.assemble_plant(full.select(range(26)), ports(), evaluation=full)
+    plant = plant.discretized(RATE, delay=one.delay)
+    observer = fx.design_kalman(plant)
+    servo = fx.design_servo(plant, bandwidth=70.0, observer=observer)
+    promised = fx.close_loop(plant, observer, servo)
     kept = one.loop(ports(), observer, servo)
     assert kept.is_stable
     assert kept.modulus_margin > 0.95 * promised.modulus_margin
@@ -173,11 +174,12 @@ def test_a_tolerant_controller_holds_on_a_machine_of_another_formulation():
     _, full = drawn()
     one = fx.testbeds.magnet_stage(individual=2)
     own = ports().replace(references=[fx.Reference("die")])
-    plant = fx.assemble_plant(full.select(range(14)), own).discretized(RATE, delay=one.delay)
+    plant = fx.assemble_plant(full.select(range(14)), own, evaluation=full)
+    plant = plant.discretized(RATE, delay=one.delay)
     off = plant.uncertain(frequency=0.005)
     assert list(off.frequencies) == list(range(7, 15))
-    controller = fx.design_stage(off, bandwidth=60.0, larger=full)
-    promised = fx.close_loop(plant, controller, larger=full).completed
+    controller = fx.design_stage(off, bandwidth=60.0)
+    promised = fx.close_loop(plant, controller).completed
     machine_loop = one.loop(own, controller)
     assert promised.modulus_margin > 0.4
     assert machine_loop.is_stable

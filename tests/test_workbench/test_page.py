@@ -314,12 +314,13 @@ def test_with_a_plant_the_page_shows_the_error_and_the_modes_left_out():
     model = fx.chain(masses=[1.0] * 4, stiffnesses=[4e5] * 3)
     modes = fx.solve_modes(model, count=4, damping=fx.ModalDamping(0.01))
     ports = fx.testbeds.three_masses().assembled.ports
-    plant = fx.assemble_plant(modes.select([0, 1]), ports).discretized(2e3, delay=1)
-    bench = fx.workbench(plant, larger=modes, open_browser=False)
+    plant = fx.assemble_plant(modes.select([0, 1]), ports, evaluation=modes)
+    plant = plant.discretized(2e3, delay=1)
+    bench = fx.workbench(plant, open_browser=False)
     page = Page(bench)
     assert bench.design.references == {"cog:x": "die:ref"}
     K = page.design.controller()
-    loop = fx.close_loop(plant, K, larger=modes)
+    loop = fx.close_loop(plant, K)
     answer = page.answer
     assert answer.channel == "die:error"
     assert answer.rms == pytest.approx(loop.rms("die:error"), rel=1e-9)

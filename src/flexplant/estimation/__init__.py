@@ -1,7 +1,7 @@
 """Estimation: the motion at a point of interest from sensors elsewhere.
 
-- `design_kalman(plant, larger=)`: the stationary filter of the POIs; modes left out of the plant
-  count as noise where a larger model is given.
+- `design_kalman(plant)`: the stationary filter of the POIs; the modes that the plant lacks of its
+  evaluation model count as noise.
 - `KalmanEstimator.rms(channel)`: the predicted error; ``rms(channel, on=other_plant)``: elsewhere.
 - `KalmanEstimator.estimate(records)`: recorded data (`FixedLag`, `Smoother`, gaps, outliers, a
   moving POI); ``step(y, u)`` runs sample by sample.
@@ -14,17 +14,17 @@
 >>> observer = fx.design_kalman(plant)
 >>> print(observer)
 <KalmanEstimator: 7 states, 2 sensors, spectral radius 0.960145
-  rms error die:x 1.88 nm (modes left out are not known: truncation is not in these numbers)>
+  rms error die:x 1.88 nm (not judged on a larger model: truncation is not in these numbers)>
 >>> static = fx.design_static(plant)
 >>> round(static.rms("die:x") / observer.rms("die:x"), 1)
 25.9
 
-**How good is a predicted error?** As good as the larger model, mesh errors of its modes included.
-On a plate of 0.6 m x 0.6 m 8 x 8 elements predict the error of z on finer meshes within 6 %, that
-of rotations within 23 %; on one of 0.5 m x 0.3 m they predict z 65 % too large, since other shapes
-mix in modes of almost one frequency above 10 kHz. There 12 x 12 elements are within 5 % for z,
-beside 24 x 24. The certificate states which share of a variance is from modes left out with fewer
-than 4 nodes of their mesh per wavelength (``unresolved``); more than half warns.
+**How good is a predicted error?** As good as the evaluation model, errors of its mesh included. On
+a plate of 0.6 m x 0.6 m 8 x 8 elements predict the error of z on finer meshes within 6 %, that of
+rotations within 23 %; on one of 0.5 m x 0.3 m they predict z 65 % too large, since other shapes mix
+in modes of almost one frequency above 10 kHz. There 12 x 12 elements are within 5 % for z, beside
+24 x 24. The certificate states which share of a variance is from modes left out with fewer than 4
+nodes of their mesh per wavelength (``unresolved``); more than half warns.
 
 Names elsewhere: ``kalman``, ``lqe`` (MATLAB, python-control), filterpy
 (`KalmanEstimator.to_filterpy`).

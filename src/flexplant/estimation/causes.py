@@ -216,7 +216,7 @@ def peak_verdicts(
     before: Examined,
 ) -> list[LikelyCause]:
     """Return the verdicts of peaks beyond the pooled `level` (m,); U (m, nu) are the commands."""
-    # `whole` is the larger plant with the numbers of the modes left out, where it is known. Of the
+    # `whole` is the evaluation plant with the numbers of the modes left out, or None. Of the
     # highest peak any cause, of the others only whether a kept mode has changed
     plant, rate = observer.plant, 1.0 / observer.plant.dt
     kept = sampled_modes(plant)
@@ -313,7 +313,7 @@ def _phrase(peak: ExcessPeak, rate: float) -> str:
 
 
 def left_modes(whole: StandardPlant, numbers: IntArray) -> SampledModes:
-    """Return the modes left out of a larger plant."""
+    """Return the modes left out of an evaluation plant."""
     every = sampled_modes(whole)
     at = np.flatnonzero(np.isin(every.numbers, numbers))
     return SampledModes(every.numbers[at], every.freq[at])
@@ -326,9 +326,9 @@ def _left_out_mode(observer: KalmanEstimator, left: SampledModes, at: float) -> 
     i = int(np.argmin(np.abs(seen - at)))
     if abs(seen[i] - at) > _NEAR * at:
         return None
-    name = f"{left.named(i)} in the larger model), which the plant leaves out"
+    name = f"{left.named(i)} in the evaluation model), which the plant leaves out"
     cure = (
-        "give design_kalman(larger=), so that it counts as noise"
+        "give the plant an evaluation model, so that it counts as noise"
         if observer.left_out is None
         else "leave it: it counts as white noise in this filter"
     )
@@ -341,18 +341,18 @@ def _left_out_mode(observer: KalmanEstimator, left: SampledModes, at: float) -> 
 def known_verdict(
     observer: KalmanEstimator, left: SampledModes, parts: InnovationParts, freq: FloatArray
 ) -> LikelyCause:
-    """Return the verdict of innovations that are those of the larger plant, as they should be."""
+    """Return the verdict of innovations that are those of the evaluation plant."""
     rate = 1.0 / observer.plant.dt
     at = float(freq[np.argmax(parts.pooled.sum(axis=0))]) * rate
     i = int(np.argmin(np.abs(folded(left.freq, rate) - at)))
     end = (
-        "Keep more modes, or give design_kalman(larger=), so that they count as noise."
+        "Keep more modes, or give the plant an evaluation model, so that they count as noise."
         if observer.left_out is None
         else "These count as white noise in this filter: its predicted errors hold."
     )
     return LikelyCause(
         "folding" if left.freq[i] > 0.5 * rate else "truncation",
-        "the innovations are those of the larger model: the plant is right, they are coloured by "
-        f"the {counted(left.freq.size, 'mode')} left out (most at {at:.4g} Hz, next to "
-        f"{left.named(i)} in the larger model)). {end}",
+        "the innovations are those of the evaluation model: the plant is right, they are coloured "
+        f"by the {counted(left.freq.size, 'mode')} left out (most at {at:.4g} Hz, next to "
+        f"{left.named(i)} in the evaluation model)). {end}",
     )

@@ -11,8 +11,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, Value, between, instance, real_array, short
 from ..errors import ModelError, ShapeError, counted
 from ..loop import ClosedLoop
-from ..plant import StandardPlant, larger_plant
-from ..plant.realisation import Structure
+from ..plant import StandardPlant
 from .causes import (
     Cause,
     Examined,
@@ -52,10 +51,10 @@ from .moved_modes import ModeChange, MovedModes, moved_modes
 _FEWEST = 200
 #: tests that share the level
 _TESTS = 5
-#: samples that are compared with a larger plant: its response is computed at each of their lines
+#: samples that are compared with an evaluation plant, whose response is computed at each line
 _COMPARED = 32768
-#: the innovations are those of the larger plant unless it is this unlikely: they fail as those of
-#: the plant already, so that a failure by chance would name a cause that is none
+#: p-value below which innovations are not those of the evaluation plant; small, since they have
+#: failed as those of the plant already
 _AGREES = 1e-4
 #: steps of the fit of two noise levels, and what keeps it regular where one of them is not seen
 _SCORING, _RIDGE = 40, 1e-9
@@ -143,7 +142,6 @@ def consistency(
     observer: KalmanEstimator | ClosedLoop,
     estimate: Estimate | Any,
     *,
-    larger: StandardPlant | Structure | None = None,
     truth: Any = None,
     level: float = 0.95,
 ) -> Consistency:
@@ -160,7 +158,7 @@ def consistency(
 
     What these make is taken away, the rest has one more cause:
 
-    - coloured as on the larger plant, where modes left out are known: the plant is right and its
+    - coloured as on the evaluation model, where there is one: the plant is right and its
       *truncation*, or the *folding* of modes above half the rate, is what shows;
     - white, NIS off: the *noise level*; the sensors whose innovations are too large are named;
     - coloured, but no more than other levels of process and sensor noise explain (two levels,
@@ -181,8 +179,6 @@ def consistency(
     estimate : Estimate, Response or mapping {channel: (N,) array}
         Of `observer.estimate(records)`; samples that its gate left out are missing ones. Or the
         records themselves: all sensors and commands.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        With the modes left out, as in `design_kalman`. None: what the observer was designed with.
     truth : mapping {channel: (N,) array}, optional
         True motions at POIs, of a simulation or a reference instrument, for the NEES; its interval
         allows for the correlation of the errors over time.
@@ -213,9 +209,7 @@ def consistency(
     'the innovations are white and of the predicted size.'
     """
     if isinstance(observer, ClosedLoop):
-        beyond = observer.larger if larger is None else larger
-        plant = observer.plant
-        observer = design_kalman(plant, larger=plant if beyond is None else beyond)
+        observer = design_kalman(observer.plant)
     is_filter = isinstance(observer, KalmanEstimator)
     if is_filter and hasattr(estimate, "keys") and not isinstance(estimate, Estimate):
         estimate = observer.estimate(estimate)
@@ -250,7 +244,7 @@ def consistency(
     if constant is not None:
         said.append(LikelyCause("offset", constant.text))
         white = settled - constant.mean  # what an offset does at first is no constant
-    whole = _larger_plant(observer, larger)
+    whole = _evaluation_plant(observer)
     if said or whole is not None:
         rest = _tested(observer, white, normal, whole, alpha, u)
     verdicts = _verdicts(observer, rest, whole, estimate.sensors, Examined.of([], whole))
@@ -410,13 +404,10 @@ def _tested(
     )  # fmt: skip
 
 
-def _larger_plant(observer: KalmanEstimator, larger: Any) -> StandardPlant | None:
-    """Return the plant with the modes left out, read like the observer's, or None."""
+def _evaluation_plant(observer: KalmanEstimator) -> StandardPlant | None:
+    """Return the evaluation plant, read like the observer's, or None."""
     plant = observer.plant
-    if larger is None:
-        found = None if observer.left_out is None else observer.left_out.larger
-    else:
-        found = None if larger is plant else larger_plant(plant, larger)
+    found = plant.evaluation_plant if observer.left_out is None else observer.left_out.whole
     return None if found is None else read_alike(plant, found)
 
 

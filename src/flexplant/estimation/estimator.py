@@ -14,6 +14,7 @@ from ..checks import FloatArray, positive, real_array
 from ..errors import ModelError, ShapeError, counted, only_one, require_known
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..plant.evaluation_model import NOT_JUDGED
 from .error import PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels
@@ -76,7 +77,7 @@ class KalmanEstimator(PoiFilter):
     def __repr__(self) -> str:
         count = self.certificate.left_out
         beyond = (
-            "modes left out are not known: truncation is not in these numbers"
+            f"{NOT_JUDGED}: truncation is not in these numbers"
             if count is None
             else f"with {counted(count, 'mode')} left out"
             if count
@@ -86,7 +87,7 @@ class KalmanEstimator(PoiFilter):
         if share is not None and share > NOTED:
             beyond += (
                 f";\n  up to {share:.0%} of a variance is from modes with fewer than {NODES:g} "
-                "nodes of the mesh a wavelength:\n  a finer one for larger= would change it"
+                "nodes of the mesh a wavelength:\n  a finer evaluation model would change it"
             )
         if self.certificate.difference > _STATED:
             beyond += f";\n  variances hold to {self.certificate.difference:.0e}"
@@ -349,8 +350,8 @@ def _model_at(
     moved = plant.with_ports(wider)
     if found is None:
         return filter_model(moved)
-    assert found.larger is not None  # noqa: S101 - left_out sets it
-    whole = found.larger.with_ports(wider)
+    assert found.whole is not None  # noqa: S101 - left_out sets it
+    whole = found.whole.with_ports(wider)
     return filter_model(moved, left_out(moved, whole))
 
 

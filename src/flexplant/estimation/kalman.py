@@ -13,9 +13,8 @@ from ..lti.lyapunov import dual_variances
 from ..lti.riccati import filter_dare, riccati_root
 from ..lti.statespace import System
 from ..parallel import one_thread
-from ..plant import StandardPlant, larger_plant
+from ..plant import StandardPlant
 from ..plant.partition import require_sampled
-from ..plant.realisation import Structure
 from .error import error_variances
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike
@@ -39,17 +38,15 @@ _OWN = 1e-10
 
 
 @one_thread()
-def design_kalman(
-    plant: StandardPlant | System, larger: StandardPlant | Structure | None = None
-) -> KalmanEstimator:
+def design_kalman(plant: StandardPlant | System) -> KalmanEstimator:
     """Return the stationary Kalman filter of the POIs on a sampled plant.
 
     It reads the sensors (not the references) and the applied u, and gives `die:hat` for a POI
     "die": ``observer.rms("die")`` is the error that is predicted, ``close_loop(plant, observer,
-    servo)`` runs it in a loop, ``observer.estimate(records)`` on recorded data. Give `larger`, a
-    model with the modes that the plant left out: their motion then counts as noise, and the
-    predicted error is as good as that model (how good: ``help(flexplant.estimation)``; the
-    equations: `algorithms`).
+    servo)`` runs it in a loop, ``observer.estimate(records)`` on recorded data. The motion of the
+    modes that the plant lacks of its evaluation model counts as noise, and the predicted error is
+    as good as that model (how good: ``help(flexplant.estimation)``; the equations: `algorithms`).
+    Without an evaluation model truncation is not in the predicted error.
 
     Parameters
     ----------
@@ -57,10 +54,6 @@ def design_kalman(
         Sampled: `assemble_plant(model, ports).discretized(rate, delay=1)`, also read `through` a
         static block, decoupled motions say: their noise is then correlated. A system with labels
         lacks noise densities: the error names what gives them.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        The structure with more modes, such as `solve_modes(fit.applied_to(model), count=100)`.
-        None: the modes of the plant's reduced model beyond those it kept; where it has
-        none, truncation is not in the predicted error. The plant itself: no modes are left out.
 
     Returns
     -------
@@ -74,9 +67,9 @@ def design_kalman(
         each sample reaches a sensor directly, w does not excite a rigid-body mode or y does not
         see it.
     ModelError
-        When the plant is weighted or its noise is not known, or the larger model is not larger.
+        When the plant is weighted, its noise is not known, or the evaluation model has fewer modes.
     LabelError
-        When the labels of a system do not name w, u, z and y, or the larger plant has others.
+        When the labels of a system do not name w, u, z and y.
     SolverError
         When no strictly stable filter exists for another reason.
     CertificateError
@@ -85,8 +78,8 @@ def design_kalman(
     Warns
     -----
     FlexplantWarning
-        When more than half of a predicted variance is from modes that the mesh of `larger`
-        resolves badly.
+        When more than half of a predicted variance is from modes that the mesh of the evaluation
+        model resolves badly.
 
     References
     ----------
@@ -103,13 +96,13 @@ def design_kalman(
     require_sampled(plant, "this filter runs at samples")
     check_noises(plant)
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")
-    whole = None if larger is plant else larger_plant(plant, larger)
+    whole = plant.evaluation_plant
     found = None if whole is None else left_out(plant, whole)
     observer = _observer(plant, found)
     certificate = observer.certificate
     if whole is None or found is None:
         return observer.replace(
-            certificate=certificate.replace(left_out=None if larger is None else 0)
+            certificate=certificate.replace(left_out=None if whole is None else 0)
         )
     complete = error_variances(read_alike(plant, whole), observer.system)
     certificate = certificate.replace(

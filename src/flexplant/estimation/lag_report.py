@@ -17,9 +17,8 @@ from ..errors import AssumptionError, FlexplantError, aligned, require_known
 from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
-from ..plant import StandardPlant, larger_plant
+from ..plant import StandardPlant
 from ..plant.partition import require_plain, require_sampled
-from ..plant.realisation import Structure
 from ..plant.rigid_motion import rigid_rows
 from .error import error_variances
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
@@ -239,13 +238,10 @@ class StaticEstimator(Value):
         From the displacement sensors to `die:hat`, ...; no states.
     plant : StandardPlant
         Whose geometry it uses.
-    larger : StandardPlant, optional
-        The plant with the modes left out, where these are known.
     """
 
     system: StateSpace
     plant: StandardPlant
-    larger: StandardPlant | None = None
 
     def __repr__(self) -> str:
         g = self.system
@@ -267,7 +263,7 @@ class StaticEstimator(Value):
         """
         row = row_of(poi_channels(self.plant), channel)
         require_sampled(self.plant, "an rms is of samples")
-        plant = self.larger or self.plant
+        plant = self.plant.evaluation_plant or self.plant
         if on is not None:
             plant = same_pois(self.plant, on)
         held = plant.rigid_motions if plant.is_assembled else None
@@ -275,9 +271,7 @@ class StaticEstimator(Value):
         return float(np.sqrt(found.values[row]))
 
 
-def design_static(
-    plant: StandardPlant, larger: StandardPlant | Structure | None = None
-) -> StaticEstimator:
+def design_static(plant: StandardPlant) -> StaticEstimator:
     """Return the static geometric relation between the displacement sensors and the POIs.
 
     ``hat = R_z R_y^+ y`` with R_y and R_z the rigid-body modes at the sensors and the POIs: the
@@ -288,9 +282,6 @@ def design_static(
     ----------
     plant : StandardPlant
         Assembled from a structure that is free or on weak springs, continuous or sampled.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        The structure with more modes, for the predicted error. None: the modes of the plant's
-        reduced model beyond those it kept.
 
     Returns
     -------
@@ -303,7 +294,7 @@ def design_static(
         When the structure has no rigid-body or suspension mode, or the displacement sensors do
         not determine the POI's rigid-body motion.
     ModelError
-        When the plant is weighted, or the larger one is not sampled alike.
+        When the plant is weighted.
 
     References
     ----------
@@ -335,4 +326,4 @@ def design_static(
         )
     names: Any = {"inputs": used, "outputs": estimates(channels), "units": plant.units}
     system = StateSpace([], [], [], gain, plant.dt, name="static", **names)
-    return StaticEstimator(system, plant, None if larger is plant else larger_plant(plant, larger))
+    return StaticEstimator(system, plant)

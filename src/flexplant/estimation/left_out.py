@@ -1,6 +1,6 @@
 """Modes left out of a filter's model: noise on its sensors and POIs, and a static compliance.
 
-And which of them the mesh of the larger model resolves badly.
+And which of them the mesh of the evaluation model resolves badly.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from ..tolerances import SAME, TINY, divisor
 from .error import error_variances
 from .estimator_channels import poi_channels, read_alike, sensors
 
-#: a mode of the plant is one of the larger plant's within this part of its frequency
+#: a mode of the plant is one of the evaluation model's within this relative difference of frequency
 _SAME = 0.15
 #: how much another shape weighs beside another frequency when modes are paired
 _SHAPE = 0.02
@@ -43,7 +43,7 @@ class LeftOut(Value):
     Parameters
     ----------
     modes : (m,) array of int
-        Numbers of the modes left out, in the larger model, from 1.
+        Numbers of the modes left out, in the evaluation model, from 1.
     sensors : (ny, ny) array
         R_t, their stationary covariance at the sensors.
     pois : (nz, nz) array
@@ -53,7 +53,7 @@ class LeftOut(Value):
     plant : StandardPlant
         The plant whose motions also follow u by the static compliance of the modes left out.
         Shapes that stood for them (attachment vectors) are excited by u only.
-    larger : StandardPlant, optional
+    whole : StandardPlant, optional
         The plant that has the modes: from it the same follows for a POI elsewhere.
 
     Examples
@@ -62,8 +62,8 @@ class LeftOut(Value):
     >>> model = fx.chain(masses=[1.0] * 4, stiffnesses=[4e5] * 3)
     >>> modes = fx.solve_modes(model, count=4, damping=fx.ModalDamping(0.01))
     >>> ports = fx.testbeds.three_masses().assembled.ports
-    >>> plant = fx.assemble_plant(modes.select([0, 1, 2]), ports).discretized(2e3, delay=1)
-    >>> fx.design_kalman(plant, larger=modes).left_out.modes
+    >>> plant = fx.assemble_plant(modes.select([0, 1, 2]), ports, evaluation=modes)
+    >>> fx.design_kalman(plant.discretized(2e3, delay=1)).left_out.modes
     array([4])
     """
 
@@ -72,14 +72,14 @@ class LeftOut(Value):
     pois: FloatArray
     cross: FloatArray
     plant: StandardPlant
-    larger: StandardPlant | None = None
+    whole: StandardPlant | None = None
 
     def __repr__(self) -> str:
         return f"<LeftOut: {counted(self.modes.size, 'mode')} as noise and static compliance>"
 
 
-def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
-    """Return what the modes of a larger plant do that the plant lacks; None when it lacks none.
+def left_out(plant: StandardPlant, whole: StandardPlant) -> LeftOut | None:
+    """Return what the modes do that a plant lacks of an evaluation plant; None when it lacks none.
 
     With the poles lambda of the modes left out, b what white noise of unit intensity drives and c
     what is seen, ``X_ij = - b_i b_j^* / (lambda_i + lambda_j^*)`` is the stationary covariance,
@@ -92,7 +92,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     covariance. Disturbances with a shape drive a mode with their density at its frequency, and
     their slow part moves it statically; filters and delays of sensors act at its pole.
     """
-    own, others_own = plant.assembled, larger.assembled
+    own, others_own = plant.assembled, whole.assembled
     small, big, ports = own.realisation, others_own.realisation, own.ports
     bare = structure_system(small, ports)
     kept = _mode_blocks(small, bare)
@@ -101,8 +101,8 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     genuine = np.setdiff1d(np.arange(kept_omega.size), _of_vectors(small))
     if genuine.size > all_modes.omega.size:
         raise ModelError(
-            f"the larger model has {counted(all_modes.omega.size, 'elastic mode')}, the plant "
-            f"{genuine.size}: it is not larger. Pass more modes of the full structure."
+            f"the evaluation model has {counted(all_modes.omega.size, 'elastic mode')}, fewer than "
+            f"the {genuine.size} of the plant. Pass more modes of the full structure."
         )
     rows, columns = _same_modes(kept, all_modes, genuine)
     others = np.setdiff1d(np.arange(all_modes.omega.size), columns)
@@ -114,7 +114,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     # an acceleration has no static part: what modes answer at once they take back at rest
     moving = [i for i, sensor in enumerate(ports.y) if sensor.order == 2]
     flexibility[[len(flexibility) - len(ports.y) + i for i in moving]] = 0.0
-    covariance = _motion_covariance(all_modes, others, larger)
+    covariance = _motion_covariance(all_modes, others, whole)
     nz = covariance.shape[0] - len(ports.y)
     y = plant.unweighted.y
     read = plant.reading_gain[np.ix_(
@@ -128,7 +128,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
         covariance[:nz, :nz],
         covariance[:nz, nz:] @ read.T,
         read_alike(plant, quiet),
-        larger,
+        whole,
     )
 
 
@@ -181,14 +181,14 @@ def _of_vectors(realisation: ModalRealisation) -> IntArray:
     return np.sort(np.argsort(part)[part.size - model.n_vectors :])
 
 
-def _same_modes(kept: _Blocks, larger: _Blocks, genuine: IntArray) -> tuple[IntArray, IntArray]:
+def _same_modes(kept: _Blocks, every: _Blocks, genuine: IntArray) -> tuple[IntArray, IntArray]:
     """Return the modes of both that are the same ones, by frequency and by compliance."""
-    one, two = kept.static[genuine], larger.static
+    one, two = kept.static[genuine], every.static
     size = np.maximum(np.abs(two).max(axis=0, initial=0.0), TINY)
     one, two = ((part / size).reshape(part.shape[0], -1) for part in (one, two))
     lengths = np.outer(np.linalg.norm(one, axis=1), np.linalg.norm(two, axis=1))
     alike = np.abs(one @ two.T) / divisor(lengths)
-    apart = np.abs(np.log(kept.omega[genuine][:, None] / larger.omega))
+    apart = np.abs(np.log(kept.omega[genuine][:, None] / every.omega))
     partner = assigned(np.minimum(apart, 1.0) + _SHAPE * (1.0 - alike))
     near = (partner >= 0) & (apart[np.arange(partner.size), partner] < _SAME)
     return genuine[near], partner[near]
@@ -252,7 +252,7 @@ def _with_flexibility(
         B, D = np.array(physical.B), np.array(physical.D)
         B[:, columns], D[:, columns] = without.B[:, columns], without.D[:, columns]
         physical = physical.replace(B=B, D=D)
-    fresh = wired(StandardPlant, Assembled(ports, realisation, physical))
+    fresh = wired(StandardPlant, Assembled(ports, realisation, physical), None)
     return sampled_like(plant, loud_like(plant, fresh))
 
 
@@ -361,7 +361,7 @@ def _neighbours(xyz: FloatArray) -> IntArray:
 
 def unresolved_share(
     plant: StandardPlant,
-    larger: StandardPlant,
+    whole: StandardPlant,
     modes: IntArray,
     observer: StateSpace,
     variances: FloatArray,
@@ -370,18 +370,18 @@ def unresolved_share(
 
     Their disturbances are taken away, and the error is computed once more.
     """
-    if not larger.is_assembled:
+    if not whole.is_assembled:
         return None
-    realisation = larger.assembled.realisation
+    realisation = whole.assembled.realisation
     if _KEPT not in realisation.__dict__:  # many plants are made of one
-        realisation.__dict__[_KEPT] = _nodes_of(larger.model, realisation.outputs)
+        realisation.__dict__[_KEPT] = _nodes_of(whole.model, realisation.outputs)
     nodes = realisation.__dict__[_KEPT]
     if nodes is None:
         return None
     coarse = modes[nodes[modes - 1] < NODES] - 1
     if not coarse.size:
         return 0.0
-    still = read_alike(plant, _quiet(larger, larger, coarse))
+    still = read_alike(plant, _quiet(whole, whole, coarse))
     rest = error_variances(still, observer).values
     shares = 1.0 - rest / divisor(variances)
     share = float(np.max(shares))
@@ -389,7 +389,7 @@ def unresolved_share(
         named = [c for c, part in zip(poi_channels(plant), shares, strict=True) if part > WARNED]
         warn(
             f"{share:.0%} of the predicted variance of {', '.join(named)} is from modes "
-            f"that the mesh of larger= resolves with fewer than {NODES:g} nodes a wavelength: "
-            "these errors may be off by as much. Pass a model with a finer mesh as larger=."
+            f"that the mesh of the evaluation model resolves with fewer than {NODES:g} nodes a "
+            "wavelength: these errors may be off by as much. Pass evaluation= of a finer mesh."
         )
     return max(share, 0.0)

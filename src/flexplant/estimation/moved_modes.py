@@ -79,7 +79,7 @@ class MovedModes(Value):
     >>> stiffer = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4.2e5, 4.2e5])
     >>> stiffer = stiffer.with_damping(fx.ModalDamping(0.01))
     >>> machine = fx.assemble_plant(stiffer, plant.assembled.ports).discretized(2e3, delay=1)
-    >>> observer = fx.design_kalman(plant, larger=plant)
+    >>> observer = fx.design_kalman(plant)
     >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
     >>> run = fx.simulate(fx.close_loop(machine, observer, servo), duration=8.0, rng=1)
     >>> fx.estimation.consistency(observer, run).moved.modes

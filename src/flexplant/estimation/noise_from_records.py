@@ -12,8 +12,7 @@ from ..checks import ComplexArray, FloatArray, Value
 from ..errors import AssumptionError, ModelError, SolverError, counted, warn
 from ..lti.statespace import System
 from ..parallel import one_thread
-from ..plant import StandardPlant, larger_plant
-from ..plant.realisation import Structure
+from ..plant import StandardPlant
 from ..tolerances import SETTLED, TINY
 from .causes import settling
 from .consistency import consistency
@@ -29,7 +28,7 @@ _PASSES, _SETTLED = 6, 1e-3
 _STEPS, _FLAT = 60, 1e-4
 #: share of right models of whose levels nothing is said
 _LEVEL = 0.999
-_LARGER = " Pass larger= with the modes left out, if that is what it lacks."
+_EVALUATION = " Give the plant an evaluation model, if modes left out are what it lacks."
 #: lags of the autocovariances of the start
 _LAGS = 40
 #: smallest eigenvalue of the information of unit size, below which levels cannot be separated
@@ -42,11 +41,7 @@ _LOW, _HIGH = 1e-6, 1e6
 
 @one_thread()
 def estimate_noise(
-    plant: StandardPlant | System,
-    records: Any,
-    *,
-    larger: StandardPlant | Structure | None = None,
-    gate: float | None = None,
+    plant: StandardPlant | System, records: Any, *, gate: float | None = None
 ) -> NoiseLevels:
     """Return the densities of all disturbances and sensor noises that explain a record best.
 
@@ -69,15 +64,11 @@ def estimate_noise(
     ----------
     plant : StandardPlant
         Sampled, with guesses of all densities that are to be found (their orders of magnitude);
-        what has none stays without.
+        what has none stays without. The record is explained with the modes of its evaluation
+        model, which are to be those of the machine, `fit.applied_to(model)`; without one the
+        noises of the sensors stand for the modes left out.
     records : Response, mapping {channel: (N,) array} or data frame
         All sensors and commands; the longest stretch without gaps is used.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        The structure with the modes that the plant leaves out, as in `design_kalman`: the record
-        is explained with these, so that what they do is no noise of the sensors. It counts whole:
-        its modes are to be those of the machine, `fit.applied_to(model)`. None: the modes of the
-        plant's reduced model beyond those it kept; where it has none, the sensors' noises stand for
-        the modes left out. The plant itself: none are left out.
     gate : float, optional
         As in `KalmanEstimator.estimate`: outliers are gaps.
 
@@ -119,11 +110,11 @@ def estimate_noise(
     True
     """
     plant = checked_plant(plant)
-    channels, whole = _noise_channels(plant), _whole_plant(plant, larger)
+    channels, whole = _noise_channels(plant), _whole_plant(plant)
     ratios, first = np.ones(len(channels)), np.zeros(0)
     for _ in range(_PASSES):
         now = _scaled(whole, channels, ratios)
-        observer = design_kalman(now, larger=now)
+        observer = design_kalman(now)
         estimate = observer.estimate(records, gate=gate)
         innovations = _longest_stretch(observer, estimate)
         spectrum = _level_spectrum(observer, _sources(now, channels), innovations)
@@ -145,16 +136,16 @@ def estimate_noise(
         raise SolverError(
             f"the noise levels still change after {_PASSES} designs of the filter, the last one "
             f"by {np.max(np.abs(np.sqrt(found.variances) - 1.0)):.2g}. "
-            f"{_advice(observer, estimate, larger)}"
+            f"{_advice(observer, estimate, whole is plant)}"
         )
     now = _scaled(whole, channels, ratios)
-    final = design_kalman(now, larger=now)
+    final = design_kalman(now)
     verdict = consistency(final, final.estimate(records, gate=gate), level=_LEVEL)
     if not verdict.holds:
         warn(
             "the noise levels do not explain the record: "
             f"{verdict.text} The levels stand for what the model lacks, and their deviations hold "
-            f"for a right model only.{_LARGER if whole is plant else ''}"
+            f"for a right model only.{_EVALUATION if whole is plant else ''}"
         )
     return NoiseLevels(
         plant, channels, ratios, covariance, first, found.slope, verdict.nis, len(innovations),
@@ -162,9 +153,9 @@ def estimate_noise(
     )  # fmt: skip
 
 
-def _whole_plant(plant: StandardPlant, larger: Any) -> StandardPlant:
+def _whole_plant(plant: StandardPlant) -> StandardPlant:
     """Return the plant with the modes left out, with the densities of the given one."""
-    found = None if larger is plant else larger_plant(plant, larger)
+    found = plant.evaluation_plant
     if found is None:
         return plant
     if found.is_assembled and plant.is_assembled:
@@ -172,12 +163,12 @@ def _whole_plant(plant: StandardPlant, larger: Any) -> StandardPlant:
     return read_alike(plant, found)
 
 
-def _advice(observer: KalmanEstimator, estimate: Estimate, larger: Any) -> str:
+def _advice(observer: KalmanEstimator, estimate: Estimate, alone: bool) -> str:
     """Return what the record says of the plant where its levels are not found, and what to do."""
     said = consistency(observer, estimate, level=_LEVEL)
     if said.cause in ("none", "noise level", "noise ratio"):
         return "Pass a plant with densities nearer to the true ones, or a longer record."
-    return f"With the last ones {said.text}{_LARGER if larger is None else ''}"
+    return f"With the last ones {said.text}{_EVALUATION if alone else ''}"
 
 
 def _noise_channels(plant: StandardPlant) -> tuple[str, ...]:
@@ -319,7 +310,7 @@ def _scored(spectrum: _LevelSpectrum, start: FloatArray, lowest: FloatArray) -> 
     raise SolverError(
         f"the likelihood of the noise levels did not settle in {_STEPS} steps: the spectrum of the "
         "innovations is far from any that these channels make. Judge the record with "
-        "flexplant.estimation.consistency, and pass larger= with the modes left out."
+        "flexplant.estimation.consistency, and give the plant an evaluation model."
     )
 
 

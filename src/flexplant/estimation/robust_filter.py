@@ -18,7 +18,7 @@ from ..lti.norms import hinf_norm
 from ..lti.riccati import filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import Progress, one_thread, tick
-from ..plant import StandardPlant, UncertainPlant
+from ..plant import StandardPlant, UncertainPlant, standard_plant
 from ..tolerances import TINY
 from .error import PoiFilter, error_variances, moving_parts
 from .estimator_channels import same_pois
@@ -198,7 +198,7 @@ def design_hinf_filter(plant: StandardPlant | System, *, accuracy: float = 1e-3)
     """
     why = "Closer to the optimum the Riccati equation has no digits left. Pass 1e-3, say."
     accuracy = between(accuracy, "accuracy", 1e-6, 1.0, why, ends="[]")
-    kalman = design_kalman(plant, larger=plant)  # type: ignore[arg-type]
+    kalman = design_kalman(standard_plant(plant).replace(evaluation=None))
     plant = kalman.plant
     sizes = np.sqrt(kalman.variances)
     model = kalman.model
@@ -331,7 +331,7 @@ def design_minimax_filter(
     True
     """
     steps = whole(iterations, "iterations")
-    kalman = design_kalman(plant, larger=plant)  # type: ignore[arg-type]
+    kalman = design_kalman(standard_plant(plant).replace(evaluation=None))
     plant, model = kalman.plant, kalman.model
     sizes = np.sqrt(kalman.variances)
     if isinstance(machines, UncertainPlant):
@@ -363,7 +363,7 @@ def design_minimax_filter(
             f"the variances of the search and those of the filter in closed form differ by "
             f"{difference:.1e} (allowed {_ALIKE:.0e}). The filter cannot be trusted."
         )
-    best = [design_kalman(other, larger=other).variances for other in others]
+    best = [design_kalman(other.replace(evaluation=None)).variances for other in others]
     certificate = MinimaxCertificate(
         float(truth.max()),
         float(_means(others, kalman.system, sizes).max()),

@@ -211,6 +211,8 @@ def with_known(plant: StandardPlant, systems: Sequence[StateSpace]) -> StandardP
     w, y = (*plant.w, *fresh), (*plant.y, *fresh)
     known = {(name, name): 1.0 for name in fresh}
     system = among(plant.system, [*w, *plant.u], [*plant.z, *y], known)
+    if (whole := plant.evaluation_plant) is not None:
+        plant = plant.replace(evaluation=with_known(whole, systems))
     return plant.replace(system=system, w=w, y=y)
 
 

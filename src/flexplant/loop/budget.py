@@ -24,6 +24,7 @@ from ..lti.responses import responder
 from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..plant.evaluation_model import NOT_JUDGED
 from ..plant.partition import require_plain
 from ..tolerances import divisor
 
@@ -113,7 +114,7 @@ class ErrorBudget(Value):
         if np.isinf(self.left_out):
             lines.append("with the modes left out of the model the loop is unstable")
         elif np.isnan(self.left_out):
-            lines.append("modes left out of the model are not in it: none are known")
+            lines.append(NOT_JUDGED)
         else:
             lines.append(f"with the modes left out of the model: {self.left_out / size:.5g}")
         return "\n".join(lines)

@@ -18,7 +18,7 @@ from ..lti.interconnection import lft, loop_poles
 from ..lti.norms import Obstacle, obstacle
 from ..lti.responses import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
-from ..plant import StandardPlant, larger_plant, standard_plant
+from ..plant import StandardPlant, standard_plant
 from ..plant.uncertainty.uncertain_plant import UncertainPlant
 from .blocks import as_block, check_inputs, commands, drives, driving_blocks, tapped, with_known
 from .broken import BrokenLoop, Path, plant_path
@@ -63,9 +63,6 @@ class ClosedLoop(Value):
         blocks (an observer's estimates, say), which are monitored.
     idle : sequence of str
         Actuators that nothing drives.
-    larger : StandardPlant, optional
-        The plant with the modes that it left out, where they are known; `left_out` is how the same
-        controller stands there.
 
     Examples
     --------
@@ -84,7 +81,6 @@ class ClosedLoop(Value):
     blocks: tuple[StateSpace, ...]
     controller: StateSpace
     idle: tuple[str, ...] = ()
-    larger: StandardPlant | None = None
 
     def __repr__(self) -> str:
         kind = f"dt {self.plant.dt:g} s" if self.plant.dt else "continuous"
@@ -103,6 +99,8 @@ class ClosedLoop(Value):
             lines.append(f"  references that no block reads: {' '.join(unread)}")
         if self.left_out is not None:
             lines.append(f"  with the modes left out: {self.left_out.summary}")
+        elif self.plant.unjudged:
+            lines.append(f"  {self.plant.unjudged}")
         if self.tolerances is not None:
             found = self.tolerances.certificate
             lines.append(f"  {one_line(found) if found else self.tolerances.summary}")
@@ -263,7 +261,8 @@ class ClosedLoop(Value):
     @cached_property
     def completed(self) -> ClosedLoop | None:
         """The same controller closed around the plant with the modes left out; None: not known."""
-        return None if self.larger is None else self.around(self.larger)
+        whole = None if self.plant.is_weighted else self.plant.evaluation_plant
+        return None if whole is None else self.around(whole)
 
     @cached_property
     def left_out(self) -> SpillOver | None:
@@ -432,10 +431,7 @@ class ClosedLoop(Value):
 
 
 def close_loop(
-    plant: StandardPlant | UncertainPlant[Any] | System,
-    *blocks: Any,
-    idle: Iterable[str] = (),
-    larger: Any = None,
+    plant: StandardPlant | UncertainPlant[Any] | System, *blocks: Any, idle: Iterable[str] = ()
 ) -> ClosedLoop:
     """Return the closed loop of a plant with controller blocks, connected by name.
 
@@ -449,17 +445,14 @@ def close_loop(
     Parameters
     ----------
     plant : StandardPlant, UncertainPlant, StateSpace or control.StateSpace
-        The plant; of an uncertain one the nominal plant, and the repr says what its modes hold to
+        The plant; the loop is checked on its evaluation model too (`ClosedLoop.left_out`). For an
+        uncertain one it is the nominal plant, and the repr says what its modes hold to
         (`ClosedLoop.tolerances`). A system whose channels are named like those of an assembled
         plant (see `StandardPlant.from_statespace`) is one.
     *blocks : StateSpace, or values with a `system` such as KalmanEstimator and Controller
         The controller in any number of parts. Sampled at the plant's rate, or static gains.
     idle : iterable of str
         Actuators that stay without a drive on purpose.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes that the plant left out, as for `larger_plant`. The loop is then
-        checked there too (`ClosedLoop.left_out`); unless given, with those that the plant's reduced
-        model still has.
 
     Returns
     -------
@@ -480,8 +473,8 @@ def close_loop(
         connected to nothing, an actuator is driven by nothing (and not idle), or a name other than
         an actuator's is driven twice.
     ModelError
-        When there is no block, a block is no system or stands twice, sampling times differ, the
-        algebraic loop is ill-posed, or `larger` does not go with the plant.
+        When there is no block, a block is no system or stands twice, sampling times differ, or the
+        algebraic loop is ill-posed.
 
     Examples
     --------
@@ -505,14 +498,11 @@ def close_loop(
         )
     resting = name_list(idle, "idle actuators")
     require_known("actuator to leave idle", resting, plant.u)
-    larger = _completed(plant, larger)
     plant = with_known(plant, systems)
     driven, watched = drives(plant, systems, resting)
     check_inputs(plant, systems)
     controller = driving_blocks(plant, systems, driven, watched)
-    loop = ClosedLoop(
-        plant, systems, controller, resting, None if larger is None else with_known(larger, systems)
-    )
+    loop = ClosedLoop(plant, systems, controller, resting)
     found = loop.left_out
     if not loop.is_stable and loop.obstacle and loop.obstacle.reason.startswith("unstable"):
         warn(
@@ -529,15 +519,3 @@ def close_loop(
     if plant.uncertainty is not None and loop.tolerances is not None:
         loop.tolerances.warn_of_critical()
     return loop
-
-
-def _completed(plant: StandardPlant, larger: Any) -> StandardPlant | None:
-    """Return the plant with the modes left out, None where they are not known."""
-    if not plant.is_weighted:
-        return larger_plant(plant, larger)
-    if larger is not None:
-        raise ModelError(
-            "the plant is weighted, or seen through a block, and the larger one is not: close the "
-            "loop on plant.unweighted (with that block first) to check it with the modes left out."
-        )
-    return None

@@ -25,7 +25,7 @@ from ..checks import (
 from ..errors import AssumptionError, ModelError, aligned, counted, warn
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..plant.larger_plant import draws_with_left_out
+from ..plant.drawn_machines import draws_with_left_out
 from ..plant.realisation import natural
 from ..plant.uncertainty.uncertain_plant import UncertainPlant, modal_realisation
 from ..tolerances import TINY
@@ -466,7 +466,7 @@ def machine_draws(
     number, chance = whole(count, "draws"), generator(rng)
     around = loop.completed or loop
     machines = draws_with_left_out(uncertain, around.plant, chance, number)
-    if machines is None:  # what is uncertain is no property of the larger plant's modes
+    if machines is None:  # what is uncertain is no property of the evaluation model's modes
         around, machines = loop, iter(uncertain.sample(chance, number))
     loops = map(around.around, machines)
     margins = [one.modulus_margin if one.is_stable else 0.0 for one in loops]

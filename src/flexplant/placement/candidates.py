@@ -10,7 +10,7 @@ import numpy as np
 
 from ..checks import FloatArray, Value, several, short
 from ..errors import LabelError, ModelError, require_known
-from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
+from ..plant import Actuator, EvaluationModel, SensorPort, StandardPlant, standard_plant
 from ..plant.partition import require_plain, require_sampled
 from ..plant.scheduling import port_at, require_positions
 from ..structure import Disc, Rectangle
@@ -90,7 +90,11 @@ def _restricted(plant: StandardPlant, kept: dict[str, list[str]]) -> StandardPla
     z = [name for name in plant.z if name not in idle]
     asd = {name: size for name, size in plant.asd.items() if name not in silent}
     system = plant.system.select([*z, *y], [*w, *u])
-    return StandardPlant(system, tuple(w), tuple(u), tuple(z), tuple(y), asd, plant.origin)
+    whole = plant.evaluation_plant
+    return StandardPlant(
+        system, tuple(w), tuple(u), tuple(z), tuple(y), asd, plant.origin,
+        evaluation=EvaluationModel.of(whole and _restricted(whole, kept)),
+    )  # fmt: skip
 
 
 def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> dict[str, Port]:

@@ -203,7 +203,7 @@ class ClosedLoopH2(MotionAndEffort):
         self.check(plant, ())
         plant.check().require(("stabilisable", "detectable"), "a stationary controller")
         A, B, W, rows, R, S, F = self._control(plant)
-        estimator = design_kalman(plant, larger=plant)
+        estimator = design_kalman(plant.replace(evaluation=None))
         P, K = estimator.covariance, estimator.gain
         read = [plant.y.index(name) for name in sensors(plant)]  # without references
         C, noise = plant.C2[read], plant.sensor_noise[np.ix_(read, read)]

@@ -97,21 +97,20 @@ class OnPlant(Scorer):
 
 @dataclass(frozen=True, eq=False)
 class OnBoth(Scorer):
-    """The scores of a function of a plant and a larger one of the same choice."""
+    """The scores of a function of plants with an evaluation plant of the same choice."""
 
     chosen: OnPlant
-    larger: StandardPlant
-    function: Callable[[StandardPlant, StandardPlant], float]
+    evaluation: StandardPlant
 
     def __repr__(self) -> str:
         return repr(self.chosen)
 
     def value(self, chosen: Sequence[int]) -> float:
-        """Return what the function gives on both plants with this choice."""
+        """Return what the function gives on the plant with this choice."""
         own = self.chosen
         ports = [own.candidates[i] for i in chosen]
-        both = (with_side(plant, own.side, ports) for plant in (own.whole, self.larger))
-        return self.function(*both)
+        plant, judge = (with_side(p, own.side, ports) for p in (own.whole, self.evaluation))
+        return float(own.function(plant.replace(evaluation=judge)))
 
 
 class Criterion(Value):

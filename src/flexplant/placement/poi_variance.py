@@ -14,12 +14,9 @@ from ..estimation import Filter, FixedLag, KalmanEstimator, Predictor, design_ka
 from ..estimation.estimator_channels import sensors
 from ..lti.sampling import held_exactly, reaches_at_once
 from ..lti.statespace import StateSpace
-from ..modes import Modes
-from ..plant import Actuator, StandardPlant, larger_plant
+from ..plant import Actuator, StandardPlant
 from ..plant.building import direct_effect
 from ..plant.partition import require_noise
-from ..reduction import ReducedModel
-from ..structure import FEModel
 from .candidates import Port, with_side
 from .convex import WorstRow, quadratic
 from .criterion import Criterion, OnBoth, OnPlant, Scorer
@@ -152,8 +149,6 @@ def bare(port: Any) -> bool:
 
 
 _LAGS = "The end of a record does not depend on a sample: pass one of these."
-_STRUCTURES = "Every choice of sensors gets a plant of its own: pass a structure."
-_STRUCTURE = checked(instance, kind=FEModel | Modes | ReducedModel, hint=_STRUCTURES)
 Lag: TypeAlias = Predictor | Filter | FixedLag
 
 
@@ -179,12 +174,8 @@ class PoiVariance(Criterion):
     lag : Predictor, Filter or FixedLag, optional
         When the estimate is wanted: before the measurement, with it (when not given), or some
         samples later. Of predictor and lag the plant's own modes alone are counted.
-    larger : Modes, FEModel or ReducedModel, optional
-        The structure with the modes left out, as for `design_kalman`: best as Modes, which are
-        solved once. None: the modes of the plant's reduced model beyond those it kept, if it has
-        any.
     own_modes : bool
-        Whether modes left out do not count, whatever the reduced model has kept of them.
+        Whether the plant's own modes alone count, whatever its evaluation model is.
 
     References
     ----------
@@ -202,24 +193,11 @@ class PoiVariance(Criterion):
     _: KW_ONLY
     measure: str = field(default="sum", metadata=checked(one_of, choices=("sum", "max")))
     lag: Lag | None = field(default=None, metadata=checked(instance, kind=Lag, hint=_LAGS))
-    larger: Any = field(default=None, metadata=_STRUCTURE)
     own_modes: bool = field(default=False, metadata=checked(flag))
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.larger is not None and (self.own_modes or self._lagging):
-            raise ModelError(
-                "larger= gives modes left out, own_modes=True (and a predictor or lag) leaves "
-                "them: pass one."
-            )
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return the variance [m^2] on a sampled plant, by its certified Kalman filter."""
-        return self._value(plant, plant if self._own else self.larger)
-
-    def _value(self, plant: StandardPlant, larger: Any) -> float:
-        """Return the variance [m^2] on a plant with the modes left out given by another one."""
-        estimator = design_kalman(plant, larger=larger)
+        estimator = design_kalman(plant.replace(evaluation=None) if self._own else plant)
         factors = self._factors(plant)
         if self._lagging:
             terms = _lagged(estimator, poi_rows(plant, factors), self.lag)
@@ -254,9 +232,9 @@ class PoiVariance(Criterion):
         motions some samples ago are states as well.
         """
         chosen = OnPlant(plant, "y", tuple(candidates), self)
-        larger = None if self._own else larger_plant(chosen.whole, self.larger)
-        if larger is not None:
-            return OnBoth(chosen, larger, self._value)
+        judge = None if self._own else chosen.whole.evaluation_plant
+        if judge is not None:
+            return OnBoth(chosen, judge)
         read, system = sensors(chosen.whole), chosen.whole.system  # a reference is no sensor
         at_once = [name for name in chosen.whole.w if name.removesuffix(":noise") not in read]
         if not plain(plant, candidates) or np.any(system.select(read, at_once).D):

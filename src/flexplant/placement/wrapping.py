@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ..checks import FloatArray, checked, function, one_of, positive, short
 from ..errors import AssumptionError, FlexplantError, LabelError, ModelError, counted
-from ..plant import StandardPlant, larger_plant
+from ..plant import StandardPlant
 from ..plant.scheduling import values_over
 from ..tolerances import TINY
 from .candidates import SIDES, Port, sampled_plant, side_of, sides_of, with_side
@@ -60,17 +60,15 @@ class LeftOutModes(Criterion):
 
     Parameters
     ----------
-    larger : Modes, FEModel or ReducedModel, optional
-        The structure with more modes; None: those of the plant's reduced model beyond those kept.
     of : {"sensors", "actuators"}
         Of which devices, when it is called on a plant.
 
     Raises
     ------
     ModelError
-        When `of` is none of these; when called, when larger is no structure.
+        When `of` is neither of these.
     AssumptionError
-        When called, where no modes left out are known.
+        When called on a plant without an evaluation model of more modes.
 
     Examples
     --------
@@ -80,7 +78,6 @@ class LeftOutModes(Criterion):
     """
 
     scale: ClassVar[float] = 1e-6  # micrometres beside metres
-    larger: Any = None
     of: str = field(default="sensors", kw_only=True, metadata=checked(one_of, choices=SIDES))
 
     def __call__(self, plant: StandardPlant) -> float:
@@ -92,13 +89,13 @@ class LeftOutModes(Criterion):
         """Return the share of choices among candidates of this kind; others do not count."""
         own = [side_of(port) == SIDES[self.of] for port in candidates]
         counts = np.array(own, dtype=np.float64)
-        whole = larger_plant(plant, self.larger)
+        whole = plant.evaluation_plant
         kept = shapes_of(plant, candidates)
         more = None if whole is None else shapes_of(whole, candidates)
         if more is None or more.omega.size <= kept.omega.size:
             raise AssumptionError(
-                "no modes left out of the plant are known: pass placement.LeftOutModes(larger), "
-                "the structure with more modes."
+                "no modes left out of the plant are known: give it an evaluation model with more "
+                "modes, assemble_plant(model, ports, evaluation=)."
             )
         # modes are in order of their frequency: the plant has the first of them
         beyond = more.omega > 1.0001 * np.max(kept.omega)

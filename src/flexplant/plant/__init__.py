@@ -71,6 +71,7 @@ Names elsewhere: ``augw``, ``mixsyn``: `mixed_sensitivity`, then `fx.design_hinf
 from ..rooms import public_names as _public_names
 from .assumptions import AssumptionReport as AssumptionReport
 from .assumptions import ModeVisibility as ModeVisibility
+from .evaluation_model import EvaluationModel as EvaluationModel
 from .forces import Actuator as Actuator
 from .forces import BaseAcceleration as BaseAcceleration
 from .forces import Disturbance as Disturbance
@@ -79,7 +80,6 @@ from .forces import NarrowBand as NarrowBand
 from .forces import OutputDisturbance as OutputDisturbance
 from .forces import RandomWalk as RandomWalk
 from .forces import RigidForce as RigidForce
-from .larger_plant import larger_plant as larger_plant
 from .moving import Along as Along
 from .moving import PositionMap as PositionMap
 from .partition import Assembled as Assembled

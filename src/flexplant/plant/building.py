@@ -21,15 +21,14 @@ from ..lti.sampling import (
     sample_and_hold,
 )
 from ..lti.statespace import StateSpace, System, as_statespace, single_channel
-from ..modes import Modes
-from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..structure.rigid import SPANNED, Structure
 from ..tolerances import ROUNDING, SAME
+from .evaluation_model import EvaluationModel
 from .partition import Assembled, Foreign, Partition, Weighted, require_plain
 from .port import QUANTITIES, ForcePort, Seen, SensorPort
 from .ports import Poi, Ports
-from .realisation import ModalRealisation, natural, plant_modes
+from .realisation import ModalRealisation, natural
 
 
 class PortRows(NamedTuple):
@@ -304,7 +303,7 @@ def _with_states(g: StateSpace, stay: npt.NDArray[np.bool_]) -> StateSpace:
 P = TypeVar("P", bound=Partition)
 
 
-def wired(cls: type[P], origin: Assembled) -> P:
+def wired(cls: type[P], origin: Assembled, evaluation: EvaluationModel | None) -> P:
     """Return the plant of an origin: what is static is added to its physical system."""
     physical, ports = origin.physical, origin.ports
     actuators = [a.name for a in ports.u]
@@ -327,15 +326,20 @@ def wired(cls: type[P], origin: Assembled) -> P:
         outputs=[*physical.outputs, *errors],
     )
     system = among(shown, inputs, outputs, dict.fromkeys(pairs, 1.0)).replace(units=ports.units)
-    return cls(system, tuple(w), tuple(actuators), tuple(z), tuple(y), ports.densities, origin)
+    return cls(
+        system, tuple(w), tuple(actuators), tuple(z), tuple(y), ports.densities, origin,
+        evaluation=evaluation,
+    )  # fmt: skip
 
 
-def continuous_plant(cls: type[P], realisation: ModalRealisation, ports: Ports) -> P:
+def continuous_plant(
+    cls: type[P], realisation: ModalRealisation, ports: Ports, evaluation: EvaluationModel | None
+) -> P:
     """Return the continuous plant of a structure's modes with its channels."""
     given: object = ports
     instance(given, Ports, "ports", "Pass Ports(w=[...], u=[...], z=[...], y=[...]).")
     physical = with_filters(structure_system(realisation, ports), realisation, ports)
-    return wired(cls, Assembled(ports, realisation, physical))
+    return wired(cls, Assembled(ports, realisation, physical), evaluation)
 
 
 def sampled(plant: P, rate: float, delay: float) -> P:
@@ -362,7 +366,7 @@ def sampled(plant: P, rate: float, delay: float) -> P:
     sizes = np.array([plant.asd.get(name, 0.0) for name in held]) * np.sqrt(0.5 * rate)
     factor = np.hstack([factor, physical.B[:, physical.input_index(held)] * sizes])
     known = {"noise_factor": factor, "delay": float(delay), "continuous": plant}
-    found = wired(type(plant), origin.replace(physical=physical, **known))
+    found = wired(type(plant), origin.replace(physical=physical, **known), plant.evaluation)
     own = {name: level for name, level in plant.asd.items() if name in found.w}
     return found if own == found.asd else found.replace(asd=own, origin=found.origin)
 
@@ -452,29 +456,33 @@ def rebuilt(
     """Return a plant with other ports or of other modes, sampled like the old one."""
     # ports that are among its own are rows and columns of it
     require_plain(plant, "other ports or modes are for a plant as it was made")
-    own = plant.assembled
+    own, judged = plant.assembled, _evaluation_of_rebuilt(plant, ports, realisation)
     if isinstance(ports, Ports) and realisation is None and not changed_densities(plant):
         found = with_ports_of(own, ports)
         if found is not None:
             before = own.continuous
             whole = None if before is None else rebuilt(before, ports=ports)
-            return wired(type(plant), found.replace(continuous=whole))
+            return wired(type(plant), found.replace(continuous=whole), judged)
     if ports is None and realisation is not None and _moves_alike(own, realisation):
-        fresh = wired(type(plant), _with_modes(plant.continuous.assembled, realisation))
+        fresh = wired(type(plant), _with_modes(plant.continuous.assembled, realisation), judged)
     else:
         modes = own.realisation if realisation is None else realisation
-        fresh = continuous_plant(type(plant), modes, own.ports if ports is None else ports)
+        fresh = continuous_plant(type(plant), modes, own.ports if ports is None else ports, judged)
     return sampled_like(plant, loud_like(plant, fresh))
 
 
-def with_modes_of(plant: P, larger: object) -> P:
-    """Return the plant of a larger structure, with the ports of the given one and sampled like it.
-
-    Of a reduced model the modes that it left out itself count as well.
-    """
-    given = instance(larger, FEModel | Modes | ReducedModel, "larger", "Pass one, or a plant.")
-    whole = given.completed() if isinstance(given, ReducedModel) else given
-    return rebuilt(plant, realisation=plant_modes(whole))
+def _evaluation_of_rebuilt(
+    plant: Partition, ports: object, realisation: ModalRealisation | None
+) -> EvaluationModel | None:
+    """Return the evaluation model of a plant that gets other ports or other modes."""
+    judged = plant.evaluation
+    if judged is None:
+        return None
+    if isinstance(ports, Ports):
+        judged = judged.with_ports(ports)
+    own, new = plant.model, plant.model if realisation is None else realisation.model
+    # the modes that a reduced model left out follow a change of this model
+    return EvaluationModel.known_to(new) if judged.source is own and new is not own else judged
 
 
 def weighted(plant: P, z: Any, w: Any) -> P:

@@ -105,7 +105,8 @@ def seen_elsewhere(plant: P, ports: Ports) -> P | None:
     before = own.continuous
     whole = None if before is None else seen_elsewhere(before, ports)
     physical = own.physical.replace(C=C)
-    return wired(type(plant), own.replace(ports=ports, physical=physical, continuous=whole))
+    judged = None if plant.evaluation is None else plant.evaluation.with_ports(ports)
+    return wired(type(plant), own.replace(ports=ports, physical=physical, continuous=whole), judged)
 
 
 def _is_row(port: Any) -> bool:

@@ -21,6 +21,8 @@ from ..errors import (
 )
 from ..labels import DIRECTIONS
 from ..lti.statespace import StateSpace, System, as_statespace
+from ..structure import FEModel
+from .evaluation_model import NOT_JUDGED, EvaluationModel
 from .ports import Ports
 from .realisation import MODAL, ModalRealisation
 
@@ -161,6 +163,7 @@ class Partition(Value):
     asd: Mapping[str, float]
     origin: Origin = ELSEWHERE
     uncertainty: Any = None
+    evaluation: EvaluationModel | None = None
 
     def __post_init__(self) -> None:
         for side in "wuzy":
@@ -177,7 +180,7 @@ class Partition(Value):
             )
         require_known("w channel with an asd", self.asd, self.w)
         asd = {name: positive(a, f"asd of {name!r}", zero=True) for name, a in self.asd.items()}
-        self._set(asd=asd)
+        self._set(asd=asd, evaluation=EvaluationModel.of(self.evaluation))
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed, checked like a new one.
@@ -198,6 +201,15 @@ class Partition(Value):
                     before: Any = self.continuous.replace(asd=loud)
                     factor = before.discretized(1.0 / self.dt, delay=self.delay).noise_factor
                 changes["origin"] = self.assembled.replace(noise_factor=factor)
+        if "evaluation" in changes:  # the plants that it was made of have the same one
+            judged = EvaluationModel.of(changes["evaluation"])
+            origin = changes.get("origin", self.origin)
+            before = {
+                name: other.replace(evaluation=judged)
+                for name in ("plain", "continuous")
+                if (other := getattr(origin, name)) is not None and other.evaluation is not judged
+            }
+            changes |= {"evaluation": judged, "origin": origin.replace(**before)}
         return super().replace(**changes)
 
     def __repr__(self) -> str:
@@ -217,6 +229,8 @@ class Partition(Value):
             lines.append(f"  at {self.assembled.ports.standing}")
         if self.form.startswith("dense"):
             lines.append(f"  {self.form}")
+        if self.evaluation is not None:
+            lines.append(f"  evaluation model: {self.evaluation.text}")
         if self.unstable_modes:
             lines.append(f"  unstable rigid-body pairs: {self.unstable_text}")
         return "\n".join(lines)
@@ -249,6 +263,7 @@ class Partition(Value):
         z: Sequence[str] | None = None,
         asd: Mapping[str, float] | None = None,
         noise_factor: FloatArray | None = None,
+        evaluation: Any = None,
     ) -> Self:
         """Return the standard plant of a system made elsewhere.
 
@@ -267,6 +282,8 @@ class Partition(Value):
             is the w channel `y1:noise`.
         noise_factor : (n, r) array, optional
             G with G G' the covariance of x that disturbances add in one sample.
+        evaluation : StandardPlant, optional
+            The plant that answers are judged on, with the same channels.
 
         Returns
         -------
@@ -295,7 +312,7 @@ class Partition(Value):
             g.select([*z, *y], [*w, *u]),
             tuple(w), tuple(u), tuple(z), tuple(y),
             {} if asd is None else mapping(asd, "asd", "Pass {channel: density}."),
-            Foreign(noise_factor),
+            Foreign(noise_factor), evaluation=evaluation,
         )  # fmt: skip
 
     @property
@@ -322,6 +339,15 @@ class Partition(Value):
     def is_weighted(self) -> bool:
         """Whether it was made by `weighted` or `through`: `alteration` says which."""
         return self.origin.plain is not None
+
+    @property
+    def unjudged(self) -> str:
+        """What answers on this plant say where it has no evaluation model; else empty.
+
+        A plant that was assembled from a full FEModel lacks no modes and has no larger model.
+        """
+        complete = isinstance(self.model, FEModel)
+        return "" if complete or self.evaluation is not None else NOT_JUDGED
 
     @property
     def alteration(self) -> str:

@@ -15,6 +15,8 @@ from ..labels import Place
 from ..lti.statespace import StateSpace, System
 from .assumptions import AssumptionReport
 from .building import continuous_plant, measured_through, rebuilt, sampled, weighted
+from .evaluation_model import EvaluationModel
+from .judging import check_channels, evaluation_plant, own_plant
 from .moving import Along, PositionMap, along, moved_ports, position_map, seen_elsewhere
 from .partition import Partition
 from .ports import Ports
@@ -52,6 +54,10 @@ class StandardPlant(Partition):
         was assembled from a structure, `plant.unweighted` is the plant before weights.
     uncertainty : UncertainPlant, optional
         By what its modes may be off: of ``plant.uncertain(...).nominal``, kept by weights.
+    evaluation : EvaluationModel, optional
+        The larger model of the same machine that answers are judged on, as `assemble_plant` takes
+        it. ``plant.replace(evaluation=model)`` gives the plant another one,
+        ``plant.replace(evaluation=None)`` takes it away.
 
     Raises
     ------
@@ -204,7 +210,11 @@ class StandardPlant(Partition):
         if positions:
             ports = ports.at(positions)
         there = ports if poi is None else moved_ports(ports, poi)
-        return seen_elsewhere(self, there) or self.with_ports(there)
+        found = seen_elsewhere(self, there) or self.with_ports(there)
+        judged = self.evaluation
+        if judged is None or judged.is_structure:
+            return found
+        return found.replace(evaluation=own_plant(StandardPlant, judged).at(poi, **positions))
 
     def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
         """Return what the position does: decoupling, modes seen and reached, figures of one's own.
@@ -339,6 +349,19 @@ class StandardPlant(Partition):
         """
         return rigid_modes_of(self)
 
+    @cached_property
+    def evaluation_plant(self) -> StandardPlant | None:
+        """The evaluation model with this plant's channels, sampled and delayed like it.
+
+        Assembled once and kept. None without an evaluation model. For a weighted plant, or one
+        seen `through` a block, it is that of the plain plant.
+
+        LabelError or ModelError when a plant that was given as evaluation model has other channels,
+        or another sampling time or delay.
+        """
+        plain = self.unweighted
+        return evaluation_plant(self) if plain is self else plain.evaluation_plant
+
     def to_control(self) -> Any:
         """Return the whole system as a `control.StateSpace` with the same names."""
         return self.system.to_control()
@@ -380,7 +403,11 @@ def standard_plant(given: StandardPlant | UncertainPlant[StandardPlant] | System
 
 
 def assemble_plant(
-    model: Structure | ModalRealisation, ports: Ports, *, residual: ResidualForm | None = None
+    model: Structure | ModalRealisation,
+    ports: Ports,
+    *,
+    evaluation: Any = None,
+    residual: ResidualForm | None = None,
 ) -> StandardPlant:
     """Return the standard plant of a structure with its channels.
 
@@ -393,6 +420,11 @@ def assemble_plant(
     model : FEModel, Modes or ReducedModel
         The structure. A plant's `realisation` serves too: the modes are then not solved again.
     ports : Ports
+    evaluation : Modes, FEModel, ReducedModel or StandardPlant, optional
+        The model of the same machine that answers are judged on, with the modes that `model` lacks.
+        Every plant made from this one has it too, and every filter, controller, loop, score and
+        budget accounts for it. A structure gets the ports, a plant must have their channels. When
+        not given: the modes that a reduced `model` still knows beyond those it kept.
     residual : FastStates or Feedthrough, optional
         What residual attachment vectors of Modes become: fast modes (when not given), or a
         compliance that answers at once.
@@ -407,7 +439,10 @@ def assemble_plant(
     Raises
     ------
     LabelError
-        When a place is not on the structure, or an actuator and a sensor have the same name.
+        When a place is not on the structure, an actuator and a sensor have the same name, or an
+        evaluation model that is a plant has other channels.
+    ModelError
+        When the evaluation model is neither a structure nor a plant.
 
     Warns
     -----
@@ -438,4 +473,9 @@ def assemble_plant(
       z (2) die:x  u1:effort
       y (1) y1
     """
-    return continuous_plant(StandardPlant, plant_modes(model, residual), ports)
+    realisation = plant_modes(model, residual)
+    judged = EvaluationModel.of(evaluation) or EvaluationModel.known_to(realisation.model)
+    found = continuous_plant(StandardPlant, realisation, ports, judged)
+    if judged is not None and not judged.is_structure:
+        check_channels(found, standard_plant(judged.source).unweighted)
+    return found

@@ -26,6 +26,7 @@ from ..parallel import Progress, tick
 from ..placement import ParetoCurve, Placement, SensorMap
 from ..placement.criterion import in_words
 from ..plant import StandardPlant, decouple
+from ..plant.evaluation_model import NOT_JUDGED
 from ..reduction import ReducedModel
 from ..rooms import versions
 from ..simulation import ErrorMap, ExposureErrors, Response, Verdict
@@ -364,7 +365,7 @@ def _stability(loop: ClosedLoop) -> list[Tile]:
     found = [("stability", "stable" if stable else "UNSTABLE", own, "good" if stable else "bad")]
     left = loop.left_out
     if left is None:
-        return [*found, ("with the modes left out", "not checked", "close_loop(larger=...)", "")]
+        return [*found, ("with the modes left out", NOT_JUDGED, "assemble_plant(evaluation=)", "")]
     word, kind = "stable" if left.is_stable else "UNSTABLE", "good" if left.is_fine else "bad"
     beside = left.named_modes if left.modes else one_line({stability_name(sampled): left.stability})
     what = f"with the modes left out ({counted(left.states, 'state')})"

@@ -26,7 +26,7 @@ Names elsewhere: ``lsim``, ``forced_response``, Simulink.
 **Many machines.** `MachinePipeline` is the usual chain: a machine's FRF is identified, the
 difference from the drawing localised among candidates, the model updated and calibrated, plant,
 observer and (unless one is given) a controller made that tolerates what is not known of the modes,
-the loop checked on a larger model and run against its specification. A machine is a measured
+the loop checked on an evaluation model and run against its specification. A machine is a measured
 `fx.Frf`, its `fx.MeasuredModes`, or a virtual one. With the names of the README's script:
 
 ```python

@@ -29,7 +29,7 @@ from ..identification import MeasuredModes, identify_modes, numbered
 from ..loop import ClosedLoop, SpillOver, bandwidth, close_loop
 from ..lti.frequency import Frf
 from ..modes import MeshError, Modes, solve_modes
-from ..plant import Ports, StandardPlant, UncertainPlant, assemble_plant, larger_plant
+from ..plant import Ports, StandardPlant, UncertainPlant, assemble_plant
 from ..reduction import ModalTruncation, ReducedModel, reduce
 from ..store import written
 from ..structure import Damping, FEModel
@@ -74,7 +74,7 @@ class MachinePipeline(Value):
 
     - an `Frf` that was measured: its modes are identified, and paired by frequency and shape with
       those of the model, then of the updated model until the pairs stay. The loop runs on the
-      larger model, the updated full structure;
+      evaluation model, the updated full structure;
     - `MeasuredModes` with the numbers of the model's modes, in place of an FRF;
     - a virtual one, which answers to ``loop(ports, *blocks)``, on which the loop runs, and to
       ``poles(modes)``, or to ``measure_frf(ports, **measurement)``, as `fx.testbeds.WaferStage`
@@ -129,7 +129,7 @@ class MachinePipeline(Value):
         Of the run.
     duration : float [s]
         Of that run.
-    larger : int
+    evaluation_modes : int
         Modes of the updated full structure that are known, those of the reduced model included; at
         most all. Of Modes and of a reduced model all count.
     folder : path, optional
@@ -174,7 +174,7 @@ class MachinePipeline(Value):
     specification: Specification | None = None
     reference: Any = None
     duration: float = field(default=1.0, metadata=checked(positive))
-    larger: int = field(default=80, metadata=checked(whole))
+    evaluation_modes: int = field(default=80, metadata=checked(whole))
     folder: str | None = None
     damping: Damping | None = field(
         default=None,
@@ -223,17 +223,18 @@ class MachinePipeline(Value):
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             measured, places, fit = self._fitted(self._measured(machine, of_measurement))
-            many = self._larger(fit, measured)
+            many = self._evaluation(fit, measured)
             model = fit.calibrated(measured)
-            plant = assemble_plant(model, self.ports).discretized(self.rate, delay=self.delay)
-            observer = design_kalman(plant, larger=many)
+            plant = assemble_plant(model, self.ports, evaluation=many)
+            plant = plant.discretized(self.rate, delay=self.delay)
+            observer = design_kalman(plant)
             if self.blocks is None:
                 off = fit.uncertainty(measured, mesh=self.mesh)
-                blocks, left_out = self._designed(plant.uncertain(off), many)
+                blocks, left_out = self._designed(plant.uncertain(off))
             else:
                 blocks = tuple(self.blocks)
-                left_out = close_loop(plant, *blocks, larger=many).left_out
-            loop = self._loop(machine, plant, blocks, many)
+                left_out = close_loop(plant, *blocks).left_out
+            loop = self._loop(machine, plant, blocks)
             run = simulate(loop, duration=self.duration, reference=self.reference, rng=of_run)
             check = self.specification
             verdict = None if check is None else check.check(loop, run)
@@ -293,14 +294,14 @@ class MachinePipeline(Value):
             unknowns = [*unknowns, *chosen]
         return places, update(self.model, unknowns, residuals, starts=self.starts)
 
-    def _larger(self, fit: UpdateResult, measured: MeasuredModes) -> Modes:
+    def _evaluation(self, fit: UpdateResult, measured: MeasuredModes) -> Modes:
         """Return the modes of the updated full structure, calibrated unless damping couples them.
 
         Its numbers are the reduced model's, or it is left as it is where its order differs.
         """
         known = self.full
         if isinstance(known, FEModel):
-            count = min(self.larger, known.n_dof)
+            count = min(self.evaluation_modes, known.n_dof)
             many = solve_modes(fit.applied_to(known), count=count, damping=self.damping)
         else:
             if isinstance(known, Modes):  # their attachment vectors count among the modes left out
@@ -312,28 +313,23 @@ class MachinePipeline(Value):
         near = np.abs(many.omega[numbers] / np.abs(measured.poles) - 1.0) < _SAME
         return many.calibrated(measured) if near.all() else many
 
-    def _designed(
-        self, plant: UncertainPlant[Any], many: Modes
-    ) -> tuple[tuple[Any, ...], SpillOver | None]:
+    def _designed(self, plant: UncertainPlant[Any]) -> tuple[tuple[Any, ...], SpillOver | None]:
         """Return the fastest controller that tolerates what is not known, and how it holds."""
         for wanted in self._tried:
             try:
-                found = design_stage(plant, bandwidth=wanted, margin=self.margin, larger=many)
+                found = design_stage(plant, bandwidth=wanted, margin=self.margin)
                 break
             except InfeasibleError:
                 if wanted == self._tried[-1]:
                     raise
         return (found,), found.left_out
 
-    def _loop(
-        self, machine: Any, plant: StandardPlant, blocks: Sequence[Any], many: Modes
-    ) -> ClosedLoop:
-        """Return the loop on a virtual machine, else on the larger model."""
+    def _loop(self, machine: Any, plant: StandardPlant, blocks: Sequence[Any]) -> ClosedLoop:
+        """Return the loop on a virtual machine, else on the evaluation model."""
         if hasattr(machine, "loop"):
             own: ClosedLoop = machine.loop(self.ports, *blocks)
             return own
-        whole = larger_plant(plant, many)
-        return close_loop(plant if whole is None else whole, *blocks)
+        return close_loop(plant.evaluation_plant or plant, *blocks)
 
     def _row(self, found: MachineReport) -> dict[str, Any]:
         fit, loop = found.fit, found.loop
@@ -375,10 +371,9 @@ class MachineReport(Value):
         Of the POI, with the modes left out as noise.
     blocks : tuple of StateSpace or Controller
     left_out : SpillOver or None
-        The certificate on the larger model: how the loop on the updated one stands with the modes
-        left out.
+        The certificate on the evaluation model: how the loop stands with the modes left out.
     loop : ClosedLoop
-        On the machine; on the larger model for a machine that was measured only.
+        On the machine; on the evaluation model for a machine that was measured only.
     run : Response
         Of that loop.
     verdict : Verdict, optional
@@ -417,7 +412,7 @@ class MachineReport(Value):
             "Updated": [self.fit],
             "Observer": [self.observer],
             "Controller": self.blocks,
-            "Loop on the larger model": [self.left_out and self.left_out.summary],
+            "Loop on the evaluation model": [self.left_out and self.left_out.summary],
             "Loop that was run": [self.loop],
             "The run beside the model": [self._judged()],
             "Specification": [self.verdict],

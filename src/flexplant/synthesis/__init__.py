@@ -1,7 +1,7 @@
 """Controllers: the servo on the estimated point of interest, H2 and H-infinity, tuned loops.
 
 A `Controller` carries what was checked of it: norm by two routes, stability, the loop on a model
-with the modes left out (``larger=``), and how far each mode may be off.
+with the modes left out (the plant's evaluation model), and how far each mode may be off.
 
 - `design_servo(plant, bandwidth=)`: decoupled PID on the estimate; `servo_bandwidth`: the largest.
 - `design_stage(plant)`: the fastest H-infinity controller that tolerates errors of the modes.

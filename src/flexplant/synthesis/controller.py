@@ -18,8 +18,7 @@ from ..lti.frequency_sweep import highest, largest_gains, resonance_grid
 from ..lti.norms import peak_gain
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
-from ..plant import StandardPlant, larger_plant
-from ..structure import FEModel
+from ..plant import StandardPlant
 from .preparation import Prepared
 
 
@@ -210,13 +209,13 @@ def _loop_grid(loop: StateSpace) -> FloatArray:
 CLOSE = ", and one that differs a little from the model may be unstable"
 
 
-def checked_loop(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> ClosedLoop | None:
+def checked_loop(plant: StandardPlant, blocks: Sequence[Any]) -> ClosedLoop | None:
     """Return a design's loop, with warnings of what modes do to it; None: nothing to check it by.
 
     With the modes left out, where they are known, and with what the plant's own modes hold to.
     """
     plain, reading = plant.unweighted, plant.origin.reading
-    whole = larger_plant(plant, larger)
+    whole = plant.evaluation_plant
     before = [] if reading is None else [reading]
     # a block that is read in the place of what is measured, under its names: no loop by names
     renamed = any(set(block.outputs) & set(plain.y) for block in before)
@@ -224,7 +223,7 @@ def checked_loop(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Cl
         return None
     with warnings.catch_warnings():  # one warning is enough, where the user called from
         warnings.simplefilter("ignore", FlexplantWarning)
-        loop = close_loop(plain, *before, *blocks, larger=whole)
+        loop = close_loop(plain, *before, *blocks)
     found = loop.left_out
     if found is not None and not found.is_fine:
         warn(
@@ -238,11 +237,11 @@ def checked_loop(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Cl
 
 
 def with_left_out(
-    answer: Controller, plant: StandardPlant, larger: Any, block: StateSpace | None = None
+    answer: Controller, plant: StandardPlant, block: StateSpace | None = None
 ) -> Controller:
     """Return an answer with its check on the modes left out, or the note that none are known."""
     # the block is its part from the plant's y to u, unless all of its system is
-    loop = checked_loop(plant, [answer.system if block is None else block], larger)
+    loop = checked_loop(plant, [answer.system if block is None else block])
     return with_checks(answer, plant, loop)
 
 
@@ -252,14 +251,10 @@ def with_checks(answer: Controller, plant: StandardPlant, loop: ClosedLoop | Non
     certificate = dict(answer.certificate or {})
     for found in (left_out, tolerances):
         certificate |= {} if found is None else found.certificate
-    notes = answer.notes if left_out is not None else (*answer.notes, *unchecked(plant))
+    alone = (plant.unjudged,) if left_out is None and plant.unjudged else ()
     return answer.replace(
-        certificate=certificate, left_out=left_out, tolerances=tolerances, notes=notes
+        certificate=certificate,
+        left_out=left_out,
+        tolerances=tolerances,
+        notes=(*answer.notes, *alone),
     )
-
-
-def unchecked(plant: StandardPlant) -> tuple[str, ...]:
-    """Return a note that no modes left out are known, for a plant that may have left out some."""
-    if not plant.is_assembled or isinstance(plant.model, FEModel):
-        return ()
-    return ("modes left out of the plant: none known, none checked; larger= gives them",)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -27,11 +26,7 @@ AGREEMENT = 1e-5
 
 @one_thread()
 def design_h2(
-    plant: StandardPlant | System,
-    *,
-    u: Sequence[str] | None = None,
-    y: Sequence[str] | None = None,
-    larger: Any = None,
+    plant: StandardPlant | System, *, u: Sequence[str] | None = None, y: Sequence[str] | None = None
 ) -> Controller:
     """Return the controller ``u = K y`` of least H2 norm from w to z: the rms of z for white w.
 
@@ -48,7 +43,7 @@ def design_h2(
     ----------
     plant : StandardPlant
         Continuous or sampled. A labelled StateSpace (ours or python-control's) serves too.
-    u, y, larger
+    u, y
         As for `design_hinf`, with its warning of modes left out.
 
     Returns
@@ -69,7 +64,7 @@ def design_h2(
     CertificateError
         When the closed loop is not stable or its norm is not that of the formula.
     ModelError
-        When the plant is of another type, or `larger` does not go with it.
+        When the plant is of another type.
 
     Notes
     -----
@@ -114,7 +109,7 @@ def design_h2(
         certificate=certificate | dict(found.certificate),
         notes=found.notes,
     )
-    return with_left_out(answer, plant, larger)
+    return with_left_out(answer, plant)
 
 
 def _optimal_controller(p: Prepared) -> SolvedController:

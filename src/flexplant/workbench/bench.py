@@ -69,7 +69,6 @@ class Bench:
         machines: Mapping[str, Any],
         design: LoopDesign,
         model: Any = None,
-        larger: Any = None,
         channel: str | None = None,
         move: SetPoint | None = None,
         limits: LoopLimits | None = None,
@@ -81,7 +80,7 @@ class Bench:
         self.start = design
         self.limits = limits or LoopLimits()
         self.machines = [BenchMachine.on(one, design, name) for name, one in machines.items()]
-        self.larger, self.channel, self.move = larger, channel, move
+        self.channel, self.move = channel, move
         nominal = self.machines[0]
         if model is not None:
             self.model: BenchMachine | None = BenchMachine.on(model, design, "model")
@@ -107,13 +106,13 @@ class Bench:
         followed = _references(first if model is None else model, design)
         if not design.references and followed:
             design = design.replace(references=followed)
-        kept = {n: options.get(n) for n in ("larger", "channel", "move", "limits")}
+        kept = {n: options.get(n) for n in ("channel", "move", "limits")}
         return cls(machines, design, model, source=str(options.get("source") or ""), **kept)
 
     @cached_property
     def question(self) -> Question:
         """What is computed beside the axis."""
-        return Question(self.machines[0], self.model, self.larger, self.channel, self.move)
+        return Question(self.machines[0], self.model, self.channel, self.move)
 
     def question_of(self, index: int) -> Question:
         """Return the same of another machine."""

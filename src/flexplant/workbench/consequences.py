@@ -59,7 +59,6 @@ class Question:
 
     machine: BenchMachine
     model: BenchMachine | None
-    larger: Any
     channel: str | None
     move: SetPoint | None
 
@@ -96,7 +95,7 @@ class Question:
         K = design.controller()
         owners = tuple(f"{name}:" for name in plant.y if name.endswith(":ref"))
         read = [n for n in K.inputs if n in plant.y or n.startswith(owners)]
-        return close_loop(plant, K.select(inputs=read), larger=self.larger)
+        return close_loop(plant, K.select(inputs=read))
 
     def _on_the_plant(self, found: Consequences, design: LoopDesign, loop: AxisLoop) -> None:
         closed, plant = self._closed(design), self.plant
@@ -181,16 +180,12 @@ _PERIOD = 0.3
 class Tuning:
     """A search for laws that began with the peak and the axes of a page."""
 
-    def __init__(
-        self, plant: Any, design: LoopDesign, peak: float, notches: int, larger: Any = None
-    ) -> None:
+    def __init__(self, plant: Any, design: LoopDesign, peak: float, notches: int) -> None:
         self._design = design
         self._folder = tempfile.TemporaryDirectory(prefix="flexplant-")
         folder = Path(self._folder.name)
         getattr(plant, "nominal", plant).save(folder / "plant.npz")
         design.save(folder / "design.npz")
-        if larger is not None:
-            larger.save(folder / "larger.npz")
         #: what it does, in words
         self.said = "starting"
         words = [sys.executable, "-m", __name__, self._folder.name, repr(peak), str(notches)]
@@ -234,7 +229,6 @@ class Tuning:
 def search(folder: Path, peak: float, notches: int) -> None:
     """Search in the process: files in, a file out."""
     plant, design = load(folder / "plant.npz"), load(folder / "design.npz")
-    larger = load(folder / "larger.npz") if (folder / "larger.npz").exists() else None
     bars, over = bars_of_thread(), threading.Event()
 
     def report() -> None:
@@ -248,7 +242,7 @@ def search(folder: Path, peak: float, notches: int) -> None:
 
     threading.Thread(target=report, daemon=True).start()
     measured = type(plant).__name__ == "Frf"
-    more: dict[str, Any] = {"larger": larger}
+    more: dict[str, Any] = {}
     if measured:
         more = {"rate": design.rate or None, "delay": design.delay, "hold": design.hold}
         more["rigid"] = design.rigid

@@ -118,7 +118,7 @@ class Workbench(Bench):
         The first is shaped.
     design : LoopDesign
         To begin with; `design` is what was shaped last in any tab.
-    model, larger, channel, move, limits, source : as for `workbench`
+    model, channel, move, limits, source : as for `workbench`
 
     Examples
     --------
@@ -194,7 +194,6 @@ def workbench(
     *,
     design: LoopDesign | None = None,
     model: StandardPlant | System | None = None,
-    larger: Any = None,
     before: System | FloatArray | None = None,
     after: System | FloatArray | None = None,
     rate: float | None = None,
@@ -224,8 +223,6 @@ def workbench(
         To go on with; else each axis begins with PID and low-pass well below its resonances.
     model : StandardPlant or StateSpace, optional
         Of a measured plant: drawn beside it, for its error and the modes left out.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes left out, as for `larger_plant`.
     before, after, rate, delay, hold, rigid, unstable, references
         As for `design_loops`; of an assembled plant, or of the model, the rigid-body axes.
     channel : str, optional
@@ -266,7 +263,7 @@ def workbench(
     instance(move, SetPoint | None, "move", "Pass setpoint(...).")
     instance(design, LoopDesign | None, "design", "Pass LoopDesign.on(plant).", LabelError)
     options = {
-        "model": model, "larger": larger, "before": before, "after": after, "rate": rate,
+        "model": model, "before": before, "after": after, "rate": rate,
         "delay": delay, "hold": hold, "rigid": rigid, "unstable": unstable,
         "references": references, "channel": channel, "move": move, "limits": limits,
         "source": source,

@@ -484,7 +484,7 @@ class Page:
         if self.tuning is not None:
             return
         plant = self.machine.given
-        self.tuning = Tuning(plant, self.design, self.limits.peak, notches, self.bench.larger)
+        self.tuning = Tuning(plant, self.design, self.limits.peak, notches)
         self.side.show_tuning(self.tuning.said, True)
         if self._doc is not None:
             self._polled = self._doc.add_periodic_callback(self._poll, _POLL)

@@ -65,11 +65,11 @@ def sections(design: LoopDesign) -> bytes:
     return ("\n".join(rows) + "\n").encode()
 
 
-def report_page(design: LoopDesign, plant: Any, larger: Any = None) -> bytes:
+def report_page(design: LoopDesign, plant: Any) -> bytes:
     """Return the report page of the design and its loops."""
     from ..plot import report as write_report
 
-    loops = design.loops(plant, larger=larger)
+    loops = design.loops(plant)
     parts = {"design": design, "loops": loops, "controller": loops.system}
     return _written("loops.html", lambda path: write_report(path, parts, title="Loops by hand"))
 
@@ -264,7 +264,7 @@ class SideCards:
     def _report(self) -> bytes:
         page = self.page
         plant = page.bench.question_of(page.index).plant
-        return report_page(page.design, plant or page.machine.given, page.bench.larger)
+        return report_page(page.design, plant or page.machine.given)
 
     def _made(self, make: Callable[[], bytes]) -> Any:
         """Return a file for the browser; what is wrong with it appears on the page."""

@@ -69,7 +69,7 @@ def delta_channels(uncertain: UncertainPlant[Any]) -> DeltaChannels:
     if uncertain.neglected is not None and uncertain.neglected.sampled is None:
         raise ModelError(
             "the bound on neglected modes is of a continuous plant, this one is sampled: pass the "
-            "larger model itself, plant.uncertain(fit, neglected=larger)."
+            "whole model itself, plant.uncertain(fit, neglected=whole)."
         )
     sampled = None if uncertain.neglected is None else uncertain.neglected.sampled
     return _with_neglected(system, sizes, sampled, distance)

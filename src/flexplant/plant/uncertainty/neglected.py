@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
@@ -17,9 +17,9 @@ from ...lti.interconnection import among, side_by_side
 from ...lti.modal import part_of
 from ...lti.statespace import StateSpace, System
 from ...tolerances import ROUNDING, TINY
-from ..building import sampled_like, with_modes_of
+from ..building import sampled_like
+from ..judging import evaluation_plant
 from ..partition import Partition, is_plant
-from ..realisation import Structure
 
 #: a plant and the larger one, without rigid-body motions
 Pair: TypeAlias = tuple[StateSpace, StateSpace]
@@ -86,11 +86,11 @@ class NeglectedModes(Value):
 
 
 def neglected_modes(
-    plant: Partition | System, larger: Partition | System | Structure, *, resonances: int = 24
+    plant: Partition | System, evaluation: Any, *, resonances: int = 24
 ) -> NeglectedModes:
-    """Return weights that bound the difference of a larger model and a plant, (w, u) to (z, y).
+    """Return weights that bound the difference of a whole model and a plant, (w, u) to (z, y).
 
-    ``sigma_max(W^-1 (G_larger - G) diag(scales)) <= 1`` from 0 Hz up. The square of each weight is
+    ``sigma_max(W^-1 (G_whole - G) diag(scales)) <= 1`` from 0 Hz up. The square of each weight is
     ``p_0 + sum_k p_k / |s^2 + 2 zeta_k omega_k s + omega_k^2|^2`` at ``s = i omega``, p by linear
     programming: least mean looseness over the logarithm of frequency, above the difference at
     every frequency. The resonances are those of the lowest modes neglected, further terms are well
@@ -102,7 +102,7 @@ def neglected_modes(
     ----------
     plant : StandardPlant
         Continuous, or sampled (its continuous plant is compared).
-    larger : StandardPlant, FEModel, Modes or ReducedModel
+    evaluation : StandardPlant, FEModel, Modes or ReducedModel
         With the same channels; a structure gets the plant's ports.
     resonances : int
         How many neglected modes the weights follow; all others lie below a smooth line. Each
@@ -132,7 +132,10 @@ def neglected_modes(
     """
     given = Partition.of(plant)
     small = given.continuous
-    big = Partition.of(larger).continuous if is_plant(larger) else with_modes_of(small, larger)
+    if is_plant(evaluation):
+        big = Partition.of(evaluation).continuous
+    else:
+        big = evaluation_plant(small.replace(evaluation=evaluation)) or small
     follow = whole(resonances, "resonances")
     found = _bounding(_elastic_pair(small, big), follow)
     if not given.dt:
@@ -144,7 +147,7 @@ def _bounding(pair: Pair, follow: int) -> NeglectedModes:
     """Return the weights that bound the difference of two systems."""
     pair, mirrored = _distinct(*pair)
     if not pair[0].outputs or not pair[0].inputs:
-        raise ModelError("the larger model does not differ from the plant: nothing is neglected.")
+        raise ModelError("the model does not differ from the plant: nothing is neglected.")
     poles = _upper_poles(*pair)
     grid = _resonance_grid(poles)
     gap = _deviation(pair, grid)
@@ -203,7 +206,7 @@ def _elastic_pair(small: Partition, big: Partition) -> Pair:
     names = (*small.z, *small.y), (*small.w, *small.u)
     if not set(names[0]) <= set(big.system.outputs) or not set(names[1]) <= set(big.system.inputs):
         raise ModelError(
-            f"the larger plant has other channels: {big.w + big.u} -> {big.z + big.y}. Assemble "
+            f"the other plant has other channels: {big.w + big.u} -> {big.z + big.y}. Assemble "
             "both with the same ports."
         )
     systems, bodies = [], []

@@ -193,7 +193,7 @@ def _with_bound(
     covariance: FloatArray,
     deviations: float,
 ) -> UncertainPlant[P]:
-    """Return an uncertain plant, the modes that it lacks bounded where a larger model is given."""
+    """Return an uncertain plant, the modes that it lacks bounded by a model that has them."""
     if neglected is not None and not isinstance(neglected, NeglectedModes):
         neglected = neglected_modes(plant, neglected)
     if neglected is not None:
@@ -482,7 +482,7 @@ def _parameter_channels(
                 loads.append(_Load(f"{name}:w", -np.sign(values[i]) * size * vectors[:, i]))
                 felt.append(_Felt(f"{name}:z", size * vectors[:, i], quantity=QUANTITIES[order]))
     wider = ports.replace(w=[*loads, *ports.w], y=[*ports.y, *felt])
-    system = continuous_plant(type(plant), realisation, wider).system
+    system = continuous_plant(type(plant), realisation, wider, None).system
     return (
         system.select(
             [*(port.name for port in felt), *plant.z, *plant.y],

@@ -74,12 +74,7 @@ class _FactoredController(NamedTuple):
 
 @one_thread()
 def reduce_controller(
-    plant: StandardPlant | System,
-    controller: Any,
-    *,
-    order: int | None = None,
-    loss: float = 0.1,
-    larger: Any = None,
+    plant: StandardPlant | System, controller: Any, *, order: int | None = None, loss: float = 0.1
 ) -> Controller:
     """Return a controller of fewer states that keeps the closed loop, or none at all.
 
@@ -102,8 +97,6 @@ def reduce_controller(
         States of the result; the fewest that keep the loop when not given.
     loss : float
         Relative loss of the modulus margin, or growth of gamma, that is allowed.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes left out, as for `larger_plant`: the loop is checked there too.
 
     Returns
     -------
@@ -159,7 +152,7 @@ def reduce_controller(
         gamma=None if np.isnan(after.gamma) else after.gamma,
         certificate=after.certificate | was | {"weighted error": error},
     )
-    return with_left_out(answer, given, larger)
+    return with_left_out(answer, given)
 
 
 def _fewest_states(
@@ -265,7 +258,7 @@ def loop_facts(plant: StandardPlant, controller: StateSpace) -> LoopFacts:
     """Return what a controller keeps on a plant."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FlexplantWarning)
-        loop = close_loop(plant, controller, larger=None)
+        loop = close_loop(plant, controller)
     poles, dt, stable = loop.poles(), loop.plant.dt, loop.obstacle is None
     least = poles[np.argmax(np.abs(poles) if dt else poles.real)] if poles.size else np.nan
     freq = float(np.abs(np.angle(least) / dt if dt else np.imag(least)) / (2.0 * np.pi))
@@ -307,12 +300,7 @@ def stable_before(plant: StandardPlant, controller: StateSpace) -> Any:
 
 
 def discretise_controller(
-    plant: StandardPlant,
-    controller: Any,
-    *,
-    prewarp: float | None = None,
-    loss: float = 0.5,
-    larger: Any = None,
+    plant: StandardPlant, controller: Any, *, prewarp: float | None = None, loss: float = 0.5
 ) -> Controller:
     """Return a continuous controller at the rate of a sampled plant, and how its loop stands there.
 
@@ -330,7 +318,6 @@ def discretise_controller(
         A frequency that keeps its response: a notch, the crossover.
     loss : float
         Relative loss of the modulus margin that is allowed.
-    larger : as for `larger_plant`, optional
 
     Returns
     -------
@@ -382,4 +369,4 @@ def discretise_controller(
         + ("" if prewarp is None else f", exact at {prewarp:g} Hz"),
         certificate=after.certificate | continuous,
     )
-    return with_left_out(answer, given, larger)
+    return with_left_out(answer, given)

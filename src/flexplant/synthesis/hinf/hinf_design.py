@@ -60,7 +60,6 @@ def design_hinf(
     y: Sequence[str] | None = None,
     uncertain: UncertainPlant[Any] | None = None,
     damped_below: float = 0.0,
-    larger: Any = None,
     progress: bool | None = None,
 ) -> Controller:
     """Return a controller ``u = K y`` that keeps the H-infinity norm of w -> z small.
@@ -103,10 +102,6 @@ def design_hinf(
     damped_below : float [Hz]
         Uncertain modes below it that actuators push are damped, not only tolerated: their channel
         then covers errors of 1 % and of their shapes. `design_stage` has 3.5 times the bandwidth.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes that the plant left out, as for `larger_plant`: the loop is checked
-        there too, sampled and delayed alike. Unless given, with those that the plant's reduced
-        model still has.
     progress : bool, optional
         True shows a bar of the method's steps at once, False never; None after two seconds on a
         terminal.
@@ -128,8 +123,7 @@ def design_hinf(
     CertificateError
         When the closed loop misses the norm that was claimed.
     ModelError
-        When the plant or the method is of another type, a sampled plant has a pole at z = -1, or
-        `larger` does not go with the plant.
+        When the plant or the method is of another type, or a sampled plant has a pole at z = -1.
 
     Warns
     -----
@@ -157,10 +151,10 @@ def design_hinf(
             f"method must be Riccati(...) or Lmi(...), got {short(method)}. Pass one, or none."
         )
     if isinstance(plant, Mapping):
-        if uncertain is not None or larger is not None:
+        if uncertain is not None:
             raise ModelError(
-                "plants by position are designed for as they are: leave out uncertain= and "
-                "larger=, and check the loop at each position."
+                "plants by position are designed for as they are: leave out uncertain=, and check "
+                "the loop at each position."
             )
         posed_at = {x: posed(one, u, y, "H-infinity synthesis") for x, one in plant.items()}
         if bandwidth is not None and posed_at:
@@ -179,7 +173,7 @@ def design_hinf(
         )
     else:
         found = _design_one(plant, method, progress)
-    return with_left_out(found, plant, larger)
+    return with_left_out(found, plant)
 
 
 class Evened(NamedTuple):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import scipy.linalg as la
 
@@ -40,7 +38,6 @@ def design_ncf(
     after: System | FloatArray | None = None,
     bandwidth: float | None = None,
     back_off: float = 0.1,
-    larger: Any = None,
 ) -> Controller:
     """Return the loop-shaping controller of Glover and McFarlane, ``u = K y``.
 
@@ -65,8 +62,6 @@ def design_ncf(
         ``k (1 + w / (10 s))``, w = 2 pi bandwidth, with gain 1 at the bandwidth.
     back_off : float
         Relative distance from gamma_min, at which K_s is singular.
-    larger
-        Of a StandardPlant, as for `design_hinf`.
 
     Returns
     -------
@@ -124,7 +119,7 @@ def design_ncf(
         lower=least,
         certificate=certificate | {"modulus margin": modulus_margin((G, whole))},
     )
-    return with_left_out(answer, plant, larger) if isinstance(plant, StandardPlant) else answer
+    return with_left_out(answer, plant) if isinstance(plant, StandardPlant) else answer
 
 
 def ncf_margin(plant: StandardPlant | System, controller: Controller | System) -> float:

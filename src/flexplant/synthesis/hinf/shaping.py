@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.linalg as la
@@ -84,7 +83,6 @@ def shape_loop(
     weight: float = 1.0,
     references: Mapping[str, str] | None = None,
     back_off: float = 0.1,
-    larger: Any = None,
 ) -> ShapedLoop:
     """Return the loop shaped to a bandwidth by the recipe of Glover and McFarlane.
 
@@ -115,8 +113,6 @@ def shape_loop(
         all axes, ``cog:z:ref`` and so on, unless given.
     back_off : float
         Relative distance from the smallest gamma, with one degree of freedom.
-    larger
-        Of a StandardPlant, as for `design_hinf`.
 
     Returns
     -------
@@ -200,7 +196,7 @@ def shape_loop(
         certificate=certificate,
     )
     if axes.given is not None:
-        controller = with_left_out(controller, axes.given, larger, feedback)
+        controller = with_left_out(controller, axes.given, feedback)
     return ShapedLoop(shaped, controller, report)
 
 

@@ -23,8 +23,8 @@ from ...loop.other_machines import BEYOND, mode_tolerances
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
-from ...plant import StandardPlant, larger_plant, reference_errors, stage_weights, standard_plant
-from ...plant.larger_plant import damped_less, draws_with_left_out
+from ...plant import StandardPlant, reference_errors, stage_weights, standard_plant
+from ...plant.drawn_machines import damped_less, draws_with_left_out
 from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import Controller, with_left_out
@@ -59,7 +59,6 @@ def design_stage(
     poi: str | None = None,
     disturbance: float | None = None,
     effort: float | None = None,
-    larger: Any = None,
     progress: bool | None = None,
 ) -> Controller:
     """Return the fastest H-infinity controller of a stage that tolerates errors of its modes.
@@ -87,7 +86,7 @@ def design_stage(
         As for `stage_weights` and `reference_errors`.
     disturbance, effort : float
         As for `stage_weights` of an uncertain plant.
-    larger, progress : as for `design_hinf`
+    progress : as for `design_hinf`
 
     Returns
     -------
@@ -118,13 +117,13 @@ def design_stage(
     uncertain = given.uncertainty
     if uncertain is None:
         uncertain = given.uncertain(frequency=0.005)
-    task = _StageTask(uncertain, positive(margin, "margin"), poi, disturbance, effort, larger)
+    task = _StageTask(uncertain, positive(margin, "margin"), poi, disturbance, effort)
     with Progress(_MOST, "bandwidths", progress=progress) as bar:
         if bandwidth is not None:
             task.holds(positive(bandwidth, "bandwidth") / _CROSSES)
         else:
             task.search(bar)
-    return with_left_out(task.answer(), uncertain.plant, task.whole)
+    return with_left_out(task.answer(), uncertain.plant)
 
 
 class _StageTask:
@@ -137,7 +136,6 @@ class _StageTask:
         poi: str | None,
         disturbance: float | None,
         effort: float | None,
-        larger: Any,
     ) -> None:
         if margin >= 1.0:
             raise ModelError(f"margin must be below 1, got {margin}: no loop that acts keeps it.")
@@ -154,7 +152,7 @@ class _StageTask:
             )
         self.plant: StandardPlant = uncertain.plant
         #: with the modes left out: a controller of the reduced plant may make them unstable
-        self.whole = larger_plant(self.plant, larger)
+        self.whole = self.plant.evaluation_plant
         self.errors = reference_errors(self.plant, poi=poi)
         self.through = self.plant.through(self.errors)
         self.tried: dict[float, float] = {}
@@ -224,7 +222,7 @@ class _StageTask:
         # one on which the loop does not hold
         block = self._block(system)
         loop = close_loop(self.plant, block)
-        wholes = [] if self.whole is None else [close_loop(self.whole, block)]
+        wholes = [] if loop.completed is None else [loop.completed]
         margin = min(one.modulus_margin if one.is_stable else 0.0 for one in (loop, *wholes))
         if margin < self.margin or not self._tolerates(loop, self.ranges):
             return margin, 0.0

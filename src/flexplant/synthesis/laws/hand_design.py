@@ -312,23 +312,20 @@ class LoopDesign(Value):
         found = {**own, **self.references}
         return {name: found[name] for name in self.axes if name in found}
 
-    def loops(self, plant: Any, *, larger: Any = None) -> DesignedLoops:
+    def loops(self, plant: Any) -> DesignedLoops:
         """Return the loops on a plant, all axes closed: report, check with the modes left out.
 
         Parameters
         ----------
         plant : StandardPlant, StateSpace or Frf
             With the channels and the rate of the design.
-        larger : as for `design_loops`, optional
 
         Raises
         ------
         LabelError, ModelError, ShapeError
             As for `design_loops`.
         """
-        return made(
-            self.placed(plant), self.laws, self.rigid, self.unstable, dict(self.references), larger
-        )
+        return made(self.placed(plant), self.laws, self.rigid, self.unstable, dict(self.references))
 
     def placed(self, plant: Any) -> Axes:
         """Return a plant in the axes of the design.

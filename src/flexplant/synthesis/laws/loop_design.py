@@ -19,7 +19,7 @@ from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...plant import StandardPlant, decouple
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ..controller import checked_loop, unchecked
+from ..controller import checked_loop
 from .law import Law, LawElement
 
 
@@ -142,7 +142,6 @@ def design_loops(
     rigid: int = 0,
     unstable: int = 0,
     references: Mapping[str, str] | None = None,
-    larger: Any = None,
 ) -> DesignedLoops:
     """Return the controller of laws made by hand, ``u = -before diag(laws) after y``, and a report.
 
@@ -166,8 +165,6 @@ def design_loops(
         `report_loops`.
     references : mapping {axis: channel of y}, optional
         References that an axis follows, such as ``{"cog:z": "die:ref"}``.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes left out, for the check of a StandardPlant as for `larger_plant`.
 
     Returns
     -------
@@ -199,7 +196,7 @@ def design_loops(
     True
     """
     axes = axes_of(plant, before, after, rate, delay, hold)
-    found = made(axes, checked_laws(axes, laws), rigid, unstable, references, larger)
+    found = made(axes, checked_laws(axes, laws), rigid, unstable, references)
     if found.report.is_stable is False:
         warn(
             f"the loops are unstable ({found.report.poles}){_unstable_at(axes, found)}. Check sign "
@@ -226,7 +223,6 @@ def made(
     rigid: int,
     unstable: int,
     references: Mapping[str, str] | None,
-    larger: Any,
 ) -> DesignedLoops:
     """Return the design of laws that were checked; parameters as for `design_loops`."""
     inner = axes_controller(axes, laws)
@@ -235,9 +231,10 @@ def made(
     if axes.given is None:
         return DesignedLoops(system, laws, report)
     feedback = system.select(inputs=axes.after.inputs)  # references take no part in the loop
-    loop = checked_loop(axes.given, [feedback], larger)
+    loop = checked_loop(axes.given, [feedback])
     left_out, tolerances = (None, None) if loop is None else (loop.left_out, loop.tolerances)
-    notes = () if left_out is not None else unchecked(axes.given)
+    alone = axes.given.unjudged
+    notes = (alone,) if left_out is None and alone else ()
     return DesignedLoops(system, laws, report, left_out, notes, tolerances)
 
 

@@ -18,7 +18,7 @@ from ...loop.sensitivity import taken_apart
 from ...lti.interconnection import loop_poles
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
-from ...plant import Poi, StandardPlant, larger_plant, standard_plant
+from ...plant import Poi, StandardPlant, standard_plant
 from ...plant.partition import require_plain, require_sampled
 from ...plant.rigid_motion import require_weak
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
@@ -48,7 +48,6 @@ def design_servo(
     integrator: float | None = None,
     notches: Sequence[float] | None = None,
     observer: Any = None,
-    larger: Any = None,
 ) -> Controller:
     """Return a decoupled PID controller of the rigid-body motion at a POI.
 
@@ -81,9 +80,6 @@ def design_servo(
         notch lowers it; an empty sequence means none.
     observer : KalmanEstimator, StaticEstimator or StateSpace, optional
         What will give the estimates `die:hat`, ...; unless given, the POI itself.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes that the plant left out, as for `larger_plant`. Unless given, those
-        that the plant's reduced model still has.
 
     Returns
     -------
@@ -101,8 +97,7 @@ def design_servo(
     LabelError
         When the POI is unknown, or the observer does not give its estimates.
     ModelError
-        When the plant is weighted, a frequency is not positive or not below half the rate, or
-        `larger` does not go with the plant.
+        When the plant is weighted, or a frequency is not positive or not below half the rate.
     SolverError
         When the rigid-body loop is unstable (the bandwidth is too high for rate and delay), or the
         loop with the observer is; the message names the modes and the largest bandwidth.
@@ -122,7 +117,7 @@ def design_servo(
     >>> fx.close_loop(plant, observer, servo).is_stable
     True
     """
-    task = servo_task(plant, poi, rolloff, integrator, notches, observer, larger)
+    task = servo_task(plant, poi, rolloff, integrator, notches, observer)
     if positive(bandwidth, "bandwidth") >= 0.2 * task.rate:
         raise ModelError(
             f"bandwidth {bandwidth:g} Hz is not well below the rate, {task.rate:g} Hz: the lead "
@@ -182,7 +177,6 @@ def servo_bandwidth(
     integrator: float | None = None,
     notches: Sequence[float] | None = None,
     observer: Any = None,
-    larger: Any = None,
 ) -> float:
     """Return the largest bandwidth [Hz] at which `design_servo` keeps |S| at u below a peak.
 
@@ -194,7 +188,7 @@ def servo_bandwidth(
 
     Parameters
     ----------
-    plant, poi, rolloff, integrator, notches, observer, larger : as for `design_servo`
+    plant, poi, rolloff, integrator, notches, observer : as for `design_servo`
     peak : float
         Bound on the largest singular value of S at u; 2 is 6 dB.
 
@@ -217,7 +211,7 @@ def servo_bandwidth(
     True
     """
     peak = between(peak, "peak", 1.0, float("inf"), "No loop keeps |S| below 1: try 2.")
-    task = servo_task(plant, poi, rolloff, integrator, notches, observer, larger)
+    task = servo_task(plant, poi, rolloff, integrator, notches, observer)
     return task.largest(float(peak))
 
 
@@ -249,7 +243,6 @@ class ServoTask:
     integrator: float | None
     notches: tuple[float, ...] | None
     observer: StateSpace | None
-    larger: StandardPlant | None
 
     @property
     def rate(self) -> float:
@@ -267,7 +260,9 @@ class ServoTask:
     @property
     def loop(self) -> ServoLoop:
         """Over frequency, with the modes left out where they are known."""
-        return servo_loop(self.larger or self.plant, self.observer, self.poi, self.plant)
+        return servo_loop(
+            self.plant.evaluation_plant or self.plant, self.observer, self.poi, self.plant
+        )
 
     def notched(self, axis: Axis) -> Axis:
         """Return the axis with notches where they serve, unless they were given."""
@@ -296,16 +291,15 @@ class ServoTask:
     @cached_property
     def closed(self) -> Callable[[Axis], ClosedLoop]:
         """The function of an axis that gives the loop that will run."""
-        plant, larger = self.plant, self.larger
+        plant = self.plant
         before = () if self.observer is None else (self.observer,)
         if not before:
             plant = seeing(plant, self.poi)
-            larger = None if larger is None else seeing(larger, self.poi)
 
         def found(axis: Axis) -> ClosedLoop:
             blocks = (*before, self.controller(axis))
             controller = driving_blocks(plant, blocks, *drives(plant, blocks, ()))
-            return ClosedLoop(plant, blocks, controller, larger=larger)
+            return ClosedLoop(plant, blocks, controller)
 
         return cache(found)
 
@@ -354,7 +348,7 @@ class ServoTask:
             if size > peak:
                 return False
             closed = self.closed(axis)
-            # the larger loop, which costs most, only where the smaller one is fine
+            # the loop on the evaluation model, which costs most, only where the smaller one is fine
             return fine(closed) and (closed.left_out is None or fine(closed.left_out))
 
         trials = np.geomspace(0.19 * self.rate, slowest, _TRIALS)
@@ -393,7 +387,6 @@ def servo_task(
     integrator: float | None,
     notches: Sequence[float] | None,
     observer: Any,
-    larger: Any,
 ) -> ServoTask:
     """Return the task of a servo; parameters as for `design_servo`."""
     plant = standard_plant(given)
@@ -409,7 +402,6 @@ def servo_task(
         integrator,
         None if centres is None else tuple(centres),
         observer_system(observer, plant, port),
-        larger_plant(plant, larger),
     )
 
 

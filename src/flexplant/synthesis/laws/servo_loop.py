@@ -17,7 +17,7 @@ from ...lti.frequency_sweep import resonance_grid
 from ...lti.responses import responses
 from ...lti.sampling import held_exactly
 from ...lti.statespace import StateSpace
-from ...plant import Foreign, Poi, StandardPlant
+from ...plant import EvaluationModel, Foreign, Poi, StandardPlant
 from ...plant.realisation import natural
 from ...plant.rigid_motion import rigid_gain
 from ...tolerances import divisor
@@ -159,7 +159,11 @@ def seeing(plant: StandardPlant, poi: Poi) -> StandardPlant:
     rows = [*range(nz), *own, *(nz + i for i in kept)]
     y = (*(poi.derived(axis, "hat") for axis in poi.axes), *(plant.y[i] for i in kept))
     system = g.replace(C=g.C[rows], D=g.D[rows], outputs=[*plant.z, *y])
-    return StandardPlant(system, plant.w, plant.u, plant.z, y, {}, Foreign(delay=plant.delay))
+    whole = plant.evaluation_plant
+    return StandardPlant(
+        system, plant.w, plant.u, plant.z, y, {}, Foreign(delay=plant.delay),
+        evaluation=EvaluationModel.of(whole and seeing(whole, poi)),
+    )  # fmt: skip
 
 
 def observer_system(observer: Any, plant: StandardPlant, poi: Poi) -> StateSpace | None:

@@ -20,7 +20,7 @@ from ...lti.interconnection import loop_poles, series
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import Progress, one_thread
-from ...plant import StandardPlant, larger_plant
+from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from .axis_law import AxisLaw, MeasuredAxis, are_stable, linear_step, near_lowest
 from .law import Law, decoupled, tustin_s
@@ -43,7 +43,6 @@ def tune_loops(
     peak: float = TARGET,
     rigid: int | None = None,
     notches: int = 3,
-    larger: Any = None,
     progress: bool | None = None,
 ) -> DesignedLoops:
     """Return the laws of highest bandwidth that keep |S| below a peak, all axes together.
@@ -65,8 +64,6 @@ def tune_loops(
         whose modes lie within the lines.
     notches : int
         At most so many for each axis; one has to raise the bandwidth by 2 %.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        Of a StandardPlant, as for `design_servo`: the peak holds there too.
     progress : bool, optional
         A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
 
@@ -106,7 +103,7 @@ def tune_loops(
         rigid = int(np.count_nonzero(distance <= _ZERO * np.max(distance, initial=0.0))) // 2
     rigid = whole(rigid, "rigid", minimum=0)
     most = whole(notches, "notches", minimum=0)
-    plants = _joint_plants(plant, axes, rigid, larger, {"rate": rate, "delay": delay, "hold": hold})
+    plants = _joint_plants(plant, axes, rigid, {"rate": rate, "delay": delay, "hold": hold})
     frf, of, alone = _axes_response(plants[-1], axes), [], []
     with Progress(len(axes.names), "axes", progress=progress) as bar:
         for i, name in enumerate(axes.names):
@@ -116,7 +113,7 @@ def tune_loops(
             alone.append(of[i].best())
             bar.advance()
     found = JointSearch(of, plants, float(peak), alone).best()
-    design = made(axes, dict(zip(axes.names, found.laws, strict=True)), rigid, 0, None, larger)
+    design = made(axes, dict(zip(axes.names, found.laws, strict=True)), rigid, 0, None)
     notes = [note for law, x in zip(of, found.numbers, strict=True) for note in law.notes(x)]
     if found.worst.size > peak:
         notes.append(
@@ -130,7 +127,7 @@ def tune_loops(
 
 
 def _joint_plants(
-    plant: Any, axes: Axes, rigid: int, larger: Any, measured: Mapping[str, Any]
+    plant: Any, axes: Axes, rigid: int, measured: Mapping[str, Any]
 ) -> list[JointPlant]:
     """Return the plant in its own channels, and the one with the modes left out where known."""
     u, y, static = axes.before.outputs, axes.after.inputs, (axes.before.D, axes.after.D)
@@ -139,7 +136,7 @@ def _joint_plants(
         return [JointPlant(in_axes(given.select(y, u), **measured), *static, axes.names, rigid)]
     own = as_statespace(plant if axes.given is None else axes.given.Gyu)
     found = [JointPlant(own.select(y, u), *static, axes.names, rigid)]
-    more = None if axes.given is None else larger_plant(axes.given, larger)
+    more = None if axes.given is None else axes.given.evaluation_plant
     if axes.given is not None and more is not None:
         reading, G = axes.given.origin.reading, more.system.select(more.y, more.u)
         if reading is not None:

@@ -44,7 +44,6 @@ def design_lmi(
     subject_to: Sequence[H2 | Hinf | PeakGain | PoleRegion] = (),
     back_off: float = 0.03,
     max_states: int = 20,
-    larger: Any = None,
 ) -> Controller:
     """Return a controller that keeps several norms below bounds and makes one of them small.
 
@@ -67,8 +66,6 @@ def design_lmi(
         more where no controller keeps the bounds there: the certificate says how much.
     max_states : int
         Larger problems are refused: the time grows with the sixth power.
-    larger
-        As for `design_hinf`, with its warning of modes left out.
 
     Returns
     -------
@@ -127,7 +124,7 @@ def design_lmi(
             certificate={"LMI optimum": claim, "LMI bound": bound, **reached},
             reached=reached,
         )
-        return with_left_out(answer, given, larger)
+        return with_left_out(answer, given)
     raise CertificateError(
         f"the LMIs claim {claim:.6g}, but no controller kept all bounds: {failures[-1]} Loosen "
         "bounds, add a little noise to each sensor, or raise back_off."

@@ -80,7 +80,6 @@ def design_mu(
     method: SynthesisMethod | None = None,
     iterations: int = 4,
     order: int = 1,
-    larger: Any = None,
     progress: bool | None = None,
 ) -> Controller:
     """Return a controller whose weighted gain stays small on every machine of an uncertainty.
@@ -98,7 +97,7 @@ def design_mu(
     Parameters
     ----------
     uncertain : UncertainPlant
-        From `plant.uncertain(fit, neglected=larger)`, continuous or sampled.
+        From `plant.uncertain(fit, neglected=whole)`, continuous or sampled.
     w, z : mapping {name: weight}, or sequence of str
         Weights of performance, as for `StandardPlant.weighted`, those of `stage_weights` too:
         None leaves a channel out, as does not naming it.
@@ -107,7 +106,7 @@ def design_mu(
         Most steps.
     order : int
         Most states of D for each Delta and side.
-    larger, progress
+    progress
         As for `design_hinf`, with its warning of modes left out.
 
     Returns
@@ -135,7 +134,7 @@ def design_mu(
     if uncertain.neglected is None and all(one.kind == "freq" for one in uncertain.deltas):
         answer = _by_mode_channels(uncertain, w, z, most, method, progress)
         if answer is not None:
-            return with_left_out(answer, uncertain.plant, larger)
+            return with_left_out(answer, uncertain.plant)
     steps = _filter_steps(uncertain, w, z, method, most, states)
     best, found = _best_step(steps, most + 1, _SETTLED, progress)
     if best is None:
@@ -146,7 +145,7 @@ def design_mu(
         gamma=best.mu,
         certificate={"mu": best.mu, "at Hz": best.freq} | found,
     )
-    return with_left_out(answer, uncertain.plant, larger)
+    return with_left_out(answer, uncertain.plant)
 
 
 def _best_step(

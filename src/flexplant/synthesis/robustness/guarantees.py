@@ -18,7 +18,7 @@ from ...lti.frequency_sweep import largest_gains
 from ...lti.norms import peak_gain
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
-from ...plant import StandardPlant, larger_plant
+from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..hinf.mode_channels import mode_channels, tolerated, with_mode_channels
 from .lower import Destabilising, destabilising, smallest_with_block
@@ -113,7 +113,6 @@ def robust_stability(
     uncertain: UncertainPlant[Any],
     *blocks: Any,
     quick: bool = False,
-    larger: Any = None,
     machines: int = 20,
     rng: Any = 0,
     progress: bool | None = None,
@@ -127,7 +126,7 @@ def robust_stability(
     Parameters
     ----------
     uncertain : UncertainPlant
-        From `plant.uncertain(fit, neglected=larger)`.
+        From `plant.uncertain(fit, neglected=whole)`.
     *blocks : StateSpace, or values with a `system`
         The controller, as for `close_loop`.
     quick : bool
@@ -135,9 +134,6 @@ def robust_stability(
         sampled mode to first order, on a grid through the resonances: a fraction of a second for
         ten modes. Where it is below 1 it is the answer, without a lower bound; else the whole
         search follows.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes that the plant left out, as for `larger_plant`: the nominal loop is
-        checked there too.
     machines : int
         How many are drawn, each Delta at an end of its interval.
     rng : int, SeedSequence, Generator or None
@@ -175,7 +171,7 @@ def robust_stability(
     count = whole(machines, "machines", minimum=0, maximum=MOST)
     chance = generator(rng)
     if quick:
-        first = _quick(uncertain, blocks, larger, count, chance)
+        first = _quick(uncertain, blocks, count, chance)
         if first is not None:
             return first
     loop = uncertain_loop(uncertain, blocks)
@@ -196,7 +192,7 @@ def robust_stability(
         machine,
         loop.freq(found.frequencies),
         np.sqrt(np.maximum(found.bounds, 0.0)),
-        *_tried_on(uncertain, loop.loop, names, upper, count, chance, larger, beside),
+        *_tried_on(uncertain, loop.loop, names, upper, count, chance, beside),
     )
 
 
@@ -238,11 +234,7 @@ def _worst_machine(
 
 
 def _quick(
-    uncertain: UncertainPlant[Any],
-    blocks: tuple[Any, ...],
-    larger: Any,
-    count: int,
-    rng: np.random.Generator,
+    uncertain: UncertainPlant[Any], blocks: tuple[Any, ...], count: int, rng: np.random.Generator
 ) -> RobustStability | None:
     """Return the answer of one channel a mode where it shows stability, None where it does not."""
     if uncertain.neglected is not None or any(d.kind != "freq" for d in uncertain.deltas):
@@ -261,7 +253,7 @@ def _quick(
     upper = max(1.0 / size, tolerated(channels, opened, controller, size) / size)
     none, beside = np.zeros(0), {"modes, each by one channel": float(len(channels))}
     names = [delta.name for delta in uncertain.deltas]
-    tried = _tried_on(uncertain, loop, names, upper, count, rng, larger, beside)
+    tried = _tried_on(uncertain, loop, names, upper, count, rng, beside)
     return RobustStability(upper, 0.0, float("nan"), {}, None, none, none, *tried)
 
 
@@ -272,7 +264,6 @@ def _tried_on(
     upper: float,
     count: int,
     rng: np.random.Generator,
-    larger: Any,
     beside: Mapping[str, float],
 ) -> tuple[dict[str, float], SpillOver | None]:
     """Return how stable machines at corners are, each closed exactly, and the modes left out."""
@@ -289,8 +280,6 @@ def _tried_on(
     if count:
         kind = "largest spectral radius" if nominal.plant.dt else "largest real part"
         found[f"{kind} of {counted(count, 'machine')}"] = worst
-    if larger is not None:
-        nominal = nominal.replace(larger=larger_plant(nominal.plant, larger))
     left_out = nominal.left_out
     return found | dict(beside) | dict(left_out.certificate if left_out else {}), left_out
 

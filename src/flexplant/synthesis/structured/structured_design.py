@@ -73,7 +73,6 @@ def design_structured(
     starts: int = 8,
     rng: Rng = 0,
     evaluations: int = 10_000,
-    larger: Any = None,
     progress: bool | None = None,
 ) -> Controller:
     """Return the controller of a structure with the least norm found from w to z.
@@ -105,8 +104,6 @@ def design_structured(
         Draws starts.
     evaluations : int
         After so many closed loops of each plant the search ends with the best that it has.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes that the (first) plant left out, as for `larger_plant`.
     progress : bool, optional
         Show a bar; unless given, on a terminal after a while.
 
@@ -218,7 +215,7 @@ def design_structured(
         structure=final,
         tried=search.tried,
     )
-    return with_left_out(answer, plants[0], larger)
+    return with_left_out(answer, plants[0])
 
 
 def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> list[StandardPlant]:

@@ -1,4 +1,4 @@
-"""The plant with the modes left out: from what the model knows, or from what is given."""
+"""The evaluation model of a plant: from what the model knows, or from what is given."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ import flexplant as fx
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.lti import frequency_response
 from flexplant.modes import solve_modes
-from flexplant.plant import assemble_plant, larger_plant
+from flexplant.plant import assemble_plant
 from flexplant.reduction import DesiredDofs, ModalTruncation, reduce
 from flexplant.structure import ModalDamping
 from plates import make_plate
@@ -33,14 +33,14 @@ def same_response(ours, theirs):
 @pytest.mark.parametrize("method", [DesiredDofs(GRID), ModalTruncation(9, static_at=["1:z"])])
 def test_what_the_model_knows_is_the_plant_of_all_modes(method):
     plant = plant_of(reduce(MODES, method))
-    same_response(larger_plant(plant), plant_of(MODES))
+    same_response(plant.evaluation_plant, plant_of(MODES))
     continuous = plant.continuous
-    assert not larger_plant(continuous).dt
+    assert not continuous.evaluation_plant.dt
 
 
 @pytest.mark.parametrize("given", ["modes", "model", "reduced", "plant", "sampled plant"])
-def test_any_larger_model_serves(given):
-    larger = {
+def test_any_evaluation_model_serves(given):
+    whole = {
         "modes": MODES,
         "model": PLATE,
         "reduced": reduce(MODES, ModalTruncation(30)),
@@ -49,39 +49,39 @@ def test_any_larger_model_serves(given):
     }[given]
     plant = plant_of(reduce(MODES, ModalTruncation(9)))
     expected = plant_of(PLATE if given == "model" else MODES)
-    same_response(larger_plant(plant, larger), expected)
+    same_response(plant.replace(evaluation=whole).evaluation_plant, expected)
 
 
 def test_weights_and_blocks_are_taken_off():
     plant = plant_of(reduce(MODES, DesiredDofs(GRID)))
     weighted = plant.through(fx.reference_errors(plant)).weighted(z={"die:error": 2.0})
-    same_response(larger_plant(weighted), plant_of(MODES))
+    same_response(weighted.evaluation_plant, plant_of(MODES))
 
 
 def test_nothing_known_is_none():
-    assert larger_plant(plant_of(solve_modes(PLATE, count=9))) is None
-    assert larger_plant(fx.StandardPlant.from_statespace(plant_of(MODES).system)) is None
+    assert plant_of(solve_modes(PLATE, count=9)).evaluation_plant is None
+    assert fx.StandardPlant.from_statespace(plant_of(MODES).system).evaluation_plant is None
 
 
 def test_refusals():
     plant = plant_of(reduce(MODES, ModalTruncation(9)))
     with pytest.raises(ModelError, match=r"delay 1, the plant .* and 1\.5"):
-        larger_plant(plant, plant_of(MODES, delay=1))
+        _ = plant.replace(evaluation=plant_of(MODES, delay=1)).evaluation_plant
     slow = assemble_plant(MODES, ports()).discretized(5e3, delay=1.5)
     assert slow.dt != plant.dt
     with pytest.raises(ModelError, match="could not be compared"):
-        larger_plant(plant, slow)
+        _ = plant.replace(evaluation=slow).evaluation_plant
     other = assemble_plant(MODES, ports().replace(y=ports().y[:3]))
     with pytest.raises(LabelError, match="other channels in w"):
-        larger_plant(plant, other)
+        _ = plant.replace(evaluation=other).evaluation_plant
     foreign = fx.StandardPlant.from_statespace(plant.system)
-    with pytest.raises(ModelError, match="not assembled from a structure"):
-        larger_plant(foreign, MODES)
-    with pytest.raises(ModelError, match="larger must be of type FEModel"):
-        larger_plant(plant, "larger")
+    with pytest.raises(ModelError, match="this plant was not assembled from one"):
+        _ = foreign.replace(evaluation=MODES).evaluation_plant
+    with pytest.raises(ModelError, match="evaluation must be of type FEModel"):
+        plant.replace(evaluation="whole")
 
 
-def test_a_larger_model_of_another_machine_is_warned_of():
+def test_an_evaluation_model_of_another_machine_is_warned_of():
     """A plate of 0.7 m beside one of 0.6 m: 13.5 nm were predicted for 0.67."""
 
     def plate(size, count, density=2702):
@@ -103,6 +103,6 @@ def test_a_larger_model_of_another_machine_is_warned_of():
     )
     plant = fx.assemble_plant(plate(0.6, 12), own).discretized(1e4, delay=1.0)
     with pytest.warns(FlexplantWarning, match="another rigid body.* differs by"):
-        fx.plant.larger_plant(plant, plate(0.7, 20))
+        _ = plant.replace(evaluation=plate(0.7, 20)).evaluation_plant
     # an added mass of some per cent is that of an update
-    fx.plant.larger_plant(plant, plate(0.6, 20, density=2702 * 1.05))
+    _ = plant.replace(evaluation=plate(0.6, 20, density=2702 * 1.05)).evaluation_plant
