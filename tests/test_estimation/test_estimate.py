@@ -414,7 +414,7 @@ def test_the_report_by_lag_is_that_of_the_estimates():
 def test_a_moving_poi_is_at_each_sample_a_poi_that_stands_there(method, truncated):
     """Start, a gap, blocks, compliance and noise of modes left out: row by row the fixed POI's."""
     plant = plate_plant(2e-2, count=5, sensor_asd=1e-10)
-    kalman = design_kalman(plant.replace(evaluation=modes(2e-2, 9) if truncated else plant))
+    kalman = design_kalman(plant.replace(evaluation=modes(2e-2, 9) if truncated else None))
     model = kalman.model
     rng = np.random.default_rng(9)
     y, u = 1e-8 * rng.standard_normal((600, 4)), 10 * rng.standard_normal((600, 4))
@@ -426,7 +426,7 @@ def test_a_moving_poi_is_at_each_sample_a_poi_that_stands_there(method, truncate
         found = kalman.estimate(channels, method, start=start, path=places[which])
         for i, point in enumerate(places):
             there = plant.at(point.tolist())
-            fixed = design_kalman(there.replace(evaluation=modes(2e-2, 9) if truncated else there))
+            fixed = design_kalman(there.replace(evaluation=modes(2e-2, 9) if truncated else None))
             wanted = fixed.estimate(channels, method, start=start)
             at = np.flatnonzero(which == i)[1:]
             for name in wanted.names:

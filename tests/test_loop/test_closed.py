@@ -213,6 +213,7 @@ def test_repr_is_short(loop):
         f"  stable: spectral radius {loop.spectral_radius:.9g}, modulus margin 0.586",
         "  driven: u1 u2",
         "  monitored: die:hat",
+        "  not judged on a larger model",
     ]
 
 

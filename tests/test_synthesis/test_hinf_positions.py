@@ -66,4 +66,4 @@ def test_a_scanning_plate_is_held_where_designs_for_a_place_are_unstable():
 
 def test_options_for_one_plant_are_refused():
     with pytest.raises(ModelError, match="leave out uncertain="):
-        fx.design_hinf(moving(), uncertain=machine().uncertain(frequency=0.01))
+        fx.design_hinf(moving(), uncertain=fx.testbeds.three_masses().uncertain(frequency=0.01))

@@ -168,7 +168,7 @@ def test_search_and_certificate_break_the_same_loop():
         plants.append(assemble_plant(plant.model, seen).discretized(2e3, delay=1))
     pairs = [(plant, design_static(plant)), *((one, design_kalman(one)) for one in plants)]
     for one, observer in pairs:
-        task = servo_task(one, None, None, None, (), observer, None)
+        task = servo_task(one, None, None, None, (), observer)
         for bandwidth in (5.0, 20.0):
             axis = task.axis(bandwidth)
             found = task.loop.gain(axis)

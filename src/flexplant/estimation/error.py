@@ -365,7 +365,7 @@ def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop
     hats = estimates(channels)
     own = [block for block in loop.blocks if set(hats) & set(block.outputs)]
     if not own:
-        loop = close_loop(loop.plant, *loop.blocks, estimator)
+        loop = close_loop(loop.plant.replace(evaluation=None), *loop.blocks, estimator)
     elif not all(equal_matrices(block, estimator) for block in own):
         raise ModelError(
             f"the loop has {', '.join(hats)} from another estimator. Close it with this one: "
@@ -550,6 +550,6 @@ def _rms(estimator: Any, machine: StandardPlant, channel: str, blocks: Sequence[
         return float(estimator.rms(channel, on=machine))
     with warnings.catch_warnings():  # the table itself says which loops are unstable
         warnings.simplefilter("ignore", FlexplantWarning)
-        loop = close_loop(machine, estimator, *blocks)
+        loop = close_loop(machine.replace(evaluation=None), estimator, *blocks)
     row = row_of(poi_channels(estimator.plant), channel)
     return float(np.sqrt(loop_variances(estimator.plant, estimator.system, loop)[row]))

@@ -135,7 +135,8 @@ def lag_errors(
         curve[k] = curve[k - 1] - np.sum((w @ seen.T) ** 2, axis=1)
         w = w @ F.T
     try:
-        static, note = np.array([design_static(plant).rms(name) for name in channels]), ""
+        alone = design_static(plant.replace(evaluation=None))  # as the other rows
+        static, note = np.array([alone.rms(name) for name in channels]), ""
     except FlexplantError as error:
         static, note = np.full(len(channels), np.nan), str(error)
     table = [static**2, predicted, base, *(curve[k] for k in counts.values()), smooth]

@@ -480,9 +480,15 @@ def _evaluation_of_rebuilt(
         return None
     if isinstance(ports, Ports):
         judged = judged.with_ports(ports)
-    own, new = plant.model, plant.model if realisation is None else realisation.model
-    # the modes that a reduced model left out follow a change of this model
-    return EvaluationModel.known_to(new) if judged.source is own and new is not own else judged
+    if realisation is None:
+        return judged
+    # other modes are another machine, which the evaluation model does not describe. What a reduced
+    # model left out follows a change of that model
+    if judged.source is not plant.model:
+        return None
+    return (
+        judged if realisation.model is plant.model else EvaluationModel.known_to(realisation.model)
+    )
 
 
 def weighted(plant: P, z: Any, w: Any) -> P:

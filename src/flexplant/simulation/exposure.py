@@ -358,7 +358,7 @@ def error_map(
     pois = [Poi(name, at=tuple(p), axes=(axis,)) for name, p in zip(names, places, strict=True)]
     wide = loop.plant.with_ports(ports.replace(z=[*ports.z, *pois]))
     given = {} if reference is None else {_map_reference(ports, axis): reference}
-    closed = close_loop(wide, *loop.blocks, idle=loop.idle)
+    closed = close_loop(wide.replace(evaluation=None), *loop.blocks, idle=loop.idle)
     run = simulate(closed, duration=duration, reference=given, noise=noise, rng=rng)
     target = [run[followed] for followed in given] or [np.zeros(run.time.size)]
     shown = [poi.channel(axis) for poi in pois]

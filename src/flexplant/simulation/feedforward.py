@@ -190,7 +190,7 @@ def design_feedforward(
     T, axes = force_axes(plant, poi)
     wanted = np.eye(len(poi.axes))[:, [poi.axes.index(axis)]]
     blocks = () if loop is None else loop.blocks
-    forced = close_loop(plant, *blocks, known_forces(plant))
+    forced = close_loop(plant.replace(evaluation=None), *blocks, known_forces(plant))
     gains = coefficients(_inverse_of(forced, poi, T, wanted, name, along), plant.dt, axes)
     gains[:, :, highest + 1 :] = 0.0
     return Feedforward(name, axes, T, tuple(plant.u), gains, plant.dt)
@@ -491,7 +491,7 @@ def _check_minimum(
 
 def _feedback(loop: ClosedLoop, force: FloatArray, move: SetPoint, name: str) -> FloatArray:
     """Return what the controller adds (n_time, nu) while these forces move its own plant."""
-    plant = loop.plant
+    plant = loop.plant.replace(evaluation=None)
     names = [force_name(u) for u in plant.u]
     alone = close_loop(plant, known_forces(plant))
     given = {one: force[:, i] for i, one in enumerate(names)}

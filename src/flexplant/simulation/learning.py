@@ -163,7 +163,8 @@ def _effects(
     channels: list[str],
 ) -> FloatArray:
     """Return what a unit of each gain adds to the errors (n_gain, n_channel * n_time)."""
-    forced = close_loop(loop.plant, *loop.blocks, known_forces(loop.plant), idle=loop.idle)
+    plant = loop.plant.replace(evaluation=None)
+    forced = close_loop(plant, *loop.blocks, known_forces(plant), idle=loop.idle)
     time = np.arange(round(positive(duration, "duration") / loop.plant.dt)) * loop.plant.dt
     signals = move.at(time)
     rows = []

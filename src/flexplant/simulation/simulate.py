@@ -221,7 +221,8 @@ def finer_loop(loop: ClosedLoop, finer: int) -> ClosedLoop:
             "elsewhere. Make it by assemble_plant(model, ports).discretized(rate), or simulate at "
             "its own samples."
         )
-    fine = plant.continuous.discretized(finer / plant.dt, delay=finer * plant.delay)
+    bare = plant.continuous.replace(evaluation=None)
+    fine = bare.discretized(finer / plant.dt, delay=finer * plant.delay)
     fine = with_known(fine, loop.blocks)
     if (fine.w, fine.u, fine.z, fine.y) != (plant.w, plant.u, plant.z, plant.y):
         raise ModelError(

@@ -258,7 +258,7 @@ def loop_facts(plant: StandardPlant, controller: StateSpace) -> LoopFacts:
     """Return what a controller keeps on a plant."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FlexplantWarning)
-        loop = close_loop(plant, controller)
+        loop = close_loop(plant.replace(evaluation=None), controller)
     poles, dt, stable = loop.poles(), loop.plant.dt, loop.obstacle is None
     least = poles[np.argmax(np.abs(poles) if dt else poles.real)] if poles.size else np.nan
     freq = float(np.abs(np.angle(least) / dt if dt else np.imag(least)) / (2.0 * np.pi))
