@@ -19,12 +19,12 @@ from ..errors import (
     some_names,
     unknown_label,
 )
-from ..labels import DIRECTIONS
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..structure import FEModel
 from .evaluation_model import NOT_JUDGED, EvaluationModel
 from .ports import Ports
 from .realisation import MODAL, ModalRealisation
+from .sides import TYPE_THIS, sides_of
 
 
 class _Unknown:
@@ -297,7 +297,7 @@ class Partition(Value):
         """
         g = as_statespace(sys)
         if u is None and y is None and w is None and z is None:
-            w, u, z, y = sides(g)
+            w, u, z, y = sides_of(g)
         if u is None or y is None:
             raise LabelError(
                 f"name both u and y, got u = {u} and y = {y}. Type {TYPE_THIS}, or leave all four "
@@ -546,10 +546,6 @@ class Partition(Value):
     Gyu = property(lambda self: self.system.select(self.y, self.u), doc="The system u -> y.")
 
 
-#: what to type for a system whose names do not show its channels
-TYPE_THIS = "StandardPlant.from_statespace(sys, w=[...], u=[...], z=[...], y=[...], asd={...})"
-
-
 def require_plain(plant: Partition, why: str, error: type[FlexplantError] = ModelError) -> None:
     """Refuse a plant that is weighted or seen through a block."""
     if plant.is_weighted:
@@ -571,41 +567,3 @@ def require_noise(sizes: Mapping[str, float]) -> None:
             f"sensors {some_names(silent)} have no noise (asd 0): filters would trust them without "
             "limit and differentiate them. Give Sensor(..., asd=) what the data sheet says."
         )
-
-
-def sides(g: StateSpace) -> tuple[list[str], list[str], list[str], list[str]]:
-    """Return w, u, z, y of a system whose channels are named like those of an assembled plant."""
-    # each actuator `u1` has its effort `u1:effort` among the outputs: these inputs are u, the
-    # others w. Outputs that are efforts, errors (`die:error`) or motions of POIs (`die:z`) are z;
-    # the others are y: references (`die:ref`, an input too), outputs with a noise `y1:noise` in w,
-    # and plain names
-    efforts = [name.removesuffix(":effort") for name in g.outputs if name.endswith(":effort")]
-    u = [name for name in g.inputs if name in efforts]
-    noisy = [name.removesuffix(":noise") for name in g.inputs if name.endswith(":noise")]
-    references = [name for name in g.inputs if name.endswith(":ref")]
-    if not u:
-        raise _untold("no input has an effort among the outputs, such as 'u1:effort' for 'u1'")
-    z, y = [], []
-    for name in g.outputs:
-        ending = name.rpartition(":")[2] if ":" in name else ""
-        if name in noisy or name in references or not ending:
-            y.append(name)
-        elif ending in ("effort", "error", *DIRECTIONS):
-            z.append(name)
-        else:
-            raise _untold(f"the output {name!r} may be a measurement or a performance")
-    for name, listed, what in (
-        *((name, g.inputs, "effort") for name in efforts),
-        *((name, y, "noise") for name in noisy),
-    ):
-        if name not in listed:
-            raise _untold(f"{name + ':' + what!r} is there, {name!r} is not")
-    if not y:
-        raise _untold("no output is a measurement")
-    return [name for name in g.inputs if name not in u], u, z, y
-
-
-def _untold(why: str) -> LabelError:
-    return LabelError(
-        f"the names of the channels do not show which are w, u, z and y: {why}. Type {TYPE_THIS}."
-    )
