@@ -1,13 +1,15 @@
 """The evaluation model of a plant: from what the model knows, or from what is given."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 
 import flexplant as fx
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
-from flexplant.lti import frequency_response
+from flexplant.lti import StateSpace, frequency_response
 from flexplant.modes import solve_modes
-from flexplant.plant import assemble_plant
+from flexplant.plant import assemble_plant, evaluation_model, judging
 from flexplant.reduction import DesiredDofs, ModalTruncation, reduce
 from flexplant.structure import ModalDamping
 from plates import make_plate
@@ -106,3 +108,99 @@ def test_an_evaluation_model_of_another_machine_is_warned_of():
         _ = plant.replace(evaluation=plate(0.7, 20)).evaluation_plant
     # an added mass of some per cent is that of an update
     _ = plant.replace(evaluation=plate(0.6, 20, density=2702 * 1.05)).evaluation_plant
+
+
+#: a block that reads two sensors
+READ = {"inputs": ["y1", "y2"], "outputs": ["a", "b"]}
+STEPS = {
+    "discretized": lambda plant: plant.discretized(4e3, delay=1.0),
+    "at": lambda plant: plant.at((0.15, 0.3, 0.0)),
+    "with_ports": lambda plant: plant.with_ports(ports().replace(y=ports().y[:3])),
+    "asd": lambda plant: plant.replace(asd={**plant.asd, "amp1": 2e-3}),
+    "uncertain": lambda plant: plant.uncertain(frequency=0.01).nominal,
+    "evaluation": lambda plant: plant.replace(evaluation=MODES),
+}
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_made_of_a_plant_is_judged_on_what_is_made_of_its_evaluation_model(seed):
+    """Steps in any order: the evaluation plant is the plant of all modes after the same steps."""
+    rng = np.random.default_rng(seed)
+    names = [str(name) for name in rng.permutation(sorted(STEPS))]
+    # a density of a channel stays where its port stays; a Delta is of the plant as it is last
+    plant, every = assemble_plant(MODES.select(range(9)), ports()), assemble_plant(MODES, ports())
+    for name in names:
+        plant = STEPS[name](plant)
+        every = every if name in ("uncertain", "evaluation") else STEPS[name](every)
+    judge = plant.evaluation_plant
+    same_response(judge, every)
+    assert judge.asd == every.asd and judge.evaluation is None
+    assert plant.evaluation_plant is judge
+    heavy = plant.weighted(z={"die:z": 2.0}).through(StateSpace([], [], [], np.eye(2), **READ))
+    assert heavy.evaluation_plant is judge
+
+
+def test_a_plant_that_is_the_evaluation_model_follows_the_steps():
+    """A plant has ports of its own: it is moved, gets other ports and is sampled by itself."""
+    small, every = (assemble_plant(model, ports()) for model in (MODES.select(range(9)), MODES))
+    plant = assemble_plant(small.model, ports(), evaluation=every)
+    for name in ("at", "discretized", "with_ports", "uncertain"):
+        plant = STEPS[name](plant)
+        every = every if name == "uncertain" else STEPS[name](every)
+        same_response(plant.evaluation_plant, every)
+
+
+def test_a_system_made_elsewhere_has_a_plant_as_its_evaluation_model():
+    few, every = (plant_of(model) for model in (MODES.select(range(9)), MODES))
+    plant = fx.StandardPlant.from_statespace(
+        few.system, w=few.w, u=few.u, z=few.z, y=few.y, evaluation=every.system
+    )
+    same_response(plant.evaluation_plant.replace(origin=every.origin), every)
+    with pytest.raises(ModelError, match="this plant was not assembled from one"):
+        _ = plant.replace(evaluation=MODES).evaluation_plant
+
+
+@pytest.mark.filterwarnings("ignore:.*evaluation= of a finer mesh")
+def test_it_is_solved_and_assembled_once(monkeypatch):
+    """Its modes are solved once, and its plant is assembled once, whoever asks for it."""
+    calls = Counter()
+    for owner, name in ((evaluation_model, "plant_modes"), (judging, "continuous_plant")):
+        plain = getattr(owner, name)
+
+        def counted(*given, plain=plain, name=name):
+            calls[name] += 1
+            return plain(*given)
+
+        monkeypatch.setattr(owner, name, counted)
+    plant = assemble_plant(MODES.select(range(9)), ports(), evaluation=PLATE)
+    assert not calls  # only answers need it
+    plant = plant.discretized(10e3, delay=1.5)
+    observer = fx.design_kalman(plant)
+    servo = fx.design_servo(plant, bandwidth=40.0, observer=observer)
+    loop = fx.close_loop(plant, observer, servo)
+    assert np.isfinite(loop.budget("die:error").left_out)
+    assert fx.design_static(plant.continuous.discretized(10e3, delay=1.5)).rms("die") > 0
+    assert calls == {"plant_modes": 1, "continuous_plant": 1}
+    _ = plant.at((0.15, 0.3, 0.0)).evaluation_plant
+    assert calls["plant_modes"] == 1
+
+
+def test_machines_drawn_from_a_plant_have_no_evaluation_model():
+    """It describes the plant, no other machine; what a reduced model knows follows."""
+    plant = assemble_plant(MODES.select(range(9)), ports(), evaluation=MODES)
+    assert plant.uncertain(frequency=0.01).sample(1)[0].evaluation is None
+    known = assemble_plant(reduce(MODES, ModalTruncation(9)), ports())
+    assert known.uncertain(frequency=0.01).sample(1)[0].evaluation is known.evaluation
+
+
+@pytest.mark.filterwarnings("ignore:.*evaluation= of a finer mesh")
+def test_results_say_where_they_are_not_judged():
+    """Once in each printed result; nothing of it where there is an evaluation model."""
+    alone = plant_of(MODES.select(range(9)))
+    judged = alone.replace(evaluation=MODES)
+    for plant, count in ((alone, 4), (judged, 4), (plant_of(PLATE), 3)):
+        static = fx.design_static(plant)
+        servo = fx.design_servo(plant, bandwidth=40.0, observer=static)
+        loop = fx.close_loop(plant, static, servo)
+        for result in (servo, loop, fx.design_kalman(plant), loop.budget("die:error"))[:count]:
+            assert repr(result).count("not judged on a larger model") == (plant is alone)

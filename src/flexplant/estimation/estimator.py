@@ -77,7 +77,9 @@ class KalmanEstimator(PoiFilter):
     def __repr__(self) -> str:
         count = self.certificate.left_out
         beyond = (
-            f"{NOT_JUDGED}: truncation is not in these numbers"
+            "no modes are left out"
+            if count is None and not self.plant.unjudged
+            else f"{NOT_JUDGED}: truncation is not in these numbers"
             if count is None
             else f"with {counted(count, 'mode')} left out"
             if count
