@@ -83,7 +83,7 @@ def test_sources_are_told_apart(plate):
     assert found.shares.sum() == pytest.approx(1.0, rel=1e-12)
     text = repr(found)
     assert text.startswith("rms of die:error [nm] by source") and "total" in text
-    assert "none are known" in text
+    assert "not judged on a larger model" in text
     ax = fx.plot.budget(found, most=3)
     assert ax.get_ylim()[1] >= (1e9 * found.rms) ** 2 and "5 others" in str(
         [t.get_text() for t in ax.get_legend().get_texts()]
