@@ -16,7 +16,7 @@ from ..lti.statespace import StateSpace, System
 from .assumptions import AssumptionReport
 from .building import continuous_plant, measured_through, rebuilt, sampled, weighted
 from .evaluation_model import EvaluationModel
-from .judging import check_channels, evaluation_plant, own_plant
+from .evaluation_plants import check_channels, evaluation_plant, own_plant
 from .moving import Along, PositionMap, along, moved_ports, position_map, seen_elsewhere
 from .partition import Partition
 from .ports import Ports

@@ -18,7 +18,7 @@ from ...lti.modal import part_of
 from ...lti.statespace import StateSpace, System
 from ...tolerances import ROUNDING, TINY
 from ..building import sampled_like
-from ..judging import evaluation_plant
+from ..evaluation_plants import evaluation_plant
 from ..partition import Partition, is_plant
 
 #: a plant and the larger one, without rigid-body motions
