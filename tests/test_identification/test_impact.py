@@ -178,6 +178,88 @@ def test_mains_in_the_record_is_no_pole(seed):
         test.corrected(found)
 
 
+def half_sines(rng, n, rate, *, front=400):
+    """Blows of one random width, each with a random phase, and the response of one mode."""
+    width = rng.uniform(3.0, 30.0)
+    force = np.zeros(n)
+    for at in range(front, n - 1500, 2000):
+        time = np.arange(n) - at - rng.uniform(0.0, 1.0)
+        inside = (time >= 0) & (time <= width)
+        force[inside] += rng.uniform(100.0, 200.0) * np.sin(np.pi * time[inside] / width)
+    p = pole(rng.uniform(0.01, 0.05) * rate, 0.02)
+    mode = ss.cont2discrete(([abs(p) ** 2], [1.0, -2 * p.real, abs(p) ** 2]), 1 / rate)
+    return force, ss.lfilter(mode[0][0], mode[1], force)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_level_of_rest_is_no_limit(seed):
+    """Without noise, with an offset, of either sign, rectified noise, few bits: all are used."""
+    rng = np.random.default_rng(seed)
+    rate = 10 ** rng.uniform(3, 5)
+    force, y = half_sines(rng, 10_000, rate)
+    count = np.count_nonzero(np.diff(np.concatenate([[0.0], (force > 0).astype(float)])) > 0)
+    sign, offset = rng.choice([-1.0, 1.0]), rng.choice([0.0, 7.3, -120.0])
+    kind = seed % 3
+    if kind == 1:  # a converter that knows no negative force
+        force = np.maximum(force + rng.normal(size=force.size), 0.0)
+    if kind == 2:
+        quantum = 200.0 / 2 ** rng.integers(8, 16)
+        force = quantum * np.round(force / quantum)
+    y = y + 1e-4 * np.abs(y).max() * rng.normal(size=y.size)
+    test = impact_frf(sign * force + offset, y, rate, segment=1500 / rate)
+    assert (len(test.used), test.refused) == (count, ())
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_clipped_blows_are_found_whatever_the_offset(seed):
+    """The converter stops at a part of the largest blow; channels with a stated range keep it."""
+    rng = np.random.default_rng(100 + seed)
+    rate = 4000.0
+    force = np.zeros(9000)
+    width = int(rng.integers(8, 24))
+    pulse = np.sin(np.pi * (np.arange(width) + rng.uniform()) / (width + 1))
+    for at, peak in ((500, 100.0), (3500, 400.0), (6500, 90.0)):
+        force[at : at + width] = peak * pulse
+    y = np.convolve(force, np.exp(-np.arange(900) / 90.0) * np.sin(np.arange(900)))[:9000]
+    force = np.minimum(force + (seed % 2) * 0.3 * rng.normal(size=9000), 160.0)
+    sign, offset = rng.choice([-1.0, 1.0]), rng.choice([0.0, 33.0])
+    y += 1e-4 * rng.normal(size=y.size)
+    given = {"force": sign * force + offset, "response": {"y": y}, "rate": rate, "segment": 0.5}
+    test = impact_frf(**given)
+    assert [round(blow.time * rate, -2) for blow in test.refused] == [3500]
+    assert "u1 is at the limit" in test.refused[0].reason
+    assert len(impact_frf(**given, limits=1e9).used) == 3
+    assert len(impact_frf(**given, limits={"u1": 1e9}).used) == 3
+    assert len(impact_frf(**given, limits={"y": 1e9}).used) == 2
+    assert len(impact_frf(**given, limits=float(np.abs(given["force"]).max())).used) == 2
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_record_may_begin_with_its_blow(seed):
+    """The same FRF as with zeros in front, whatever is missing of them."""
+    rng = np.random.default_rng(seed)
+    rate, lead = 4000.0, 300
+    force, y = half_sines(rng, 4000, rate, front=lead)
+    y = np.diff(y, 2, prepend=[0.0, 0.0])  # an acceleration, whose mean is zero
+    first = int(np.flatnonzero(force)[0])
+    whole = impact_frf(force, y, rate, segment=0.4, decay=np.inf)
+    for keep in (0, 1, 2, 5):
+        cut = slice(first - keep, None)
+        if keep == 0 and force[first] > force[first + 1]:
+            continue
+        test = impact_frf(force[cut], y[cut], rate, segment=0.4, decay=np.inf)
+        assert len(test.used) == len(whole.used)
+        assert abs(test.used[0].time * rate - keep) <= 2.0  # a pulse begins above 5 % of its peak
+        pulse = np.abs(np.fft.rfft(force[first : first + 1600]))[1:800]
+        seen = pulse > 0.2 * pulse.max()
+        ours, theirs = test.frf.data[0, 0, seen], whole.frf.data[0, 0, seen]
+        np.testing.assert_allclose(ours, theirs, atol=1e-3 * np.abs(theirs).max())
+    top = first + int(np.argmax(force[first : first + 40]))
+    if force[top + 1] > 0.05 * force.max():
+        with pytest.raises(ModelError, match="the record begins within its pulse"):
+            impact_frf(force[top:2000], y[top:2000], rate, segment=0.4)
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "text"),
     [
@@ -186,7 +268,8 @@ def test_mains_in_the_record_is_no_pole(seed):
         ({"decay": 0.0}, ModelError, "decay"),
         ({"level": 1.5}, ModelError, "level"),
         ({"quantity": "position"}, LabelError, "quantity"),
-        ({"limits": 5.0}, ShapeError, "limits"),
+        ({"limits": "5"}, ShapeError, "limits"),
+        ({"limits": -5.0}, ModelError, "limits"),
         ({"limits": {"x": 5.0}}, LabelError, "channel"),
         ({"force": np.zeros((2, 4000))}, ModelError, "no blow"),
         ({"response": np.zeros(300)}, ShapeError, "same experiments"),

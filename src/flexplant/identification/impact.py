@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import ComplexArray, FloatArray, IntArray, Value, between, instance, positive
+from ..checks import ComplexArray, FloatArray, IntArray, Value, between, instance, positive, short
 from ..errors import ModelError, ShapeError, SolverError, counted, require_known
 from ..lti.frequency import Frf
 from ..tolerances import TINY
@@ -187,7 +187,7 @@ def impact_frf(
     segment: float,
     decay: float | None = None,
     level: float = 0.05,
-    limits: Mapping[str, float] | None = None,
+    limits: Mapping[str, float] | float | None = None,
     quantity: str | None = None,
 ) -> ImpactTest:
     r"""Return the FRFs of an impact test, ``G = sum(Y F^*) / sum(F F^*)`` over its blows.
@@ -196,7 +196,8 @@ def impact_frf(
     force beside the pulse is set to zero (the force window) and force and responses are multiplied
     by ``exp(-t/decay)``, which moves all poles by -1/decay (`ImpactTest.corrected` takes it out).
     What rings on at its end changes residues and no pole. Left out are blows with another one in
-    their segment, clipped ones, and those cut off by the end of the record.
+    their segment, clipped ones, and those cut off by the end of the record. Before a record that
+    begins with a blow the machine is taken to be at rest.
 
     Parameters
     ----------
@@ -212,9 +213,11 @@ def impact_frf(
         for none.
     level : float
         Share of the largest force of a record above which a pulse begins, between 0 and 1.
-    limits : mapping {channel: value}, optional
-        Full scale of channels: a blow that reaches it is refused. Channels that stay at their
-        extreme value after a steep rise are found without; outputs that keep one are warned of.
+    limits : mapping {channel: value}, or float, optional
+        Full scale of channels, or of all: a blow that reaches it is refused. A channel without one
+        is at its limit where it stays at its extreme value after a steep rise, unless this is the
+        level at which it rests; ``limits=1e9`` switches that test off. Outputs that keep one value
+        are warned of.
     quantity : {"displacement", "velocity", "acceleration"}, optional
         What the responses are.
 
@@ -265,13 +268,12 @@ def impact_frf(
                 refused.append(blow)
                 continue
             used.append(blow)
-            part = slice(start, start + length)
             # 1 until a pulse's width after it, then half a cosine to zero over another width
             time = np.arange(length) - (before + 2 * width)
             force_window = 0.5 + 0.5 * np.cos(np.pi * np.clip(time / max(width, 1), 0.0, 1.0))
-            own = f[e, i, part] * force_window * window
+            own = _segment(f[e, i], start, length) * force_window * window
             forces[i].append(np.fft.rfft(own))
-            motions[i].append(np.fft.rfft(y[e, :, part] * window, axis=1))
+            motions[i].append(np.fft.rfft(_segment(y[e], start, length) * window, axis=1))
     for name, own_forces in zip(data.inputs, forces, strict=True):
         if not own_forces:
             why = "; ".join(repr(blow) for blow in refused if blow.input == name)
@@ -291,6 +293,13 @@ def impact_frf(
     return ImpactTest(
         frf, used=tuple(used), refused=tuple(refused), segment=length / data.rate, decay=tau
     )
+
+
+def _segment(signals: FloatArray, start: int, length: int) -> FloatArray:
+    """Return samples from `start` on, with zeros for what lies before the record."""
+    inside = signals[..., max(start, 0) : start + length]
+    front = np.zeros((*signals.shape[:-1], length - inside.shape[-1]))
+    return np.concatenate([front, inside], axis=-1)
 
 
 def _averaged(
@@ -348,15 +357,20 @@ def _blows(
         for begin, end in _pulses(force, level, largest)
     )
     before = 2 + max((end - begin for begin, end, _ in pulses), default=0)
-    limited = _limited(data.u[e], data.inputs, full) | _limited(data.y[e], data.outputs, full)
+    # a force rests nearly all the time, within its noise; what a response does between is not known
+    rest = NOISE * NORMAL * np.median(np.abs(f[e]), axis=1)
+    limited = _limited(data.u[e], data.inputs, full, rest)
+    limited |= _limited(data.y[e], data.outputs, full, np.zeros(len(data.outputs)))
     begins = [pulse[0] for pulse in pulses]
     for k, (begin, end, i) in enumerate(pulses):
         start = begin - before
         reason = _unusable(begins, k, start, length, f.shape[2], data.rate)
+        pulse = f[e, i, begin:end]
+        if not reason and begin == 0 and end > 1 and abs(pulse[0]) > abs(pulse[1]):
+            reason = "the record begins within its pulse"
         over = [name for name, at in limited.items() if at[max(start, 0) : start + length].any()]
         if not reason and over:
             reason = f"{over[0]} is at the limit of its range"
-        pulse = f[e, i, begin:end]
         peak = float(pulse[np.argmax(np.abs(pulse))])
         blow = Blow(data.inputs[i], begin / data.rate, peak, e, reason)
         yield blow, i, start, (before, end - begin)
@@ -385,27 +399,29 @@ def _unusable(begins: list[int], k: int, start: int, length: int, n_time: int, r
         return f"a blow came {(begins[k] - begins[k - 1]) / rate:.3g} s before"
     if k + 1 < len(begins) and begins[k + 1] < start + length:
         return f"another blow follows after {(begins[k + 1] - begins[k]) / rate:.3g} s"
-    if start < 0:
-        return "the record begins with it"
     if start + length > n_time:
         return f"the record ends {(n_time - begins[k]) / rate:.3g} s after it"
     return ""
 
 
 def _limited(
-    signals: FloatArray, names: tuple[str, ...], full: Mapping[str, float]
+    signals: FloatArray, names: tuple[str, ...], full: Mapping[str, float], rest: FloatArray
 ) -> dict[str, Any]:
-    """Return {channel: samples at the limit of its range}, of those that ever are."""
+    """Return {channel: samples at the limit of its range}, of those that ever are.
+
+    `rest` is how far from their medians signals (n, n_time) may be at rest.
+    """
     found = {}
-    for name, signal in zip(names, signals, strict=True):
-        at = np.zeros(signal.size, dtype=np.bool_)
+    for name, signal, near in zip(names, signals, rest.tolist(), strict=True):
         if name in full:
-            at |= np.abs(signal) >= full[name]
-        steps = np.abs(np.diff(signal))
-        moving = steps[steps > 0]
-        if moving.size:
+            at = np.abs(signal) >= full[name]
+        else:
+            at = np.zeros(signal.size, dtype=np.bool_)
+            steps = np.abs(np.diff(signal))
+            least = steps[steps > 0].min(initial=np.inf)
             for extreme in (signal.max(), signal.min()):
-                at |= _flat_runs(signal == extreme, steps, STEEP * float(moving.min()))
+                if abs(extreme - np.median(signal)) > near:
+                    at |= _flat_runs(signal == extreme, steps, STEEP * float(least))
         if at.any():
             found[name] = at
     return found
@@ -428,10 +444,16 @@ def _dependence(damped: float) -> float:
 
 
 def _full_scale(limits: Any, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> dict[str, float]:
-    """Return limits of known channels."""
+    """Return limits of known channels, of all where one number is given."""
+    names = [*inputs, *outputs]
     if limits is None:
         return {}
+    if isinstance(limits, int | float) and not isinstance(limits, bool):
+        return dict.fromkeys(names, positive(limits, "limits"))
     if not isinstance(limits, Mapping):
-        raise ShapeError("limits is a mapping {channel: full scale}, such as {'force': 500.0}.")
-    require_known("channel", limits, [*inputs, *outputs])
+        raise ShapeError(
+            "limits is a full scale of all channels, or a mapping {channel: full scale} such as "
+            f"{{'force': 500.0}}, got {short(limits)}."
+        )
+    require_known("channel", limits, names)
     return {name: positive(value, f"limits[{name!r}]") for name, value in limits.items()}
