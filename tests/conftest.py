@@ -51,10 +51,18 @@ def pytest_itemcollected(item):
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items):
-    """Put files that hold slow tests first, the most of them ahead: none is left for the end."""
+def pytest_collection_modifyitems(config, items):
+    """Leave out static checks unless their file is named; put files with slow tests first."""
+    named = {Path(argument.split("::")[0]).name for argument in config.args}
+    static = [one for one in items if one.get_closest_marker("static")]
+    left_out = {one for one in static if one.path.name not in named}
+    config.hook.pytest_deselected(items=list(left_out))
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
-    items.sort(key=lambda item: -slow[item.path])  # stable: a file stays in one piece
+    # the files with the most slow tests ahead, so that none is left for the end; the sort is
+    # stable: a file stays in one piece
+    items[:] = sorted(
+        (one for one in items if one not in left_out), key=lambda one: -slow[one.path]
+    )
 
 
 def pytest_ignore_collect(collection_path, config):

@@ -120,8 +120,11 @@ LEFT_OUT = ("self", "cls", "progress", "executor", "build", "design", "trial", "
 
 
 #: rooms by how long their walk takes; whose examples take a quarter of a minute: ``-m benchmark``
-QUICK = ["lti", "modes", "structure", "reduction", "joining", "plant", "loop", "identification"]
-LONG = [pytest.param(one, marks=pytest.mark.long) for one in ("updating", "placement", "io")]
+QUICK = ["lti", "modes", "structure", "reduction", "joining", "plant"]
+LONG = [
+    pytest.param(one, marks=pytest.mark.long)
+    for one in ("loop", "identification", "updating", "placement", "io")
+]
 DESIGNS = [
     pytest.param(one, marks=pytest.mark.benchmark)
     for one in ("estimation", "simulation", "synthesis", "sparse", "testbeds", "plot")

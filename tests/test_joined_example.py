@@ -18,6 +18,7 @@ def example():
         yield importlib.import_module("joined_machine")
 
 
+@pytest.mark.long
 def test_the_joined_machine(example):
     result = example.main()
     full, small = result["modes"]

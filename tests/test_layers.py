@@ -12,7 +12,7 @@ import pytest
 
 import flexplant
 
-pytestmark = pytest.mark.slow  # every module is parsed
+pytestmark = [pytest.mark.slow, pytest.mark.static]  # every module is parsed
 
 ROOT = Path(flexplant.__file__).parent
 #: in import order; the first entry is the foundation, whose modules may use each other

@@ -174,7 +174,7 @@ print(json.dumps({"found": found, "same": bool(same)}))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_interrupted_work_leaves_nothing_behind():
     """By the signal of Ctrl-C: threads of BLAS, bars and processes are as before."""
     process = child(INTERRUPTED, subprocess.PIPE)

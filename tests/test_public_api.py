@@ -243,6 +243,7 @@ ELSEWHERE = {"append", "split", "matched", "Filter", "LoopLimits"}
 
 
 @pytest.mark.slow
+@pytest.mark.static
 def test_names_in_advice_are_at_the_front_or_have_their_room():
     """`GroundSpring` in an error sends a reader to search; `fx.plant.GroundSpring` does not."""
     homes = {n: room for room, where in rooms().items() for n in dir(where) if room != "errors"}
@@ -259,6 +260,7 @@ def test_names_in_advice_are_at_the_front_or_have_their_room():
 
 
 @pytest.mark.slow
+@pytest.mark.static
 def test_tests_import_public_names_where_users_do():
     """From the front or a room: a name that moves between modules moves no test."""
     shown = {n: room for room, where in rooms().items() for n in dir(where) if room != "errors"}

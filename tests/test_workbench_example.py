@@ -23,6 +23,7 @@ def result(example):
     return example.main()
 
 
+@pytest.mark.long
 def test_six_decibel_on_all_axes_of_the_measurement(result):
     report = result["loops"].report
     assert report.is_stable

@@ -101,7 +101,7 @@ Peers are better where no check is wanted. Of the 16 ms for all modes of the pla
 of each, 6 set rigid-body motions apart and find soft modes again to all digits; a hold returns a
 labelled system, checked; H-infinity of 3 states is enclosed to 1 %, its norm found twice; mu has a
 lower bound too, by a perturbation that reaches it.
-``python -m pytest -m benchmark -s tests/benchmarks`` times many more.
+``python -m pytest -n 0 -m benchmark -s tests/benchmarks`` times many more.
 
 **Limits**
 

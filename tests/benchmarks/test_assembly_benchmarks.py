@@ -1,8 +1,9 @@
 """Assembly: CPU time by part at a million DOFs, and beside scikit-fem on the same meshes.
 
-Run with ``-m benchmark -s`` and ``OMP_NUM_THREADS=1``. Times are process CPU time, the shortest of
-a few runs. The peers assemble mass and stiffness of the same structure, a vectorised quadrature
-over all elements; ratio: peer / ours, per DOF where their elements have other DOFs than ours.
+Run with ``-n 0 -m benchmark -s`` and ``OMP_NUM_THREADS=1``. Times are process CPU time, the
+shortest of a few runs. The peers assemble mass and stiffness of the same structure, a vectorised
+quadrature over all elements; ratio: peer / ours, per DOF where their elements have other DOFs than
+ours.
 """
 
 import time

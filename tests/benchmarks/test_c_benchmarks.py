@@ -1,7 +1,7 @@
 """CPU time of a sample and size of code of a controller in C, beside loops and scipy's sosfilt.
 
-Run with ``-m benchmark -s``. One controller of 60 states, 1 Hz to 2 kHz at 10 kHz, in full matrices
-as a design leaves it.
+Run with ``-n 0 -m benchmark -s``. One controller of 60 states, 1 Hz to 2 kHz at 10 kHz, in full
+matrices as a design leaves it.
 """
 
 import shutil

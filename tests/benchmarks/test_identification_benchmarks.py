@@ -1,4 +1,4 @@
-"""Identification beside its peers: a close pair, real sets, 56 FRFs; ``-m benchmark -s``."""
+"""Identification beside its peers: a close pair, real sets, 56 FRFs; ``-n 0 -m benchmark -s``."""
 
 import time
 import warnings

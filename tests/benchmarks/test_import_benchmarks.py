@@ -1,6 +1,7 @@
 """How long the import takes, beside NumPy and the parts of SciPy that it uses.
 
-``OMP_NUM_THREADS=1 python -m pytest -m benchmark -s tests/benchmarks/test_import_benchmarks.py``
+``python -m pytest -n 0 -m benchmark -s tests/benchmarks/test_import_benchmarks.py``, with
+``OMP_NUM_THREADS=1``
 """
 
 import subprocess

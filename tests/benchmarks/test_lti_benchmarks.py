@@ -1,6 +1,6 @@
 """Systems: time and agreement beside python-control, scipy and slycot.
 
-Run with ``-m benchmark -s`` and ``OMP_NUM_THREADS=1``. Each line: ours, the peer, their ratio
+Run with ``-n 0 -m benchmark -s`` and ``OMP_NUM_THREADS=1``. Each line: ours, the peer, their ratio
 (above one: ours is faster) and the largest relative difference of the answers. Ours and the peer
 run in turn, equally often, and the shortest time of each counts: a busy machine hurts both. The
 peers get the same A, whose 2 x 2 blocks spare their Schur forms most of the work, too.

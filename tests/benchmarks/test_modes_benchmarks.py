@@ -1,6 +1,6 @@
 """24 modes at scale: CPU, memory and residuals beside SciPy's eigsh, each in a fresh process.
 
-Run with ``-m benchmark -s``. Peers: eigsh at its defaults (SuperLU with COLAMD), and eigsh on
+Run with ``-n 0 -m benchmark -s``. Peers: eigsh at its defaults (SuperLU with COLAMD), and eigsh on
 SuperLU in symmetric mode; neither counts, and neither is checked. Ours is all of `solve_modes`: the
 order, the factor, Lanczos, the count (also told by itself) and the checks. CPU seconds are those of
 the process, so that a busy machine disturbs them less than the clock.

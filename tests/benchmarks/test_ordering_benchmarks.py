@@ -1,8 +1,8 @@
 """Nested dissection without coordinates beside METIS: entries of the factor and CPU seconds.
 
-Run with ``-m benchmark -s``. Entries of METIS's order are counted by symbolic elimination of the
-graph of nodes, ours are those that the fronts store: leaves of up to 64 DOFs as dense squares. Of
-the small matrix, which `solve_modes` takes as a dense one, the order is compared: entries of the
+Run with ``-n 0 -m benchmark -s``. Entries of METIS's order are counted by symbolic elimination of
+the graph of nodes, ours are those that the fronts store: leaves of up to 64 DOFs as dense squares.
+Of the small matrix, which `solve_modes` takes as a dense one, the order is compared: entries of the
 lower triangle, leaves of up to 32 DOFs.
 """
 

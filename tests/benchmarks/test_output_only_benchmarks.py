@@ -1,4 +1,4 @@
-"""Modes of a mast from its own motion: twelve, in near pairs; ``-m benchmark -s``."""
+"""Modes of a mast from its own motion: twelve, in near pairs; ``-n 0 -m benchmark -s``."""
 
 import time
 

@@ -1,6 +1,6 @@
 """Reductions: process time and agreement beside scipy and pyMOR.
 
-Run with ``-m benchmark -s`` and ``OMP_NUM_THREADS=1``. Each line: ours, the peer, their ratio
+Run with ``-n 0 -m benchmark -s`` and ``OMP_NUM_THREADS=1``. Each line: ours, the peer, their ratio
 (above one: ours is faster) and the largest relative difference of the answers.
 """
 

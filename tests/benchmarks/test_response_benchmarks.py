@@ -1,8 +1,8 @@
 """Responses of a full model between its ports, beside a direct sparse solution at each frequency.
 
-Run with ``-m benchmark -s`` and ``OMP_NUM_THREADS=1``. Ours is all of `frequency_response`: the
-modes, the static shapes and the direct solutions that check them. The peer is SciPy's SuperLU of
-``K (1 + i eta) - omega^2 M``; it solves some of the lines, whose time is counted for all.
+Run with ``-n 0 -m benchmark -s`` and ``OMP_NUM_THREADS=1``. Ours is all of `frequency_response`:
+the modes, the static shapes and the direct solutions that check them. The peer is SciPy's SuperLU
+of ``K (1 + i eta) - omega^2 M``; it solves some of the lines, whose time is counted for all.
 """
 
 import time

@@ -1,9 +1,10 @@
 """Loops promised and measured, on machines of another formulation than the design model's.
 
-Run with ``-m benchmark -s``: some fifteen minutes. The drawing is a mesh with 24 modes; machines
-are plates in polynomials with rotary inertia, scattered stiffness and damping (0.1 % on average),
-0.2 to 0.9 kg that no drawing shows and a second mass. Their first ten poles are measured to 1e-5;
-four of them give mass and stiffness, all calibrate the model, the fit says what is not known.
+Run with ``-n 0 -m benchmark -s``: some fifteen minutes. The drawing is a mesh with 24 modes;
+machines are plates in polynomials with rotary inertia, scattered stiffness and damping (0.1 % on
+average), 0.2 to 0.9 kg that no drawing shows and a second mass. Their first ten poles are measured
+to 1e-5; four of them give mass and stiffness, all calibrate the model, the fit says what is not
+known.
 """
 
 import time

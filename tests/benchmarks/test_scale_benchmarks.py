@@ -1,6 +1,6 @@
 """How far it goes: many items, many samples, many candidates, many states.
 
-Run with ``-m benchmark -s``. Asserted is that answers hold; seconds and bytes are printed.
+Run with ``-n 0 -m benchmark -s``. Asserted is that answers hold; seconds and bytes are printed.
 """
 
 import shutil

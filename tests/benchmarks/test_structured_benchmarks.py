@@ -1,6 +1,6 @@
 """Fixed order beside published optima; loop shaping and H2 beside python-control with slycot.
 
-Run with ``-m benchmark -s``. Norms are of the loop, by a sweep of dense matrices.
+Run with ``-n 0 -m benchmark -s``. Norms are of the loop, by a sweep of dense matrices.
 """
 
 import pickle

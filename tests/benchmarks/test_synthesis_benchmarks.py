@@ -1,7 +1,7 @@
 """H-infinity synthesis beside slycot's and cvxpy's: claim, true norm of the loop, time.
 
-Run with ``-m benchmark -s``. The peer runs in a process of its own with a time limit: it was seen
-to claim less than a tenth of what its loop has, and to take minutes.
+Run with ``-n 0 -m benchmark -s``. The peer runs in a process of its own with a time limit: it was
+seen to claim less than a tenth of what its loop has, and to take minutes.
 """
 
 import csv

@@ -1,9 +1,9 @@
 """What is promised of machines that nobody has seen: errors at the die, and loops that hold.
 
-``python -m pytest tests/benchmarks/test_unseen_machines_benchmarks.py -m benchmark -s`` prints the
-tables, in some 30 minutes of CPU; ``-k errors`` the first ones, in four. Each machine is a plate in
-polynomials with rotary inertia, 0.1 to 1 kg at a place that is known, up to 0.1 kg somewhere,
-scattered stiffness and damping; drawing, mesh and measurement are those of
+``python -m pytest tests/benchmarks/test_unseen_machines_benchmarks.py -n 0 -m benchmark -s`` prints
+the tables, in some 30 minutes of CPU; ``-k errors`` the first ones, in four. Each machine is a
+plate in polynomials with rotary inertia, 0.1 to 1 kg at a place that is known, up to 0.1 kg
+somewhere, scattered stiffness and damping; drawing, mesh and measurement are those of
 `test_robustness_benchmarks`. Errors on the machine are exact (a Lyapunov equation), without the
 steps of its sensors. How many of a fleet hold at 0.2 %: ``python examples/fleet.py 50``.
 """

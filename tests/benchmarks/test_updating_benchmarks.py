@@ -1,4 +1,4 @@
-"""The numbers of updating, beside a peer where there is one; run with ``-m benchmark -s``."""
+"""The numbers of updating, beside a peer where there is one; run with ``-n 0 -m benchmark -s``."""
 
 import time
 import warnings

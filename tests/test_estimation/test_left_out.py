@@ -322,7 +322,10 @@ CASES = [(kind, DAMPINGS[(i + j) % 2], LEVELS[(i + 2 * j) % 3])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "zeta", "level"), CASES)
+@pytest.mark.parametrize(
+    ("kind", "zeta", "level"),
+    [pytest.param(*case, marks=[pytest.mark.long] * (i % 2)) for i, case in enumerate(CASES)],
+)
 def test_predicted_within_five_percent_on_machines_of_another_mesh(kind, zeta, level):
     estimator, truth = filter_of(kind, zeta, level), on_machine(kind, zeta, level)
     error = estimator.rms("die", on=truth)

@@ -30,7 +30,7 @@ def scalar_record(seed, count, a=0.9, q=1.0, r=2.0):
     return {"y1": x + np.sqrt(r) * rng.standard_normal(count), "u1": np.zeros(count)}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_known_levels_from_50000_samples():
     """Eight levels, guesses off by factors of 3 and 2: within 10 % and four deviations."""
     records, _ = recorded(machine(), steps=50000)

@@ -135,9 +135,10 @@ def test_every_order_passes_and_weak_springs_change_little():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [12, 18])
-@pytest.mark.parametrize("freq", [2.0, 8.0])
-@pytest.mark.parametrize("kind", CUBES)
+@pytest.mark.parametrize(
+    ("kind", "freq", "count"),
+    [("flat", 2.0, 12), ("flat", 8.0, 18), ("long", 2.0, 18), ("long", 8.0, 12)],
+)
 def test_a_block_on_springs(kind, freq, count):
     modes = block_modes(kind, freq)
     check(block_plant(kind, modes.select(range(count))), modes)

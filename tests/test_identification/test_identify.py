@@ -299,7 +299,7 @@ def test_without_noise_nothing_is_warned_of():
     assert max(near) < 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_noise_to_machine_precision():
     frf = measured(level=0.0, known=False)
     found = identify_modes(frf, orders=ORDERS)
@@ -343,7 +343,7 @@ def test_the_quantity_and_the_unit_do_not_matter(quantity):
     assert np.allclose(found.std, base.std, rtol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_poles_by_hand_give_the_same_fit(tmp_path):
     frf = measured()
     diagram = stabilisation_diagram(frf, orders=ORDERS)
@@ -425,7 +425,9 @@ TRIAL = pole([47.5, 48.2, 53.0], [0.004, 0.005, 0.003])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("common", "trials"), [(0.0, 30), (0.9, 40)])
+@pytest.mark.parametrize(
+    ("common", "trials"), [(0.0, 30), pytest.param(0.9, 40, marks=pytest.mark.long)]
+)
 def test_confidence_covers_the_truth(common, trials):
     """Many trials: chi-square of all poles together, 95 % regions within a binomial interval.
 

@@ -14,6 +14,7 @@ VISIBLE = {4, 6, 7, 8, 9, 10, 11}
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.long
 def test_true_poles_lie_within_three_sigma():
     """Modes 5 and 12 are zero at the actuators; 825 Hz is a mode of 9175 Hz that folds.
 

@@ -89,7 +89,7 @@ def test_whitened_shape_residuals_are_chi_square():
     assert blind < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_and_with_sensor_noise_alone():
     found, blind = sums(0.0, known=True)
     assert found == pytest.approx(1.0, abs=MARGIN)

@@ -62,7 +62,9 @@ def test_a_fine_clamped_beam(elements):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("elements", [50, 400, 700, 751, 2000])
+@pytest.mark.parametrize(
+    "elements", [50, 400, pytest.param(700, marks=pytest.mark.long), 751, 2000]
+)
 def test_a_clamped_beam_of_any_size_has_the_textbook_frequency(elements):
     """Dense up to 750 elements, sparse beyond: 2e-4 off at 400, refused from 500 on before."""
     model = beam(
@@ -87,8 +89,9 @@ def test_a_stiff_grounding_spring_is_a_support(factor):
 
 @pytest.mark.slow
 @EXTENDED
-@pytest.mark.parametrize("stiffness", [1e-2, 1.0, 1e3, 1e6])
-@pytest.mark.parametrize("route", ["dense", "sparse"])
+@pytest.mark.parametrize(
+    ("stiffness", "route"), [(1e-2, "sparse"), (1.0, "dense"), (1e3, "sparse"), (1e6, "dense")]
+)
 def test_soft_springs_beside_extended_precision(stiffness, route, monkeypatch):
     if route == "sparse":
         for module in (solve, statics):
@@ -150,7 +153,7 @@ def test_what_is_free_says_how_soft_a_suspension_would_look_free():
     assert solve_modes(lost, count=5).n_rigid == check(lost).n_rigid == 3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_soft_suspension_of_a_small_plate_is_found_down_to_a_hundredth_of_a_hertz():
     free = plate((20, 20), size=(0.6, 0.6), thickness=0.0272)
     for hertz in (2.0, 0.25, 0.08, 0.01):

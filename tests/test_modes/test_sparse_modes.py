@@ -51,7 +51,7 @@ def test_no_member_of_a_repeated_pair_is_missing(structure, seed):
     np.testing.assert_allclose(factor.sigma + 1 / theta, expected[:count], rtol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_none_is_missing_in_many_runs(structure):
     # eigsh drops members of such pairs in 8 of 720 runs
     model, expected = structure

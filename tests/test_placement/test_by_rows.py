@@ -104,7 +104,7 @@ def mean_gap(seeds):
     return float(np.mean(gaps)), min(gaps)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_gap_of_joshi_and_boyd():
     mean, least = mean_gap(range(10))
     assert least >= 0.0

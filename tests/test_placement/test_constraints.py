@@ -86,8 +86,9 @@ def machine(make):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", CASES)
-@pytest.mark.parametrize("side", ["y", "u"])
+@pytest.mark.parametrize(
+    ("kind", "side"), [*((kind, "y") for kind in CASES), ("mirrored", "u"), ("budget", "u")]
+)
 def test_every_search_finds_the_best_that_satisfies(machine, monkeypatch, kind, side):
     for name, few in (("_SCREENED", 30), ("_SCORED", 5)):
         monkeypatch.setattr(f"flexplant.placement.branch_and_bound.{name}", few)

@@ -48,7 +48,7 @@ def same(one, other):
     assert one._fields() | {"ports": 0} == other._fields() | {"ports": 0}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_serial_process_pool_and_dask_agree_to_the_bit(make, send_everything):
     distributed = pytest.importorskip("distributed")
     plant, sensors, _ = make(12)
@@ -220,10 +220,13 @@ WAYS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", [None, lowpass(60.0)], ids=["white", "shaped"])
 @pytest.mark.parametrize(
-    ("use", "way"),
-    [*((use, way) for use in USES for way in ("usual", "own")), ("sensor_map", "judged")],
+    ("use", "way", "shape"),
+    [
+        *((use, way, None) for use in USES for way in ("usual", "own")),
+        *((use, "usual", lowpass(60.0)) for use in ("place_both", "sensor_map")),
+        ("sensor_map", "judged", None),
+    ],
 )
 def test_plants_are_assembled_once_not_per_choice(monkeypatch, use, way, shape):
     """However many candidates there are, and what depends on the model alone is found once."""
@@ -256,9 +259,15 @@ def test_plants_are_assembled_once_not_per_choice(monkeypatch, use, way, shape):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", [None, lowpass(60.0)], ids=["white", "shaped"])
-@pytest.mark.parametrize("delay", [1.0, 1.5])
-@pytest.mark.parametrize("references", [(), (Reference("die"),)], ids=["", "reference"])
+@pytest.mark.parametrize(
+    ("shape", "delay", "references"),
+    [
+        (None, 1.0, (Reference("die"),)),
+        (None, 1.5, ()),
+        (lowpass(60.0), 1.0, ()),
+        (lowpass(60.0), 1.5, (Reference("die"),)),
+    ],
+)
 def test_on_a_shaken_floor_fast_scores_are_those_of_the_criteria(shape, delay, references):
     plant, sensors, actuators = _shaken(6, shape)
     plant = plant.with_ports(plant.assembled.ports.replace(references=references))

@@ -209,7 +209,7 @@ def test_a_parameter_beside_modes_and_gains():
             every_kind(**wrong)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_loop_under_all_kinds_at_once():
     """What mu calls stable is stable on machines at corners, which are solved anew."""
     plant = spring_of_masses()

@@ -139,7 +139,7 @@ def test_pictures_can_be_read_in_a_column(text):
     assert max(widths) < 474.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_same_values_give_the_same_file(design, tmp_path):
     """Names of elements and the order of all parts hang on nothing else."""
     parts = [one for one in design if not isinstance(one, fx.ClosedLoop)]

@@ -43,7 +43,7 @@ def close(one, other):
         assert one[name] == pytest.approx(other[name], rel=1e-5, abs=0, nan_ok=True), name
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_modes_and_reduced_models_are_updated_as_the_drawing_is():
     """With all modes of the drawing the rows are the same, attachment vectors included."""
     drawing = bare().with_damping(LAW)
@@ -84,7 +84,7 @@ def test_damping_in_place_of_a_matrix():
         pipeline(damping=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_damping_of_a_model_that_is_large():
     """A matrix D would be full; what is light and stiff hardly changes anything."""
     large = bare(5002)

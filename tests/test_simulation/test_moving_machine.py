@@ -88,7 +88,7 @@ def by_fine_steps(modes, loop, steps, parts, amplitude):
     return shown
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_against_fine_steps(modes, loop):
     steps = 120
     run = fx.simulate(
@@ -205,7 +205,7 @@ def test_predicted_rms_of_a_machine_that_stands_is_its_budget(loop):
     np.testing.assert_allclose(found.rms, again.rms, rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_predicted_rms_of_a_repeated_scan_is_that_of_many_repetitions(loop):
     """The periodic equation against repetitions from rest, and both against where it stands."""
     scan = lambda t: 0.09 * np.sin(2 * np.pi * 25.0 * t)  # noqa: E731

@@ -58,7 +58,7 @@ def test_serial_and_process_pool_agree_to_the_bit():
     np.testing.assert_allclose(plain["largest"][ok], np.array(expected)[ok], rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_dask_agrees_to_the_bit():
     distributed = pytest.importorskip("distributed")
     plain = study(range(8), drawn, rng=5)

@@ -131,7 +131,7 @@ def test_functions_of_the_centre_and_arrays_are_the_same():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_disc_cuts_elements_by_their_area():
     """Against a mesh so fine that its staircase does not count."""
     size, disc = {"size": (0.6, 0.4), "thickness": 0.02}, Disc((0.3, 0.2), 0.1)

@@ -104,7 +104,7 @@ def body(late, spring=0.0):
     return discretized(G, RATE, delay=late)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("sign", "cases"), [(1.0, ((6, 2.0), (1, 2.0), (1, 3.0))), (-1.0, ((6, 2.0), (1, 2.0)))]
 )

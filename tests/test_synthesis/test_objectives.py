@@ -53,7 +53,7 @@ def test_single_objectives_have_their_known_optima(sampled):
     assert found.gamma >= best.lower * (1 - 1e-3)
 
 
-@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("sampled", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_mixed_h2_and_hinf(sampled):
     """Between the two: less H2 than the H-infinity design, less peak than LQG."""
     given = plant(sampled)
@@ -94,6 +94,7 @@ def test_poles_lie_in_their_region():
     assert np.abs(closed(sampled, found).poles()).max() <= np.exp(-0.4 / 500.0) * (1 + 1e-6)
 
 
+@pytest.mark.long
 def test_peak_gain_is_the_integral_of_the_impulse_response():
     given = plant()
     goal = PeakGain(w=["d"], z=["tip:x"])
@@ -118,6 +119,7 @@ def mass(rate=0.0):
     return fx.StandardPlant.from_statespace(held_exactly(g, rate) if rate else g, u=["f"], y=["s"])
 
 
+@pytest.mark.long
 def test_sampled_poles_lie_in_their_region():
     """Damping, bandwidth of log(z) / dt by eigenvalues; the optimum without them breaks both."""
     region = PoleRegion(decay=0.5, damping=0.75, bandwidth=0.55)
@@ -154,6 +156,7 @@ def test_the_regions_of_z_are_inside_those_of_s(ratio):
         assert np.count_nonzero(held) > 0.5 * np.count_nonzero(np.abs(s) <= speed)
 
 
+@pytest.mark.long
 def test_the_rate_of_decay_is_searched():
     """The least over 40 rates, each given to PeakGain, is found without naming one."""
     given = mass()

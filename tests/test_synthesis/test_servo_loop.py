@@ -140,7 +140,7 @@ def test_one_flipped_sign_is_unstable():
         design_servo(plant, bandwidth=50.0, observer=lying)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_largest_bandwidth_that_holds_6_dB():
     plant, observer = updated()[:2]
     reach = servo_bandwidth(plant, observer=observer)
@@ -176,7 +176,7 @@ def test_search_and_certificate_break_the_same_loop():
             np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("asd", [1e-10, 1e-8])
 def test_where_the_estimate_leans_on_the_model_a_bandwidth_is_found(asd):
     """A slow Kalman estimate reads u more than y: broken where both read u no bandwidth held."""

@@ -230,7 +230,7 @@ def test_laws_are_tuned_to_a_local_minimum():
         assert near >= found.gamma * (1 - 1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_controller_for_several_machines():
     """Modes at 26 and 36 Hz: one law holds both, a law for one is worse on the other."""
     plants = [machine(26.0), machine(36.0)]

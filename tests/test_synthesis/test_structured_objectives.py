@@ -128,7 +128,7 @@ def test_gradients_by_differences(kind, sampled):
             assert at(-1) - 2 * at(0) + at(1) == pytest.approx(bend, rel=1e-2, abs=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_fixed_order_for_a_fleet():
     """A mode from 26 to 36 Hz: two states hold machines that the design has not seen."""
     fleet = [machine(freq) for freq in (26.0, 30.0, 36.0)]

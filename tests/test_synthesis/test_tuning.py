@@ -155,7 +155,7 @@ def joint_peaks(plant, design):
     return [1 / np.linalg.svd(eye - L, compute_uv=False)[:, -1].min() for L in (C @ P, P @ C)]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_six_axes_hold_the_peak_together():
     """Each axis alone reaches 400 Hz and more, and the modes couple them: 40 dB at u together."""
     plant, modes = block()

@@ -266,7 +266,7 @@ def test_the_search_judges_the_modes_left_out():
     assert one.loop(own, fast).modulus_margin < 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_predicted_errors_are_those_of_unseen_machines():
     """Within 10 %: of 30 machines 97 % were (rms 4.6 %), the rest is damping nobody measured."""
     model, off = drawing(), []

@@ -151,7 +151,7 @@ def test_identified_poles_are_those_of_the_machine():
     assert (np.abs([off.real, off.imag]) < 4.0 * std).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_a_loop_promises_is_kept_on_the_machine():
     """Margin within 5 %, errors of the die in six axes within 5 %: bricks against polynomials."""
     _, full = drawn()
@@ -168,7 +168,7 @@ def test_what_a_loop_promises_is_kept_on_the_machine():
     assert np.abs(off).max() < 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_tolerant_controller_holds_on_a_machine_of_another_formulation():
     """Six axes on magnets: what a body on negative stiffness has is no uncertain frequency."""
     _, full = drawn()

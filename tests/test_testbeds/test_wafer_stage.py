@@ -29,7 +29,10 @@ PRINTED = (-28.5 + 2870j, -39.3 + 3970j)
 Y, U = [f"y{i}" for i in range(1, 5)], [f"u{i}" for i in range(1, 5)]
 
 
-@pytest.fixture(scope="module", params=[0.01, 0.001], ids=["1 %", "0.1 %"])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(0.01, id="1 %", marks=pytest.mark.long), pytest.param(0.001, id="0.1 %")],
+)
 def zeta(request):
     return request.param
 
@@ -136,7 +139,7 @@ def test_without_its_mass_it_is_the_drawing():
     np.testing.assert_allclose(found.poles.real, -0.01 * wanted, rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_finer_mesh():
     # notes.md: refining moves the frequencies by 0.2 % at most; 507 DOFs
     fine = wafer_stage(elements=(12, 12))

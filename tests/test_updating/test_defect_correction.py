@@ -51,7 +51,7 @@ def test_responses_end_at_the_estimate_of_the_full_model(machine):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["responses", "modes"])
+@pytest.mark.parametrize("kind", [pytest.param("responses", marks=pytest.mark.long), "modes"])
 def test_the_covariance_is_that_of_the_errors(machine, kind):
     """5 noisy measurements, 5 unknowns: ``(p - p_true)^T C^-1 (p - p_true)`` is chi-square."""
     total = wrong = 0.0

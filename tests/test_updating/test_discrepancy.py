@@ -85,7 +85,7 @@ def test_variances_are_those_of_balanced_groups():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("individual", [1, 2])
+@pytest.mark.parametrize("individual", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_no_mode_dictates_what_the_model_cannot_explain(individual):
     """0.5 kg: two poles alone, whose noise is 1e-5, gave 0.93 +- 0.04 and 0.85 +- 0.02."""
     two = fitted(individual, (6, 7), elastic=False)

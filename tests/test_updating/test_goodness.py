@@ -40,7 +40,12 @@ def heavier(model, place=1, mass=0.3):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("weights", "prior"), [(None, False), ([1.0, 9.0, 0.2, 3.0], False), (None, True)]
+    ("weights", "prior"),
+    [
+        (None, False),
+        pytest.param([1.0, 9.0, 0.2, 3.0], False, marks=pytest.mark.long),
+        pytest.param(None, True, marks=pytest.mark.long),
+    ],
 )
 def test_chi_square_is_that_of_noise(chain, weights, prior):
     """150 noisy measurements: p-values are uniform, whatever the weights, with priors and not."""
@@ -172,7 +177,10 @@ def changed_plate(plate, zeta, mass, stiffer):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("zeta", "mass", "stiffer"), [(0.01, 0.7, -0.09), (0.002, 0.6, 0.05)])
+@pytest.mark.parametrize(
+    ("zeta", "mass", "stiffer"),
+    [(0.01, 0.7, -0.09), pytest.param(0.002, 0.6, 0.05, marks=pytest.mark.long)],
+)
 def test_responses_are_fitted_from_far_away(plate, zeta, mass, stiffer):
     """Peaks far from those of the model: by magnitude first it is found, at once it is not."""
     M, D, K = changed_plate(plate, zeta, mass, stiffer)

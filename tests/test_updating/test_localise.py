@@ -42,7 +42,7 @@ def measured(model, hidden, seed, count=12, noise=1e-4):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(n, marks=pytest.mark.long) for n in (2, 3))])
 def test_two_masses_are_found_together(plate, uneven, seed):
     """The best single places are often none of the two; what they leave shows the others."""
     rng = np.random.default_rng(100 + seed)

@@ -11,7 +11,7 @@ from noisy_plate import Campaign, judged, with_mass
 TRIALS = 100
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_few_noisy_responses_find_the_mass():
     campaign, rng = Campaign(), np.random.default_rng(1)
     fits = [campaign.fit(rng) for _ in range(4)]

@@ -91,7 +91,7 @@ def test_a_mass_looked_for_in_the_wrong_place():
     assert found.chosen_values[0] == pytest.approx(0.5, rel=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_full_model_from_its_default_start():
     """Responses of all DOFs, 1.5 kg and 8 % away from them: found from zeros, up to noise."""
     shape = {"size": (0.6, 0.45), "thickness": 0.02, "elements": (4, 4), "density": 2702}
@@ -114,7 +114,7 @@ def test_a_full_model_from_its_default_start():
     assert np.abs((fit.values - [1.5, 0.08]) / fit.std).max() < 4
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_other_starts_are_tried_where_the_first_explains_nothing(plate):
     """2 kg and 12 % at 0.2 % damping end at -0.45 kg from zero; a start farther on finds them."""
     zeta, mass, stiffer = 0.002, 2.0, 0.12

@@ -274,7 +274,7 @@ def blamed(seed):
     return localise(FEModel(M, K, 2e-5 * K, dofs=line(n)), pool, [data]), str(at)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_blames_a_sound_place_is_hardly_better_than_the_next_set():
     """4 of 24 name a wrong place: each by less than 3 of BIC, and says so; none that is certain."""
     wrong, certain = 0, 0

@@ -134,7 +134,7 @@ def test_modes_are_expanded_to_the_full_structure(plate):
     assert weight > 1 - 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_update_takes_the_full_model_too(plate):
     fe = plate.model
     target = oracle.truth(0.0)

@@ -270,6 +270,7 @@ def token_of(url):
     return re.search(r'"token":"([^"]+)"', text).group(1)
 
 
+@pytest.mark.long
 def test_from_the_shell_until_ctrl_c(tmp_path):
     measured(light()).save(tmp_path / "measured.npz")
     words = [sys.executable, "-m", "flexplant.workbench", str(tmp_path / "measured.npz")]
