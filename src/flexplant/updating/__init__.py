@@ -30,8 +30,8 @@ from noisy responses to a model, ``examples/paper_plate.py`` has the paper's num
 from ..rooms import public_names as _public_names
 from .discrepancy import Discrepancy as Discrepancy
 from .discrepancy import ModalUncertainty as ModalUncertainty
-from .judgement.goodness import Identifiability as Identifiability
-from .judgement.goodness import identifiability as identifiability
+from .judgement.identifiability import Identifiability as Identifiability
+from .judgement.identifiability import identifiability as identifiability
 from .judgement.localise import Localisation as Localisation
 from .judgement.localise import localise as localise
 from .judgement.posterior import Posterior as Posterior

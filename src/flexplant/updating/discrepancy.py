@@ -116,6 +116,7 @@ class _Weighed(Bound):
 
     def __init__(self, bound: Bound, V: FloatArray) -> None:
         self.own, self.numbers, self.name = bound, bound.numbers, bound.name
+        self.lost = bound.lost
         self.factor = la.cholesky(V, lower=True)
         self.size = np.abs(self.white(np.eye(len(V)))) @ np.broadcast_to(bound.size, len(V))
 

@@ -21,7 +21,7 @@ from ..errors import (
 from ..tolerances import TINY, divisor
 from .changed_model import changed_model
 from .family import Point
-from .judgement.goodness import chance, chi_square, is_bad
+from .judgement.goodness import chance, chi_square, is_bad, noise_misfit
 from .parameters import PointParameter, checked_values
 from .residuals.frf_residual import FrfResidual
 from .residuals.modal_residuals import Eigenvalues, ModeShapes
@@ -369,12 +369,12 @@ def _above(objective: Objective, best: SearchEnd, minima: list[SearchEnd]) -> Fl
         return np.zeros(0)
     point, free = objective.at(best.p), np.ones(best.p.size, dtype=bool)
     rows, (least, dof) = objective.values(point).size, chi_square(objective, point, free)
-    if least is None or is_bad(chance(least, dof)):
+    if least is None or not objective.noise_known or is_bad(chance(least, dof)):
         costs = np.array([max(end.cost, TINY) for end in minima])
         return np.asarray(rows * np.log(costs / max(best.cost, TINY)), dtype=np.float64)
     found, objective.path = [], []
     for end in minima:
-        chi2, _ = chi_square(objective, objective.follow(end.trail.p), free)
+        chi2 = noise_misfit(objective, objective.follow(end.trail.p), free)
         found.append((chi2 or 0.0) - least)
     objective.follow(best.trail.p)
     above = np.array(found, dtype=np.float64)

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from ..checks import FloatArray, Rng, flag, generator, instance, positive, whole
-from ..errors import FlexplantError, ModelError, counted, warn
+from ..errors import FlexplantError, ModelError, counted, some_names, warn
 from ..parallel import Progress
 from ..structure.model import FEModel
 from ..tolerances import TINY
 from .changed_model import MOST_ROUNDS, FullBasis, changed_model, is_large
 from .discrepancy import weigh_discrepancy
 from .judgement.goodness import chi_square, covariance, is_bad, worst
+from .judgement.identifiability import resolution
 from .parameters import Parameter, checked_parameters, checked_values
 from .residuals.modal_residuals import Eigenvalues
 from .residuals.residual import Residual
@@ -102,18 +103,21 @@ def update(
     Returns
     -------
     UpdateResult
-        With `converged` False when the tolerance was not met.
+        With `converged` False when the tolerance was not met, or the data do not determine the
+        parameters.
 
     Warns
     -----
     FlexplantWarning
-        When the tolerance was not met; when an end is found, but not from the `start` that was
+        When the tolerance was not met; when the data do not determine the parameters (their rank at
+        the end, bounds that are reached and priors included, is too low): the combinations that
+        they determine are named; when an end is found, but not from the `start` that was
         given; when the last round of defect correction still moved the estimate by more than half
-        a standard deviation; when the fit leaves more than known noise does in one of 10 000 cases:
-        parameters, and for each kind of residual the standard deviation of what the model cannot
-        explain, are then estimated together (`UpdateResult.discrepancy`; with responses the
-        covariance is widened instead, by chi-square over its degrees of freedom, and no +- is
-        printed).
+        a standard deviation; when the residuals of known noise leave more than it does in one of
+        10 000 cases: parameters, and for each kind of residual the standard deviation of what the
+        model cannot explain, are then estimated together (`UpdateResult.discrepancy`; with
+        responses the covariance is widened instead, by chi-square over its degrees of freedom, and
+        no +- is printed).
 
     Raises
     ------
@@ -186,6 +190,8 @@ def update(
     _ends_warned(objective, best, estimates, lost if isinstance(lost, FlexplantError) else None)
     fit = _result(model, objective, method, best, begins[0])
     fit = fit.replace(starts=tried, rounds=np.array(estimates), residuals=given)
+    if fit.determined is not None:
+        warn(_undetermined(fit, objective.text))
     if not method.least_squares or not is_bad(fit.p_value):
         return fit
     named = worst(objective, objective.at(best.p))
@@ -244,7 +250,13 @@ def _result(
         fitted &= best.p != begin
     chi2, dof = chi_square(objective, point, fitted)
     spread, correlation = covariance(objective, point)
-    spread = None if method.penalised else spread
+    determined: tuple[str, ...] | None = None
+    if not method.penalised:
+        # what a bound or a prior holds is known, whatever the data determine
+        found = resolution(objective, point, ~fitted | (objective.has_prior & objective.uses_prior))
+        if not found.clear.all():
+            determined = tuple(found.combinations(names.tolist()))
+    spread = spread if determined is None and not method.penalised else None
     std = None if spread is None else np.sqrt(np.diag(spread))
     trail = best.trail
     return UpdateResult(
@@ -255,12 +267,26 @@ def _result(
         correlation=correlation,
         model=changed_model(model, objective.parameters, best.p, objective.family, std),
         history=History(*map(np.array, (trail.p, trail.poles, trail.error, trail.fraction))),
-        converged=best.converged,
-        reason=best.reason,
+        converged=best.converged and determined is None,
+        reason=best.reason if determined is None else "not determined",
+        determined=determined,
         at_bound=at_bound,
         unknowns=objective.parameters,
         chi2=chi2,
         dof=dof,
+    )
+
+
+def _undetermined(fit: UpdateResult, text: str) -> str:
+    """Return what the data determine of a fit of which they do not determine every parameter."""
+    names, known = fit.parameters, fit.determined or ()
+    listed = f": {'; '.join(known[:6])}" if known else ""
+    return (
+        f"the parameters are not determined: {text} determine {len(known)} of "
+        f"{counted(len(names), 'combination')} of {some_names(names)}, to first order{listed}. "
+        "Other values fit as well as those that were found, and there is no covariance. Measure "
+        "more (identifiability(model, parameters, residuals) names the modes), drop parameters, or "
+        "give priors and the noise of the measurement."
     )
 
 

@@ -144,7 +144,8 @@ class UpdateResult(Value):
         Of the estimate. With measured covariances C: ``G C G^T`` of the linear estimator
         ``G = (J^T W J)^-1 J^T W`` with J = [Re S; Im S], whatever the weights. Without:
         ``s^2 (J^T W J)^-1`` with the residual variance ``s^2 = e / (2 m - q)``, which holds the
-        model's own error too; None when 2 m = q. Where `chi2` is more than noise (`p_value` below
+        model's own error too; None when 2 m = q. Where some residuals have a covariance and others
+        none, s^2 is that of the others. Where `chi2` is more than noise (`p_value` below
         1e-4) C holds the discrepancy too, or with responses is widened by ``chi2 / dof``.
     correlation : (q, q) array
         The correlation of the estimate for errors of covariance W^-1 (of `covariance` where
@@ -153,7 +154,7 @@ class UpdateResult(Value):
         Of the kind given, with M, D and K changed.
     history : History
     converged : bool
-        Whether a tolerance was met.
+        Whether a tolerance was met and the data determine the parameters.
     reason : str
         Why the iteration ended.
     at_bound : sequence of str
@@ -165,11 +166,12 @@ class UpdateResult(Value):
         What was estimated, as it was given to `update`.
     chi2 : float or None
         What is left of the residuals (and priors), squared and summed in units of their noise, by
-        the parameters that leave least: about `dof` when the model explains the measurement. None
-        where the noise is not known.
+        the parameters that leave least: about `dof` when the model explains the measurement. Only
+        residuals whose noise is known count where others stand next to them, at the estimate; None
+        where there are none.
     dof : int
-        Degrees of freedom: residuals and priors less the parameters that were fitted and did not
-        end at a bound.
+        Degrees of freedom: residuals and priors that count, less what the parameters that did not
+        end at a bound take of them.
     rounds : (r, q) array or None
         The estimate of the reduced model alone and after each round of defect correction.
     residuals : sequence of Residual
@@ -177,6 +179,9 @@ class UpdateResult(Value):
     discrepancy : sequence of Discrepancy
         What the model is off by in each kind of residual, beside noise; empty where noise explains
         what is left.
+    determined : sequence of str or None
+        None where the data determine all parameters. Else the combinations that they determine
+        to first order, in words: no other value means anything.
     """
 
     parameters: tuple[str, ...]
@@ -196,6 +201,7 @@ class UpdateResult(Value):
     rounds: FloatArray | None = None
     residuals: tuple[Residual, ...] = ()
     discrepancy: tuple[Discrepancy, ...] = ()
+    determined: tuple[str, ...] | None = None
 
     def __getitem__(self, name: str) -> float:
         require_known("parameter", [name], self.parameters)
@@ -250,6 +256,8 @@ class UpdateResult(Value):
             lines.append(f"  ... and {len(self.parameters) - 5} more")
         if self.at_bound:
             lines.append(f"  at a bound: {', '.join(self.at_bound[:5])}")
+        if self.determined is not None:
+            lines.append(f"  determined only: {'; '.join(self.determined) or 'nothing':.200}")
         if self.negative_masses:
             lines.append(f"  negative: {', '.join(self.negative_masses[:5])}")
         rivals = [] if self.starts is None else self.starts.rivals

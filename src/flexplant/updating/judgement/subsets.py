@@ -17,7 +17,7 @@ from ..family import ROUNDING, Eigen, Family, Point, factors
 from ..search import Objective, TrustRegion
 from ..search.objective import SearchEnd
 from ..search.penalised import bic
-from .goodness import chance, chi_square, is_bad, worst
+from .goodness import chance, is_bad, noise_misfit, worst
 
 #: best subsets of each size that grow
 BEAM = 3
@@ -125,7 +125,9 @@ class Subsets:
         """Return what the model at a point leaves; `values`: of the parameters that were fitted."""
         r, k = objective.values(point), len(subset)
         error = float(r @ r)
-        chi2, _ = chi_square(objective, point, np.full(point.p.size, bool(values.size)))
+        # residuals without a scale weigh as much as the others: their squares count alike
+        free = np.full(point.p.size, bool(values.size))
+        chi2 = noise_misfit(objective, point, free) if objective.noise_known else None
         misfit = error if chi2 is None else chi2
         score = bic(misfit, self.rows, k + len(self.beside), chi2 is not None)
         return SubsetFit(values, error, chi2, score + 2 * log(comb(self.count, k)))
@@ -133,7 +135,8 @@ class Subsets:
     def chi2(self, subset: Subset) -> tuple[float | None, int]:
         """Return what a subset leaves (None where the noise is not known) and its freedom."""
         found = self.fit(subset)
-        dof = self.rows - len(subset) - len(self.beside)
+        lost = sum(bound.lost for bound in self.whole.bounds)
+        dof = self.rows - lost - len(subset) - len(self.beside)
         return (None if found is None else found.chi2), dof
 
     def runner_up(self, best: Subset) -> tuple[Subset, float]:

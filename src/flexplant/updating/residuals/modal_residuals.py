@@ -350,6 +350,9 @@ class BoundShapes(Bound):
         parts = 2 if np.iscomplexobj(self.psi) else 1
         self._order = [i for group in (alone, *near) for i in group]
         self._rows_each = self.psi.shape[0] * parts
+        # what lies in the span of the model's shapes
+        spans = [len(modes) for batch in self.batches for modes in batch.sets]
+        self.lost = sum(min(parts * span, self._rows_each) for span in spans)
         lengths = [float(np.linalg.norm(one)) for batch in self.batches for one in batch.psi]
         self.size = np.repeat(lengths, self._rows_each)
         self.name = f"shapes of modes {', '.join(map(str, own))}"
@@ -511,7 +514,7 @@ class _BoundMac(BoundShapes):
 
     def __init__(self, residual: ModeShapes, family: Family) -> None:
         super().__init__(residual, family)
-        self.noisy, self.size, self._rows_each = False, 1.0, 1
+        self.noisy, self.size, self._rows_each, self.lost = False, 1.0, 1, 0
 
     def _inside(self, batch: _Batch, Q: Any) -> tuple[FloatArray, FloatArray]:
         """Return |psi| and |Q^H psi| (b,)."""

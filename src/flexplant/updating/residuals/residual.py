@@ -60,12 +60,19 @@ class Bound(ABC):
     noisy: bool = False
     #: the covariance of the rows where it is known but not the unit matrix
     noise: Matrix | None = None
+    #: directions of the rows in which residuals cannot lie: scale and phase of a shape
+    lost: int = 0
     #: what the whole of a measured value is in each row: a part of it is a relative change
     size: FloatArray | float = 1.0
     name: str = ""
     #: what a model is off by here, and by which share of the measured value it usually is
     kind: str = "value"
     usual: float = 0.01
+
+    @property
+    def has_noise(self) -> bool:
+        """Whether the covariance of the rows is known, whatever their weights."""
+        return self.noisy or self.noise is not None
 
     @abstractmethod
     def values(self, point: Point) -> FloatArray:

@@ -173,7 +173,7 @@ class Objective:
     @property
     def noise_known(self) -> bool:
         """Whether the covariance of all residuals is known, whatever their weights."""
-        return all(bound.noisy or bound.noise is not None for bound in self.bounds)
+        return all(bound.has_noise for bound in self.bounds)
 
     def rows(self, point: Point) -> list[tuple[Bound, slice]]:
         """Return which rows of `values` belong to each residual; those of the priors follow."""

@@ -1,0 +1,267 @@
+"""Which parameters, or combinations of them, the residuals determine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg as la
+
+from ...checks import FloatArray, Value
+from ...errors import counted
+from ...tolerances import TINY, divisor
+from ..family import Point, repeated_groups
+from ..parameters import Parameter, checked_parameters, checked_values
+from ..search import Objective, checked_residuals
+from .goodness import LOST
+
+#: correlations beyond this are listed
+CORRELATED = 0.99
+#: a relative change of the data below this part of the relative change of an eigenvalue that the
+#: parameter can cause at most is rounding
+ROUNDING = 1e-12
+#: an eigenvalue that changes by less than this part of what the parts of a combination change it
+#: by does not determine the combination
+CANCELS = 1e-3
+#: part of a combination below which a parameter is not printed in it
+MINOR = 1e-3
+#: number of modes that are named as missing
+NAMED = 3
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identifiability(Value):
+    """What the residuals determine of the parameters, to first order.
+
+    Parameters
+    ----------
+    parameters : sequence of q str
+    singular_values : (q,) array
+        Of the sensitivities, each column scaled to length one: sqrt(q) to zero.
+    combinations : (q, q) array
+        Columns: the combinations of (scaled) parameters of each singular value.
+    std : (q,) array
+        Standard deviations to be expected where the noise is known (else for unit noise of the
+        weighted residuals); infinite where a parameter cannot be found.
+    correlation : (q, q) array
+        Of the errors to be expected; zero with parameters that cannot be found.
+    unseen : sequence of str
+        Parameters that no residual depends on.
+    mixed : sequence of (str, ...)
+        Groups of parameters of which a combination cannot be determined.
+    missing : mapping {str: (int, ...)}
+        For parameters that are unseen or mixed: the modes, not measured so far, whose eigenvalues
+        would determine the lost combinations, those that change most first; none where no
+        eigenvalue does, as of mirror images on a symmetric structure.
+    """
+
+    parameters: tuple[str, ...]
+    singular_values: FloatArray
+    combinations: FloatArray
+    std: FloatArray
+    correlation: FloatArray
+    unseen: tuple[str, ...]
+    mixed: tuple[tuple[str, ...], ...]
+    missing: dict[str, tuple[int, ...]]
+
+    @property
+    def rank(self) -> int:
+        """Number of combinations of parameters that can be determined."""
+        return int(np.sum(self.singular_values > LOST * self.singular_values[0]))
+
+    def __repr__(self) -> str:
+        lines = [
+            (
+                f"<Identifiability: {self.rank} of {counted(len(self.parameters), 'combination')}, "
+                f"singular values {self.singular_values[0]:.3g} to {self.singular_values[-1]:.3g}"
+            )
+        ]
+        if self.unseen:
+            lines.append(f"  unseen: {', '.join(self.unseen[:4])}")
+        lines += [f"  not distinguished: {', '.join(group[:4])}" for group in self.mixed[:2]]
+        q = len(self.parameters)
+        close = [
+            f"{self.parameters[i]} and {self.parameters[j]} {self.correlation[i, j]:+.3f}"
+            for i in range(q)
+            for j in range(i)
+            if abs(self.correlation[i, j]) > CORRELATED
+        ]
+        lines += [f"  correlated: {text}" for text in close[:2]]
+        for name, modes in list(self.missing.items())[:2]:
+            if modes:
+                lines.append(f"  measure modes {', '.join(map(str, modes))} for {name}")
+            else:
+                lines.append(f"  no eigenvalue separates {name}: measure shapes or responses")
+        return "\n".join(lines) + ">"
+
+
+def identifiability(
+    model: Any,
+    parameters: Sequence[Parameter],
+    residuals: Sequence[Any],
+    *,
+    start: Sequence[float] | FloatArray | None = None,
+) -> Identifiability:
+    """Return which parameters the residuals determine at a start, before solving.
+
+    The singular values of the weighted sensitivities S, the correlation
+    ``(S^T S)^-1`` of the estimate, and which modes are missing. Priors take no part.
+
+    Parameters
+    ----------
+    model, parameters, start : as for `update`
+    residuals : sequence of Residual
+        Data; the values are not used, only what they would depend on (and their noise).
+
+    Returns
+    -------
+    Identifiability
+
+    Raises
+    ------
+    ModelError, LabelError, ShapeError
+        As `update`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> drawing = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
+    >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[630.0j], modes=[2]))
+    >>> found = fx.identifiability(drawing, [fx.AddedMass("1:x"), fx.AddedMass("3:x")], [poles])
+    >>> found.rank  # of two: one pole is the same for both ends
+    1
+    """
+    listed = checked_parameters(parameters)
+    objective = Objective(model, listed, checked_residuals(residuals), prior=False)
+    p = objective.default_start if start is None else checked_values(start, listed, "start")
+    point = objective.begin(p)
+    names = tuple(q.name for q in listed)
+    found = resolution(objective, point)
+    s, Vt, clear, seen, length = found.values, found.axes, found.clear, found.seen, found.length
+    half = Vt[clear].T / s[clear]
+    unit = half @ half.T
+    # squares: a share of 1e-3 of a lost combination
+    lost = np.sum(Vt[~clear] ** 2, axis=0) > 1e-6
+    std = np.where(lost | ~seen, np.inf, np.sqrt(np.diag(unit)) / length)
+    size = np.where(lost, 1.0, np.sqrt(np.maximum(np.diag(unit), TINY)))
+    correlation = np.where(np.outer(~lost, ~lost), unit / np.outer(size, size), np.eye(lost.size))
+    parts = np.array(names, dtype=object)
+    groups = [tuple(parts[seen & (np.abs(vector) > 0.1)].tolist()) for vector in Vt[~clear]]
+    mixed = [group for group in groups if len(group) > 1]
+    unseen = tuple(n for n, ok in zip(names, seen, strict=True) if not ok)
+    poor = list(dict.fromkeys([*unseen, *(n for group in mixed for n in group)]))
+    # combinations of the parameters themselves that change no residual
+    lost = Vt[~clear] / length
+    return Identifiability(
+        parameters=names,
+        singular_values=s,
+        combinations=Vt.T,
+        std=std,
+        correlation=correlation,
+        unseen=unseen,
+        mixed=tuple(mixed),
+        missing=_missing_modes(objective, point, names, poor, lost),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Resolution:
+    """What residuals determine of q parameters at a point: a singular value decomposition.
+
+    The sensitivities have columns of length one: ``J diag(1/length) = U diag(values) axes``.
+    """
+
+    values: FloatArray
+    axes: FloatArray
+    #: (q,) one where a parameter is not seen
+    length: FloatArray
+    #: (q,) whether any residual depends on a parameter
+    seen: npt.NDArray[np.bool_]
+
+    @property
+    def clear(self) -> npt.NDArray[np.bool_]:
+        """Which combinations (q,) are determined."""
+        return np.asarray(self.values > LOST * self.values[0])
+
+    def combinations(self, names: Sequence[str]) -> list[str]:
+        """Return the determined combinations in words, each of as few parameters as possible."""
+        # the rows that span them, solved for as many parameters: each of these appears once
+        rows = self.axes[self.clear] * self.length
+        rank = len(rows)
+        pivots = la.qr(self.axes[self.clear], mode="r", pivoting=True)[1][:rank]
+        reduced = np.linalg.solve(rows[:, pivots], rows)
+        felt = np.abs(reduced) / self.length > MINOR / self.length[pivots][:, None]
+        return [
+            " ".join(
+                [
+                    names[pivot],
+                    *(
+                        f"{'-' if reduced[i, j] < 0 else '+'} {abs(reduced[i, j]):.3g} {names[j]}"
+                        for j in np.flatnonzero(felt[i]).tolist()
+                        if j not in pivots
+                    ),
+                ]
+            )
+            for i, pivot in sorted(enumerate(pivots.tolist()), key=lambda pair: pair[1])
+        ]
+
+
+def resolution(
+    objective: Objective, point: Point, pinned: npt.NDArray[np.bool_] | None = None
+) -> Resolution:
+    """Return what the residuals determine at a point; `pinned`: known anyhow, by a prior, say."""
+    J = objective.slopes(point, prior=False)
+    length = np.linalg.norm(J, axis=0)
+    own = np.abs(J).max(initial=0.0) * ROUNDING
+    omega = float(np.median(np.abs(point.eigen.poles))) if point.eigen.poles.size else 1.0
+    reach = objective.family.strength(omega)
+    # a column far below what the parameter can do to this model is rounding: compared with the
+    # strongest one, and, as a single one is its own strongest, as a relative change of the data
+    strongest = float(np.max(length / reach, initial=0.0))
+    change = np.linalg.norm(J / divisor(objective.size(point)[: len(J)])[:, None], axis=0)
+    # nine decades below the strongest nothing is seen but rounding
+    seen = (length > own) & (length > 1e-9 * strongest * reach)
+    seen &= change > ROUNDING * reach / omega
+    length = np.where(seen, length, 1.0)
+    known = np.eye(seen.size)[[] if pinned is None else pinned]
+    _, s, Vt = np.linalg.svd(np.vstack([np.where(seen, J / length, 0.0), known]))
+    s = np.concatenate([s, np.zeros(seen.size - s.size)])
+    return Resolution(s, Vt, length, seen)
+
+
+def _missing_modes(
+    objective: Objective, point: Any, names: tuple[str, ...], poor: list[str], lost: FloatArray
+) -> dict[str, tuple[int, ...]]:
+    """Return the unmeasured modes that determine a lost combination, for poorly known parameters.
+
+    The change of an eigenvalue along the combination counts, against that by its parts.
+    """
+    numbers = [int(n) for n in point.labels if n and n not in objective.numbers]
+    if not poor:
+        return {}
+    columns = point.columns(numbers)
+    size = np.abs(point.eigen.poles[columns])[:, None]
+    S = objective.family.sensitivity(point.eigen, columns) / size
+    # how repeated modes split has no sign: only their mean has a direction
+    for group in repeated_groups(point.eigen.poles):
+        mean = np.trace(objective.family.group_derivative(point.eigen, group), axis1=1, axis2=2)
+        for i in [i for i, column in enumerate(columns) if column in group]:
+            S[i] = mean / len(group) / size[i]
+    along = np.abs(S @ lost.T)
+    parts = np.abs(S) @ np.abs(lost.T)
+    # what cancels but for rounding, or the truncation of the model, determines nothing
+    felt = parts > 1e-6 * np.max(parts, axis=0, initial=0.0)
+    clear = np.where(felt & (along > CANCELS * parts), along, 0.0)
+    found = {}
+    for name in poor:
+        # takes part
+        own = np.abs(lost[:, names.index(name)]) > 1e-3 * np.abs(lost).max(axis=1, initial=0.0)
+        share = np.max(clear[:, own], axis=1, initial=0.0)
+        order = np.argsort(-share, kind="stable")[:NAMED]
+        largest = share.max(initial=0.0)
+        # modes that take no part but for rounding
+        found[name] = tuple(numbers[i] for i in order if share[i] > 1e-6 * largest > 0)
+    return found
