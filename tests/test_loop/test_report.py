@@ -1,11 +1,13 @@
 """Loop-by-loop margins and the Nyquist count, against closed forms and polynomial roots."""
 
+import warnings
+
 import numpy as np
 import pytest
 import scipy.linalg as la
 
 import flexplant as fx
-from flexplant.errors import ModelError
+from flexplant.errors import AssumptionError, ModelError
 from flexplant.loop import in_axes, report_loops
 from flexplant.loop.broken import scaled_size
 from flexplant.loop.report import loop_margins
@@ -329,3 +331,115 @@ def test_lines_above_half_the_rate_are_seen_below():
     assert np.max(np.abs(found.data[0, 0] - wanted)[near]) < 1e-2 * size
     with pytest.raises(ModelError, match=r"all lines, from 2 Hz, lie above half the rate, 1.5 Hz"):
         in_axes(frf, rate=3.0)
+
+
+def crossings_of_poles(G, K, factors):
+    """The gain factors at which the number of unstable poles of the loop changes, by bisection."""
+    g, k, dt = G.system if hasattr(G, "system") else G, K, G.dt
+
+    def unstable(factor):
+        poles = la.eigvals(np.block([
+            [g.A + g.B @ (factor * k.D) @ g.C, g.B @ (factor * k.C)], [k.B @ g.C, k.A],
+        ]))  # fmt: skip
+        return int(np.sum(np.abs(poles) > 1 if dt else poles.real > 0))
+
+    counts = [unstable(f) for f in factors]
+    found = []
+    for i in np.flatnonzero(np.diff(counts)):
+        low, high = factors[i], factors[i + 1]
+        for _ in range(60):
+            middle = np.sqrt(low * high)
+            low, high = (middle, high) if unstable(middle) == counts[i] else (low, middle)
+        found.append(low)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("kind", ["undamped", "light", "integrator", "lags"])
+def test_gain_margins_are_the_factors_at_which_poles_cross(kind, sampled):
+    """PI controllers: also where an undamped pole takes the loop gain through infinity."""
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        w = 10 ** rng.uniform(0, 1)
+        den = {
+            "undamped": [1 / w**2, 0.0, 1.0], "light": [1 / w**2, 2e-3 / w, 1.0],
+            "integrator": [1 / w**2, 1 / w, 0.0], "lags": [1 / w**2, 2.2 / w, 1.0],
+        }[kind]  # fmt: skip
+        G = of([1.0], den, inputs=["u"], outputs=["y"])
+        gain, time = 10 ** rng.uniform(-1, 0.5), 10 ** rng.uniform(0.5, 1.5) / w
+        K = StateSpace([[0.0]], [[1.0]], [[-gain / time]], [[-gain]], inputs=["y"], outputs=["u"])
+        if sampled:
+            rate = w * 10 ** rng.uniform(0.5, 1.5)
+            G, K = discretized(G, rate), fx.lti.tustin(K, rate)
+        one = report_loops((G, K))["u"]
+        below = crossings_of_poles(G, K, np.geomspace(1e-6, 1.0, 400))
+        above = crossings_of_poles(G, K, np.geomspace(1.0, 1e4, 400))
+        if below.size:
+            assert one.gain_reduction == pytest.approx(below.max(), rel=1e-4), seed
+        else:
+            assert one.gain_reduction == 0.0, seed
+        if above.size:
+            assert one.gain_margin == pytest.approx(above.min(), rel=1e-4), seed
+        else:
+            assert one.gain_margin > 1e4, seed
+
+
+def measured_machine(rng):
+    """Free and flexible modes on sampled channels, delayed; PD control of each channel."""
+    n = int(rng.integers(1, 4))
+    free, rate = int(rng.integers(0, n + 1)), 1000.0
+    w = np.concatenate([np.zeros(free), 2 * np.pi * rng.uniform(5, 40, rng.integers(1, 3))])
+    A = la.block_diag(*([[0, 1], [-x * x, -2 * rng.uniform(0.01, 0.05) * x]] for x in w))
+    phi = 0.5 * rng.standard_normal((n, w.size))
+    phi[:, :free] = la.qr(rng.standard_normal((n, n)))[0][:, :free]
+    B, C = np.zeros((2 * w.size, n)), np.zeros((n, 2 * w.size))
+    B[1::2], C[:, ::2] = phi.T * rng.choice([-1.0, 1.0], w.size, p=[0.4, 0.6])[:, None], phi
+    B[1 : 2 * free : 2] = phi[:, :free].T
+    names = {"inputs": [f"u{i}" for i in range(n)], "outputs": [f"y{i}" for i in range(n)]}
+    G = discretized(StateSpace(A, B, C, np.zeros((n, n)), **names), rate, delay=1.0)
+    cross = 2 * np.pi * 10 ** rng.uniform(0.0, 1.2)
+    law = fx.lti.tustin(fx.lti.tf([-3 * cross, -(cross**2)], [1 / (8 * cross), 1.0]), rate)
+    laws = [law.replace(inputs=[f"y{i}"], outputs=[f"u{i}"], states=[f"s{i}"]) for i in range(n)]
+    K = append(*laws)
+    closed = np.block([[G.A + G.B @ K.D @ G.C, G.B @ K.C], [K.B @ G.C, K.A]])
+    return G, K, int(np.sum(np.abs(la.eigvals(closed)) > 1))
+
+
+@pytest.mark.parametrize("zero", [False, True])
+def test_the_modulus_margin_of_a_measured_loop_is_that_of_a_stable_one(zero):
+    """Poles of the model say which; an Frf that begins at 0 Hz is read from its next line on."""
+    lines = np.arange(0.05, 500.0, 0.05)
+    seen = {"stable": 0, "unstable": 0, "open": 0}
+    for seed in range(0, 60, 2):
+        G, K, unstable = measured_machine(np.random.default_rng(seed + zero))
+        freq, data = lines, frequency_response(G, lines).data
+        if zero:
+            freq, data = np.append(0.0, lines), np.concatenate([0 * data[..., :1], data], axis=2)
+        pair = Frf(freq, data, inputs=G.inputs, outputs=G.outputs), K
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                margin = fx.modulus_margin(pair)
+            except AssumptionError as error:
+                assert "not known whether the closed loop is stable" in str(error)
+                seen["open"] += 1
+                continue
+            of_model = fx.modulus_margin((G, K))
+        said = [str(one.message) for one in caught if "no modulus margin" in str(one.message)]
+        seen["unstable" if unstable else "stable"] += 1
+        assert len(said) == (2 if unstable else 0)  # of the lines and of the model
+        assert margin == (0.0 if unstable else pytest.approx(of_model, rel=0.1)), seed
+        assert not unstable or f"{unstable} pole" in said[0]
+    assert seen["stable"] > 10
+    assert seen["unstable"] >= 3
+    assert seen["open"] <= 6
+
+
+def test_a_loop_that_is_not_judged_has_no_margin_alone():
+    frf = Frf([1.0, 2.0], [[[1.0, 0.5]]], inputs=["u"], outputs=["y"])
+    K = StateSpace([], [], [], [[-1.0]], inputs=["y"], outputs=["u"])
+    with pytest.raises(AssumptionError, match=r"2 lines show no stability.*report_loops\("):
+        fx.modulus_margin((frf, K))
+    assert "stability not judged, modulus margin" in repr(report_loops((frf, K)))
+    with pytest.raises(ModelError, match="no line above 0 Hz"):
+        fx.modulus_margin((Frf([0.0], [[[1.0]]], inputs=["u"], outputs=["y"]), K))

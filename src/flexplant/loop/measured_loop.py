@@ -10,9 +10,11 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, flag, instance, positive
 from ..errors import ModelError, ShapeError, counted
 from ..lti.frequency import Frf
-from ..lti.measured_lines import HiddenModes, on_lines
+from ..lti.measured_lines import FEWEST, HiddenModes, free_motions, low_slope, on_lines
 from ..lti.responses import Responder
 from ..lti.statespace import StateSpace, System, as_statespace
+from ..tolerances import TINY
+from .broken import BrokenLoop
 
 #: degrees of freedom above which a variance is taken as it is
 _FREEDOM = 20.0
@@ -198,6 +200,8 @@ _END = 0.25 * np.pi
 _SLOPE = 0.75
 #: how far, beside the lowest line, a measured plant is continued to lower frequencies
 _BELOW = 1e-3
+#: a pole of the controller this near to zero frequency, relative to its fastest, integrates
+_INTEGRATES = 1e-9
 
 
 class NyquistCount(NamedTuple):
@@ -215,7 +219,7 @@ def nyquist_count(
     controller: Responder,
     hidden: HiddenModes,
     *,
-    slope: int,
+    rigid: int,
     at_zero: int,
     unstable: int,
 ) -> NyquistCount:
@@ -225,7 +229,7 @@ def nyquist_count(
     ``pi (p + n0 / 2 - z)``: p unstable and n0 integrating poles of K P, z unstable ones of the
     loop. Below the lines F continues as ``c / (i w)^n0``, c real; above them it ends positive.
     """
-    freq, L = _continued(lines, plant, controller, slope)
+    freq, L = _continued(lines, plant, controller, rigid)
     F = np.linalg.det(np.eye(L.shape[-1]) - L)
     if not np.all(np.abs(F) > 0.0):
         return NyquistCount(None, "a line lies on the critical point")
@@ -274,14 +278,57 @@ def nyquist_count(
     return NyquistCount(round(count), "", float(hidden.width[widest]), near)
 
 
+def broken_count(parts: BrokenLoop, rigid: int | None, unstable: int) -> NyquistCount:
+    """Return the unstable poles of a loop that is taken apart; numbers as for `report_loops`.
+
+    Without `rigid` it is the number of free motions that the lowest lines show.
+    """
+    grid, poles = parts.grid, parts.poles()
+    distance = np.log(np.where(poles == 0, TINY, poles)) if parts.dt else poles
+    scale = 1.0 if parts.dt else np.max(np.abs(poles), initial=TINY)
+    if parts.measured is None:
+        return NyquistCount(int(np.count_nonzero(distance.real >= 0.0)))
+    if grid.size < FEWEST:
+        return NyquistCount(
+            None, f"{grid.size} lines show no stability, {FEWEST} are the fewest: measure more"
+        )
+    zero = np.abs(distance) <= _INTEGRATES * scale
+    own = int(np.count_nonzero((distance.real > 0.0) & ~zero))
+    plant = parts.plant(grid)
+    rigid = free_motions(grid, plant) if rigid is None else rigid
+    at_zero = 2 * rigid + int(np.count_nonzero(zero))
+    slope = low_slope(grid, plant)
+    if abs(slope - (2 if rigid else 0)) > 1.0:
+        return NyquistCount(
+            None,
+            f"at the lowest lines, from {grid[0]:.4g} Hz, the plant falls with slope {slope:.2g}, "
+            f"but rigid={rigid} was stated: a free body falls with slope 2, a held one "
+            "does not. State rigid=, or measure at lower frequencies",
+        )
+    return nyquist_count(
+        grid, plant, parts.controller, parts.hidden,
+        rigid=rigid, at_zero=at_zero, unstable=unstable + own,
+    )  # fmt: skip
+
+
 def _continued(
-    freq: FloatArray, plant: ComplexArray, controller: Responder, slope: int
+    freq: FloatArray, plant: ComplexArray, controller: Responder, rigid: int
 ) -> tuple[FloatArray, ComplexArray]:
     """Return frequencies and K P (n_freq, nu, nu) of a measured plant, also below its lines."""
-    # the plant below its lines: its real part over f^slope, its imaginary part (delay) less by f
+    # below the lines: the largest directions, those of the rigid-body modes, over f^2, the others
+    # level; the imaginary part (delay) falls by f more
     low = np.geomspace(_BELOW, 1.0, 150)[:-1]
-    first = plant[:, :, :1]
-    below = (first.real + 1j * low * first.imag) / low**slope
+    first = plant[:, :, 0]
+    left, sizes, right = np.linalg.svd(first.real)
+    to, fro = left[:, :rigid], right[:rigid]
+    free = (to * sizes[:rigid]) @ fro + 1j * (to @ to.T @ first.imag @ fro.T @ fro)
+    held = first - free
+
+    def over(part: ComplexArray, fall: FloatArray) -> ComplexArray:
+        whole = part[:, :, None]
+        return np.asarray((whole.real + 1j * low * whole.imag) / fall)
+
+    below = over(free, low**2) + over(held, np.ones(low.size))
     every = np.concatenate([low * freq[0], freq])
     P = np.concatenate([below, plant], axis=2)
     return every, np.einsum("uyf,yvf->fuv", controller(every), P)

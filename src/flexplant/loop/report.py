@@ -11,16 +11,13 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, Value, instance, mapping, whole
 from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label
 from ..lti.frequency_sweep import climbed_grid, crossings, highest
-from ..lti.measured_lines import FEWEST, low_slope
-from ..tolerances import TINY
+from ..tolerances import SPLIT
 from .blocks import references
 from .broken import BrokenLoop, inverted
 from .closed import ClosedLoop
-from .measured_loop import NyquistCount, nyquist_count
+from .measured_loop import broken_count
 from .sensitivity import Loop, first_crossing, taken_apart
 
-#: a pole of the controller this near to zero frequency integrates
-_INTEGRATES = 1e-9
 #: a loop gain at the first or last line that counts as real
 _REAL = 0.05
 #: slope of its size over frequency at the first line below which it is taken to be level
@@ -238,35 +235,6 @@ def broken_margins(parts: BrokenLoop, at: Literal["u", "y"]) -> tuple[LoopMargin
     return tuple(map(one, range(len(names))))
 
 
-def broken_count(parts: BrokenLoop, rigid: int, unstable: int) -> NyquistCount:
-    """Return the unstable poles of a loop that is taken apart; numbers as for `report_loops`."""
-    grid, poles = parts.grid, parts.poles()
-    distance = np.log(np.where(poles == 0, TINY, poles)) if parts.dt else poles
-    scale = 1.0 if parts.dt else np.max(np.abs(poles), initial=TINY)
-    if parts.measured is None:
-        return NyquistCount(int(np.count_nonzero(distance.real >= 0.0)))
-    if grid.size < FEWEST:
-        return NyquistCount(
-            None, f"{grid.size} lines show no stability, {FEWEST} are the fewest: measure more"
-        )
-    zero = np.abs(distance) <= _INTEGRATES * scale
-    own = int(np.count_nonzero((distance.real > 0.0) & ~zero))
-    at_zero = 2 * rigid + int(np.count_nonzero(zero))
-    plant = parts.plant(grid)
-    slope = low_slope(grid, plant)
-    if abs(slope - (2 if rigid else 0)) > 1.0:
-        return NyquistCount(
-            None,
-            f"at the lowest lines, from {grid[0]:.4g} Hz, the plant falls with slope {slope:.2g}, "
-            f"but rigid={rigid} was stated: a free body falls with slope 2, a held one "
-            "does not. State rigid=, or measure at lower frequencies",
-        )
-    return nyquist_count(
-        grid, plant, parts.controller, parts.hidden,
-        slope=2 if rigid else 0, at_zero=at_zero, unstable=unstable + own,
-    )  # fmt: skip
-
-
 def loop_margins(
     name: str,
     freq: FloatArray,
@@ -287,8 +255,11 @@ def loop_margins(
     find = between if exact is None else exact
     crossovers = crossings(lambda f: np.abs(find(f)) - 1.0, freq, np.abs(L) - 1.0)
     phases = np.abs(np.degrees(np.angle(find(crossovers))))
-    # L is real where the imaginary part changes sign; positive: towards the critical point
+    # L is real where the imaginary part changes sign; positive: towards the critical point. At an
+    # undamped pole or zero it changes sign through infinity or zero, where L turns round
     turns = crossings(lambda f: find(f).imag, freq, L.imag)
+    before, after = (find(np.clip(turns * by, freq[0], freq[-1])) for by in (1 - SPLIT, 1 + SPLIT))
+    turns = turns[(before * after.conj()).real > 0]
     reals = find(turns).real.tolist()
     # and at its ends, half the rate and zero frequency (unless it integrates), where it is real
     slope = (

@@ -15,8 +15,10 @@ from ..errors import (
     LabelError,
     ModelError,
     ShapeError,
+    counted,
     require_known,
     unknown_label,
+    warn,
 )
 from ..lti.frequency import Frf, frequency_response, sampled_freq
 from ..lti.frequency_sweep import crossings
@@ -28,6 +30,7 @@ from ..plant import StandardPlant
 from ..tolerances import SAME
 from .broken import BrokenLoop, inverted, movable_outputs
 from .closed import ClosedLoop
+from .measured_loop import broken_count
 
 #: a closed loop; a plant (StandardPlant, StateSpace or measured Frf) and a controller; a loop gain
 Loop: TypeAlias = "ClosedLoop | tuple[Any, Any] | StateSpace | Frf"
@@ -274,8 +277,11 @@ def _measured_loop(plant: Frf, controller: StateSpace, quantities: dict[str, str
     if not driven:
         raise unknown_label("measured input", controller.outputs[0], plant.inputs, "the Frf")
     controller = controller.select(driven)
-    P = plant.select(controller.inputs, driven).data
-    lines = np.array(plant.freq)
+    # at 0 Hz a free body and an integrator are infinite
+    lines, P = np.array(plant.freq), plant.select(controller.inputs, driven).data
+    lines, P = lines[lines > 0], P[:, :, lines > 0]
+    if not lines.size:
+        raise ModelError("the Frf has no line above 0 Hz, which a loop needs: measure more lines.")
     return BrokenLoop(
         tuple(driven), tuple(controller.inputs),
         lambda freq: frequency_response(controller, freq).data,
@@ -316,18 +322,23 @@ def modulus_margin(loop: Loop) -> float:
     Parameters
     ----------
     loop : ClosedLoop, or (plant, controller)
-        As for `loop_gain`. An unstable loop has no margin: 0. For a measured plant the peak is
-        that over its lines and through the modes that these show between them; its stability, and
-        what the lines leave open, is found by `report_loops`. Where the actuators have several
-        units (N and N m) it is the margin with scaled axes, `LoopReport.scaled_margin`.
+        As for `loop_gain`. Stability is judged first. A model has poles. For a measured plant
+        unstable poles are counted as by `report_loops`, with a free motion for each direction that
+        falls with slope 2 at its lowest lines and no unstable pole of the plant; the peak is that
+        over its lines and through the modes that these show between them. Where the actuators have
+        several units (N and N m) it is the margin with scaled axes, `LoopReport.scaled_margin`.
 
     Returns
     -------
     float
-        At most 1 for sampled loops; |S| below 6 dB is a margin above 0.5.
+        At most 1 for sampled loops; |S| below 6 dB is a margin above 0.5. An unstable loop has no
+        margin: 0, with a FlexplantWarning that says so.
 
     Raises
     ------
+    AssumptionError
+        When the lines of a measured plant do not show whether the loop is stable: the distance to
+        the critical point is then no margin. `report_loops` takes what is known of the plant.
     LabelError, ModelError
         When channels do not match, or `loop` is of another type.
 
@@ -342,7 +353,21 @@ def modulus_margin(loop: Loop) -> float:
     >>> round(fx.modulus_margin(L), 2)
     1.0
     """
-    return taken_apart(loop).margin()
+    parts = taken_apart(loop)
+    count = broken_count(parts, None, 0)
+    if count.unstable is None:
+        raise AssumptionError(
+            f"it is not known whether the closed loop is stable: {count.reason}. Only a stable "
+            "loop has a modulus margin. Pass what is known of the plant to fx.loop.report_loops"
+            "(loop, rigid=, unstable=), which also says how far the loop is judged."
+        )
+    if count.unstable:
+        warn(
+            f"the closed loop is unstable ({counted(count.unstable, 'pole')} outside the stability "
+            "region): it has no modulus margin, which is returned as 0."
+        )
+        return 0.0
+    return parts.margin()
 
 
 def bandwidth(loop: Loop) -> float:

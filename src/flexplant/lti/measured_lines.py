@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..checks import ComplexArray, FloatArray, IntArray, between, complex_array
+from ..checks import BoolArray, ComplexArray, FloatArray, IntArray, between, complex_array
 from ..errors import ModelError, ShapeError
-from ..tolerances import SAME, TINY
+from ..tolerances import ROUNDING, SAME, TINY
 
 #: samples of a window that stand for all lengths
 SAMPLES = 256
@@ -219,9 +219,23 @@ class HiddenModes(NamedTuple):
 
 def low_slope(freq: FloatArray, plant: ComplexArray) -> float:
     """Return how P (ny, nu, n) falls at the lowest lines: 2 for a free body, 0 for a held one."""
-    low = freq <= max(1.5 * freq[0], freq[min(3, freq.size - 1)])
+    low = _lowest(freq)
     size = np.maximum(np.linalg.norm(plant[:, :, low], axis=(0, 1)), TINY)
     return -float(np.polyfit(np.log(freq[low]), np.log(size), 1)[0])
+
+
+def free_motions(freq: FloatArray, plant: ComplexArray) -> int:
+    """Return how many directions of P (ny, nu, n), the largest, fall with slope 2 at low lines."""
+    low = _lowest(freq)
+    sizes = np.linalg.svd(np.moveaxis(plant[:, :, low], -1, 0), compute_uv=False)
+    slopes = -np.polyfit(np.log(freq[low]), np.log(np.maximum(sizes, TINY)), 1)[0]
+    free = (slopes > 1.0) & (sizes[0] > ROUNDING * sizes[0, 0])
+    return int(np.cumprod(free).sum())
+
+
+def _lowest(freq: FloatArray) -> BoolArray:
+    """Return which lines show how a plant goes on to lower frequencies."""
+    return np.asarray(freq <= max(1.5 * freq[0], freq[min(3, freq.size - 1)]))
 
 
 def hidden_modes(freq: FloatArray, plant: ComplexArray, controller: ComplexArray) -> HiddenModes:

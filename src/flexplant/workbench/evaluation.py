@@ -15,8 +15,8 @@ from ..checks import ComplexArray, FloatArray
 from ..errors import AssumptionError
 from ..loop import LoopMargins
 from ..loop.broken import BrokenLoop
-from ..loop.measured_loop import NyquistCount
-from ..loop.report import broken_count, broken_margins
+from ..loop.measured_loop import NyquistCount, broken_count
+from ..loop.report import broken_margins
 from ..loop.sensitivity import broken_bandwidth
 from ..lti.frequency import Frf
 from ..lti.frequency_sweep import resonance_grid

@@ -391,10 +391,8 @@ def are_stable(laws: Sequence[Law], freq: FloatArray, P: ComplexArray, *, rigid:
 
     if freq.size < FEWEST:
         return False
-    hidden, slope, at_zero = hidden_modes(freq, P, respond(freq)), 2 * bool(rigid), 2 * rigid
-    count = nyquist_count(
-        freq, P, respond, hidden, slope=slope, at_zero=at_zero + len(laws), unstable=0
-    )
+    hidden, at_zero = hidden_modes(freq, P, respond(freq)), 2 * rigid + len(laws)
+    count = nyquist_count(freq, P, respond, hidden, rigid=rigid, at_zero=at_zero, unstable=0)
     return count.unstable == 0
 
 
