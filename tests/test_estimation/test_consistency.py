@@ -67,7 +67,7 @@ def quiet_plant(chosen):
     return assemble_plant(modes(3e-3, 40).select(chosen), own).discretized(RATE, delay=1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_right_model_passes_as_often_as_stated():
     """One state, 200 records of 1000 samples at 95 %: the share is binomial."""
     design = one_state(0.9)

@@ -51,7 +51,7 @@ def test_known_levels_from_50000_samples():
     assert consistency(observer, observer.estimate(records)).holds
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_stated_deviations_are_those_of_repeated_records():
     """40 records of 2000 samples: the squared scores of both levels are chi-square."""
     scores = []
@@ -124,7 +124,8 @@ def chain_record(count, rate, seed, duration=4.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("count", "kept", "rate", "kind"), [(5, 3, 2e3, "modes"), (8, 4, 1e4, "plant")]
+    ("count", "kept", "rate", "kind"),
+    [(5, 3, 2e3, "modes"), pytest.param(8, 4, 1e4, "plant", marks=pytest.mark.long)],
 )
 def test_modes_left_out_are_no_noise_of_the_sensors(count, kept, rate, kind):
     """Without an evaluation model sensors would be 100 times noisier, +- 0.3 %."""

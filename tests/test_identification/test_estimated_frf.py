@@ -66,7 +66,7 @@ def test_periodic_uses_the_excited_lines_and_names():
     assert estimate_frf(u, y, RATE, method=part).freq.tolist() == [30 + 2 * k for k in range(6)]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_periodic_variance_and_correlation_are_those_of_the_errors():
     """Common noise on both outputs; 300 trials of 40 lines: 3 standard errors of the mean."""
     rng = np.random.default_rng(5)

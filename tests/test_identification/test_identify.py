@@ -226,7 +226,7 @@ def test_a_few_outputs_prove_a_pole_that_all_share():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("known", "seeds"),
-    [(True, range(1000, 1005)), (False, range(2000, 2002))],
+    [pytest.param(True, range(1000, 1005), marks=pytest.mark.long), (False, range(2000, 2002))],
     ids=["variance", "no variance"],
 )
 def test_no_pole_is_lost_in_silence_and_the_doubt_is_honest(known, seeds):
@@ -462,7 +462,7 @@ def test_confidence_covers_the_truth(common, trials):
         assert np.mean(np.array(blind) < chi2.ppf(0.95, 6)) < 0.95 - margin
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_covariance_of_shapes_is_that_of_many_measurements():
     """Trials: whitened errors of shapes, their own direction (the scale) left out."""
     H = modal_frf(COARSE, TRIAL, PHI[:, :3], PHI[:2, :3], static=np.full((5, 2), 1e-7))

@@ -89,7 +89,7 @@ def test_poles_are_the_machines_without_the_windows_damping():
         assert abs(np.vdot(shape, phi[:, k])) ** 2 / np.sum(phi[:, k] ** 2) > 0.9999
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_deviations_of_few_blows_are_those_of_the_errors():
     """Three blows that ring to 1 % and less, and noise: two modes, 12 records, 48 scores."""
     rng = np.random.default_rng(6)

@@ -107,7 +107,7 @@ FREQS, ZETA = np.array([50.0, 90.0]), 0.05
 PHI = np.array([[1.0, 0.8], [0.6, -1.0], [-0.7, 0.5]])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_fits_over_hann_lines_claim_what_they_are_off_by():
     """12 records, four poles parts each: the rms of z is 1 within 20 %; it was 1.4."""
     truth, rate, scores, misfits = pole(FREQS, ZETA), 400.0, [], []

@@ -316,7 +316,7 @@ def test_what_was_measured_together_has_one_shift():
             identify_modes(frf, setups=wrong)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_runs_of_a_drifting_machine_give_means_and_how_they_differ():
     """Of the mean of such runs 8 % of the frequencies lay within 1.96 deviations, in silence."""
     inside, dofs = 0, {"y1": "a", "u1": "a", "y2": "b", "u2": "b"}

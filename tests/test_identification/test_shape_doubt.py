@@ -81,7 +81,7 @@ def sums(force, *, known):
     return np.mean(found), np.mean(blind)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_whitened_shape_residuals_are_chi_square():
     """Forces' noise moves all sensors along the shape at a resonance: correlation must count."""
     found, blind = sums(0.05, known=True)
@@ -96,7 +96,7 @@ def test_and_with_sensor_noise_alone():
     assert blind == pytest.approx(found, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:more than noise")  # few runs: some lines look too certain
 def test_and_with_doubt_from_repeated_measurements():
     """Eight runs: variances of 14 degrees of freedom, which weights and doubt are made from."""

@@ -136,7 +136,7 @@ def test_predictor_and_lag_are_those_of_the_report(make, lag, row):
         PoiVariance("die", lag=Smoother())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_over_machines(make):
     """Machines of other frequencies: the mean and the worst are those of single plants."""
     plant, sensors, _ = make(45)

@@ -49,7 +49,7 @@ def by_hand(chosen):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("measure", ["worst", "mean"])
+@pytest.mark.parametrize("measure", ["worst", pytest.param("mean", marks=pytest.mark.long)])
 def test_the_best_over_positions_is_that_of_plants_by_hand(measure):
     plant, heads = plant_at()
     criterion = OverPositions(PoiVariance("die"), {"x": X}, measure=measure)

@@ -28,7 +28,7 @@ def first_place(plant):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [4, 5])
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.long)])
 def test_sensor_scores_are_those_of_the_recursion(make, seed):
     plant, sensors, _ = make(seed)
     layouts = [sensors[:3], sensors[2:6], sensors[1:9:2], sensors]

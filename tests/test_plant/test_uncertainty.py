@@ -358,7 +358,7 @@ def test_neglected_modes_are_bounded_by_their_weights():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [6, 12])
+@pytest.mark.parametrize("count", [6, pytest.param(12, marks=pytest.mark.long)])
 def test_the_bound_on_neglected_modes_is_tight(count):
     """At 0.1 % damping, from 0 Hz: median of bound over difference, by modes written apart."""
     plant = assemble_plant(some_modes(0.001, count=count, attached=False), ports())

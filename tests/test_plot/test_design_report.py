@@ -18,7 +18,7 @@ import flexplant as fx
 from flexplant.checks import with_unit
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.plot.page import neighbours
-from stages import RATE, full, ports, reduced, some_modes
+from stages import RATE, ports, reduced, some_modes
 
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
@@ -41,8 +41,8 @@ def design():
     channels = ports(references=[fx.Reference("die", axes=("z", "rx", "ry"))])
     plant = fx.assemble_plant(reduced(), channels).discretized(RATE, delay=1)
     observer = fx.design_static(plant)
-    servo = fx.design_servo(plant.replace(evaluation=full()), bandwidth=40.0, observer=observer)
-    loop = fx.close_loop(plant.replace(evaluation=full()), observer, servo)
+    servo = fx.design_servo(plant.replace(evaluation=some_modes(count=60)), bandwidth=40.0, observer=observer)
+    loop = fx.close_loop(plant.replace(evaluation=some_modes(count=60)), observer, servo)
     move = fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0)
     run = fx.simulate(loop, reference={"die:ref": move}, duration=0.1, rng=7)
     sensors = tuple(ports().y)

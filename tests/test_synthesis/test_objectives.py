@@ -38,7 +38,7 @@ def closed(given, controller):
     return lft(given.system, controller.system)
 
 
-@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("sampled", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_single_objectives_have_their_known_optima(sampled):
     """LQG by two Riccati equations; H-infinity by the projected LMIs."""
     given = plant(sampled)
@@ -169,6 +169,7 @@ def test_the_rate_of_decay_is_searched():
     assert found == pytest.approx(min(single), rel=5e-3, abs=0)
 
 
+@pytest.mark.long
 def test_the_peak_gain_of_a_sampled_plant_is_the_sum_of_its_impulse_response():
     given, goal = mass(50.0), PeakGain(w=["d"], z=["x"], decay=1.5)
     limit = PeakGain(z=["e"], below=2.0, decay=1.5)

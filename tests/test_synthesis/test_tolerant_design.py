@@ -118,7 +118,7 @@ def test_a_bandwidth_that_cannot_be_kept_is_refused_with_what_was_tried():
 PROMISED = "least modulus margin of 20 machines drawn"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_fails_on_machines_drawn_is_not_promised(monkeypatch):
     """Shapes that mix by 10 %: each frequency alone may be off, and no loop holds on all."""
     small = sampled(some_modes(ZETA, 8, attached=False), CHANNELS)
@@ -131,7 +131,7 @@ def test_what_fails_on_machines_drawn_is_not_promised(monkeypatch):
         fx.design_stage(uncertain, bandwidth=60.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_promised_holds_where_shapes_are_mixed_by_hand():
     """A mass of 20 g anywhere, of 26.5 kg: shapes of all modes differ, frequencies do too."""
     uncertain = plant().uncertain(frequency=SHARE)

@@ -52,7 +52,11 @@ def on_truth(law, modes):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "notches"),
-    [*((name, 1) for name in PLANTS), ("free", 0), ("turned by half, below crossover", 2)],
+    [
+        *((name, 1) for name in PLANTS),
+        ("free", 0),
+        pytest.param("turned by half, below crossover", 2, marks=pytest.mark.long),
+    ],
 )
 def test_as_fast_as_brute_force(name, notches):
     """On the same lines no search over the same laws finds one that is 2 % faster."""
@@ -78,7 +82,9 @@ def exact_bandwidth():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("known", ["variance", "coherence", "nothing"])
+@pytest.mark.parametrize(
+    "known", [pytest.param("variance", marks=pytest.mark.long), "coherence", "nothing"]
+)
 def test_noise_is_not_fitted(known):
     """3 % noise on lines of 2 Hz: the plant itself keeps 6 dB, at the cost of a third at most."""
     modes, rng = PLANTS["two above"], np.random.default_rng(5)

@@ -337,7 +337,7 @@ def test_a_second_size_is_its_own_machine():
         fx.testbeds.wafer_stage(thickness=0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_second_size_is_measured_at_its_own_places():
     """The measured FRF is that of the hidden matrices; the paper's centre is off this plate."""
     other = fx.testbeds.wafer_stage(size=(0.5, 0.28), thickness=0.03)

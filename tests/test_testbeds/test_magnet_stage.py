@@ -139,7 +139,7 @@ def drawn():
     return poles, suspend(fine.calibrated(poles), machine().magnets)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_identified_poles_are_those_of_the_machine():
     """Among aliased ones: a mode above half the rate swings at the rate less its frequency."""
     poles, _ = drawn()

@@ -188,7 +188,7 @@ def test_a_measured_frf_is_the_truths_within_noise():
     assert np.abs((thick - wanted) / size).max() > 0.2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_changes_between_periods_is_the_doubt():
     """The machine drifts, and drift leaks: the spread of single periods says six times too much."""
     quiet_sensors = ports(sensor_asd=1e-14)
@@ -231,7 +231,7 @@ def test_kalman_study_in_closed_form(zeta):
         assert static > 2 * nominal
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_per_cent_of_thickness_moves_the_study():
     pins = errors_on_the_machine(0.001)
     thick = errors_on_the_machine(0.001, 0.0272 * 1.01)

@@ -247,7 +247,7 @@ def test_posterior_covariance_is_that_of_the_linear_problem(chain):
     assert (high - low) / 2 == pytest.approx(1.959964 * fit.std[0], rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_laplace_and_ensemble_draws_agree(chain):
     parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
     residuals = [Eigenvalues(measured(parts, 0.005))]
@@ -455,7 +455,7 @@ def test_localisation_finds_z8_up_to_the_plates_symmetry(plate):
     assert sum(row.endswith("alike") for row in found.table.splitlines()) == 4
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_localisation_beside_a_wrong_stiffness(plate):
     """Hidden 0.5 kg and 2 % of stiffness: alone z8 is not found, with the nuisance it is."""
     rom = plate.reduced(0.01, True)

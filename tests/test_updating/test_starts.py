@@ -245,7 +245,7 @@ def scattered_machine(seed):
     return FEModel(M, K, 2e-5 * K, dofs=line(n)), unknowns, data, [mass, stiffer]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_printed_deviations_hold_95_percent_where_the_model_is_wrong():
     """80 parameters: 74 % of them within two of the standard deviations, 95 % of those printed."""
     inside, narrow = [], []

@@ -408,7 +408,7 @@ def test_unobservable_parameters_are_named(plate, make):
 # ---- doubt
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_covariance_is_that_of_repeated_measurements(make):
     model = make([1, 2, 1.5], [(0, None, 90), (0, 1, 110), (1, 2, 70)], beta=2e-3)
     truth = changed_poles(model, [(0, 1, 0.3), (1, 1, 0.1)])

@@ -47,7 +47,7 @@ def test_localisation_judges_by_the_correlated_noise(monkeypatch):
     assert wrong.p_value < 1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_update_counts_the_correlation_of_windowed_lines(monkeypatch):
     """24 measurements, a resonance of some 14 lines, errors correlated by 4/9 and 1/36."""
     freq = np.linspace(420, 480, 90)
