@@ -356,6 +356,7 @@ def on_soft_springs(at, asd, sensor_asd, rate=5e3):
     return assemble_plant(modes, ports).discretized(rate, delay=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", ["25:z", "4:z", "1:z", (0.2, 0.1, 0.0)])
 def test_one_disturbance_on_a_softly_mounted_plate(at):
     """Refused before ("the Stein series does not end"), in half of such cases."""

@@ -107,6 +107,7 @@ def test_poles_of_a_ruler_picked_by_hand_stay_where_outputs_see_them():
         assert np.all(modes.std.real < 0.3 * -modes.poles.real)
 
 
+@pytest.mark.slow
 def test_one_odd_output_is_named():
     rng, freq = np.random.default_rng(7), np.arange(20.0, 160.0, 0.25)
     phi, drive, truth = rng.normal(size=(6, 3)), rng.normal(size=(1, 3)), np.array([33.0, 58.0, 91])
@@ -133,6 +134,7 @@ def test_a_band_little_wider_than_its_resonance(seed):
     assert found.freq.tolist() == pytest.approx([108.5], rel=5e-3)
 
 
+@pytest.mark.slow
 def test_a_first_answer_far_from_what_was_measured_is_warned_of():
     frf, _ = roving(1e-3, 3)
     with pytest.warns(FlexplantWarning, match="more than noise is left"):

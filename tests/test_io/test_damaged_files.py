@@ -133,6 +133,7 @@ def test_a_parser_that_dies_leaves_this_process_alive(tmp_path):
     assert io.read_matlab(good).n_dof == 2
 
 
+@pytest.mark.slow
 def test_without_an_interpreter_to_start_files_are_read_here(tmp_path, monkeypatch):
     scipy.io.savemat(tmp_path / "K.mat", {"K": np.eye(2), "s": {"a": 1.0}})
     foreign_parsers._close_all()

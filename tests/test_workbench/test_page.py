@@ -127,6 +127,7 @@ def test_undo_redo_keep_and_go_back(page):
     assert page.design is moved
 
 
+@pytest.mark.slow
 def test_what_is_wrong_is_said_and_the_last_good_design_stands(page):
     good, shown = page.design, page.views.sources["magnitude main"].data["y"]
     number = numbers(page, 1)["frequency"]
