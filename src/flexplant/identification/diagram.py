@@ -393,7 +393,7 @@ POLES = 100
 
 def affordable(orders: list[int] | None, ready: PreparedLines) -> list[int]:
     """Return the orders, by default as many as the lines afford; ModelError for too high ones."""
-    parts = _line_windows(ready)
+    parts = line_windows(ready)
     fewest = min(seen.stop - seen.start for _, seen in parts)
     if orders is None:
         # four orders at least are compared, which twenty lines afford
@@ -428,7 +428,7 @@ LINES, OVERLAP = 400, 0.25
 MARGIN = 0.04
 
 
-def _line_windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
+def line_windows(ready: PreparedLines) -> list[tuple[slice, slice]]:
     """Return the lines of parts of about 400, cut where responses are weakest, and those used."""
     import scipy.ndimage as ndi
 
@@ -456,9 +456,9 @@ def diagram_of(
     low, high = float(ready.freq[0]), float(ready.freq[-1])
     edge, band, first = MARGIN * (high - low), np.array([low, high]), 0
     found = []
-    for own, seen in _line_windows(ready):
+    for own, seen in line_windows(ready):
         freq = ready.freq[seen]
-        moments = _moments_in(ready, seen, orders[-1])
+        moments = moments_in(ready, seen, orders[-1])
         inside = partial(_in_band, low=freq[0], high=freq[-1], max_zeta=max_zeta)
         results = [moments.solve(order, inside) for order in orders]
         diagram = built_diagram(results, band, tolerances, first=first)
@@ -486,16 +486,17 @@ def weighted_by_remainder(ready: PreparedLines, order: int) -> PreparedLines:
     n_out, n_in, n_freq = ready.data.shape
     for _ in range(2):
         error: FloatArray = np.zeros(ready.data.shape)
-        parts = _line_windows(now)
+        parts = line_windows(now)
         for own, seen in parts:
-            fitted: ComplexArray = _moments_in(now, seen, order).response(order, now.freq[own])
+            fitted: ComplexArray = moments_in(now, seen, order).response(order, now.freq[own])
             error[:, :, own] = np.abs(now.data[:, :, own] - fitted) ** 2
         share = (order + 1) * len(parts) / n_freq * (1 + n_in / n_out)
         now = now.from_errors(error, min(0.5, share))
     return now
 
 
-def _moments_in(ready: PreparedLines, seen: slice, order: int) -> Moments:
+def moments_in(ready: PreparedLines, seen: slice, order: int) -> Moments:
+    """Return the normal equations of the lines of one part."""
     return Moments(ready.freq[seen], ready.data[:, :, seen], ready.line_weight[:, seen], order)
 
 

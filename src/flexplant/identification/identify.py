@@ -12,6 +12,7 @@ from ..errors import LabelError, ModelError, SolverError, require_known
 from ..lti.frequency import Frf
 from ..parallel import one_thread
 from ..tolerances import ROUNDING
+from .causality import forward_in_time
 from .diagram import (
     PoleSelection,
     StabilisationDiagram,
@@ -89,7 +90,8 @@ def stabilisation_diagram(
             f"{tolerances!r}."
         )
     top = between(max_zeta, "max_zeta", 0.0, 1.0, "From 1 on nothing oscillates: pass 0.2, say.")
-    ready, listed = prepared_lines(frf, band), None if orders is None else checked_orders(orders)
+    ready = prepared_lines(forward_in_time(frf, band), band)
+    listed = None if orders is None else checked_orders(orders)
     if not ready.known:
         ready = weighted_by_remainder(ready, affordable(listed, ready)[-1])
     with one_thread():
@@ -176,7 +178,8 @@ def identify_modes(
     FlexplantWarning
         When the residual of a stretch of lines is more than noise: a missed or merged mode; or
         when a resonance is narrower than half a line of Hann-windowed segments, or than about four
-        where the window is not fitted through.
+        where the window is not fitted through; when the FRF is of the convention exp(-i omega t),
+        whose conjugate is then used.
 
     Raises
     ------
@@ -208,6 +211,7 @@ def identify_modes(
         runs = repetitions(runs)
     with one_thread():
         try:
+            runs = tuple(forward_in_time(run, band) for run in runs)
             ready = prepared_lines(stacked_runs(runs) if len(runs) > 1 else runs[0], band)
             rate = None if hold is None else positive(hold, "hold")
             high = float(ready.freq[-1])
