@@ -1,5 +1,7 @@
 """Ports that move with the machine: rows at a position, by hand and by interpolation."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -120,6 +122,22 @@ def test_a_port_that_moves_can_be_put_elsewhere(modes):
     np.testing.assert_allclose(back, (0.17, 0.04, 0.0), atol=1e-12)
     back = moved.at(x=0.0).assembled.ports.sensor("y1").at
     np.testing.assert_allclose(back, (0.45, 0.02, 0.0), atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_position_at_the_end_of_its_range_is_inside_but_for_rounding(seed):
+    rng = np.random.default_rng(seed)
+    low, high = np.sort(10.0 ** rng.uniform(-4, 2) * rng.uniform(-1, 1, 2)).tolist()
+    end, sign = ((low, -1), (high, 1))[seed % 2]
+    x = fx.plant.Position("x", range=(low, high))
+    for excess in 10.0 ** rng.uniform(-16, -6.1, 5):
+        assert low <= x.within(end + sign * excess * (high - low)) <= high
+    for excess in 10.0 ** rng.uniform(-5.9, 1, 5):
+        given = end + sign * excess * (high - low)
+        with pytest.raises(ModelError, match="outside its range") as refusal:
+            x.within(given)
+        numbers = re.findall(r"-?[\d.]+(?:e-?\d+)?", str(refusal.value).split(":")[0])
+        assert [float(one) for one in numbers] == [given, low, high]
 
 
 def test_refusals(modes):

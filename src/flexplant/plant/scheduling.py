@@ -11,7 +11,7 @@ import numpy as np
 from ..checks import FloatArray, Value, instance, number, real_array, short, whole
 from ..errors import LabelError, ModelError, require_known
 from ..labels import Place
-from ..tolerances import SAME
+from ..tolerances import SAME, TYPED
 
 #: points of a position that a mapping of them does not name
 _POINTS = 21
@@ -69,16 +69,17 @@ class Position(Value):
         self._set(start=self.within(start))
 
     def within(self, value: Any) -> float:
-        """Return a value of it as a float; ModelError when it lies outside the range."""
+        """Return a value inside the range, to six digits; ModelError when it is farther outside."""
         found = number(value, f"position {self.name!r}")
         low, high = self.range
-        spare = SAME * (high - low)
+        spare = TYPED * (high - low)
         if not low - spare <= found <= high + spare:
+            # all digits: 0.15001 is not printed as 0.15
             raise ModelError(
-                f"position {self.name!r} is {found:g}, outside its range from {low:g} to {high:g}: "
+                f"position {self.name!r} is {found}, outside its range from {low} to {high}: "
                 "nothing is known of the machine there. Stay inside, or widen its range."
             )
-        return found
+        return min(max(found, low), high)
 
 
 def values_over(positions: Sequence[Position], points: Any) -> dict[str, FloatArray]:

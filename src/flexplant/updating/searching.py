@@ -424,7 +424,7 @@ def _check_inside(objective: Objective, start: FloatArray) -> None:
     ):
         if not low <= value <= high:
             raise ModelError(
-                f"start of {q.name} is {value:g}, outside its bounds ({low:g}, {high:g})."
+                f"start of {q.name} is {value}, outside its bounds ({low}, {high}). Begin inside."
             )
 
 

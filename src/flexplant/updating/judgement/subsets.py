@@ -67,6 +67,8 @@ class Subsets:
         self.linear: FloatArray | None = None
         #: the points each fit went through, and the model where it ended
         self.ways: dict[Subset, list[FloatArray]] = {(): [self.start[self.beside]]}
+        #: values near those of a set's fit, where they are known from elsewhere
+        self.guesses: dict[Subset, FloatArray] = {}
         self.ends: dict[Subset, Point] = {}
         point = whole.begin(np.where(np.arange(self.start.size) < count, 0.0, self.start))
         self.rows = whole.values(point).size
@@ -260,6 +262,10 @@ class Subsets:
         order = np.argsort(-gain[i, j], kind="stable")[: 2 * JOIN]
         return [(int(i[n]), int(j[n])) for n in order]
 
+    def few(self, picked: list[int]) -> Objective:
+        """Return the objective of some parameters, in few coordinates where these suffice."""
+        return self._objective(picked, self._coordinates(picked))
+
     def _objective(self, picked: list[int], B: FloatArray | None = None) -> Objective:
         """Return the objective of some parameters, in the coordinates B where they are given."""
         family = self.whole.family.of(picked)
@@ -339,6 +345,8 @@ class Subsets:
 
     def _guess(self, subset: Subset) -> FloatArray | None:
         """Return values near the fit of a subset: of the best part of it, or to first order."""
+        if subset in self.guesses:
+            return self.guesses[subset]
         # from zero a trust region grows by a factor of two a step to where one of these begins
         parts = [tuple(k for k in subset if k != out) for out in subset]
         parts = [part for part in parts if part and self.done.get(part) is not None]
