@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg as la
 
 from flexplant import DofSet
-from flexplant.errors import AssumptionError, ModelError
+from flexplant.errors import ModelError, SolverError
 from flexplant.estimation import design_kalman
 from flexplant.identification import MeasuredModes
 from flexplant.loop import close_loop
@@ -168,11 +168,11 @@ def test_the_loop_is_closed_on_observer_servo_and_h_infinity():
     plant = assemble_plant(suspend(reduced(0.001), magnets()), ports()).discretized(RATE, delay=1)
     free = assemble_plant(reduced(0.001), ports()).discretized(RATE, delay=1)
     observer = design_kalman(plant)
-    with pytest.raises(AssumptionError, match=r"1\.728 Hz.*Raise the bandwidth above 5\.185 Hz"):
-        design_servo(plant, bandwidth=4.0, observer=observer)
+    with pytest.raises(SolverError, match="unstable"):  # slower than the magnets, at 1.7 Hz
+        design_servo(plant, bandwidth=1.5, observer=observer)
     servo = design_servo(plant, bandwidth=50.0, observer=observer)
     loop = close_loop(plant, observer, servo)
-    assert servo.certificate["rigid-body spectral radius"] < 1
+    assert servo.certificate["spectral radius"] < 1
     assert loop.spectral_radius < 1
     on_free = design_servo(free, bandwidth=50.0, observer=design_kalman(free))
     margins = [one.certificate["modulus margin"] for one in (servo, on_free)]

@@ -1,4 +1,4 @@
-"""design_servo: decoupling by F = m a, PID in closed form, loops by dense eigenvalues."""
+"""design_servo on a free plate: decoupling by F = m a, PID in closed form, dense eigenvalues."""
 
 import warnings
 
@@ -15,11 +15,11 @@ from flexplant.errors import (
 )
 from flexplant.estimation import design_kalman, design_static
 from flexplant.loop import close_loop
-from flexplant.plant import Actuator, Poi, Ports, assemble_plant
-from flexplant.structure import FEModel
+from flexplant.plant import Actuator, Poi, assemble_plant
 from flexplant.synthesis import Controller, design_servo
-from oracles_plant import hold
-from stages import INSET, RATE, Z8, L, block, fitted, full, ports, reduced, sampled, some_modes
+from flexplant.testbeds import maglev_block
+from judge import through
+from stages import INSET, RATE, Z8, L, block, fitted, ports, reduced, sampled, some_modes
 
 MASS = L * L * 0.0272 * 2702
 INERTIA = MASS * L * L / 12
@@ -66,19 +66,44 @@ def pid(freq, bandwidth, *, rolloff=None, integrator=None, notches=(), rate=RATE
     return (2 * np.pi * bandwidth) ** 2 * shape(freq) / abs(shape(bandwidth))
 
 
+def exact(plant, channels, bandwidth, **options):
+    """The law by dense solves: pinv(G(sigma)), each axis crossing 1 by its response at j omega."""
+    g = plant.system
+    rows = [g.outputs.index(name) for name in channels]
+    B, D = g.B[:, -8:][:, -4:], g.D[rows, -4:]
+
+    def response(s):
+        z = np.exp(s * g.dt)
+        return g.C[rows] @ np.linalg.solve(z * np.eye(g.n_states) - g.A, B) + D
+
+    w = 2 * np.pi * bandwidth
+    T = np.linalg.pinv(response(w).real)
+    size = np.abs(np.diag(response(1j * w) @ T))
+    return lambda freq: T * pid(freq, bandwidth, **options) / w**2 / size
+
+
+#: how far a plate that bends at 245 Hz is from F = m a at 50 Hz
+BENT = 0.01
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("die", [(L / 2, L / 2, 0.0), (0.31, 0.1, 0.0)])
 @pytest.mark.parametrize("notches", [(), (459.0, 640.0)])
 def test_the_controller_in_closed_form(die, notches):
-    servo = design_servo(sampled(reduced(), ports(die=die)), bandwidth=50.0, notches=notches)
+    plant = sampled(reduced(), ports(die=die))
+    servo = design_servo(plant, bandwidth=50.0, notches=notches)
+    law = exact(plant, ["die:z", "die:rx", "die:ry"], 50.0, notches=notches)
     assert servo.system.inputs == ("die:ref", *HATS)
     assert servo.system.outputs == ("u1", "u2", "u3", "u4")
     gain = rigid_gain(die, INSET)
     for freq in (2.0, 50.0, 459.0, 2000.0):
         K = at(servo.system, freq, HATS)
-        wanted = pid(freq, 50.0, notches=notches)
-        # plant rigid gain times T_u is the identity
-        np.testing.assert_allclose(gain @ K / -wanted, np.eye(3), rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(K, -law(freq), rtol=1e-6, atol=1e-9 * abs(K).max())
+        # nearly that of F = m a: the plate bends a little
+        nearly = gain @ K / -pid(freq, 50.0, notches=notches)
+        scale = np.diag([1.0, L, L])
+        unit = np.linalg.inv(scale) @ nearly @ scale
+        np.testing.assert_allclose(unit, np.eye(3), atol=6 * BENT)
         ref = at(servo.system, freq, ["die:ref"])
         np.testing.assert_allclose(ref[:, 0], -K[:, 0], rtol=1e-9, atol=1e-15 * abs(K).max())
 
@@ -89,11 +114,13 @@ def test_the_decoupling_takes_least_force():
     servo = design_servo(sampled(reduced()), bandwidth=50.0, notches=())
     T_u = at(servo.system, 50.0, HATS) / -pid(50.0, 50.0)
     wanted = np.linalg.pinv(rigid_gain((L / 2, L / 2), INSET))
-    np.testing.assert_allclose(T_u, wanted, rtol=1e-6, atol=1e-6 * abs(wanted).max())
-    np.testing.assert_allclose(T_u[:, 0], MASS / 4, rtol=1e-6)
+    np.testing.assert_allclose(T_u, wanted, rtol=BENT, atol=BENT * abs(wanted).max())
+    np.testing.assert_allclose(T_u[:, 0], MASS / 4, rtol=BENT)
+    null = np.array([1.0, -1.0, -1.0, 1.0])  # four forces that move no axis
+    np.testing.assert_allclose(null @ T_u, 0.0, atol=BENT * abs(wanted).max())
     thick = design_servo(sampled(reduced(thickness=0.0272 * 1.01)), bandwidth=50.0, notches=())
     T_u = at(thick.system, 50.0, HATS) / -pid(50.0, 50.0)
-    np.testing.assert_allclose(T_u[:, 0], 1.01 * MASS / 4, rtol=1e-6)
+    np.testing.assert_allclose(T_u[:, 0], 1.01 * MASS / 4, rtol=0.5 * BENT)
 
 
 def test_options_reach_the_controller():
@@ -102,63 +129,33 @@ def test_options_reach_the_controller():
     servo = design_servo(plant, bandwidth=30.0, **options)
     K = at(servo.system, 100.0, HATS)
     found = rigid_gain((L / 2, L / 2), INSET) @ K
-    np.testing.assert_allclose(found[0, 0], -pid(100.0, 30.0, **options), rtol=1e-6)
-
-
-def rigid_loop(servo, delay, rate=RATE, sign=1.0):
-    """Eigenvalues of the rigid plate, held and late, with the controller: dense."""
-    gain = rigid_gain((L / 2, L / 2), INSET)
-    A = np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(3))
-    B = np.vstack([np.zeros((3, 4)), gain])
-    Ad, _ = hold(A, B, 1 / rate)
-    whole, fraction = int(delay), delay - int(delay)
-    new = hold(A, B, (1 - fraction) / rate)[1]
-    old = hold(A, B, (1 - fraction) / rate)[0] @ hold(A, B, fraction / rate)[1]
-    lines = whole + 1
-    n, k = 6, 4 * lines
-    P = np.zeros((n + k, n + k))
-    P[:n, :n] = Ad
-    Bp = np.zeros((n + k, 4))
-    if whole:
-        P[:n, n + 4 * (whole - 1) : n + 4 * whole] = new
-    else:
-        Bp[:n] = new
-    P[:n, n + 4 * whole : n + 4 * (whole + 1)] += old
-    Bp[n : n + 4] = np.eye(4)
-    for i in range(1, lines):
-        P[n + 4 * i : n + 4 * i + 4, n + 4 * i - 4 : n + 4 * i] = np.eye(4)
-    C = np.hstack([np.eye(3), np.zeros((3, 3 + k))])
-    g = servo.system
-    Bc, Dc = sign * g.B[:, 1:], sign * g.D[:, 1:]
-    loop = np.block([[P + Bp @ Dc @ C, Bp @ g.C], [Bc @ C, g.A]])
-    return np.abs(np.linalg.eigvals(loop)).max()
+    np.testing.assert_allclose(found[0, 0], -pid(100.0, 30.0, **options), rtol=BENT)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", [0, 1, 1.5, 2])
-@pytest.mark.parametrize("bandwidth", [10.0, 50.0, 200.0])
-def test_the_certificate(delay, bandwidth):
+@pytest.mark.parametrize("bandwidth", [10.0, 50.0])
+def test_the_certificate_and_the_crossover_by_dense_matrices(delay, bandwidth):
+    """Closed by hand on the POI: eigenvalues, |S| at u, and |L| = 1 at the bandwidth, as asked."""
     plant = sampled(reduced(), delay=delay)
-    with warnings.catch_warnings():  # at 200 Hz the modes are unstable: this is of the rigid body
-        warnings.simplefilter("ignore", FlexplantWarning)
-        servo = design_servo(plant, bandwidth=bandwidth, notches=())
+    servo = design_servo(plant, bandwidth=bandwidth, notches=())
+    g, k = plant.system, servo.system
+    rows = [g.outputs.index(name) for name in ("die:z", "die:rx", "die:ry")]
+    B, C = g.B[:, -4:], g.C[rows]
+    Bk, Dk = k.B[:, 1:], k.D[:, 1:]
+    A = np.block([[g.A + B @ Dk @ C, B @ k.C], [Bk @ C, k.A]])
     found = servo.certificate
-    radius = rigid_loop(servo, delay)
-    # a cluster of three equal axes: eigenvalues of the dense loop are known to its cube root
-    assert radius < 1
-    assert found["rigid-body spectral radius"] == pytest.approx(radius, abs=1e-4)
-    assert rigid_loop(servo, delay, sign=-1.0) > 1
-    freq = np.geomspace(0.02 * bandwidth, 0.5 * RATE, 4000)[:-1]
-    z = np.exp(2j * np.pi * freq / RATE)
-    whole, f = int(delay), delay - int(delay)
-    held = [0.5 / RATE**2 * c for c in ((1 - f) ** 2, 1 + 2 * f * (1 - f), f**2)]
-    body = (held[0] * z**2 + held[1] * z + held[2]) / (z * (z - 1) ** 2) / z**whole
-    L_ = np.array([pid(f0, bandwidth) for f0 in freq]) * body
-    margin = np.abs(1 + L_).min()
-    assert found["rigid-body modulus margin"] == pytest.approx(margin, rel=1e-3)
-    # |S| near 4 dB, as the docstring says, where rate and delay leave the phase alone
-    if bandwidth < 100:
-        assert 3.0 < -20 * np.log10(margin) < 5.5
+    assert found["spectral radius"] == pytest.approx(np.abs(np.linalg.eigvals(A)).max(), abs=1e-6)
+
+    def loop(f):
+        z = np.exp(2j * np.pi * f / RATE)
+        P = C @ np.linalg.solve(z * np.eye(g.n_states) - g.A, B)
+        return at(k, f, HATS) @ P, P @ at(k, f, HATS)
+
+    np.testing.assert_allclose(np.abs(np.diag(loop(bandwidth)[1])), 1.0, rtol=1e-6)
+    freq = through(np.linalg.eigvals(A), plant.dt)
+    least = min(np.linalg.svd(np.eye(4) - loop(f)[0])[1][-1] for f in freq[freq > 1.0])
+    assert (1 - 2e-2) * least < found["modulus margin"] <= least * (1 + 1e-6)
 
 
 def test_the_loop_on_the_plate_is_stable_and_turns_unstable_with_the_sign():
@@ -192,8 +189,10 @@ def test_one_of_several_pois_and_no_reference():
     assert servo.system.inputs == ("edge:hat", "edge:rx:hat", "edge:ry:hat")
     gain = rigid_gain(Z8, INSET)
     K = at(servo.system, 50.0, servo.system.inputs)
-    np.testing.assert_allclose(gain @ K / -pid(50.0, 50.0), np.eye(3), atol=1e-5)
-    with pytest.raises(LabelError, match=r"2 POIs \(die, edge\): say which, poi='die'"):
+    scale = np.diag([1.0, L, L])
+    unit = np.linalg.inv(scale) @ gain @ K @ scale / -pid(50.0, 50.0)
+    np.testing.assert_allclose(unit, np.eye(3), atol=6 * BENT)
+    with pytest.raises(AssumptionError, match=r"do not move these axes apart: die:z, .*axes=\["):
         design_servo(plant, bandwidth=50.0)
     with pytest.raises(LabelError, match="no POI 'dye'"):
         design_servo(plant, bandwidth=50.0, poi="dye")
@@ -203,8 +202,8 @@ def test_one_of_several_pois_and_no_reference():
 def test_what_it_is():
     servo = design_servo(sampled(reduced()), bandwidth=50.0, notches=())
     assert isinstance(servo, Controller)
-    assert repr(servo).startswith("<Controller servo 50 Hz on 'die': 12 states")
-    assert "rigid-body modulus margin" in repr(servo)
+    assert repr(servo).startswith("<Controller servo 50 Hz: 12 states")
+    assert "lines: die:z mass, die:rx mass, die:ry mass" in repr(servo)
     assert servo.gamma is None
     assert set(block(servo.system)) == {"A", "B", "C", "D", "inputs", "outputs"}
     after = fitted(reduced(), [-28.569 + 2883.567j, -39.451 + 3983.308j]).model
@@ -223,11 +222,11 @@ def test_bad_frequencies(name, bad):
 
 @pytest.mark.slow
 def test_a_fast_servo_keeps_its_rolloff_below_half_the_rate():
-    plant = sampled(some_modes(), delay=0)
-    with pytest.warns(FlexplantWarning, match=r"on the POI itself is unstable .*mode \d"):
-        fast = design_servo(plant, bandwidth=0.08 * RATE, notches=())
-    with pytest.warns(FlexplantWarning, match="observer="):
-        given = design_servo(plant, bandwidth=0.08 * RATE, notches=(), rolloff=0.4 * RATE)
+    plant = maglev_block(delay=0)
+    with warnings.catch_warnings():  # the block's modes are unstable at this bandwidth
+        warnings.simplefilter("ignore", FlexplantWarning)
+        fast = design_servo(plant, bandwidth=0.06 * RATE, notches=())
+        given = design_servo(plant, bandwidth=0.06 * RATE, notches=(), rolloff=0.4 * RATE)
     np.testing.assert_array_equal(fast.system.A, given.system.A)
 
 
@@ -235,7 +234,7 @@ def test_refusals():
     plant = sampled(some_modes())
     with pytest.raises(ModelError, match="bandwidth 5000 Hz is not well below the rate"):
         design_servo(plant, bandwidth=5000.0)
-    with pytest.raises(SolverError, match=r"unstable \(spectral radius.*Lower the bandwidth"):
+    with pytest.raises(SolverError, match=r"unstable \(phase margin -.*Lower the bandwidth"):
         design_servo(sampled(some_modes(), delay=3), bandwidth=1500.0)
     with pytest.raises(ModelError, match="notch must be positive"):
         design_servo(plant, bandwidth=50.0, notches=[-1.0])
@@ -251,20 +250,20 @@ def test_refusals():
             design_servo(plant, bandwidth=50.0, **options)
     with pytest.raises(AssumptionError, match=r"discretized\(rate"):
         design_servo(assemble_plant(some_modes(), ports()), bandwidth=50.0)
-    with pytest.raises(AssumptionError, match=r"axes that span them.*z, rx, ry"):
-        design_servo(plant.at({"die": Z8}).with_ports(
-            ports(z=[Poi("die", at=Z8, axes=("z", "rx"))])), bandwidth=50.0)  # fmt: skip
     with pytest.raises(ModelError, match="need a StandardPlant, got 'plant'"):
         design_servo("plant", bandwidth=50.0)
     with pytest.raises(ModelError, match=r"weighted.*plant.unweighted"):
         design_servo(plant.weighted(z={"die:z": 2.0}), bandwidth=50.0)
-    with pytest.raises(AssumptionError, match="a POI"):
+    with pytest.raises(AssumptionError, match="no POI"):
         design_servo(plant.with_ports(ports(z=[], references=[])), bandwidth=50.0)
     few = ports(u=[Actuator("u1", at=INSET[0]), Actuator("u2", at=INSET[1])])
+    with pytest.raises(
+        AssumptionError, match="do not move these axes apart: die:z, die:rx, die:ry"
+    ):
+        design_servo(plant.with_ports(few), bandwidth=50.0, axes=["die:z", "die:rx", "die:ry"])
     with pytest.raises(AssumptionError, match="u does not reach the rigid-body"):
         design_servo(plant.with_ports(few), bandwidth=50.0)
-    free = full()
-    held = FEModel(free.M, free.K + 1e7 * free.M, dofs=free.dofs)
-    port = Ports(u=few.u, z=few.z, y=few.y)
-    with pytest.raises(AssumptionError, match="constrained"):
-        design_servo(assemble_plant(held, port).discretized(RATE), bandwidth=50.0)
+    with pytest.raises(LabelError, match="no axis 'die:x'"):
+        design_servo(plant, bandwidth=50.0, axes=["die:x"])
+    with pytest.raises(LabelError, match="no bandwidth of die:rx, die:ry"):
+        design_servo(plant, bandwidth={"die:z": 50.0})

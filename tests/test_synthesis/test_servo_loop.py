@@ -9,12 +9,12 @@ from flexplant.errors import FlexplantWarning, LabelError, ModelError, SolverErr
 from flexplant.estimation import design_kalman, design_static
 from flexplant.loop import close_loop
 from flexplant.lti import StateSpace
-from flexplant.plant import Poi, Sensor, assemble_plant
+from flexplant.plant import Sensor, assemble_plant
 from flexplant.synthesis import design_servo, servo_bandwidth
 from flexplant.synthesis.laws.servo_design import servo_task
 from flexplant.testbeds import three_masses, wafer_stage
 from oracles_plant import closed_loop
-from stages import RATE, L, block, calibrated, ports, reduced, sampled
+from stages import RATE, block, calibrated, ports, reduced, sampled
 
 U, Y = [f"u{i}" for i in range(1, 5)], [f"y{i}" for i in range(1, 5)]
 
@@ -77,7 +77,6 @@ def test_the_certificate_is_of_the_loop_that_runs(which):
     top = peak_at_u(plant, observer.system, servo.system, freq[freq < 4990])
     # the grid of the oracle may miss the top of a resonance, not exceed it
     assert 0.95 / top < found["modulus margin"] < (1 + 1e-6) / top
-    assert found["modulus margin"] < found["rigid-body modulus margin"] * 1.02
     # stable on the machine too
     assert dense(truth(), observer.system, servo.system) < 1
 
@@ -168,11 +167,11 @@ def test_search_and_certificate_break_the_same_loop():
         plants.append(assemble_plant(plant.model, seen).discretized(2e3, delay=1))
     pairs = [(plant, design_static(plant)), *((one, design_kalman(one)) for one in plants)]
     for one, observer in pairs:
-        task = servo_task(one, None, None, None, (), observer)
+        task = servo_task(one, None, None, None, None, (), observer)
         for bandwidth in (5.0, 20.0):
-            axis = task.axis(bandwidth)
-            found = task.loop.gain(axis)
-            wanted = task.closed(axis).broken.gain(task.loop.freq)
+            law = task.law(bandwidth)
+            found = task.loop.gain(law)
+            wanted = task.closed(law).broken.gain(task.loop.freq)
             np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-9 * np.abs(wanted).max())
 
 
@@ -222,9 +221,6 @@ def test_refusals():
         design_servo(plant, bandwidth=50.0, observer=slower)
     with pytest.raises(ModelError, match="peak must be above 1"):
         servo_bandwidth(plant, peak=1.0)
-    with pytest.raises(SolverError, match=r"no bandwidth from .* rigid body by itself does not"):
+    with pytest.raises(SolverError, match=r"no bandwidth from .*phase margin of .*Raise the rate"):
         servo_bandwidth(plant, peak=1.02)
-    z = Poi("die", at=(L / 2, L / 2, 0.0), axes=("z",))
-    with pytest.raises(Exception, match="axes that span"):
-        servo_bandwidth(sampled(reduced(0.001), ports(z=[z])))
     assert isinstance(static.system, StateSpace)

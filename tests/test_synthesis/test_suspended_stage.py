@@ -27,19 +27,7 @@ from flexplant.simulation import simulate
 from flexplant.structure import FEModel, ModalDamping, Spring, kirchhoff_plate, solid_block
 from flexplant.synthesis import design_hinf, design_servo
 from plates import make_plate
-from stages import (
-    AXES,
-    CORNERS,
-    INSET,
-    OFF_NODE,
-    RATE,
-    L,
-    full,
-    ports,
-    reduced,
-    sampled,
-    some_modes,
-)
+from stages import AXES, CORNERS, INSET, OFF_NODE, L, full, ports, reduced, sampled, some_modes
 
 MASS = L * L * 0.0272 * 2702
 INERTIA = MASS * L * L / 12
@@ -160,17 +148,15 @@ def loops(model):
 
 
 @pytest.mark.slow
-def test_the_servo_is_the_free_ones_and_its_loop_too():
+def test_the_servo_is_nearly_the_free_ones_and_its_loop_too():
+    """By T = pinv(G(sigma)): the mass line is seen above springs of 1 / 33 of the bandwidth."""
     (free, free_loop), (soft, soft_loop) = loops(some_modes)
     for name in "ABCD":
         wanted = getattr(free.system, name)
         np.testing.assert_allclose(
-            getattr(soft.system, name), wanted, atol=1e-9 * max(abs(wanted).max(), 1e-300)
+            getattr(soft.system, name), wanted, atol=5e-3 * max(abs(wanted).max(), 1e-300)
         )
     assert soft_loop.spectral_radius < 1
-    margin = "rigid-body modulus margin"
-    assert soft.certificate[margin] == pytest.approx(free.certificate[margin], rel=2e-2)
-    assert soft.certificate[margin] != free.certificate[margin]
     assert soft_loop.modulus_margin == pytest.approx(free_loop.modulus_margin, rel=5e-2)
 
 
@@ -185,52 +171,24 @@ def test_the_error_settles_on_springs():
 
 
 @pytest.mark.slow
-def test_the_loop_of_the_dense_rigid_plate_on_springs():
-    """The certificate against eigenvalues of a rigid plate with springs, held and late."""
-    from oracles_plant import hold
-
-    servo = design_servo(held(freq=4.0), bandwidth=50.0, notches=())
-    gain = newton((L / 2, L / 2))
-    omega = 2 * np.pi * 4.0 * np.array([1, 3**0.5, 3**0.5])
-    A = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.diag(omega**2), np.zeros((3, 3))]])
-    Ad, Bd = hold(A, np.vstack([np.zeros((3, 4)), gain]), 1 / RATE)
-    P = np.block([[Ad, Bd], [np.zeros((4, 10))]])
-    B = np.vstack([np.zeros((6, 4)), np.eye(4)])
-    C = np.hstack([np.eye(3), np.zeros((3, 7))])
-    g = servo.system
-    Bc, Dc = g.B[:, 1:], g.D[:, 1:]
-    loop = np.block([[P + B @ Dc @ C, B @ g.C], [Bc @ C, g.A]])
-    radius = np.abs(np.linalg.eigvals(loop)).max()
-    assert servo.certificate["rigid-body spectral radius"] == pytest.approx(radius, abs=1e-5)
-    assert radius < 1
-
-
-@pytest.mark.slow
-def test_springs_that_are_not_weak_beside_the_bandwidth_are_refused():
-    plant = held(freq=4.0)  # rocks at 6.93 Hz
-    assert design_servo(plant, bandwidth=21.0).certificate
-    for call, what in (
-        (lambda: design_servo(plant, bandwidth=20.0), "a servo of 20 Hz"),
-        (lambda: stage_weights(plant, 20.0), "a set of weights of 20 Hz"),
-    ):
-        with pytest.raises(AssumptionError, match=rf"6\.927 Hz: {what}.*bandwidth above 20\.78 Hz"):
-            call()
-    stiff = sampled(suspend(full(), [GroundSpring(p, 1e9) for p in CORNERS]))
-    for call in (
-        lambda: design_servo(stiff, bandwidth=50.0),
-        lambda: stage_weights(stiff, 50.0),
-        lambda: reference_errors(stiff),
-    ):
-        with pytest.raises(AssumptionError, match=r"no suspension modes: it is constrained.*Use"):
-            call()
+@pytest.mark.parametrize("bandwidth", [2.0, 10.0, 40.0])
+def test_springs_of_any_stiffness_are_held_below_and_above_their_modes(bandwidth):
+    """Springs at 6.9 and 12 Hz: on their line, next to their modes, on the mass line."""
+    plant = held(freq=6.93)
+    servo = design_servo(plant, bandwidth=bandwidth)
+    line = {2.0: "spring", 10.0: "mass", 40.0: "mass"}[bandwidth]
+    assert f"die:z {line}" in repr(servo)
+    assert servo.certificate["modulus margin"] > 0.4
 
 
 @pytest.mark.parametrize("die", [(L / 2, L / 2, 0.0), OFF_NODE])
 def test_error_measurements_and_the_static_relation_are_the_free_ones(die):
     free = sampled(some_modes(), ports(die=die))
     soft = held(die=die)
-    for design in (lambda p: reference_errors(p).D, lambda p: design_static(p).system.D):
-        np.testing.assert_allclose(design(soft), design(free), atol=1e-9)
+    np.testing.assert_allclose(design_static(soft).gain, design_static(free).gain, atol=1e-9)
+    # at rest the forces against the springs bend the plate a little: 1.5 Hz beside 245 Hz, squared
+    bent = 5.0 * (1.5 / 245.0) ** 2
+    np.testing.assert_allclose(reference_errors(soft).D, reference_errors(free).D, atol=bent)
 
 
 def test_the_static_relation_predicts_the_same_rms_on_springs():
@@ -250,7 +208,7 @@ def test_weights_of_a_suspended_stage_are_the_free_ones_and_its_hinf_loop():
         loop = close_loop(plant, errors, found)
         assert loop.spectral_radius < 1
         gammas.append((found.gamma, weights.w["amp1"], loop.modulus_margin))
-    np.testing.assert_allclose(gammas[1][1], gammas[0][1], rtol=1e-9)
+    np.testing.assert_allclose(gammas[1][1], gammas[0][1], rtol=5e-3)  # (1.5 / 48)^2
     np.testing.assert_allclose(gammas[1], gammas[0], rtol=0.05)
 
 
@@ -318,6 +276,8 @@ def test_hinf_of_plates_and_solids_on_springs_reaches_what_the_weights_require(c
     assert close_loop(plant, errors, found).spectral_radius < 1.0
 
 
-def test_axes_that_do_not_span_the_suspended_body():
-    with pytest.raises(AssumptionError, match="3 rigid-body modes"):
-        design_servo(held(axes=AXES[:2]), bandwidth=50.0)
+def test_some_axes_of_a_suspended_body():
+    """z and rx alone: the springs hold the third motion."""
+    servo = design_servo(held(axes=AXES[:2]), bandwidth=50.0)
+    assert servo.system.inputs == ("die:ref", "die:hat", "die:rx:hat")
+    assert servo.certificate["spectral radius"] < 1.0

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from ..checks import Value, positive
-from ..errors import AssumptionError, ModelError, only_one
+from ..errors import AssumptionError, ModelError, require_known
 from ..lti.discretisation import tustin
 from ..lti.filters import inverse_sensitivity, leadlag
 from ..lti.interconnection import connect, series, side_by_side
 from ..lti.statespace import StateSpace, System, as_statespace
+from ..tolerances import divisor
+from .at_rest import followed_at_rest
+from .axes import DrivenAxes, driven_axes, real_gain
 from .building import at_rate
-from .forces import BaseAcceleration
-from .ports import Ports
-from .rigid_motion import RigidModes, require_weak, rigid_gain, rigid_rows
 from .standard import StandardPlant, standard_plant
 
 #: |S| of the finished loop crosses 1 below the weight's crossing by about this factor (measured:
@@ -26,21 +26,28 @@ _HEADROOM = 1.6
 #: disturbance and effort: the middle of that table; and where frequencies are
 #: uncertain, with which tolerant designs of eleven machines had margins of 0.40 to 0.43
 _SURE, _UNSURE = (3.0, 3.0), (20.0, 10.0)
+#: an axis that the sensors show less than this, relative to the first, has no arm
+_UNSEEN = 1e-9
+#: size of a disturbance elsewhere than at the actuators, relative to one of the same effect there
+_ELSEWHERE = 0.01
+#: least size of a channel, relative to the largest of its kind: one that takes hardly any part
+_IDLE = 0.03
 
 
 def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSpace:
     """Return the static block from sensors and references to errors at the sensors.
 
-    ``y_i:error = y_i,ref - y_i``, where y_i,ref is where sensor i would be if the whole body were
-    rigid and the POI followed its references, its other axes at rest. A controller that reads these
-    errors has one degree of freedom: what it does to a reference it does to a disturbance.
+    ``y_i:error = y_i,ref - y_i``, where y_i,ref is where sensor i is while the machine rests with
+    its POIs at their references, the other axes (`driven_axes`) at zero: ``G_yu T (G_zu T)^-1 r``
+    at rest. On a free body this is its rigid-body motion. A controller that reads these errors has
+    one degree of freedom: what it does to a reference it does to a disturbance.
 
     Parameters
     ----------
     plant : StandardPlant
-        Assembled from a free or suspended structure, with a reference and displacement sensors.
+        Assembled from a structure, with a reference and displacement sensors.
     poi : str, optional
-        The POI whose reference the errors follow; the one that has a reference when not given.
+        The POI whose references the errors follow; all that have some when not given.
 
     Returns
     -------
@@ -50,9 +57,9 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     Raises
     ------
     AssumptionError, LabelError, ModelError
-        When the plant has no reference, no displacement sensors, or the POI's axes do not span
-        the rigid-body modes; when several POIs have a reference and none is named, or the named
-        one has none; when the plant was not assembled from a structure.
+        When the plant has no reference or no displacement sensors; when the named POI has no
+        reference; when the actuators do not move the axes apart, or the plant was not assembled
+        from a structure.
 
     Examples
     --------
@@ -62,31 +69,26 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     ('y1:error', 'y2:error')
     """
     plant = standard_plant(plant)
-    motions, ports = plant.rigid_motions, plant.assembled.ports
+    ports = plant.assembled.ports
     if not ports.references:
         raise AssumptionError("the plant has no reference: add Reference(...) to the ports.")
-    known = [reference.poi for reference in ports.references]
-    followed = ports.poi(only_one("followed POI", known, poi, "poi="))
+    if poi is not None:
+        require_known("followed POI", [poi], [reference.poi for reference in ports.references])
     sensors = [s.name for s in ports.y if s.order == 0]
     if not sensors:
         kinds = ", ".join(sorted({s.quantity for s in ports.y})) or "none"
         raise AssumptionError(
-            f"there is no displacement sensor in y (its sensors: {kinds}): they do not "
-            "determine where the rigid body is. Add Sensor(name, at=...)."
+            f"there is no displacement sensor in y (its sensors: {kinds}): none of them shows "
+            "where the machine rests. Add Sensor(name, at=...)."
         )
-    axes = rigid_rows(plant, motions, [followed.channel(axis) for axis in followed.axes])
-    count = motions.modes.size
-    if len(followed.axes) < count or np.linalg.matrix_rank(axes) < count:
-        raise AssumptionError(
-            f"POI {followed.name!r} with axes {followed.axes} does not determine the {count} "
-            "rigid-body motions: give the POI all its axes."
-        )
-    own = [axis for one, axis in ports.followed if one is followed]
-    turned = np.linalg.pinv(axes)[:, [followed.axes.index(axis) for axis in own]]
-    moved = rigid_rows(plant, motions, sensors) @ turned
+    driven = driven_axes(plant, poi=poi)
+    own = [(p, axis) for p, axis in ports.followed if p.channel(axis) in driven.channels]
+    columns = [driven.channels.index(p.channel(axis)) for p, axis in own]
+    g, T = plant.system, driven.T
+    moved = followed_at_rest(g, T, plant.u, driven.channels, sensors, plant.dt)[:, columns]
     return StateSpace(
         [], [], [], np.hstack([-np.eye(len(sensors)), moved]), plant.dt,
-        inputs=[*sensors, *(followed.derived(axis, "ref") for axis in own)],
+        inputs=[*sensors, *(p.derived(axis, "ref") for p, axis in own)],
         outputs=[f"{name}:error" for name in sensors],
         name="reference errors",
         units=plant.units | {f"{n}:error": plant.units[n] for n in sensors if n in plant.units},
@@ -138,13 +140,13 @@ def stage_weights(
     Parameters
     ----------
     plant : StandardPlant
-        Assembled from a structure that is free or on springs that hold it at no more than a third
-        of the bandwidth; continuous or sampled.
+        Assembled from a structure; continuous or sampled.
     bandwidth : float [Hz]
         Below which |S| shall stay under 1.
     poi : str, optional
-        The POI whose first axis carries the length scale; needed when there are several. The
-        others are left out of z when there is a reference: they move with it.
+        The POI that counts; all axes that the actuators move independently when not given
+        (`driven_axes`). Others are left out of z: they move with these. The first axis carries the
+        scale.
     peak : float
         Bound on |T| at u where gamma is 1; 1/W_S at high frequencies, beside 1 at f_c.
     disturbance, effort : float, optional
@@ -152,7 +154,7 @@ def stage_weights(
         |T| at u decides, and the less |S|. 3 and 3 when not given; 20 and 10 where frequencies are
         uncertain: modes may then be damped as much as they are pushed.
     noise : float
-        Noise of each sensor beside 1 m of reference.
+        Noise of a sensor relative to what it shows of a unit of reference.
     uncertainty : UncertainPlant, float, (m,) array or {mode: float}, optional
         By what share the modes' frequencies may be off, as for ``plant.uncertain(frequency=)``;
         what the plant says itself when not given.
@@ -164,9 +166,9 @@ def stage_weights(
     Raises
     ------
     AssumptionError, LabelError, ModelError
-        When the structure is not free or weakly suspended, or has no POIs, actuators or sensors;
-        when there are several POIs and none is named, or the name is unknown; when the plant was
-        not assembled from a structure, or a number is out of range.
+        When there are no POIs, actuators or sensors, or the actuators do not move the axes apart;
+        when the name of the POI is unknown; when the plant was not assembled from a structure, or a
+        number is out of range.
 
     Examples
     --------
@@ -177,7 +179,7 @@ def stage_weights(
     (['die:error', 'die:x', 'u1:effort'], ['amp', 'y1:noise', 'y2:noise'])
     """
     plant = standard_plant(plant)
-    motions, ports = plant.rigid_motions, plant.assembled.ports
+    ports = plant.assembled.ports
     if uncertainty is not None and not hasattr(uncertainty, "nominal"):
         uncertainty = plant.uncertain(frequency=uncertainty)
     known = plant.uncertainty if uncertainty is None else uncertainty
@@ -187,73 +189,119 @@ def stage_weights(
     sensed = positive(noise, "noise")
     if not ports.z or not ports.u or not ports.y:
         raise AssumptionError("stage weights need a POI, actuators and sensors in the ports.")
-    scale = ports.poi(only_one("POI", [port.name for port in ports.z], poi, "poi="))
-    first = scale.channel(scale.axes[0])
-    push = np.linalg.norm(rigid_gain(plant, motions, [first], [port.name for port in ports.u]))
     crossing = _HEADROOM * positive(bandwidth, "bandwidth")
     if plant.dt and crossing * plant.dt > 0.2:
         raise ModelError(
             f"bandwidth {bandwidth:g} Hz is not well below the rate, {1 / plant.dt:g} Hz: the "
             "weights could not be sampled. Lower it, or raise the rate."
         )
-    require_weak(motions, bandwidth, "a set of weights")
-    force = (2.0 * np.pi * crossing) ** 2 / float(push)
-    arm = _arm(plant, ports, motions)
+    sizes = _Sizes.of(plant, driven_axes(plant, freq=crossing, poi=poi), 2.0 * np.pi * crossing)
     sense = inverse_sensitivity(crossing, peak=peak, floor=0.01)
     unit = 1.0 / (peak * push_size * push_cost)  # of z: gamma is |T| at u beside peak
-    rolloff = leadlag(6.0 * crossing, 60.0 * crossing, gain=unit * push_cost / force)
-
-    def turned(direction: str) -> float:
-        return arm if direction.startswith("r") else 1.0
-
+    axes = {(p, axis): p.channel(axis) for p in ports.z for axis in p.axes}
     z: dict[str, Any] = {}
-    # one rigid body: where a reference takes one POI, the others cannot stay
-    left = [goal.name for goal in ports.z if ports.references and goal is not scale]
-    for goal in ports.z:
-        for axis in goal.axes:
-            channel, error = goal.channel(axis), goal.derived(axis, "error")
-            z |= {name: None for name in (channel, error) if name in plant.z}
-            if goal.name not in left:
-                weight = series(sense, np.array([[unit * turned(axis)]]))
-                z[error if error in plant.z else channel] = _at_plant_rate(weight, plant)
-    z |= {f"{port.name}:effort": _at_plant_rate(rolloff, plant) for port in ports.u}
     w: dict[str, Any] = {}
+    for (goal, axis), channel in axes.items():
+        error, ref = goal.derived(axis, "error"), goal.derived(axis, "ref")
+        z |= {name: None for name in (channel, error) if name in plant.z}
+        if channel in sizes.axes:
+            weight = series(sense, np.array([[unit * sizes.axes[channel]]]))
+            z[error if error in plant.z else channel] = _at_plant_rate(weight, plant)
+            w |= {ref: 1.0 / sizes.axes[channel]} if ref in plant.w else {}
+    for name, force in sizes.forces.items():
+        rolloff = leadlag(6.0 * crossing, 60.0 * crossing, gain=unit * push_cost / force)
+        z[f"{name}:effort"] = _at_plant_rate(rolloff, plant)
+    noisy = [port.name for port in ports.u if port.asd > 0]
     for port in ports.w:
-        if port.added_to is not None:
-            w[port.name] = sensed
-        elif isinstance(port, BaseAcceleration):
-            w[port.name] = push_size / turned(port.direction) * (2.0 * np.pi * crossing) ** 2
-        else:
-            w[port.name] = push_size * force * turned(port.direction)
-    noisy = [port for port in ports.u if port.asd > 0]
-    w |= {f"{port.name}:disturbance": push_size * force * turned(port.direction) for port in noisy}
-    w |= {name: sensed for name in plant.w if name.endswith(":noise")}
+        if port.added_to:
+            w[port.name] = sensed * sizes.sensors[port.added_to]
+        else:  # the margin at u asks for disturbances there: those elsewhere excite what u does not
+            w[port.name] = push_size * sizes.pushes[port.name] * (_ELSEWHERE if noisy else 1.0)
+    w |= {f"{name}:disturbance": push_size * sizes.forces[name] for name in noisy}
+    noises = {f"{name}:noise": sensed * size for name, size in sizes.sensors.items()}
+    w |= {name: size for name, size in noises.items() if name in plant.w}
+    left = [
+        goal.name
+        for goal in ports.z
+        if not any(goal.channel(axis) in sizes.axes for axis in goal.axes)
+    ]
     text = (
-        f"{bandwidth:g} Hz: gamma 1 is |T| < {peak:g} at u, forces in {force:.4g} N, rotations in "
-        f"1/{arm:.3g} rad, disturbance {push_size:g}, effort {push_cost:g}, noise {noise:g}"
+        f"{bandwidth:g} Hz: gamma 1 is |T| < {peak:g} at u; {sizes.text}; disturbance "
+        f"{push_size:g}, effort {push_cost:g}, noise {noise:g}"
     )
     if left:
-        text += f"; on {scale.name}, left out of z: {', '.join(left)} (moved by the reference)"
+        text += f"; left out of z: {', '.join(left)}"
+        text += " (moved by the reference)" if ports.references else ""
     return StageWeights(z, w, text, known)
 
 
-def _arm(plant: StandardPlant, ports: Ports, motions: RigidModes) -> float:
-    """Return the length that makes rotations displacements: how far the sensors are, in shape."""
-    # the largest rms displacement of the sensors for a unit rotation of the POI about the axis for
-    # which it is least: what is added to it by moving without turning does not count, so that the
-    # arbitrary basis of the motions (columns of `t = R v, s = S v`) does not enter
-    turning = [p.channel(a) for p in ports.z for a in p.axes if a.startswith("r")]
-    if not turning:
-        return 1.0
-    R = rigid_rows(plant, motions, turning)
-    S = rigid_rows(plant, motions, [s.name for s in ports.y]) / np.sqrt(len(ports.y))
-    # directions in which no axis turns come out as rounding of the others
-    turn = np.linalg.pinv(R, rcond=1e-6)
-    straight = S @ (np.eye(R.shape[1]) - turn @ R)
-    sheared = S @ turn
-    return float(
-        np.linalg.norm(sheared - straight @ (np.linalg.pinv(straight, rcond=1e-6) @ sheared), 2)
-    )
+@dataclass(frozen=True)
+class _Sizes:
+    """The sizes of channels that go with a unit of the first axis at the crossing."""
+
+    #: length by which an axis is multiplied, and how far a unit of it shows at sensors
+    axes: Mapping[str, float]
+    sensors: Mapping[str, float]
+    #: of actuators, and of disturbances that move the axes as much as these
+    forces: Mapping[str, float]
+    pushes: Mapping[str, float]
+
+    @classmethod
+    def of(cls, plant: StandardPlant, driven: DrivenAxes, sigma: float) -> _Sizes:
+        """Return the sizes by the decoupled response on the real axis."""
+        # Y = G_yu T of unit axes, d_i = rms(Y_i) / rms(Y_1); T / d are forces of equal motion
+        ports = plant.assembled.ports
+        sensors, pushed = [s.name for s in ports.y], [p.name for p in ports.w if not p.added_to]
+        T = sigma**2 * driven.T
+        Y = real_gain(plant.system, sigma, sensors, plant.u) @ T
+        shown = np.linalg.norm(Y, axis=0)
+        first, r, m = float(shown[0]), len(driven.channels), len(plant.u)
+        d = shown / first if first and np.all(shown > _UNSEEN * first) else np.ones(r)
+        forces = np.sqrt(m / r) * np.linalg.norm(T / d, axis=1)
+        # an actuator that the decoupling leaves at rest has a size nevertheless
+        forces = np.maximum(forces, _IDLE * forces.max())
+        noises = np.linalg.norm(Y / d, axis=1) / np.sqrt(r)
+        noises = np.maximum(noises, _IDLE * noises.max(initial=0.0))
+        W = real_gain(plant.system, sigma, driven.channels, pushed)
+        moved = np.linalg.norm(d[:, None] * W, axis=0) * np.sqrt(m / r)
+        equal = dict(zip(pushed, (1.0 / divisor(moved)).tolist(), strict=True))
+        return cls(
+            dict(zip(driven.channels, d.tolist(), strict=True)),
+            dict(zip(sensors, noises.tolist(), strict=True)),
+            dict(zip(plant.u, forces.tolist(), strict=True)),
+            _capped(equal, dict(zip(plant.u, forces.tolist(), strict=True)), plant.units, sigma),
+        )
+
+    @property
+    def text(self) -> str:
+        """Forces and arms, in words."""
+        forces = sorted({f"{force:.4g}" for force in self.forces.values()}, key=float)
+        arms = sorted({f"{arm:.3g}" for arm in self.axes.values()}, key=float)
+        return f"efforts in {_ends(forces)}, axes times {_ends(arms)}"
+
+
+def _capped(
+    equal: Mapping[str, float], forces: Mapping[str, float], units: Mapping[str, str], sigma: float
+) -> dict[str, float]:
+    """Return the sizes of disturbances that move the axes as actuators do, bounded by their kind.
+
+    One that hardly moves the axes, such as a force on a heavy base, is no larger than an actuator's
+    of the same unit or the least of its kind; an acceleration of the floor is that of a unit axis.
+    """
+    found = {}
+    for name, size in equal.items():
+        unit = units.get(name)
+        if unit in ("m/s^2", "rad/s^2"):
+            found[name] = sigma**2
+            continue
+        alike = [force for own, force in forces.items() if units.get(own) == unit]
+        others = [other for own, other in equal.items() if units.get(own) == unit]
+        found[name] = min(size, max(alike) if alike else min(others))
+    return found
+
+
+def _ends(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{words[0]} to {words[-1]}"
 
 
 def _at_plant_rate(weight: StateSpace, plant: StandardPlant) -> StateSpace:

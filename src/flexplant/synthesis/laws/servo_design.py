@@ -1,38 +1,37 @@
-"""design_servo: a rigid-body decoupled PID with roll-off, on the estimated point of interest."""
+"""design_servo: a law for each axis that the actuators move, on the estimated point of interest."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from ...checks import below_half_rate, between, positive, real_array
-from ...errors import AssumptionError, ModelError, SolverError, only_one, warn
+from ...checks import FloatArray, below_half_rate, between, positive, real_array
+from ...errors import ModelError, SolverError, warn
 from ...loop import ClosedLoop
 from ...loop.blocks import drives, driving_blocks
 from ...loop.other_machines import growing_modes, modes_in_words
-from ...loop.sensitivity import taken_apart
-from ...lti.interconnection import loop_poles
+from ...loop.report import axis_sensitivities
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
-from ...plant import Poi, StandardPlant, standard_plant
+from ...plant import StandardPlant, standard_plant
+from ...plant.axes import driven_axes
 from ...plant.partition import require_plain, require_sampled
-from ...plant.rigid_motion import require_weak
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
-from ...tolerances import SAME
 from ..controller import CLOSE, Controller, with_checks
 from .loop_design import Axes, axes_controller, connected
+from .servo_axis import POWERS, Axis, combinations, gains_at, lines_of
 from .servo_loop import (
     TARGET,
-    Axis,
+    Reading,
+    ServoLaw,
     ServoLoop,
-    decoupling,
     highest_bandwidth,
     observer_system,
-    rigid_body,
+    reading_of,
     seeing,
     servo_loop,
 )
@@ -42,20 +41,24 @@ from .servo_loop import (
 def design_servo(
     plant: StandardPlant | UncertainPlant[Any],
     *,
-    bandwidth: float,
+    bandwidth: float | Mapping[str, float],
     poi: str | None = None,
+    axes: Sequence[str] | None = None,
     rolloff: float | None = None,
     integrator: float | None = None,
     notches: Sequence[float] | None = None,
     observer: Any = None,
 ) -> Controller:
-    """Return a decoupled PID controller of the rigid-body motion at a POI.
+    """Return a controller with one law for each axis that the actuators move.
 
-    Each axis of the POI is a double integrator of the acceleration a commanded there (on weak
-    springs, `suspend`, ``1 / (s^2 + w_s^2)``); ``u = T_u a``, T_u the least-force right inverse of
-    the rigid-body gain. Each axis gets
-    ``a = k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s) (ref - hat)``, F a second-order
-    roll-off and the notches; with k the open loop of the rigid body crosses 1 at the bandwidth.
+    ``u = -T C(z) (hat - ref)``. T decouples the axes on the real axis, ``T = pinv(G(sigma)) /
+    sigma^2`` at sigma = 2 pi bandwidth (`flexplant.plant.driven_axes`). The law of an axis follows
+    from the line on which its response lies at the bandwidth w_b: on a mass line (a free body, or
+    above its springs) ``k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s)``, on that of a
+    damper ``k (1 + w_i / s) F(s)``, of a spring ``k F(s) / s``, and ``k F(s)`` where the response
+    vanishes at rest. F is a second-order roll-off and the notches; with k the loop of the axis
+    crosses 1 at the bandwidth, by the exact response of the plant. Where two lines are near, the
+    exact |S| at u decides.
 
     Certified is the loop that will run: with observer, flexible modes and delay, and with the modes
     left out where they are known. `servo_bandwidth` gives the largest bandwidth that holds 6 dB.
@@ -63,15 +66,18 @@ def design_servo(
     Parameters
     ----------
     plant : StandardPlant
-        Sampled, with a POI whose axes span its rigid-body modes; free, or on springs that hold it
-        at no more than a third of the bandwidth.
-    bandwidth : float [Hz]
-        Where the open loop of each axis crosses 1; below a fifth of the rate.
+        Sampled.
+    bandwidth : float or mapping {axis: float} [Hz]
+        Where the loop of each axis crosses 1; below a fifth of the rate. The error is suppressed
+        up to a lower frequency where the plant resonates: the certificate has both.
     poi : str, optional
-        Which POI, when the plant has several.
+        The POI whose axes are controlled; those of all POIs when not given.
+    axes : sequence of str, optional
+        Channels of z (axes of POIs) or y (sensors) to control, as for
+        `flexplant.plant.driven_axes`.
     rolloff : float [Hz], optional
-        Corner of the second-order low-pass, below half the rate; unless given 8 bandwidths, or 0.4
-        of the rate where that is less.
+        Corner of the second-order low-pass, below half the rate; unless given 8 bandwidths (3 of an
+        axis on a spring), or 0.4 of the rate where that is less.
     integrator : float [Hz], optional
         Corner of the integral action; a tenth of the bandwidth unless given.
     notches : sequence of float [Hz], optional
@@ -84,23 +90,22 @@ def design_servo(
     Returns
     -------
     Controller
-        From the reference `die:ref` where there is one and the estimates `die:hat`, `die:rx:hat`,
-        ... to the actuators. The certificate holds spectral radius and modulus margin: of the worst
-        motion of the rigid body alone (on springs, without their damping), of the plant with the
-        observer, and with the modes left out; where |S| at u exceeds 6 dB, the largest bandwidth.
+        From the references `die:ref`, ... where there are some and the estimates `die:hat`,
+        `die:rx:hat`, ... to the actuators. The certificate holds spectral radius and modulus margin
+        of the plant with the observer, and with the modes left out; the frequency up to which |S|
+        of every reference is below 1; where |S| at u exceeds 6 dB, the largest bandwidth.
 
     Raises
     ------
     AssumptionError
-        When the plant is continuous or held, its springs are too stiff for the bandwidth, or the
-        axes or actuators do not span the rigid-body modes.
+        When the plant is continuous, or the actuators do not move the axes apart.
     LabelError
-        When the POI is unknown, or the observer does not give its estimates.
+        When the POI or an axis is unknown, or the observer does not give its estimates.
     ModelError
         When the plant is weighted, or a frequency is not positive or not below half the rate.
     SolverError
-        When the rigid-body loop is unstable (the bandwidth is too high for rate and delay), or the
-        loop with the observer is; the message names the modes and the largest bandwidth.
+        When rate and delay leave too little phase at the bandwidth, or the loop with the observer
+        is unstable; the message names the modes and the largest bandwidth.
 
     Warns
     -----
@@ -117,25 +122,12 @@ def design_servo(
     >>> fx.close_loop(plant, observer, servo).is_stable
     True
     """
-    task = servo_task(plant, poi, rolloff, integrator, notches, observer)
-    if positive(bandwidth, "bandwidth") >= 0.2 * task.rate:
-        raise ModelError(
-            f"bandwidth {bandwidth:g} Hz is not well below the rate, {task.rate:g} Hz: the lead "
-            f"needs room above it. Stay below {0.2 * task.rate:g} Hz, or raise the rate."
-        )
-    require_weak(task.plant.rigid_motions, bandwidth, "a servo")
-    axis = task.notched(task.axis(float(bandwidth)))
-    radius = task.rigid_radius(axis)
-    if not radius < 1.0:
-        raise SolverError(
-            f"the rigid-body loop at {bandwidth:g} Hz is unstable (spectral radius {radius:.6f}): "
-            f"rate {task.rate:g} Hz and a delay of {task.plant.delay:g} samples leave too little "
-            "phase. Lower the bandwidth or the delay, or raise the rate or the roll-off."
-        )
-    closed = task.closed(axis)
+    task = servo_task(plant, poi, axes, rolloff, integrator, notches, observer)
+    law = task.law(bandwidth)
+    task.require_phase(law)
+    law = task.notched(law)
+    closed = task.closed(law)
     certificate = {
-        "rigid-body spectral radius": radius,
-        "rigid-body modulus margin": 1.0 / task.rigid_peak(axis),
         "spectral radius": closed.spectral_radius,
         "modulus margin": closed.modulus_margin,
     }
@@ -149,22 +141,49 @@ def design_servo(
         else:
             certificate["largest bandwidth at 6 dB [Hz]"] = reach
             advice = f"The largest bandwidth that holds 6 dB there is {reach:.3g} Hz."
+    at = _in_words(law)
     if not closed.is_stable:
-        _refuse(closed, float(bandwidth), observer is not None, advice)
-    elif left_out is not None and not left_out.is_fine:
+        _refuse(closed, at, observer is not None, advice)
+    elif closed.is_stable and any(name.endswith(":ref") for name in closed.plant.w):
+        certificate["|S| of the references below 1 up to [Hz]"] = suppressed_up_to(closed)
+    if left_out is not None and not left_out.is_fine and closed.is_stable:
         warn(
-            f"with the modes that the plant left out the servo's loop at {bandwidth:g} Hz is "
+            f"with the modes that the plant left out the servo's loop at {at} is "
             f"{left_out.summary}. The machine has these modes{CLOSE if left_out.is_high else ''}. "
             f"{advice}"
         )
     if closed.tolerances is not None:
         closed.tolerances.warn_of_critical()
-    notes = [f"notches at {', '.join(f'{f:.4g}' for f in axis.notches)} Hz"] if axis.notches else []
+    notes = [f"notches at {', '.join(f'{f:.4g}' for f in law.notches)} Hz"] if law.notches else []
     if observer is None:
         notes.append("certified on the POI itself: observer= certifies the loop that will run")
-    method = f"servo {bandwidth:g} Hz on {task.poi.name!r}"
-    answer = Controller(task.controller(axis), method, certificate=certificate, notes=tuple(notes))
+    lines = ", ".join(
+        f"{name} {axis.line}" for name, axis in zip(law.driven.channels, law.axes, strict=True)
+    )
+    notes.append(f"lines: {lines}")
+    answer = Controller(
+        task.controller(law), f"servo {at}", certificate=certificate, notes=tuple(notes)
+    )
     return with_checks(answer, task.plant, closed)
+
+
+def _in_words(law: ServoLaw) -> str:
+    """Return the bandwidths of the axes."""
+    each = {name: axis.bandwidth for name, axis in zip(law.driven.channels, law.axes, strict=True)}
+    if len(set(each.values())) == 1:
+        return f"{next(iter(each.values())):g} Hz"
+    return ", ".join(f"{f:g} Hz of {name}" for name, f in each.items())
+
+
+def suppressed_up_to(closed: ClosedLoop) -> float:
+    """Return the least frequency [Hz] at which |S| of a reference first crosses 1."""
+    found = []
+    for freq, size in axis_sensitivities(closed).values():
+        below = np.flatnonzero(size < 1.0)
+        above = np.flatnonzero(size >= 1.0)
+        later = above[above > below[0]] if below.size else above
+        found.append(float(freq[later[0]]) if later.size else float(freq[-1]))
+    return min(found, default=0.0)
 
 
 @one_thread()
@@ -173,6 +192,7 @@ def servo_bandwidth(
     *,
     peak: float = TARGET,
     poi: str | None = None,
+    axes: Sequence[str] | None = None,
     rolloff: float | None = None,
     integrator: float | None = None,
     notches: Sequence[float] | None = None,
@@ -188,7 +208,7 @@ def servo_bandwidth(
 
     Parameters
     ----------
-    plant, poi, rolloff, integrator, notches, observer : as for `design_servo`
+    plant, poi, axes, rolloff, integrator, notches, observer : as for `design_servo`
     peak : float
         Bound on the largest singular value of S at u; 2 is 6 dB.
 
@@ -211,16 +231,16 @@ def servo_bandwidth(
     True
     """
     peak = between(peak, "peak", 1.0, float("inf"), "No loop keeps |S| below 1: try 2.")
-    task = servo_task(plant, poi, rolloff, integrator, notches, observer)
+    task = servo_task(plant, poi, axes, rolloff, integrator, notches, observer)
     return task.largest(float(peak))
 
 
-def _refuse(closed: ClosedLoop, bandwidth: float, observed: bool, advice: str) -> None:
+def _refuse(closed: ClosedLoop, at: str, observed: bool, advice: str) -> None:
     """Raise SolverError for the loop that will run, warn of a loop on the POI itself."""
     modes = modes_in_words(*growing_modes(closed.monitored, closed.plant.system.states))
     what = "with its observer" if observed else "on the POI itself"
     text = (
-        f"the servo's loop at {bandwidth:g} Hz {what} is unstable (spectral radius "
+        f"the servo's loop at {at} {what} is unstable (spectral radius "
         f"{closed.spectral_radius:.6f}; takes part most: {modes}). {advice} "
         "Lower the bandwidth or the delay, or raise the rate."
     )
@@ -229,8 +249,11 @@ def _refuse(closed: ClosedLoop, bandwidth: float, observed: bool, advice: str) -
     warn(f"{text} Pass observer= to check the loop that will run.")
 
 
-#: bandwidths that `ServoTask.largest` tries from 0.19 of the rate down, before it halves intervals
-_TRIALS = 80
+#: bandwidths that `ServoTask.largest` tries, from 0.19 of the rate down to a part of it below
+#: which loops lose digits, before it halves intervals
+_TRIALS, _SLOWEST = 80, 2e-4
+#: roll-off beside the bandwidth: on a spring the integrator leaves more phase for it
+_ROLLOFF = {"mass": 8.0, "damper": 8.0, "speed": 8.0, "spring": 3.0}
 
 
 @dataclass(frozen=True)
@@ -238,7 +261,7 @@ class ServoTask:
     """What does not depend on the bandwidth."""
 
     plant: StandardPlant
-    poi: Poi
+    channels: tuple[str, ...]
     rolloff: float | None
     integrator: float | None
     notches: tuple[float, ...] | None
@@ -249,88 +272,116 @@ class ServoTask:
         """Sampling rate [Hz]."""
         return 1.0 / self.plant.dt
 
-    def axis(self, bandwidth: float) -> Axis:
-        """Return the controller of one axis, with the notches that were given."""
-        rolloff = min(8.0 * bandwidth, 0.4 * self.rate) if self.rolloff is None else self.rolloff
-        slow = 0.1 * bandwidth if self.integrator is None else self.integrator
-        for name, freq in (("rolloff", rolloff), ("integrator", slow)):
-            below_half_rate(freq, name, self.rate)
-        return Axis(bandwidth, float(rolloff), float(slow), self.notches or (), self.rate)
+    @property
+    def reading(self) -> Reading:
+        """What the servo reads."""
+        return reading_of(self.plant, self.channels)
 
     @property
     def loop(self) -> ServoLoop:
         """Over frequency, with the modes left out where they are known."""
-        return servo_loop(
-            self.plant.evaluation_plant or self.plant, self.observer, self.poi, self.plant
-        )
+        whole = self.plant.evaluation_plant or self.plant
+        return servo_loop(whole, self.observer, self.reading, self.plant)
 
-    def notched(self, axis: Axis) -> Axis:
-        """Return the axis with notches where they serve, unless they were given."""
+    def law(self, bandwidth: float | Mapping[str, float]) -> ServoLaw:
+        """Return the laws of the axes, with the notches that were given."""
+        wanted = bandwidth if isinstance(bandwidth, Mapping) else positive(bandwidth, "bandwidth")
+        driven = driven_axes(self.plant, freq=wanted, axes=self.channels)
+        for f in driven.freq:
+            if f >= 0.2 * self.rate:
+                raise ModelError(
+                    f"bandwidth {f:g} Hz is not well below the rate, {self.rate:g} Hz: the law "
+                    f"needs room above it. Stay below {0.2 * self.rate:g} Hz, or raise the rate."
+                )
+        gains = np.abs(gains_at(self.plant, driven))
+        tried = [
+            ServoLaw(
+                driven,
+                tuple(
+                    self.axis(line, float(f), float(gain))
+                    for line, f, gain in zip(lines, driven.freq, gains, strict=True)
+                ),
+            )
+            for lines in combinations(lines_of(self.plant, driven))
+        ]
+        if len(tried) == 1:
+            return tried[0]
+        return min(tried, key=lambda one: (not self.closed(one).is_stable, self.loop.peak(one)[0]))
+
+    def axis(self, line: str, bandwidth: float, gain: float) -> Axis:
+        """Return the law of an axis on a line, whose plant has a gain there."""
+        usual = min(_ROLLOFF[line] * bandwidth, 0.4 * self.rate)
+        rolloff = usual if self.rolloff is None else self.rolloff
+        slow = 0.1 * bandwidth if self.integrator is None else self.integrator
+        for name, freq in (("rolloff", rolloff), ("integrator", slow)):
+            below_half_rate(freq, name, self.rate)
+        notches = self.notches or ()
+        return Axis(line, bandwidth, float(rolloff), float(slow), gain, self.rate, notches)
+
+    def notched(self, law: ServoLaw) -> ServoLaw:
+        """Return the law with notches where they serve, unless they were given."""
         if self.notches is not None:
-            return axis
-        return self.loop.notched(axis, lambda one: self.closed(one).is_stable)
+            return law
+        return self.loop.notched(law, lambda one: self.closed(one).is_stable)
+
+    def phase_margins(self, law: ServoLaw) -> FloatArray:
+        """Return the phases [rad] (r,) that remain of -pi at the bandwidth, on each axis's line."""
+        # hold and delay turn a line as they turn the plant; its modes are not in it
+        late = np.array([2.0 * np.pi * a.bandwidth for a in law.axes]) * self.plant.dt
+        turned = np.array([a.law.at(np.array([a.bandwidth]))[0] for a in law.axes])
+        lines = np.array([POWERS.get(a.line, 1.0) for a in law.axes])
+        own = np.angle(turned * 1j ** -(lines - 1.0)) - 0.5 * np.pi
+        return np.asarray(own - late * (0.5 + self.plant.delay) + np.pi)
+
+    def require_phase(self, law: ServoLaw) -> None:
+        """Raise SolverError where rate and delay leave no phase at the bandwidth of an axis."""
+        margins = self.phase_margins(law)
+        if margins.min() <= 0.0:
+            i = int(np.argmin(margins))
+            raise SolverError(
+                f"the loop of {law.driven.channels[i]} at {law.axes[i].bandwidth:g} Hz is unstable "
+                f"(phase margin {np.rad2deg(margins[i]):.3g} deg): rate {self.rate:g} Hz and a "
+                f"delay of {self.plant.delay:g} samples leave too little phase. Lower the "
+                "bandwidth or the delay, or raise the rate or the roll-off."
+            )
 
     @cached_property
-    def controller(self) -> Callable[[Axis], StateSpace]:
-        """The function of an axis that gives [refs, hats] -> u: its law for each, decoupled."""
-        hats = tuple(self.poi.derived(name, "hat") for name in self.poi.axes)
-        refs = (self.poi.derived(name, "ref") for name in self.poi.axes)
-        read = {hat: ref for hat, ref in zip(hats, refs, strict=True) if ref in self.plant.y}
-        T_u = decoupling(self.plant, self.poi)
-        before = StateSpace([], [], [], T_u, inputs=hats, outputs=self.plant.u)
-        after = StateSpace([], [], [], np.eye(len(hats)), inputs=hats, outputs=hats)
-        axes = Axes(None, before, after, self.rate)
+    def controller(self) -> Callable[[ServoLaw], StateSpace]:
+        """The function of a law that gives [refs, readings] -> u."""
+        reads = tuple(self.reading.reads.values())
+        read = {self.reading.reads[name]: ref for name, ref in self.reading.references.items()}
+        after = StateSpace([], [], [], np.eye(len(reads)), inputs=reads, outputs=reads)
 
-        def found(axis: Axis) -> StateSpace:
-            inner = axes_controller(axes, dict.fromkeys(hats, axis.law))
-            system = connected(axes, inner, read).select(inputs=[*read.values(), *hats])
+        def found(law: ServoLaw) -> StateSpace:
+            before = StateSpace([], [], [], law.driven.T, inputs=reads, outputs=self.plant.u)
+            axes = Axes(None, before, after, self.rate)
+            laws = {name: axis.law for name, axis in zip(reads, law.axes, strict=True)}
+            system = connected(axes, axes_controller(axes, laws), read)
+            system = system.select(inputs=[*read.values(), *reads])
             return system.replace(name="servo", units=self.plant.units)
 
-        return cache(found)
+        return found
 
     @cached_property
-    def closed(self) -> Callable[[Axis], ClosedLoop]:
-        """The function of an axis that gives the loop that will run."""
+    def closed(self) -> Callable[[ServoLaw], ClosedLoop]:
+        """The function of a law that gives the loop that will run."""
         plant = self.plant
         before = () if self.observer is None else (self.observer,)
-        if not before:
-            plant = seeing(plant, self.poi)
+        if not before and self.reading.estimates:
+            plant = seeing(plant, self.reading)
+        kept: dict[tuple[Axis, ...], ClosedLoop] = {}
 
-        def found(axis: Axis) -> ClosedLoop:
-            blocks = (*before, self.controller(axis))
-            controller = driving_blocks(plant, blocks, *drives(plant, blocks, ()))
-            return ClosedLoop(plant, blocks, controller)
+        def found(law: ServoLaw) -> ClosedLoop:
+            if law.axes not in kept:
+                blocks = (*before, self.controller(law))
+                controller = driving_blocks(plant, blocks, *drives(plant, blocks, ()))
+                kept[law.axes] = ClosedLoop(plant, blocks, controller)
+            return kept[law.axes]
 
-        return cache(found)
-
-    @cached_property
-    def _bodies(self) -> list[StateSpace]:
-        """The motions of the rigid body, each as a system of its own."""
-        free = np.unique(self.plant.rigid_motions.freq)
-        return [rigid_body(self.rate, self.plant.delay, float(f)) for f in free]
-
-    def rigid_radius(self, axis: Axis) -> float:
-        """Return the spectral radius of the worst axis of the rigid body."""
-        # all axes have one controller: the loop falls apart into the body's own motions
-        poles = [loop_poles(body, axis.law.system) for body in self._bodies]
-        return float(max(np.abs(of_body).max() for of_body in poles))
-
-    def rigid_peak(self, axis: Axis) -> float:
-        """Return max |S| of the worst axis of the rigid body, stable or not."""
-        act = axis.law.system
-        loops = (
-            taken_apart((one, act.replace(inputs=one.outputs, outputs=one.inputs)))
-            for one in self._bodies
-        )
-        return max(loop.worst("u", False)[0] for loop in loops)
+        return found
 
     def largest(self, peak: float) -> float:
         """Return the largest bandwidth that holds a peak of |S| at u."""
-        slowest = max(
-            # slower loops lose digits
-            3.0 * float(np.abs(self.plant.rigid_motions.freq).max()) * (1 + SAME),
-            2e-4 * self.rate,
-        )
         best: tuple[float, float, float] = (np.inf, np.nan, np.nan)
 
         def fine(loop: Any) -> bool:
@@ -338,51 +389,49 @@ class ServoTask:
 
         def holds(bandwidth: float) -> bool:
             nonlocal best
-            axis = self.axis(bandwidth)
-            if self.rigid_radius(axis) >= 1.0:
+            law = self.law(bandwidth)
+            if self.phase_margins(law).min() <= 0.0:
                 return False
-            axis = self.notched(axis)
-            size, at = self.loop.peak(axis)
-            if size < best[0] and self.closed(axis).is_stable:
+            law = self.notched(law)
+            size, at = self.loop.peak(law)
+            if size < best[0] and self.closed(law).is_stable:
                 best = size, at, bandwidth
             if size > peak:
                 return False
-            closed = self.closed(axis)
+            closed = self.closed(law)
             # the loop on the evaluation model, which costs most, only where the smaller one is fine
             return fine(closed) and (closed.left_out is None or fine(closed.left_out))
 
-        trials = np.geomspace(0.19 * self.rate, slowest, _TRIALS)
+        trials = np.geomspace(0.19 * self.rate, _SLOWEST * self.rate, _TRIALS)
         found = highest_bandwidth(trials.tolist(), holds)
         if found is None:
             raise SolverError(
-                f"no bandwidth from {slowest:.3g} to {trials[0]:.3g} Hz holds |S| at u below "
-                f"{20 * np.log10(peak):.2g} dB{self._why(peak, *best)}"
+                f"no bandwidth from {trials[-1]:.3g} to {trials[0]:.3g} Hz holds |S| at u below "
+                f"{20 * np.log10(peak):.2g} dB{self._why(*best)}"
             )
         return found
 
-    def _why(self, peak: float, size: float, at: float, bandwidth: float) -> str:
+    def _why(self, size: float, at: float, bandwidth: float) -> str:
         """Return what is nearest to holding a peak, what stops it and what to change, in words."""
         if not np.isfinite(size):
             return (
                 ": none gives a stable loop. Check the observer's signs and units, or design it "
                 "on this plant."
             )
-        nearest = f"; the least is {20 * np.log10(size):.3g} dB, of {bandwidth:.3g} Hz, at {at:.4g}"
-        if self.rigid_peak(self.axis(bandwidth)) > peak:
-            return (
-                f"{nearest} Hz. The rigid body by itself does not hold it there: raise the rate, "
-                "lower the delay, or raise peak=."
-            )
+        margins = np.rad2deg(self.phase_margins(self.law(bandwidth)))
         return (
-            f"{nearest} Hz. The rigid body by itself holds it there, so rate and delay do not "
-            "limit it but what the flexible modes and the observer add at that frequency: place a "
-            "notch there, change the observer's noise intensities, or raise peak=."
+            f"; the least is {20 * np.log10(size):.3g} dB, of {bandwidth:.3g} Hz, at {at:.4g} Hz. "
+            f"There rate and delay leave a phase margin of {margins.min():.2g} deg on the axes' "
+            "lines; what is lacking beyond that is due to the flexible modes and the observer. "
+            "Raise the rate or lower the delay, place a notch at that frequency, change the "
+            "observer's noise intensities, or raise peak=."
         )
 
 
 def servo_task(
     given: StandardPlant | UncertainPlant[Any],
     poi: str | None,
+    axes: Sequence[str] | None,
     rolloff: float | None,
     integrator: float | None,
     notches: Sequence[float] | None,
@@ -390,27 +439,18 @@ def servo_task(
 ) -> ServoTask:
     """Return the task of a servo; parameters as for `design_servo`."""
     plant = standard_plant(given)
-    port = _poi(plant, poi)
+    require_plain(plant, "a servo acts on physical channels")
     require_sampled(plant, "a servo is designed at its sampling rate")
+    driven = driven_axes(plant, axes=axes, poi=poi)
+    (plant.continuous or plant).check().require(("stabilisable",), "a servo")
     centres = None if notches is None else real_array(notches, "notches", (None,)).tolist()
     for freq in centres or ():
         below_half_rate(freq, "notch", 1.0 / plant.dt)
     return ServoTask(
         plant,
-        port,
+        driven.channels,
         rolloff,
         integrator,
         None if centres is None else tuple(centres),
-        observer_system(observer, plant, port),
+        observer_system(observer, plant, reading_of(plant, driven.channels).estimates),
     )
-
-
-def _poi(plant: StandardPlant, name: str | None) -> Poi:
-    require_plain(plant, "a servo acts on physical channels")
-    ports = plant.assembled.ports
-    if not ports.z:
-        raise AssumptionError(
-            "a servo needs a plant with a POI, assembled from a structure: "
-            "assemble_plant(model, ports)."
-        )
-    return ports.poi(only_one("POI", [poi.name for poi in ports.z], name, "poi="))

@@ -1,0 +1,106 @@
+"""What a plant does near rest: the expansion of a function of s at zero, on circles around it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from ..checks import ComplexArray, FloatArray
+from ..errors import AssumptionError
+from ..lti.statespace import StateSpace
+from ..tolerances import divisor
+from .axes import complex_gain
+
+#: a function of s, real on the real axis, to an array of any shape
+OfS: TypeAlias = Callable[[complex], ComplexArray]
+
+#: points on a circle of Cauchy's integrals; its largest radius [rad/s], and how often it is halved
+_SAMPLES, _LARGEST, _RADII = 16, 6e3, 30
+#: relative: two circles give the same coefficients
+_SAME = 1e-8
+#: where the expansion is compared with the function, as a part of the radius, and relative
+#: difference: with eight terms it lacks 0.1^8 of a function that is regular within the circle
+_INSIDE, _NEAR = 0.1, 1e-6
+#: terms that are compared
+_TERMS = 8
+#: condition, rows and columns scaled, above which a response counts as singular
+_SINGULAR = 1e9
+
+
+def at_rest(find: OfS, dt: float, axes: Sequence[str], count: int = 5) -> FloatArray:
+    """Return k_0, k_1, ... (..., count) of ``F(s) = k_0 + k_1 s + ...`` around rest.
+
+    On the largest circle within which F has no pole: two circles agree, which they also do where
+    both enclose the same poles, and the expansion is F inside of them.
+    """
+    radius = min(_LARGEST, 0.5 / dt) if dt else _LARGEST
+    powers = np.arange(_TERMS)
+    outer = _on_circle(find, radius)
+    for _ in range(_RADII):
+        inner = _on_circle(find, 0.5 * radius)
+        size = np.abs(outer) * radius**powers
+        scale = divisor(size.max(axis=tuple(range(1, size.ndim)), keepdims=True))
+        low = (0.5 * radius) ** powers
+        same = np.abs(outer - inner)[..., :count] * low[:count] <= _SAME * scale
+        if np.all(same) and _is_inside(find, inner, 0.5 * radius):
+            inner[np.abs(inner) * low <= _SAME * scale] = 0.0
+            return np.asarray(inner[..., :count])
+        outer, radius = inner, 0.5 * radius
+    raise AssumptionError(
+        f"the response of {', '.join(axes)} to the actuators has no inverse that is regular at low "
+        "frequency: there is a zero at rest. Check which axes the actuators move."
+    )
+
+
+def _is_inside(find: OfS, terms: FloatArray, radius: float) -> bool:
+    """Return whether an expansion is the function inside the circle."""
+    s = _INSIDE * radius
+    wanted = find(complex(s)).real
+    found = terms @ s ** np.arange(terms.shape[-1])
+    scale = np.abs(wanted).max(axis=tuple(range(1, wanted.ndim)), keepdims=True)
+    return bool(np.all(np.abs(found - wanted) <= _NEAR * divisor(scale)))
+
+
+def _on_circle(find: OfS, radius: float) -> FloatArray:
+    """Return k_m = sum F(s_i) s_i^-m / N over N points of a circle (the lower half conjugate)."""
+    turns = np.exp(2j * np.pi * (np.arange(_SAMPLES // 2) + 0.5) / _SAMPLES)
+    values = np.array([find(radius * complex(turn)) for turn in turns])
+    powers = turns[:, None] ** -np.arange(_TERMS)
+    summed = np.einsum("t...,tm->...m", values, powers).real
+    return np.asarray(2.0 / _SAMPLES * summed / radius ** np.arange(_TERMS))
+
+
+def solved(G: ComplexArray, wanted: ComplexArray, axes: Sequence[str]) -> ComplexArray:
+    """Return ``G^-1 wanted`` of square G (..., r, r), which has to be regular."""
+    rows = np.max(np.abs(G), axis=-1, keepdims=True)
+    columns = np.max(np.abs(G), axis=-2, keepdims=True)
+    flat = rows.min(initial=1.0) <= 0 or columns.min(initial=1.0) <= 0
+    if flat or np.max(np.linalg.cond(G / np.sqrt(rows * columns))) > _SINGULAR:
+        raise AssumptionError(
+            f"the actuators do not move {', '.join(axes)} apart from each other, so that there is "
+            "no inverse. Choose other axes."
+        )
+    return np.asarray(
+        np.linalg.solve(G, np.broadcast_to(wanted, (*G.shape[:-2], *wanted.shape[-2:])))
+    )
+
+
+def followed_at_rest(
+    g: StateSpace,
+    T: FloatArray,
+    inputs: Sequence[str],
+    axes: Sequence[str],
+    seen: Sequence[str],
+    dt: float,
+) -> FloatArray:
+    """Return where outputs are (p, r) while each axis rests at one unit: ``G_y T (G_z T)^-1``."""
+    names = [*axes, *seen]
+
+    def found(s: complex) -> ComplexArray:
+        both = complex_gain(g, s, names, inputs) @ T
+        moved, seen_there = both[: len(axes)], both[len(axes) :]
+        return np.asarray(np.linalg.solve(moved.T, seen_there.T).T, dtype=np.complex128)
+
+    return at_rest(found, dt, axes, 1)[..., 0]

@@ -1,0 +1,224 @@
+"""Axes: the motions of a plant that its actuators move, and their decoupling on the real axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..checks import ComplexArray, FloatArray, Value, name_list, positive
+from ..errors import AssumptionError, LabelError, require_known, some_names
+from ..lti.statespace import StateSpace
+from ..tolerances import divisor
+from .partition import Partition
+from .ports import Poi
+from .realisation import natural
+
+#: smallest over largest singular value of the gain, rows and columns scaled, from which on axes
+#: count as moved apart: below it a machine would have to bend or to push a hundred times as hard
+_APART = 1e-2
+#: sweeps that scale rows and columns of a gain to one length
+_SWEEPS = 20
+#: a usual bandwidth as a part of the rate, and of the fastest mode of a continuous plant
+_OF_RATE, _OF_MODE = 0.01, 0.1
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DrivenAxes(Value):
+    """Channels of a plant that its actuators move independently, and how.
+
+    Parameters
+    ----------
+    channels : sequence of r str
+        Channels of z (POIs) or y (sensors).
+    actuators : sequence of m str
+    freq : (r,) array [Hz]
+        Frequencies of sigma = 2 pi freq at which each axis is decoupled.
+    T : (m, r) array
+        Commands of the axes to actuators: ``G(sigma) T = I / sigma^2`` with ``G(sigma)`` the
+        response of the channels to the actuators at z = exp(sigma dt), but for the factor
+        ``exp(-sigma dt (delay + 1/2))`` of hold and delay. A command is the acceleration of its
+        axis where it moves as a mass: T is that mass then.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.plant.driven_axes(fx.testbeds.dual_stage(), freq=20.0)
+    <DrivenAxes die:x, gap:x by long, short, decoupled at 20 Hz>
+    """
+
+    channels: tuple[str, ...]
+    actuators: tuple[str, ...]
+    freq: FloatArray
+    T: FloatArray
+
+    def __repr__(self) -> str:
+        at = ", ".join(f"{f:.4g}" for f in np.unique(self.freq))
+        by = some_names(list(self.actuators))
+        return f"<DrivenAxes {', '.join(self.channels)} by {by}, decoupled at {at} Hz>"
+
+
+def driven_axes(
+    plant: Partition,
+    *,
+    freq: float | Mapping[str, float] | None = None,
+    axes: Sequence[str] | None = None,
+    poi: str | None = None,
+) -> DrivenAxes:
+    """Return the axes of a plant and their decoupling on the real axis.
+
+    ``T = pinv(G(sigma)) / sigma^2``. On the real axis no mode resonates: the sum of
+    phi phi' / (sigma^2 + omega^2) keeps its sign on mass and on stiffness lines, and T is real.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Continuous or sampled, of any origin.
+    freq : float or mapping {channel: float} [Hz], optional
+        Where each axis is decoupled, its bandwidth; a hundredth of the rate when not given, of a
+        continuous plant a tenth of the frequency of its fastest mode.
+    axes : sequence of str, optional
+        Channels of z or y. When not given all axes of the POIs where the actuators move them
+        independently, else those of the POIs that have a reference, else those with a reference.
+    poi : str, optional
+        The POI whose axes are meant, when `axes` is not given.
+
+    Returns
+    -------
+    DrivenAxes
+
+    Raises
+    ------
+    AssumptionError
+        When the actuators do not move the axes apart.
+    LabelError
+        When a channel is not one of the plant's, or the plant has no POI.
+
+    References
+    ----------
+    [Skogestad2005]_, section 3.4 (decoupling).
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.plant.driven_axes(fx.testbeds.ball_screw(), axes=["motor_encoder"]).channels
+    ('motor_encoder',)
+    """
+    plant = Partition.of(plant)
+    named = freq.keys() if isinstance(freq, Mapping) else None
+    sets = _candidates(plant, axes, poi)
+    first: tuple[str, ...] = ()
+    for channels in sets:
+        sigma = _sigmas(plant, channels, freq, named)
+        gains = {s: real_gain(plant.system, s, channels, plant.u) for s in np.unique(sigma)}
+        if all(apart(G) for G in gains.values()):
+            inverse = {s: np.linalg.pinv(G) for s, G in gains.items()}
+            late = np.exp(-sigma * plant.dt * (plant.delay + 0.5))  # of hold and delay
+            columns = [inverse[s][:, i] / s**2 for i, s in enumerate(sigma)]
+            T = np.stack(columns, axis=1) * late
+            return DrivenAxes(channels, tuple(plant.u), sigma / (2.0 * np.pi), T)
+        first = first or channels
+    raise AssumptionError(
+        f"the actuators ({some_names(list(plant.u)) or 'none'}) do not move these axes apart: "
+        f"{some_names(list(first))}. Add or move actuators, or choose fewer axes, axes=[...]."
+    )
+
+
+def _candidates(
+    plant: Partition, axes: Sequence[str] | None, poi: str | None
+) -> list[tuple[str, ...]]:
+    """Return sets of axes, of which the first that the actuators move apart is meant."""
+    if axes is not None:
+        chosen = name_list(axes, "axes")
+        known = [name for name in (*plant.z, *plant.y) if not name.endswith((":ref", ":effort"))]
+        require_known("axis", chosen, known)
+        if not chosen:
+            raise LabelError(f"axes names no channel. Choose from {some_names(known)}.")
+        return [chosen]
+    ports = plant.assembled.ports
+    pois = [ports.poi(poi)] if poi is not None else list(ports.z)
+    if not pois:
+        raise AssumptionError(
+            "the plant has no POI, so that there is nothing to move: add Poi(...) to the ports, or "
+            "name sensors, axes=[...]."
+        )
+    every = _channels(pois)
+    goals = [one for one, _ in ports.followed]
+    led = _channels([one for one in pois if one in goals])
+    followed = tuple(one.channel(axis) for one, axis in ports.followed if one in pois)
+    sets = [one for one in (every, led, followed) if one]
+    return list(dict.fromkeys(sets))
+
+
+def _channels(pois: Sequence[Poi]) -> tuple[str, ...]:
+    return tuple(one.channel(axis) for one in pois for axis in one.axes)
+
+
+def _sigmas(plant: Partition, channels: Sequence[str], freq: Any, named: Any) -> FloatArray:
+    """Return 2 pi freq (r,) [rad/s] of each channel."""
+    if freq is None:
+        freq = usual_frequency(plant)
+    if named is not None:
+        require_known("axis of a bandwidth", named, channels)
+        missing = [name for name in channels if name not in named]
+        if missing:
+            raise LabelError(
+                f"there is no bandwidth of {', '.join(missing)}: give one for each axis, or a "
+                "number for all."
+            )
+        found = [positive(freq[name], f"bandwidth of {name}") for name in channels]
+    else:
+        found = [positive(freq, "bandwidth")] * len(channels)
+    return np.asarray(2.0 * np.pi * np.array(found))
+
+
+def usual_frequency(plant: Partition) -> float:
+    """Return a usual bandwidth [Hz] of a plant: a hundredth of its rate, a tenth of its modes."""
+    if plant.dt:
+        return _OF_RATE / plant.dt
+    fastest = np.abs(plant.system.poles()).max(initial=0.0) / (2.0 * np.pi)
+    return _OF_MODE * float(fastest) or 1.0
+
+
+def apart(G: FloatArray) -> bool:
+    """Return whether the rows of a gain (r, m) are independent, whatever the channels' units."""
+    if not G.size or G.shape[0] > G.shape[1]:
+        return False
+    scaled = np.array(G)
+    for _ in range(_SWEEPS):  # rows last: an actuator may move nothing, an axis may not stay
+        scaled = scaled / divisor(np.linalg.norm(scaled, axis=0, keepdims=True))
+        scaled = scaled / divisor(np.linalg.norm(scaled, axis=1, keepdims=True))
+    sizes = np.linalg.svd(scaled, compute_uv=False)
+    return bool(np.all(np.any(G, axis=1)) and sizes[-1] > _APART * sizes[0])
+
+
+def real_gain(
+    g: StateSpace, sigma: float, outputs: Sequence[str], inputs: Sequence[str]
+) -> FloatArray:
+    """Return the gain (p, m) at s = sigma [rad/s] of the real axis."""
+    return np.asarray(complex_gain(g, complex(sigma), outputs, inputs).real)
+
+
+def complex_gain(
+    g: StateSpace, s: complex, outputs: Sequence[str], inputs: Sequence[str]
+) -> ComplexArray:
+    """Return the gain (p, m) at any s [rad/s], of a sampled system at z = exp(s dt)."""
+    rows, columns = g.output_index(list(outputs)), g.input_index(list(inputs))
+    # next to z = 1, with the difference of both, no digit of a slow pole is lost
+    shift = np.expm1(s * g.dt) if g.dt else s
+    eye = np.eye(g.n_states)
+    pencil = shift * eye - (g.A - eye if g.dt else g.A)
+    states = np.linalg.solve(pencil, g.B[:, columns].astype(np.complex128))
+    return np.asarray(g.C[rows] @ states + g.D[np.ix_(rows, columns)])
+
+
+def elastic(plant: Partition) -> FloatArray:
+    """Return the frequencies [Hz] of the modes that oscillate below 0.45 of the rate, in order."""
+    if not plant.is_assembled:
+        return np.zeros(0)
+    pairs = plant.modal_blocks[plant.n_rigid : plant.assembled.realisation.n_modes]
+    freq = natural(pairs)[0] / (2.0 * np.pi)
+    freq = freq[freq > 0]  # unstable pairs do not resonate
+    return np.asarray(freq[freq * plant.dt < 0.45])
