@@ -40,7 +40,7 @@ def uncertain_plant(case: dict[str, Any]) -> tuple[fx.StandardPlant, Any, Any]:
     moved = set(range(MODES + 1)) - {*UNMOVED}
     off = {mode: part for mode, part in case["off"].items() if mode in moved}
     alone = plant.uncertain(frequency=off)
-    return plant, alone, plant.uncertain(frequency=off, neglected=full)
+    return plant, alone, plant.uncertain(fx.plant.Neglected(full), frequency=off)
 
 
 # %% The guarantee: mu of the sampled loop, its worst machine, and the machine itself

@@ -12,6 +12,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import CertificateError, ModelError
+from flexplant.plant import Neglected
 from flexplant.synthesis import FixedOrder, PoleRegion
 from flexplant.synthesis.preparation import prepared
 from mutants import LINES, SOURCE
@@ -223,14 +224,14 @@ WRONG = {
         "loop costs",
     ),
     "affine channels of a sampled plant": (
-        "plant.uncertainty.delta_channels._distance", lambda _: lambda *_: 1.0,
+        "plant.uncertainty.sampled_channels._distance", lambda _: lambda *_: 1.0,
         lambda: fx.synthesis.robust_stability(
             two_masses().discretized(2e3).uncertain(frequency=0.01, damping=0.1), lead(2e3)
         ), "lie 100 % off",
     ),
     "bound of neglected modes": (
-        "plant.uncertainty.neglected._MARGIN", lambda margin: 0.5 * margin,
-        lambda: two_masses().uncertain(frequency=0.01, neglected=two_masses(3)),
+        "plant.uncertainty.neglected_modes._MARGIN", lambda margin: 0.5 * margin,
+        lambda: two_masses().uncertain(Neglected(two_masses(3)), frequency=0.01),
         "times the weights",
     ),
     "reduced controller": (

@@ -15,8 +15,9 @@ from flexplant.estimation.innovations import cumulative_periodogram, density_of,
 from flexplant.identification import MeasuredModes
 from flexplant.loop import close_loop
 from flexplant.modes import solve_modes
-from flexplant.plant import Delta, Sensor, assemble_plant
-from flexplant.plant.uncertainty.uncertain_plant import with_changes
+from flexplant.plant import Sensor, assemble_plant
+from flexplant.plant.uncertainty.delta import with_changes
+from flexplant.plant.uncertainty.mode_delta import DampingDelta, FrequencyDelta
 from flexplant.plot import report
 from flexplant.simulation import setpoint, simulate
 from flexplant.structure import ModalDamping, chain
@@ -28,6 +29,7 @@ from stages import Z8, full, reduced
 from stages import ports as stage_ports
 
 RATE = 4e3
+KINDS = {"freq": FrequencyDelta, "damping": DampingDelta}
 
 
 @cache
@@ -120,7 +122,7 @@ def test_process_noise_alone_is_off():
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", [4, 6])
 def test_a_wrong_frequency_is_named_with_its_mode(mode):
-    moved = with_changes(machine(), [(Delta(f"mode{mode}:freq", mode, "freq", 1.0), 0.06)])
+    moved = with_changes(machine(), [(FrequencyDelta.of(mode, 1.0), 0.06)])
     found = judged(machine(), moved)
     assert found.causes == ("frequency",)
     assert f"near mode {mode} " in found.text
@@ -174,7 +176,7 @@ def test_a_folded_mode_beside_a_kept_one_is_named():
     ("mode", "kind", "amount"), [(7, "freq", 0.04), (4, "damping", -0.8), (11, "freq", 0.05)]
 )
 def test_a_changed_mode_is_no_other_mode(mode, kind, amount):
-    moved = with_changes(plant(count=12), [(Delta("change", mode, kind, 1.0), amount)])
+    moved = with_changes(plant(count=12), [(KINDS[kind].of(mode, 1.0), amount)])
     found = judged(plant(count=12), moved)
     assert found.causes == ("frequency",)
     assert f"near mode {mode} " in found.text
@@ -200,7 +202,7 @@ def one_sensor(count):
     ],
 )
 def test_one_sensor_shows_whether_a_mode_has_moved_or_is_left_out(kept, mode, kind, amount, cause):
-    truth = with_changes(one_sensor(5), [(Delta("change", mode, kind, 1.0), amount)])
+    truth = with_changes(one_sensor(5), [(KINDS[kind].of(mode, 1.0), amount)])
     observer = design_kalman(one_sensor(kept))
     records, _ = recorded(truth, axes=("die:x",))
     found = consistency(observer, observer.estimate(records))
@@ -340,7 +342,7 @@ def test_a_machine_of_another_formulation_that_has_changed_since_it_was_measured
 @pytest.mark.long
 def test_deviations_of_moved_modes_cover_in_closed_loop():
     """Runs with moves and 1 % damping: frequency and decay lie in their intervals."""
-    moved = with_changes(machine(), [(Delta("f", 6, "freq", 1.0), 0.05)])
+    moved = with_changes(machine(), [(FrequencyDelta.of(6, 1.0), 0.05)])
     observer = design_kalman(machine())
     servo = design_servo(machine(), bandwidth=25.0, observer=observer)
     loop, z = close_loop(moved, observer, servo), []
@@ -357,7 +359,7 @@ def test_deviations_of_moved_modes_cover_in_closed_loop():
 @pytest.mark.long
 def test_the_report_of_a_loop_names_the_mode_that_moved(tmp_path):
     """A run on a machine whose mode 6 is 2.5 % higher, beside the loop on the model."""
-    moved = with_changes(machine(), [(Delta("f", 6, "freq", 1.0), 0.05)])
+    moved = with_changes(machine(), [(FrequencyDelta.of(6, 1.0), 0.05)])
     observer = design_kalman(machine())
     servo = design_servo(machine(), bandwidth=25.0, observer=observer)
     promised, there = (close_loop(P, observer, servo) for P in (machine(), moved))

@@ -12,8 +12,9 @@ import flexplant as fx
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation import design_hinf_filter, design_kalman, design_minimax_filter
 from flexplant.lti import StateSpace
-from flexplant.plant import Delta, StandardPlant
-from flexplant.plant.uncertainty.uncertain_plant import with_changes
+from flexplant.plant import StandardPlant
+from flexplant.plant.uncertainty.delta import with_changes
+from flexplant.plant.uncertainty.mode_delta import FrequencyDelta
 from oracles_estimation import error_by_frequency, error_peak, scalar_filter_variance
 
 DT = 1e-3
@@ -39,7 +40,7 @@ def plate():
 @cache
 def machines(count=6):
     rng = np.random.default_rng(1)
-    deltas = [Delta(f"mode{k}:freq", k, "freq", 1.0) for k in range(4, 9)]
+    deltas = [FrequencyDelta.of(k, 1.0) for k in range(4, 9)]
     scatter = 0.01 * rng.standard_normal((count, len(deltas)))
     return [with_changes(plate(), list(zip(deltas, row, strict=True))) for row in scatter]
 

@@ -28,7 +28,7 @@ from flexplant.identification.pole_test import (
     split_proposals,
     unexplained,
 )
-from flexplant.identification.refine import LEAST, Fit, Lines, refined
+from flexplant.identification.refine import LEAST, Lines, PoleFit, refined
 from flexplant.lti import Frf
 from oracles_identification import held_mode, mac, modal_frf, noisy, pole
 
@@ -409,9 +409,9 @@ def test_slopes_against_central_differences():
         free = [(1, 0), (1, 1), (0, 2)]
         for k, place in enumerate(free):
             moved[place] += x[6 + k] + 1j * x[9 + k]
-        return Fit(lines, poles + x[:3] + 1j * x[3:6], moved, pivots).cost
+        return PoleFit(lines, poles + x[:3] + 1j * x[3:6], moved, pivots).cost
 
-    g = Fit(lines, poles, part, pivots).gradient()[1]
+    g = PoleFit(lines, poles, part, pivots).gradient()[1]
     step = np.array([1e-4] * 6 + [1e-5] * 6)
     for k in range(12):
         e = np.zeros(12)

@@ -75,7 +75,14 @@ def made():
     plant = fx.assemble_plant(rom, ports())
     sampled = plant.discretized(RATE, delay=1)
     updated = fx.assemble_plant(fit.model, ports())
-    uncertain = updated.uncertain(fit, unknowns, modes=[6], neglected=full(mass=fit.values[0]))
+    uncertain = updated.uncertain(
+        fx.plant.Fit(fit, modes=[6]), fx.plant.Neglected(full(mass=fit.values[0]))
+    )
+    kinds = fx.plant
+    yield from (kinds.Frequencies({4: 0.01}), kinds.Dampings(0.3), kinds.Gains({"u1": 0.02}))
+    yield from (kinds.Delay(0.2), kinds.Parameters({unknowns[0]: 0.05}), uncertain.neglected)
+    yield kinds.Shapes(np.ones((1, 3, 1)), [4])
+    yield from (uncertain.deltas[0], kinds.MachineParts.of(updated))
     static = fx.design_static(sampled)
     servo = fx.design_servo(sampled, bandwidth=40.0)
     loop = close_loop(sampled, static, servo)
@@ -352,9 +359,9 @@ def same(a, b, where):
         assert (a != b).nnz == 0, where
         assert not b.data.flags.writeable, where
     elif isinstance(a, Mapping):
-        assert list(a) == list(b), where
-        for key in a:
-            same(a[key], b[key], f"{where}[{key!r}]")
+        same(list(a), list(b), where)
+        for key, twin in zip(a, b, strict=True):
+            same(a[key], b[twin], f"{where}[{key!r}]")
         with pytest.raises(TypeError):
             b["new"] = 1
     elif isinstance(a, list | tuple):

@@ -10,8 +10,8 @@ import scipy.linalg as la
 import flexplant as fx
 from flexplant.errors import AssumptionError, FlexplantWarning, ModelError
 from flexplant.loop.other_machines import mode_tolerances
-from flexplant.plant import Delta
-from flexplant.plant.uncertainty.uncertain_plant import with_changes
+from flexplant.plant.uncertainty.delta import with_changes
+from flexplant.plant.uncertainty.mode_delta import FrequencyDelta
 from stages import RATE, ports, sampled, some_modes
 
 ZETA, COUNT = 1e-3, 15
@@ -305,11 +305,11 @@ def test_positions_and_speeds_measured_together_a_fraction_of_a_sample_late():
         for end in found.stable[row][np.isfinite(found.stable[row])]:
             seen += 1
             for part, holds in ((0.99, True), (1.01, False)):
-                moved = [(Delta("", mode, "freq", 1.0), (1.0 + part * end) ** 2 - 1.0)]
+                moved = [(FrequencyDelta.of(mode, 1.0), (1.0 + part * end) ** 2 - 1.0)]
                 assert closed.around(with_changes(closed.plant, moved)).is_stable == holds
         for end in found.within[row][np.isfinite(found.within[row])]:
             seen += 1
-            moved = [(Delta("", mode, "freq", 1.0), (1.0 + end) ** 2 - 1.0)]
+            moved = [(FrequencyDelta.of(mode, 1.0), (1.0 + end) ** 2 - 1.0)]
             there = closed.around(with_changes(closed.plant, moved))
             assert not there.is_stable or there.modulus_margin == pytest.approx(0.35, rel=0.02)
     assert seen >= 3
@@ -342,7 +342,7 @@ def test_sensors_behind_filters_and_latencies(sensors):
 
     def off(mode, change):
         return closed.around(
-            with_changes(plant, [(Delta("", mode, "freq", 1.0), (1 + change) ** 2 - 1)])
+            with_changes(plant, [(FrequencyDelta.of(mode, 1.0), (1 + change) ** 2 - 1)])
         )
 
     found = closed.mode_tolerances()

@@ -79,7 +79,10 @@ def test_a_fit_alone_opens_its_uncertainty():
     unknowns = [fx.AddedMass(at), fx.AddedDamping(at)]
     fit = fx.update(rom, unknowns, [fx.Eigenvalues(poles)])
     plant = fx.assemble_plant(fit.model, ports())
-    alone, told = plant.uncertain(fit, modes=[6]), plant.uncertain(fit, unknowns, modes=[6])
+    alone, told = (
+        plant.uncertain(fx.plant.Fit(fit, modes=[6], parameters=given))
+        for given in (None, unknowns)
+    )
     np.testing.assert_array_equal(alone.system.A, told.system.A)
     assert [p.name for p in fit.unknowns] == list(fit.parameters)
 

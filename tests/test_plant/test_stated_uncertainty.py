@@ -7,6 +7,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import LabelError, ModelError
+from flexplant.plant import Dampings, Delay, Frequencies, Gains, Parameters, Shapes
 from stages import sampled, some_modes
 
 
@@ -40,7 +41,7 @@ def test_one_number_is_for_all_elastic_modes_and_an_array_for_some():
     every = plant().uncertain(frequency=0.005, damping=0.3)
     assert sorted({d.mode for d in every.deltas}) == [4, 5, 6, 7, 8]
     assert {d.kind: d.scale for d in every.deltas} == {"freq": 0.01, "damping": 0.3}
-    some = plant().uncertain(frequency=[0.01, 0.02], modes=[5, 7])
+    some = plant().uncertain(Frequencies([0.01, 0.02], modes=[5, 7]))
     assert {d.mode: d.scale for d in some.deltas} == {5: 0.02, 7: 0.04}
 
 
@@ -57,39 +58,52 @@ def test_draws_spread_as_stated():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "error", "said"),
+    ("kinds", "error", "said"),
     [
-        ({"frequency": 0.0}, ModelError, "nothing uncertain"),
-        ({"frequency": -0.1}, ModelError, "0 or more, got -0.1"),
-        ({"frequency": {99: 0.01}}, LabelError, "99"),
-        ({"frequency": 0.01, "modes": [1]}, LabelError, "elastic mode of the plant"),
-        ({"frequency": [0.01, 0.02]}, fx.FlexplantError, "frequency of a mode"),
-        ({"damping": 1.5}, ModelError, "damping of mode 4"),
-        ({}, ModelError, "frequency=0.005"),
-        ({"gain": {"u9": 0.1}}, LabelError, "u9"),
-        ({"gain": {"u1": 1.5}}, ModelError, "sign is not known"),
-        ({"delay": 3.0}, ModelError, "cannot become negative"),
-        ({"parameters": {}}, ModelError, "empty"),
-        ({"parameters": {"mass": 0.1}}, ModelError, "AddedMass"),
-        ({"parameters": {fx.AddedMass("1:z"): 0.1}}, ModelError, "ReducedModel or an FEModel"),
+        (lambda: [Frequencies(0.0)], ModelError, "nothing uncertain"),
+        (lambda: [Frequencies(-0.1)], ModelError, "0 or more, got -0.1"),
+        (lambda: [Frequencies({99: 0.01})], LabelError, "99"),
+        (lambda: [Frequencies(0.01, modes=[1])], LabelError, "elastic mode of the plant"),
+        (lambda: [Frequencies([0.01, 0.02])], fx.FlexplantError, "stiffness of a mode"),
+        (
+            lambda: [Frequencies(0.01), Frequencies({4: 0.02})],
+            ModelError,
+            "freq is uncertain twice",
+        ),
+        (lambda: [Dampings(1.5)], ModelError, "damping of mode 4"),
+        (list, ModelError, "frequency=0.005"),
+        (lambda: [Gains({"u9": 0.1})], LabelError, "u9"),
+        (lambda: [Gains({"u1": 1.5})], ModelError, "sign is not known"),
+        (lambda: [Delay(3.0)], ModelError, "cannot become negative"),
+        (lambda: [Parameters({})], ModelError, "empty"),
+        (lambda: [Parameters({"mass": 0.1})], ModelError, "AddedMass"),
+        (
+            lambda: [Parameters({fx.AddedMass("1:z"): 0.1})],
+            ModelError,
+            "ReducedModel or an FEModel",
+        ),
     ],
 )
-def test_what_cannot_be_stated_is_refused(arguments, error, said):
+def test_what_cannot_be_stated_is_refused(kinds, error, said):
     with pytest.raises(error, match=said):
-        plant().uncertain(**arguments)
+        plant().uncertain(*kinds())
 
 
-def test_a_fit_and_a_stated_share_exclude_each_other():
-    measured = fx.MeasuredModes([-1 + 1500j], modes=[4], covariance=np.eye(2))
-    with pytest.raises(ModelError, match="Pass one or the other"):
+def test_no_mode_is_uncertain_by_a_measurement_and_a_share():
+    pole = (-1e-3 + 1j) * swing(plant())[0][0]
+    measured = fx.MeasuredModes([pole], modes=[4], covariance=1e-2 * np.eye(2))
+    with pytest.raises(ModelError, match="mode4:freq is uncertain twice"):
         plant().uncertain(measured, frequency=0.01)
+    both = plant().uncertain(measured, frequency={5: 0.01})
+    names = [delta.name for delta in both.deltas]
+    assert names == ["mode4:freq", "mode4:damping", "mode5:freq"]
 
 
 def test_gains_and_delay_go_beside_a_source():
     omega = swing(plant())[0][:2]
     poles, covariance = (-1e-3 + 1j) * omega, np.diag([0.1, 0.1, 4.0, 4.0])
     measured = fx.MeasuredModes(poles, modes=[4, 5], covariance=covariance)
-    uncertain = plant().uncertain(measured, gain={"u1": 0.1}, delay=0.2)
+    uncertain = plant().uncertain(measured, Gains({"u1": 0.1}), Delay(0.2))
     names = [delta.name for delta in uncertain.deltas]
     assert names[-2:] == ["u1:gain", "delay"] and "mode4:freq" in names
     assert len({one.delay for one in uncertain.sample(2, 3)}) == 3
@@ -113,7 +127,7 @@ def closed_deltas(uncertain, values):
 
 
 def test_gains_of_actuators_and_sensors():
-    uncertain = plant().uncertain(frequency={4: 0.01}, gain={"u1": 0.05, "y2": 0.02})
+    uncertain = plant().uncertain(Gains({"u1": 0.05, "y2": 0.02}), frequency={4: 0.01})
     values = {"mode4:freq": 0.5, "u1:gain": 1.0, "y2:gain": -0.5}
     machine = uncertain.lft(values)
     only = uncertain.lft({"mode4:freq": 0.5})
@@ -132,7 +146,7 @@ def test_gains_of_actuators_and_sensors():
 
 
 def test_the_delay():
-    uncertain = plant().uncertain(delay=0.2)
+    uncertain = plant().uncertain(Delay(0.2))
     machine = uncertain.lft({"delay": -0.5})
     wanted = plant().continuous.discretized(1.0 / plant().dt, delay=plant().delay - 0.1)
     found = response(machine.system, 130.0)
@@ -151,7 +165,7 @@ def spring_of_masses(extra=0.0):
 @pytest.mark.slow
 def test_a_parameter_of_the_model():
     """A mass known to 5 %: the machine is that of the heavier chain, shapes and all."""
-    uncertain = spring_of_masses().uncertain(parameters={fx.AddedMass("3:x"): 0.05})
+    uncertain = spring_of_masses().uncertain(Parameters({fx.AddedMass("3:x"): 0.05}))
     assert "mass at 3:x" in repr(uncertain)
     assert "+- 0.05 kg" in repr(uncertain)
     found = uncertain.lft({"mass at 3:x": 1.0})
@@ -169,9 +183,14 @@ def test_a_parameter_of_the_model():
 BESIDE = {"mass at 3:x": 1.0, "mode2:freq": -1.0, "mode3:damping": 1.0, "u1:gain": -0.5}
 
 
-def every_kind(**more):
-    stated = {"frequency": {2: 0.02}, "damping": {3: 0.3}, "gain": {"u1": 0.1}} | more
-    return spring_of_masses().uncertain(parameters={fx.AddedMass("3:x"): 0.05}, **stated)
+def every_kind(*more, frequency=0.02, damping=0.3, gain=0.1):
+    return spring_of_masses().uncertain(
+        Parameters({fx.AddedMass("3:x"): 0.05}),
+        Frequencies({2: frequency}),
+        Dampings({3: damping}),
+        Gains({"u1": gain}),
+        *more,
+    )
 
 
 @pytest.mark.slow
@@ -197,16 +216,15 @@ def test_a_parameter_beside_modes_and_gains():
     )
     made, wanted = closed_deltas(uncertain, BESIDE), response(found.continuous.system, 130.0)
     np.testing.assert_allclose(made, wanted, rtol=1e-8, atol=1e-9 * np.abs(wanted).max())
-    draws = every_kind(delay=0.1).sample(1, 20)
+    draws = every_kind(Delay(0.1)).sample(1, 20)
     assert len({one.delay for one in draws}) == 20
     assert len({swing(one)[0][0] for one in draws}) == 20
-    for wrong, said in (
-        ({"delay": 9.0}, "become negative"),
-        ({"gain": 1.0}, "sign is not known"),
-        ({"frequency": None, "damping": None, "modes": [2]}, "nothing uncertain"),
-    ):
-        with pytest.raises(ModelError, match=said):
-            every_kind(**wrong)
+    with pytest.raises(ModelError, match="become negative"):
+        every_kind(Delay(9.0))
+    with pytest.raises(ModelError, match="sign is not known"):
+        every_kind(gain=1.0)
+    with pytest.raises(ModelError, match="Leave Shapes out"):
+        every_kind(Shapes(0.01 * np.ones((1, 3, 1)), [2]))
 
 
 @pytest.mark.long
@@ -215,8 +233,7 @@ def test_a_loop_under_all_kinds_at_once():
     plant = spring_of_masses()
     observer = fx.design_kalman(plant)
     servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
-    shares = {"frequency": {2: 0.005}, "damping": {3: 0.1}}
-    uncertain = every_kind(**shares, delay=0.1)
+    uncertain = every_kind(Delay(0.1), frequency=0.005, damping=0.1)
     found = fx.synthesis.robust_stability(uncertain, observer, servo, machines=2)
     size = 0.98 / found.upper
     random = np.random.default_rng(1)
@@ -234,7 +251,7 @@ def test_a_gain_margin_is_what_mu_says():
     P = fx.testbeds.three_masses()
     observer = fx.design_kalman(P)
     servo = fx.design_servo(P, bandwidth=20.0, observer=observer)
-    uncertain = P.uncertain(gain={"u1": 0.5})
+    uncertain = P.uncertain(Gains({"u1": 0.5}))
     found = fx.synthesis.robust_stability(uncertain, observer, servo, machines=2)
 
     def stable(delta):
@@ -269,7 +286,7 @@ def test_the_gain_of_an_actuator_behind_its_own_filter(rate, amplifier):
         plant = fx.assemble_plant(modes, own)
         return plant.discretized(rate, delay=1.0) if rate else plant
 
-    known = made(1.0).uncertain(gain={"u1": 0.05})
+    known = made(1.0).uncertain(Gains({"u1": 0.05}))
     changed, wanted = known.lft({"u1:gain": 1.0}), made(1.05)
     assert ("u1:disturbance" in wanted.w) == bool(amplifier)
     np.testing.assert_allclose(

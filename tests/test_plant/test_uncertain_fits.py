@@ -102,7 +102,7 @@ def test_modes_that_change_places_by_what_was_measured():
     poles = own.poles[[3, 4]]
     crossed = fx.MeasuredModes(poles[::-1] * 1.001, modes=[4, 5], covariance=[1e-2, 4e-2])
     plant = fx.assemble_plant(fit.calibrated(crossed), PORTS)
-    uncertain = plant.uncertain(fit, modes=[4, 5])
+    uncertain = plant.uncertain(fx.plant.Fit(fit, modes=[4, 5]))
     expected = shares(crossed)[0][::-1]  # of the lower pole first
     found = [d.scale for d in uncertain.deltas if d.name in ("mode4:freq", "mode5:freq")]
     np.testing.assert_allclose(found, 2.0 * expected, rtol=1e-3)
@@ -145,4 +145,4 @@ def test_what_was_measured_determines_shares_or_says_that_it_does_not(seed, damp
     plant = fx.assemble_plant(fit.calibrated(data), PORTS)
     with pytest.raises(ModelError, match=f"mode {open_modes[0]}"):
         plant.uncertain(fit)
-    assert {d.mode for d in plant.uncertain(fit, modes=[2, 3]).deltas} == {2, 3}
+    assert {d.mode for d in plant.uncertain(fx.plant.Fit(fit, modes=[2, 3])).deltas} == {2, 3}

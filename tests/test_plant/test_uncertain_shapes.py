@@ -16,8 +16,19 @@ from flexplant.identification import (
 )
 from flexplant.lti import Frf, frequency_response
 from flexplant.modes import Modes, solve_modes
-from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
-from flexplant.plant.uncertainty.delta_channels import delta_channels
+from flexplant.plant import (
+    Actuator,
+    Delay,
+    Disturbance,
+    Fit,
+    Gains,
+    Poi,
+    Ports,
+    Sensor,
+    Shapes,
+    assemble_plant,
+)
+from flexplant.plant.uncertainty.sampled_channels import delta_channels
 from flexplant.structure import ModalDamping, chain
 
 DOFS = DofSet([1, 2, 3], ["z"] * 3, [[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]])
@@ -48,7 +59,9 @@ def test_a_value_of_delta_is_the_plant_with_that_shape():
     poles = np.array([complex(*_upper(plant, k)) for k in (2, 3)])
     measured = MeasuredModes(poles, modes=(2, 3), covariance=np.full(2, 0.25))
     shapes = 0.05 * rng.normal(size=(2, 3, 2))
-    uncertain = plant.uncertain(measured, shapes=shapes, deviations=3.0)
+    uncertain = plant.uncertain(
+        Fit(measured, deviations=3.0), Shapes(shapes, measured.modes, deviations=3.0)
+    )
     names = [delta.name for delta in uncertain.deltas]
     assert names[4:] == ["mode2:shape1", "mode2:shape2", "mode3:shape1", "mode3:shape2"]
     values = {
@@ -75,19 +88,22 @@ def test_a_value_of_delta_is_the_plant_with_that_shape():
     np.testing.assert_allclose(np.cov(np.array(drawn).T), wanted, atol=0.2 * np.trace(wanted))
     # sampled: of positions as good as affine, with the channels of each Delta side by side
     seen = plant.with_ports(PORTS.replace(y=[Sensor("y1", at="1:z")])).discretized(2e3)
-    sampled = seen.uncertain(measured, shapes=shapes, deviations=1.0)
+    sampled = seen.uncertain(
+        Fit(measured, deviations=1.0), Shapes(shapes, measured.modes, deviations=1.0)
+    )
     found = delta_channels(sampled)
     assert found.distance < 1e-4
     # an acceleration holds the product of both shapes: no rate makes it affine
     seen = plant.with_ports(PORTS.replace(y=[Sensor("y3", at="3:z", quantity="acceleration")]))
-    fast = seen.discretized(2e5).uncertain(measured, shapes=3.0 * shapes, deviations=1.0)
+    wide = Shapes(3.0 * shapes, measured.modes, deviations=1.0)
+    fast = seen.discretized(2e5).uncertain(Fit(measured, deviations=1.0), wide)
     with pytest.raises(CertificateError, match=r"what y3 measure .* measure displacements there"):
         delta_channels(fast)
     assert dict(found.deltas)["mode3:shape1"] == 2
     with pytest.raises(ShapeError, match="shapes"):
-        plant.uncertain(measured, shapes=shapes[:, :2])
+        plant.uncertain(measured, Shapes(shapes[:, :2], measured.modes))
     silent = np.zeros((2, 3, 1))
-    assert len(plant.uncertain(measured, shapes=silent).deltas) == 4
+    assert len(plant.uncertain(measured, Shapes(silent, measured.modes)).deltas) == 4
 
 
 def test_gains_and_a_delay_go_beside_shapes():
@@ -99,7 +115,7 @@ def test_gains_and_a_delay_go_beside_shapes():
     measured = MeasuredModes(poles, modes=(2, 3), covariance=np.full(2, 0.25))
     shapes = 0.05 * rng.normal(size=(2, 3, 1))
     gain = dict.fromkeys((plant.u[0], "y1", "y3"), 0.1)
-    uncertain = plant.uncertain(measured, shapes=shapes, gain=gain)
+    uncertain = plant.uncertain(measured, Shapes(shapes, measured.modes), Gains(gain))
     values = {delta.name: rng.uniform(-1, 1) for delta in uncertain.deltas}
     by_channels = closed(uncertain, values)
     exact = frequency_response(uncertain.lft(values).system, FREQ).data
@@ -108,7 +124,9 @@ def test_gains_and_a_delay_go_beside_shapes():
     assert np.abs((found - exact) / size).max() < 1e-9
     owners = list(dict.fromkeys(uncertain.channels.values()))
     assert [name for name in owners if name.endswith("gain")] == owners[:3]
-    late = plant.discretized(2e3, delay=1).uncertain(measured, shapes=shapes, delay=0.5)
+    late = plant.discretized(2e3, delay=1).uncertain(
+        measured, Shapes(shapes, measured.modes), Delay(0.5)
+    )
     assert [delta.kind for delta in late.deltas].count("delay") == 1
 
 
@@ -155,7 +173,9 @@ def test_shapes_spread_as_stated(driven):
     # and the plant takes them
     known = numbered(found, made)
     plant = assemble_plant(made, ports)
-    uncertain = plant.uncertain(known, shapes=shape_deviations(found, model.dofs, count=1))
+    uncertain = plant.uncertain(
+        known, Shapes(shape_deviations(found, model.dofs, count=1), known.modes)
+    )
     assert sum(delta.kind == "shape" for delta in uncertain.deltas) == 3
     # one direction has the variance of all
     assert np.linalg.norm(shape_deviations(found, model.dofs, count=1)[0]) == pytest.approx(

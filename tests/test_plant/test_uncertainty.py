@@ -15,6 +15,8 @@ from flexplant.identification import MeasuredModes
 from flexplant.lti import StateSpace, frequency_response, lft, lowpass
 from flexplant.plant import (
     BaseAcceleration,
+    Fit,
+    Neglected,
     Poi,
     Ports,
     Sensor,
@@ -45,6 +47,10 @@ def fitted(std=0.5):
     at = model.full_dofs.nearest(Z8, "z")
     unknowns = (AddedMass(at), AddedDamping(at))
     return update(model, unknowns, [Eigenvalues(measured(std))]), unknowns
+
+
+def open_fit(std=0.5, **options):
+    return Fit(fitted(std)[0], **options)
 
 
 def updated(std=0.5):
@@ -104,7 +110,7 @@ def test_a_value_of_delta_is_the_plant_with_that_frequency_and_damping(quantity,
     )  # fmt: skip
     plant = assemble_plant(modes, channels)
     doubt = own_doubt(plant, (5, 6), 0.06)
-    uncertain = plant.uncertain(doubt, deviations=3.0)
+    uncertain = plant.uncertain(Fit(doubt, deviations=3.0))
     scale = 3.0 * np.sqrt(np.diag(_relative(doubt.poles, doubt.covariance)))
     omega, zeta = np.array(modes.basis_omega), np.array(modes.basis_zeta)
     for name, value in values.items():
@@ -138,9 +144,9 @@ VALUES = {"mode6:freq": 0.7, "mode7:damping": -0.5, "mode7:freq": -1.0, "mode6:d
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [None, RATE])
 def test_a_fit_with_a_damper_gives_complex_modes_and_the_same_lft(rate):
-    fit, unknowns = fitted()
+    fit = fitted()[0]
     plant = updated() if rate is None else updated().discretized(rate, delay=1.5)
-    uncertain = plant.uncertain(fit, unknowns, modes=[6, 7])
+    uncertain = plant.uncertain(Fit(fit, modes=[6, 7]))
     assert uncertain.system.dt == 0
     changed = uncertain.lft(VALUES)
     assert (changed.dt, changed.delay) == (plant.dt, plant.delay)
@@ -162,7 +168,7 @@ def test_a_fit_with_a_damper_gives_complex_modes_and_the_same_lft(rate):
 @pytest.mark.slow
 def test_names_and_order_of_the_channels():
     plant = updated()
-    uncertain = plant.uncertain(*fitted(), modes=[7, 6])
+    uncertain = plant.uncertain(open_fit(modes=[7, 6]))
     names = ["mode6:freq", "mode6:damping", "mode7:freq", "mode7:damping"]
     assert [delta.name for delta in uncertain.deltas] == names
     assert [(delta.mode, delta.kind) for delta in uncertain.deltas][2] == (7, "freq")
@@ -172,7 +178,7 @@ def test_names_and_order_of_the_channels():
     lines = repr(uncertain).splitlines()
     assert lines[0] == "<UncertainPlant: 4 real Deltas at 2 std"
     assert lines[1].startswith("  mode6:freq +- 0.00958 %")
-    assert repr(plant.uncertain(*fitted())).splitlines()[-1] == "  ... and 20 more>"
+    assert repr(plant.uncertain(open_fit())).splitlines()[-1] == "  ... and 20 more>"
 
 
 def propagated(fit, unknowns, wanted):
@@ -189,7 +195,7 @@ def test_the_covariance_of_the_parameters_goes_to_the_modes():
     fit, unknowns = fitted()
     plant = updated()
     modes = (5, 6, 7, 9)
-    uncertain = plant.uncertain(fit, unknowns, modes=modes, deviations=1.5)
+    uncertain = plant.uncertain(Fit(fit, modes=modes, deviations=1.5))
     poles = np.array([complex(*_upper(plant.modal_blocks[k - 1])) for k in modes])
     wanted = _relative(poles, propagated(fit, unknowns, poles))
     order = [0, 4, 1, 5, 2, 6, 3, 7]
@@ -214,7 +220,7 @@ def test_machines_of_a_fit_spread_as_its_covariance_says():
     plant = updated(0.1)
     std = np.sqrt(np.diag(fit.covariance))
     fit = fit.replace(covariance=np.outer(std, std) * [[1.0, -0.9], [-0.9, 1.0]])
-    uncertain = plant.uncertain(fit, unknowns, modes=[6, 7])
+    uncertain = plant.uncertain(Fit(fit, modes=[6, 7]))
     machines = uncertain.sample(4, 120)
     poles = np.array(
         [[complex(*_upper(m.modal_blocks[k - 1])) for k in (6, 7, 9)] for m in machines]
@@ -248,7 +254,7 @@ def test_machines_of_measured_modes_spread_as_measured():
 @pytest.mark.slow
 def test_seeds_belong_to_machines():
     plant = updated(0.1).discretized(RATE, delay=1)
-    uncertain = plant.uncertain(*fitted(0.1), modes=[6])
+    uncertain = plant.uncertain(open_fit(0.1, modes=[6]))
     three, five = uncertain.sample(7, 3), uncertain.sample(rng=7, n=5)
     for one, same in zip(three, five, strict=False):
         assert np.array_equal(one.system.A, same.system.A)
@@ -313,10 +319,10 @@ def seen_and_pushed():
 @pytest.mark.slow
 def test_neglected_modes_are_bounded_by_their_weights():
     """The difference between all DOFs and the reduced model, by dense solves, from 0 Hz up."""
-    fit, unknowns = fitted()
+    fit = fitted()[0]
     plant = updated()
     added = fit["mass at 23:z"]
-    uncertain = plant.uncertain(fit, unknowns, modes=[6], neglected=full(mass=added))
+    uncertain = plant.uncertain(Fit(fit, modes=[6]), Neglected(full(mass=added)))
     found = uncertain.neglected
     names = ["die:z", "die:rx", "die:ry", "y1", "y2", "y3", "y4"]
     assert found.outputs == tuple(names)
@@ -384,15 +390,15 @@ def test_the_bound_on_neglected_modes_is_tight(count):
 
 @pytest.mark.slow
 def test_neglected_modes_are_no_excuse_for_another_mass():
-    fit, unknowns = fitted()
+    fit = fitted()[0]
     plant = updated()
     with pytest.raises(ModelError, match=r"grows toward low frequencies.*mass"):
-        plant.uncertain(fit, unknowns, modes=[6], neglected=full())
+        plant.uncertain(fit, Neglected(full()))
     with pytest.raises(ModelError, match="does not differ"):
-        plant.uncertain(fit, unknowns, modes=[6], neglected=plant)
+        plant.uncertain(fit, Neglected(plant))
     three = assemble_plant(full(mass=0.5), ports(u=ports().u[:3]))
     with pytest.raises(ModelError, match="other channels"):
-        plant.uncertain(fit, unknowns, modes=[6], neglected=three)
+        plant.uncertain(fit, Neglected(three))
 
 
 @pytest.mark.slow
@@ -402,25 +408,25 @@ def test_what_cannot_be_opened_is_said():
     with pytest.raises(LabelError, match=r"got the parameters \[\].*given to update"):
         plant.uncertain(fit.replace(unknowns=()))
     with pytest.raises(LabelError, match="same order"):
-        plant.uncertain(fit, unknowns[::-1])
+        plant.uncertain(Fit(fit, parameters=unknowns[::-1]))
     with pytest.raises(ModelError, match="no covariance"):
-        plant.uncertain(fit.replace(covariance=None), unknowns)
+        plant.uncertain(fit.replace(covariance=None))
     with pytest.raises(LabelError, match="no mode 99"):
-        plant.uncertain(fit, unknowns, modes=[99])
+        plant.uncertain(Fit(fit, modes=[99]))
     with pytest.raises(LabelError, match="rigid-body mode"):
-        plant.uncertain(fit, unknowns, modes=[2])
+        plant.uncertain(Fit(fit, modes=[2]))
     with pytest.raises(ModelError, match=r"mode 6 has the pole.*not of the same model"):
-        assemble_plant(reduced(), ports()).uncertain(fit, unknowns, modes=[6])
+        assemble_plant(reduced(), ports()).uncertain(Fit(fit, modes=[6]))
     with pytest.raises(ModelError, match="UpdateResult or MeasuredModes, got str"):
         plant.uncertain("fit")
     with pytest.raises(ModelError, match="mode numbers and a covariance"):
         plant.uncertain(MeasuredModes(measured().poles, modes=(6, 7)))
     with pytest.raises(LabelError, match="no measured mode 8"):
-        plant.uncertain(measured(), modes=[8])
+        plant.uncertain(Fit(measured(), modes=[8]))
     with pytest.raises(LabelError, match="no elastic mode of the plant 2"):
         plant.uncertain(MeasuredModes([-1 + 9j], modes=(2,), covariance=[1.0]))
     with pytest.raises(ModelError, match="deviations must be positive"):
-        plant.uncertain(measured(), deviations=0.0)
+        plant.uncertain(Fit(measured(), deviations=0.0))
     with pytest.raises(ModelError, match=r"damping of mode 6 is uncertain by \d+ % at 2 standard"):
         plant.uncertain(measured(60.0))
     weighted = plant.weighted(z={"die:z": 2.0})
@@ -431,7 +437,7 @@ def test_what_cannot_be_opened_is_said():
 
 
 def test_values_of_delta_are_checked():
-    uncertain = updated().uncertain(*fitted(), modes=[6])
+    uncertain = updated().uncertain(open_fit(modes=[6]))
     with pytest.raises(LabelError, match=r"no Delta 'mode6:frequency'.*mode6:freq"):
         uncertain.lft({"mode6:frequency": 0.1})
     with pytest.raises(ModelError, match="leaves mode 6 with negative damping"):
@@ -451,20 +457,20 @@ def test_values_of_delta_are_checked():
 @pytest.mark.parametrize("filtered", [False, True])
 def test_accelerations_of_complex_modes_repeat_the_deltas(filtered):
     """Exact: as the changed plant, and s^2 times what displacement sensors of it show."""
-    fit, unknowns = fitted(0.5)
+    fit = fitted(0.5)[0]
     damped = fit.replace(model=fit.model.replace(D=damped_unevenly(fit.model)))
     dynamics = lowpass(900.0, order=2) if filtered else None
     y = [Sensor(f"y{i}", at=p, quantity="acceleration", dynamics=dynamics)
          for i, p in enumerate(CORNERS, 1)]  # fmt: skip
     plant = assemble_plant(damped.model, ports(y=y))
-    uncertain = plant.uncertain(damped, unknowns, modes=[6, 7])
+    uncertain = plant.uncertain(Fit(damped, modes=[6, 7]))
     assert set(uncertain.channels) - {d.name for d in uncertain.deltas} == {
         f"{d.name}:rate" for d in uncertain.deltas
     }
     found = closed(uncertain, VALUES)
     assert same_response(found, uncertain.lft(VALUES).system)
     still = [port.replace(quantity="displacement") for port in y]
-    places = assemble_plant(damped.model, ports(y=still)).uncertain(damped, unknowns, modes=[6, 7])
+    places = assemble_plant(damped.model, ports(y=still)).uncertain(Fit(damped, modes=[6, 7]))
     assert tuple(places.channels) == tuple(d.name for d in places.deltas)
     freq = np.array([30.0, 240.0, 458.0, 640.0])
     moved = frequency_response(closed(places, VALUES).select(["y2"], ["u1", "u3"]), freq).data
@@ -473,21 +479,21 @@ def test_accelerations_of_complex_modes_repeat_the_deltas(filtered):
 
 
 def test_velocities_of_complex_modes_need_no_second_copy():
-    fit, unknowns = fitted(0.5)
+    fit = fitted(0.5)[0]
     damped = fit.replace(model=fit.model.replace(D=damped_unevenly(fit.model)))
     speeds = [Sensor(f"y{i}", at=p, quantity="velocity") for i, p in enumerate(CORNERS, 1)]
     plant = assemble_plant(damped.model, ports(y=speeds))
-    uncertain = plant.uncertain(damped, unknowns, modes=[6])
+    uncertain = plant.uncertain(Fit(damped, modes=[6]))
     assert len(uncertain.channels) == len(uncertain.deltas)
     assert same_response(closed(uncertain, VALUES6), uncertain.lft(VALUES6).system)
 
 
 def test_a_fit_of_a_mass_with_accelerometers():
     """Every fit of mass and damper makes complex modes: the plant of the fit itself."""
-    fit, unknowns = fitted(0.5)
+    fit = fitted(0.5)[0]
     y = [Sensor(f"y{i}", at=p, quantity="acceleration") for i, p in enumerate(CORNERS, 1)]
     plant = assemble_plant(fit.model, ports(y=y))
-    uncertain = plant.uncertain(fit, unknowns)
+    uncertain = plant.uncertain(fit)
     rng = np.random.default_rng(3)
     values = {d.name: float(rng.uniform(-1, 1)) for d in uncertain.deltas}
     assert same_response(closed(uncertain, values), uncertain.lft(values).system)
@@ -495,14 +501,14 @@ def test_a_fit_of_a_mass_with_accelerometers():
 
 def test_a_large_damper_to_ground_has_the_parameters_as_deltas():
     """Against M, D, K changed by hand: mass and damper at z8, accelerometers, a moving floor."""
-    fit, unknowns = fitted(0.5)
+    fit = fitted(0.5)[0]
     at = fit.model.row((0.1, 0.2, 0.0))
     dragged = fit.replace(model=fit.model.replace(D=fit.model.D + 900.0 * np.outer(at, at)))
     y = [Sensor(f"y{i}", at=p, quantity="acceleration") for i, p in enumerate(CORNERS, 1)]
     channels = ports(y=y, w=[BaseAcceleration("floor")], references=())
     with pytest.warns(FlexplantWarning, match="drag rigid-body motion"):
         plant = assemble_plant(dragged.model, channels)
-    uncertain = plant.uncertain(dragged, unknowns, deviations=3.0)
+    uncertain = plant.uncertain(Fit(dragged, deviations=3.0))
     assert [d.name for d in uncertain.deltas] == list(fit.parameters)
     assert "+-" in repr(uncertain)
     assert "kg" in repr(uncertain)
@@ -531,9 +537,9 @@ def test_a_large_damper_to_ground_has_the_parameters_as_deltas():
         np.testing.assert_allclose(shown, wanted, rtol=1e-7, atol=1e-9)
     assert len(uncertain.sample(1, 2)) == 2
     with pytest.raises(ModelError, match=r"Leave modes out"):
-        plant.uncertain(dragged, unknowns, modes=[6])
+        plant.uncertain(Fit(dragged, modes=[6]))
     with pytest.raises(ModelError, match="another D than the fit's model"):
-        plant.uncertain(fit, unknowns)
+        plant.uncertain(fit)
 
 
 VALUES6 = {"mode6:freq": 0.9, "mode6:damping": -0.9}
@@ -552,8 +558,8 @@ def damped_unevenly(model):
 
 @pytest.mark.slow
 def test_a_machine_that_cannot_be_is_named():
-    fit, unknowns = fitted(0.1)
+    fit = fitted(0.1)[0]
     huge = fit.replace(covariance=fit.covariance * 1e10)
-    uncertain = updated(0.1).uncertain(fit, unknowns, modes=[6]).replace(fit=huge)
+    uncertain = updated(0.1).uncertain(Fit(fit, modes=[6])).replace(kinds=[Fit(huge, modes=[6])])
     with pytest.raises(ModelError, match=r"machine \d+ of the sample is not physical"):
         uncertain.sample(1, 50)

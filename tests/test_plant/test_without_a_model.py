@@ -8,7 +8,7 @@ from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.identification import identify_modes, numbered, structural_modes
 from flexplant.lti import Frf, frequency_response
 from flexplant.modes import solve_modes
-from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
+from flexplant.plant import Actuator, Disturbance, Fit, Poi, Ports, Sensor, assemble_plant
 from flexplant.structure import ModalDamping, interpolated, kirchhoff_plate
 
 FREQ = np.arange(60.0, 701.0, 4.0)
@@ -117,7 +117,7 @@ def test_a_plant_from_measured_modes(machine):
     # the covariance of the poles is the plant's uncertainty
     known = numbered(machine.found, modes)
     assert known.modes == tuple(range(4, 4 + len(known)))
-    uncertain = plant.uncertain(known, modes=[4, 5], deviations=3.0)
+    uncertain = plant.uncertain(Fit(known, modes=[4, 5], deviations=3.0))
     assert [d.name for d in uncertain.deltas] == [
         "mode4:freq", "mode4:damping", "mode5:freq", "mode5:damping"
     ]  # fmt: skip

@@ -9,6 +9,7 @@ import pytest
 import flexplant as fx
 from flexplant.errors import AssumptionError, LabelError, ModelError
 from flexplant.lti import StateSpace, lft, tustin
+from flexplant.plant import Delay, Fit, Neglected
 from flexplant.synthesis import design_mu, robust_stability, worst_case_gain
 from stages import ports, reduced, sampled, some_modes
 
@@ -39,7 +40,7 @@ def uncertain(sampled=False, std=0.04, modes=(2, 3)):
     poles = np.array([complex(*_upper(plant().modal_blocks[k - 1])) for k in modes])
     spread = np.concatenate([0.1 * np.abs(poles.real), std * poles.imag])
     measured = fx.MeasuredModes(poles, modes=modes, covariance=np.diag(spread**2))
-    return plant(sampled).uncertain(measured, deviations=1.0)
+    return plant(sampled).uncertain(Fit(measured, deviations=1.0))
 
 
 def _upper(pair):
@@ -117,7 +118,7 @@ def test_neglected_modes_are_one_full_block(sampled):
     poles = np.array([complex(*_upper(few.modal_blocks[1]))])
     spread = np.array([0.1 * abs(poles[0].real), 0.01 * poles[0].imag])
     measured = fx.MeasuredModes(poles, modes=(2,), covariance=np.diag(spread**2))
-    deltas = given.uncertain(measured, deviations=1.0, neglected=plant())
+    deltas = given.uncertain(Fit(measured, deviations=1.0), Neglected(plant()))
     controller = lead(sampled, 25.0)
     found = robust_stability(deltas, controller)
     assert found.lower <= found.upper <= 1.3 * found.lower
@@ -143,7 +144,7 @@ def test_refusals():
         worst_case_gain(uncertain(std=0.3), lead(gain=60.0), w=["d"], z=["tip:x"])
     with pytest.raises(ModelError, match=r"plant\.uncertain"):
         robust_stability(plant(), lead())
-    late = plant(True).uncertain(delay=0.2)
+    late = plant(True).uncertain(Delay(0.2))
     with pytest.raises(ModelError, match=r"1 \+- 0.2 samples passes a whole number"):
         robust_stability(late, lead(True))
     with pytest.raises(LabelError, match="no output 'x'"):
@@ -213,11 +214,11 @@ def test_weights_of_a_stage_with_a_channel_left_out():
 def test_a_delay_within_a_sample_is_a_delta():
     """Some 0.5 samples of 400 Hz at a crossover of 1.5 Hz are little, 3 samples are not."""
     later = plant().discretized(RATE, delay=1.3)
-    found = robust_stability(later.uncertain(delay=0.25), lead(True))
-    machines = [later.uncertain(delay=0.25).lft({"delay": one}) for one in (-1.0, 1.0)]
+    found = robust_stability(later.uncertain(Delay(0.25)), lead(True))
+    machines = [later.uncertain(Delay(0.25)).lft({"delay": one}) for one in (-1.0, 1.0)]
     assert found.is_robust == all(stable(one, lead(True)) for one in machines)
     assert found.lower <= found.upper < 1.0
-    both = robust_stability(later.uncertain(delay=0.25, frequency=0.02), lead(True))
+    both = robust_stability(later.uncertain(Delay(0.25), frequency=0.02), lead(True))
     assert both.upper >= 0.99 * found.upper
 
 

@@ -208,7 +208,7 @@ def test_the_quick_bound_of_one_mode_is_its_tolerance():
     mode, edge = int(found.modes[worst]), np.abs(found.stable[worst]).min()
     shown = [
         _quick(
-            plant().uncertain(frequency=part * edge, modes=[mode]),
+            plant().uncertain(frequency={mode: part * edge}),
             loop.blocks,
             None,
             2,

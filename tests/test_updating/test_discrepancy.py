@@ -171,7 +171,7 @@ def test_plants_are_as_uncertain_as_the_fit_says():
     scales = {d.mode: d.scale for d in found.deltas if d.kind == "damping"}
     assert scales[9] == pytest.approx(min(own.damping[9], 0.99))
     calibrated = fx.assemble_plant(fit.calibrated(data), ports()).discretized(RATE, delay=1)
-    joint = calibrated.uncertain(fit.uncertainty(data), modes=[5, 9, 12])
+    joint = calibrated.uncertain(fx.plant.Fit(fit.uncertainty(data), modes=[5, 9, 12]))
     assert [d.mode for d in joint.deltas] == [5, 5, 9, 9, 12, 12]
     assert joint.frequencies[9] == pytest.approx(1e-3)
     np.testing.assert_allclose(np.diag(joint.covariance), 0.25)
@@ -181,4 +181,4 @@ def test_plants_are_as_uncertain_as_the_fit_says():
     with pytest.raises(ModelError, match="not of the same model"):
         plant.uncertain(fit.uncertainty(data))
     with pytest.raises(LabelError, match="elastic mode"):
-        calibrated.uncertain(fit.uncertainty(data), modes=[2])
+        calibrated.uncertain(fx.plant.Fit(fit.uncertainty(data), modes=[2]))

@@ -7,7 +7,7 @@ import oracles_updating as oracle
 from flexplant.errors import ModelError, ShapeError
 from flexplant.identification import MeasuredModes
 from flexplant.modes import solve_modes
-from flexplant.plant import Actuator, Poi, Ports, Sensor, assemble_plant
+from flexplant.plant import Actuator, Fit, Poi, Ports, Sensor, assemble_plant
 from flexplant.structure import ModalDamping, chain
 from flexplant.updating import (
     Eigenvalues,
@@ -68,7 +68,7 @@ def test_three_per_cent_are_found(thickness, plate):
     ends = {"at": plate.grid[0]}
     ports = Ports(u=[Actuator("u", **ends)], z=[Poi("die", at=plate.grid[12], axes=("z",))],
                   y=[Sensor("y", **ends)])  # fmt: skip
-    deltas = assemble_plant(fit.model, ports).uncertain(fit, modes=[6], deviations=1.0).deltas
+    deltas = assemble_plant(fit.model, ports).uncertain(Fit(fit, modes=[6], deviations=1.0)).deltas
     wanted = 2 * fit.std[0] / (1.03 * H)
     assert deltas[0].scale == pytest.approx(wanted, rel=1e-3)
 

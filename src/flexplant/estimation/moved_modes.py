@@ -13,7 +13,8 @@ from ..identification import MeasuredModes
 from ..lti.frequency import frequency_response
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from ..plant.uncertainty.uncertain_plant import Delta, with_changes
+from ..plant.uncertainty.delta import Delta, with_changes
+from ..plant.uncertainty.mode_delta import DampingDelta, FrequencyDelta
 from .estimate import Estimate
 from .estimator import KalmanEstimator
 from .innovations import InnovationLines, density_of, whitening
@@ -52,8 +53,8 @@ class ModeChange(NamedTuple):
         """The relative changes of stiffness and damping, for `with_changes`."""
         n = self.mode
         return [
-            (Delta(f"mode{n}:freq", n, "freq", 1.0), float(np.expm1(2.0 * self.frequency))),
-            (Delta(f"mode{n}:damping", n, "damping", 1.0), float(np.expm1(self.decay))),
+            (FrequencyDelta.of(n, 1.0), float(np.expm1(2.0 * self.frequency))),
+            (DampingDelta.of(n, 1.0), float(np.expm1(self.decay))),
         ]
 
 

@@ -234,7 +234,7 @@ def design_hinf_filter(plant: StandardPlant | System, *, accuracy: float = 1e-3)
     return RobustFilter(system, plant, K, L_z, sizes, own_variances(model, K, L_z), certificate)
 
 
-def _central_gains(m: FilterModel, gamma: float) -> Gains | None:
+def _central_gains(m: FilterModel, gamma: float) -> GainPair | None:
     """Return the gains of the central filter of a level, None when there is none."""
     rows, nz = np.vstack([m.C2, m.C1]), len(m.C1)
     weight = la.block_diag(m.R, -(gamma**2) * np.eye(nz))
@@ -252,7 +252,7 @@ def _central_gains(m: FilterModel, gamma: float) -> Gains | None:
     left = m.C1 @ (P - gain @ m.C2 @ P) @ m.C1.T
     if np.max(np.linalg.eigvalsh(0.5 * (left + left.T))) >= gamma**2:
         return None
-    return Gains(m.A @ gain + shift, m.C1 @ gain)
+    return GainPair(m.A @ gain + shift, m.C1 @ gain)
 
 
 #: width of the smooth maximum relative to the largest value, from coarse to fine
@@ -342,11 +342,11 @@ def design_minimax_filter(
     hint = "Pass plant.uncertain(fit).sample(rng, 20)."
     listed = members(machines, StandardPlant, "machines", hint)
     others = [same_pois(plant, other) for other in listed]
-    start = Gains(kalman.predictor_gain, model.C1 @ kalman.gain)
+    start = GainPair(kalman.predictor_gain, model.C1 @ kalman.gain)
     P = kalman.predicted_covariance
     scale, unit = scale_of(P.diagonal()), np.sqrt(sizes.size) * sizes[:, None]
 
-    def part(gains: Gains) -> FilterPart:
+    def part(gains: GainPair) -> FilterPart:
         return filter_part(model, gains, scale, unit)
 
     errors = [machine_error(plant, model, other, start, scale, unit) for other in others]
@@ -406,15 +406,15 @@ class _Units(NamedTuple):
         values, vectors = np.linalg.eigh(innovation / size / size[:, None])
         return cls(states, (vectors / np.sqrt(values)).T / size, *into)
 
-    def change(self, x: FloatArray) -> Gains:
+    def change(self, x: FloatArray) -> GainPair:
         """Return the change of the gains for a vector (n ny + nz ny,)."""
         n, ny = len(self.states), len(self.right)
         K, L = x[: n * ny].reshape(n, ny), x[n * ny :].reshape(-1, ny)
-        return Gains(
+        return GainPair(
             self.scale[:, None] * (self.states @ K @ self.right), self.unit * (L @ self.right)
         )
 
-    def slope(self, rate: Gains) -> FloatArray:
+    def slope(self, rate: GainPair) -> FloatArray:
         """Return the derivatives to that vector from those to gains in scaled states."""
         both = self.states.T @ rate.K @ self.right.T, rate.L_z @ self.right.T
         return np.concatenate([one.reshape(-1) for one in both])
@@ -422,21 +422,21 @@ class _Units(NamedTuple):
 
 def _best_gains(
     errors: Sequence[MachineError],
-    part: Callable[[Gains], FilterPart],
+    part: Callable[[GainPair], FilterPart],
     units: _Units,
-    start: Gains,
+    start: GainPair,
     steps: int,
-) -> tuple[Gains, float]:
+) -> tuple[GainPair, float]:
     """Return the best gains that were found, and the relative slope there."""
     from scipy.optimize import minimize
 
-    best: list[tuple[float, Gains]] = []
+    best: list[tuple[float, GainPair]] = []
 
     def smooth(x: FloatArray, width: float, scale: float) -> tuple[float, FloatArray]:
         """Return the smooth maximum relative to a scale, and its slope."""
         tick(STEPS)
         change = units.change(x)
-        at = Gains(start.K + change.K, start.L_z + change.L_z)
+        at = GainPair(start.K + change.K, start.L_z + change.L_z)
         try:
             shared = part(at)
             found = [error.value_and_slopes(shared) for error in errors]
@@ -473,7 +473,7 @@ def _best_gains(
 _MISSED = 1e-7
 
 
-class Gains(NamedTuple):
+class GainPair(NamedTuple):
     """K (n, ny) and L_z (nz, ny), or the derivatives of a number to them."""
 
     K: FloatArray
@@ -492,7 +492,7 @@ class FilterPart(NamedTuple):
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def filter_part(m: FilterModel, gains: Gains, scale: FloatArray, unit: FloatArray) -> FilterPart:
+def filter_part(m: FilterModel, gains: GainPair, scale: FloatArray, unit: FloatArray) -> FilterPart:
     """Return the part of the errors that does not depend on the machine."""
     K, L, C0 = gains.K / scale[:, None], gains.L_z / unit, m.C2 * scale
     repeated = powers(m.A * scale / scale[:, None] - K @ C0)
@@ -517,7 +517,7 @@ class MachineError(NamedTuple):
     driven: FloatArray
     root: FloatArray
 
-    def value_and_slopes(self, part: FilterPart) -> tuple[float, Gains]:
+    def value_and_slopes(self, part: FilterPart) -> tuple[float, GainPair]:
         """Return the mean relative variance and its derivatives to K and L of the part."""
         # `J = tr(E X E')`, X = F X F' + N N', Y = F' Y F + E' E: dJ/dF = 2 Y F X, dJ/dN = 2 Y N,
         # dJ/dE = 2 E X with `F = [A, 0; B, A_o]`, B = K C - back; of Y the rows of the filter are
@@ -544,14 +544,14 @@ class MachineError(NamedTuple):
         to_N[:, own:] += Y_oe @ self.G
         K = to_Fe @ self.C.T - to_Fo @ part.C0.T + to_N @ self.root.T
         L = -to_e @ self.C.T + to_o @ part.C0.T + direct @ self.root.T
-        return value, Gains(2 * K, 2 * L)
+        return value, GainPair(2 * K, 2 * L)
 
 
 def machine_error(
     plant: StandardPlant,
     model: FilterModel,
     machine: StandardPlant,
-    start: Gains,
+    start: GainPair,
     scale: FloatArray,
     unit: FloatArray,
 ) -> MachineError:

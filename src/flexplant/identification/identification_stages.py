@@ -49,7 +49,7 @@ from .pole_test import (
     unwindowed,
     warned,
 )
-from .refine import Exhausted, Fit, Lines, Products, pivoted, refined, scaled_inverse
+from .refine import Exhausted, Lines, PoleFit, Products, pivoted, refined, scaled_inverse
 from .result import IdentifiedModes, answer, hann_segment, leakage_warned
 
 #: half-widths beside a pole within which another one may stand for the same resonance
@@ -57,8 +57,8 @@ BESIDE = 3.0
 
 
 def gated(
-    fit: Fit, steps: int, *, alone: bool, compare: bool
-) -> tuple[Fit, IntArray, tuple[Rejected, ...]]:
+    fit: PoleFit, steps: int, *, alone: bool, compare: bool
+) -> tuple[PoleFit, IntArray, tuple[Rejected, ...]]:
     """Return the fit without poles that are none, the places of those reported, and the others."""
     # twins, and poles that nothing is known of, are left out of the fit, one by one; what lies at
     # the edge of the band or is mains remains in it, not reported. Poles chosen by hand (not
@@ -81,13 +81,13 @@ def gated(
     return fit, kept, tuple(sorted(listed))
 
 
-def _without(fit: Fit, place: int, steps: int) -> Fit:
+def _without(fit: PoleFit, place: int, steps: int) -> PoleFit:
     """Return the fit without one of its poles."""
     return refined(fit.lines, *fit.rest(place), steps=steps, strict=False)
 
 
 def steady(
-    fit: Fit, reported: IntArray, apart: Disagreement
+    fit: PoleFit, reported: IntArray, apart: Disagreement
 ) -> tuple[IntArray, tuple[Rejected, ...]]:
     """Return which poles outputs (or inputs) that disagree share, and the others."""
     # one beside another, whose damping at one output is not known from zero (95 %), stands for what
@@ -121,13 +121,13 @@ def _none_left(listed: Sequence[Rejected]) -> SolverError:
     )
 
 
-def rejection(fit: Fit, k: int, reason: str) -> Rejected:
+def rejection(fit: PoleFit, k: int, reason: str) -> Rejected:
     """Return the line of a list of what is not reported."""
     pole = complex(fit.poles[k])
     return abs(pole) / (2 * np.pi), -pole.real / abs(pole), reason
 
 
-def _needless(fit: Fit, steps: int, alone: bool, compare: bool) -> tuple[int, str] | None:
+def _needless(fit: PoleFit, steps: int, alone: bool, compare: bool) -> tuple[int, str] | None:
     """Return a pole that is to be left out, and why."""
     size, worse = np.abs(fit.poles), max(1.0, fit.misfit) * fit.lines.inflation
     variance = np.diag(scaled_inverse(fit.gradient()[0]))[: 2 * fit.m] * worse
@@ -159,7 +159,7 @@ def _needless(fit: Fit, steps: int, alone: bool, compare: bool) -> tuple[int, st
     return None
 
 
-def lesser(fit: Fit, vectors: ComplexArray, alike: float = 0.0) -> list[int]:
+def lesser(fit: PoleFit, vectors: ComplexArray, alike: float = 0.0) -> list[int]:
     """Return the weaker poles beside others (of vectors of so high a MAC), the weakest first."""
     height, found = strength(fit), []
     for k in np.argsort(height):
@@ -170,7 +170,7 @@ def lesser(fit: Fit, vectors: ComplexArray, alike: float = 0.0) -> list[int]:
     return found
 
 
-def single(lines: Lines, fit: Fit, vectors: ComplexArray, steps: int) -> Fit:
+def single(lines: Lines, fit: PoleFit, vectors: ComplexArray, steps: int) -> PoleFit:
     """Return the fit of lines, of one pole a resonance, whose participation are these vectors."""
     # rows that disagree give each resonance several poles of one participation (or, exchanged,
     # shape). It is held: poles that the rows do not share would bend it
@@ -271,7 +271,7 @@ class _Stage(NamedTuple):
     """Lines and their fit."""
 
     ready: PreparedLines
-    fit: Fit
+    fit: PoleFit
 
     @property
     def lines(self) -> Lines:
@@ -406,7 +406,7 @@ def _answered(
         apart = disagreement(fit, gain_due_of_own_poles(fit), excess)
         if apart is not None:
             reported, others = steady(fit, reported, apart)
-            fit = Fit(lines, apart.poles, fit.participation, fit.pivots)
+            fit = PoleFit(lines, apart.poles, fit.participation, fit.pivots)
             rejected += others
     # a first answer may leave some misfit, but not so much that deviations are twice as large
     if compare or task.budget.done > BUDGET or (begin.alone and fit.misfit > LARGE):
@@ -415,7 +415,7 @@ def _answered(
     if task.side == RUNS:
         ready = ready.over_runs(task.runs)
         lines = replace(lines, data=ready.data, weight=ready.weight, setups=())
-        fit = Fit(lines, fit.poles, fit.participation, fit.pivots)
+        fit = PoleFit(lines, fit.poles, fit.participation, fit.pivots)
     found = answer(
         *(task.frf, ready, fit, reported, task.labels, begin.diagram),
         *(tuple(sorted(weaker + rejected + ready.mains)), reason, apart),
@@ -456,7 +456,7 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
     """
     spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
     none = np.zeros((lines.data.shape[1], 0), dtype=np.complex128)
-    fit = Fit(lines, none[0], none)
+    fit = PoleFit(lines, none[0], none)
     ends = 2 * np.pi * np.array([lines.freq[FLANK], lines.freq[-1 - FLANK]])
     for _ in range(MOST):
         trials = [one for rivals in missed_poles(fit) for one in rivals]
@@ -469,17 +469,17 @@ def _at_peaks(lines: Lines) -> PoleSelection | None:
         best = max(trials, key=lambda trial: trial.gain - trial.least, default=None)
         if best is None or best.gain < best.least:
             break
-        fit = Fit(lines, best.poles, best.participation)
+        fit = PoleFit(lines, best.poles, best.participation)
     return PoleSelection(fit.poles, fit.participation) if fit.poles.size else None
 
 
 def _first_fit(
     lines: Lines, chosen: PoleSelection, alone: bool, steps: int
-) -> tuple[Fit, tuple[Rejected, ...]]:
+) -> tuple[PoleFit, tuple[Rejected, ...]]:
     """Return the fit near the poles chosen, with all residual terms and no search for others."""
     # of more poles than are requested the strongest are kept; the others are returned too
     if not alone:
-        fit = Fit(lines, chosen.poles, chosen.participation)
+        fit = PoleFit(lines, chosen.poles, chosen.participation)
         now = fit.poles, fit.participation
         return (refined(lines, *now, steps=steps, strict=False) if steps else fit), ()
     fit = supported(lines, chosen.poles, chosen.participation)

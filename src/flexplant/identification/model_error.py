@@ -9,7 +9,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray
 from ..modes.matching import mac_matrix
 from ..tolerances import TINY
-from .refine import Fit, scaled_inverse
+from .refine import PoleFit, scaled_inverse
 
 #: MAC from which two shapes are one: they differ by less than what a neighbour's tail makes
 ALIKE = 0.9
@@ -36,12 +36,12 @@ ODD = 6.0
 NEAR, WIDE = 20.0, 3.0
 
 
-def own_cost(fit: Fit) -> float:
+def own_cost(fit: PoleFit) -> float:
     """Return the cost of fits of each output alone, with poles of its own."""
     return sum(one.cost for one in fit.own)
 
 
-def outputs_disagree(fit: Fit, least: float = np.inf) -> bool:
+def outputs_disagree(fit: PoleFit, least: float = np.inf) -> bool:
     """Return whether poles of each output's own leave noise alone, shared ones far more.
 
     And less than another fit, of more poles, does (`least`). Where the shared poles are is known
@@ -58,7 +58,7 @@ def outputs_disagree(fit: Fit, least: float = np.inf) -> bool:
     return alone < min(least, free + noise) and alone * NOISE < fit.cost
 
 
-def coherence(fit: Fit, pole: complex) -> float:
+def coherence(fit: PoleFit, pole: complex) -> float:
     """Return by how much more a misfit near a pole lowers the cost by chance than noise does."""
     # the mean of `|e|^2/\sigma^2` there, times `1 + 2 \sum_k \rho_k` of the correlation of e over
     # neighbouring lines: misfit that is smooth over some of them counts as one error
@@ -80,14 +80,14 @@ def coherence(fit: Fit, pole: complex) -> float:
     return max(1.0, power / (2.0 * error.size)) * max(1.0, total / lines.inflation)
 
 
-def strength(fit: Fit) -> FloatArray:
+def strength(fit: PoleFit) -> FloatArray:
     """Return the height of each resonance, weighted as the lines are."""
     power = np.sum(fit.lines.weight**2, axis=(1, 2)) / fit.lines.freq.size
     height = np.sqrt(power @ np.abs(fit.shapes) ** 2) / -fit.poles.real
     return np.asarray(height * np.linalg.norm(fit.participation, axis=0))
 
 
-def twin_poles(fit: Fit) -> tuple[int, int] | None:
+def twin_poles(fit: PoleFit) -> tuple[int, int] | None:
     """Return two poles within a bandwidth with the same shape and participation, the weak one last.
 
     One resonance that is no straight circle (leakage, amplitude) looks so; with one input two modes
@@ -134,7 +134,7 @@ class Disagreement:
         return np.asarray(formal + self.correlation * np.outer(rest, rest))
 
 
-def disagreement(fit: Fit, least: float, excess: float) -> Disagreement | None:
+def disagreement(fit: PoleFit, least: float, excess: float) -> Disagreement | None:
     """Return by how much the outputs of a fit differ, and the mean of their own poles."""
     # None where poles of their own lower the cost by less than `least`, or do not explain nearly
     # all of the cost's `excess` over that of noise: something else is wrong then
@@ -146,7 +146,7 @@ def disagreement(fit: Fit, least: float, excess: float) -> Disagreement | None:
     places = np.array([np.concatenate([one.poles.real, one.poles.imag]) for one in own])
     # an output that hardly sees a mode may have its own pole anywhere: known no better than there
     parted = [
-        Fit(fit.lines.of_rows(rows), fit.poles, fit.participation, fit.pivots)
+        PoleFit(fit.lines.of_rows(rows), fit.poles, fit.participation, fit.pivots)
         for rows in fit.lines.parts
     ]
     seen, alone = (np.array([_variance(one) for one in fits]) for fits in (parted, own))
@@ -167,13 +167,13 @@ def disagreement(fit: Fit, least: float, excess: float) -> Disagreement | None:
     return Disagreement(size, poles, spread, deviation, weighted.T @ weighted, odd)
 
 
-def _variance(one: Fit) -> FloatArray:
+def _variance(one: PoleFit) -> FloatArray:
     """Return the variances (2 m,) of a fit's poles, its participation held."""
     N = one.gradient()[0][: 2 * one.m, : 2 * one.m]
     return np.asarray(one.lines.inflation * np.diag(scaled_inverse(N)))
 
 
-def _strayed(fit: Fit, own: list[Fit]) -> tuple[FloatArray, FloatArray]:
+def _strayed(fit: PoleFit, own: list[PoleFit]) -> tuple[FloatArray, FloatArray]:
     """Return the squares (n, m) of how far own poles are that stand for something else."""
     # first of those that came nearer to another shared pole, then of those that are much broader
     # than in most outputs: where an output hardly sees a mode, its pole becomes a part of the

@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ..checks import ComplexArray, FloatArray
 from ..errors import SolverError, attempted, warn
 from .model_error import coherence, own_cost, twin_poles
-from .refine import Fit, Lines, pivoted, refined
+from .refine import Lines, PoleFit, pivoted, refined
 
 #: probability that noise anywhere in the band passes for a pole
 CHANCE = 1e-3
@@ -20,7 +20,7 @@ CHANCE = 1e-3
 ALARM = 1e-9
 
 
-def supported(lines: Lines, poles: ComplexArray, part: ComplexArray) -> Fit:
+def supported(lines: Lines, poles: ComplexArray, part: ComplexArray) -> PoleFit:
     """Leave out, one by one, poles that noise alone may explain; SolverError when none is left."""
     least = gain_due_of_pole(lines)
     fit = pivoted(lines, poles, part)
@@ -50,7 +50,7 @@ def _seen(lines: Lines, poles: ComplexArray, part: ComplexArray, kept: list[int]
     if -poles[k].real > spacing:
         return True
     rest = [other for other in kept if other != k]
-    less, more = (Fit(lines, poles[some], part[:, some]).model for some in (rest, kept))
+    less, more = (PoleFit(lines, poles[some], part[:, some]).model for some in (rest, kept))
     return corroborated(lines, less, more)
 
 
@@ -113,12 +113,12 @@ class Trial(NamedTuple):
 #: the rivals of each place at which something may be changed, the best ones first
 Proposals: TypeAlias = Iterable[list[Trial]]
 #: what proposes one kind of change
-Kind: TypeAlias = Callable[[Fit], Proposals]
+Kind: TypeAlias = Callable[[PoleFit], Proposals]
 
 
 def improved(
-    fit: Fit, kinds: Sequence[tuple[Kind, int]], *, steps: int, rough: bool = False
-) -> Fit:
+    fit: PoleFit, kinds: Sequence[tuple[Kind, int]], *, steps: int, rough: bool = False
+) -> PoleFit:
     """Return the fit with the changes that lower its cost by more than noise does."""
     # each kind proposes changes, until none is accepted or so many are: refined, it lowers the cost
     # by what it must, no pole becomes broader than a mode, and a pole more is borne out by several
@@ -135,7 +135,7 @@ def improved(
     return fit
 
 
-def _accepted(fit: Fit, trial: Trial, steps: int) -> Fit | None:
+def _accepted(fit: PoleFit, trial: Trial, steps: int) -> PoleFit | None:
     """Return the refined fit of a trial where it is better by more than noise makes it."""
     more_poles = trial.poles.size > fit.m
     if trial.gain < min(trial.least, BEFORE * trial.least) or (
@@ -160,7 +160,7 @@ def _accepted(fit: Fit, trial: Trial, steps: int) -> Fit | None:
     return more
 
 
-def shared(fit: Fit, more: Fit, least: float) -> bool:
+def shared(fit: PoleFit, more: PoleFit, least: float) -> bool:
     """Return whether the outputs share what a pole more explains, beyond what else they are off by.
 
     It is to lower the cost by what it must, or by the `coherence` of what is left near it; where
@@ -178,10 +178,10 @@ def shared(fit: Fit, more: Fit, least: float) -> bool:
     return fit.cost - apart < gain_due_of_own_poles(fit) or apart - own_cost(more) > least
 
 
-def _proven(fit: Fit, more: Fit, least: float) -> bool:
+def _proven(fit: PoleFit, more: PoleFit, least: float) -> bool:
     """Return whether a few outputs, with poles of their own, prove the pole more already."""
     # most poles are: fits of the other outputs, which take most of the time, are not made then
-    found: list[Fit] = []
+    found: list[PoleFit] = []
     gain = 0.0
     for rows, own in zip(fit.lines.parts, more.own, strict=True):
         alone = None
@@ -193,23 +193,23 @@ def _proven(fit: Fit, more: Fit, least: float) -> bool:
         gain += alone.cost - own.cost
         if gain > least:
             return True
-    vars(fit)["own"] = found  # all of them were made, as `Fit.own` does
+    vars(fit)["own"] = found  # all of them were made, as `PoleFit.own` does
     return False
 
 
-def newest_pole(fit: Fit, more: Fit) -> int:
+def newest_pole(fit: PoleFit, more: PoleFit) -> int:
     """Return which pole of a fit of more poles is farthest from those before."""
     away = [np.min(np.abs(pole - fit.poles), initial=np.inf) for pole in more.poles]
     return int(np.argmax(away))
 
 
-def gain_due_of_own_poles(fit: Fit) -> float:
+def gain_due_of_own_poles(fit: PoleFit) -> float:
     """Return by how much poles of their own at each output must lower the cost."""
     count = 2 * fit.m * (len(fit.lines.parts) - 1)
     return max(1.0, fit.misfit) * gain_due(fit.lines, max(1, count), ALARM)
 
 
-def unwindowed(fit: Fit) -> Proposals:
+def unwindowed(fit: PoleFit) -> Proposals:
     """Propose lines that are not seen through the window of segments."""
     # H2, Hv and bursts that end within a segment are not, H1 of an input that is white nearby is
     if fit.lines.segment is not None:
@@ -217,7 +217,7 @@ def unwindowed(fit: Fit) -> Proposals:
         yield [Trial(plain, fit.poles, fit.participation, np.inf, 0.0)]
 
 
-def dropped(fit: Fit) -> Proposals:
+def dropped(fit: PoleFit) -> Proposals:
     """Propose the poles that are modes and that noise alone does not explain."""
     light = np.flatnonzero(-fit.poles.real < BROADEST * np.abs(fit.poles))
     less = supported(fit.lines, fit.poles[light], fit.participation[:, light])
@@ -225,30 +225,30 @@ def dropped(fit: Fit) -> Proposals:
         yield [Trial(fit.lines, less.poles, less.participation, np.inf, -np.inf)]
 
 
-def merged(fit: Fit) -> Proposals:
+def merged(fit: PoleFit) -> Proposals:
     """Propose the fit without the weaker one of two poles of one resonance."""
     pair = twin_poles(fit)
     if pair is not None:
         yield [Trial(fit.lines, *fit.rest(pair[1]), np.inf, -np.inf)]
 
 
-def _refit_terms(fit: Fit, upper: int, chance: float) -> Trial:
+def _refit_terms(fit: PoleFit, upper: int, chance: float) -> Trial:
     """Return the fit with another number of residual terms of modes above the band."""
     lines, count = fit.lines, upper - fit.lines.upper
     other = replace(lines, upper=upper)
-    gain = fit.cost - Fit(other, fit.poles, fit.participation).cost
+    gain = fit.cost - PoleFit(other, fit.poles, fit.participation).cost
     channels = lines.data.shape[0] * lines.data.shape[1]
     least = np.sign(count) * max(1.0, fit.misfit) * gain_due(lines, channels * abs(count), chance)
     return Trial(other, fit.poles, fit.participation, gain, least)
 
 
-def fewer_terms(fit: Fit) -> Proposals:
+def fewer_terms(fit: PoleFit) -> Proposals:
     """Propose the fewest residual terms that the data let pass."""
     trials = (_refit_terms(fit, upper, FEW) for upper in UPPER if upper < fit.lines.upper)
     yield [trial for trial in trials if trial.gain > trial.least]
 
 
-def more_terms(fit: Fit) -> Proposals:
+def more_terms(fit: PoleFit) -> Proposals:
     """Propose more residual terms where the data require them, as many as the lines afford."""
     # folded modes are weak and broad: what few terms leave of them is not seen, but biases
     lines = fit.lines
@@ -257,7 +257,7 @@ def more_terms(fit: Fit) -> Proposals:
     yield [trial for trial in trials if trial.gain > trial.least]
 
 
-def split_proposals(fit: Fit) -> Proposals:
+def split_proposals(fit: PoleFit) -> Proposals:
     r"""Propose to take those poles apart that are two.
 
     A pole of two modes, repeated or so close that one pole passes for both, requires residues
@@ -270,13 +270,13 @@ def split_proposals(fit: Fit) -> Proposals:
     yield sorted((_more_poles(fit, *pair) for pair in pairs), key=lambda trial: -trial.gain)
 
 
-def _more_poles(fit: Fit, poles: ComplexArray, part: ComplexArray) -> Trial:
+def _more_poles(fit: PoleFit, poles: ComplexArray, part: ComplexArray) -> Trial:
     """Return the trial of a fit with a pole more."""
     least = gain_due_of_pole(fit.lines) * max(1.0, fit.misfit)
-    return Trial(fit.lines, poles, part, fit.cost - Fit(fit.lines, poles, part).cost, least)
+    return Trial(fit.lines, poles, part, fit.cost - PoleFit(fit.lines, poles, part).cost, least)
 
 
-def _pairs(fit: Fit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
+def _pairs(fit: PoleFit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
     """Return poles and participation with pole k twice: other directions, other places."""
     pole, own = fit.poles[k], fit.participation[:, [k]]
     delta = 1j * APART * abs(pole.real)
@@ -291,19 +291,19 @@ def _pairs(fit: Fit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
     return pairs
 
 
-def relocated(fit: Fit) -> Proposals:
+def relocated(fit: PoleFit) -> Proposals:
     """Propose other places for weak poles, within seven half-widths."""
     # the likelihood of a mode that is hardly seen has several peaks; a fit climbs the nearest
     for k, pole in enumerate(fit.poles):
         if fit.m == 1 or -pole.real > 0.05 * abs(pole):
             continue
-        if Fit(fit.lines, *fit.rest(k)).cost - fit.cost > WEAK * gain_due_of_pole(fit.lines):
+        if PoleFit(fit.lines, *fit.rest(k)).cost - fit.cost > WEAK * gain_due_of_pole(fit.lines):
             continue
         trials = []
         for shift in np.arange(-7.0, 7.1, 0.7):
             poles = fit.poles.copy()
             poles[k] = pole + 1j * shift * abs(pole.real)
-            trials.append((Fit(fit.lines, poles, fit.participation).cost, abs(shift), poles))
+            trials.append((PoleFit(fit.lines, poles, fit.participation).cost, abs(shift), poles))
         best = sorted(trials, key=lambda trial: trial[0])[:RIVALS]
         # refined, it is to lower the cost: where it begins it does so seldom
         yield [
@@ -313,7 +313,7 @@ def relocated(fit: Fit) -> Proposals:
         ]
 
 
-def missed_poles(fit: Fit) -> Proposals:
+def missed_poles(fit: PoleFit) -> Proposals:
     """Propose a pole at the highest peaks of what is left, single lines apart."""
     for peak in [peak for peak in unexplained(fit) if not peak.isolated][:TRIED]:
         yield [_more_poles(fit, *_with_pole(fit, peak))]
@@ -345,7 +345,7 @@ class Peak:
     isolated: bool = False  # one or two lines, and noise alone around them
 
 
-def unexplained(fit: Fit) -> list[Peak]:
+def unexplained(fit: PoleFit) -> list[Peak]:
     """Return the stretches whose residual is more than noise, each once, the highest first."""
     # over L lines of c channels the sum of `2 |e|^2/\sigma^2` is chi-square with 2 c L degrees of
     # freedom. Its middle and spread are also taken from all stretches (median, median absolute
@@ -416,7 +416,7 @@ def _surpassing(lines: Lines, model: ComplexArray, where: slice) -> bool:
     return bool(-nu * np.log1p(x / nu) < np.log(CHANCE / lines.data.size))
 
 
-def _is_exact(fit: Fit) -> bool:
+def _is_exact(fit: PoleFit) -> bool:
     """Whether a fit leaves rounding only."""
     data = fit.lines.data
     return bool(la.norm(data - fit.model) < ROUNDING * la.norm(data))
@@ -432,7 +432,7 @@ def _is_smooth(lines: Lines, model: ComplexArray) -> bool:
     return bool(np.median(near / np.convolve(power[1:], window, mode="valid")) > 0.5)
 
 
-def _with_pole(fit: Fit, peak: Peak) -> tuple[ComplexArray, ComplexArray]:
+def _with_pole(fit: PoleFit, peak: Peak) -> tuple[ComplexArray, ComplexArray]:
     """Return poles and participation with the one added that explains a peak best."""
     # of frequencies across the peak and some damping ratios; the participation is the leading right
     # singular vector of what the pole has in common with the residual

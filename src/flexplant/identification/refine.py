@@ -125,8 +125,8 @@ def refined(
     fine: bool = False,
     below: float = np.inf,
     poles_only: bool = False,
-    first: Fit | None = None,
-) -> Fit:
+    first: PoleFit | None = None,
+) -> PoleFit:
     r"""Return the weighted least-squares fit of poles and residual terms.
 
     .. math:: H_{oi}(s) = \sum_k \frac{\psi_{ok} l_{ik}}{s - \lambda_k}
@@ -166,7 +166,7 @@ def refined(
             trial = _apply_step(poles, participation, pivots, step)
             near = np.abs(trial[0]).max() < farthest and np.abs(trial[1]).max() < 1e6
             if near and np.all(trial[0].imag > 0):
-                better = Fit(lines, *trial, pivots)
+                better = PoleFit(lines, *trial, pivots)
                 gained = now.cost - better.cost
                 if gained >= 0:
                     break
@@ -202,10 +202,12 @@ def scaled_inverse(N: FloatArray) -> FloatArray:
     return np.asarray(la.pinvh(N / np.outer(size, size), rtol=RANK) / np.outer(size, size))
 
 
-def pivoted(lines: Lines, poles: ComplexArray, participation: ComplexArray) -> Fit:
+def pivoted(lines: Lines, poles: ComplexArray, participation: ComplexArray) -> PoleFit:
     """Return the fit whose largest entry of each column of the participation is 1, and held."""
     pivots = np.argmax(np.abs(participation), axis=0)
-    return Fit(lines, poles, participation / participation[pivots, np.arange(poles.size)], pivots)
+    return PoleFit(
+        lines, poles, participation / participation[pivots, np.arange(poles.size)], pivots
+    )
 
 
 def unsettled(count: int, steps: int) -> SolverError:
@@ -216,7 +218,7 @@ def unsettled(count: int, steps: int) -> SolverError:
     )
 
 
-class Fit:
+class PoleFit:
     """The best shapes and residual terms at given poles (m,) and participation (n_in, m).
 
     `pivots` are the entries of its columns that are held at 1 where they are parameters.
@@ -286,11 +288,11 @@ class Fit:
         return found
 
     @cached_property
-    def own(self) -> list[Fit]:
+    def own(self) -> list[PoleFit]:
         """The fits of each output, or set-up, alone."""
         return [self.of_rows(rows) for rows in self.lines.parts]
 
-    def of_rows(self, rows: IntArray, below: float = np.inf) -> Fit:
+    def of_rows(self, rows: IntArray, below: float = np.inf) -> PoleFit:
         """Return the fit of some outputs alone: poles of their own, the participation of all."""
         return refined(
             *(self.lines.of_rows(rows), self.poles, self.participation),

@@ -16,13 +16,13 @@ from .diagram import StabilisationDiagram
 from .line_weights import PreparedLines, Rejected
 from .measured import MeasuredModes
 from .model_error import Disagreement
-from .refine import Fit, axis, free_inputs, pole_terms, residual_terms, scaled_inverse
+from .refine import PoleFit, axis, free_inputs, pole_terms, residual_terms, scaled_inverse
 
 
 def answer(
     frf: Frf,
     ready: PreparedLines,
-    fit: Fit,
+    fit: PoleFit,
     reported: IntArray,
     labels: Mapping[str, str],
     diagram: StabilisationDiagram | None,
@@ -78,7 +78,7 @@ def answer(
     )
 
 
-def _covariances(fit: Fit, ready: PreparedLines) -> tuple[FloatArray, ComplexArray]:
+def _covariances(fit: PoleFit, ready: PreparedLines) -> tuple[FloatArray, ComplexArray]:
     """Return the covariance of [Re lambda; Im lambda] and that of shapes and participation."""
     # the latter E[n n^H] of the errors n (n_out + n_in,) of each mode. With poles and participation
     # theta, the error of the shape at output a is `S_a d theta + D_a^T e_a`,

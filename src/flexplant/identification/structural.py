@@ -66,7 +66,7 @@ def structural_modes(
         ("imaginary") and, with `over`, what part of a measured shape the model's modes do not make
         ("expansion"); above a tenth both are warned of.
         ``plant.uncertain(numbered(measured, modes))`` gives the covariance of the poles to the
-        plant, with ``shapes=shape_deviations(measured, dofs)`` that of shapes too.
+        plant, with ``Shapes(shape_deviations(measured, dofs), measured.modes)`` that of shapes too.
 
     Raises
     ------
@@ -329,7 +329,7 @@ def shape_deviations(
     Returns
     -------
     (m, n, count) array
-        v_j over the DOFs of the modes: ``plant.uncertain(measured, shapes=...)``.
+        v_j over the DOFs of the modes: ``plant.uncertain(measured, Shapes(...))``.
 
     Raises
     ------

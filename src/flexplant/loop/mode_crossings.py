@@ -30,7 +30,7 @@ from ..lti.sampling import acting
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..plant.building import sampled_motions
-from ..plant.uncertainty.uncertain_plant import Delta, changed_pairs
+from ..plant.uncertainty.mode_delta import DampingDelta, FrequencyDelta, changed_pairs
 from ..tolerances import SAME, SETTLED, TINY
 from .broken import BrokenLoop, inverted
 
@@ -302,7 +302,8 @@ def _polynomials(
     n, m = plant.system.n_states, len(broken.u)
     A, fed = np.zeros((nodes.size, len(modes), 2, 2)), np.zeros((nodes.size, len(modes), 2, n + m))
     where = {name: j for j, name in enumerate(plant.system.states)}
-    deltas = [Delta("", int(mode), kind, 1.0) for mode in modes]
+    delta = FrequencyDelta if kind == "freq" else DampingDelta
+    deltas = [delta.of(int(mode), 1.0) for mode in modes]
     amounts = (1.0 + nodes) ** 2 - 1.0 if kind == "freq" else nodes
     blocks = [changed_pairs(realisation, [(one, float(x)) for one in deltas]) for x in amounts]
     for i, g in enumerate(sampled_motions(plant, blocks, broken.y, broken.u)):

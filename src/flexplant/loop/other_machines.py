@@ -27,7 +27,8 @@ from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..plant.drawn_machines import draws_with_left_out
 from ..plant.realisation import natural
-from ..plant.uncertainty.uncertain_plant import UncertainPlant, modal_realisation
+from ..plant.uncertainty.mode_delta import modal_realisation
+from ..plant.uncertainty.uncertain_plant import UncertainPlant
 from ..tolerances import TINY
 from .broken import BrokenLoop
 from .mode_crossings import LIMIT, ModeLoops, axis_crossings, size_reached

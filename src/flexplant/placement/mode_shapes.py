@@ -24,7 +24,7 @@ from .problem import Found, Problem, Search
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
+class PlacedShapes:
     """Mass-normalised shapes of a plant's modes, rigid-body modes first."""
 
     phi: FloatArray
@@ -40,7 +40,7 @@ class Shapes:
         return slice(int(np.count_nonzero(self.omega == 0)), None)
 
 
-def shapes_of(plant: StandardPlant, ports: Sequence[Any]) -> Shapes:
+def shapes_of(plant: StandardPlant, ports: Sequence[Any]) -> PlacedShapes:
     """Return the shapes at ports of a plant that was assembled from a structure."""
     real = plant.assembled.realisation
     m = real.n_modes
@@ -51,7 +51,7 @@ def shapes_of(plant: StandardPlant, ports: Sequence[Any]) -> Shapes:
     full = real.inputs[:, 1 : 2 * m : 2]
     rows = [p.row(real) if isinstance(p, SensorPort) else p.push(real) for p in ports]
     stacked = np.array(rows).reshape(len(ports), full.shape[0])
-    return Shapes(stacked @ full, omega, zeta, stacked, full, noise_sizes(ports))
+    return PlacedShapes(stacked @ full, omega, zeta, stacked, full, noise_sizes(ports))
 
 
 class ByShapes(Criterion):
@@ -61,7 +61,7 @@ class ByShapes(Criterion):
     scale: ClassVar[float] = 1.0
 
     @abstractmethod
-    def of(self, plant: StandardPlant, shapes: Shapes) -> Scorer:
+    def of(self, plant: StandardPlant, shapes: PlacedShapes) -> Scorer:
         """Return the scores of choices among the ports that the shapes belong to."""
 
     def __call__(self, plant: StandardPlant) -> float:
@@ -120,7 +120,7 @@ class AutoMac(ByShapes):
     0.0
     """
 
-    def of(self, plant: StandardPlant, shapes: Shapes) -> LargestMac:
+    def of(self, plant: StandardPlant, shapes: PlacedShapes) -> LargestMac:
         """Return the largest entry of choices."""
         return LargestMac(shapes.phi[:, shapes.elastic])
 
@@ -155,7 +155,7 @@ class KineticEnergy(ByShapes):
         default=None, metadata=checked(instance, kind=FEModel | ReducedModel, hint="Pass one.")
     )
 
-    def of(self, plant: StandardPlant, shapes: Shapes) -> SummedWorth:
+    def of(self, plant: StandardPlant, shapes: PlacedShapes) -> SummedWorth:
         """Return the energy of choices."""
         model = plant.assembled.realisation.model if self.model is None else self.model
         if not isinstance(model, FEModel | ReducedModel):
@@ -202,7 +202,7 @@ class SensorIndices(ByShapes):
 
     norm: str = field(default="h2", metadata=checked(one_of, choices=("h2", "hinf", "hankel")))
 
-    def of(self, plant: StandardPlant, shapes: Shapes) -> SummedWorth:
+    def of(self, plant: StandardPlant, shapes: PlacedShapes) -> SummedWorth:
         """Return the indices of choices."""
         kept = shapes.elastic
         # in sqrt(Hz) / pm, so that the indices are numbers of usual size
@@ -282,7 +282,7 @@ class ModeInformation(ByShapes):
     sides: ClassVar[str] = "y"
     elastic: bool = field(default=False, metadata=checked(flag))
 
-    def of(self, plant: StandardPlant, shapes: Shapes) -> ModeRows:
+    def of(self, plant: StandardPlant, shapes: PlacedShapes) -> ModeRows:
         """Return the information of choices."""
         kept = shapes.elastic if self.elastic else slice(None)
         # units in which the best of the sensors has noise 1: constants do not decide

@@ -20,7 +20,7 @@ from ..tolerances import TINY
 from .candidates import SIDES, Port, sampled_plant, side_of, sides_of, with_side
 from .convex import Below, Branch, Convex, Tangent, least_sum
 from .criterion import Criterion, Scorer, Wrapping, as_criterion
-from .mode_shapes import Shapes, shapes_of
+from .mode_shapes import PlacedShapes, shapes_of
 from .problem import RigidPart
 
 MEASURES = ("worst", "mean")
@@ -180,7 +180,7 @@ def _penalised_sum(value: Any, penalty: Any, weight: float) -> Any:
     return value + weight * np.abs(value) * penalty
 
 
-def _worth(shapes: Shapes, which: npt.NDArray[np.bool_]) -> FloatArray:
+def _worth(shapes: PlacedShapes, which: npt.NDArray[np.bool_]) -> FloatArray:
     omega, zeta = shapes.omega[which], shapes.zeta[which]
     return np.asarray(np.sum(shapes.phi[:, which] ** 2 / (4.0 * zeta * omega**3), axis=1))
 

@@ -6,7 +6,8 @@ every model of a machine. The plant is always ``[w; u] -> [z; y]``, and ``u = K 
 - `assemble_plant(model, ports)`: a `StandardPlant`; `standard_plant` of systems made elsewhere.
 - `StandardPlant.discretized(rate, delay=)`: exact sampling, with the noise of each sample.
 - `StandardPlant.weighted(z=, w=)`: with weights for H-infinity; `stage_weights` has a set of them.
-- `StandardPlant.uncertain(fit)`, or of stated errors of frequency, damping, gain, delay.
+- `StandardPlant.uncertain(Frequencies(0.005), Gains(0.02), fit, ...)`: what is not known, opened
+  as Deltas and drawn as machines; a kind of one's own derives from `Uncertainty`.
 - `decouple`: axes of the rigid body; `frequency_response` of structures between their ports.
 
 >>> import flexplant as fx
@@ -107,9 +108,20 @@ from .structure_frf import StructureFrf as StructureFrf
 from .structure_frf import frequency_response as frequency_response
 from .suspension import GroundSpring as GroundSpring
 from .suspension import suspend as suspend
-from .uncertainty.neglected import NeglectedModes as NeglectedModes
-from .uncertainty.neglected import neglected_modes as neglected_modes
-from .uncertainty.uncertain_plant import Delta as Delta
+from .uncertainty.dampings import Dampings as Dampings
+from .uncertainty.delay import Delay as Delay
+from .uncertainty.delta import Delta as Delta
+from .uncertainty.delta import MachineParts as MachineParts
+from .uncertainty.fit import Fit as Fit
+from .uncertainty.frequencies import Frequencies as Frequencies
+from .uncertainty.gains import Gains as Gains
+from .uncertainty.kind import Known as Known
+from .uncertainty.kind import Uncertainty as Uncertainty
+from .uncertainty.neglected import Neglected as Neglected
+from .uncertainty.neglected_modes import NeglectedModes as NeglectedModes
+from .uncertainty.neglected_modes import neglected_modes as neglected_modes
+from .uncertainty.parameter_amounts import Parameters as Parameters
+from .uncertainty.shape_directions import Shapes as Shapes
 from .uncertainty.uncertain_plant import UncertainPlant as UncertainPlant
 from .weights import StageWeights as StageWeights
 from .weights import mixed_sensitivity as mixed_sensitivity

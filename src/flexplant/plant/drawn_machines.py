@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -13,10 +13,10 @@ from ..tolerances import SAME
 from .building import rebuilt
 from .realisation import ModalRealisation, natural
 from .standard import StandardPlant
-from .uncertainty.uncertain_plant import Delta, UncertainPlant, changed_modes, modal_realisation
+from .uncertainty.delta import Delta
+from .uncertainty.mode_delta import DampingDelta, FrequencyDelta, changed_pairs, modal_realisation
+from .uncertainty.uncertain_plant import UncertainPlant
 
-#: kinds of Deltas that say the same of the modes of a larger plant
-_OF_MODES = ("freq", "damping")
 #: std of the logarithm of the damping of a mode that was not measured (one structure's modes
 #: scatter by 20 to 40 %)
 _DAMPING = 0.3
@@ -59,10 +59,17 @@ def draws_with_left_out(
         scattered = np.exp(_DAMPING * apart.standard_normal(len(unknown.modes)))
         every = [*deltas, *unknown.frequencies]
         changes = [(d, float(max(d.scale * x, -0.9))) for d, x in zip(every, amounts, strict=True)]
-        modes = changed_modes(whole, [*changes, *unknown.damped(scattered)])
+        modes = _changed_modes(whole, [*changes, *unknown.damped(scattered)])
         return rebuilt(whole, realisation=_mixed(modes, own_rng, shapes) if shapes else modes)
 
     return (one(each) for each in rng.spawn(count))
+
+
+def _changed_modes(
+    plant: StandardPlant, changes: Sequence[tuple[Delta, float]]
+) -> ModalRealisation:
+    realisation = modal_realisation(plant)
+    return realisation.replace(pairs=changed_pairs(realisation, changes))
 
 
 def damped_less(
@@ -80,7 +87,7 @@ def damped_less(
     ranges = {delta.mode: 0.5 * delta.scale for delta in unknown.frequencies}
     given = uncertain.frequencies.items()
     own = {mode: 0.5 * share for mode, share in given if mode in unknown.modes}
-    return rebuilt(whole, realisation=changed_modes(whole, lower)), ranges | own
+    return rebuilt(whole, realisation=_changed_modes(whole, lower)), ranges | own
 
 
 @dataclass(frozen=True)
@@ -93,8 +100,7 @@ class _Unmeasured:
     @classmethod
     def of(cls, uncertain: UncertainPlant[StandardPlant], whole: StandardPlant) -> Self | None:
         """Return them; None where a Delta is of something else than modes."""
-        kinds = {delta.kind for delta in uncertain.deltas}
-        if uncertain.fit is not None or not kinds <= set(_OF_MODES) or not whole.has_own_modes:
+        if not uncertain.is_modal or not whole.has_own_modes:
             return None
         realisation, ranges = modal_realisation(whole), uncertain.frequencies
         omega, zeta = natural(realisation.pairs)
@@ -108,14 +114,14 @@ class _Unmeasured:
             if least and i + 1 not in ranges and not (i < n and same[i])
         ]
         wide = [mode for mode, r in ranges.items() if r > _MEASURED * (1.0 + SAME) * zeta[mode - 1]]
-        known = {delta.mode for delta in uncertain.deltas if delta.kind == "damping"}
+        known = {one.mode for one in uncertain.deltas if isinstance(one, DampingDelta)}
         modes = tuple(mode for mode in sorted({*left, *wide} - known) if zeta[mode - 1] < 1.0)
-        return cls(modes, tuple(Delta(f"mode{m}:freq", m, "freq", 2.0 * least) for m in left))
+        return cls(modes, tuple(FrequencyDelta.of(mode, 2.0 * least) for mode in left))
 
     def damped(self, factors: FloatArray) -> list[tuple[Delta, float]]:
         """Return the changes by which the damping of each is a multiple of what it was."""
         return [
-            (Delta(f"mode{mode}:damping", mode, "damping", 1.0), float(factor - 1.0))
+            (DampingDelta.of(mode, 1.0), float(factor - 1.0))
             for mode, factor in zip(self.modes, factors, strict=True)
         ]
 

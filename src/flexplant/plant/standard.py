@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy.typing as npt
 
-from ..checks import FloatArray, short
+from ..checks import short
 from ..errors import LabelError, ModelError
 from ..labels import Place
 from ..lti.statespace import StateSpace, System
@@ -22,8 +22,9 @@ from .partition import Partition
 from .ports import Ports
 from .realisation import ModalRealisation, ResidualForm, Structure, plant_modes
 from .rigid_motion import RigidModes, rigid_modes_of
-from .uncertainty.opening import uncertain
-from .uncertainty.uncertain_plant import UncertainPlant
+from .uncertainty.dampings import Dampings
+from .uncertainty.frequencies import Frequencies
+from .uncertainty.uncertain_plant import UncertainPlant, uncertain_plant
 
 _WEIGHTS = "Pass stage_weights(plant, bandwidth), or z={...} and w={...}."
 
@@ -256,61 +257,22 @@ class StandardPlant(Partition):
         return along(self, name, points)
 
     def uncertain(
-        self,
-        source: Any = None,
-        parameters: Any = None,
-        *,
-        frequency: Any = None,
-        damping: Any = None,
-        gain: Any = None,
-        delay: float | None = None,
-        modes: Sequence[int] | None = None,
-        deviations: float = 2.0,
-        neglected: Any = None,
-        shapes: FloatArray | None = None,
+        self, *kinds: Any, frequency: Any = None, damping: Any = None
     ) -> UncertainPlant[StandardPlant]:
-        """Return the plant with the uncertainty of a fit, or a stated one, as Deltas on its modes.
+        """Return the plant with what is not known of it, in any combination.
 
-        The covariance of the parameters goes to the modes by the eigenvalue sensitivities,
-        ``J C J'``; each chosen mode's stiffness omega^2 and damping 2 zeta omega becomes a channel
-        `mode6:freq`, `mode6:damping` with ``|delta| <= 1`` at some standard deviations. Where
-        damping couples the modes (a large damper to ground, an overdamped pair), the parameters of
-        the fit themselves are the Deltas, and act on all modes and shapes.
+        ``plant.uncertain(Frequencies(0.005), Gains(0.02), fit, Neglected(larger))``: each kind is a
+        value, opened as Deltas with ``|delta| <= 1`` and drawn for machines. The order does not
+        matter.
 
         Parameters
         ----------
-        source : UpdateResult, ModalUncertainty or MeasuredModes, optional
-            A fit whose `model` this plant was assembled from (one with a discrepancy counts as its
-            `uncertainty()`: two deviations are what a mode may be off by), the uncertainty of a
-            calibrated model, ``fit.uncertainty(measured)``, or measured poles with mode numbers and
-            a covariance.
-        parameters : sequence of Parameter or {Parameter: float}, optional
-            Those that were given to `update`, in its order; those the fit keeps when not given. Or
-            in place of a source parameters with the amount by which each may be off at delta = 1,
-            in its own unit: ``{AddedMass("41:z"): 0.025}`` for 0.5 kg within 5 %. All that follows
-            may be stated beside these; a mode is then that of the nominal plant, whose K changes
-            by a share of ``omega^2 (M phi)(M phi)'``.
+        *kinds : Uncertainty, UpdateResult, ModalUncertainty or MeasuredModes
+            `Frequencies`, `Dampings`, `Shapes` of modes, `Parameters` of the model, `Gains`,
+            `Delay`, `Neglected` modes, or what a `Fit` leaves open: a fit, its uncertainty or
+            measured modes may be given as they are. A user's own kind derives from `Uncertainty`.
         frequency, damping : float, (m,) array or {mode: float}, optional
-            In place of a source: by what share frequencies and damping of modes may be off, at
-            delta = 1; one for all, one for each of `modes`, or by mode. ``frequency=0.005`` is
-            what an updated model of a structure seldom does better than where it was not measured.
-        gain : float or {name: float}, optional
-            By what share the gains of actuators and sensors may be off: `u1:gain`; one for all, or
-            by name. Beside a source too.
-        delay : float [samples], optional
-            By how much the delay of a sampled plant may be off, more or less. Beside a source too.
-        modes : sequence of int, optional
-            Numbers from 1, rigid-body modes included; all elastic (or all measured) ones when not
-            given.
-        deviations : float
-            Standard deviations at which a delta is 1.
-        neglected : StandardPlant, FEModel, Modes, ReducedModel or NeglectedModes, optional
-            A larger model with the same channels: the difference from w and u to z and y is
-            bounded by additive weights (see `NeglectedModes`).
-        shapes : (m, n, r) array, optional
-            Of measured modes: directions over the n DOFs of the plant's modes, each a standard
-            deviation of the shape, independent (`flexplant.identification.structural`). Each
-            becomes a Delta `mode6:shape1` on what drives the mode and what is seen of it.
+            Short for `Frequencies` and `Dampings`.
 
         Returns
         -------
@@ -321,24 +283,26 @@ class StandardPlant(Partition):
         Raises
         ------
         LabelError
-            When parameters are not those of the fit, or a mode is unknown.
+            When a mode, a port or a parameter is unknown.
         ModelError
-            When there is no covariance, the fit is of another model, the uncertainty covers
-            negative stiffness or damping, or shapes are given that are not real.
+            When nothing is uncertain, or something twice; when a kind is of another model or
+            covers negative stiffness or damping; when no channels express a Delta.
+
+        Examples
+        --------
+        >>> import flexplant as fx
+        >>> from flexplant.plant import Delay, Gains
+        >>> fx.testbeds.three_masses().uncertain(Gains({"u1": 0.02}), Delay(0.2), frequency=0.005)
+        <UncertainPlant: 4 real Deltas at 2 std
+          mode2:freq +- 0.5 %
+          mode3:freq +- 0.5 %
+          u1:gain +- 2 %
+          delay +- 0.2 samples>
         """
-        return uncertain(
-            self if self.uncertainty is None else self.replace(uncertainty=None),
-            source,
-            parameters,
-            frequency=frequency,
-            damping=damping,
-            gain=gain,
-            delay=delay,
-            modes=modes,
-            deviations=deviations,
-            neglected=neglected,
-            shapes=shapes,
-        )
+        stated = [] if frequency is None else [Frequencies(frequency)]
+        more = [] if damping is None else [Dampings(damping)]
+        plain = self if self.uncertainty is None else self.replace(uncertainty=None)
+        return uncertain_plant(plain, [*kinds, *stated, *more])
 
     @cached_property
     def rigid_motions(self) -> RigidModes:

@@ -17,7 +17,7 @@ from ...lti.norms import hinf_norm
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, tick
 from ...plant import StandardPlant, standard_plant
-from ...plant.uncertainty.opening import with_channels
+from ...plant.uncertainty.channels import with_channels
 from ...tolerances import SAME
 from ..controller import Controller
 from ..preparation import prepared

@@ -158,7 +158,7 @@ class _StageTask:
         self.tried: dict[float, float] = {}
         self.failures: dict[float, FlexplantError] = {}
         self.best: _StageTry | None = None
-        self.known = self.plant.uncertain(frequency=self.ranges, modes=list(self.ranges))
+        self.known = self.plant.uncertain(frequency=self.ranges)
         self.loop_plant = self.plant if self.whole is None else self.whole
         #: what was not measured damped by two deviations less, and the ranges of its frequencies
         self.damped_less = damped_less(self.known, self.loop_plant)

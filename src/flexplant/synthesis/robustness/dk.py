@@ -97,7 +97,7 @@ def design_mu(
     Parameters
     ----------
     uncertain : UncertainPlant
-        From `plant.uncertain(fit, neglected=whole)`, continuous or sampled.
+        From `plant.uncertain(fit, plant.Neglected())`, continuous or sampled.
     w, z : mapping {name: weight}, or sequence of str
         Weights of performance, as for `StandardPlant.weighted`, those of `stage_weights` too:
         None leaves a channel out, as does not naming it.
@@ -131,7 +131,7 @@ def design_mu(
     require_uncertain(uncertain)
     most = whole(iterations, "iterations")
     states = whole(order, "order", minimum=0)
-    if uncertain.neglected is None and all(one.kind == "freq" for one in uncertain.deltas):
+    if uncertain.is_of_frequencies:
         answer = _by_mode_channels(uncertain, w, z, most, method, progress)
         if answer is not None:
             return with_left_out(answer, uncertain.plant)

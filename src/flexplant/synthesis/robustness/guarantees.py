@@ -126,7 +126,7 @@ def robust_stability(
     Parameters
     ----------
     uncertain : UncertainPlant
-        From `plant.uncertain(fit, neglected=whole)`.
+        From `plant.uncertain(fit, plant.Neglected())`.
     *blocks : StateSpace, or values with a `system`
         The controller, as for `close_loop`.
     quick : bool
@@ -237,7 +237,7 @@ def _quick(
     uncertain: UncertainPlant[Any], blocks: tuple[Any, ...], count: int, rng: np.random.Generator
 ) -> RobustStability | None:
     """Return the answer of one channel a mode where it shows stability, None where it does not."""
-    if uncertain.neglected is not None or any(d.kind != "freq" for d in uncertain.deltas):
+    if not uncertain.is_of_frequencies:
         return None
     loop = close_loop(uncertain.plant, *blocks)
     if loop.obstacle is not None:

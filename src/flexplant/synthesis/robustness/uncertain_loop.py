@@ -18,8 +18,8 @@ from ...lti.responses import Responder, responder
 from ...lti.statespace import StateSpace, as_statespace, single_channel
 from ...plant import StandardPlant
 from ...plant.building import at_rate
-from ...plant.uncertainty.delta_channels import DeltaChannels, delta_channels
-from ...plant.uncertainty.neglected import with_neglected
+from ...plant.uncertainty.neglected_modes import with_neglected
+from ...plant.uncertainty.sampled_channels import DeltaChannels, delta_channels
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from .uncertainty_blocks import Block, FullBlock, Perturbation, RepeatedScalar, realised_delta
 

@@ -1,0 +1,46 @@
+"""Damping of modes that is known within stated shares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..partition import Partition
+from .delta import Delta
+from .kind import Uncertainty
+from .mode_delta import DampingDelta, stated_by_mode
+
+
+@dataclass(frozen=True, eq=False)
+class Dampings(Uncertainty):
+    """Damping of modes, off by a share of it: `mode6:damping` on 2 zeta omega.
+
+    Parameters
+    ----------
+    share : float, (m,) array or {mode: float}
+        By what share damping may be off at delta = 1: one for all, one for each of `modes`, or by
+        mode.
+    modes : sequence of int, optional
+        Numbers from 1, rigid-body modes included; all elastic ones when not given.
+
+    Raises
+    ------
+    LabelError, ModelError, ShapeError
+        When a plant lacks a mode, its modes are coupled by damping, or a share is negative, or 1 or
+        more.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.testbeds.three_masses().uncertain(fx.plant.Dampings({2: 0.3}))
+    <UncertainPlant: 1 real Delta at 2 std
+      mode2:damping +- 30 %>
+    """
+
+    share: Any
+    modes: Sequence[int] | None = field(default=None, kw_only=True)
+
+    def deltas(self, plant: Partition) -> Sequence[Delta]:
+        """Return a Delta for the damping of each mode."""
+        return stated_by_mode(DampingDelta, plant, self.share, self.modes)

@@ -1,0 +1,47 @@
+"""Frequencies of modes that are known within stated shares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..partition import Partition
+from .delta import Delta
+from .kind import Uncertainty
+from .mode_delta import FrequencyDelta, stated_by_mode
+
+
+@dataclass(frozen=True, eq=False)
+class Frequencies(Uncertainty):
+    """Frequencies of modes, off by a share of them: `mode6:freq` on the stiffness omega^2.
+
+    Parameters
+    ----------
+    share : float, (m,) array or {mode: float}
+        By what share frequencies may be off at delta = 1: one for all, one for each of `modes`, or
+        by mode. 0.005 is what an updated model of a structure seldom does better than where it was
+        not measured.
+    modes : sequence of int, optional
+        Numbers from 1, rigid-body modes included; all elastic ones when not given.
+
+    Raises
+    ------
+    LabelError, ModelError, ShapeError
+        When a plant lacks a mode, its modes are coupled by damping, or a share is negative.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.testbeds.three_masses().uncertain(fx.plant.Frequencies({2: 0.005}))
+    <UncertainPlant: 1 real Delta at 2 std
+      mode2:freq +- 0.5 %>
+    """
+
+    share: Any
+    modes: Sequence[int] | None = field(default=None, kw_only=True)
+
+    def deltas(self, plant: Partition) -> Sequence[Delta]:
+        """Return a Delta for the stiffness of each mode."""
+        # stiffness is omega^2
+        return stated_by_mode(FrequencyDelta, plant, self.share, self.modes, 2.0)

@@ -1,0 +1,86 @@
+"""What is not known of a machine, as a value: the base that all kinds of it derive from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...checks import FloatArray, Value
+from ..partition import Partition
+from .delta import Delta
+
+#: standard deviations at which a Delta is 1, where nothing else is said
+DEVIATIONS = 2.0
+
+
+class Known(NamedTuple):
+    """What a kind of uncertainty says of a plant.
+
+    Parameters
+    ----------
+    deltas : sequence of Delta
+    covariance : (m, m) array
+        Of the deltas as random numbers.
+    drawn : sequence of Delta, optional
+        What is drawn for a machine instead: the parameters of a fit, which move all modes and
+        shapes.
+    drawn_covariance : (q, q) array, optional
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.plant.Known.independent([fx.plant.Delta("off", 0.1)]).covariance
+    array([[0.25]])
+    """
+
+    deltas: tuple[Delta, ...]
+    covariance: FloatArray
+    drawn: tuple[Delta, ...] | None = None
+    drawn_covariance: FloatArray | None = None
+
+    @classmethod
+    def independent(cls, deltas: Sequence[Delta], *, deviations: float = DEVIATIONS) -> Known:
+        """Return independent Deltas, each of which is 1 at some standard deviations."""
+        return cls(tuple(deltas), np.eye(len(deltas)) / deviations**2)
+
+
+class Uncertainty(Value):
+    """Something that is not known of a machine, for ``plant.uncertain(...)``.
+
+    A new kind says by `deltas` which Deltas a plant has; one whose Deltas are correlated, or that
+    draws something else for a machine, by `known`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True, eq=False)
+    ... class Warmth(fx.plant.Delta):
+    ...     def changed(self, machine, amount):
+    ...         return machine.replace(gains={"u1": 1.0 + amount, "y1": 1.0 + amount})
+    >>> @dataclass(frozen=True, eq=False)
+    ... class Warm(fx.plant.Uncertainty):
+    ...     def deltas(self, plant):
+    ...         return [Warmth("warmth", 0.02)]
+    >>> fx.testbeds.three_masses().uncertain(Warm())
+    <UncertainPlant: 1 real Delta at 2 std
+      warmth +- 2 %>
+    """
+
+    def deltas(self, plant: Partition) -> Sequence[Delta]:
+        """Return the Deltas that a plant has."""
+        return ()
+
+    def known(self, plant: Partition) -> Known:
+        """Return the Deltas that a plant has, and how they are drawn."""
+        return Known.independent(self.deltas(plant))
+
+    def bound(self, plant: Partition) -> Any:
+        """Return the `NeglectedModes` of a plant, None of a kind that bounds nothing."""
+        return None
+
+    def completion(self, plant: Partition) -> Delta | None:
+        """Return what every machine that is drawn has besides, None without any."""
+        return None
