@@ -283,6 +283,13 @@ def test_neglected_modes_are_bounded_and_drawn(rate):
         assert 1e-6 < moved[0] < 0.02
         np.testing.assert_allclose(moved[1:], 0.0, atol=1e-9)
     assert plant.uncertain(uncertain.neglected, frequency={2: 0.01}).neglected.tightest <= 1.0
+    with pytest.raises(ModelError, match="no evaluation model"):
+        plant.uncertain(Neglected(), frequency=0.01)
+    judged = plant.replace(evaluation=whole()).uncertain(Neglected(), frequency={2: 0.01})
+    assert judged.neglected.tightest == uncertain.neglected.tightest
+    np.testing.assert_array_equal(
+        judged.sample(2, 1)[0].system.A, uncertain.sample(2, 1)[0].system.A
+    )
     with pytest.raises(ModelError, match="neglected twice"):
         plant.uncertain(Neglected(whole()), Neglected(whole()), frequency=0.01)
 

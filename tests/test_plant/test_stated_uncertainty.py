@@ -223,7 +223,7 @@ def test_a_parameter_beside_modes_and_gains():
         every_kind(Delay(9.0))
     with pytest.raises(ModelError, match="sign is not known"):
         every_kind(gain=1.0)
-    with pytest.raises(ModelError, match="Leave Shapes out"):
+    with pytest.raises(ModelError, match="of the shape of a mode"):
         every_kind(Shapes(0.01 * np.ones((1, 3, 1)), [2]))
 
 

@@ -261,7 +261,7 @@ class StandardPlant(Partition):
     ) -> UncertainPlant[StandardPlant]:
         """Return the plant with what is not known of it, in any combination.
 
-        ``plant.uncertain(Frequencies(0.005), Gains(0.02), fit, Neglected(larger))``: each kind is a
+        ``plant.uncertain(Frequencies(0.005), Gains(0.02), fit, Neglected())``: each kind is a
         value, opened as Deltas with ``|delta| <= 1`` and drawn for machines. The order does not
         matter.
 
