@@ -83,8 +83,9 @@ def update(
     rng : int, SeedSequence or Generator
         For drawn starts.
     prior : bool
-        Whether priors take part. Two finite bounds without a prior make one: zero (or the bound
-        nearest to it) most probable, the farther bound three standard deviations away.
+        Whether priors take part; they can where the noise of all residuals is known. Two finite
+        bounds without a prior make one: zero (or the bound nearest to it) most probable, the
+        farther bound three standard deviations away.
     max_iterations : int, optional
         Most steps from one start; 20 for Gauss-Newton, 200 for the others when not given.
     tolerance : float
@@ -190,6 +191,8 @@ def update(
     _ends_warned(objective, best, estimates, lost if isinstance(lost, FlexplantError) else None)
     fit = _result(model, objective, method, best, begins[0])
     fit = fit.replace(starts=tried, rounds=np.array(estimates), residuals=given)
+    if known and takes_part and not objective.uses_prior:
+        warn(_unused_priors(objective))
     if fit.determined is not None:
         warn(_undetermined(fit, objective.text))
     if not method.least_squares or not is_bad(fit.p_value):
@@ -202,7 +205,7 @@ def update(
         # whether the model is right is judged by the noise alone, at the least chi-square
         fit = again.replace(chi2=fit.chi2, dof=fit.dof, discrepancy=found, **kept)
     elif fit.covariance is not None and fit.chi2 is not None:
-        fit = fit.replace(covariance=fit.covariance * (fit.chi2 / fit.dof))
+        fit = fit.replace(covariance=fit.widened(fit.chi2 / fit.dof))
     warn(_complaint(fit, named))
     return fit
 
@@ -270,10 +273,24 @@ def _result(
         converged=best.converged and determined is None,
         reason=best.reason if determined is None else "not determined",
         determined=determined,
+        prior_std=np.where(objective.has_prior, objective.prior_std, np.inf)
+        if objective.uses_prior
+        else None,
         at_bound=at_bound,
         unknowns=objective.parameters,
         chi2=chi2,
         dof=dof,
+    )
+
+
+def _unused_priors(objective: Objective) -> str:
+    """Return that the priors take no part, and of which residuals the noise is not known."""
+    named = [q.name for q in objective.parameters if getattr(q, "prior", None) is not None]
+    silent = " and ".join(bound.name for bound in objective.bounds if not bound.noisy)
+    return (
+        f"the priors of {some_names(named)} take no part: their weight against {silent}, whose "
+        "noise is not known, is open. Give the noise (covariance=, std=, variance=) without "
+        "weights, or pass prior=False."
     )
 
 

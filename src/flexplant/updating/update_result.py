@@ -16,6 +16,7 @@ from ..checks import (
     Value,
     between,
     generator,
+    positive,
     short,
     whole,
     with_deviation,
@@ -182,6 +183,9 @@ class UpdateResult(Value):
     determined : sequence of str or None
         None where the data determine all parameters. Else the combinations that they determine
         to first order, in words: no other value means anything.
+    prior_std : (q,) array or None
+        Standard deviations of the priors that took part, infinite where a parameter has none; None
+        where no prior did.
     """
 
     parameters: tuple[str, ...]
@@ -202,6 +206,7 @@ class UpdateResult(Value):
     residuals: tuple[Residual, ...] = ()
     discrepancy: tuple[Discrepancy, ...] = ()
     determined: tuple[str, ...] | None = None
+    prior_std: FloatArray | None = None
 
     def __getitem__(self, name: str) -> float:
         require_known("parameter", [name], self.parameters)
@@ -256,6 +261,9 @@ class UpdateResult(Value):
             lines.append(f"  ... and {len(self.parameters) - 5} more")
         if self.at_bound:
             lines.append(f"  at a bound: {', '.join(self.at_bound[:5])}")
+        unused = [q.name for q in self.unknowns if getattr(q, "prior", None) is not None]
+        if unused and self.prior_std is None:
+            lines.append(f"  priors that took no part: {', '.join(unused[:5])}")
         if self.determined is not None:
             lines.append(f"  determined only: {'; '.join(self.determined) or 'nothing':.200}")
         if self.negative_masses:
@@ -283,9 +291,34 @@ class UpdateResult(Value):
         all modes together takes one, since no mode shows it. ModelError where the covariance is
         not known.
         """
+        from scipy.special import ndtri
+
         share = between(level, "level", 0.0, 1.0, "Choose 0.95, say.")
-        half = self._quantile(share) * self._known_std()
+        half = float(ndtri((1 + share) / 2)) * self._wider_std(share)
         return np.column_stack([self.values - half, self.values + half])
+
+    def widened(self, factor: float) -> FloatArray:
+        """Return the covariance (q, q) where that of all data is larger by a factor.
+
+        What the priors say holds whatever the data are worth: no parameter is known less well than
+        by its prior. ModelError where the covariance is not known.
+        """
+        std, factor = self._known_std(), positive(factor, "factor")
+        wide: FloatArray = np.asarray(self.covariance) * factor
+        if self.prior_std is not None:
+            # information adds up: that of the priors is no part of what is divided
+            size = np.outer(std, std)
+            held = np.diag((std / self.prior_std) ** 2)
+            told = np.linalg.inv(np.asarray(self.covariance) / size) - held
+            wide = np.linalg.inv(held + told / factor) * size
+        return wide
+
+    def _wider_std(self, share: float) -> FloatArray:
+        """Return deviations of which the normal quantile holds a share of each distribution."""
+        from scipy.special import ndtri
+
+        ratio = self._quantile(share) / float(ndtri((1 + share) / 2))
+        return np.sqrt(np.diag(self.widened(ratio**2)))
 
     def _quantile(self, share: float) -> float:
         """Return how many standard deviations hold a share of a parameter's distribution."""
@@ -299,13 +332,10 @@ class UpdateResult(Value):
     def _printed_deviations(self) -> list[float | None]:
         """Return deviations of which two hold 95 % of machines, None where nothing says so."""
         # of responses that a model does not explain, the misfit is coherent from line to line
-        from scipy.special import ndtri
-
         std, rejected = self.std, is_bad(self.p_value)
         if std is None or (rejected and not self.discrepancy):
             return [None] * len(self.parameters)
-        wider = self._quantile(SHARE) / float(ndtri((1 + SHARE) / 2)) if rejected else 1.0
-        return [wider * deviation for deviation in std.tolist()]
+        return list((self._wider_std(SHARE) if rejected else std).tolist())
 
     def sample(self, count: int, *, rng: Rng = 0) -> FloatArray:
         """Return draws (count, q), normal with `values` and `covariance` (Laplace's posterior).
