@@ -14,7 +14,6 @@ import flexplant as fx
 from flexplant.errors import CertificateError, ModelError
 from flexplant.plant import Neglected
 from flexplant.synthesis import FixedOrder, PoleRegion
-from flexplant.synthesis.preparation import prepared
 from mutants import LINES, SOURCE
 
 
@@ -152,16 +151,6 @@ def opposite(function):
     return called
 
 
-def unproven(function):
-    """A loop whose norm is not finite."""
-
-    def called(*args):
-        found = function(*args)
-        return found._replace(gamma=np.inf)
-
-    return called
-
-
 class Unstable:
     """The report of a loop that is not stable."""
 
@@ -269,12 +258,6 @@ WRONG = {
         lambda function: lambda *args, **options: Unstable(function(*args, **options)),
         lambda: fx.synthesis.shape_loop(fx.lti.tf([1.0], [1.0, 1.0, 0.0]), bandwidth=10.0),
         "a mode was hidden",
-    ),
-    "no feedback": (
-        "synthesis.hinf.hinf_design._certified_answer", unproven,
-        lambda: import_module("flexplant.synthesis.hinf.hinf_design").idle_answer(
-            problem(), prepared(problem().system, problem().u, problem().y), ""
-        ), "cannot be verified",
     ),
     "two degrees of freedom": (
         "synthesis.hinf.shaping.following", larger(0.5, 1),

@@ -114,6 +114,9 @@ def newton_maxima(model: Residues, start: FloatArray, tolerance: float) -> Peaks
             break
         keep = height >= PART * height.max()
         omega = np.abs(omega + move)[keep]
+    else:  # the last step has moved or left out points: what belongs to those that stay
+        one, near = _expansion(model, omega), model.nearest(omega)
+        height = one.values[:, 0]
     return Peaks(omega, np.sqrt(height), _zone_radii(model, omega, near, one, tolerance))
 
 

@@ -153,6 +153,12 @@ def certified_norm(
     """Return what was verified of a closed loop: its norm by two routes, and its stability."""
     least = required_stability(loop)
     norm, _ = peak_gain(loop)
+    if not np.isfinite(norm):
+        raise CertificateError(
+            "the norm of the closed loop is infinite within its rounding: a pole is too close to "
+            "the edge of stability. Bring the sizes of the weights closer together, or give the "
+            "mode damping."
+        )
     swept = swept_norm(loop, respond)
     if not abs(norm - swept) <= AGREEMENT * norm:
         raise CertificateError(

@@ -16,7 +16,7 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from .controller import Controller, SolvedController, required_stability, with_left_out
-from .hinf.singular import made_regular, missing_ranks
+from .hinf.singular import lacking, made_regular
 from .preparation import Prepared, posed, prepared, require_reach
 from .structured.judges import require_finite_h2
 
@@ -77,7 +77,7 @@ def design_h2(
 
     Where D12 or D21 has not full rank, a little noise on each sensor and effort of each actuator
     is added, as for `design_hinf`, and lowered until that gains next to nothing. Where w and z miss
-    an undamped mode (no Riccati solution), each state is given some of both.
+    an undamped mode, w also acts a little where u does, and z sees a little of y.
 
     References
     ----------
@@ -114,13 +114,8 @@ def design_h2(
 
 def _optimal_controller(p: Prepared) -> SolvedController:
     """Return the optimal controller; noise and effort are added where the problem is singular."""
-    lacking = missing_ranks(p)
-    if not lacking:
-        try:
-            return _solve_regular(p)
-        except AssumptionError as error:  # a mode on the stability boundary is missed by w or z
-            lacking = (str(error).rstrip("."),)
-    return made_regular(p, _solve_regular, lacking, h2_norm)
+    lack = lacking(p)
+    return made_regular(p, _solve_regular, lack, h2_norm) if any(lack) else _solve_regular(p)
 
 
 def _solve_regular(p: Prepared) -> SolvedController:

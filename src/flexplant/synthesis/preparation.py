@@ -19,21 +19,26 @@ import scipy.linalg as la
 from ..checks import FloatArray, Value, inner_names
 from ..errors import AssumptionError, ModelError
 from ..lti.discretisation import bilinear, image_freq, tustin
-from ..lti.equations import bordered_scale, mean_speed, state_scale
+from ..lti.equations import mean_speed
 from ..lti.joining import Matrices
 from ..lti.modal import modal_form
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, standard_plant
 from ..plant.uncertainty.uncertain_plant import UncertainPlant
-from ..tolerances import ROUNDING, TINY, divisor
+from ..tolerances import ROUNDING, TINY
+from .scaling import (
+    POINT,
+    answers,
+    balanced,
+    departure_from_normal,
+    loop_speed,
+    normalised,
+    own_gain,
+    timed,
+)
 
-#: a direction of D12 or D21 that is smaller beside what the plant does on its channels is missing
-_RANK = 1e-9
-#: where the plant's answers are taken: at its own speed, away from its resonances
-_POINT, _DIRECT = complex(np.exp(0.25j * np.pi)), complex(1.5 * np.exp(1j))
-#: part of the motion of the states that counts for a channel which z or w does not know
-_HIDDEN = 1e-3
-#: departure from normal above which modal coordinates are taken; their largest condition beside it
+#: departure from normal above which modal coordinates are taken; the condition of their
+#: eigenvectors may be as many times larger
 _MIXED, _CONDITION = 5.0, 1e3
 
 
@@ -58,6 +63,8 @@ class Prepared(Value):
     y: Sequence[str]
     departure: float = 1.0
     direct: bool = False
+    #: point at the loop's speed: e^(j pi/4), or what it is in z for a problem that stays sampled
+    point: complex = POINT
 
     @property
     def system(self) -> StateSpace:
@@ -77,15 +84,15 @@ class Prepared(Value):
     @property
     def own_sizes(self) -> tuple[FloatArray, FloatArray]:
         """What the plant does on each channel: sizes of u in z (nu,) and of w in y (ny,)."""
-        # with feedthrough, away from resonances; a channel that does nothing has the largest size
-        s = self._point
-        u = np.hypot(_answers(self.A, self.B2, self.C1, s), np.linalg.norm(self.D12, axis=0))
-        y = np.hypot(_answers(self.A.T, self.C2.T, self.B1.T, s), np.linalg.norm(self.D21, axis=1))
+        # at the loop's speed; a channel that does nothing has the largest size
+        u = answers(self.A, self.B2, self.C1, self.D12, self.point)
+        y = answers(self.A.T, self.C2.T, self.B1.T, self.D21.T, self.point)
         return _none_zero(u), _none_zero(y)
 
     @property
-    def _point(self) -> complex:
-        return _DIRECT if self.direct else _POINT
+    def own_gain(self) -> float:
+        """Size of w in z at the loop's speed, 1 where w does nothing there."""
+        return own_gain(self.A, self.B1, self.C1, self.D11, self.point)
 
     def measured_in(self, unit: float) -> Prepared:
         """Return the problem with z in multiples of `unit`; u too, so that D12 is kept."""
@@ -134,113 +141,71 @@ def prepared(
     P: StateSpace, u: Sequence[str], y: Sequence[str], *, direct: bool = False
 ) -> Prepared:
     """Return a standard plant ``[w; u] -> [z; y]``, made ready for synthesis."""
+    dt, direct = P.dt, direct and bool(P.dt)
+    m1, p1 = len(P.inputs) - len(u), len(P.outputs) - len(y)
     # balanced first: whether I + A can be inverted must not depend on the units of the states
     s = np.exp(1j) * (1.5 if P.dt else mean_speed(P.poles()))
-    A, B, C = _balanced(P.A, P.B, P.C, s)
-    departure = departure_from_normal(A)
+    P, image = _with_image(P, *balanced(P.A, P.B, P.C, s))
+    speed = loop_speed(image, m1, p1, dt)
+    departure = departure_from_normal(P.A, speed * (dt or 1.0))
     if departure > _MIXED:
         form = modal_form(P, largest_condition=_CONDITION * departure)
         if not form.reason:
-            A, B, C = _balanced(form.system.A, form.system.B, form.system.C, s)
-    g = P.replace(A=A, B=B, C=C, blocks=None)
-    direct = direct and bool(P.dt)
-    g = bilinear(g, 1.0 / P.dt) if P.dt and not direct else g
-    speed = 1.0 if direct else mean_speed(g.poles())
-    m1, p1 = len(g.inputs) - len(u), len(g.outputs) - len(y)
-    root = np.sqrt(speed)
-    A, B, C = g.A / speed, g.B / root, g.C / root
-    D12, D21 = g.D[:p1, m1:], g.D[p1:, :m1]
-    point = _DIRECT if direct else _POINT
-    z_turn, u_scale = normalised(D12, _answers(A, B[:, m1:], C[:p1], point))
-    w_turn, y_scale_t = normalised(D21.T, _answers(A.T, C[p1:].T, B[:, :m1].T, point))
+            P, image = _with_image(P, form.system.A, form.system.B, form.system.C)
+    if direct:
+        half, speed = 0.5 * speed * dt * POINT, 1.0
+        point = complex((1.0 + half) / (1.0 - half))
+        A, B, C = balanced(P.A, P.B, P.C, point)
+    else:
+        P, point = image, POINT
+        A, B, C = timed(P.A, P.B, P.C, speed)
+    D12, D21 = P.D[:p1, m1:], P.D[p1:, :m1]
+    z_turn, u_scale = normalised(D12, answers(A, B[:, m1:], C[:p1], D12, point))
+    w_turn, y_scale_t = normalised(D21.T, answers(A.T, C[p1:].T, B[:, :m1].T, D21.T, point))
     y_scale = y_scale_t.T
-    A, B, C = _balanced(
+    # balanced with z and u in the unit of what w does to z, so that its unit does not matter
+    unit = own_gain(A, B[:, :m1], C[:p1], P.D[:p1, :m1], point)
+    units = np.where(np.arange(B.shape[1]) < m1, 1.0, unit)
+    rows = np.where(np.arange(len(C)) < p1, unit, 1.0)[:, None]
+    A, B, C = balanced(
         A,
-        np.hstack([B[:, :m1] @ w_turn, B[:, m1:] @ u_scale]),
-        np.vstack([z_turn.T @ C[:p1], y_scale @ C[p1:]]),
-        s if direct else np.exp(1j),
+        np.hstack([B[:, :m1] @ w_turn, B[:, m1:] @ u_scale]) * units,
+        np.vstack([z_turn.T @ C[:p1], y_scale @ C[p1:]]) / rows,
+        point,
     )
+    B, C = B / units, C * rows
     return Prepared(
         A,
         B[:, :m1],
         B[:, m1:],
         C[:p1],
         C[p1:],
-        z_turn.T @ g.D[:p1, :m1] @ w_turn,
+        z_turn.T @ P.D[:p1, :m1] @ w_turn,
         z_turn.T @ D12 @ u_scale,
         y_scale @ D21 @ w_turn,
-        y_scale @ g.D[p1:, m1:] @ u_scale,
+        y_scale @ P.D[p1:, m1:] @ u_scale,
         u_scale,
         y_scale,
         speed,
-        P.dt,
+        dt,
         tuple(u),
         tuple(y),
         departure,
         direct,
+        point,
     )
 
 
-def normalised(D: FloatArray, own: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return an orthogonal Z and a scaling S with ``Z' D S = [0; I]`` where D has full rank."""
-    # rank must depend neither on units nor on rounding: columns are brought to unit size first,
-    # together with `own` (m,), what the plant itself does on their channels. A direction of D that
-    # is nothing beside it (rank-deficient) is only turned
-    m = D.shape[1]
-    columns = np.hypot(np.linalg.norm(D, axis=0), own)
-    columns = divisor(columns)
-    left, values, right = la.svd(D / columns, full_matrices=True)
-    sizes = np.zeros(m)
-    sizes[: values.size] = values
-    rank = int(np.count_nonzero(sizes > _RANK))
-    # columns of Z: what D does not reach first, then what it does
-    Z = np.hstack([left[:, rank:], left[:, :rank]])
-    S = right.T @ np.diag(1.0 / np.where(np.arange(m) < rank, sizes, 1.0))
-    return Z, S / columns[:, None]
-
-
-def _answers(A: FloatArray, B: FloatArray, C: FloatArray, s: complex) -> FloatArray:
-    """Return the sizes (m,) of ``C (s I - A)^-1 B`` by column, at least a part of its terms'."""
-    # what u moves and z does not show has no size there but rounding
-    try:
-        states = np.linalg.solve(s * np.eye(A.shape[0]) - A, B)
-    except np.linalg.LinAlgError:  # a pole at s
-        states = np.asarray(B, dtype=np.complex128)
-    terms = np.linalg.norm(C) * np.linalg.norm(states, axis=0)
-    return np.asarray(np.maximum(np.linalg.norm(C @ states, axis=0), _HIDDEN * terms))
+def _with_image(
+    P: StateSpace, A: FloatArray, B: FloatArray, C: FloatArray
+) -> tuple[StateSpace, StateSpace]:
+    """Return a plant in other coordinates, and its continuous image when it is sampled."""
+    P = P.replace(A=A, B=B, C=C, blocks=None)
+    return P, bilinear(P, 1.0 / P.dt) if P.dt else P
 
 
 def _none_zero(sizes: FloatArray) -> FloatArray:
     return np.asarray(np.where(sizes > 0.0, sizes, np.max(sizes, initial=0.0) or 1.0))
-
-
-def departure_from_normal(A: FloatArray) -> float:
-    """Return the size of A beside that of its eigenvalues: 1 for a normal matrix (Henrici)."""
-    size = float(np.linalg.norm(np.linalg.eigvals(A))) if A.size else 0.0
-    return float(np.linalg.norm(A)) / size if size else 1.0
-
-
-def _balanced(
-    A: FloatArray, B: FloatArray, C: FloatArray, s: complex
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the system in states scaled (by powers of two) so that rows and columns match."""
-    # Osborne's balancing of A bordered by the sizes of the rows of B and of the columns of C; the
-    # border counts as much as it takes to give `C (s I - A)^-1 B` unit size, which no scaling of
-    # states or channels changes
-    n = A.shape[0]
-    if not n:
-        return A, B, C
-    scale = state_scale(A, B, C)  # never A alone: that shrinks one side of a nearly triangular A
-    for _ in range(2):  # the border is weighed anew once the states have sizes alike
-        A_, B_, C_ = A * scale / scale[:, None], B / scale[:, None], C * scale
-        try:
-            gain = float(np.linalg.norm(C_ @ np.linalg.solve(s * np.eye(n) - A_, B_)))
-        except np.linalg.LinAlgError:  # a pole at s: any weight will do
-            gain = 1.0
-        weight = 1.0 / np.sqrt(gain) if 0.0 < gain < np.inf else 1.0
-        drive, sight = np.linalg.norm(B_, axis=1), np.linalg.norm(C_, axis=0)
-        scale = scale * bordered_scale(A_, weight * drive, weight * sight)
-    return A * scale / scale[:, None], B / scale[:, None], C * scale
 
 
 #: relative: poles so small are zero, real parts above this are not stable

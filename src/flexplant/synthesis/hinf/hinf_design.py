@@ -12,12 +12,10 @@ from ...errors import (
     AssumptionError,
     CertificateError,
     FlexplantError,
-    InfeasibleError,
     ModelError,
     SolverError,
     attempted,
     counted,
-    warn,
 )
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
@@ -35,17 +33,20 @@ from ..controller import (
     with_left_out,
 )
 from ..lmi.lmi_programs import Lmi
-from ..preparation import Prepared, departure_from_normal, posed, prepared, require_reach
-from .hinf_riccati import Riccati, require_shown
+from ..preparation import Prepared, posed, prepared, require_reach
+from ..scaling import departure_from_normal
+from .hinf_riccati import Riccati
 from .lower_bound import pointwise_bound, raised_bound
 from .mode_channels import ModeChannel, mode_channels, rebalanced, tolerated, with_mode_channels
 from .moved_design import over_positions
-from .singular import ADDED
+from .singular import require_shown
 
 #: A beside its poles, from which on coordinates are blamed for a failure
 _MIXED = 1e3
 #: in the certificate: the upper bound of real mu of all uncertain frequencies together
 TOLERATED = "all frequencies at once"
+#: ratio of gamma to its lower bound up to which bad coordinates may have been harmless
+_CLOSE = 1.06
 #: relative change of gamma by rounding of such a plant for which they are, over so many draws
 _SENSITIVE, _DRAWS = 2e-4, 3
 
@@ -80,11 +81,9 @@ def design_hinf(
         those of all positions and half way between. A labelled StateSpace (ours or
         python-control's) serves too: by the names of its channels, or with u and y named.
     method : Riccati or Lmi, optional
-        Unless given `Riccati()`, which adds a little noise and effort where D12 or D21 is singular;
-        where what it finds is not close to its lower bound the better of it and
-        `Riccati(regularised=True)`, which adds them anyway. `Lmi()` needs no rank and suits up to
-        30 states. Where all fail, a stable plant is left without feedback, K = 0, and the notes
-        say why.
+        `Riccati()` unless given, which adds a little noise and effort where D12 or D21 is singular,
+        and a little disturbance where w or z misses an undamped mode. `Lmi()` needs neither and
+        suits up to 30 states.
     bandwidth : float [Hz], optional
         Of a stage that has no weights yet: those of `stage_weights` are used, for the POI's only
         reference. `design_stage` finds the largest that holds.
@@ -118,10 +117,9 @@ def design_hinf(
     AssumptionError
         When an assumption of the method fails; the message says which, in physical words.
     InfeasibleError, SolverError
-        When no stabilising controller was found; never, but where gamma has the infimum zero, for a
-        stable plant when no method is given.
+        When no stabilising controller was found, or gamma has the infimum zero.
     CertificateError
-        When the closed loop misses the norm that was claimed.
+        When the closed loop misses the norm that was claimed, or its norm is not finite.
     ModelError
         When the plant or the method is of another type, or a sampled plant has a pole at z = -1.
 
@@ -129,7 +127,6 @@ def design_hinf(
     -----
     FlexplantWarning
         When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
-        When a stable plant is left without feedback.
 
     References
     ----------
@@ -236,42 +233,33 @@ def _design_one(
 ) -> Controller:
     """Return the verified controller of a plant."""
     problem = prepared(plant.system, plant.u, plant.y)
+    method = method or Riccati()
+    if progress is not None and isinstance(method, (Riccati, Lmi)):
+        method = method.replace(progress=progress)
     try:
         require_reach(problem)
         if plant.is_assembled:  # whatever a method makes of it: this motion would drift
             require_shown(problem)
-        if method is None:
-            answer = best_answer(plant, problem, progress)
-        else:
-            if progress is not None and isinstance(method, (Riccati, Lmi)):
-                method = method.replace(progress=progress)
-            answer = _certified_answer(plant, problem, method, method.solve(problem))
-            lower = max(answer.lower, pointwise_bound(problem))
-            answer = answer._replace(lower=raised_bound(problem, answer.gamma, lower))
-        _require_known(plant, problem, answer)
-    except (AssumptionError, InfeasibleError, SolverError, CertificateError) as error:
-        blamed = _blamed(problem, error)
-        if isinstance(blamed, InfeasibleError):  # of this plant, whatever its coordinates
-            raise
-        named = isinstance(error, AssumptionError)  # what physically lacks is not for a note
-        if named or method is not None or not plant.system.is_stable:
-            raise blamed from error
-        try:
-            answer = idle_answer(plant, problem, blamed)
-        except FlexplantError:
-            raise blamed from error
-        warn(answer.controller.notes[0])
-    return answer.controller.replace(lower=answer.lower)
+        found = method.solve(problem)
+        answer = _verified(plant, problem, type(method).__name__, found)
+        norm = float(answer.gamma or 0.0)
+        lower = raised_bound(problem, norm, max(found.lower, pointwise_bound(problem)))
+        _require_known(plant, problem, answer.system, norm, lower)
+    except (AssumptionError, SolverError, CertificateError) as error:
+        raise _blamed(problem, error) from error
+    return answer.replace(lower=lower)
 
 
-def _require_known(plant: StandardPlant, problem: Prepared, answer: Answer) -> None:
+def _require_known(
+    plant: StandardPlant, problem: Prepared, K: StateSpace, gamma: float, lower: float
+) -> None:
     """Raise SolverError when rounding in the given coordinates may have made another plant."""
     if problem.departure < _MIXED:
         return
-    if departure_from_normal(problem.A) > _MIXED or not answer.is_close:
+    if gamma > _CLOSE * lower or departure_from_normal(problem.A, 1.0) > _MIXED:
         raise SolverError(
-            f"a controller with gamma {answer.gamma:.4g} was found, the lower bound is "
-            f"{answer.lower:.4g}, and both hang on rounding."
+            f"a controller with gamma {gamma:.4g} was found, the lower bound is {lower:.4g}, and "
+            "both hang on rounding."
         )
     P, rng, change = plant.system, np.random.default_rng(0), 0.0
     for _ in range(_DRAWS):
@@ -279,12 +267,12 @@ def _require_known(plant: StandardPlant, problem: Prepared, answer: Answer) -> N
             name: part * (1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], size=part.shape))
             for name, part in (("A", P.A), ("B", P.B), ("C", P.C))
         }
-        gain = hinf_norm(lft(P.replace(**moved, blocks=None), answer.controller.system))
-        change = max(change, abs(gain / answer.gamma - 1.0) if answer.gamma else 0.0)
+        norm = hinf_norm(lft(P.replace(**moved, blocks=None), K))
+        change = max(change, abs(norm / gamma - 1.0) if gamma else 0.0)
     if change > _SENSITIVE:
         raise SolverError(
-            f"a controller with gamma {answer.gamma:.4g} was found, but one rounding of each entry "
-            f"of A, B and C changes it by {100 * change:.2g} %."
+            f"a controller with gamma {gamma:.4g} was found, but one rounding of each entry of A, "
+            f"B and C changes it by {100 * change:.2g} %."
         )
 
 
@@ -300,117 +288,22 @@ def _blamed(problem: Prepared, error: FlexplantError) -> FlexplantError:
     )
 
 
-#: an answer so close to the lower bound is taken at once (`Riccati` stays 1 to 5 % away from it)
-_CLOSE = 1.06
-#: and one so close to the best, found earlier, is preferred to it
-_SAME = 1.02
-
-
-class Answer(NamedTuple):
-    """A controller, the norm of its loop that was verified, and a bound on what any reaches."""
-
-    gamma: float
-    lower: float
-    controller: Controller
-
-    @property
-    def is_close(self) -> bool:
-        """Whether no controller can do much better."""
-        return self.gamma <= _CLOSE * self.lower
-
-
-def best_answer(plant: StandardPlant, problem: Prepared, progress: bool | None) -> Answer:
-    """Return the answer of `Riccati`, or where it is not close to its bound the better of two."""
-    answers: list[Answer] = []
-    #: answers whose loop may be stable with a larger norm than the method claims
-    broken: list[tuple[SynthesisMethod, SolvedController]] = []
-    failures: dict[str, FlexplantError] = {}
-    tried: dict[str, float] = {}
-    lower = pointwise_bound(problem)
-    for name, regularised in (("Riccati()", None), ("Riccati(regularised=True)", True)):
-        method = Riccati(regularised=regularised, progress=progress)
-        tried[name], found = np.inf, None
-        try:
-            found = method.solve(problem)
-            one = _certified_answer(plant, problem, method, found)
-        except FlexplantError as error:
-            if found is None and isinstance(error, InfeasibleError) and not answers:
-                raise
-            failures[name] = error
-            if found is not None:
-                broken.append((method, found))
-        else:
-            answers.append(one)
-            tried[name] = one.gamma
-            lower = raised_bound(problem, one.gamma, max(lower, one.lower))
-        added = found is not None and ADDED in found.certificate
-        if added or any(one.gamma <= _CLOSE * lower for one in answers):
-            break
-    if not answers:
-        for tried_method, claimed in broken:
-            with attempted("another controller than that which was claimed"):
-                answers.append(_beyond_claim(plant, problem, tried_method, claimed))
-        if not answers:
-            raise _failure(failures)
-    least = min(one.gamma for one in answers)
-    if np.isfinite(least):  # of a broken answer too
-        lower = raised_bound(problem, least, lower)
-    best = next(one for one in answers if one.gamma <= _SAME * least)
-    return Answer(best.gamma, min(lower, best.gamma), best.controller.replace(tried=tried))
-
-
-def _failure(failures: Mapping[str, FlexplantError]) -> FlexplantError:
-    """Return the first failure, which says what failed besides."""
-    (_, first), *others = failures.items()
-    said = [f"{name}: {'the same' if str(e) == str(first) else e}" for name, e in others]
-    return type(first)(str(first) + (f" (Tried besides: {' '.join(said)})" if said else ""))
-
-
-def _beyond_claim(
-    plant: StandardPlant, problem: Prepared, method: SynthesisMethod, found: SolvedController
-) -> Answer:
-    """Return an answer whose norm is only what was verified, with a note."""
-    one = _certified_answer(plant, problem, method, found._replace(gamma=np.inf))
-    note = (
-        f"rounding costs {100 * (one.gamma / found.gamma - 1.0):.2g} % of gamma: "
-        f"{found.gamma:.6g} was found for the scaled plant, {one.gamma:.6g} verified for this "
-        "one. Its gains are close to infinite; weight the efforts and give the sensors noise."
-    )
-    K = one.controller
-    certificate = dict(K.certificate or {}) | {"claim": found.gamma}
-    return one._replace(controller=K.replace(certificate=certificate, notes=(*K.notes, note)))
-
-
-def idle_answer(plant: StandardPlant, problem: Prepared, failure: FlexplantError) -> Answer:
-    """Return no feedback, K = 0, which a stable plant needs none of, with its verified norm."""
-    n_u, n_y = len(plant.u), len(plant.y)
-    note = f"no feedback (K = 0), which is stable here, because no other was found: {failure}"
-    parts = np.zeros((0, 0)), np.zeros((0, n_y)), np.zeros((n_u, 0)), np.zeros((n_u, n_y))
-    one = _certified_answer(
-        plant, problem, None, SolvedController(*parts, np.inf, 0.0, {}, (note,))
-    )
-    if not np.isfinite(one.gamma):  # the poles are stable by no more than their rounding
-        raise CertificateError("the norm of the plant without feedback cannot be verified.")
-    return one._replace(lower=min(pointwise_bound(problem), one.gamma))
-
-
-def _certified_answer(
-    plant: StandardPlant, problem: Prepared, method: SynthesisMethod | None, found: SolvedController
-) -> Answer:
-    """Return what a method found as an answer, its norm verified on the plant."""
+def _verified(
+    plant: StandardPlant, problem: Prepared, name: str, found: SolvedController
+) -> Controller:
+    """Return what a method found, its norm verified on the plant."""
     K = problem.restored(found.A, found.B, found.C, found.D)
     K = K.replace(name="hinf", units=plant.units)
     loop = lft(plant.system, K)
     respond = remembered(responder(loop))  # swept twice over the same frequencies
     certificate = certified_norm(loop, found.gamma, respond)
-    gamma, name = certificate["norm"], type(method).__name__
-    controller = Controller(
+    gamma = certificate["norm"]
+    return Controller(
         K,
-        "no feedback" if method is None else f"H-infinity by {name}",
+        f"H-infinity by {name}",
         gamma=gamma,
         certificate=certificate | dict(found.certificate),
         reached=reached_norms(plant, loop, respond),
         notes=found.notes,
-        tried={"no feedback" if method is None else f"{name}()": gamma},
+        tried={f"{name}()": gamma},
     )
-    return Answer(gamma, found.lower, controller)

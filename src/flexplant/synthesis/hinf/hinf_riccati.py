@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -11,22 +10,23 @@ import numpy as np
 import scipy.linalg as la
 
 from ...checks import FloatArray, Value, checked, positive
-from ...errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, SolverError
+from ...errors import FlexplantError, InfeasibleError, ModelError, SolverError
 from ...lti.equations import OnAxisError, stabilising
 from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
 from ...lti.responses import responses
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
-from ...tolerances import ROUNDING, SPLIT
+from ...tolerances import ROUNDING
 from ..controller import SolvedController
 from ..preparation import Prepared, beyond_rounding
 from .lower_bound import are_coupled, both_sides, parrott
-from .singular import LEVELS, Regularised, made_regular, missing_ranks, require_ranks
+from .singular import LEVELS, Regularised, lacking, made_regular, require_ranks, require_shown
 
 #: distances from the smallest gamma: 5 % of it cost 3 to 5 % of rms and 0.02 of margin; near it
-#: gains stay finite where D12 and D21 have full rank, and grow without bound where they have not
-_REGULAR, _SINGULAR = 0.01, 0.05
+#: gains stay finite where D12 and D21 have full rank, so that 1 % is kept with the tolerance, and
+#: with what is added for undamped modes; they grow without bound where the ranks are missing
+_REGULAR, _MODES, _SINGULAR = 0.008, 0.003, 0.05
 #: relative width at which the bisection of a step of a search stops
 _QUICK = 0.005
 #: steps of the bisection, and of going up from its result
@@ -51,16 +51,17 @@ class Riccati(Value):
     lower bound is the largest gamma that was refuted, not the largest that failed.
 
     The equations need D12 and D21 of full rank, and z and w that miss no mode on the stability
-    boundary. A problem without these, or on which they fail, is solved with a little noise on each
-    sensor and a little effort of each actuator added, 1e-3 of what the plant itself does there or
-    less; the loop is verified without them. The notes and the certificate say what was added and
-    what it costs in gamma.
+    boundary. Where a rank is missing, a little noise on each sensor and a little effort of each
+    actuator are added, at most 1e-3 of what the plant itself does at the speed of its loop; where
+    a mode is missed, or one that decays by less than 1e-4 of that speed, w also acts a little at
+    the actuators and z sees a little of the sensors. The loop is verified without them. The notes
+    and the certificate say what was added and what it costs in gamma.
 
     Parameters
     ----------
     back_off : float, optional
-        Relative distance from the smallest gamma found. Unless given 1 % where D12 and D21 have
-        full rank, and 5 % where noise and effort are added.
+        Relative distance from the smallest gamma found. Unless given 0.8 % where D12 and D21 have
+        full rank (0.3 % with what is added for a missed mode), and 5 % where they have not.
     tolerance : float
         Relative width at which the bisection stops.
     regularised : bool, optional
@@ -99,16 +100,15 @@ class Riccati(Value):
         SolverError
             When the plant is too badly conditioned to be stabilised in rounding.
         """
-        lacking = missing_ranks(problem)
+        lack = lacking(problem)
         if self.regularised is False:
-            require_ranks(lacking)
+            require_ranks(lack.ranks)
+            require_shown(problem)
             return self._regular(problem, _REGULAR)
-        if not lacking and self.regularised is None:
-            try:
-                return self._regular(problem, _REGULAR)
-            except (AssumptionError, SolverError) as error:
-                lacking = (str(error).rstrip("."),)
-        return made_regular(problem, lambda regular: self._regular(regular, _SINGULAR), lacking)
+        if self.regularised is None and not any(lack):
+            return self._regular(problem, _REGULAR)
+        back_off = _SINGULAR if lack.ranks else _MODES
+        return made_regular(problem, lambda regular: self._regular(regular, back_off), lack)
 
     def _regular(
         self,
@@ -121,7 +121,7 @@ class Riccati(Value):
         try:
             least = h2_controller(problem)
             unit = _resonance_gain(problem, least)
-        except (la.LinAlgError, SolverError):
+        except (la.LinAlgError, OnAxisError, SolverError):
             unit = np.inf
         if not np.isfinite(unit):
             raise SolverError(
@@ -153,10 +153,11 @@ class Riccati(Value):
             middle = float(np.sqrt(max(tried, 1e-2 * high) * high))
             K, refuted = _attempt(problem, middle)
             bar.advance()
-            if K is not None and _resonance_gain(problem, K) <= middle * (1.0 + _SLACK):
+            gain = np.inf if K is None else _resonance_gain(problem, K)
+            if gain <= middle * (1.0 + _SLACK):
                 high = middle
                 continue
-            tried = middle
+            high, tried = min(high, gain), middle  # rounding costs some of what is promised
             if refuted:
                 low = middle
         return high, low
@@ -186,9 +187,10 @@ def quick_answer(problem: Prepared) -> SolvedController:
     # where ranks are missing with the most noise and effort that `made_regular` adds; gains are
     # seen at resonances alone
     quick = Riccati(tolerance=_QUICK, progress=False)
-    if not missing_ranks(problem):
+    lack = lacking(problem)
+    if not any(lack):
         return quick._regular(problem, _REGULAR, _resonance_gain)
-    regular = Regularised(problem, LEVELS[0])
+    regular = Regularised(problem, LEVELS[0], bool(lack.modes))
     found = quick._regular(regular.problem, _SINGULAR, _resonance_gain)
     return SolvedController(*regular.restored(found), found.gamma, 0.0)
 
@@ -263,7 +265,7 @@ def _attempt(problem: Prepared, gamma: float) -> _Attempt:
         )
     except (la.LinAlgError, ValueError, SolverError):
         return _Attempt(None)
-    if known.refutes(X) or dual.refutes(Y) or are_coupled(X, Y, gamma):
+    if known.refutes(X, F) or dual.refutes(Y, Ht) or are_coupled(X, Y, gamma):
         return _Attempt(None, True)
     try:
         return _Attempt(central(problem, gamma, X, F, Y, Ht.T))
@@ -319,56 +321,10 @@ def _contraction(M: FloatArray, left: FloatArray, right: FloatArray) -> FloatArr
     return np.asarray(0.5 * W[:, reached] @ Xt[reached])
 
 
-#: what an undamped mode lacks, and what to do about it
-_MISSED = {
-    "z": "z does not feel all that u moves at {}: an undamped (rigid-body or integrating) mode "
-    "there is left out of z, or u -> z (a weight) has a zero there. Keep that motion in z with a "
-    "weight of finite gain, or give it damping.",
-    "w": "w does not excite all that y sees at {}: an undamped (rigid-body or integrating) mode "
-    "there has no disturbance, or w -> y (a weight) has a zero there. Add a disturbance that "
-    "reaches it, or give it damping.",
-}
-
-
-@contextmanager
-def _missed_by(p: Prepared, side: str) -> Iterator[None]:
-    """Say of an eigenvalue on the axis which mode z or w misses."""
-    try:
-        yield
-    except OnAxisError as found:
-        omega = float(np.min(found.omega))
-        # a double pole at zero comes out of rounding beside it
-        freq = p.frequency(omega if omega > 1e-6 else 0.0)
-        raise AssumptionError(_MISSED[side].format(f"{freq:.3g} Hz")) from found
-
-
-def require_shown(p: Prepared) -> None:
-    """Raise AssumptionError when z or w misses an undamped mode, whatever D12 and D21 are."""
-    with _missed_by(p, "z"):
-        _require_full_columns(p.A, p.B2, p.C1, p.D12)
-    with _missed_by(p, "w"):
-        _require_full_columns(p.A.T, p.C2.T, p.B1.T, p.D21.T)
-
-
 def h2_controller(p: Prepared) -> StateSpace:
     """Return the controller of least H2 norm, feedthrough apart (gamma without bound)."""
     rows, columns = p.B2.shape[1], p.C2.shape[0]
-    require_shown(p)
-    with _missed_by(p, "z"):
-        _, F = stabilising(p.A, p.B2, p.C1.T @ p.C1, np.eye(rows), p.C1.T @ p.D12)
-    with _missed_by(p, "w"):
-        _, Ht = stabilising(p.A.T, p.C2.T, p.B1 @ p.B1.T, np.eye(columns), p.B1 @ p.D21.T)
+    _, F = stabilising(p.A, p.B2, p.C1.T @ p.C1, np.eye(rows), p.C1.T @ p.D12)
+    _, Ht = stabilising(p.A.T, p.C2.T, p.B1 @ p.B1.T, np.eye(columns), p.B1 @ p.D21.T)
     A, D = p.A + p.B2 @ F + Ht.T @ p.C2, np.zeros((rows, columns))
     return StateSpace(A, -Ht.T, F, D, inputs=p.y, outputs=p.u)
-
-
-def _require_full_columns(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> None:
-    """Raise OnAxisError when [A - s I, B; C, D] loses rank at an undamped pole s of A."""
-    # of the Hamiltonian four eigenvalues meet at a rigid-body mode, spread by rounding over 1e-4
-    poles = np.linalg.eigvals(A)
-    size = float(np.linalg.norm(A, 2)) if A.size else 0.0
-    near = poles[np.abs(poles.real) <= SPLIT * size]
-    for omega in np.unique(np.where(np.abs(near) < SPLIT * size, 0.0, np.abs(near.imag))):
-        pencil = np.block([[A - 1j * omega * np.eye(A.shape[0]), B], [C, D]])
-        if la.svdvals(pencil)[-1] < ROUNDING * size:
-            raise OnAxisError(np.array([omega]))

@@ -81,7 +81,7 @@ def _bound_at_zeros(side: FullInformation) -> float:
         null = (left[:, rank:] / rows[:, None]).conj().T
         driven = null @ np.vstack([B1, D11])
         turn, sizes, _ = np.linalg.svd(null[:, n:], full_matrices=False)
-        if sizes.size == len(null) and sizes[-1] > _LOST * sizes[0]:
+        if 0 < sizes.size == len(null) and sizes[-1] > _LOST * sizes[0]:
             found = max(found, float(np.linalg.norm(turn.conj().T @ driven / sizes[:, None], 2)))
     return found
 
@@ -108,6 +108,9 @@ def _adjoint(M: ComplexArray | FloatArray) -> ComplexArray:
 
 #: relative: a direction of D12 that is smaller is rounding
 _RANK = 1e-9
+#: relative to the largest eigenvalue of X: a negative one that is its error (the residual is 1e-6);
+#: rounding of the terms of its equation
+_NEGATIVE, _ROUNDED = 1e-5, 1e-14
 #: relative: how much rho(X Y) exceeds gamma^2 where gamma is refuted
 _BEYOND = 1e-5
 #: gamma is tried at these parts of what is reached, until one is refuted; then halving intervals
@@ -150,15 +153,21 @@ class FullInformation(NamedTuple):
         """Return X (n, n) of x, None where gamma is refuted."""
         if gamma <= self.direct:
             return None
-        X, _ = self.solution(gamma)
-        return None if self.refutes(X) else np.asarray(self.T @ X @ self.T.T)
+        X, F = self.solution(gamma)
+        return None if self.refutes(X, F) else np.asarray(self.T @ X @ self.T.T)
 
-    def refutes(self, X: FloatArray) -> bool:
-        """Return whether a solution has a negative eigenvalue beyond rounding."""
-        values = la.eigvalsh(X) if X.size else np.zeros(1)
-        size = float(np.linalg.norm(self.C)) ** 2 / (float(np.linalg.norm(self.A)) or 1.0)
-        # an accurate X to 1e-6 of its size (the residual), and beyond what its equation rounds
-        return bool(values[0] < -1e-5 * max(values[-1], -values[0]) and values[0] < -1e-9 * size)
+    def refutes(self, X: FloatArray, F: FloatArray) -> bool:
+        """Return whether a solution with its gain has a negative eigenvalue beyond rounding."""
+        if not X.size:
+            return False
+        values, vectors = la.eigh(X)
+        if values[0] >= -_NEGATIVE * max(values[-1], -values[0]):
+            return False
+        # a residual of the equation moves X by itself over twice the slowest decay
+        x = vectors[:, 0]
+        terms = np.sum(self.C**2) + 2.0 * np.linalg.norm(X @ x) * np.linalg.norm(self.A @ x)
+        poles = la.eigvals(self.A + np.hstack([self.B1, self.B2]) @ F)
+        return bool(values[0] < -_ROUNDED * terms / np.min(np.abs(poles.real)))
 
     def regular(self) -> FullInformation:
         """Return the problem in which D12 has full rank."""

@@ -9,13 +9,15 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...checks import FloatArray
+from ...checks import ComplexArray, FloatArray
 from ...errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
 from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
 from ...lti.statespace import StateSpace
+from ...tolerances import ROUNDING, SPLIT
 from ..controller import SolvedController
-from ..preparation import Prepared, normalised
+from ..preparation import Prepared
+from ..scaling import normalised
 
 #: a direction of D12 or D21 that is smaller is missing (in a prepared problem the others are 1)
 _RANK = 0.5
@@ -23,6 +25,8 @@ _RANK = 0.5
 ADDED = "added noise"
 #: sizes of what is added, tried in turn: the largest that costs next to nothing in gamma is taken
 LEVELS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
+#: two more where only modes are missed: what acts on a chain of k integrators costs the k-th root
+FINER = (*LEVELS, 1e-8, 1e-9)
 #: relative: what a level may cost in gamma, compared with a tenth of it
 _COST = 1e-3
 #: relative: a smaller gamma that is the same
@@ -37,9 +41,40 @@ _SETTLED = 1.2
 _GROWTH = 3.0
 
 
+#: relative to the loop's speed: a mode that decays more slowly, and that z or w shows by less, is
+#: taken for undamped; the same of what is undamped but for rounding
+_SLOW = 1e-4
+#: what an undamped mode lacks, and what to do about it
+_MISSED = {
+    "z": "z does not feel all that u moves at {}: an undamped (rigid-body or integrating) mode "
+    "there is left out of z, or u -> z (a weight) has a zero there. Keep that motion in z with a "
+    "weight of finite gain, or give it damping.",
+    "w": "w does not excite all that y sees at {}: an undamped (rigid-body or integrating) mode "
+    "there has no disturbance, or w -> y (a weight) has a zero there. Add a disturbance that "
+    "reaches it, or give it damping.",
+}
+
+
+class Lacking(NamedTuple):
+    """What a problem lacks for its equations to be regular, in words."""
+
+    ranks: tuple[str, ...]
+    modes: tuple[str, ...]
+
+    @property
+    def words(self) -> str:
+        """All of it, without a last stop."""
+        return "; ".join(one.rstrip(".") for one in (*self.ranks, *self.modes))
+
+
+def lacking(problem: Prepared) -> Lacking:
+    """Return which of D12 and D21 has not full rank, and which slow modes z or w misses."""
+    return Lacking(missing_ranks(problem), missed_modes(problem, _SLOW, _SLOW))
+
+
 def missing_ranks(problem: Prepared) -> tuple[str, ...]:
-    """Return in words which of D12 and D21 has not full rank, empty for a regular problem."""
-    lacking = []
+    """Return in words which of D12 and D21 has not full rank."""
+    found = []
     for name, matrix, names, cause in (
         ("D12", problem.D12, problem.u, "costs nothing in z at high frequencies"),
         ("D21", problem.D21.T, problem.y, "is free of noise in w at high frequencies"),
@@ -47,43 +82,90 @@ def missing_ranks(problem: Prepared) -> tuple[str, ...]:
         needed = matrix.shape[1]
         rank = int(np.linalg.matrix_rank(matrix, tol=_RANK)) if matrix.size else 0
         if rank < needed:
-            lacking.append(
+            found.append(
                 f"{name} has rank {rank} of {needed}: a combination of {', '.join(names)} {cause}"
             )
-    return tuple(lacking)
+    return tuple(found)
 
 
-def require_ranks(lacking: Sequence[str]) -> None:
-    """Raise AssumptionError when something is lacking, with the cure of each."""
-    if lacking:
+def missed_modes(p: Prepared, decay: float, shown: float) -> tuple[str, ...]:
+    """Return in words what z or w shows by less than `shown` of modes that decay so slowly.
+
+    Zeros of u -> z and of w -> y so close to the limit of stability count like such modes.
+    """
+    p = p.measured_in(p.own_gain)  # the unit of z must not matter
+    found = []
+    sides = ("z", p.A, p.B2, p.C1, p.D12), ("w", p.A.T, p.C2.T, p.B1.T, p.D21.T)
+    for side, A, B, C, D in sides:
+        # [A - s I, B2; C1, D12] loses rank there: at poles of A, or of A without what D12 can hide
+        inner = A - B @ np.linalg.pinv(D) @ C
+        for s in _limit(p, np.concatenate([la.eigvals(A), la.eigvals(inner)]), decay):
+            pencil = np.block([[A - s * np.eye(len(A)), B], [C, D]])
+            if la.svdvals(pencil)[-1] <= shown:
+                omega = abs(np.angle(s)) / p.dt if p.direct else abs(s.imag)
+                found.append(_MISSED[side].format(f"{p.frequency(omega):.3g} Hz"))
+                break
+    return tuple(found)
+
+
+def _limit(p: Prepared, poles: ComplexArray, decay: float) -> ComplexArray:
+    """Return the points of the limit of stability next to poles that decay slowly."""
+    if p.direct:
+        decay *= abs(p.point - 1.0)
+        near = poles[np.abs(np.abs(poles) - 1.0) <= decay]
+        limit = np.where(np.abs(near - 1.0) <= decay, 1.0, near / np.abs(near))
+    else:
+        near = poles[np.abs(poles.real) <= decay]
+        limit = 1j * np.where(np.abs(near) <= decay, 0.0, near.imag)
+    return np.unique(limit[limit.imag >= 0.0])
+
+
+def require_shown(p: Prepared) -> None:
+    """Raise AssumptionError when z or w misses an undamped mode, whatever D12 and D21 are."""
+    size = max(float(np.linalg.norm(p.A, 2)) if p.A.size else 0.0, 1.0)
+    for one in missed_modes(p, SPLIT * size, ROUNDING * size):
+        raise AssumptionError(one)
+
+
+def require_ranks(ranks: Sequence[str]) -> None:
+    """Raise AssumptionError when D12 or D21 has not full rank, with the cure of each."""
+    if ranks:
         raise AssumptionError(
-            f"{'; '.join(lacking)}, and nothing may be added (regularised=False). "
-            f"{_remedy(lacking)} Or use Lmi(), which needs no rank."
+            f"{'; '.join(ranks)}, and nothing may be added (regularised=False). "
+            f"{_remedy(ranks)} Or use Lmi(), which needs no rank."
         )
 
 
-def _remedy(lacking: Sequence[str]) -> str:
+def _remedy(ranks: Sequence[str]) -> str:
     """Return what to do about what is lacking, that of D21 where only it lacks rank."""
-    effort, noise = (any(one.startswith(name) for one in lacking) for name in ("D12", "D21"))
+    effort, noise = (any(one.startswith(name) for one in ranks) for name in ("D12", "D21"))
     cures = ["weight the efforts in z"] * (effort or not noise)
     cures += ["give each sensor noise in w"] * (noise or not effort)
     return " and ".join(cures).capitalize() + "."
 
 
 class Regularised:
-    """A problem with noise on each y and effort for each u, `level` of the channel's own size."""
+    """A problem with noise on each y and effort for each u, `level` of the channel's own size.
 
-    def __init__(self, problem: Prepared, level: float, states: bool = False) -> None:
-        n, nu, ny = problem.A.shape[0], problem.B2.shape[1], problem.C2.shape[0]
-        nx = n if states else 0
-        B1 = np.hstack([problem.B1, level * np.eye(n)[:, :nx], np.zeros((n, ny))])
-        C1 = np.vstack([problem.C1, level * np.eye(n)[:nx], np.zeros((nu, n))])
-        effort, noise = (level * np.diag(sizes) for sizes in problem.own_sizes)
-        D12 = np.vstack([problem.D12, np.zeros((nx, nu)), effort])
-        D21 = np.hstack([problem.D21, np.zeros((ny, nx)), noise])
-        D11 = la.block_diag(problem.D11, np.zeros((nu + nx, ny + nx)))
-        z_turn, self._u = normalised(D12, np.zeros(nu))
-        w_turn, y_scale = normalised(D21.T, np.zeros(ny))
+    With `modes` w also acts where u does, and z sees what y does: no mode that u reaches and y sees
+    is missed then.
+    """
+
+    def __init__(self, problem: Prepared, level: float, modes: bool = False) -> None:
+        self.given, self.level = problem, level
+        nu, ny = problem.B2.shape[1], problem.C2.shape[0]
+        size_u, size_y = problem.own_sizes
+        gain = level * problem.own_gain
+        drive = (gain * problem.B2 / size_u)[:, : nu * modes]
+        sight = (gain * problem.C2 / size_y[:, None])[: ny * modes]
+        n, mu, my = problem.A.shape[0], drive.shape[1], len(sight)
+        B1 = np.hstack([problem.B1, drive, np.zeros((n, ny))])
+        C1 = np.vstack([problem.C1, sight, np.zeros((nu, n))])
+        D12 = np.vstack([problem.D12, np.zeros((my, nu)), level * np.diag(size_u)])
+        D21 = np.hstack([problem.D21, np.zeros((ny, mu)), level * np.diag(size_y)])
+        D11 = la.block_diag(problem.D11, np.zeros((my + nu, mu + ny)))
+        z_turn, self._u = normalised(D12)
+        w_turn, y_scale = normalised(D21.T)
         self._y = y_scale.T
         self.problem = problem.replace(
             B1=B1 @ w_turn,
@@ -118,57 +200,49 @@ class _Found(NamedTuple):
 def made_regular(
     problem: Prepared,
     solve: Callable[[Prepared], SolvedController],
-    lacking: Sequence[str],
+    lack: Lacking,
     norm: Callable[[StateSpace], float] = hinf_norm,
 ) -> SolvedController:
     """Return the controller of a singular problem, found with a little noise and effort added."""
     found: list[_Found] = []
     errors: list[FlexplantError] = []
-    for level in LEVELS:
+    for level in LEVELS if lack.ranks else FINER:
         try:
-            found.append(_with_level(problem, solve, norm, level))
+            found.append(_with_level(Regularised(problem, level, bool(lack.modes)), solve, norm))
         except FlexplantError as error:
             errors.append(error)
             continue
         if len(found) > 1 and found[-2].gamma <= found[-1].gamma * (1.0 + _COST):
             break
     if not found:
-        raise next((e for e in errors if isinstance(e, AssumptionError)), errors[0])
+        raise errors[0]
     least = min(one.gamma for one in found)
-    _require_positive_infimum(problem, found, lacking)
+    _require_positive_infimum(problem, found, lack)
     index = next(i for i, one in enumerate(found) if one.gamma <= least * (1.0 + _COST))
-    return _with_notes(found, index, lacking, problem)
+    return _with_notes(found, index, lack, problem)
 
 
 def _with_level(
-    problem: Prepared,
+    regular: Regularised,
     solve: Callable[[Prepared], SolvedController],
     norm: Callable[[StateSpace], float],
-    level: float,
 ) -> _Found:
     """Return the controller for one level, judged on the problem itself."""
-    regular = Regularised(problem, level)
-    try:
-        answer = solve(regular.problem)
-    except AssumptionError:  # a mode on the stability boundary is missed by w or z
-        regular = Regularised(problem, level, states=True)
-        answer = solve(regular.problem)
+    problem = regular.given
+    A, B, C, D = regular.restored(solve(regular.problem))
     system = problem.system
-    A, B, C, D = regular.restored(answer)
     K = StateSpace(A, B, C, D, inputs=problem.y, outputs=problem.u, dt=system.dt)
     gamma = norm(lft(system, K))
     if not np.isfinite(gamma):
         raise SolverError(
-            f"with noise and effort of {level:.0e} added, the controller does not stabilise in "
-            "rounding, or a mode that z and w miss stays on the edge of stability. Weight the "
-            "efforts and that motion in z, and give each sensor noise in w."
+            f"with noise and effort of {regular.level:.0e} added, the controller does not "
+            "stabilise in rounding, or a mode that z and w miss stays on the edge of stability. "
+            "Weight the efforts and that motion in z, and give each sensor noise in w."
         )
-    return _Found(level, K, gamma)
+    return _Found(regular.level, K, gamma)
 
 
-def _require_positive_infimum(
-    problem: Prepared, found: Sequence[_Found], lacking: Sequence[str]
-) -> None:
+def _require_positive_infimum(problem: Prepared, found: Sequence[_Found], lack: Lacking) -> None:
     gammas = [one.gamma for one in found]
     least = int(np.argmin(gammas))
     settled = any(later < _SETTLED * gammas[least] for later in gammas[least + 1 :])
@@ -182,19 +256,19 @@ def _require_positive_infimum(
         f"there is no smallest gamma: the infimum is 0. With noise and effort of "
         f"{found[0].level:.0e} to {found[least].level:.0e} added, {gammas[0]:.3g} to "
         f"{gammas[-1]:.3g} are reached by ever larger gains, with which u "
-        f"({', '.join(problem.u)}) cancels w in z at no cost. {'; '.join(lacking)}. "
-        f"{_remedy(lacking)}"
+        f"({', '.join(problem.u)}) cancels w in z at no cost. {lack.words}. "
+        f"{_remedy(lack.ranks)}"
     )
 
 
 def _with_notes(
-    found: Sequence[_Found], index: int, lacking: Sequence[str], problem: Prepared
+    found: Sequence[_Found], index: int, lack: Lacking, problem: Prepared
 ) -> SolvedController:
     one, finer = found[index], found[min(index + 1, len(found) - 1)]
     K = one.K
     cost = max(one.gamma / finer.gamma - 1.0, 0.0) if finer.gamma else 0.0
     note = (
-        f"{'; '.join(lacking)}. Designed with noise of {one.level:.0e} on each sensor and as much "
+        f"{lack.words}. Designed with noise of {one.level:.0e} on each sensor and as much "
         "effort of each actuator, relative to the plant's own channels, and verified without them"
     )
     if finer is not one:
@@ -211,7 +285,7 @@ def _with_notes(
         notes.append(
             "the smallest gamma is approached by infinite gain only: the controller's fastest pole "
             f"lies at {problem.speed * one.speed:.3g} rad/s and moves on as the added noise falls. "
-            f"{_remedy(lacking)[:-1]} to get a slower one."
+            f"{_remedy(lack.ranks)[:-1]} to get a slower one."
         )
     certificate = {ADDED: one.level}
     if finer is not one:

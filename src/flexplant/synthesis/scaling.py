@@ -1,0 +1,131 @@
+"""Units of a synthesis problem in which few digits are lost: of time, of states and of channels."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg as la
+
+from ..checks import FloatArray
+from ..lti.equations import bordered_scale, state_scale
+from ..lti.norms import eigenvalues_with_error
+from ..lti.responses import responses
+from ..lti.statespace import StateSpace
+from ..tolerances import divisor
+
+#: point at which answers are taken, in the unit of the loop's speed: away from resonances
+POINT = complex(np.exp(0.25j * np.pi))
+#: relative singular value of D12 or D21, its columns of unit size, that counts as zero
+_RANK = 1e-9
+#: fraction of its terms that an answer has at least: what they cancel to may be rounding
+_HIDDEN = 1e-3
+#: effort or noise that is smaller, relative to the plant's own answer at the loop's speed, is not
+#: felt: less than the least that is added where there is none. Rounding is 1e-14 or less
+FELT = 1e-7
+#: relative to the fastest pole: where the search for the loop's speed ends. A double integrator has
+#: lost 14 digits there
+_FAR = 1e7
+#: the same of a sampled plant [half the rate in rad/s, as mapped]: a third of the rate, since all
+#: answers are distorted above it
+_THIRD = float(np.tan(np.pi / 3.0))
+#: points a decade of the search for the loop's speed, its start relative to the slowest pole (not
+#: a whole decade below it: an undamped pole is no point), and the factor a decade that is a fall
+_POINTS, _START, _FALL = 8, 0.09, 2.0
+
+
+def balanced(
+    A: FloatArray, B: FloatArray, C: FloatArray, s: complex
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the system in states scaled (by powers of two) so that rows and columns match."""
+    # Osborne's balancing of A bordered by the sizes of the rows of B and of the columns of C; the
+    # border counts as much as it takes to give `C (s I - A)^-1 B` unit size, which no scaling of
+    # states or channels changes
+    n = A.shape[0]
+    if not n:
+        return A, B, C
+    scale = state_scale(A, B, C)  # never A alone: that shrinks one side of a nearly triangular A
+    for _ in range(2):  # the border is weighed anew once the states have sizes alike
+        A_, B_, C_ = A * scale / scale[:, None], B / scale[:, None], C * scale
+        try:
+            gain = float(np.linalg.norm(C_ @ np.linalg.solve(s * np.eye(n) - A_, B_)))
+        except np.linalg.LinAlgError:  # a pole at s: any weight will do
+            gain = 1.0
+        weight = 1.0 / np.sqrt(gain) if 0.0 < gain < np.inf else 1.0
+        drive, sight = np.linalg.norm(B_, axis=1), np.linalg.norm(C_, axis=0)
+        scale = scale * bordered_scale(A_, weight * drive, weight * sight)
+    return A * scale / scale[:, None], B / scale[:, None], C * scale
+
+
+def timed(
+    A: FloatArray, B: FloatArray, C: FloatArray, speed: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the system with speed [rad/s] as its unit of frequency, balanced there."""
+    root = np.sqrt(speed)
+    return balanced(A / speed, B / root, C / root, POINT)
+
+
+def answers(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, s: complex, hidden: float = _HIDDEN
+) -> FloatArray:
+    """Return the sizes (m,) of ``C (s I - A)^-1 B + D`` by column, at least a part of its terms."""
+    # what u moves and z does not show has no size there but rounding
+    try:
+        states = np.linalg.solve(s * np.eye(A.shape[0]) - A, B)
+    except np.linalg.LinAlgError:  # a pole at s
+        states = np.asarray(B, dtype=np.complex128)
+    terms = np.linalg.norm(C) * np.linalg.norm(states, axis=0) + np.linalg.norm(D, axis=0)
+    return np.asarray(np.maximum(np.linalg.norm(C @ states + D, axis=0), hidden * terms))
+
+
+def own_gain(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray, s: complex) -> float:
+    """Return the largest of the answers of w in z, 1 where w does nothing."""
+    return float(np.max(answers(A, B, C, D, s), initial=0.0)) or 1.0
+
+
+def loop_speed(g: StateSpace, m1: int, p1: int, dt: float = 0.0) -> float:
+    """Return the frequency [rad/s] at which the loop of ``[w; u] -> [z; y]`` crosses over."""
+    # a loop gains nothing where u costs as much as it does to z, or where y shows as much noise as
+    # w: the answers from u to z, and from w to y, have fallen to their feedthrough there. The
+    # slowest of all channels counts; the mean pole where no channel has such a frequency
+    poles, _, error = eigenvalues_with_error(g.A)
+    sizes = np.abs(poles)[np.abs(poles) > error]
+    if not sizes.size:
+        return 1.0
+    start = _START * float(sizes.min())
+    far = max(2.0 * _THIRD / dt, 2.0 * start) if dt else _FAR * float(sizes.max())
+    omega = np.geomspace(start, far, 1 + int(_POINTS * np.log10(far / start)))
+    G = responses(g, omega / (2.0 * np.pi))
+    sides = np.linalg.norm(G[:p1, m1:], axis=0), np.linalg.norm(G[p1:, :m1], axis=1)
+    slopes = np.diff(np.log(np.maximum(np.vstack(sides), np.finfo(float).tiny)))
+    falls = slopes < -np.log(_FALL) / _POINTS
+    # the first point after the first fall at which there is none
+    settled = np.logical_or.accumulate(falls, axis=1) & ~falls
+    found = [omega[np.argmax(one)] for one in settled if one.any()]
+    return float(min(found) if found else np.exp(np.mean(np.log(sizes))))
+
+
+def normalised(D: FloatArray, own: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """Return an orthogonal Z and a scaling S with ``Z' D S = [0; I]`` where D has full rank."""
+    # columns have unit size before the rank is taken, so that it does not depend on units. One that
+    # is not felt beside what the plant does on its channel at the loop's speed, `own` (m,), counts
+    # as zero, and `own` is its unit
+    m = D.shape[1]
+    sizes = np.linalg.norm(D, axis=0)
+    felt = sizes > FELT * own
+    columns = divisor(np.where(felt, sizes, own))
+    left, values, right = la.svd(np.where(felt, D, 0.0) / columns, full_matrices=True)
+    sizes = np.zeros(m)
+    sizes[: values.size] = values
+    rank = int(np.count_nonzero(sizes > _RANK))
+    # columns of Z: what D does not reach first, then what it does
+    Z = np.hstack([left[:, rank:], left[:, :rank]])
+    S = right.T @ np.diag(1.0 / np.where(np.arange(m) < rank, sizes, 1.0))
+    return Z, S / columns[:, None]
+
+
+def departure_from_normal(A: FloatArray, speed: float) -> float:
+    """Return the size of A relative to that of its poles, or of as many at a speed."""
+    # Henrici's measure, 1 for a normal matrix; poles slower than the loop are all the same to it
+    if not A.size:
+        return 1.0
+    poles = float(np.linalg.norm(np.linalg.eigvals(A)))
+    return float(np.linalg.norm(A) / np.hypot(poles, speed * np.sqrt(len(A))))

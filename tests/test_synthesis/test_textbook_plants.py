@@ -1,0 +1,109 @@
+"""H-infinity on what students and engineers type first, beside optima found by other hands."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from flexplant.lti import StateSpace, tf
+from flexplant.plant import StandardPlant, mixed_sensitivity
+from flexplant.synthesis import design_hinf
+from oracles_synthesis import split
+from textbook_plants import KINDS, problem
+
+oracle = pytest.importorskip("oracles_hinf", exc_type=ImportError)  # needs slycot
+
+#: gamma over the optimum: the back-off, its tolerance and what the oracle leaves; without full rank
+FULL, SINGULAR = 1.0102, 1.065
+
+
+def as_system(given, dt=0.0):
+    """A plant or a weight as a user gives it."""
+    if not isinstance(given, tuple):
+        return float(given)
+    return tf(*given) if len(given) == 2 else StateSpace(*given, dt)
+
+
+def posed(p):
+    """A problem as a user poses it: mixed sensitivity by its verb, the others in matrices."""
+    if p.G is not None:
+        weights = {key: as_system(one) for key, one in p.weights.items()}
+        return mixed_sensitivity(as_system(p.G, p.dt), **weights)
+    A, B, C, D = p.parts
+    u, y = [f"u{i}" for i in range(p.nu)], [f"y{i}" for i in range(p.ny)]
+    w, z = [f"w{i}" for i in range(B.shape[1] - p.nu)], [f"z{i}" for i in range(len(C) - p.ny)]
+    system = StateSpace(A, B, C, D, p.dt, inputs=[*w, *u], outputs=[*z, *y])
+    return StandardPlant.from_statespace(system, u=u, y=y)
+
+
+class Verdict(NamedTuple):
+    """A design's gamma, bound and norm of its loop over the optimum, and what is allowed."""
+
+    gamma: float
+    lower: float
+    norm: float
+    allowed: float
+
+    @property
+    def word(self):
+        if not np.isfinite(self.gamma):
+            return "infinite"
+        if self.norm > 1.01 * self.gamma or self.gamma < 0.999 * self.lower:
+            return "false claim"
+        if self.lower > 1.01:
+            return "bound too high"
+        return "right" if self.gamma <= self.allowed else "loose"
+
+
+def judged(kind, seed, method=None):
+    """The verdict on a design; the loop is that of the oracle's plant."""
+    p = problem(kind, seed)
+    best, found = oracle.smallest_norm(p), design_hinf(posed(p), method, progress=False)
+    K = found.system
+    norm = oracle.loop_norm(p, (K.A, K.B, K.C, K.D))
+    parts = split(*p.parts, p.nu, p.ny)
+    ranks = [np.linalg.matrix_rank(parts[name], rtol=1e-12) for name in ("D12", "D21")]
+    allowed = FULL if ranks == [p.nu, p.ny] else SINGULAR
+    return Verdict(found.gamma / best, found.lower / best, norm / best, allowed)
+
+
+@pytest.mark.parametrize("kind", ["one lag", "three lags", "double integrator", "GS/T", "sampled"])
+def test_what_is_typed_first(kind):
+    assert judged(kind, 0).word == "right"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind(kind, seed):
+    verdict = judged(kind, seed)
+    assert verdict.word == "right", verdict
+
+
+#: kinds whose optimum is that of a w which is known: u sees it in y as soon as it acts
+KNOWN = ["two lags", "integrator", "double integrator", "RHP zero", "aircraft", "MIMO integrators"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KNOWN)
+def test_two_routes_to_the_optimum_agree(kind):
+    """SLICOT's controllers from above, a problem of least squares from below."""
+    p = problem(kind, 0)
+    low, high = oracle.least_cost(p), oracle.smallest_norm(p)
+    assert 0.995 * high <= low <= high * (1 + 1e-4)
+    assert design_hinf(posed(p)).gamma >= low
+
+
+@pytest.mark.parametrize(
+    ("G", "S", "KS", "best"),
+    [
+        (([1], [1, 1e-4]), ([0.5, 2], [1, 2e-4]), 0.05, 0.534),
+        (([1], [1, 2e-3, 1e-6]), ([0.5, 0.3], [1, 3e-4]), 0.1, 0.5666),
+        (([1], [1, 0, 0]), ([0.5, 0.3], [1, 3e-4]), 0.1, 0.567),
+    ],
+)
+def test_slow_poles_and_integrators(G, S, KS, best):
+    """They were refused, four times too large, and infinite."""
+    found = design_hinf(mixed_sensitivity(tf(*G), S=tf(*S), KS=KS))
+    assert found.gamma == pytest.approx(best, rel=1.1e-2)
+    assert 0.99 * best <= found.lower <= 1.002 * best
