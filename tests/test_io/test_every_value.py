@@ -74,6 +74,7 @@ def made():
     fit = fx.update(rom, unknowns, [residual])
     plant = fx.assemble_plant(rom, ports())
     sampled = plant.discretized(RATE, delay=1)
+    yield fx.assemble_plant(rom, ports(), evaluation=fe).evaluation
     updated = fx.assemble_plant(fit.model, ports())
     uncertain = updated.uncertain(
         fx.plant.Fit(fit, modes=[6]), fx.plant.Neglected(full(mass=fit.values[0]))
