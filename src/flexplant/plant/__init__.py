@@ -72,6 +72,8 @@ Names elsewhere: ``augw``, ``mixsyn``: `mixed_sensitivity`, then `fx.design_hinf
 from ..rooms import public_names as _public_names
 from .assumptions import AssumptionReport as AssumptionReport
 from .assumptions import ModeVisibility as ModeVisibility
+from .axes import DrivenAxes as DrivenAxes
+from .axes import driven_axes as driven_axes
 from .evaluation_model import EvaluationModel as EvaluationModel
 from .forces import Actuator as Actuator
 from .forces import BaseAcceleration as BaseAcceleration

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import ComplexArray, FloatArray, Value, name_list, positive
+from ..checks import ComplexArray, FloatArray, IntArray, Value, name_list, positive
 from ..errors import AssumptionError, LabelError, require_known, some_names
 from ..lti.statespace import StateSpace
 from ..tolerances import divisor
@@ -19,10 +19,14 @@ from .realisation import natural
 #: smallest over largest singular value of the gain, rows and columns scaled, from which on axes
 #: count as moved apart: below it a machine would have to bend or to push a hundred times as hard
 _APART = 1e-2
+#: a gain this small relative to its terms is rounding: the actuator does not move the axis
+_ROUNDING = 1e-6
 #: sweeps that scale rows and columns of a gain to one length
 _SWEEPS = 20
 #: a usual bandwidth as a part of the rate, and of the fastest mode of a continuous plant
 _OF_RATE, _OF_MODE = 0.01, 0.1
+#: what counts as rest, relative to a usual bandwidth: squared it is below what tests of rest see
+_RESTING = 1e-4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,7 +116,7 @@ def driven_axes(
     first: tuple[str, ...] = ()
     for channels in sets:
         sigma = _sigmas(plant, channels, freq, named)
-        gains = {s: real_gain(plant.system, s, channels, plant.u) for s in np.unique(sigma)}
+        gains = {s: _felt(plant, s, channels) for s in np.unique(sigma)}
         if all(apart(G) for G in gains.values()):
             inverse = {s: np.linalg.pinv(G) for s, G in gains.items()}
             late = np.exp(-sigma * plant.dt * (plant.delay + 0.5))  # of hold and delay
@@ -182,6 +186,21 @@ def usual_frequency(plant: Partition) -> float:
     return _OF_MODE * float(fastest) or 1.0
 
 
+def resting_frequency(plant: Partition) -> float:
+    """Return a frequency [Hz] next to rest, far below all that a plant does."""
+    return _RESTING * usual_frequency(plant)
+
+
+def _felt(plant: Partition, sigma: float, channels: Sequence[str]) -> FloatArray:
+    """Return the gain (r, m) of channels to actuators on the real axis, rounding set to zero."""
+    g = plant.system
+    rows, columns = g.output_index(list(channels)), g.input_index(list(plant.u))
+    states = _states(g, complex(sigma), columns).real
+    G = g.C[rows] @ states + g.D[np.ix_(rows, columns)]
+    most = np.abs(g.C[rows]) @ np.abs(states)
+    return np.asarray(np.where(np.abs(G) > _ROUNDING * most, G, 0.0))
+
+
 def apart(G: FloatArray) -> bool:
     """Return whether the rows of a gain (r, m) are independent, whatever the channels' units."""
     if not G.size or G.shape[0] > G.shape[1]:
@@ -206,12 +225,16 @@ def complex_gain(
 ) -> ComplexArray:
     """Return the gain (p, m) at any s [rad/s], of a sampled system at z = exp(s dt)."""
     rows, columns = g.output_index(list(outputs)), g.input_index(list(inputs))
+    return np.asarray(g.C[rows] @ _states(g, s, columns) + g.D[np.ix_(rows, columns)])
+
+
+def _states(g: StateSpace, s: complex, columns: IntArray) -> ComplexArray:
+    """Return ``(z I - A)^-1 B`` of some inputs."""
     # next to z = 1, with the difference of both, no digit of a slow pole is lost
     shift = np.expm1(s * g.dt) if g.dt else s
     eye = np.eye(g.n_states)
     pencil = shift * eye - (g.A - eye if g.dt else g.A)
-    states = np.linalg.solve(pencil, g.B[:, columns].astype(np.complex128))
-    return np.asarray(g.C[rows] @ states + g.D[np.ix_(rows, columns)])
+    return np.asarray(np.linalg.solve(pencil, g.B[:, columns].astype(np.complex128)))
 
 
 def elastic(plant: Partition) -> FloatArray:

@@ -16,7 +16,7 @@ from ..lti.interconnection import connect, series, side_by_side
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..tolerances import divisor
 from .at_rest import followed_at_rest
-from .axes import DrivenAxes, driven_axes, real_gain
+from .axes import DrivenAxes, driven_axes, real_gain, resting_frequency
 from .building import at_rate
 from .standard import StandardPlant, standard_plant
 
@@ -81,7 +81,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
             f"there is no displacement sensor in y (its sensors: {kinds}): none of them shows "
             "where the machine rests. Add Sensor(name, at=...)."
         )
-    driven = driven_axes(plant, poi=poi)
+    driven = driven_axes(plant, freq=resting_frequency(plant), poi=poi)
     own = [(p, axis) for p, axis in ports.followed if p.channel(axis) in driven.channels]
     columns = [driven.channels.index(p.channel(axis)) for p, axis in own]
     g, T = plant.system, driven.T

@@ -81,8 +81,8 @@ from .exposure import exposure_errors as exposure_errors
 from .exposure import settling_time as settling_time
 from .feedforward import Feedforward as Feedforward
 from .feedforward import design_feedforward as design_feedforward
-from .feedforward import inverse_forces as inverse_forces
 from .feedforward import known_forces as known_forces
+from .inverse_forces import inverse_forces as inverse_forces
 from .learning import LearnedFeedforward as LearnedFeedforward
 from .learning import learn_feedforward as learn_feedforward
 from .machine_pipeline import MachinePipeline as MachinePipeline

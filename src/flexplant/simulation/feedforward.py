@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,25 +19,23 @@ from ..checks import (
     short,
     whole,
 )
-from ..errors import (
-    AssumptionError,
-    CertificateError,
-    LabelError,
-    ModelError,
-    counted,
-    only_one,
-    warn,
-)
+from ..errors import AssumptionError, LabelError, ModelError, counted, only_one
 from ..loop import ClosedLoop, close_loop
 from ..loop.blocks import DERIVATIVES, force_name
-from ..lti.responses import responder
 from ..lti.statespace import StateSpace
-from ..plant import Poi, StandardPlant, decouple, standard_plant
-from ..plant.partition import require_plain, require_sampled
+from ..plant import Poi, StandardPlant, driven_axes, standard_plant
+from ..plant.at_rest import OfS, at_rest, solved
+from ..plant.axes import resting_frequency
+from ..plant.partition import require_plain
 from ..tolerances import divisor
 from .motion import SetPoint
+from .response import Response
 from .simulate import simulate
 
+#: how long a loop is watched after the beginning of a move, relative to it, for gains of the move
+_AFTER = 1.5
+#: relative: combinations of gains that change the errors less are left out
+_RESOLVED = 1e-8
 #: what a set-point gives, by the order of the derivative
 TERMS = ("position", *DERIVATIVES)
 
@@ -47,17 +44,17 @@ TERMS = ("position", *DERIVATIVES)
 class Feedforward(Value):
     """Forces proportional to a set-point and its derivatives; a block for `close_loop`.
 
-    ``u = T sum_m gains[m] d^m r / dt^m``, T from forces and moments of the POI's axes at the
-    centre of gravity to the actuators. Made by `design_feedforward`.
+    ``u = T sum_m gains[m] d^m r / dt^m``, T from a total force of each axis to the actuators. Made
+    by `design_feedforward`.
 
     Parameters
     ----------
     reference : str
         The channel of the set-point r.
     axes : sequence of str
-        The r axes of the forces.
+        The r channels of POIs that the forces move.
     T : (nu, r) array
-        Forces to actuators.
+        Forces of axes to actuators: sizes of a column add to one.
     actuators : sequence of str
     gains : (p, r, 5) array
         On position, velocity, acceleration, jerk and snap; one row, or one for each of p places.
@@ -129,20 +126,25 @@ def design_feedforward(
     *,
     reference: str | None = None,
     order: int = 4,
+    move: SetPoint | None = None,
     along: npt.ArrayLike | None = None,
 ) -> Feedforward:
     """Return the feedforward of a plant or a loop: its inverse at low frequency, term by term.
 
-    With P the response from forces at the centre of gravity to the POI (the hold, all delays,
-    sensors' and actuators' filters in it), ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``: of a free
-    machine k_2 is the mass, k_3 the mass times the delay, and k_4 holds half the square of the
-    delay and, negative, the compliance of the flexible modes between actuators and POI; on springs
-    k_0 and k_1 are their stiffness and damping. In a loop ``G_u F + G_r = 1`` is solved for F
-    instead, G_u and G_r the responses of the POI to forces and reference in closed loop: where
-    sensors and POI do not move alike, the feedback would oppose the inverse of P. The
-    coefficients are Cauchy's integrals on a circle, the largest on which they no longer depend on
-    its radius. All axes of the POI are taken together: the forces that keep the axes without a
-    reference at rest are in it.
+    With P the response of the axes to forces T along them (the hold, all delays, sensors' and
+    actuators' filters in it), ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``: of a free machine k_2 is
+    the mass, k_3 the mass times the delay, and k_4 holds half the square of the delay and,
+    negative, the compliance of the flexible modes between actuators and POI; on springs k_0 and k_1
+    are their stiffness and damping. In a loop ``G_u F + G_r = 1`` is solved for F instead, G_u and
+    G_r the responses of the POI to forces and reference in closed loop: where sensors and POI do
+    not move alike, the feedback would oppose the inverse of P. The coefficients are Cauchy's
+    integrals on a circle around rest, the largest on which two radii agree and within which the
+    expansion is the inverse itself: a zero of P (a mass on a spring beside the POI) is left
+    outside. All axes that the actuators move apart (`flexplant.plant.driven_axes`, next to rest)
+    are taken together: the forces that keep the axes without a reference at rest are in it.
+
+    With a move the gains are those of least squares of the errors of a loop in that move instead,
+    which also serves where zeros of P are as slow as the move.
 
     Parameters
     ----------
@@ -153,6 +155,8 @@ def design_feedforward(
         The reference's channel; the plant's only one when not given.
     order : int
         Highest derivative, 2 to 4: acceleration, jerk, snap.
+    move : SetPoint, optional
+        The move in which a loop is to have the least errors.
     along : (p, 3) array [m], optional
         Places of the POI: gains for each of them, for a POI that moves (`simulate(moving=)`).
 
@@ -168,7 +172,8 @@ def design_feedforward(
     AssumptionError
         When the actuators cannot move the POI's axes apart from each other.
     ModelError
-        When the plant was not assembled from a structure or is weighted, or the order is none.
+        When the plant was not assembled from a structure or is weighted, or the order is not 2 to
+        4; when a move is given without a loop, or with places.
 
     References
     ----------
@@ -182,18 +187,30 @@ def design_feedforward(
     (1, 1, 5)
     >>> forward.up_to("jerk")
     <Feedforward die:ref to 1 actuator>
-      x: acceleration 3  jerk 0.00225
+      die:x: acceleration 3  jerk 0.00225
     """
     loop = given if isinstance(given, ClosedLoop) else None
     plant, poi, axis, name = tracked(given if loop is None else loop.plant, reference)
     highest = whole(order, "order", minimum=2, maximum=4)
-    T, axes = force_axes(plant, poi)
-    wanted = np.eye(len(poi.axes))[:, [poi.axes.index(axis)]]
+    driven, T = force_axes(plant)
+    wanted = np.array([[1.0 if one == poi.channel(axis) else 0.0] for one in driven])
+    if not np.any(wanted):
+        raise AssumptionError(
+            f"the actuators do not move {poi.channel(axis)} apart from other POIs: they move "
+            f"{', '.join(driven)}. Leave other POIs out of the ports, or add actuators."
+        )
+    empty = Feedforward(name, driven, T, tuple(plant.u), np.zeros((1, len(driven), 5)), plant.dt)
+    if move is not None:
+        if loop is None or along is not None:
+            raise ModelError("a move needs a ClosedLoop, without along=: pass design_feedforward"
+                             "(loop, move=move).")  # fmt: skip
+        return _of_move(empty, loop, move, highest)
     blocks = () if loop is None else loop.blocks
-    forced = close_loop(plant.replace(evaluation=None), *blocks, known_forces(plant))
-    gains = coefficients(_inverse_of(forced, poi, T, wanted, name, along), plant.dt, axes)
+    forced = close_loop(plant, *blocks, known_forces(plant))
+    find = _inverse_of(forced, poi, T, driven, wanted, name, along)
+    gains = at_rest(find, plant.dt, driven)
     gains[:, :, highest + 1 :] = 0.0
-    return Feedforward(name, axes, T, tuple(plant.u), gains, plant.dt)
+    return empty.replace(gains=gains)
 
 
 def known_forces(plant: StandardPlant) -> StateSpace:
@@ -233,46 +250,110 @@ def tracked(plant: Any, reference: str | None) -> tuple[StandardPlant, Poi, str,
     return plant, *found[reference], reference
 
 
-def force_axes(plant: StandardPlant, poi: Poi) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return T (nu, r), forces along the POI's axes at the centre of gravity to actuators."""
-    decoupled = decouple(plant, axes=poi.axes)
-    return decoupled.T_u, tuple(decoupled.axes)
+def force_axes(plant: StandardPlant) -> tuple[tuple[str, ...], FloatArray]:
+    """Return the axes that the actuators move, and T (nu, r): total forces to actuators."""
+    driven = driven_axes(plant, freq=resting_frequency(plant))
+    return driven.channels, driven.T / np.abs(driven.T).sum(axis=0)
 
 
 def _inverse_of(
     forced: ClosedLoop,
     poi: Poi,
     T: FloatArray,
+    axes: tuple[str, ...],
     wanted: FloatArray,
     name: str,
     along: npt.ArrayLike | None,
-) -> Inverse:
+) -> OfS:
     """Return the function of s that gives F (p, r) in a loop with known forces, at p places."""
     # a place changes what is seen of the states and of u, which the feedback does not read
-    g, plant, r = forced.monitored, forced.plant, len(poi.axes)
+    g, plant = forced.monitored, forced.plant
     acts = np.zeros((len(plant.w), T.shape[1] + 1))
     acts[g.input_index([force_name(u) for u in plant.u]), :-1] = T
     acts[g.input_index([name]), -1] = 1.0
-    rows = g.output_index([poi.channel(axis) for axis in poi.axes])
+    rows = g.output_index(list(axes))
     C, D = g.C[rows][None], (g.D[rows] @ acts)[None]
     if along is not None:
         places = plant.along(poi.name, real_array(along, "along", (None, 3)))
-        own, u = places.D[:, :r], g.output_index(forced.driven)
-        by_u = own[:, :, plant.system.input_index(forced.driven)]
-        C = by_u @ g.C[u]
-        C[:, :, : plant.system.n_states] += places.C[:, :r]
-        D = (own[:, :, plant.system.input_index(plant.w)] + by_u @ g.D[u]) @ acts
+        there = {poi.channel(axis): i for i, axis in enumerate(poi.axes)}
+        own = [there[one] for one in axes if one in there]
+        at = [i for i, one in enumerate(axes) if one in there]
+        u = g.output_index(forced.driven)
+        by_u = places.D[:, own][:, :, plant.system.input_index(forced.driven)]
+        C = np.repeat(C, len(places.D), axis=0)
+        D = np.repeat(D, len(places.D), axis=0)
+        C[:, at] = by_u @ g.C[u]
+        C[:, at, : plant.system.n_states] += places.C[:, own]
+        direct = places.D[:, own][:, :, plant.system.input_index(plant.w)]
+        D[:, at] = (direct + by_u @ g.D[u]) @ acts
 
-    def found(s: complex) -> tuple[ComplexArray, ComplexArray]:
+    def found(s: complex) -> ComplexArray:
         both = C @ _states(g, g.B @ acts, s) + D
-        return both[:, :, :-1], wanted - both[:, :, -1:]
+        return solved(both[:, :, :-1], wanted - both[:, :, -1:], axes)[..., 0]
 
     return found
 
 
+def _of_move(empty: Feedforward, loop: ClosedLoop, move: SetPoint, highest: int) -> Feedforward:
+    """Return the gains by least squares of the errors of a loop in a move."""
+    instance(move, SetPoint, "move", "Use setpoint(...) or scan(...).")
+    duration, orders = _AFTER * move.duration, list(range(min(highest, move.order) + 1))
+    plant = loop.plant.replace(evaluation=None)
+    alone = close_loop(plant, *loop.blocks, idle=loop.idle)
+    _, poi, axis, _ = tracked(plant, empty.reference)
+    others = [one for one in empty.axes if one != poi.channel(axis)]
+    channels = [poi.derived(axis, "error"), *others]
+    given = {empty.reference: move}
+    error = run_errors(simulate(alone, reference=given, duration=duration, noise=False), channels)
+    effects = gain_effects(empty, loop, move, duration, orders, channels)
+    unit = divisor(np.linalg.norm(effects, axis=1))
+    found = np.linalg.lstsq((effects / unit[:, None]).T, -error, rcond=_RESOLVED)[0] / unit
+    gains = empty.gains.copy()
+    gains[0][:, orders] = found.reshape(len(empty.axes), len(orders))
+    return empty.replace(gains=gains)
+
+
+def gain_effects(
+    start: Feedforward,
+    loop: ClosedLoop,
+    move: SetPoint,
+    duration: float,
+    orders: list[int],
+    channels: list[str],
+) -> FloatArray:
+    """Return what a unit of each gain adds to the errors (n_gain, n_channel * n_time)."""
+    plant = loop.plant.replace(evaluation=None)
+    forced = close_loop(plant, *loop.blocks, known_forces(plant), idle=loop.idle)
+    time = np.arange(round(positive(duration, "duration") / loop.plant.dt)) * loop.plant.dt
+    signals = move.at(time)
+    rows = []
+    for axis in range(len(start.axes)):
+        for order in orders:
+            # of size one: a unit gain may make forces far larger than any that is meant
+            size = float(np.max(np.abs(signals[order]))) or 1.0
+            force = np.outer(start.T[:, axis], signals[order] / size)
+            given = {force_name(u): force[i] for i, u in enumerate(start.actuators)}
+            run = simulate(forced, reference=given, duration=duration, noise=False)
+            rows.append(size * run_errors(run, channels))
+    return np.array(rows)
+
+
+def run_errors(run: object, channels: list[str]) -> FloatArray:
+    """Return the errors one after the other; the mean over runs where there are several."""
+    if not isinstance(run, Response) or any(name not in run for name in channels):
+        raise ModelError(
+            f"a trial must return a Response with {', '.join(channels)}, got {short(run)}. Return "
+            "simulate(loop, reference=move, duration=...)."
+        )
+    signals = [run[name] for name in channels]
+    return np.concatenate([s.mean(axis=0) if s.ndim == 2 else s for s in signals])
+
+
 def _states(g: StateSpace, B: FloatArray, s: complex) -> ComplexArray:
-    z = np.exp(s * g.dt) if g.dt else s
-    return np.asarray(np.linalg.solve(z * np.eye(g.n_states) - g.A, B.astype(np.complex128)))
+    # next to z = 1 no digit of a slow pole is lost
+    shift, eye = (np.expm1(s * g.dt) if g.dt else s), np.eye(g.n_states)
+    pencil = shift * eye - (g.A - eye if g.dt else g.A)
+    return np.asarray(np.linalg.solve(pencil, B.astype(np.complex128)))
 
 
 def _term_index(term: Any) -> int:
@@ -298,218 +379,3 @@ def _check_order(move: Any, gains: FloatArray) -> None:
             f"so that its {TERMS[highest]} is impulses. Give the set-point a bound on "
             f"{TERMS[highest]}, or use feedforward.up_to({TERMS[move.order]!r})."
         )
-
-
-#: points on a circle of Cauchy's integrals; its largest radius [rad/s], and how often it is halved
-_SAMPLES, _LARGEST, _RADII = 16, 6e3, 24
-#: relative: two circles give the same coefficients
-_SAME = 1e-8
-#: condition above which a response counts as singular
-_SINGULAR = 1e9
-#: the response of a POI to forces, and what is to follow, at s
-Inverse: TypeAlias = Callable[[complex], tuple[ComplexArray, ComplexArray]]
-
-
-def coefficients(find: Inverse, dt: float, axes: Sequence[str]) -> FloatArray:
-    """Return k_0, ..., k_4 (p, r, 5) of F(s), G F = rhs, on the largest circle that allows it."""
-    radius = min(_LARGEST, 0.5 / dt) if dt else _LARGEST
-    powers = np.arange(5)
-    outer = _on_circle(find, radius, axes)
-    for _ in range(_RADII):
-        inner = _on_circle(find, 0.5 * radius, axes)
-        size = np.abs(outer) * radius**powers
-        scale = size.max(axis=(1, 2), keepdims=True)
-        if np.all(np.abs(outer - inner) * (0.5 * radius) ** powers <= _SAME * scale):
-            inner[np.abs(inner) * (0.5 * radius) ** powers <= _SAME * scale] = 0.0
-            return inner
-        outer, radius = inner, 0.5 * radius
-    raise AssumptionError(
-        f"the response from forces along {', '.join(axes)} to the POI has no inverse that is "
-        "regular at low frequency: there is a zero at rest. Check which axes the actuators move."
-    )
-
-
-def _on_circle(find: Inverse, radius: float, axes: Sequence[str]) -> FloatArray:
-    """Return k_m = sum F(s_i) s_i^-m / N over N points of a circle (the lower half conjugate)."""
-    turns = np.exp(2j * np.pi * (np.arange(_SAMPLES // 2) + 0.5) / _SAMPLES)
-    values = []
-    for turn in turns:
-        G, wanted = find(radius * complex(turn))
-        rows = np.max(np.abs(G), axis=2, keepdims=True)
-        columns = np.max(np.abs(G), axis=1, keepdims=True)
-        flat = rows.min(initial=1.0) <= 0 or columns.min(initial=1.0) <= 0
-        if flat or np.max(np.linalg.cond(G / np.sqrt(rows * columns))) > _SINGULAR:
-            raise AssumptionError(
-                f"the forces along {', '.join(axes)} do not move these axes of the POI apart from "
-                "each other, so that there is no inverse. Choose other axes of the POI."
-            )
-        values.append(
-            np.linalg.solve(G, np.broadcast_to(wanted, (len(G), *wanted.shape[-2:])))[..., 0]
-        )
-    F = np.array(values)[..., None] * (turns[:, None] ** -np.arange(5))[:, None, None, :]
-    return np.asarray(2.0 / _SAMPLES * F.sum(axis=0).real / radius ** np.arange(5))
-
-
-#: gradient of what forces minimise, of that without forces; 2e-13 was seen
-AGREEMENT = 1e-7
-#: part of the largest force that may fall outside the run
-_OUTSIDE = 1e-3
-
-
-def inverse_forces(
-    loop: ClosedLoop,
-    move: SetPoint,
-    *,
-    duration: float,
-    bandwidth: float,
-    reference: str | None = None,
-) -> dict[str, FloatArray]:
-    """Return the forces that make the POI follow a set-point, by the plant's regularised inverse.
-
-    Minimises ``|r - P u|^2 + rho |u|^2`` over all forces, those before a change of the set-point
-    included: at each frequency ``U = P* (P P* + rho)^-1 R``. A plant with zeros outside the
-    stability region (sampled or with sensors away from actuators) has no stable causal inverse;
-    this one is stable, and acts ahead of the set-point (preview). In units of acceleration rho is
-    ``(2 pi bandwidth)^-4``: far below the bandwidth the plant is inverted, far above nothing is
-    done. All axes of the POI are followed, those without a reference at rest. What the feedback of
-    the loop would add on the model, because its sensors do not move like the POI, is subtracted.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        The controller on a model: a sampled plant, assembled from a free structure.
-    move : SetPoint
-        With a rest before it that is long enough for the preview; a warning says when it is not.
-    duration : float [s]
-        Of the run.
-    bandwidth : float [Hz]
-        Up to which the plant is inverted.
-    reference : str, optional
-        The reference's channel; the plant's only one when not given.
-
-    Returns
-    -------
-    dict {channel: (n_time,) array}
-        `u1:feedforward`, ...: references of a loop with the block `known_forces(plant)`.
-
-    Raises
-    ------
-    LabelError, AssumptionError
-        As for `design_feedforward`.
-    CertificateError
-        When responses by the plant's matrices give other forces, at five of the frequencies.
-    ModelError
-        When the plant is continuous or held, `move` is no SetPoint, or a number is not positive.
-
-    Warns
-    -----
-    FlexplantWarning
-        When forces of more than 0.1 % of the largest fall before the run, or after it.
-
-    References
-    ----------
-    [VanZundertOomen2018]_.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> observer = fx.design_kalman(plant)
-    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
-    >>> loop = fx.close_loop(plant, observer, servo, fx.simulation.known_forces(plant))
-    >>> move = fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.05)
-    >>> sorted(fx.simulation.inverse_forces(loop, move, duration=0.2, bandwidth=60.0))
-    ['u1:feedforward']
-    """
-    instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
-    plant, poi, axis, name = tracked(loop.plant, reference)
-    instance(move, SetPoint, "move", "Use setpoint(...) or scan(...).")
-    require_sampled(plant, "the inverse is of samples", ModelError)
-    steps = round(positive(duration, "duration") / plant.dt)
-    reach = 2.0 * np.pi * positive(bandwidth, "bandwidth") * plant.dt
-    T, axes = force_axes(plant, poi)
-    low = design_feedforward(plant, reference=name, order=2)
-    if np.any(low.gains[:, :, :2]):
-        raise ModelError(
-            "the plant is held, so that it takes a force to stay away from rest: this inverse is "
-            "of free machines. Use design_feedforward(plant)."
-        )
-    channels = [poi.channel(axis) for axis in poi.axes]
-    size = 1 << int(np.ceil(np.log2(4 * steps)))  # what wraps around has three lengths to decay
-    freq: FloatArray = np.asarray(np.fft.rfftfreq(size, plant.dt), dtype=np.float64)
-    P = np.moveaxis(responder(plant.system.select(channels, plant.u))(freq[1:]), 2, 0) @ T
-    z = np.exp(2j * np.pi * freq[1:] * plant.dt)
-    second = z - 2.0 + 1.0 / z  # the second difference of a motion: finite at rest, as P s^2
-    H = P * second[:, None, None]
-    # in units in which a unit force accelerates its own axis by one unit per sample^2
-    masses = decouple(plant, axes=poi.axes).mass.diagonal()
-    scale = np.diag(masses / plant.dt**2)
-    H = H @ scale
-    damping = (np.abs(second) / reach**2) ** 2
-    back = H.conj().swapaxes(1, 2)
-    gram = H @ back + damping[:, None, None] * np.eye(len(axes))
-    position = np.asarray(move.at((np.arange(-1, steps + 1)) * plant.dt).position)
-    spectrum = np.fft.rfft(np.diff(position, 2), size)
-    target = np.zeros((freq.size - 1, len(axes), 1), dtype=np.complex128)
-    target[:, poi.axes.index(axis), 0] = spectrum[1:]
-    U = np.zeros((freq.size, len(axes)), dtype=np.complex128)
-    U[1:] = (back @ np.linalg.solve(gram, target))[:, :, 0]
-    U[0] = low.gains[0, :, 2] / masses * spectrum[0].real
-    for k in np.unique(np.geomspace(1, np.count_nonzero(freq <= bandwidth), 5).astype(int)) - 1:
-        g, rate = plant.system.select(channels, plant.u), second[k]
-        direct = g.C @ np.linalg.solve(z[k] * np.eye(g.n_states) - g.A, g.B) + g.D
-        _check_minimum(
-            rate * direct @ T @ scale, target[k, :, 0], U[k + 1], damping[k], freq[k + 1]
-        )
-    force = np.fft.irfft(U, size, axis=0) @ (T @ scale).T
-    outside = float(np.max(np.abs(force[steps:])))
-    if outside > _OUTSIDE * float(np.max(np.abs(force))):
-        late = np.flatnonzero(np.max(np.abs(force), axis=1) > _OUTSIDE * np.abs(force).max())
-        ahead = (size - late[late > size // 2].min(initial=size)) * plant.dt
-        warn(
-            f"forces up to {outside:.3g} N fall outside the run and are cut off: the inverse acts "
-            f"{ahead:.3g} s before the run begins, or after it ends. Give the set-point a longer "
-            "rest and the run more time, or lower the bandwidth."
-        )
-    own = force[:steps] - _feedback(loop, force[:steps], move, name)
-    return {force_name(actuator): own[:, i] for i, actuator in enumerate(plant.u)}
-
-
-def _check_minimum(
-    H: ComplexArray, target: ComplexArray, U: ComplexArray, damping: float, freq: float
-) -> None:
-    """Refuse forces at which the gradient of ``|target - H U|^2 + damping |U|^2`` is not zero."""
-    back = H.conj().T
-    off = float(np.linalg.norm(back @ (target - H @ U) - damping * U))
-    alone = float(np.linalg.norm(back @ target))
-    if not off <= AGREEMENT * alone:
-        raise CertificateError(
-            f"forces do not minimise the error at {freq:.4g} Hz: by the plant's matrices the "
-            f"gradient is {off / divisor(alone):.2g} of what it would be without forces."
-        )
-
-
-def _feedback(loop: ClosedLoop, force: FloatArray, move: SetPoint, name: str) -> FloatArray:
-    """Return what the controller adds (n_time, nu) while these forces move its own plant."""
-    plant = loop.plant.replace(evaluation=None)
-    names = [force_name(u) for u in plant.u]
-    alone = close_loop(plant, known_forces(plant))
-    given = {one: force[:, i] for i, one in enumerate(names)}
-    duration = len(force) * plant.dt
-    run = simulate(alone, reference={**given, name: move}, duration=duration, noise=False)
-    # a loop that passes forces on already would count them twice
-    passed = {name for block in loop.blocks for name in block.inputs}
-    more = () if passed.issuperset(names) else (known_forces(plant),)
-    both = close_loop(plant, *loop.blocks, *more)
-    law, x = both.controller, np.zeros(both.controller.n_states)
-    sensed = [one for one in plant.y if one not in names]
-    y_at, f_at = law.input_index(sensed), law.input_index(names)
-    rows = law.output_index(plant.u)
-    read = np.array([run[one] for one in sensed]).T
-    direct = np.linalg.inv(law.D[np.ix_(rows, f_at)])
-    known = np.zeros_like(force)
-    for k, y in enumerate(read):
-        # the force beside the controller's own that makes the sum what is wanted
-        known[k] = direct @ (force[k] - law.C[rows] @ x - law.D[np.ix_(rows, y_at)] @ y)
-        x = law.A @ x + law.B[:, y_at] @ y + law.B[:, f_at] @ known[k]
-    return force - known
