@@ -179,7 +179,7 @@ def dies(mutant: Mutant) -> bool:
         setting = os.environ | {"PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1"}
         for speed in ("not slow and not benchmark", "slow and not benchmark"):
             command = [
-                *(sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"),
+                *(sys.executable, "-m", "pytest", "-n", "0", "-x", "-q", "-p", "no:cacheprovider"),
                 *("-m", speed, "tests/test_certificates.py", *_tests(mutant)),
             ]
             done = subprocess.run(command, cwd=TOP, env=setting, capture_output=True, check=False)
