@@ -124,7 +124,7 @@ def scheduled_form(
         cure = (
             "Write it in double precision, or reduce the controllers."
             if single
-            else "Their entries were not copied as they are: report this as a bug."
+            else "Its entries were not copied as they are."
         )
         raise CertificateError(
             f"what is written differs from the controller of a place by {error:.1e} of its largest "
