@@ -213,6 +213,33 @@ def uff(binary=0):
     return [saved(lambda path: pyuff.UFF(str(path)).write_sets([fields]))]
 
 
+def uff_records(kind=1):
+    import pyuff
+
+    fields = {
+        "type": 58, "func_type": kind, "rsp_node": 2, "rsp_dir": 3, "ref_node": 2, "ref_dir": 3,
+        "data": RNG.normal(size=20) ** 2, "x": np.arange(20.0) / 10, "abscissa_spacing": 1,
+        "abscissa_inc": 0.1, "abscissa_spec_data_type": 17, "ordinate_spec_data_type": 12,
+        "orddenom_spec_data_type": 0, "ordinate_axis_units_lab": "g^2/Hz" if kind == 9 else "g",
+    }  # fmt: skip
+    return [saved(lambda path: pyuff.UFF(str(path)).write_sets([fields]))]
+
+
+def logger(mark, point):
+    rows = [[0.01 * k, *RNG.normal(size=2)] for k in range(20)]
+    table = [mark.join(f"{x:.4f}".replace(".", point) for x in row) for row in rows]
+    return "\n".join(["Device", mark.join(["Time [s]", "F [N]", "a [g]"]), *table]).encode()
+
+
+def labview(columns):
+    end, count = "***End_of_Header***", 4 if columns == "Multi" else 3
+    head = ["LabVIEW Measurement", "Separator\tTab", "X_Columns\t" + columns, end]
+    head += ["Channels\t2", "Samples\t9\t9", "Y_Unit_Label\tN\tg", "X0\t0.0\t0.0"]
+    head += ["Delta_X\t0.01\t0.01", end, "\t".join("XaYb"[:count])]
+    rows = ["\t".join(f"{x:.4f}" for x in RNG.normal(size=count)) for _ in range(9)]
+    return "\n".join([*head, *rows, ""]).encode()
+
+
 def uff_shapes():
     import pyuff
 
@@ -347,6 +374,10 @@ READERS = {
     "uff_58b": ("m.uff", partial(uff, 1), io.read_frf_uff),
     "uff_55": ("m.uff", uff_shapes, io.read_modes_uff),
     "uff_nodes": ("m.uff", uff_shapes, io.read_nodes_uff),
+    "records_uff": ("m.uff", uff_records, io.read_records),
+    "spectra_uff": ("m.uff", partial(uff_records, 9), io.read_spectra),
+    "records_csv": ("t.csv", lambda: [logger(";", ","), logger(",", ".")], io.read_records),
+    "records_lvm": ("t.lvm", lambda: [labview("One"), labview("Multi")], io.read_records),
     "dofs": ("d.csv", dofs_table, io.read_dofs),
     "frf_csv": ("f.csv", lambda: [saved(io.write_frf_csv, responses())], io.read_frf_csv),
     "frf_npz": ("f.npz", frf_npz, io.read_frf_npz),

@@ -2,7 +2,8 @@
 
 - `read_model(K, mass=, dofs=, units=)`: matrices, nodes and DOFs of a finite-element program.
 - `read_matrices`: matrices without DOFs; `read_modes`: modes of a solved model.
-- `read_frf_uff`, `read_frf_csv`: measured responses.
+- `read_frf_uff`, `read_frf_csv`: measured responses; `read_records`: time records for
+  `estimate_frf`.
 - `read_mat`, `write_mat`: values to and from MATLAB.
 
 The first three find the format themselves; the reader of one format says more. Files that cannot
@@ -30,6 +31,7 @@ be read are refused with what to write instead.
 | Exodus | `read_exodus_modes` | .exo, .e: modes (classic netCDF; HDF5 with an extra) |
 | universal file | `read_modes_uff`, ... | .uff, .unv: 55, 58, 2414, nodes; with `flexplant[uff]` |
 | tables | `read_dofs` | .csv, text: node, direction, x, y, z |
+| records | `read_records` | .uff, .lvm, .csv of a logger: time records; `read_spectra` |
 | responses | `read_frf_csv`, ... | .csv, .mat, .npz: frequency responses |
 | values for MATLAB | `read_mat`, `write_mat` | .mat: systems, plants, reduced models, responses |
 | functional mock-up | `write_fmu` | .fmu: sampled plants and controllers, FMI 2.0 and 3.0 |
@@ -99,11 +101,13 @@ from .models import read_model as read_model
 from .op4 import read_op4 as read_op4
 from .op4 import read_op4_matrices as read_op4_matrices
 from .punch import read_dmig as read_dmig
+from .records import read_records as read_records
 from .sierra import read_exodus_modes as read_exodus_modes
 from .sierra import read_sierra as read_sierra
 from .tables import read_dofs as read_dofs
 from .uff import read_frf_uff as read_frf_uff
 from .uff import read_modes_uff as read_modes_uff
 from .uff import read_nodes_uff as read_nodes_uff
+from .uff_times import read_spectra as read_spectra
 
 __dir__ = _public_names(__name__)

@@ -124,7 +124,7 @@ def read_frf_uff(
             return computed
         kinds = sorted({whole_entry(part, "func_type") for part in records})
         what = f"{len(records)} records 58 of function types {kinds} (4 is a frequency response)"
-        do = "Export these, or estimate them from time records: estimate_frf."
+        do = "Export these, or estimate them from time records: read_records, estimate_frf."
         raise refused(path, f"holds no frequency response function: {what}", do)
     found = {KINDS.get(whole_entry(part, "ordinate_spec_data_type")) for part in responses}
     if len(found) > 1 and quantity is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,9 +13,10 @@ from ..checks import ComplexArray, FloatArray, short
 from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS
 from ..lti.frequency import ORDERS
-from ..structure.units import GRAVITY, LENGTHS, POUND
+from ..structure.units import GRAVITY, POUND
 from .assembled import extra_module
 from .files import damaged, file_path, parsing, refused, unread
+from .unit_labels import plain_label, unit_of
 
 
 def dataset_types(path: str | Path) -> list[int]:
@@ -128,7 +128,7 @@ def whole_entry(part: dict[str, Any], name: str) -> int:
         ) from None
 
 
-def _channel_of(part: dict[str, Any], side: str) -> tuple[str, int]:
+def channel_of(part: dict[str, Any], side: str) -> tuple[str, int]:
     """Return the name of a channel and the sign of its direction."""
     node, code = whole_entry(part, f"{side}_node"), whole_entry(part, f"{side}_dir")
     if 1 <= abs(code) <= 6:
@@ -144,7 +144,7 @@ def paired_records(
     pairs: dict[tuple[str, str], tuple[int, dict[str, Any]]] = {}
     doubled = []
     for part in records:
-        (output, up), (name, down) = _channel_of(part, "rsp"), _channel_of(part, "ref")
+        (output, up), (name, down) = channel_of(part, "rsp"), channel_of(part, "ref")
         pair = (output, f"u {name}")
         if pair in pairs:
             doubled.append(" <- ".join(pair))
@@ -200,7 +200,7 @@ def common_frequencies(records: list[dict[str, Any]], path: str) -> FloatArray:
         step = float(np.ptp(first)) / max(first.size - 1, 1)
         if own.size != first.size or np.max(np.abs(own - first)) > 1e-3 * step:  # single precision
             two = [
-                f"{_channel_of(one, 'rsp')[0]} <- u {_channel_of(one, 'ref')[0]} ({x.size} from "
+                f"{channel_of(one, 'rsp')[0]} <- u {channel_of(one, 'ref')[0]} ({x.size} from "
                 f"{x[0]:g} to {x[-1]:g} Hz)"
                 for one, x in ((part, own), (records[0], first))
             ]
@@ -233,22 +233,18 @@ def coherence_of(
 
 #: specific data types of dataset 58
 KINDS = {8: "displacement", 11: "velocity", 12: "acceleration"}
-#: what one of a named unit is in SI
-_LENGTHS = {**LENGTHS, "nm": 1e-9}
-_ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6}
 _FORCES = {"n": 1.0, "kn": 1e3, "mn": 1e-3, "lbf": POUND * GRAVITY, "nm": 1.0, "n*m": 1.0}
-_SECONDS = re.compile(r"\(?s(?:ec)?(?:\^|\*\*)?2?\)?")
 
 
 def record_scale(
     part: dict[str, Any], factors: dict[str, Any] | None, quantity: str | None, path: str
 ) -> float:
     """Return the factor that brings a response of dataset 58 to SI."""
-    above = _clean_text(part, "ordinate_axis_units_lab")
-    below = _clean_text(part, "orddenom_axis_units_lab")
+    above = unit_text(part, "ordinate_axis_units_lab")
+    below = unit_text(part, "orddenom_axis_units_lab")
     if "/" in above and not below:  # all in one label: m/s^2/N
         head, _, last = above.rpartition("/")
-        if last.lower() in _FORCES and not _SECONDS.fullmatch(last):
+        if last.lower() in _FORCES:
             above, below = head, last
     length, force = _motion(above, quantity), _FORCES.get(below.lower()) if below else 1.0
     # "nm" is a length above and a moment below; "mn" a millinewton
@@ -273,20 +269,19 @@ def record_scale(
     return to_length / to_force
 
 
-def _clean_text(part: dict[str, Any], name: str) -> str:
-    text = str(part.get(name) or "").strip().strip("[]").replace(" ", "")
-    return "" if text.upper() in ("NONE", "UNKNOWN", "-") else text
+def unit_text(part: dict[str, Any], name: str) -> str:
+    """Return the label of a unit, without blanks and brackets; empty for none."""
+    return plain_label(str(part.get(name) or ""))
 
 
 def _motion(label: str, quantity: str | None) -> float | None:
+    """Return the size in SI of a unit of motion, 1 where none is named."""
     if not label:
         return 1.0
-    first, *rest = label.strip("()").replace("²", "2").split("/")
-    if any(not _SECONDS.fullmatch(item.lower()) for item in rest):
+    unit = unit_of(label)
+    if unit is None or unit[1][:1] not in ("m", "r"):
         return None
-    if first == "g" and quantity in ("acceleration", None) and not rest:
-        return GRAVITY
-    return (_LENGTHS | _ANGLES).get(first.replace("µ", "u").replace("\xb5", "u"))
+    return None if plain_label(label) == "g" and quantity not in ("acceleration", None) else unit[0]
 
 
 def derivative(

@@ -113,6 +113,11 @@ class Response(Value, Mapping[str, FloatArray]):
             return 0.0
         return float(self.time[-1] - self.time[0]) / (self.time.size - 1)
 
+    @property
+    def rate(self) -> float:
+        """Sampling rate [Hz]; 0 for a single sample."""
+        return 1.0 / self.dt if self.dt else 0.0
+
     def rms(self, channel: str, *, start: float = 0.0) -> Numbers:
         """Return the root mean square of a channel about zero, a number or one for each run.
 

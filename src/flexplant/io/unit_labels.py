@@ -1,0 +1,70 @@
+"""Labels of units as measuring systems write them, and what one of each is in SI."""
+
+from __future__ import annotations
+
+import re
+
+from ..structure.units import GRAVITY, LENGTHS, POUND
+
+_LENGTHS = {**LENGTHS, "nm": 1e-9}
+_ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6}
+#: with capitals: mN is a millinewton, MN a meganewton; nm a length, Nm a moment
+_OTHERS = {
+    "N": (1.0, "N"),
+    "kN": (1e3, "N"),
+    "mN": (1e-3, "N"),
+    "MN": (1e6, "N"),
+    "lbf": (POUND * GRAVITY, "N"),
+    "Nm": (1.0, "N m"),
+    "N*m": (1.0, "N m"),
+    "V": (1.0, "V"),
+    "mV": (1e-3, "V"),
+    "A": (1.0, "A"),
+    "mA": (1e-3, "A"),
+    "g": (GRAVITY, "m/s^2"),
+}
+_TIMES = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6}
+_SECONDS = re.compile(r"\(?s(?:ec)?((?:\^|\*\*)?2)?\)?")
+_ORDERS = ("", "/s", "/s^2")
+
+
+def plain_label(text: str) -> str:
+    """Return a label without blanks and brackets, its signs those of ASCII; empty for none."""
+    label = text.strip().strip("[]").replace(" ", "").replace("²", "^2").replace("·", "*")
+    label = label.replace("µ", "u").replace("\u03bc", "u")
+    return "" if label.upper() in ("NONE", "UNKNOWN", "-") else label
+
+
+def unit_of(text: str) -> tuple[float, str] | None:
+    """Return the size in SI of one of a unit, and the unit of SI; None where it is not known."""
+    label = plain_label(text)
+    while label[:1] == "(" and label[-1:] == ")":
+        label = label[1:-1]
+    if label in _OTHERS:
+        return _OTHERS[label]
+    first, *rest = label.split("/")
+    size = (_LENGTHS | _ANGLES).get(first)
+    found = [_SECONDS.fullmatch(item.lower()) for item in rest]
+    if size is None or not all(found):
+        return None
+    order = sum(2 if match and match[1] else 1 for match in found)
+    if order > 2:
+        return None
+    return size, ("rad" if first in _ANGLES else "m") + _ORDERS[order]
+
+
+def seconds_of(text: str) -> float | None:
+    """Return the size of a unit of time [s], 1 where none is named."""
+    label = plain_label(text).lower()
+    return 1.0 if not label else _TIMES.get(label)
+
+
+def density_of(text: str) -> float | None:
+    """Return what brings a power spectral density to SI: (m/s^2)^2/Hz, g^2/Hz."""
+    label = plain_label(text)
+    match = re.fullmatch(r"(.*?)(?:\^|\*\*)?2?/Hz", label)
+    squared = re.fullmatch(r"\(?(.*?)\)?(?:\^|\*\*)2/Hz", label)
+    if match is None or squared is None:
+        return None
+    unit = unit_of(squared[1])
+    return None if unit is None else unit[0] ** 2
