@@ -231,7 +231,7 @@ WRONG = {
         "synthesis.aftercare.forms._difference", lambda _: lambda *_: 1e-3,
         lambda: import_module("flexplant.synthesis.aftercare.forms").scheduled_form(
             [lead(2e3).replace(blocks=None)], driven=1
-        ), "moves the response",
+        ), "differs from the controller of a place",
     ),
     "H2 claim": (
         "synthesis.h2._solve_regular", larger(1.001, 4),
