@@ -440,6 +440,7 @@ def check_elsewhere(values, folder):
     return {room: cls for cls, (_, *rooms) in zip(kinds, read, strict=True) for room in rooms}
 
 
+@pytest.mark.slow
 def test_every_kind_loads_in_a_new_process(tmp_path):
     """Also kinds that no room shows; each room is imported by the first file that needs it."""
     kinds = [cls for cls in all_values() if is_dataclass(cls) and not isabstract(cls)]
@@ -470,6 +471,7 @@ def rewritten(path, old, new):
         np.savez(file, **parts)
 
 
+@pytest.mark.slow
 def test_files_import_little_and_nothing_of_others(tmp_path):
     """A system needs no plant; files that name no module, or one that is gone, load too."""
     g, forward = fx.lti.tf([1.0], [1.0, 1.0]), fx.Specification(noise=1e-6)
