@@ -93,9 +93,7 @@ def test_in_a_closed_loop_a_simulation_has_the_same_error():
 
 def test_an_observer_beside_a_loop_and_what_is_refused():
     kalman, law = observer(), servo()
-    other = fx.design_kalman(
-        kalman.plant.replace(origin=kalman.plant.origin).replace(evaluation=kalman.plant)
-    )
+    other = fx.design_kalman(kalman.plant.replace(origin=kalman.plant.origin))
     loop = fx.close_loop(machine(), kalman, law)
     assert other.rms("die", on=loop) == pytest.approx(kalman.rms("die", on=loop), rel=1e-9, abs=0)
     loud = fx.design_kalman(plate_plant(1e-2, count=8, sensor_asd=1e-10))

@@ -54,10 +54,13 @@ def test_any_evaluation_model_serves(given):
     same_response(plant.replace(evaluation=whole).evaluation_plant, expected)
 
 
-def test_weights_and_blocks_are_taken_off():
+def test_weights_and_blocks_stand_around_the_evaluation_plant_too():
     plant = plant_of(reduce(MODES, DesiredDofs(GRID)))
     weighted = plant.through(fx.reference_errors(plant)).weighted(z={"die:error": 2.0})
-    same_response(weighted.evaluation_plant, plant_of(MODES))
+    same_response(weighted.unweighted.evaluation_plant, plant_of(MODES))
+    every = plant_of(MODES)
+    every = every.through(fx.reference_errors(every)).weighted(z={"die:error": 2.0})
+    same_response(weighted.evaluation_plant, every)
 
 
 def test_nothing_known_is_none():
@@ -137,7 +140,8 @@ def test_what_is_made_of_a_plant_is_judged_on_what_is_made_of_its_evaluation_mod
     assert judge.asd == every.asd and judge.evaluation is None
     assert plant.evaluation_plant is judge
     heavy = plant.weighted(z={"die:z": 2.0}).through(StateSpace([], [], [], np.eye(2), **READ))
-    assert heavy.evaluation_plant is judge
+    assert heavy.unweighted.evaluation_plant is judge
+    same_response(heavy.evaluation_plant, heavy.around(judge))
 
 
 def test_a_plant_that_is_the_evaluation_model_follows_the_steps():

@@ -121,8 +121,6 @@ def test_refusals():
         plant.discretized(RATE, delay=1).along("u1", PATH)
     with pytest.raises(ModelError, match="is a Sensor"):
         plant.along("y1", PATH)
-    with pytest.raises(ModelError, match="plant is weighted"):
-        plant.weighted(z={"die:z": 2.0}).along("die", PATH)
     slow = ports(u=[Actuator("u1", at=Z8, dynamics=lowpass(100.0))])
     with pytest.raises(ModelError, match="acts through a filter"):
         assemble_plant(some_modes(), slow).along("u1", PATH)

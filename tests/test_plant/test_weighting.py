@@ -6,7 +6,7 @@ import pytest
 
 from flexplant.errors import LabelError, ModelError
 from flexplant.lti import StateSpace, frequency_response, highpass, lowpass, tustin
-from flexplant.plant import StandardPlant, assemble_plant
+from flexplant.plant import StandardPlant, assemble_plant, standard_plant
 from stages import RATE, ports, some_modes
 
 FREQ = np.array([1.0, 50.0, 245.0, 700.0])
@@ -83,7 +83,7 @@ def test_a_plant_says_what_was_done_to_it():
                            (plant.weighted(z={"die:z": 2.0}), "weighted")):  # fmt: skip
         assert words in repr(altered).splitlines()[0]
         with pytest.raises(ModelError, match=f"the plant is {words}.*Use plant.unweighted"):
-            altered.discretized(RATE)
+            standard_plant(altered)
     assert "weighted" not in repr(mean)
     # w is physical still, and the noise of the two sensors is that of their mean
     assert mean.asd == plant.asd
@@ -118,3 +118,41 @@ def test_refusals():
     g = StateSpace([[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]], np.zeros((2, 2)))
     small = StandardPlant.from_statespace(g, u=["u2"], y=["y2"]).weighted(w={"u1": 2.0})
     assert gain_of(small.Gzw)[0, 0, 0] == pytest.approx(2 / (2j * np.pi + 1))
+
+
+#: what is done to a plant, each once
+STEPS = {
+    "discretized": lambda plant: plant.discretized(4e3, delay=1.0),
+    "at": lambda plant: plant.at((0.15, 0.3, 0.0)),
+    "weighted": lambda plant: plant.weighted(z={"die:z": lowpass(100.0)}, w={"amp1": 3.0}),
+    "through": lambda plant: plant.through(
+        StateSpace([], [], [], [[0.5, 0.5]], inputs=["y1", "y2"], outputs=["mean"])
+    ),
+    "uncertain": lambda plant: plant.uncertain(frequency=0.01),
+    "evaluation": lambda plant: plant.replace(evaluation=some_modes(attached=False)),
+}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_steps_in_any_order_give_the_same_plant(seed):
+    """Of plants with uncertainty and evaluation model, against one fixed order."""
+    names = [str(name) for name in np.random.default_rng(seed).permutation(sorted(STEPS))]
+    few = some_modes(attached=False).select(range(12))
+    plant = assemble_plant(few, ports())
+    for name in names:
+        known = name == "evaluation" and hasattr(plant, "nominal")
+        plant = STEPS[name](plant.nominal if known else plant)
+    wanted = assemble_plant(few, ports(), evaluation=some_modes(attached=False))
+    for name in ("discretized", "at", "uncertain", "through", "weighted"):
+        wanted = STEPS[name](wanted)
+    plant = getattr(plant, "nominal", plant)
+    freq = np.array([3.0, 100.0, 700.0])
+    for one, two in ((plant, wanted), (plant.evaluation_plant, wanted.evaluation_plant),
+                     (plant.uncertainty, wanted.uncertainty)):  # fmt: skip
+        assert one.system.outputs == two.system.outputs
+        assert one.system.inputs == two.system.inputs
+        ours, theirs = (frequency_response(each.system, freq).data for each in (one, two))
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12 * np.abs(theirs).max())
+    assert (plant.w, plant.u, plant.z, plant.y) == (wanted.w, wanted.u, wanted.z, wanted.y)
+    assert plant.asd == wanted.asd
+    assert plant.unweighted.dt == plant.dt == wanted.dt

@@ -14,7 +14,7 @@ from flexplant import load
 from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.loop import close_loop
 from flexplant.lti import StateSpace
-from flexplant.plant import Foreign, StandardPlant, Weighted
+from flexplant.plant import Foreign, StandardPlant
 from flexplant.simulation import Quantiser, setpoint, simulate
 from flexplant.simulation import simulate as simulate_function
 from machines import RATE, block, matrices, observer, servo, stage
@@ -309,8 +309,8 @@ def test_assumptions_are_checked(loop):
     with pytest.raises(ModelError, match="process noise"):
         simulate(close_loop(unknown, gain), duration=1.0)
     assert simulate(close_loop(unknown, gain), duration=1.0, noise=False).rms("z") == 0.0
-    weighted = loop.plant.replace(origin=Weighted(loop.plant))
-    with pytest.raises(AssumptionError, match="unweighted"):
+    weighted = loop.plant.weighted(z={"die:error": 1.0})
+    with pytest.raises(ModelError, match="unweighted"):
         simulate(close_loop(weighted, *loop.blocks), duration=1.0)
 
 

@@ -74,7 +74,7 @@ def test_what_degrades_the_loop_is_refused():
 
 def test_an_integrator_is_kept():
     """Two fast lags next to an integrator: they go, it stays where it is, at zero."""
-    given = plant(False).unweighted
+    given = plant(False).machine
     pi = StateSpace(np.diag([0.0, -300.0, -301.0]), [[1.0], [1.0], [1.0]],
                     [[-0.5, -3e3, 2.9e3]], [[-10.0]], inputs=["s"], outputs=["f"])  # fmt: skip
     found = reduce_controller(given, pi, loss=0.05)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..checks import ComplexArray, FloatArray, IntArray, with_unit
 from ..errors import counted
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from ..tolerances import SAME, TINY, divisor
 from .estimator import KalmanEstimator
 from .filter_model import innovation_root
@@ -178,7 +178,7 @@ class SampledModes(NamedTuple):
         return f"mode {self.numbers[i]} ({self.freq[i]:.4g} Hz"
 
 
-def sampled_modes(plant: StandardPlant) -> SampledModes:
+def sampled_modes(plant: AnyPlant) -> SampledModes:
     """Return the elastic modes of a plant."""
     if plant.is_assembled:
         omega = np.sqrt(np.abs(np.linalg.det(plant.modal_blocks)))[plant.n_rigid :]
@@ -201,7 +201,7 @@ class Examined(NamedTuple):
     reach: float
 
     @classmethod
-    def of(cls, tried: list[float], whole: StandardPlant | None) -> Examined:
+    def of(cls, tried: list[float], whole: AnyPlant | None) -> Examined:
         """Return the peaks; modes left out that are known may make others near kept modes."""
         return cls(np.array(tried), _NEAR if whole is None else _DRIFTED)
 
@@ -212,7 +212,7 @@ def peak_verdicts(
     U: ComplexArray,
     level: FloatArray,
     peaks: list[ExcessPeak],
-    whole: tuple[StandardPlant, IntArray] | None,
+    whole: tuple[AnyPlant, IntArray] | None,
     before: Examined,
 ) -> list[LikelyCause]:
     """Return the verdicts of peaks beyond the pooled `level` (m,); U (m, nu) are the commands."""
@@ -276,7 +276,7 @@ def _other_cause(
     peaks: list[ExcessPeak],
     kept: SampledModes,
     near: IntArray,
-    whole: tuple[StandardPlant, IntArray] | None,
+    whole: tuple[AnyPlant, IntArray] | None,
 ) -> LikelyCause:
     """Return the verdict of a highest peak that no change of a kept mode explains."""
     rate = 1.0 / observer.plant.dt
@@ -312,7 +312,7 @@ def _phrase(peak: ExcessPeak, rate: float) -> str:
     )
 
 
-def left_modes(whole: StandardPlant, numbers: IntArray) -> SampledModes:
+def left_modes(whole: AnyPlant, numbers: IntArray) -> SampledModes:
     """Return the modes left out of an evaluation plant."""
     every = sampled_modes(whole)
     at = np.flatnonzero(np.isin(every.numbers, numbers))

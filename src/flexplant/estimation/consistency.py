@@ -11,7 +11,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, Value, between, instance, real_array, short
 from ..errors import ModelError, ShapeError, counted
 from ..loop import ClosedLoop
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from .causes import (
     Cause,
     Examined,
@@ -377,7 +377,7 @@ def _tested(
     observer: KalmanEstimator,
     white: FloatArray,
     normal: FloatArray,
-    whole: StandardPlant | None,
+    whole: AnyPlant | None,
     alpha: float,
     u: FloatArray,
 ) -> _Facts:
@@ -404,19 +404,15 @@ def _tested(
     )  # fmt: skip
 
 
-def _evaluation_plant(observer: KalmanEstimator) -> StandardPlant | None:
+def _evaluation_plant(observer: KalmanEstimator) -> AnyPlant | None:
     """Return the evaluation plant, read like the observer's, or None."""
     plant = observer.plant
-    found = plant.evaluation_plant if observer.left_out is None else observer.left_out.whole
+    found = plant.machine.evaluation_plant if observer.left_out is None else observer.left_out.whole
     return None if found is None else read_alike(plant, found)
 
 
 def _verdicts(
-    observer: KalmanEstimator,
-    facts: _Facts,
-    whole: StandardPlant | None,
-    names: Any,
-    before: Examined,
+    observer: KalmanEstimator, facts: _Facts, whole: AnyPlant | None, names: Any, before: Examined
 ) -> list[LikelyCause]:
     """Return the likely causes and the verdicts in words."""
     if facts.white and facts.nis.p_value >= facts.alpha:
@@ -424,7 +420,7 @@ def _verdicts(
     numbers = None
     if whole is not None and whole.is_assembled:
         missed = observer.left_out if observer.left_out is not None else left_out(
-            observer.plant.unweighted, whole.unweighted
+            observer.plant.machine, whole.machine
         )  # fmt: skip
         numbers = None if missed is None else missed.modes
     if whole is not None and numbers is not None and facts.explained:

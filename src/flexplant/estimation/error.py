@@ -44,7 +44,7 @@ from ..lti.lyapunov import difference_of, dual_variances, solve_stein, stein_roo
 from ..lti.modal_map import ModalMap
 from ..lti.sampling import uncoupled_pairs
 from ..lti.statespace import StateSpace, System
-from ..plant import StandardPlant
+from ..plant import AnyPlant, StandardPlant
 from ..tolerances import SAME, TINY, divisor
 from .estimator_channels import estimates, poi_channels, row_of, same_pois, sensors
 
@@ -73,7 +73,7 @@ class Variances(NamedTuple):
 
 
 def error_variances(
-    plant: StandardPlant, observer: StateSpace, suspension: IntArray | None = None
+    plant: AnyPlant, observer: StateSpace, suspension: IntArray | None = None
 ) -> Variances:
     """Return the variances of ``z - hat`` at the sample instants, u at rest or known exactly.
 
@@ -130,7 +130,7 @@ class _Missed(NamedTuple):
     gap: FloatArray
 
 
-def _note_hardly_damped(plant: StandardPlant, missed: _Missed, total: FloatArray) -> None:
+def _note_hardly_damped(plant: AnyPlant, missed: _Missed, total: FloatArray) -> None:
     """Warn when most of a variance is what little is missed of motions with next to no damping."""
     slow = missed.gap < _HARDLY
     shares = np.sum(missed.variances[:, slow], axis=1) / total
@@ -179,7 +179,7 @@ class _Joint(NamedTuple):
         return own, self.A[n:, n:], coupling, own.driven(self.noise[:n]), self.noise[n:]
 
 
-def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | None) -> _Joint:
+def _joint(plant: AnyPlant, observer: StateSpace, suspension: IntArray | None) -> _Joint:
     g, factor = plant.system, plant.noise_factor
     read = [name for name in observer.inputs if name in plant.y and name not in plant.w]
     observer = observer.select(observer.outputs, read)
@@ -251,7 +251,7 @@ def _apart(joint: _Joint) -> tuple[_Joint, _Missed]:
     return joint._replace(A=A - F @ A[rows], noise=noise, E=E), left_over
 
 
-def moving_parts(plant: StandardPlant) -> tuple[IntArray, IntArray]:
+def moving_parts(plant: AnyPlant) -> tuple[IntArray, IntArray]:
     """Return the states of modes on the unit circle, and all others that noise reaches."""
     g, factor = plant.system, plant.noise_factor
     kept = np.zeros(0, dtype=np.int64)
@@ -277,7 +277,7 @@ def _solve_sylvester(A: FloatArray, n: int, entering: FloatArray, kept: FloatArr
     return V
 
 
-def _check_seen(plant: StandardPlant, seen: FloatArray, motion: FloatArray) -> None:
+def _check_seen(plant: AnyPlant, seen: FloatArray, motion: FloatArray) -> None:
     worst = np.linalg.norm(seen, axis=1) / np.maximum(np.linalg.norm(motion, axis=1), TINY)
     if np.max(worst) > _SEEN:
         raise AssumptionError(
@@ -355,7 +355,7 @@ def _dual_dense(joint: _Joint, row: FloatArray) -> float:
     return float(np.sum(joint.noise * (Y @ joint.noise)))
 
 
-def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop) -> FloatArray:
+def loop_variances(plant: AnyPlant, estimator: StateSpace, loop: ClosedLoop) -> FloatArray:
     """Return the variances (nz,) of ``z - hat`` in a closed loop, at the sample instants."""
     # what u does to a machine that is not the estimator's model enters the error, although the
     # estimator reads u: the Stein equation of the whole loop, `X = A X A' + G G'`, each noise twice
@@ -386,7 +386,7 @@ class PoiFilter(Value):
     """What stationary filters of the motions at the POIs have in common."""
 
     system: StateSpace
-    plant: StandardPlant
+    plant: AnyPlant
     variances: FloatArray
 
     @property
@@ -400,7 +400,7 @@ class PoiFilter(Value):
         rms = {name: self.rms(name) for name in poi_channels(self.plant)}
         return sizes_of(rms, self.plant.units)
 
-    def rms(self, channel: str, *, on: StandardPlant | ClosedLoop | System | None = None) -> float:
+    def rms(self, channel: str, *, on: AnyPlant | ClosedLoop | System | None = None) -> float:
         """Return the rms of the estimation error at the sample instants.
 
         Parameters

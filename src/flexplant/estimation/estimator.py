@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ..checks import FloatArray, positive, real_array
 from ..errors import ModelError, ShapeError, counted, only_one, require_known
 from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from ..plant.evaluation_model import NOT_JUDGED
 from .error import PoiFilter
 from .estimate import Estimate, estimated, in_unit_states
@@ -67,7 +67,7 @@ class KalmanEstimator(PoiFilter):
     """
 
     system: StateSpace
-    plant: StandardPlant
+    plant: AnyPlant
     gain: FloatArray
     covariance: FloatArray
     certificate: KalmanCertificate
@@ -307,7 +307,7 @@ _TOGETHER = 128
 
 
 def moving_sight(
-    plant: StandardPlant, found: LeftOut | None, model: FilterModel, path: Any, count: int
+    plant: AnyPlant, found: LeftOut | None, model: FilterModel, path: Any, count: int
 ) -> Sight:
     """Return the rows of all POIs at each sample, those on a path at its points."""
     # each distinct point is a POI of its own of the same plant: its rows of C and D are exact, and
@@ -342,18 +342,16 @@ def moving_sight(
     return Sight(c, D1, V)
 
 
-def _model_at(
-    plant: StandardPlant, found: LeftOut | None, poi: Any, points: FloatArray
-) -> FilterModel:
+def _model_at(plant: AnyPlant, found: LeftOut | None, poi: Any, points: FloatArray) -> FilterModel:
     """Return the model with a further POI at each point, after the plant's own."""
     ports = plant.assembled.ports
     more = [poi.replace(name=f"{poi.name}@{i}", at=p.tolist()) for i, p in enumerate(points)]
     wider = ports.replace(z=[*ports.z, *more])
-    moved = plant.with_ports(wider)
+    moved = plant.around(plant.machine.with_ports(wider))
     if found is None:
         return filter_model(moved)
     assert found.whole is not None  # noqa: S101 - left_out sets it
-    whole = found.whole.with_ports(wider)
+    whole = found.whole.machine.with_ports(wider)
     return filter_model(moved, left_out(moved, whole))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..checks import FloatArray, floats, real_array, short
 from ..errors import AssumptionError, LabelError, ModelError, ShapeError, unknown_label
 from ..lti.statespace import System
-from ..plant import StandardPlant, standard_plant
+from ..plant import AnyPlant, GeneralizedPlant, plant_of, standard_plant
 
 #: z channels that are not motions of a POI
 DERIVED = (":error", ":effort")
@@ -22,15 +22,12 @@ class ChannelError(LabelError, KeyError):
     __str__ = Exception.__str__
 
 
-def checked_plant(given: StandardPlant | System) -> StandardPlant:
+def checked_plant(given: AnyPlant | System) -> AnyPlant:
     """Return a StandardPlant that has something to estimate and to measure."""
-    plant = standard_plant(given)
-    if plant.origin.scaled:
-        raise ModelError(
-            f"the plant is {plant.alteration}: an estimator is of physical channels. Use "
-            "plant.unweighted."
-        )
-    plain = plant.unweighted
+    plant = plant_of(given)
+    if isinstance(plant, GeneralizedPlant) and plant.scaled:
+        plant = standard_plant(plant)  # refuses weights: an estimator is of physical channels
+    plain = plant.machine
     mixed = [plain.y.index(name) for name in plain.y if name in plain.w]
     rows = [plant.y.index(name) for name in sensors(plant)]
     if np.any(plant.reading_gain[np.ix_(rows, mixed)]):
@@ -44,25 +41,25 @@ def checked_plant(given: StandardPlant | System) -> StandardPlant:
     return plant
 
 
-def read_alike(plant: StandardPlant, other: StandardPlant) -> StandardPlant:
+def read_alike(plant: AnyPlant, other: AnyPlant) -> AnyPlant:
     """Return another plant read through the block of the first, where that has one."""
-    reading = plant.origin.reading
-    return other if reading is None else other.through(reading)
+    found: AnyPlant = plant.around(other.machine)
+    return found
 
 
-def sensors(plant: StandardPlant) -> tuple[str, ...]:
+def sensors(plant: AnyPlant) -> tuple[str, ...]:
     """Return the names in y that are measurements; references are in w as well."""
     return tuple(name for name in plant.y if name not in plant.w)
 
 
-def poi_channels(plant: StandardPlant) -> tuple[str, ...]:
+def poi_channels(plant: AnyPlant) -> tuple[str, ...]:
     """Return the names in z that are motions of POIs."""
     return tuple(name for name in plant.z if not name.endswith(DERIVED))
 
 
-def same_pois(plant: StandardPlant, on: StandardPlant | System) -> StandardPlant:
+def same_pois(plant: AnyPlant, on: AnyPlant | System) -> AnyPlant:
     """Return another plant that has the sensors and POIs of the first."""
-    other = read_alike(plant, standard_plant(on).unweighted)
+    other = read_alike(plant, plant_of(on).machine)
     for side, names in (("z", poi_channels(plant)), ("y", sensors(plant))):
         for name in names:
             if name not in getattr(other, side):

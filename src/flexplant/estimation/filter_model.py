@@ -14,8 +14,8 @@ from ..errors import CertificateError, ModelError, ShapeError, SolverError
 from ..lti.lyapunov import difference_of, solve_stein, square_root
 from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
-from ..plant.partition import require_noise
+from ..plant import AnyPlant, StandardPlant
+from ..plant.partitioned import require_noise
 from ..tolerances import SAME
 from .estimator_channels import estimates, poi_channels, sensors
 from .left_out import LeftOut
@@ -135,7 +135,7 @@ def weigh(part: FloatArray, spread: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(spread / size / size[:, None], (part / size).T).T / size)
 
 
-def filter_model(plant: StandardPlant, found: LeftOut | None = None) -> FilterModel:
+def filter_model(plant: AnyPlant, found: LeftOut | None = None) -> FilterModel:
     """Return the model of a sampled plant, with the modes left out as noise where known."""
     own = plant if found is None else found.plant
     g = own.system
@@ -162,7 +162,7 @@ def filter_model(plant: StandardPlant, found: LeftOut | None = None) -> FilterMo
     )  # fmt: skip
 
 
-def check_noises(plant: StandardPlant) -> None:
+def check_noises(plant: AnyPlant) -> None:
     """Raise AssumptionError for a sensor without noise, or one that white noise reaches at once."""
     _ = plant.noise_factor  # raises where it is not known
     read, own = sensors(plant), plant.sensor_noise.diagonal()
@@ -200,7 +200,7 @@ class Sight(NamedTuple):
 
 
 def filter_system(
-    plant: StandardPlant,
+    plant: AnyPlant,
     model: FilterModel,
     K: FloatArray,
     L_z: FloatArray,
@@ -360,7 +360,7 @@ class KalmanCertificate(Certificate):
     unresolved: float | None = None
 
 
-def check_gain(plant: StandardPlant, gain: FloatArray, covariance: FloatArray) -> float:
+def check_gain(plant: AnyPlant, gain: FloatArray, covariance: FloatArray) -> float:
     """Return how far the POI variances of a gain are from those that a covariance claims.
 
     The error's covariance follows from the gain alone:

@@ -10,7 +10,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray
 from ..lti.frequency import frequency_response
 from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from .estimator import KalmanEstimator
 from .filter_model import innovation_root
 
@@ -215,7 +215,7 @@ def impulse(observer: KalmanEstimator, count: int) -> FloatArray:
 
 def density_of(
     observer: KalmanEstimator,
-    plant: StandardPlant | None,
+    plant: AnyPlant | None,
     freq: FloatArray,
     white: ComplexArray | None = None,
 ) -> InnovationParts:
@@ -243,7 +243,7 @@ def density_of(
     return InnovationParts(process, sensors)
 
 
-def expected(observer: KalmanEstimator, plant: StandardPlant, samples: int) -> InnovationParts:
+def expected(observer: KalmanEstimator, plant: AnyPlant, samples: int) -> InnovationParts:
     """Return the mean of the periodogram of so many samples, at the lines of `lines_of`."""
     # the density seen through the record's length (Fejer's kernel): its covariance c_l counts
     # `1 - |l| / N`. A line narrower than 1 / N leaks into its neighbours in just this way

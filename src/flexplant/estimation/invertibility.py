@@ -13,8 +13,8 @@ from ..checks import ComplexArray, FloatArray, Value, check_names, name_list
 from ..errors import AssumptionError, require_known
 from ..lti.equations import state_scale
 from ..lti.statespace import System
-from ..plant import StandardPlant
-from ..plant.partition import require_sampled
+from ..plant import AnyPlant
+from ..plant.partitioned import require_sampled
 from ..tolerances import SPLIT, TINY, divisor
 from .estimator_channels import checked_plant
 from .filter_model import FilterModel, filter_model
@@ -110,7 +110,7 @@ class Invertibility(Value):
         return f"a force of {freq:.4g} Hz{grows}"
 
 
-def invertibility(plant: StandardPlant | System, inputs: Sequence[str]) -> Invertibility:
+def invertibility(plant: AnyPlant | System, inputs: Sequence[str]) -> Invertibility:
     """Return whether the sensors determine disturbances that nothing is assumed of.
 
     With d held over each sample, ``x+ = A x + G d``, ``y = C x + H d``, an unbiased filter with
@@ -153,7 +153,7 @@ def invertibility(plant: StandardPlant | System, inputs: Sequence[str]) -> Inver
     return ranks_and_zeros(filter_model(plant), input_entry(plant, names), names)
 
 
-def unknown_names(plant: StandardPlant, inputs: Sequence[str]) -> tuple[str, ...]:
+def unknown_names(plant: AnyPlant, inputs: Sequence[str]) -> tuple[str, ...]:
     """Return the names of unknown inputs, each a disturbance of w."""
     require_sampled(plant, "unknown inputs are held over samples")
     names = name_list(inputs, "unknown inputs")
@@ -167,7 +167,7 @@ def unknown_names(plant: StandardPlant, inputs: Sequence[str]) -> tuple[str, ...
     return names
 
 
-def input_entry(plant: StandardPlant, names: Sequence[str]) -> InputEntry:
+def input_entry(plant: AnyPlant, names: Sequence[str]) -> InputEntry:
     """Return how disturbances, held over each sample, enter states, sensors and POIs."""
     g, m = plant.system, filter_model(plant)
     columns = g.input_index(names)
@@ -232,7 +232,7 @@ _UNDETERMINED = 1e-9
 _PART = 1e-6
 
 
-def check_bias(plant: StandardPlant | System, inputs: Sequence[str]) -> None:
+def check_bias(plant: AnyPlant | System, inputs: Sequence[str]) -> None:
     """Raise AssumptionError, with the names, when sensors do not determine constant forces.
 
     A constant force d is seen unless some x and d leave the machine at rest and y at zero, or it
@@ -283,7 +283,7 @@ def check_bias(plant: StandardPlant | System, inputs: Sequence[str]) -> None:
     )
 
 
-def _unseen_forces(plant: StandardPlant, names: Sequence[str]) -> FloatArray:
+def _unseen_forces(plant: AnyPlant, names: Sequence[str]) -> FloatArray:
     """Return the combinations (m, k) of constant forces that leave y at zero, in reduced form."""
     m, d = filter_model(plant), input_entry(plant, names)
     n = len(m.A)

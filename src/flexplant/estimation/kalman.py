@@ -13,8 +13,8 @@ from ..lti.lyapunov import dual_variances
 from ..lti.riccati import filter_dare, riccati_root
 from ..lti.statespace import System
 from ..parallel import one_thread
-from ..plant import StandardPlant
-from ..plant.partition import require_sampled
+from ..plant import AnyPlant
+from ..plant.partitioned import require_sampled
 from .error import error_variances
 from .estimator import KalmanEstimator
 from .estimator_channels import checked_plant, read_alike
@@ -38,7 +38,7 @@ _OWN = 1e-10
 
 
 @one_thread()
-def design_kalman(plant: StandardPlant | System) -> KalmanEstimator:
+def design_kalman(plant: AnyPlant | System) -> KalmanEstimator:
     """Return the stationary Kalman filter of the POIs on a sampled plant.
 
     It reads the sensors (not the references) and the applied u, and gives `die:hat` for a POI
@@ -96,7 +96,7 @@ def design_kalman(plant: StandardPlant | System) -> KalmanEstimator:
     require_sampled(plant, "this filter runs at samples")
     check_noises(plant)
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")
-    whole = plant.evaluation_plant
+    whole = plant.machine.evaluation_plant
     found = None if whole is None else left_out(plant, whole)
     observer = _observer(plant, found)
     certificate = observer.certificate
@@ -114,7 +114,7 @@ def design_kalman(plant: StandardPlant | System) -> KalmanEstimator:
 
 
 def redesigned(
-    observer: KalmanEstimator, change: Callable[[StandardPlant], StandardPlant]
+    observer: KalmanEstimator, change: Callable[[AnyPlant], AnyPlant]
 ) -> KalmanEstimator:
     """Return the observer of a changed plant, the modes left out and their noise as they are."""
     # its predicted errors are those of its own model
@@ -124,7 +124,7 @@ def redesigned(
     return _observer(change(observer.plant), found)
 
 
-def _observer(plant: StandardPlant, found: LeftOut | None) -> KalmanEstimator:
+def _observer(plant: AnyPlant, found: LeftOut | None) -> KalmanEstimator:
     """Return the filter of a plant and of modes left out, with its errors on its own model."""
     model = filter_model(plant, found)
     design = filter_design(model)

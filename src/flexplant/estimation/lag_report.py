@@ -17,8 +17,8 @@ from ..errors import AssumptionError, FlexplantError, aligned, require_known
 from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
-from ..plant import StandardPlant
-from ..plant.partition import require_plain, require_sampled
+from ..plant import AnyPlant, standard_plant
+from ..plant.partitioned import require_sampled
 from ..plant.rigid_motion import rigid_rows
 from .error import error_variances
 from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
@@ -107,7 +107,7 @@ class LagReport(Value):
 
 @one_thread()
 def lag_errors(
-    plant: StandardPlant,
+    plant: AnyPlant,
     steady: Steady,
     sight: Sight,
     on_whole: FloatArray,
@@ -242,7 +242,7 @@ class StaticEstimator(Value):
     """
 
     system: StateSpace
-    plant: StandardPlant
+    plant: AnyPlant
 
     def __repr__(self) -> str:
         g = self.system
@@ -253,7 +253,7 @@ class StaticEstimator(Value):
         """The gains (n_poi, n_sensors)."""
         return self.system.D
 
-    def rms(self, channel: str, *, on: StandardPlant | System | None = None) -> float:
+    def rms(self, channel: str, *, on: AnyPlant | System | None = None) -> float:
         """Return the predicted rms of the error at sample instants, with u at rest.
 
         What the disturbances bend, the modes left out among it where they are known, and the
@@ -272,7 +272,7 @@ class StaticEstimator(Value):
         return float(np.sqrt(found.values[row]))
 
 
-def design_static(plant: StandardPlant) -> StaticEstimator:
+def design_static(plant: AnyPlant) -> StaticEstimator:
     """Return the static geometric relation between the displacement sensors and the POIs.
 
     ``hat = R_z R_y^+ y`` with R_y and R_z the rigid-body modes at the sensors and the POIs: the
@@ -307,8 +307,7 @@ def design_static(plant: StandardPlant) -> StaticEstimator:
     >>> fx.design_static(fx.testbeds.three_masses()).gain.round(6)  # the mean of both ends
     array([[0.5, 0.5]])
     """
-    plant = checked_plant(plant)
-    require_plain(plant, "what is seen of the rigid body is known of sensors only")
+    plant = standard_plant(checked_plant(plant))
     ports = plant.assembled.ports
     motions = plant.rigid_motions
     orders = {s.name: s.order for s in ports.y}

@@ -18,9 +18,9 @@ from ..lti.modal_map import ModalMap
 from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..modes.matching import assigned
-from ..plant import StandardPlant
+from ..plant import AnyPlant, StandardPlant
 from ..plant.building import loud_like, sampled_like, structure_system, wired, with_filters
-from ..plant.partition import Assembled
+from ..plant.origins import Assembled
 from ..plant.ports import Ports
 from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
@@ -71,14 +71,14 @@ class LeftOut(Value):
     sensors: FloatArray
     pois: FloatArray
     cross: FloatArray
-    plant: StandardPlant
-    whole: StandardPlant | None = None
+    plant: AnyPlant
+    whole: AnyPlant | None = None
 
     def __repr__(self) -> str:
         return f"<LeftOut: {counted(self.modes.size, 'mode')} as noise and static compliance>"
 
 
-def left_out(plant: StandardPlant, whole: StandardPlant) -> LeftOut | None:
+def left_out(plant: AnyPlant, whole: AnyPlant) -> LeftOut | None:
     """Return what the modes do that a plant lacks of an evaluation plant; None when it lacks none.
 
     With the poles lambda of the modes left out, b what white noise of unit intensity drives and c
@@ -116,12 +116,12 @@ def left_out(plant: StandardPlant, whole: StandardPlant) -> LeftOut | None:
     flexibility[[len(flexibility) - len(ports.y) + i for i in moving]] = 0.0
     covariance = _motion_covariance(all_modes, others, whole)
     nz = covariance.shape[0] - len(ports.y)
-    y = plant.unweighted.y
+    y = plant.machine.y
     read = plant.reading_gain[np.ix_(
         [plant.y.index(name) for name in sensors(plant)], [y.index(port.name) for port in ports.y]
     )]  # fmt: skip
     fresh = _with_flexibility(plant, bare, flexibility)
-    quiet = _quiet(fresh, plant, plant.n_rigid + stand_ins)
+    quiet = _quiet(fresh.machine, plant.machine, plant.n_rigid + stand_ins)
     return LeftOut(
         others + big.n_rigid + 1,
         read @ covariance[nz:, nz:] @ read.T,
@@ -194,7 +194,7 @@ def _same_modes(kept: _Blocks, every: _Blocks, genuine: IntArray) -> tuple[IntAr
     return genuine[near], partner[near]
 
 
-def _may_follow(plant: StandardPlant, ports: Ports) -> FloatArray:
+def _may_follow(plant: AnyPlant, ports: Ports) -> FloatArray:
     """Return which forces a static compliance may answer (m,)."""
     # a white disturbance has no value at an instant, and u must not reach y in the sample in which
     # it is computed from y
@@ -205,7 +205,7 @@ def _may_follow(plant: StandardPlant, ports: Ports) -> FloatArray:
     )
 
 
-def _motion_covariance(blocks: _Blocks, chosen: IntArray, plant: StandardPlant) -> FloatArray:
+def _motion_covariance(blocks: _Blocks, chosen: IntArray, plant: AnyPlant) -> FloatArray:
     """Return the stationary covariance of the motions of some modes of a plant."""
     ports = plant.assembled.ports
     poles = blocks.poles[chosen].reshape(-1)
@@ -238,9 +238,7 @@ def _siso_response(part: StateSpace | None, at: ComplexArray) -> ComplexArray:
     return np.array([part.evaluated(s)[0, 0] for s in at])
 
 
-def _with_flexibility(
-    plant: StandardPlant, bare: StateSpace, flexibility: FloatArray
-) -> StandardPlant:
+def _with_flexibility(plant: AnyPlant, bare: StateSpace, flexibility: FloatArray) -> AnyPlant:
     """Return a plant whose structure's motions (p, m) also answer forces at once, sampled alike."""
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
     physical = with_filters(bare.replace(D=bare.D + flexibility), realisation, ports)
@@ -253,7 +251,7 @@ def _with_flexibility(
         B[:, columns], D[:, columns] = without.B[:, columns], without.D[:, columns]
         physical = physical.replace(B=B, D=D)
     fresh = wired(StandardPlant, Assembled(ports, realisation, physical), None)
-    return sampled_like(plant, loud_like(plant, fresh))
+    return sampled_like(plant.machine, loud_like(plant.machine, fresh))
 
 
 def _quiet(fresh: StandardPlant, plant: StandardPlant, modes: IntArray) -> StandardPlant:
@@ -360,11 +358,7 @@ def _neighbours(xyz: FloatArray) -> IntArray:
 
 
 def unresolved_share(
-    plant: StandardPlant,
-    whole: StandardPlant,
-    modes: IntArray,
-    observer: StateSpace,
-    variances: FloatArray,
+    plant: AnyPlant, whole: AnyPlant, modes: IntArray, observer: StateSpace, variances: FloatArray
 ) -> float | None:
     """Return the largest share of POI variances from modes left out that the mesh resolves badly.
 
@@ -381,7 +375,7 @@ def unresolved_share(
     coarse = modes[nodes[modes - 1] < NODES] - 1
     if not coarse.size:
         return 0.0
-    still = read_alike(plant, _quiet(whole, whole, coarse))
+    still = read_alike(plant, _quiet(whole.machine, whole.machine, coarse))
     rest = error_variances(still, observer).values
     shares = 1.0 - rest / divisor(variances)
     share = float(np.max(shares))

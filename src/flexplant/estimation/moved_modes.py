@@ -12,7 +12,7 @@ from ..checks import BoolArray, ComplexArray, FloatArray, Value, with_deviation
 from ..identification import MeasuredModes
 from ..lti.frequency import frequency_response
 from ..parallel import one_thread
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from ..plant.uncertainty.delta import Delta, with_changes
 from ..plant.uncertainty.mode_delta import DampingDelta, FrequencyDelta
 from .estimate import Estimate
@@ -226,7 +226,7 @@ class _Likelihood:
         poles = self.poles(observer.plant)
         self.widths: FloatArray = np.asarray(-poles.real / np.abs(poles))
 
-    def poles(self, plant: StandardPlant) -> ComplexArray:
+    def poles(self, plant: AnyPlant) -> ComplexArray:
         """Return the poles [rad/s] of the modes."""
         blocks = plant.modal_blocks[np.array(self.modes) - 1]
         found = np.linalg.eigvals(blocks).astype(np.complex128)
@@ -236,7 +236,9 @@ class _Likelihood:
         """Return the innovations with the modes so changed."""
         parts = zip(self.modes, *theta.reshape(2, -1).tolist(), strict=True)
         changes = [amount for one in parts for amount in ModeChange(*one).amounts]
-        observer = redesigned(self.observer, lambda plant: with_changes(plant, changes))
+        observer = redesigned(
+            self.observer, lambda plant: plant.around(with_changes(plant.machine, changes))
+        )
         estimate = observer.estimate(self.record, Filter())
         S = observer.model.innovation(observer.predicted_covariance)
         log_size = 0.5 * float(np.linalg.slogdet(S)[1])
@@ -293,7 +295,7 @@ def explained_by_change(
     def cost(x: FloatArray) -> float:
         if not -0.5 <= x[0] <= 1.5:
             return np.inf  # another peak than this one
-        machine = with_changes(plant, change(x).amounts)
+        machine = plant.around(with_changes(plant.machine, change(x).amounts))
         S = density_of(observer, machine, lines, V).both - usual + np.eye(p)[None]
         left = band.X
         if driven:
@@ -320,7 +322,7 @@ def explained_by_change(
     return change(best.x) if best.fun + 2 * price <= new + (2 * p + 1) * price else None
 
 
-def _commanded(observer: KalmanEstimator, plant: StandardPlant, freq: FloatArray) -> ComplexArray:
+def _commanded(observer: KalmanEstimator, plant: AnyPlant, freq: FloatArray) -> ComplexArray:
     """Return the responses (m, ny, nu) of the sensors to the commands."""
     path = plant.system.select(observer.sensors, observer.model.commands)
     return np.asarray(frequency_response(path, freq).data.transpose(2, 0, 1))

@@ -15,7 +15,7 @@ from ..errors import CertificateError, LabelError, ModelError, ShapeError, count
 from ..lti.riccati import filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from ..tolerances import TINY
 from .estimator_channels import checked_plant, estimates, poi_channels, recorded, row_of, sensors
 from .filter_model import (
@@ -79,7 +79,7 @@ class PeriodicEstimator(Value):
     certificate : PeriodicCertificate
     """
 
-    plant: StandardPlant
+    plant: AnyPlant
     period: int
     measured: FloatArray
     gains: FloatArray
@@ -148,7 +148,7 @@ class PeriodicEstimator(Value):
 
 @one_thread()
 def design_multirate(
-    plant: StandardPlant | System, every: Mapping[str, int | tuple[int, int]]
+    plant: AnyPlant | System, every: Mapping[str, int | tuple[int, int]]
 ) -> PeriodicEstimator:
     """Return the periodic Kalman filter of sensors that are read at different integer rates.
 

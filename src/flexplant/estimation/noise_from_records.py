@@ -12,7 +12,7 @@ from ..checks import ComplexArray, FloatArray, Value
 from ..errors import AssumptionError, ModelError, SolverError, counted, warn
 from ..lti.statespace import System
 from ..parallel import one_thread
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from ..tolerances import SETTLED, TINY
 from .causes import settling
 from .consistency import consistency
@@ -41,7 +41,7 @@ _LOW, _HIGH = 1e-6, 1e6
 
 @one_thread()
 def estimate_noise(
-    plant: StandardPlant | System, records: Any, *, gate: float | None = None
+    plant: AnyPlant | System, records: Any, *, gate: float | None = None
 ) -> NoiseLevels:
     """Return the densities of all disturbances and sensor noises that explain a record best.
 
@@ -153,13 +153,13 @@ def estimate_noise(
     )  # fmt: skip
 
 
-def _whole_plant(plant: StandardPlant) -> StandardPlant:
+def _whole_plant(plant: AnyPlant) -> AnyPlant:
     """Return the plant with the modes left out, with the densities of the given one."""
-    found = plant.evaluation_plant
+    found = plant.machine.evaluation_plant
     if found is None:
         return plant
     if found.is_assembled and plant.is_assembled:
-        found = found.with_ports(plant.unweighted.assembled.ports)
+        found = found.with_ports(plant.assembled.ports)
     return read_alike(plant, found)
 
 
@@ -171,7 +171,7 @@ def _advice(observer: KalmanEstimator, estimate: Estimate, alone: bool) -> str:
     return f"With the last ones {said.text}{_EVALUATION if alone else ''}"
 
 
-def _noise_channels(plant: StandardPlant) -> tuple[str, ...]:
+def _noise_channels(plant: AnyPlant) -> tuple[str, ...]:
     noises = tuple(f"{name}:noise" for name in sensors(plant))
     silent = [name for name in noises if not plant.asd.get(name, 0.0) > 0]
     if silent:
@@ -185,7 +185,7 @@ def _noise_channels(plant: StandardPlant) -> tuple[str, ...]:
     return *forces, *noises
 
 
-def _scaled(plant: StandardPlant, channels: tuple[str, ...], ratios: FloatArray) -> StandardPlant:
+def _scaled(plant: AnyPlant, channels: tuple[str, ...], ratios: FloatArray) -> AnyPlant:
     none = np.zeros((len(channels), len(channels)))
     return NoiseLevels(plant, channels, ratios, none, ratios, 0.0, 1.0, 0).plant
 
@@ -197,7 +197,7 @@ class _Source(NamedTuple):
     H: FloatArray
 
 
-def _sources(plant: StandardPlant, channels: tuple[str, ...]) -> list[_Source]:
+def _sources(plant: AnyPlant, channels: tuple[str, ...]) -> list[_Source]:
     """Return what each channel adds per sample, at its present level."""
     rows = [plant.y.index(name) for name in sensors(plant)]
     n, found = plant.system.n_states, []
@@ -387,7 +387,7 @@ class NoiseLevels(Value):
         Of `consistency`, on the record with these levels.
     """
 
-    given: StandardPlant
+    given: AnyPlant
     channels: tuple[str, ...]
     ratios: FloatArray
     covariance: FloatArray
@@ -427,17 +427,17 @@ class NoiseLevels(Value):
         return dict(zip(self.channels, sizes.tolist(), strict=True))
 
     @property
-    def plant(self) -> StandardPlant:
+    def plant(self) -> AnyPlant:
         """The plant with the estimated densities."""
         given = self.given
         if not given.is_assembled:
             factor = given.noise_factor * self.ratios[self.channels.index(PROCESS)]
-            origin = given.origin.replace(noise_factor=factor)
+            origin = given.machine.origin.replace(noise_factor=factor)
             return given.replace(asd={**given.asd, **self.asd}, origin=origin)
         return with_densities(given, self.asd)
 
 
-def with_densities(plant: StandardPlant, asd: Mapping[str, float]) -> StandardPlant:
+def with_densities(plant: AnyPlant, asd: Mapping[str, float]) -> AnyPlant:
     """Return an assembled plant with other densities of some of the noises that it has."""
 
     def changed(ports: Sequence[Any], ending: str = "") -> list[Any]:
@@ -445,6 +445,5 @@ def with_densities(plant: StandardPlant, asd: Mapping[str, float]) -> StandardPl
         return [port.replace(asd=level) for port, level in zip(ports, given, strict=True)]
 
     own = plant.assembled.ports
-    return plant.with_ports(
-        own.replace(w=changed(own.w), u=changed(own.u, ":disturbance"), y=changed(own.y, ":noise"))
-    )
+    w, u, y = changed(own.w), changed(own.u, ":disturbance"), changed(own.y, ":noise")
+    return plant.around(plant.machine.with_ports(own.replace(w=w, u=u, y=y)))

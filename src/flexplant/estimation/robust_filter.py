@@ -18,7 +18,7 @@ from ..lti.norms import hinf_norm
 from ..lti.riccati import filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import Progress, one_thread, tick
-from ..plant import StandardPlant, UncertainPlant, standard_plant
+from ..plant import AnyPlant, StandardPlant, UncertainPlant, standard_plant
 from ..tolerances import TINY
 from .error import PoiFilter, error_variances, moving_parts
 from .estimator_channels import same_pois
@@ -127,7 +127,7 @@ class RobustFilter(PoiFilter):
     """
 
     system: StateSpace
-    plant: StandardPlant
+    plant: AnyPlant
     gain: FloatArray
     poi_gain: FloatArray
     sizes: FloatArray
@@ -147,7 +147,7 @@ _AGREEMENT = 1e-6
 
 
 @one_thread()
-def design_hinf_filter(plant: StandardPlant | System, *, accuracy: float = 1e-3) -> RobustFilter:
+def design_hinf_filter(plant: AnyPlant | System, *, accuracy: float = 1e-3) -> RobustFilter:
     """Return the filter with the smallest largest gain from the noises to the POI errors.
 
     The Kalman filter is best for noise that is white with the stated densities; what it pays for
@@ -267,7 +267,7 @@ STEPS = "steps of the search"
 
 @one_thread()
 def design_minimax_filter(
-    plant: StandardPlant | System,
+    plant: AnyPlant | System,
     machines: Sequence[StandardPlant],
     *,
     iterations: int = 200,
@@ -375,7 +375,7 @@ def design_minimax_filter(
     return RobustFilter(system, plant, found.K, found.L_z, sizes, own, certificate)
 
 
-def _means(machines: Sequence[StandardPlant], system: StateSpace, sizes: FloatArray) -> FloatArray:
+def _means(machines: Sequence[AnyPlant], system: StateSpace, sizes: FloatArray) -> FloatArray:
     """Return the mean relative variance of a filter on each machine."""
     found = [error_variances(machine, system).values for machine in machines]
     return np.asarray(np.mean(np.array(found) / sizes**2, axis=1))
@@ -548,9 +548,9 @@ class MachineError(NamedTuple):
 
 
 def machine_error(
-    plant: StandardPlant,
+    plant: AnyPlant,
     model: FilterModel,
-    machine: StandardPlant,
+    machine: AnyPlant,
     start: GainPair,
     scale: FloatArray,
     unit: FloatArray,

@@ -17,7 +17,7 @@ from ..lti.lyapunov import solve_stein
 from ..lti.riccati import filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from ..tolerances import TINY, divisor
 from .estimator_channels import checked_plant, poi_channels, row_of
 from .filter_model import (
@@ -84,7 +84,7 @@ class Augmented(Value):
 
 @one_thread()
 def design_input_estimator(
-    plant: StandardPlant | System, inputs: Sequence[str], method: Unbiased | Augmented = Unbiased()
+    plant: AnyPlant | System, inputs: Sequence[str], method: Unbiased | Augmented = Unbiased()
 ) -> InputEstimator:
     """Return a filter of the POIs that also estimates disturbances held over each sample.
 
@@ -318,7 +318,7 @@ def _check_certificate(found: InputCertificate) -> None:
         )
 
 
-def _without_noise(plant: StandardPlant, names: Sequence[str]) -> StandardPlant:
+def _without_noise(plant: AnyPlant, names: Sequence[str]) -> AnyPlant:
     """Return the plant without the white noise of some disturbances."""
     loud = [name for name in names if plant.asd.get(name, 0.0) > 0]
     if not loud:
@@ -402,7 +402,7 @@ class InputEstimator(Value):
     """
 
     system: StateSpace
-    plant: StandardPlant
+    plant: AnyPlant
     inputs: tuple[str, ...]
     delay: int
     variances: FloatArray

@@ -14,13 +14,13 @@ from ..lti.interconnection import among, connect
 from ..lti.joining import equal_matrices
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
+from ..plant import AnyPlant, StandardPlant
 from ..tolerances import SAME
 from .anti_windup import recovery_gain
 
 
 def driving_blocks(
-    plant: StandardPlant,
+    plant: AnyPlant,
     systems: Sequence[StateSpace],
     driven: list[str],
     watched: list[str],
@@ -119,7 +119,7 @@ def as_block(block: Any, name: str, dt: float) -> StateSpace:
 
 
 def drives(
-    plant: StandardPlant, systems: Sequence[StateSpace], idle: tuple[str, ...]
+    plant: AnyPlant, systems: Sequence[StateSpace], idle: tuple[str, ...]
 ) -> tuple[list[str], list[str]]:
     """Return the driven actuators and the monitored outputs."""
     produced = [name for sys in systems for name in sys.outputs]
@@ -157,7 +157,7 @@ def drives(
     return [name for name in plant.u if name in produced], watched
 
 
-def check_inputs(plant: StandardPlant, systems: Sequence[StateSpace]) -> None:
+def check_inputs(plant: AnyPlant, systems: Sequence[StateSpace]) -> None:
     """Raise LabelError when an input of a block is connected to nothing."""
     produced = [name for sys in systems for name in sys.outputs]
     known = [*plant.y, *plant.u, *produced]
@@ -189,7 +189,7 @@ def force_name(actuator: str) -> str:
     return f"{actuator}:{_FORCE}"
 
 
-def references(plant: StandardPlant) -> list[str]:
+def references(plant: AnyPlant) -> list[str]:
     """Return the channels that are both in w and in y, what is derived from them left out."""
     both = [name for name in plant.w if name in plant.y]
     return [name for name in both if not is_known(name, both, plant.u)]
@@ -201,7 +201,7 @@ def is_known(name: str, refs: Sequence[str], actuators: Sequence[str]) -> bool:
     return (kind in DERIVATIVES and owner in refs) or (kind == _FORCE and owner in actuators)
 
 
-def with_known(plant: StandardPlant, systems: Sequence[StateSpace]) -> StandardPlant:
+def with_known(plant: AnyPlant, systems: Sequence[StateSpace]) -> AnyPlant:
     """Return the plant with the known signals that blocks read as references, in w and y."""
     read = [name for sys in systems for name in sys.inputs]
     refs = references(plant)
@@ -217,7 +217,7 @@ def with_known(plant: StandardPlant, systems: Sequence[StateSpace]) -> StandardP
 
 
 def tapped(
-    plant: StandardPlant, driven: Sequence[str], watched: Sequence[str], units: Mapping[str, str]
+    plant: AnyPlant, driven: Sequence[str], watched: Sequence[str], units: Mapping[str, str]
 ) -> StateSpace:
     """Return [w; driven; watched] -> [z; y; driven; watched; y of the loop], named `y1|loop`."""
     shown, taps = [*plant.z, *plant.y, *driven, *watched], [*driven, *watched]

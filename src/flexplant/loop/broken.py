@@ -15,7 +15,7 @@ from ..lti.frequency_sweep import SOUGHT, highest, resonance_grid
 from ..lti.measured_lines import FEWEST, HiddenModes, hidden_modes
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from ..tolerances import TINY
 
 Side = Literal["u", "y"]
@@ -168,7 +168,7 @@ class Path(NamedTuple):
 
 
 @lru_cache(maxsize=_KEPT)
-def plant_path(plant: StandardPlant, driven: tuple[str, ...]) -> Path:
+def plant_path(plant: AnyPlant, driven: tuple[str, ...]) -> Path:
     """Return what lies between some actuators and y."""
     system = plant.system.select(plant.y, driven)
     fed_back = movable_outputs(system)

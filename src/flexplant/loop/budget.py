@@ -23,9 +23,8 @@ from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..lti.responses import responder
 from ..lti.sampling import reaches_at_once
 from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
+from ..plant import AnyPlant, standard_plant
 from ..plant.evaluation_model import NOT_JUDGED
-from ..plant.partition import require_plain
 from ..tolerances import divisor
 
 #: relative: the variance by the two Lyapunov equations, and by the integral of the spectrum
@@ -366,7 +365,7 @@ class Source(NamedTuple):
     D: FloatArray
 
 
-def white_names(plant: StandardPlant) -> tuple[list[str], list[str]]:
+def white_names(plant: AnyPlant) -> tuple[list[str], list[str]]:
     """Return the channels of w that are white noise: disturbances, then noises per sample."""
     # per sample: those of sensors, and disturbances that are held over each sample
     loud = [name for name, level in plant.asd.items() if level > 0]
@@ -380,7 +379,7 @@ def white_names(plant: StandardPlant) -> tuple[list[str], list[str]]:
     return white, sensors
 
 
-def white_noise(plant: StandardPlant) -> WhiteNoise:
+def white_noise(plant: AnyPlant) -> WhiteNoise:
     """Return the noises of a sampled plant, all disturbances together."""
     # exact over a sample, what folds back included; a sensor's variance is asd^2 rate / 2
     white, sensors = white_names(plant)
@@ -390,13 +389,13 @@ def white_noise(plant: StandardPlant) -> WhiteNoise:
     return WhiteNoise(factor, columns, asd * np.sqrt(0.5 / plant.dt))
 
 
-def continuous_factor(plant: StandardPlant) -> FloatArray:
+def continuous_factor(plant: AnyPlant) -> FloatArray:
     """Return the noise factor of the disturbances that are not held over each sample."""
     total = plant.noise_factor
     return total[:, : total.shape[1] - len(plant.held)]
 
 
-def sources(plant: StandardPlant, monitored: StateSpace) -> list[Source]:
+def sources(plant: AnyPlant, monitored: StateSpace) -> list[Source]:
     """Return the white noises of a plant as they enter its closed loop, each by itself."""
     white, sensors = white_names(plant)
     found = []
@@ -412,7 +411,7 @@ def sources(plant: StandardPlant, monitored: StateSpace) -> list[Source]:
     return found
 
 
-def _disturbance_factors(plant: StandardPlant, white: list[str]) -> dict[str, FloatArray]:
+def _disturbance_factors(plant: AnyPlant, white: list[str]) -> dict[str, FloatArray]:
     """Return G of each white disturbance; of all together where they cannot be separated."""
     if not white:
         return {}
@@ -423,7 +422,7 @@ def _disturbance_factors(plant: StandardPlant, white: list[str]) -> dict[str, Fl
         found = {}
         for name in white:  # the plant sampled with one of them
             asd = {n: level for n, level in plant.asd.items() if n == name or n in plant.held}
-            alone = plant.unweighted.continuous.replace(asd=asd)
+            alone = plant.machine.continuous.replace(asd=asd)
             found[name] = continuous_factor(alone.discretized(1.0 / plant.dt, delay=plant.delay))
         # a plant whose noise was changed since it was assembled keeps its own
         if all(factor.shape[0] == total.shape[0] for factor in found.values()):
@@ -434,13 +433,9 @@ def _disturbance_factors(plant: StandardPlant, white: list[str]) -> dict[str, Fl
     return {" + ".join(white): total}
 
 
-def stationary_row(
-    plant: StandardPlant, monitored: StateSpace, problem: object, channel: str
-) -> int:
+def stationary_row(plant: AnyPlant, monitored: StateSpace, problem: object, channel: str) -> int:
     """Return the row of an output of a closed loop that has a stationary state."""
-    require_plain(
-        plant, "its z and w are no physical signals, close the loop anew", AssumptionError
-    )
+    standard_plant(plant)  # the z and w of a generalized plant are no physical signals
     given: object = channel
     instance(given, str, "a channel", "Pass its name: 'die:error'.", LabelError)
     row = int(monitored.output_index([channel])[0])

@@ -18,7 +18,7 @@ from ..lti.interconnection import lft, loop_poles
 from ..lti.norms import Obstacle, obstacle
 from ..lti.responses import Responder, remembered, responder
 from ..lti.statespace import StateSpace, System
-from ..plant import StandardPlant, standard_plant
+from ..plant import AnyPlant, StandardPlant, plant_of, standard_plant
 from ..plant.uncertainty.uncertain_plant import UncertainPlant
 from .blocks import as_block, check_inputs, commands, drives, driving_blocks, tapped, with_known
 from .broken import BrokenLoop, Path, plant_path
@@ -77,7 +77,7 @@ class ClosedLoop(Value):
     '245 nm'
     """
 
-    plant: StandardPlant
+    plant: AnyPlant
     blocks: tuple[StateSpace, ...]
     controller: StateSpace
     idle: tuple[str, ...] = ()
@@ -105,6 +105,11 @@ class ClosedLoop(Value):
             found = self.tolerances.certificate
             lines.append(f"  {one_line(found) if found else self.tolerances.summary}")
         return "\n".join(lines)
+
+    @property
+    def machine(self) -> StandardPlant:
+        """The plant of the machine; ModelError for a loop around a generalized plant."""
+        return standard_plant(self.plant)
 
     @property
     def driven(self) -> tuple[str, ...]:
@@ -261,7 +266,7 @@ class ClosedLoop(Value):
     @cached_property
     def completed(self) -> ClosedLoop | None:
         """The same controller closed around the plant with the modes left out; None: not known."""
-        whole = None if self.plant.is_weighted else self.plant.evaluation_plant
+        whole = self.plant.evaluation_plant
         return None if whole is None else self.around(whole)
 
     @cached_property
@@ -300,7 +305,7 @@ class ClosedLoop(Value):
         """
         return reported_tolerances(self)
 
-    def around(self, plant: StandardPlant) -> ClosedLoop:
+    def around(self, plant: AnyPlant) -> ClosedLoop:
         """Return the loop of the same controller around a machine with the same u, y and rate."""
         return ClosedLoop(with_known(plant, self.blocks), self.blocks, self.controller, self.idle)
 
@@ -431,7 +436,7 @@ class ClosedLoop(Value):
 
 
 def close_loop(
-    plant: StandardPlant | UncertainPlant[Any] | System, *blocks: Any, idle: Iterable[str] = ()
+    plant: AnyPlant | UncertainPlant[Any] | System, *blocks: Any, idle: Iterable[str] = ()
 ) -> ClosedLoop:
     """Return the closed loop of a plant with controller blocks, connected by name.
 
@@ -489,7 +494,7 @@ def close_loop(
     >>> loop.is_stable, round(loop.spectral_abscissa, 6)
     (True, -10.0)
     """
-    plant = standard_plant(plant)
+    plant = plant_of(plant)
     systems = tuple(as_block(block, f"block {i}", plant.dt) for i, block in enumerate(blocks, 1))
     if not systems:
         raise ModelError(

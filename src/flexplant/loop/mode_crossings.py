@@ -28,7 +28,7 @@ from ..errors import ModelError
 from ..lti.responses import Responder, points, responder
 from ..lti.sampling import acting
 from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from ..plant.building import sampled_motions
 from ..plant.uncertainty.mode_delta import DampingDelta, FrequencyDelta, changed_pairs
 from ..tolerances import SAME, SETTLED, TINY
@@ -82,7 +82,7 @@ class ModeLoops:
     what y shows of the modes' states through other states, (p, 2 modes).
     """
 
-    plant: StandardPlant
+    plant: AnyPlant
     broken: BrokenLoop
     states: Responder
     changes: Mapping[str, ModeChanges]
@@ -93,7 +93,7 @@ class ModeLoops:
     behind: Responder | None = None
 
     @classmethod
-    def of(cls, plant: StandardPlant, broken: BrokenLoop, modes: IntArray) -> ModeLoops:
+    def of(cls, plant: AnyPlant, broken: BrokenLoop, modes: IntArray) -> ModeLoops:
         """Return a loop with modes (numbers from 1); all are changed at once, being uncoupled."""
         if any(sensor.order == 2 for sensor in plant.assembled.ports.y if sensor.name in broken.y):
             raise ModelError(
@@ -293,7 +293,7 @@ class SizeBound(NamedTuple):
 
 
 def _polynomials(
-    plant: StandardPlant, broken: BrokenLoop, modes: IntArray, kind: Any
+    plant: AnyPlant, broken: BrokenLoop, modes: IntArray, kind: Any
 ) -> tuple[FloatArray, FloatArray]:
     """Return A (k, modes, 2, 2) and what feeds each mode (k, modes, 2, states and u) by power."""
     nodes = np.array([0.0, *_NODES[kind]])
@@ -306,7 +306,7 @@ def _polynomials(
     deltas = [delta.of(int(mode), 1.0) for mode in modes]
     amounts = (1.0 + nodes) ** 2 - 1.0 if kind == "freq" else nodes
     blocks = [changed_pairs(realisation, [(one, float(x)) for one in deltas]) for x in amounts]
-    for i, g in enumerate(sampled_motions(plant, blocks, broken.y, broken.u)):
+    for i, g in enumerate(sampled_motions(plant.machine, blocks, broken.y, broken.u)):
         columns = [where[name] for name in g.states]
         rows = [g.states.index(name) for name in names]
         own = np.reshape(rows, (-1, 2))

@@ -24,7 +24,7 @@ from ..checks import (
 )
 from ..errors import AssumptionError, ModelError, aligned, counted, warn
 from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
+from ..plant import AnyPlant, standard_plant
 from ..plant.drawn_machines import draws_with_left_out
 from ..plant.realisation import natural
 from ..plant.uncertainty.mode_delta import modal_realisation
@@ -405,7 +405,7 @@ def _percent(ends: FloatArray, limit: float) -> str:
 
 
 def mode_tolerances(
-    plant: StandardPlant,
+    plant: AnyPlant,
     broken: BrokenLoop,
     *,
     margin: float,
@@ -417,7 +417,7 @@ def mode_tolerances(
     # at each point of the stability boundary that a pole lies there is an equation for a complex
     # change of one mode (`mode_crossings`); where its imaginary part changes its sign along the
     # boundary, a pole crosses it at a real change. The sampled plant's matrices are exact
-    modal_realisation(plant)
+    modal_realisation(standard_plant(plant))
     margin = positive(margin, "margin")
     if margin >= 1.0:
         raise ModelError(f"margin must be below 1, the largest that a loop can keep, got {margin}.")
@@ -502,7 +502,7 @@ def _tolerances(loop: Any, known: Mapping[int, float]) -> ModeTolerances | None:
         return None
 
 
-def _swinging_modes(plant: StandardPlant) -> tuple[IntArray, FloatArray, FloatArray]:
+def _swinging_modes(plant: AnyPlant) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return numbers, frequencies [Hz] and damping ratios of the modes that swing below Nyquist."""
     realisation = plant.assembled.realisation
     omega, zeta = natural(realisation.pairs)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ..checks import FloatArray, Value, function, instance, members, real_array
 from ..errors import AssumptionError, LabelError, ModelError, counted, only_one
 from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
+from ..plant import AnyPlant, StandardPlant
 from .blocks import with_known
 from .closed import ClosedLoop, close_loop
 
@@ -78,7 +78,7 @@ class ScheduledLoop(Value):
         )
 
     @property
-    def plant(self) -> StandardPlant:
+    def plant(self) -> AnyPlant:
         """The plant, where it stands."""
         return self.loops[0].plant
 
@@ -113,7 +113,7 @@ class ScheduledLoop(Value):
         )  # fmt: skip
         return ClosedLoop(plant, (law,), law, loop.idle)
 
-    def around(self, plant: StandardPlant) -> ScheduledLoop:
+    def around(self, plant: AnyPlant) -> ScheduledLoop:
         """Return the same controllers around another machine with the same ports."""
         loops = [
             close_loop(plant.at(None, **{self.position: float(x)}), *loop.blocks)

@@ -11,7 +11,7 @@ import numpy as np
 from ..checks import FloatArray, Value, several, short
 from ..errors import LabelError, ModelError, require_known
 from ..plant import Actuator, EvaluationModel, SensorPort, StandardPlant, standard_plant
-from ..plant.partition import require_plain, require_sampled
+from ..plant.partitioned import require_sampled
 from ..plant.scheduling import port_at, require_positions
 from ..structure import Disc, Rectangle
 from ..tolerances import TYPED
@@ -67,7 +67,6 @@ def sides_of(ports: Iterable[Port]) -> Any:
 def sampled_plant(given: Any) -> StandardPlant:
     """Return a plant that is sampled and not weighted."""
     plant: StandardPlant = standard_plant(given)
-    require_plain(plant, "sensors and actuators are placed on a structure")
     require_sampled(plant, "scores are of samples", ModelError)
     return plant
 
@@ -91,10 +90,8 @@ def _restricted(plant: StandardPlant, kept: dict[str, list[str]]) -> StandardPla
     asd = {name: size for name, size in plant.asd.items() if name not in silent}
     system = plant.system.select([*z, *y], [*w, *u])
     whole = plant.evaluation_plant
-    return StandardPlant(
-        system, tuple(w), tuple(u), tuple(z), tuple(y), asd, plant.origin,
-        evaluation=EvaluationModel.of(whole and _restricted(whole, kept)),
-    )  # fmt: skip
+    judged = EvaluationModel.of(whole and _restricted(whole, kept))
+    return plant.replace(system=system, w=w, u=u, z=z, y=y, asd=asd, evaluation=judged)
 
 
 def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> dict[str, Port]:

@@ -16,7 +16,7 @@ from ..lti.sampling import held_exactly, reaches_at_once
 from ..lti.statespace import StateSpace
 from ..plant import Actuator, StandardPlant
 from ..plant.building import direct_effect
-from ..plant.partition import require_noise
+from ..plant.partitioned import require_noise
 from .candidates import Port, with_side
 from .convex import WorstRow, quadratic
 from .criterion import Criterion, OnBoth, OnPlant, Scorer

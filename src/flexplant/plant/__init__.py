@@ -83,11 +83,11 @@ from .forces import NarrowBand as NarrowBand
 from .forces import OutputDisturbance as OutputDisturbance
 from .forces import RandomWalk as RandomWalk
 from .forces import RigidForce as RigidForce
+from .generalized import GeneralizedPlant as GeneralizedPlant
 from .moving import Along as Along
 from .moving import PositionMap as PositionMap
-from .partition import Assembled as Assembled
-from .partition import Foreign as Foreign
-from .partition import Weighted as Weighted
+from .origins import Assembled as Assembled
+from .origins import Foreign as Foreign
 from .port import ForcePort as ForcePort
 from .port import Seen as Seen
 from .port import SensorPort as SensorPort
@@ -103,8 +103,10 @@ from .rigid_motion import decouple as decouple
 from .scheduling import Moves as Moves
 from .scheduling import PlaceTable as PlaceTable
 from .scheduling import Position as Position
+from .standard import AnyPlant as AnyPlant
 from .standard import StandardPlant as StandardPlant
 from .standard import assemble_plant as assemble_plant
+from .standard import plant_of as plant_of
 from .standard import standard_plant as standard_plant
 from .structure_frf import StructureFrf as StructureFrf
 from .structure_frf import frequency_response as frequency_response

@@ -14,12 +14,12 @@ from ..checks import ComplexArray, FloatArray, Value
 from ..errors import AssumptionError, unknown_label
 from ..lti.joining import block_diagonal
 from ..tolerances import SAME, TINY
-from .partition import Partition
+from .partitioned import PartitionedSystem
 from .reach_and_sight import Assumption, full_ranks, no_zeros, reach_and_sight, response_at
 from .realisation import natural
 
 #: tests of a plant, in the order in which they matter
-_Tests: TypeAlias = Callable[[Partition], list[Assumption]]
+_Tests: TypeAlias = Callable[[PartitionedSystem], list[Assumption]]
 _TESTS: tuple[_Tests, ...] = (reach_and_sight, full_ranks, no_zeros)
 
 
@@ -39,7 +39,7 @@ class AssumptionReport(Value):
     True
     """
 
-    plant: Partition
+    plant: PartitionedSystem
 
     @cached_property
     def assumptions(self) -> tuple[Assumption, ...]:
@@ -119,7 +119,7 @@ def _assumption_lines(items: tuple[Assumption, ...]) -> list[str]:
 _SHOWN = 3
 
 
-def aliased_modes(plant: Partition) -> str:
+def aliased_modes(plant: PartitionedSystem) -> str:
     """Return, in words, which elastic modes of a sampled plant are not below half its rate."""
     # a mode at f looks like one at |f - m rate|: no controller of that rate distinguishes them
     if not plant.dt or not plant.is_assembled:
@@ -195,9 +195,9 @@ class ModeVisibility(Value):
         )
 
 
-def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
+def mode_visibility(plant: PartitionedSystem) -> tuple[ModeVisibility, ...]:
     """Return the visibility of every elastic mode; none for a plant without a structure."""
-    given, plant = plant, plant.unweighted.continuous
+    given, plant = plant, plant.machine.continuous
     if not plant.is_assembled:
         return ()
     # rigid-body modes and unstable ones come first
@@ -225,7 +225,7 @@ def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
         sides[side] = names, np.abs(left.conj().T @ g.B[:, g.input_index(names)])
     orders = {s.name: s.order for s in plant.assembled.ports.y}
     for side in "yz":
-        block = given.origin.reading if side == "y" else None
+        block = given.reading if side == "y" else None
         kept = [n for n in getattr(plant, side) if n in getattr(given, side)]
         names = [n for n in kept if np.any(g.C[g.output_index([n])])]
         names = names if block is None else list(block.inputs)

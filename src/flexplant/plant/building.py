@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..checks import FloatArray, Value, instance, positive
-from ..errors import ModelError, counted, require_known
+from ..errors import ModelError, counted
 from ..lti.discretisation import tustin
 from ..lti.interconnection import among, append, series
 from ..lti.sampling import (
@@ -20,12 +20,13 @@ from ..lti.sampling import (
     light_modes,
     sample_and_hold,
 )
-from ..lti.statespace import StateSpace, System, as_statespace, single_channel
+from ..lti.statespace import StateSpace, as_statespace
 from ..structure import FEModel
 from ..structure.rigid import SPANNED, Structure
 from ..tolerances import ROUNDING, SAME
 from .evaluation_model import EvaluationModel
-from .partition import Assembled, Foreign, Partition, Weighted, require_plain
+from .origins import Assembled, Foreign
+from .partition import Partition
 from .port import QUANTITIES, ForcePort, Seen, SensorPort
 from .ports import Poi, Ports
 from .realisation import ModalRealisation, natural
@@ -348,9 +349,6 @@ def sampled(plant: P, rate: float, delay: float) -> P:
         raise ModelError(
             f"the plant is sampled already (dt {plant.dt:g} s). Start from plant.continuous."
         )
-    require_plain(
-        plant, "continuous weights would be distorted by the hold, weight it once sampled"
-    )
     check_rate(_elastic_frequencies(plant), rate, delay)
     for name, late in (plant.assembled.ports.latencies if plant.is_assembled else {}).items():
         check_latency(name, late, rate)
@@ -455,7 +453,6 @@ def rebuilt(
 ) -> P:
     """Return a plant with other ports or of other modes, sampled like the old one."""
     # ports that are among its own are rows and columns of it
-    require_plain(plant, "other ports or modes are for a plant as it was made")
     own, judged = plant.assembled, _evaluation_of_rebuilt(plant, ports, realisation)
     if isinstance(ports, Ports) and realisation is None and not changed_densities(plant):
         found = with_ports_of(own, ports)
@@ -491,66 +488,6 @@ def _evaluation_of_rebuilt(
     )
 
 
-def weighted(plant: P, z: Any, w: Any) -> P:
-    """Return ``W_z P W_w``; a weight None drops its channel."""
-    z, w = _mapping(z, "z"), _mapping(w, "w")
-    for side, weights in (("z", z), ("w", w)):
-        require_known(f"channel of {side}", weights, getattr(plant, side))
-    keep_z = [name for name in plant.z if name not in z or z[name] is not None]
-    keep_w = [name for name in plant.w if name not in w or w[name] is not None]
-    if not keep_z or not keep_w:
-        raise ModelError("all of z or w was left out: keep at least one channel of each.")
-    inner = plant.system.select([*keep_z, *plant.y], [*keep_w, *plant.u])
-    before, after = (
-        append(
-            *(_weight(plant, side.get(name, 1.0), name) for name in kept), _identity(plant, rest)
-        )
-        for side, kept, rest in ((w, keep_w, plant.u), (z, keep_z, plant.y))
-    )
-    system = series(series(before, inner), after)
-    step = tuple(z.items()), tuple(w.items())
-    return plant.replace(
-        system=system.replace(name=plant.system.name),
-        w=tuple(keep_w),
-        z=tuple(keep_z),
-        asd={},
-        origin=Weighted(plant.unweighted, plant.origin.reading, True, (*plant.origin.steps, step)),
-    )
-
-
-def _mapping(weights: Any, side: str) -> dict[str, Any]:
-    if weights is None:
-        return {}
-    instance(
-        weights, Mapping, f"weights of {side}", "{'die:error': lti.inverse_sensitivity(30.0)}, say."
-    )
-    return {
-        name: None if weight is None else as_statespace(weight) for name, weight in weights.items()
-    }
-
-
-def measured_through(plant: P, block: System) -> P:
-    """Return the plant with y read through a block."""
-    g = as_statespace(block)
-    require_known("channel of y", g.inputs, plant.y)
-    inner = plant.system.select([*plant.z, *g.inputs])
-    block = g if g.n_states else g.replace(dt=plant.dt)
-    after = append(_identity(plant, plant.z), block)
-    if plant.origin.reading is not None:
-        block = series(plant.origin.reading.select(outputs=block.inputs), block)
-    return plant.replace(
-        system=series(inner, after).replace(name=plant.system.name),
-        y=tuple(g.outputs),
-        origin=Weighted(plant.unweighted, block, plant.origin.scaled, (*plant.origin.steps, g)),
-    )
-
-
-def _weight(plant: Partition, weight: Any, name: str) -> StateSpace:
-    sys = at_rate(single_channel(weight, f"the weight of {name!r}"), name, plant.dt)
-    states = [f"{name}|{state}" for state in sys.states]
-    return sys.replace(inputs=[name], outputs=[name], states=states)
-
-
 def at_rate(weight: StateSpace, name: str, dt: float) -> StateSpace:
     """Return a weight of sampling time dt; a continuous one is sampled (Tustin)."""
     if not weight.n_states:
@@ -563,8 +500,3 @@ def at_rate(weight: StateSpace, name: str, dt: float) -> StateSpace:
             "continuous system, which is sampled at the plant's rate."
         )
     return weight
-
-
-def _identity(plant: Partition, names: tuple[str, ...]) -> StateSpace:
-    gain = as_statespace(np.eye(len(names)))
-    return gain.replace(dt=plant.dt, inputs=names, outputs=names)

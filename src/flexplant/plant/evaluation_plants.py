@@ -60,7 +60,7 @@ def _with_ports(plant: P, model: EvaluationModel) -> P:
 
 def own_plant(kind: type[P], model: EvaluationModel) -> P:
     """Return the plant that is an evaluation model, with the ports that it got since."""
-    found = kind.of(model.source).unweighted
+    found = kind.of(model.source)
     return found if model.ports is None else rebuilt(found, ports=model.ports)
 
 

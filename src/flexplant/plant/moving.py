@@ -16,7 +16,7 @@ from ..errors import AssumptionError, LabelError, ModelError, only_one, unknown_
 from .assumptions import WEAK, mode_visibility
 from .building import P, changed_densities, rebuilt, wired
 from .forces import Actuator, Disturbance
-from .partition import Partition, require_plain
+from .partition import Partition
 from .ports import Poi, Ports, Sensor
 from .rigid_body import rigid_body_of
 from .rigid_motion import Decoupling, decouple, rigid_parts
@@ -119,7 +119,6 @@ def _is_row(port: Any) -> bool:
 
 def along(plant: Partition, name: str, points: npt.ArrayLike) -> Along:
     """Return what depends on the place of a POI or a force, at many points at once."""
-    require_plain(plant, "ports move on a structure")
     places = real_array(points, "points", (None, 3))
     port = _port(plant.assembled.ports, name)
     if isinstance(port, Poi):
@@ -341,7 +340,7 @@ def _named_judges(judge: Any) -> dict[str, Callable[[Any], float]]:
     }
 
 
-def _figures_at(judges: Mapping[str, Callable[[Any], float]], plant: Partition) -> Iterator[float]:
+def _figures_at(judges: Mapping[str, Callable[[Any], float]], plant: Any) -> Iterator[float]:
     """Return figures of a plant; each is one number."""
     for name, one in judges.items():
         try:
@@ -353,7 +352,7 @@ def _figures_at(judges: Mapping[str, Callable[[Any], float]], plant: Partition) 
 def _decoupled(plant: Any) -> Decoupling | None:
     """Return the transformations of a plant as it stands; None where it has none."""
     try:
-        return decouple(plant.unweighted)
+        return decouple(plant.machine)
     except (AssumptionError, ModelError) as error:
         logger.info("no decoupling is shown over the positions: %s", error)
         return None

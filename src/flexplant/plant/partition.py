@@ -1,144 +1,21 @@
-"""A system partitioned into w, u, z and y, and where it came from: assembled, weighted, foreign."""
+"""The data of a machine's plant: its channels, where it comes from, and how it is judged."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self, TypeAlias, TypeGuard
+from typing import Any, Self, TypeGuard
 
 import numpy as np
 
-from ..checks import FloatArray, IntArray, Value, mapping, name_list, positive, real_array, short
-from ..errors import (
-    AssumptionError,
-    FlexplantError,
-    LabelError,
-    ModelError,
-    counted,
-    require_known,
-    some_names,
-    unknown_label,
-)
+from ..checks import FloatArray, mapping, name_list, real_array, short
+from ..errors import LabelError, ModelError
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..structure import FEModel
-from .evaluation_model import NOT_JUDGED, EvaluationModel
-from .ports import Ports
-from .realisation import MODAL, ModalRealisation
+from .evaluation_model import EvaluationModel
+from .origins import ELSEWHERE, Foreign, Origin
+from .partitioned import PartitionedSystem
+from .realisation import MODAL
 from .sides import TYPE_THIS, sides_of
-
-
-class _Unknown:
-    """What is known of a plant only when it was assembled from a structure."""
-
-    #: what it was assembled from, the plant before weights, and the block before y
-    structure: Any = None
-    plain: Any = None
-    reading: Any = None
-    scaled: bool = False
-    steps: tuple[Any, ...] = ()
-    #: the plant before sampling, the factor of its noise, and its delay
-    continuous: Any = None
-    noise_factor: FloatArray | None = None
-    delay: float = 0.0
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Assembled(_Unknown, Value):
-    """What is known of a plant that was assembled from a structure.
-
-    Parameters
-    ----------
-    ports : Ports
-        Where the channels are.
-    realisation : ModalRealisation
-        The structure's modes.
-    physical : StateSpace
-        Forces to motions, before noise, references and efforts are wired to it.
-    noise_factor : (n, r) array, optional
-        G with G G' the covariance of x that disturbances add in one sample.
-    delay : float [samples]
-        Of the inputs u.
-    continuous : StandardPlant, optional
-        The plant before sampling.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> made = fx.testbeds.three_masses().assembled
-    >>> made.ports, made.delay
-    (<Ports w: amp, u: u1, z: die, y: y1 y2, references: die>, 1.0)
-    """
-
-    ports: Ports
-    realisation: ModalRealisation
-    physical: StateSpace
-    noise_factor: FloatArray | None = None
-    delay: float = 0.0
-    continuous: Any = None
-
-    @property
-    def structure(self) -> Assembled:
-        """What is known of the structure: this value."""
-        return self
-
-
-@dataclass(frozen=True, eq=False)
-class Foreign(_Unknown, Value):
-    """What is known of a plant that was made elsewhere.
-
-    Parameters
-    ----------
-    noise_factor, delay, continuous : as for `Assembled`
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> A, B, C = [[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]]
-    >>> sys = fx.StateSpace(A, B, C, [[0, 0], [0, 0]], inputs=["w", "u"], outputs=["z", "y"])
-    >>> plant = fx.StandardPlant.from_statespace(sys, w=["w"], u=["u"], z=["z"], y=["y"])
-    >>> type(plant.origin).__name__
-    'Foreign'
-    """
-
-    noise_factor: FloatArray | None = None
-    delay: float = 0.0
-    continuous: Any = None
-
-
-@dataclass(frozen=True, eq=False)
-class Weighted(_Unknown, Value):
-    """A plant made from another one by `weighted` or `through`.
-
-    Parameters
-    ----------
-    plain : StandardPlant
-        The plant before weights and blocks; its structure and its delay are this plant's too.
-    reading : StateSpace, optional
-        The block of `through`: from `plain.y` to y.
-    scaled : bool
-        Whether weights were applied: w and z are then no physical channels.
-    steps : sequence
-        What was applied to `plain`, in order: a block, or the weights of z and of w.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> plant = fx.testbeds.three_masses()
-    >>> weights = fx.stage_weights(plant, 20.0)
-    >>> type(plant.weighted(z=weights.z, w=weights.w).origin).__name__
-    'Weighted'
-    """
-
-    plain: Any
-    reading: StateSpace | None = None
-    scaled: bool = False
-    steps: tuple[Any, ...] = ()
-
-
-#: where a plant may have come from
-Origin: TypeAlias = "Assembled | Foreign | Weighted"
-#: nothing is known but the system
-ELSEWHERE = Foreign()
 
 
 def is_system(given: object) -> TypeGuard[System]:
@@ -146,94 +23,54 @@ def is_system(given: object) -> TypeGuard[System]:
     return isinstance(given, StateSpace) or hasattr(given, "input_labels")
 
 
-def is_plant(given: object) -> TypeGuard[Partition | System]:
+def is_plant(given: object) -> TypeGuard[PartitionedSystem | System]:
     """Return whether it is a plant or a system with labels, not a structure."""
-    return isinstance(given, Partition) or is_system(given)
+    return isinstance(given, PartitionedSystem) or is_system(given)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Partition(Value):
+class Partition(PartitionedSystem):
     """The data of a standard plant, in the fields of `StandardPlant`, and derived quantities."""
 
-    system: StateSpace
-    w: tuple[str, ...]
-    u: tuple[str, ...]
-    z: tuple[str, ...]
-    y: tuple[str, ...]
-    asd: Mapping[str, float]
     origin: Origin = ELSEWHERE
     uncertainty: Any = None
     evaluation: EvaluationModel | None = None
 
     def __post_init__(self) -> None:
-        for side in "wuzy":
-            self._set(**{side: tuple(getattr(self, side))})
-        if (*self.w, *self.u) != tuple(self.system.inputs):
-            raise LabelError(f"inputs {self.system.inputs} are not [w; u] = {self.w + self.u}.")
-        if (*self.z, *self.y) != tuple(self.system.outputs):
-            raise LabelError(f"outputs {self.system.outputs} are not [z; y] = {self.z + self.y}.")
-        if both := [name for name in self.u if name in self.y]:
-            raise LabelError(
-                f"{short(both)} are names in u and in y: loops, filters and controllers connect "
-                "channels by name, and would take a command for a measurement. Rename the "
-                "actuators or the sensors."
-            )
-        require_known("w channel with an asd", self.asd, self.w)
-        asd = {name: positive(a, f"asd of {name!r}", zero=True) for name, a in self.asd.items()}
-        self._set(asd=asd, evaluation=EvaluationModel.of(self.evaluation))
+        super().__post_init__()
+        self._set(evaluation=EvaluationModel.of(self.evaluation))
 
-    def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed, checked like a new one.
+    @property
+    def machine(self) -> Self:
+        """The machine: the plant itself."""
+        return self
 
-        The noise of each sample follows `asd`, and so do plants that are made of this one: at
-        other places, of other modes, with other ports that have the same densities as its own.
-        """
+    def around(self, machine: Self) -> Self:
+        """Return another machine: there are no weights and blocks to put around it."""
+        return machine
+
+    def _all_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
+        """Return changes of fields with the noise of each sample and the plant before sampling."""
         asd = changes.get("asd")
         if isinstance(asd, Mapping) and self.dt and "origin" not in changes and self.is_assembled:
             quiet = {f"{name}:noise" for name in self.y}
             new, old = (
                 {n: a for n, a in d.items() if a and n not in quiet} for d in (asd, self.asd)
             )
-            if new != old and not self.is_weighted:
+            if new != old:
                 factor = np.zeros((len(self.noise_factor), len(self.held)))
                 if new:
                     loud = {n: a for n, a in new.items() if n in self.continuous.w}
                     before: Any = self.continuous.replace(asd=loud)
                     factor = before.discretized(1.0 / self.dt, delay=self.delay).noise_factor
                 changes["origin"] = self.assembled.replace(noise_factor=factor)
-        if "evaluation" in changes:  # the plants that it was made of have the same one
+        if "evaluation" in changes:  # the plant before sampling has the same one
             judged = EvaluationModel.of(changes["evaluation"])
             origin = changes.get("origin", self.origin)
-            before = {
-                name: other.replace(evaluation=judged)
-                for name in ("plain", "continuous")
-                if (other := getattr(origin, name)) is not None and other.evaluation is not judged
-            }
-            changes |= {"evaluation": judged, "origin": origin.replace(**before)}
-        return super().replace(**changes)
-
-    def __repr__(self) -> str:
-        kind = f"dt {self.dt:g} s, delay {self.delay:g}" if self.dt else "continuous"
-        named = f" {self.system.name!r}" if self.system.name else ""
-        how = f", {self.alteration}" if self.is_weighted else ""
-        lines = [f"<StandardPlant{named}: {counted(self.system.n_states, 'state')}, {kind}{how}>"]
-        for side in "wuzy":
-            names = getattr(self, side)
-            shown = "  ".join(names[:8]) + ("  ..." if len(names) > 8 else "")
-            lines.append(f"  {side} ({len(names)}) {shown}")
-        latencies = self.assembled.ports.latencies if self.is_assembled else {}
-        if latencies and not self.dt:
-            shown = ", ".join(f"{name} {late:g} s" for name, late in latencies.items())
-            lines.append(f"  latencies that act once it is sampled: {shown}")
-        if self.is_assembled and self.assembled.ports.positions:
-            lines.append(f"  at {self.assembled.ports.standing}")
-        if self.form.startswith("dense"):
-            lines.append(f"  {self.form}")
-        if self.evaluation is not None:
-            lines.append(f"  evaluation model: {self.evaluation.text}")
-        if self.unstable_modes:
-            lines.append(f"  unstable rigid-body pairs: {self.unstable_text}")
-        return "\n".join(lines)
+            if origin.continuous is not None and origin.continuous.evaluation is not judged:
+                origin = origin.replace(continuous=origin.continuous.replace(evaluation=judged))
+            changes |= {"evaluation": judged, "origin": origin}
+        return changes
 
     @classmethod
     def of(cls, given: Any) -> Self:
@@ -247,6 +84,11 @@ class Partition(Value):
             return given
         if is_system(given):
             return cls.from_statespace(given)
+        if hasattr(given, "alteration"):
+            raise ModelError(
+                f"need the plant of a machine, but the plant is {given.alteration}: its "
+                "channels are not those of the machine. Use plant.unweighted."
+            )
         raise ModelError(
             f"need a StandardPlant, got {short(given)}. Make it by assemble_plant(model, ports), "
             f"or by {TYPE_THIS}."
@@ -316,148 +158,15 @@ class Partition(Value):
         )  # fmt: skip
 
     @property
-    def is_assembled(self) -> bool:
-        """Whether it was assembled from a structure, weighted since or not."""
-        return self.unweighted.origin.structure is not None
-
-    @property
-    def assembled(self) -> Assembled:
-        """What it was assembled from: ports, realisation, noise, delay, the plant before sampling.
-
-        Of a weighted plant, what the plant underneath was assembled from. ModelError when it was
-        made elsewhere.
-        """
-        found: Assembled | None = self.unweighted.origin.structure
-        if found is None:
-            raise ModelError(
-                "this plant was not assembled from a structure: its ports, modes and process noise "
-                "are not known. Make it by assemble_plant(model, ports)."
-            )
-        return found
-
-    @property
-    def is_weighted(self) -> bool:
-        """Whether it was made by `weighted` or `through`: `alteration` says which."""
-        return self.origin.plain is not None
-
-    @property
-    def unjudged(self) -> str:
-        """What answers on this plant say where it has no evaluation model; else empty.
-
-        A plant that was assembled from a full FEModel lacks no modes and has no larger model.
-        """
-        complete = isinstance(self.model, FEModel)
-        return "" if complete or self.evaluation is not None else NOT_JUDGED
-
-    @property
-    def alteration(self) -> str:
-        """What was done to it since it was made, in words: nothing, or by `weighted`, `through`."""
-        done = ["weighted"] if self.origin.scaled else []
-        done += ["read through a block"] if self.origin.reading is not None else []
-        return " and ".join(done) or "as it was made"
-
-    @property
-    def reading_gain(self) -> FloatArray:
-        """The gain (ny, plain ny) of the static block that it is read through; I without one.
-
-        ModelError when the block has dynamics.
-        """
-        plain, reading = self.unweighted, self.origin.reading
-        if reading is None:
-            return np.eye(len(plain.y))
-        if reading.n_states:
-            raise ModelError(
-                f"the block that the plant is read through has {reading.n_states} states, so that "
-                "noise of its outputs is not white. Give the dynamics to the sensors, "
-                "Sensor(dynamics=...), or use plant.unweighted."
-            )
-        gain = np.zeros((len(self.y), len(plain.y)))
-        gain[:, [plain.y.index(name) for name in reading.inputs]] = reading.D
-        return gain
-
-    @property
-    def unweighted(self) -> Self:
-        """The plant before `weighted` and `through`; this plant where there is no weight."""
-        found: Self | None = self.origin.plain
-        return self if found is None else found
-
-    @property
     def continuous(self) -> Self:
         """The plant before sampling; this plant where it is continuous, or nothing is known."""
         found: Self | None = self.origin.continuous
         return self if found is None else found
 
     @property
-    def delay(self) -> float:
-        """Delay of the inputs u [samples]."""
-        return self.unweighted.origin.delay
-
-    @property
-    def dt(self) -> float:
-        """Sampling time [s]; 0 when continuous."""
-        return self.system.dt
-
-    @property
-    def units(self) -> dict[str, str]:
-        """The units of the channels, and of what its ports derive: estimates, too."""
-        derived = self.assembled.ports.units if self.is_assembled else {}
-        return derived | dict(self.system.units)
-
-    @property
-    def n_rigid(self) -> int:
-        """Number of rigid-body modes."""
-        return self.assembled.realisation.n_rigid if self.is_assembled else 0
-
-    @property
     def has_own_modes(self) -> bool:
-        """Whether it has modes, not weighted, each with its own frequency and damping."""
-        return self.is_assembled and not self.is_weighted and self.form == MODAL
-
-    @property
-    def form(self) -> str:
-        """`modal blocks`, `dense: ` and why modes are coupled, or `as given` without a structure.
-
-        Weights and filters of the ports add blocks of their own.
-        """
-        return self.assembled.realisation.form if self.is_assembled else "as given"
-
-    @property
-    def model(self) -> Any:
-        """The structural model that the plant was assembled from, or None."""
-        return self.assembled.realisation.model if self.is_assembled else None
-
-    @property
-    def modal_blocks(self) -> FloatArray:
-        """The (b, 2, 2) blocks of the structure's modes [rad/s], before sampling; none without."""
-        return self.assembled.realisation.pairs if self.is_assembled else np.zeros((0, 2, 2))
-
-    @property
-    def unstable_modes(self) -> dict[int, str]:
-        """Modes (counted from 1) that negative stiffness makes unstable, with their two poles."""
-        found = {}
-        for i in np.flatnonzero(np.linalg.det(self.modal_blocks) < 0).tolist():
-            low, high = np.sort(np.linalg.eigvals(self.modal_blocks[i]).real)
-            found[i + 1] = f"mode {i + 1} ({high:+.4g} and {low:+.4g} 1/s)"
-        return found
-
-    @property
-    def unstable_text(self) -> str:
-        """The first three of these modes in words, and how many more there are."""
-        listed = list(self.unstable_modes.values())
-        more = f" and {len(listed) - 3} more" if len(listed) > 3 else ""
-        return ", ".join(listed[:3]) + more
-
-    @property
-    def modal_states(self) -> IntArray:
-        """Where the states of the structure's modes are; sensors' filters stand before them.
-
-        ModelError when the plant was not assembled from a structure, or has other states now.
-        """
-        names = self.assembled.realisation.names
-        if names[0] not in self.system.states:
-            raise ModelError(f"the plant has lost the states of its modes ({names[0]!r}, ...).")
-        first = self.system.states.index(names[0])
-        return np.arange(first, first + len(names), dtype=np.int64)
+        """Whether it has modes, each with its own frequency and damping."""
+        return self.is_assembled and self.form == MODAL
 
     @property
     def noise_factor(self) -> FloatArray:
@@ -466,10 +175,6 @@ class Partition(Value):
         ModelError when it is not known.
         """
         found = self.origin.noise_factor
-        if self.origin.reading is not None and not self.origin.scaled:
-            _ = self.reading_gain  # static: the states are those of the plain plant
-            plain: FloatArray = self.unweighted.noise_factor
-            return plain
         if found is None:
             raise ModelError(
                 "labels carry no noise density, so that the process noise of each sample is not "
@@ -480,90 +185,6 @@ class Partition(Value):
         return found
 
     @property
-    def held(self) -> tuple[str, ...]:
-        """Disturbances whose noise is held over each sample: the last columns of `noise_factor`."""
-        ports = self.assembled.ports.w if self.is_assembled else ()
-        return tuple(p.name for p in ports if getattr(p, "held", False) and p.asd > 0)
-
-    @property
-    def noise_direct(self) -> FloatArray:
-        """H (ny, r): what the noises of `noise_factor` add to y in the same sample."""
-        found = np.zeros((len(self.y), self.noise_factor.shape[1]))
-        if held := self.held:
-            sizes = np.array([self.asd.get(name, 0.0) for name in held]) * np.sqrt(0.5 / self.dt)
-            columns = [self.w.index(name) for name in held]
-            found[:, -len(held) :] = self.D21[:, columns] * sizes
-        return found
-
-    @property
-    def process_noise(self) -> FloatArray:
-        """Covariance (n, n) that white disturbances add to x in one sample."""
-        return self.noise_factor @ self.noise_factor.T
-
-    @property
-    def sensor_noise(self) -> FloatArray:
-        """Covariance (ny, ny) of a sample of y: asd^2 rate / 2 for each sensor.
-
-        Through a static block T, ``T R T'``.
-        """
-        return self.sensor_noise_factor @ self.sensor_noise_factor.T
-
-    @property
-    def sensor_noise_factor(self) -> FloatArray:
-        """F (ny, sensors), F F' the covariance of a sample of y."""
-        require_sampled(self, "sensors have a noise of each sample", ModelError)
-        asd = [self.asd.get(f"{name}:noise", 0.0) for name in self.unweighted.y]
-        return np.asarray(self.reading_gain * (np.array(asd) * np.sqrt(0.5 / self.dt)))
-
-    def channel(self, name: str, side: str = "z") -> str:
-        """Return the channel of `side` that a name means: `die` or `die:hat` mean `die:z`.
-
-        LabelError when it means none.
-        """
-        names: tuple[str, ...] = getattr(self, side)
-        if not isinstance(name, str) or name in names:
-            require_known("channel", [name], names)
-            return name
-        for poi in self.assembled.ports.z if self.is_assembled else ():
-            for axis in poi.axes:
-                aliases = (poi.derived(axis, "hat"), poi.derived(axis, "error"))
-                if name in aliases or (name == poi.name and axis == poi.axes[0]):
-                    return poi.channel(axis)
-        raise unknown_label(f"channel of {side}", name, names)
-
-    B1 = property(lambda self: self.Gzw.B, doc="w to dx/dt.")
-    B2 = property(lambda self: self.Gzu.B, doc="u to dx/dt.")
-    C1 = property(lambda self: self.Gzw.C, doc="x to z.")
-    C2 = property(lambda self: self.Gyw.C, doc="x to y.")
-    D11 = property(lambda self: self.Gzw.D, doc="w to z.")
-    D12 = property(lambda self: self.Gzu.D, doc="u to z.")
-    D21 = property(lambda self: self.Gyw.D, doc="w to y.")
-    D22 = property(lambda self: self.Gyu.D, doc="u to y.")
-
-    Gzw = property(lambda self: self.system.select(self.z, self.w), doc="The system w -> z.")
-    Gzu = property(lambda self: self.system.select(self.z, self.u), doc="The system u -> z.")
-    Gyw = property(lambda self: self.system.select(self.y, self.w), doc="The system w -> y.")
-    Gyu = property(lambda self: self.system.select(self.y, self.u), doc="The system u -> y.")
-
-
-def require_plain(plant: Partition, why: str, error: type[FlexplantError] = ModelError) -> None:
-    """Refuse a plant that is weighted or seen through a block."""
-    if plant.is_weighted:
-        raise error(f"the plant is {plant.alteration}: {why}. Use plant.unweighted.")
-
-
-def require_sampled(
-    plant: Partition, why: str, error: type[FlexplantError] = AssumptionError
-) -> None:
-    """Refuse a continuous plant."""
-    if not plant.dt:
-        raise error(f"the plant is continuous: {why}. Use plant.discretized(rate, delay=1).")
-
-
-def require_noise(sizes: Mapping[str, float]) -> None:
-    """Refuse sensors whose noise has no size."""
-    if silent := [name for name, size in sizes.items() if not size > 0]:
-        raise AssumptionError(
-            f"sensors {some_names(silent)} have no noise (asd 0): filters would trust them without "
-            "limit and differentiate them. Give Sensor(..., asd=) what the data sheet says."
-        )
+    def reading_gain(self) -> FloatArray:
+        """The identity: y are the measurements of the machine."""
+        return np.eye(len(self.y))

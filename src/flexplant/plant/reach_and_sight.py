@@ -15,7 +15,7 @@ from ..lti.equations import state_scale
 from ..lti.joining import axis_zeros
 from ..lti.statespace import StateSpace
 from ..tolerances import ROUNDING, SAME, SPLIT, TINY, TYPED, divisor
-from .partition import Partition
+from .partitioned import PartitionedSystem
 from .rigid_motion import body_of, rigid_modes
 
 #: a motion weaker than this beside the strongest one counts as absent
@@ -48,9 +48,9 @@ class _Pole(NamedTuple):
     right: ComplexArray
 
 
-def reach_and_sight(plant: Partition) -> list[Assumption]:
+def reach_and_sight(plant: PartitionedSystem) -> list[Assumption]:
     """Return which modes that do not decay w and u reach, and y and z see (Hautus)."""
-    bare = plant.unweighted.continuous
+    bare = plant.machine.continuous
     if not bare.is_assembled:  # states of a system made elsewhere have any units
         bare = bare.replace(system=evened(bare.system))
     poles = _persistent(bare.system)
@@ -73,7 +73,7 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
     return found
 
 
-def _undamped_kinds(plant: Partition, poles: list[_Pole]) -> list[str]:
+def _undamped_kinds(plant: PartitionedSystem, poles: list[_Pole]) -> list[str]:
     """Return, in words, how many modes of each kind do not decay."""
     rigid, pairs = plant.n_rigid, len(plant.unstable_modes)
     every = f"all {rigid} rigid-body modes" if rigid > 1 else "the rigid-body mode"
@@ -100,9 +100,9 @@ def _undamped_kinds(plant: Partition, poles: list[_Pole]) -> list[str]:
     return words
 
 
-def _cases(bare: Partition, poles: list[_Pole], plant: Partition) -> list[_Case]:
+def _cases(bare: PartitionedSystem, poles: list[_Pole], plant: PartitionedSystem) -> list[_Case]:
     """Return the tests: of the channels that weights leave, y through the block that reads it."""
-    g, block = bare.system, plant.origin.reading
+    g, block = bare.system, plant.reading
     left = [name for name in bare.w if name in plant.w]
     noisy = [name for name in left if bare.asd.get(name, 0.0) > 0]
     pushing = [n for n in (noisy or left) if np.any(g.B[:, g.input_index([n])])]
@@ -181,7 +181,7 @@ def _sample(value: complex, rate: float) -> complex:
     return complex(np.exp(value / rate)) if rate else value
 
 
-def _lacks(plant: Partition, group: list[_Pole], case: _Case, rate: float) -> list[str]:
+def _lacks(plant: PartitionedSystem, group: list[_Pole], case: _Case, rate: float) -> list[str]:
     """Return, in words, what the channels of a case have no part in at poles that look alike."""
     g = plant.system
     bases = [pole.left if case.pushes else pole.right for pole in group]
@@ -240,7 +240,7 @@ def _modal_rows(rows: FloatArray | ComplexArray, basis: ComplexArray) -> Complex
     return product
 
 
-def _pole_name(plant: Partition, pole: complex) -> str:
+def _pole_name(plant: PartitionedSystem, pole: complex) -> str:
     """Return a pole as a mode and its frequency, or as a number."""
     if plant.n_rigid and not pole:
         return "the rigid-body motions"
@@ -254,10 +254,10 @@ def _pole_name(plant: Partition, pole: complex) -> str:
     return f"the pole {pole:.4g}"
 
 
-def _weights_without(plant: Partition, key: str) -> list[str]:
+def _weights_without(plant: PartitionedSystem, key: str) -> list[str]:
     """Return which weights do not decay: no controller can reach or see their states."""
     side = {"stabilisable": "w", "detectable": "z"}.get(key)
-    if side is None or not plant.is_weighted:
+    if side is None or plant.machine is plant:
         return []
     g, texts = plant.system, []
     for name in getattr(plant, side):
@@ -279,7 +279,7 @@ def _null_combinations(matrix: ComplexArray | FloatArray) -> ComplexArray:
     return np.asarray(U[:, np.count_nonzero(s > ABSENT * s[0]) :])
 
 
-def _axes_in_words(plant: Partition, combinations: FloatArray) -> list[str]:
+def _axes_in_words(plant: PartitionedSystem, combinations: FloatArray) -> list[str]:
     """Return rigid-body combinations (r, missing) in words, `translation z`, `rotation rx`."""
     realisation = plant.assembled.realisation
     model = realisation.model
@@ -305,7 +305,7 @@ def _axes_in_words(plant: Partition, combinations: FloatArray) -> list[str]:
     ]
 
 
-def full_ranks(plant: Partition) -> list[Assumption]:
+def full_ranks(plant: PartitionedSystem) -> list[Assumption]:
     """D12 and D21 of full rank, each row and column scaled to unit size."""
     found = []
     for key, matrix, names, text, remedy in (
@@ -326,7 +326,7 @@ def full_ranks(plant: Partition) -> list[Assumption]:
     return found
 
 
-def no_zeros(plant: Partition) -> list[Assumption]:
+def no_zeros(plant: PartitionedSystem) -> list[Assumption]:
     """Invariant zeros of u -> z and w -> y on the stability limit: none may be there."""
     found = []
     for key, fro, to, remedy in (
@@ -360,7 +360,7 @@ def evened(g: StateSpace) -> StateSpace:
     return g.replace(A=g.A * d / d[:, None], B=g.B / d[:, None], C=g.C * d)
 
 
-def _frequency(plant: Partition, zero: complex) -> str:
+def _frequency(plant: PartitionedSystem, zero: complex) -> str:
     """Return a zero on the stability limit as a frequency, with the mode it belongs to."""
     omega = abs(np.log(zero)) / plant.dt if plant.dt else abs(zero)
     top = np.pi / plant.dt if plant.dt else np.abs(plant.system.poles()).max(initial=TINY)

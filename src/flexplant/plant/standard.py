@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy.typing as npt
 
-from ..checks import short
-from ..errors import LabelError, ModelError
+from ..errors import LabelError
 from ..labels import Place
-from ..lti.statespace import StateSpace, System
+from ..lti.statespace import System, as_statespace
 from .assumptions import AssumptionReport
-from .building import continuous_plant, measured_through, rebuilt, sampled, weighted
+from .building import continuous_plant, rebuilt, sampled
 from .evaluation_model import EvaluationModel
 from .evaluation_plants import check_channels, evaluation_plant, own_plant
+from .generalized import GeneralizedPlant, both_weights, measured_through, weighted
 from .moving import Along, PositionMap, along, moved_ports, position_map, seen_elsewhere
 from .partition import Partition
 from .ports import Ports
@@ -25,8 +25,6 @@ from .rigid_motion import RigidModes, rigid_modes_of
 from .uncertainty.dampings import Dampings
 from .uncertainty.frequencies import Frequencies
 from .uncertainty.uncertain_plant import UncertainPlant, uncertain_plant
-
-_WEIGHTS = "Pass stage_weights(plant, bandwidth), or z={...} and w={...}."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,9 +48,9 @@ class StandardPlant(Partition):
     w, u, z, y : sequences of str
     asd : mapping {str: float}
         One-sided amplitude spectral density of the w channels that are white noise.
-    origin : Assembled, Weighted or Foreign
+    origin : Assembled or Foreign
         Where it came from: `plant.assembled` holds ports, modes, noise and delay of a plant that
-        was assembled from a structure, `plant.unweighted` is the plant before weights.
+        was assembled from a structure.
     uncertainty : UncertainPlant, optional
         By what its modes may be off: of ``plant.uncertain(...).nominal``, kept by weights.
     evaluation : EvaluationModel, optional
@@ -100,7 +98,7 @@ class StandardPlant(Partition):
         Raises
         ------
         ModelError
-            When the plant is sampled already, is weighted, or rate or delay is not positive; when
+            When the plant is sampled already, or rate or delay is not positive; when
             they are plausible in another unit only: the lowest elastic mode lies above five times
             the rate, a delay is below 0.01 samples, or that of a port above 1000 samples.
 
@@ -109,7 +107,7 @@ class StandardPlant(Partition):
         FlexplantWarning
             When all elastic modes lie above half the rate.
         """
-        return sampled(self, rate, delay)
+        return self._known(sampled(self, rate, delay))
 
     def weighted(
         self,
@@ -117,7 +115,7 @@ class StandardPlant(Partition):
         *,
         z: Mapping[str, Any] | None = None,
         w: Mapping[str, Any] | None = None,
-    ) -> StandardPlant:
+    ) -> GeneralizedPlant:
         """Return the plant with weights on z and w absorbed into its states; names stay.
 
         Parameters
@@ -131,7 +129,7 @@ class StandardPlant(Partition):
 
         Returns
         -------
-        StandardPlant
+        GeneralizedPlant
             `W_z P W_w`; its `unweighted` is this plant.
 
         Raises
@@ -139,13 +137,9 @@ class StandardPlant(Partition):
         LabelError, ModelError
             When a name is unknown; when a weight is not one by one, or of another sampling time.
         """
-        if weights is not None:
-            if not isinstance(getattr(weights, "z", None), Mapping):
-                raise ModelError(f"weights must be StageWeights, got {short(weights)}. {_WEIGHTS}")
-            z, w = {**weights.z, **(z or {})}, {**weights.w, **(w or {})}
-        return weighted(self, z, w)
+        return weighted(self, *both_weights(weights, z, w))
 
-    def through(self, block: System) -> StandardPlant:
+    def through(self, block: System) -> GeneralizedPlant:
         """Return the plant whose measurements are the outputs of a block that reads y.
 
         What the controller then reads may be errors, decoupled motions or filtered sensors; close
@@ -161,7 +155,7 @@ class StandardPlant(Partition):
         LabelError, ModelError
             When an input of the block is not in y; when its sampling time differs.
         """
-        return measured_through(self, block)
+        return measured_through(self, as_statespace(block))
 
     def with_ports(self, ports: Ports) -> StandardPlant:
         """Return the plant of the same structure, sampled alike, with other ports.
@@ -178,7 +172,7 @@ class StandardPlant(Partition):
 
         ``plant.at(x=0.03)`` is the plant where the machine stands at x = 0.03 m: all ports that
         move with the position x are put there. The modes, and with them A, are the same: a family
-        of plants over the positions costs rows, not models. A weighted plant keeps its weights.
+        of plants over the positions costs rows, not models.
 
         Parameters
         ----------
@@ -199,23 +193,20 @@ class StandardPlant(Partition):
                 "at needs a place: a point of the POI, {name: point}, or a position by name "
                 f"({', '.join(self.assembled.ports.values) or 'this plant has none'})."
             )
-        if self.is_weighted and self.is_assembled:
-            found = self.unweighted.at(poi, **positions)
-            for step in self.origin.steps:  # in their order: a block, or weights of z and w
-                if isinstance(step, StateSpace):
-                    found = found.through(step)
-                else:
-                    found = weighted(found, *map(dict, step))
-            return found
         ports = self.assembled.ports
         if positions:
             ports = ports.at(positions)
         there = ports if poi is None else moved_ports(ports, poi)
         found = seen_elsewhere(self, there) or self.with_ports(there)
         judged = self.evaluation
-        if judged is None or judged.is_structure:
-            return found
-        return found.replace(evaluation=own_plant(StandardPlant, judged).at(poi, **positions))
+        if judged is not None and not judged.is_structure:
+            there_too = own_plant(StandardPlant, judged).at(poi, **positions)
+            found = found.replace(evaluation=there_too)
+        return self._known(found)
+
+    def _known(self, found: StandardPlant) -> StandardPlant:
+        """Return a plant of the same modes with what is not known of this one."""
+        return found if self.uncertainty is None else self.uncertainty.replace(plant=found).nominal
 
     def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
         """Return what the position does: decoupling, modes seen and reached, figures of one's own.
@@ -317,14 +308,12 @@ class StandardPlant(Partition):
     def evaluation_plant(self) -> StandardPlant | None:
         """The evaluation model with this plant's channels, sampled and delayed like it.
 
-        Assembled once and kept. None without an evaluation model. For a weighted plant, or one
-        seen `through` a block, it is that of the plain plant.
+        Assembled once and kept. None without an evaluation model.
 
         LabelError or ModelError when a plant that was given as evaluation model has other channels,
         or another sampling time or delay.
         """
-        plain = self.unweighted
-        return evaluation_plant(self) if plain is self else plain.evaluation_plant
+        return evaluation_plant(self)
 
     def to_control(self) -> Any:
         """Return the whole system as a `control.StateSpace` with the same names."""
@@ -354,7 +343,7 @@ def standard_plant(given: StandardPlant | UncertainPlant[StandardPlant] | System
     LabelError
         When the labels do not distinguish them.
     ModelError
-        When it is neither.
+        When it is neither, or a `GeneralizedPlant`: take its `unweighted`.
 
     Examples
     --------
@@ -364,6 +353,34 @@ def standard_plant(given: StandardPlant | UncertainPlant[StandardPlant] | System
     True
     """
     return StandardPlant.of(given)
+
+
+#: what synthesis and loops take
+AnyPlant: TypeAlias = StandardPlant | GeneralizedPlant
+
+
+def plant_of(given: AnyPlant | UncertainPlant[StandardPlant] | System) -> AnyPlant:
+    """Return the plant of a synthesis or a loop: a `GeneralizedPlant`, or a `standard_plant`.
+
+    Parameters
+    ----------
+    given : StandardPlant, GeneralizedPlant, UncertainPlant, StateSpace or control.StateSpace
+
+    Raises
+    ------
+    LabelError
+        When the labels of a system do not distinguish w, u, z and y.
+    ModelError
+        When it is none of these kinds.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> heavy = fx.testbeds.three_masses().weighted(z={"die:error": 2.0})
+    >>> fx.plant.plant_of(heavy) is heavy
+    True
+    """
+    return given if isinstance(given, GeneralizedPlant) else StandardPlant.of(given)
 
 
 def assemble_plant(
@@ -441,5 +458,5 @@ def assemble_plant(
     judged = EvaluationModel.of(evaluation) or EvaluationModel.known_to(realisation.model)
     found = continuous_plant(StandardPlant, realisation, ports, judged)
     if judged is not None and not judged.is_structure:
-        check_channels(found, standard_plant(judged.source).unweighted)
+        check_channels(found, standard_plant(judged.source))
     return found

@@ -18,7 +18,7 @@ from ..tolerances import divisor
 from .at_rest import followed_at_rest
 from .axes import DrivenAxes, driven_axes, real_gain, resting_frequency
 from .building import at_rate
-from .standard import StandardPlant, standard_plant
+from .standard import AnyPlant, StandardPlant, plant_of, standard_plant
 
 #: |S| of the finished loop crosses 1 below the weight's crossing by about this factor (measured:
 #: the table in the room's docstring)
@@ -119,7 +119,7 @@ class StageWeights(Value):
 
 
 def stage_weights(
-    plant: StandardPlant,
+    plant: AnyPlant,
     bandwidth: float,
     *,
     poi: str | None = None,
@@ -178,8 +178,8 @@ def stage_weights(
     >>> sorted(weights.z), sorted(weights.w)
     (['die:error', 'die:x', 'u1:effort'], ['amp', 'y1:noise', 'y2:noise'])
     """
-    plant = standard_plant(plant)
-    ports = plant.assembled.ports
+    machine: StandardPlant = plant_of(plant).machine
+    plant, ports = machine, machine.assembled.ports
     if uncertainty is not None and not hasattr(uncertainty, "nominal"):
         uncertainty = plant.uncertain(frequency=uncertainty)
     known = plant.uncertainty if uncertainty is None else uncertainty
@@ -195,7 +195,7 @@ def stage_weights(
             f"bandwidth {bandwidth:g} Hz is not well below the rate, {1 / plant.dt:g} Hz: the "
             "weights could not be sampled. Lower it, or raise the rate."
         )
-    sizes = _Sizes.of(plant, driven_axes(plant, freq=crossing, poi=poi), 2.0 * np.pi * crossing)
+    sizes = _Sizes.of(machine, driven_axes(machine, freq=crossing, poi=poi), 2.0 * np.pi * crossing)
     sense = inverse_sensitivity(crossing, peak=peak, floor=0.01)
     unit = 1.0 / (peak * push_size * push_cost)  # of z: gamma is |T| at u beside peak
     axes = {(p, axis): p.channel(axis) for p in ports.z for axis in p.axes}
@@ -247,7 +247,7 @@ class _Sizes:
     pushes: Mapping[str, float]
 
     @classmethod
-    def of(cls, plant: StandardPlant, driven: DrivenAxes, sigma: float) -> _Sizes:
+    def of(cls, plant: AnyPlant, driven: DrivenAxes, sigma: float) -> _Sizes:
         """Return the sizes by the decoupled response on the real axis."""
         # Y = G_yu T of unit axes, d_i = rms(Y_i) / rms(Y_1); T / d are forces of equal motion
         ports = plant.assembled.ports
@@ -304,7 +304,7 @@ def _ends(words: list[str]) -> str:
     return words[0] if len(words) == 1 else f"{words[0]} to {words[-1]}"
 
 
-def _at_plant_rate(weight: StateSpace, plant: StandardPlant) -> StateSpace:
+def _at_plant_rate(weight: StateSpace, plant: AnyPlant) -> StateSpace:
     return tustin(weight, 1.0 / plant.dt) if plant.dt else weight
 
 

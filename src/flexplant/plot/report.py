@@ -25,7 +25,7 @@ from ..modes import Modes
 from ..parallel import Progress, tick
 from ..placement import ParetoCurve, Placement, SensorMap
 from ..placement.criterion import in_words
-from ..plant import StandardPlant, decouple
+from ..plant import AnyPlant, StandardPlant, decouple
 from ..plant.evaluation_model import NOT_JUDGED
 from ..reduction import ReducedModel
 from ..rooms import versions
@@ -136,7 +136,7 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
         ]
     plant = design.plant
     if isinstance(value, Placement) and plant is not None and plant.is_assembled:
-        return [("The places that were chosen", lambda: placed(value.on(plant)))]
+        return [("The places that were chosen", lambda: placed(value.on(plant.machine)))]
     if isinstance(value, Controller | StateSpace | Frf):
         system: Any = value.system if isinstance(value, Controller) else value
         if len(system.inputs) * len(system.outputs) <= _CHANNELS:
@@ -429,7 +429,7 @@ class Design:
         return {name: one for name, one in self.named.items() if isinstance(one, kind)}
 
     @property
-    def plant(self) -> StandardPlant | None:
+    def plant(self) -> AnyPlant | None:
         """The plant that was given, else that of the first loop."""
         own: list[StandardPlant] = list(self.of(StandardPlant).values())
         return next(iter([*own, *(loop.plant for loop in self.of(ClosedLoop).values())]), None)

@@ -33,7 +33,7 @@ from ..lti.lyapunov import solve_stein
 from ..lti.riccati import filter_dare
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from ..plant.partition import require_noise
+from ..plant.partitioned import require_noise
 from ..tolerances import SAME
 from .moving_machine import (
     MovingMachine,
@@ -154,7 +154,7 @@ def rms_along(
     (500,)
     """
     loop, schedule = unscheduled(loop)
-    plant = loop.plant
+    plant = loop.machine
     known_positions(plant, "errors along a trajectory need")
     steps = round(positive(duration, "duration") / plant.dt)
     time = np.asarray(np.arange(steps) * float(plant.dt), dtype=np.float64)

@@ -353,10 +353,10 @@ def error_map(
     """
     instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
     places = real_array(points, "points", (None, 3))
-    ports = loop.plant.assembled.ports
+    ports = loop.machine.assembled.ports
     names = [f"map|{i}" for i in range(1, len(places) + 1)]
     pois = [Poi(name, at=tuple(p), axes=(axis,)) for name, p in zip(names, places, strict=True)]
-    wide = loop.plant.with_ports(ports.replace(z=[*ports.z, *pois]))
+    wide = loop.machine.with_ports(ports.replace(z=[*ports.z, *pois]))
     given = {} if reference is None else {_map_reference(ports, axis): reference}
     closed = close_loop(wide.replace(evaluation=None), *loop.blocks, idle=loop.idle)
     run = simulate(closed, duration=duration, reference=given, noise=noise, rng=rng)

@@ -26,7 +26,6 @@ from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, driven_axes, standard_plant
 from ..plant.at_rest import OfS, at_rest, solved
 from ..plant.axes import resting_frequency
-from ..plant.partition import require_plain
 from ..tolerances import divisor
 from .motion import SetPoint
 from .response import Response
@@ -190,7 +189,7 @@ def design_feedforward(
       die:x: acceleration 3  jerk 0.00225
     """
     loop = given if isinstance(given, ClosedLoop) else None
-    plant, poi, axis, name = tracked(given if loop is None else loop.plant, reference)
+    plant, poi, axis, name = tracked(given if loop is None else loop.machine, reference)
     highest = whole(order, "order", minimum=2, maximum=4)
     driven, T = force_axes(plant)
     wanted = np.array([[1.0 if one == poi.channel(axis) else 0.0] for one in driven])
@@ -206,7 +205,7 @@ def design_feedforward(
                              "(loop, move=move).")  # fmt: skip
         return _of_move(empty, loop, move, highest)
     blocks = () if loop is None else loop.blocks
-    forced = close_loop(plant, *blocks, known_forces(plant))
+    forced = close_loop(plant.replace(evaluation=None), *blocks, known_forces(plant))
     find = _inverse_of(forced, poi, T, driven, wanted, name, along)
     gains = at_rest(find, plant.dt, driven)
     gains[:, :, highest + 1 :] = 0.0
@@ -244,7 +243,6 @@ def known_forces(plant: StandardPlant) -> StateSpace:
 def tracked(plant: Any, reference: str | None) -> tuple[StandardPlant, Poi, str, str]:
     """Return the plant, the POI and the axis that a reference is for, and its channel."""
     plant = standard_plant(plant)
-    require_plain(plant, "feedforward acts on a machine")
     found = {p.derived(axis, "ref"): (p, axis) for p, axis in plant.assembled.ports.followed}
     reference = only_one("reference", found, reference, "reference=")
     return plant, *found[reference], reference
@@ -267,7 +265,7 @@ def _inverse_of(
 ) -> OfS:
     """Return the function of s that gives F (p, r) in a loop with known forces, at p places."""
     # a place changes what is seen of the states and of u, which the feedback does not read
-    g, plant = forced.monitored, forced.plant
+    g, plant = forced.monitored, forced.machine
     acts = np.zeros((len(plant.w), T.shape[1] + 1))
     acts[g.input_index([force_name(u) for u in plant.u]), :-1] = T
     acts[g.input_index([name]), -1] = 1.0
@@ -298,8 +296,8 @@ def _of_move(empty: Feedforward, loop: ClosedLoop, move: SetPoint, highest: int)
     """Return the gains by least squares of the errors of a loop in a move."""
     instance(move, SetPoint, "move", "Use setpoint(...) or scan(...).")
     duration, orders = _AFTER * move.duration, list(range(min(highest, move.order) + 1))
-    plant = loop.plant.replace(evaluation=None)
-    alone = close_loop(plant, *loop.blocks, idle=loop.idle)
+    plant = loop.machine.replace(evaluation=None)
+    alone = close_loop(plant.replace(evaluation=None), *loop.blocks, idle=loop.idle)
     _, poi, axis, _ = tracked(plant, empty.reference)
     others = [one for one in empty.axes if one != poi.channel(axis)]
     channels = [poi.derived(axis, "error"), *others]
@@ -322,9 +320,11 @@ def gain_effects(
     channels: list[str],
 ) -> FloatArray:
     """Return what a unit of each gain adds to the errors (n_gain, n_channel * n_time)."""
-    plant = loop.plant.replace(evaluation=None)
-    forced = close_loop(plant, *loop.blocks, known_forces(plant), idle=loop.idle)
-    time = np.arange(round(positive(duration, "duration") / loop.plant.dt)) * loop.plant.dt
+    plant = loop.machine.replace(evaluation=None)
+    forced = close_loop(
+        plant.replace(evaluation=None), *loop.blocks, known_forces(plant), idle=loop.idle
+    )
+    time = np.arange(round(positive(duration, "duration") / loop.machine.dt)) * loop.machine.dt
     signals = move.at(time)
     rows = []
     for axis in range(len(start.axes)):

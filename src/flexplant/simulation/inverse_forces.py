@@ -11,7 +11,7 @@ from ..loop.blocks import force_name
 from ..lti.responses import responder
 from ..plant import driven_axes
 from ..plant.axes import resting_frequency
-from ..plant.partition import require_sampled
+from ..plant.partitioned import require_sampled
 from ..tolerances import divisor
 from .feedforward import design_feedforward, force_axes, known_forces, tracked
 from .motion import SetPoint
@@ -89,7 +89,7 @@ def inverse_forces(
     ['u1:feedforward']
     """
     instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
-    plant, poi, axis, name = tracked(loop.plant, reference)
+    plant, poi, axis, name = tracked(loop.machine, reference)
     instance(move, SetPoint, "move", "Use setpoint(...) or scan(...).")
     require_sampled(plant, "the inverse is of samples", ModelError)
     steps = round(positive(duration, "duration") / plant.dt)
@@ -158,7 +158,7 @@ def _check_minimum(
 
 def _feedback(loop: ClosedLoop, force: FloatArray, move: SetPoint, name: str) -> FloatArray:
     """Return what the controller adds (n_time, nu) while these forces move its own plant."""
-    plant = loop.plant.replace(evaluation=None)
+    plant = loop.machine.replace(evaluation=None)
     names = [force_name(u) for u in plant.u]
     alone = close_loop(plant, known_forces(plant))
     given = {one: force[:, i] for i, one in enumerate(names)}

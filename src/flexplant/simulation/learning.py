@@ -125,7 +125,7 @@ def learn_feedforward(
     part = positive(step, "step")
     if part > 1.0:
         raise ModelError(f"step is a part of a correction, at most 1, got {part:g}. Pass 1.0.")
-    _, poi, own, _ = tracked(loop.plant, start.reference)
+    _, poi, own, _ = tracked(loop.machine, start.reference)
     others = [one for one in start.axes if one != poi.channel(own)]
     channels = [poi.derived(own, "error"), *others]
     effects = gain_effects(start, loop, move, duration, orders, channels)

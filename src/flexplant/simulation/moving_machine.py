@@ -241,7 +241,7 @@ class MovingMachine(MovingPlant):
         schedule: ScheduledLoop | None = None,
         sensed: Acting | None = None,
     ) -> None:
-        super().__init__(loop.plant, path, noise=noise)
+        super().__init__(loop.machine, path, noise=noise)
         self.loop, self.schedule, self.sensed = loop, schedule, sensed
         if schedule is not None:
             require_known("position that schedules", [schedule.position], path.paths)

@@ -101,7 +101,7 @@ class Buffers(NamedTuple):
 
 def machine_of(loop: ClosedLoop) -> Machine:
     """Return the matrices of one sample of a closed loop without feedthrough from u to y."""
-    plant, law = loop.plant.system, loop.controller
+    plant, law = loop.machine.system, loop.controller
     diagonal, coupling, partner, rest = _split_matrix(plant)
     columns = np.flatnonzero(np.any(rest != 0, axis=0))
     B = plant.B[:, plant.input_index(loop.driven)]
@@ -111,7 +111,7 @@ def machine_of(loop: ClosedLoop) -> Machine:
         partner,
         columns,
         np.asfortranarray(np.hstack([rest[:, columns], B])),
-        np.ascontiguousarray(plant.C[plant.output_index(loop.plant.y)]),
+        np.ascontiguousarray(plant.C[plant.output_index(loop.machine.y)]),
         np.ascontiguousarray(np.block([[law.A, law.B], [law.C, law.D]])),
         law.n_states,
         len(loop.driven),
@@ -289,12 +289,12 @@ def make_runner(
     of the controller are one step. An unstable loop goes sample by sample, and so does one with
     elements that are not linear.
     """
-    drawn, met = Drawn(noise, loop.plant), met or Conditions()
+    drawn, met = Drawn(noise, loop.machine), met or Conditions()
     if met.one_by_one:
         return _under(loop, drawn, met)
-    moving = Moving(loop.plant, met.paths) if met.paths else None
+    moving = Moving(loop.machine, met.paths) if met.paths else None
     single = SampleBySample(loop, machine_of(loop), drawn, hold=met.finer)
-    if not grows and loop.plant.system.n_states + loop.controller.n_states:
+    if not grows and loop.machine.system.n_states + loop.controller.n_states:
         blocks = InBlocks(loop, drawn, given, moving, met.finer)
         if blocks.cost < single.cost and blocks.agrees(single, given):
             return blocks
@@ -304,7 +304,7 @@ def make_runner(
 
 def _under(loop: ClosedLoop, noise: Drawn, met: Conditions) -> SampleBySample:
     """Return the way through a loop under conditions that are not linear, or change with time."""
-    plant, parts, applied = loop.plant, machine_of(loop), None
+    plant, parts, applied = loop.machine, machine_of(loop), None
     dt = met.finer * plant.dt
     if met.on_u:
         command, law = split_law(loop, None if met.recovery is None else met.recovery / dt)
@@ -332,7 +332,7 @@ class SampleBySample:
         hold: int = 1,
         answering: Answering | None = None,
     ) -> None:
-        plant, self.sensed, self.applied = loop.plant, sensed, applied
+        plant, self.sensed, self.applied = loop.machine, sensed, applied
         self.answering = answering
         self.moving, self.hold = moving, hold
         self.stretch = hold * -(-STRETCH // hold)
@@ -418,7 +418,7 @@ class InBlocks:
         moving: Moving | None = None,
         hold: int = 1,
     ) -> None:
-        plant, self.plant, self.noise, self.moving = loop.plant, loop.plant, noise, moving
+        plant, self.plant, self.noise, self.moving = loop.machine, loop.machine, noise, moving
         self.loop, self.hold = loop, hold
         before = len(plant.z) + len(plant.y)
         self.n_shown = before + len(loop.controller.outputs)
@@ -509,7 +509,7 @@ def lifted_loop(
     loop: ClosedLoop, factor: FloatArray, columns: IntArray, hold: int, states: bool
 ) -> Recursion:
     """Return a sampled loop whose controller acts in the first of every `hold` samples."""
-    plant, law, g = loop.plant, loop.controller, loop.plant.system
+    plant, law, g = loop.machine, loop.controller, loop.machine.system
     used = [plant.u.index(name) for name in loop.driven]
     enter = np.hstack([plant.B1[:, columns], factor])
     n, nc, m, k = g.n_states, law.n_states, enter.shape[1], columns.size
@@ -535,7 +535,7 @@ def lifted_loop(
 def split_law(loop: ClosedLoop, recovery: float | None) -> tuple[FloatArray, FloatArray]:
     """Return the command, and then the rest, of a controller whose commands are not all applied."""
     law, L = applied_law(loop, recovery)
-    nc, ny, nu = law.n_states, len(loop.plant.y), len(loop.driven)
+    nc, ny, nu = law.n_states, len(loop.machine.y), len(loop.driven)
     C, D = law.C[:nu], law.D[:nu, :ny]
     rows = [
         [law.A - L @ C, law.B[:, :ny] - L @ D, law.B[:, ny:] + L],

@@ -27,8 +27,8 @@ from ..loop import ClosedLoop, ScheduledLoop
 from ..loop.blocks import DERIVATIVES, references, with_known
 from ..loop.budget import white_noise
 from ..parallel import Progress, one_thread
-from ..plant import StandardPlant
-from ..plant.partition import require_plain, require_sampled
+from ..plant import StandardPlant, standard_plant
+from ..plant.partitioned import require_sampled
 from ..tolerances import SAME, TYPED
 from .motion import SetPoint
 from .moving_machine import MovingMachine, trajectory, unscheduled
@@ -141,7 +141,7 @@ def simulate(
     loop, schedule = unscheduled(loop)
     _check_sampled(loop)
     closed, loop = loop, finer_loop(loop, finer)
-    plant = loop.plant
+    plant = loop.machine
     steps = round(positive(duration, "duration") / plant.dt)
     if steps > MOST_STEPS:
         raise ModelError(
@@ -214,7 +214,7 @@ def finer_loop(loop: ClosedLoop, finer: int) -> ClosedLoop:
     # the same plant before sampling, with the same delay in seconds
     if whole(finer, "finer", maximum=10_000) == 1:
         return loop
-    plant = loop.plant
+    plant = loop.machine
     if plant.continuous.dt:
         raise ModelError(
             "finer= needs the plant before it was sampled, which is not known of a plant made "
@@ -223,7 +223,7 @@ def finer_loop(loop: ClosedLoop, finer: int) -> ClosedLoop:
         )
     bare = plant.continuous.replace(evaluation=None)
     fine = bare.discretized(finer / plant.dt, delay=finer * plant.delay)
-    fine = with_known(fine, loop.blocks)
+    fine = standard_plant(with_known(fine, loop.blocks))
     if (fine.w, fine.u, fine.z, fine.y) != (plant.w, plant.u, plant.z, plant.y):
         raise ModelError(
             "the channels of the plant were changed after it was sampled, so that its motion "
@@ -257,9 +257,8 @@ def _positions(plant: StandardPlant, moving: Any) -> dict[str, Any]:
 
 
 def _check_sampled(loop: ClosedLoop) -> None:
-    plant = loop.plant
+    plant = loop.machine
     require_sampled(plant, "simulate runs sampled loops, with blocks designed at their rate")
-    require_plain(plant, "its channels are not those of the machine", AssumptionError)
     D = plant.system.select(plant.y, loop.driven).D
     if np.any(D):
         i, j = np.argwhere(D)[0]
@@ -408,7 +407,7 @@ def _generators(seed: np.random.SeedSequence, numbers: Iterable[int]) -> list[np
 
 
 def _start(loop: ClosedLoop, start: npt.ArrayLike | None) -> FloatArray:
-    plant = loop.plant.system.n_states
+    plant = loop.machine.system.n_states
     total = plant + loop.controller.n_states
     if start is None:
         return np.zeros(total)

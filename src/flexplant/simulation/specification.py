@@ -186,7 +186,7 @@ class Specification(Value):
         """Return the channel that is meant: the one named, or the only error."""
         if self.channel is not None:
             return self.channel
-        errors = [name for name in loop.plant.z if name.endswith(":error")]
+        errors = [name for name in loop.machine.z if name.endswith(":error")]
         return only_one("error channel", errors, None, "Specification(..., channel='y1')")
 
     def _of_loop(self, loop: ClosedLoop) -> list[tuple[str, str, float, float, bool]]:

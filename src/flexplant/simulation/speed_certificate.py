@@ -182,8 +182,8 @@ class _Motion:
 
     def __init__(self, loop: ClosedLoop, schedule: ScheduledLoop | None, position: str) -> None:
         self.loop, self.schedule, self.position = loop, schedule, position
-        self.h = float(loop.plant.dt)
-        self.scale = np.ones(loop.plant.system.n_states + loop.controller.n_states)
+        self.h = float(loop.machine.dt)
+        self.scale = np.ones(loop.machine.system.n_states + loop.controller.n_states)
         self.factor = np.eye(self.scale.size)
         self._known: dict[tuple[float, float], FloatArray] = {}
         standing = Trajectory(tuple(self._ports.positions), {position: np.zeros_like}, {})
@@ -194,14 +194,14 @@ class _Motion:
     def of(cls, loop: ClosedLoop | ScheduledLoop, position: str | None) -> _Motion:
         """Return the motion of a loop, refused when nothing moves."""
         own, schedule = unscheduled(loop)
-        known = [one.name for one in known_positions(own.plant, "a speed is proven of")]
+        known = [one.name for one in known_positions(own.machine, "a speed is proven of")]
         if schedule is not None and position is None:
             position = schedule.position
         return cls(own, schedule, only_one("position", known, position, "position="))
 
     @property
     def _ports(self) -> Ports:
-        return self.loop.plant.assembled.ports
+        return self.loop.machine.assembled.ports
 
     @property
     def range(self) -> tuple[float, float]:

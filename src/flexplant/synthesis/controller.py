@@ -18,7 +18,7 @@ from ..lti.frequency_sweep import highest, largest_gains, resonance_grid
 from ..lti.norms import peak_gain
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from .preparation import Prepared
 
 
@@ -173,7 +173,7 @@ def certified_norm(
     return {"norm": norm, "swept norm": swept, stability_name(loop.dt): least, "claim": claim}
 
 
-def reached_norms(P: StandardPlant, loop: StateSpace, respond: Responder) -> dict[str, float]:
+def reached_norms(P: AnyPlant, loop: StateSpace, respond: Responder) -> dict[str, float]:
     """Return the largest gain of a loop from each group of w to each group of z, by a sweep."""
     # groups by the names that `assemble_plant` gives; empty for other plants
     if not P.is_assembled:
@@ -215,13 +215,13 @@ def _loop_grid(loop: StateSpace) -> FloatArray:
 CLOSE = ", and one that differs a little from the model may be unstable"
 
 
-def checked_loop(plant: StandardPlant, blocks: Sequence[Any]) -> ClosedLoop | None:
+def checked_loop(plant: AnyPlant, blocks: Sequence[Any]) -> ClosedLoop | None:
     """Return a design's loop, with warnings of what modes do to it; None: nothing to check it by.
 
     With the modes left out, where they are known, and with what the plant's own modes hold to.
     """
-    plain, reading = plant.unweighted, plant.origin.reading
-    whole = plant.evaluation_plant
+    plain, reading = plant.machine, plant.reading
+    whole = plain.evaluation_plant
     before = [] if reading is None else [reading]
     # a block that is read in the place of what is measured, under its names: no loop by names
     renamed = any(set(block.outputs) & set(plain.y) for block in before)
@@ -243,7 +243,7 @@ def checked_loop(plant: StandardPlant, blocks: Sequence[Any]) -> ClosedLoop | No
 
 
 def with_left_out(
-    answer: Controller, plant: StandardPlant, block: StateSpace | None = None
+    answer: Controller, plant: AnyPlant, block: StateSpace | None = None
 ) -> Controller:
     """Return an answer with its check on the modes left out, or the note that none are known."""
     # the block is its part from the plant's y to u, unless all of its system is
@@ -251,7 +251,7 @@ def with_left_out(
     return with_checks(answer, plant, loop)
 
 
-def with_checks(answer: Controller, plant: StandardPlant, loop: ClosedLoop | None) -> Controller:
+def with_checks(answer: Controller, plant: AnyPlant, loop: ClosedLoop | None) -> Controller:
     """Return an answer with what its loop says of modes left out and of uncertain ones."""
     left_out, tolerances = (None, None) if loop is None else (loop.left_out, loop.tolerances)
     certificate = dict(answer.certificate or {})

@@ -14,7 +14,7 @@ from ..lti.norms import h2_norm
 from ..lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
-from ..plant import StandardPlant
+from ..plant import AnyPlant
 from .controller import Controller, SolvedController, required_stability, with_left_out
 from .hinf.singular import lacking, made_regular
 from .preparation import Prepared, posed, prepared, require_reach
@@ -26,7 +26,7 @@ AGREEMENT = 1e-5
 
 @one_thread()
 def design_h2(
-    plant: StandardPlant | System, *, u: Sequence[str] | None = None, y: Sequence[str] | None = None
+    plant: AnyPlant | System, *, u: Sequence[str] | None = None, y: Sequence[str] | None = None
 ) -> Controller:
     """Return the controller ``u = K y`` of least H2 norm from w to z: the rms of z for white w.
 

@@ -23,7 +23,7 @@ from ..lti.equations import mean_speed
 from ..lti.joining import Matrices
 from ..lti.modal import modal_form
 from ..lti.statespace import StateSpace, System
-from ..plant import StandardPlant, standard_plant
+from ..plant import AnyPlant, GeneralizedPlant, StandardPlant, plant_of
 from ..plant.uncertainty.uncertain_plant import UncertainPlant
 from ..tolerances import ROUNDING, TINY
 from .scaling import (
@@ -224,16 +224,16 @@ _ROLES = {
 
 
 def posed(
-    given: StandardPlant | UncertainPlant[Any] | System,
+    given: AnyPlant | UncertainPlant[Any] | System,
     u: Sequence[str] | None,
     y: Sequence[str] | None,
     what: str,
-) -> StandardPlant:
+) -> AnyPlant:
     """Return the plant of a synthesis: u and y named where it has no names of its own."""
     if u is None and y is None:
-        plant = standard_plant(given)
-    elif isinstance(given, StandardPlant):
-        raise ModelError("a StandardPlant names its u and y: leave them out.")
+        plant: AnyPlant = plant_of(given)
+    elif isinstance(given, StandardPlant | GeneralizedPlant):
+        raise ModelError("a plant names its u and y: leave them out.")
     else:
         plant = StandardPlant.from_statespace(given, u=u, y=y)
     for name, role in _ROLES.items():
@@ -247,12 +247,12 @@ def posed(
     return plant
 
 
-def _require_body(plant: StandardPlant, what: str) -> None:
+def _require_body(plant: AnyPlant, what: str) -> None:
     if plant.is_assembled:  # it can name the rigid-body motion that is missed
         plant.check().require(("stabilisable", "detectable"), what)
 
 
-def require_stabilisable(plant: StandardPlant, problem: Prepared, what: str) -> None:
+def require_stabilisable(plant: AnyPlant, problem: Prepared, what: str) -> None:
     """Raise AssumptionError, naming mode and channels, when no controller stabilises a plant."""
     _require_body(plant, what)
     require_reach(problem)

@@ -103,7 +103,7 @@ class Fit(Uncertainty):
         source = self.source
         if isinstance(source, UpdateResult):
             calibration = _calibration_of(plant)
-            if not plant.is_weighted and plant.form.startswith("dense"):
+            if plant.form.startswith("dense"):
                 return self._of_parameters(plant, source, calibration)
             if calibration is None and not (source.discrepancy and source.fitted_poles):
                 return self._of_fit(modal_realisation(plant), source)

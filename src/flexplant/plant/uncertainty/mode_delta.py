@@ -12,7 +12,7 @@ from ...checks import FloatArray, real_array
 from ...errors import ModelError, require_known, unknown_label
 from ...tolerances import TINY
 from ...updating.matrix_parameters import MatrixParameter
-from ..partition import Partition, require_plain
+from ..partition import Partition
 from ..realisation import MODAL, ModalRealisation
 from .channels import DeltaChannel, Opened, system_matrix, with_each
 from .delta import Delta, MachineParts, with_changes
@@ -28,7 +28,6 @@ _READ_OFF = 0.25
 
 def modal_realisation(plant: Partition) -> ModalRealisation:
     """Return the modes of a plant, each of which has its own frequency and damping."""
-    require_plain(plant, "uncertain modes are those of a structure")
     realisation = plant.assembled.realisation
     if plant.form != MODAL:
         raise ModelError(

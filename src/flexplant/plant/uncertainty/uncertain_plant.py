@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Generic
+from typing import Any, Generic, Self
 
 import numpy as np
 import scipy.linalg as la
@@ -136,6 +136,26 @@ class UncertainPlant(Value, Generic[P]):
         if self.neglected is None:
             return self.opened.system
         return with_neglected(self.opened.system, self.neglected, self.opened.width)
+
+    def discretized(self, rate: float, *, delay: float = 0.0) -> Self:
+        """Return the plant sampled at a rate with the same uncertainty."""
+        plant: Any = self.plant
+        return self.replace(plant=plant.discretized(rate, delay=delay))
+
+    def at(self, poi: Any = None, **positions: float) -> Self:
+        """Return the plant where ports are elsewhere with the same uncertainty."""
+        plant: Any = self.plant
+        return self.replace(plant=plant.at(poi, **positions))
+
+    def through(self, block: Any) -> Any:
+        """Return the nominal plant, its uncertainty known, read through a block."""
+        nominal: Any = self.nominal
+        return nominal.through(block)
+
+    def weighted(self, weights: Any = None, *, z: Any = None, w: Any = None) -> Any:
+        """Return the nominal plant, its uncertainty known, with weights."""
+        nominal: Any = self.nominal
+        return nominal.weighted(weights, z=z, w=w)
 
     @property
     def nominal(self) -> P:

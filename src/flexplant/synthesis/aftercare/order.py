@@ -22,7 +22,7 @@ from ...lti.norms import peak_gain
 from ...lti.riccati import control_care, control_dare
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
-from ...plant import StandardPlant, standard_plant
+from ...plant import AnyPlant, GeneralizedPlant, StandardPlant, plant_of
 from ..controller import Controller, with_left_out
 
 
@@ -37,7 +37,7 @@ class _FactoredController(NamedTuple):
     size: float
 
     @classmethod
-    def of(cls, plant: StandardPlant, K: StateSpace) -> _FactoredController:
+    def of(cls, plant: AnyPlant, K: StateSpace) -> _FactoredController:
         size = _controller_gain(plant, K)
         split = split_stable(K)
         scaled = split.stable.replace(C=split.stable.C / size, D=split.stable.D / size, blocks=None)
@@ -74,7 +74,7 @@ class _FactoredController(NamedTuple):
 
 @one_thread()
 def reduce_controller(
-    plant: StandardPlant | System, controller: Any, *, order: int | None = None, loss: float = 0.1
+    plant: AnyPlant | System, controller: Any, *, order: int | None = None, loss: float = 0.1
 ) -> Controller:
     """Return a controller of fewer states that keeps the closed loop, or none at all.
 
@@ -130,7 +130,7 @@ def reduce_controller(
     >>> smaller.system.n_states, fx.close_loop(plant, smaller).is_stable
     (4, True)
     """
-    given = standard_plant(plant)
+    given = plant_of(plant)
     K = as_statespace(controller)
     allowed = positive(loss, "loss", zero=True)
     before = stable_before(given, K)
@@ -156,7 +156,7 @@ def reduce_controller(
 
 
 def _fewest_states(
-    plant: StandardPlant, problem: _FactoredController, before: LoopFacts, loss: float
+    plant: AnyPlant, problem: _FactoredController, before: LoopFacts, loss: float
 ) -> tuple[StateSpace, float, LoopFacts]:
     """Return the reduced controller of the fewest states that keeps the loop, from halvings."""
     best: tuple[StateSpace, float, LoopFacts] | None = None
@@ -190,7 +190,7 @@ def _fewest_states(
     return best
 
 
-def _controller_gain(plant: StandardPlant, K: StateSpace) -> float:
+def _controller_gain(plant: AnyPlant, K: StateSpace) -> float:
     """Return the gain of the controller where the loop works, the unit of u in those of y."""
     loop = plant.system.select(plant.y, plant.u)
     grid = resonance_grid(np.concatenate([loop.poles(), K.poles()]), K.dt, points=60)
@@ -254,7 +254,7 @@ class LoopFacts(NamedTuple):
         return found if np.isnan(self.gamma) else found | {"gamma": self.gamma}
 
 
-def loop_facts(plant: StandardPlant, controller: StateSpace) -> LoopFacts:
+def loop_facts(plant: AnyPlant, controller: StateSpace) -> LoopFacts:
     """Return what a controller keeps on a plant."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FlexplantWarning)
@@ -262,7 +262,7 @@ def loop_facts(plant: StandardPlant, controller: StateSpace) -> LoopFacts:
     poles, dt, stable = loop.poles(), loop.plant.dt, loop.obstacle is None
     least = poles[np.argmax(np.abs(poles) if dt else poles.real)] if poles.size else np.nan
     freq = float(np.abs(np.angle(least) / dt if dt else np.imag(least)) / (2.0 * np.pi))
-    weighted = plant.is_weighted and stable
+    weighted = isinstance(plant, GeneralizedPlant) and stable
     gamma = peak_gain(lft(plant.system, controller))[0] if weighted else float("nan")
     margin = loop.modulus_margin if stable else 0.0
     return LoopFacts(bool(dt), stability(poles, dt), freq, stable, margin, gamma)
@@ -288,7 +288,7 @@ def required(before: LoopFacts, after: LoopFacts, loss: float, cure: str) -> Non
         raise CertificateError(f"{lost}: the controller is refused. {cure}")
 
 
-def stable_before(plant: StandardPlant, controller: StateSpace) -> Any:
+def stable_before(plant: AnyPlant, controller: StateSpace) -> Any:
     """Return the facts of the loop as it was designed."""
     facts = loop_facts(plant, controller)
     if not facts.is_stable:
@@ -300,7 +300,7 @@ def stable_before(plant: StandardPlant, controller: StateSpace) -> Any:
 
 
 def discretise_controller(
-    plant: StandardPlant, controller: Any, *, prewarp: float | None = None, loss: float = 0.5
+    plant: AnyPlant, controller: Any, *, prewarp: float | None = None, loss: float = 0.5
 ) -> Controller:
     """Return a continuous controller at the rate of a sampled plant, and how its loop stands there.
 
@@ -346,7 +346,7 @@ def discretise_controller(
     """
     given = instance(plant, StandardPlant, "plant", "Make it by assemble_plant(...).discretized().")
     K = as_statespace(controller)
-    if not given.dt or given.is_weighted or given.continuous.dt:
+    if not given.dt or given.continuous.dt:
         raise ModelError(
             "a controller is discretised for a sampled plant without weights whose continuous one "
             "is known: pass plant.unweighted.discretized(rate, delay=1)."

@@ -22,7 +22,7 @@ from ...lti.norms import hinf_norm
 from ...lti.responses import remembered, responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
-from ...plant import StandardPlant, stage_weights
+from ...plant import AnyPlant, StandardPlant, stage_weights
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import (
     Controller,
@@ -53,7 +53,7 @@ _SENSITIVE, _DRAWS = 2e-4, 3
 
 @one_thread()
 def design_hinf(
-    plant: StandardPlant | UncertainPlant[Any] | System | Mapping[float, StandardPlant],
+    plant: AnyPlant | UncertainPlant[Any] | System | Mapping[float, StandardPlant],
     method: SynthesisMethod | None = None,
     *,
     bandwidth: float | None = None,
@@ -181,7 +181,7 @@ class Evened(NamedTuple):
 
 
 def tolerant(
-    plant: StandardPlant,
+    plant: AnyPlant,
     given: Evened,
     uncertain: UncertainPlant[Any],
     method: SynthesisMethod | None = None,
@@ -205,7 +205,7 @@ def tolerant(
 
 
 def evened(
-    plant: StandardPlant,
+    plant: AnyPlant,
     uncertain: UncertainPlant[Any],
     method: SynthesisMethod | None = None,
     progress: bool | None = None,
@@ -221,7 +221,7 @@ def evened(
     return Evened(channels, first)
 
 
-def solved(plant: StandardPlant, method: SynthesisMethod) -> tuple[StateSpace, SolvedController]:
+def solved(plant: AnyPlant, method: SynthesisMethod) -> tuple[StateSpace, SolvedController]:
     """Return the controller that a method finds, not verified, and what it says of it."""
     problem = prepared(plant.system, plant.u, plant.y)
     found = method.solve(problem)
@@ -229,7 +229,7 @@ def solved(plant: StandardPlant, method: SynthesisMethod) -> tuple[StateSpace, S
 
 
 def _design_one(
-    plant: StandardPlant, method: SynthesisMethod | None, progress: bool | None
+    plant: AnyPlant, method: SynthesisMethod | None, progress: bool | None
 ) -> Controller:
     """Return the verified controller of a plant."""
     problem = prepared(plant.system, plant.u, plant.y)
@@ -251,7 +251,7 @@ def _design_one(
 
 
 def _require_known(
-    plant: StandardPlant, problem: Prepared, K: StateSpace, gamma: float, lower: float
+    plant: AnyPlant, problem: Prepared, K: StateSpace, gamma: float, lower: float
 ) -> None:
     """Raise SolverError when rounding in the given coordinates may have made another plant."""
     if problem.departure < _MIXED:
@@ -288,9 +288,7 @@ def _blamed(problem: Prepared, error: FlexplantError) -> FlexplantError:
     )
 
 
-def _verified(
-    plant: StandardPlant, problem: Prepared, name: str, found: SolvedController
-) -> Controller:
+def _verified(plant: AnyPlant, problem: Prepared, name: str, found: SolvedController) -> Controller:
     """Return what a method found, its norm verified on the plant."""
     K = problem.restored(found.A, found.B, found.C, found.D)
     K = K.replace(name="hinf", units=plant.units)

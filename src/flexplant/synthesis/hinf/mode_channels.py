@@ -15,7 +15,7 @@ from ...lti.frequency_sweep import resonance_grid
 from ...lti.interconnection import lft
 from ...lti.responses import points, responder
 from ...lti.statespace import StateSpace
-from ...plant import StandardPlant
+from ...plant import AnyPlant, StandardPlant
 from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import RANK, TINY
@@ -72,7 +72,7 @@ class ModeChannel(Value):
 
 
 def mode_channels(
-    weighted: StandardPlant, uncertain: UncertainPlant[Any], damped_below: float = 0.0
+    weighted: AnyPlant, uncertain: UncertainPlant[Any], damped_below: float = 0.0
 ) -> tuple[ModeChannel, ...]:
     """Return a channel for each mode of uncertain frequency that the weighted plant moves."""
     # D is one over the modal force of the weighted disturbances: what a Delta feeds back then
@@ -162,7 +162,7 @@ def _pole(pair: FloatArray) -> tuple[float, float]:
     return omega, zeta
 
 
-def with_mode_channels(weighted: StandardPlant, channels: Sequence[ModeChannel]) -> StandardPlant:
+def with_mode_channels(weighted: AnyPlant, channels: Sequence[ModeChannel]) -> AnyPlant:
     """Return a weighted plant with the channels before its own w and z."""
     g, n, m = weighted.system, weighted.system.n_states, len(channels)
     A, D = la.block_diag(g.A, np.zeros((m, m))), la.block_diag(np.zeros((m, m)), g.D)
@@ -183,7 +183,7 @@ def with_mode_channels(weighted: StandardPlant, channels: Sequence[ModeChannel])
 
 
 def rebalanced(
-    channels: Sequence[ModeChannel], plant: StandardPlant, controller: StateSpace
+    channels: Sequence[ModeChannel], plant: AnyPlant, controller: StateSpace
 ) -> tuple[ModeChannel, ...]:
     """Return channels whose rows and columns of the closed loop are alike at their resonances."""
     loop = lft(plant.system, controller)
@@ -197,10 +197,7 @@ def rebalanced(
 
 
 def tolerated(
-    channels: Sequence[ModeChannel],
-    plant: StandardPlant,
-    controller: StateSpace,
-    times: float = 1.0,
+    channels: Sequence[ModeChannel], plant: AnyPlant, controller: StateSpace, times: float = 1.0
 ) -> float:
     """Return an upper bound of real mu of the channels, the largest over a grid of frequencies."""
     # below 1 no Deltas of a size (`times`), all at once, put a pole on the grid's frequencies
@@ -223,7 +220,7 @@ class ModeLoop:
     def __init__(
         self,
         channels: Sequence[ModeChannel],
-        plant: StandardPlant,
+        plant: AnyPlant,
         controller: StateSpace,
         times: float,
         *,

@@ -16,7 +16,7 @@ from ...lti.interconnection import lft
 from ...lti.norms import hinf_norm
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, tick
-from ...plant import StandardPlant, standard_plant
+from ...plant import AnyPlant, StandardPlant, plant_of
 from ...plant.uncertainty.channels import with_channels
 from ...tolerances import SAME
 from ..controller import Controller
@@ -39,14 +39,14 @@ class PlantRange:
     """Plants of one machine at several positions: same channels, rate and states."""
 
     places: FloatArray
-    plants: list[StandardPlant]
+    plants: list[AnyPlant]
 
     @classmethod
     def of(cls, given: Mapping[float, Any]) -> PlantRange:
         """Return the plants of a mapping {position: plant}."""
         hint = "Pass {0.0: plant, 0.1: other}, the same model with its ports at each position."
         entries = mapping(given, "plant", hint, least=1)
-        known = {number(x, "a position"): standard_plant(one) for x, one in entries.items()}
+        known = {number(x, "a position"): plant_of(one) for x, one in entries.items()}
         if len(known) < len(entries):
             raise ModelError(f"positions of plant must differ, got {list(entries)}. {hint}")
         places = np.array(sorted(known))
@@ -68,7 +68,7 @@ class PlantRange:
                 )
         return found
 
-    def at(self, x: float) -> StandardPlant:
+    def at(self, x: float) -> AnyPlant:
         """Return the plant at a position, its matrices linear between those given."""
         known = np.flatnonzero(self.places == x)
         if known.size:
@@ -81,7 +81,7 @@ class PlantRange:
         return StandardPlant.from_statespace(a.replace(**mixed, blocks=None), **sides)
 
     def certified(
-        self, norm_of: Callable[[StandardPlant], float], norms: Sequence[float]
+        self, norm_of: Callable[[AnyPlant], float], norms: Sequence[float]
     ) -> dict[str, float]:
         """Return the norm at each position, the worst one, and the worst half way between two."""
         found = {f"norm at {x:.6g}": norm for x, norm in zip(self.places, norms, strict=True)}
@@ -107,7 +107,7 @@ class PlantRange:
 
 def over_positions(
     given: Mapping[float, Any],
-    design: Callable[[StandardPlant], Controller],
+    design: Callable[[AnyPlant], Controller],
     progress: bool | None = None,
 ) -> Controller:
     """Return the controller whose worst norm over the positions is least of those tried."""
@@ -130,7 +130,7 @@ def over_positions(
 class _Search:
     """Designs for one plant or another, each judged by its loops at all positions."""
 
-    def __init__(self, moving: PlantRange, design: Callable[[StandardPlant], Controller]) -> None:
+    def __init__(self, moving: PlantRange, design: Callable[[AnyPlant], Controller]) -> None:
         self.moving, self.design = moving, design
         self.tried: dict[str, float] = {}
         self.best: Controller | None = None
@@ -140,7 +140,7 @@ class _Search:
         """The smallest worst norm so far."""
         return min(self.tried.values(), default=np.inf)
 
-    def tried_with(self, name: str, plant: StandardPlant) -> Controller | None:
+    def tried_with(self, name: str, plant: AnyPlant) -> Controller | None:
         """Design for a plant, judge, and keep what is best."""
         found, worst = None, np.inf
         with attempted(f"the design for {name}"):
@@ -223,7 +223,7 @@ class _MotionChannels:
         self.dC, self.dB = dC[self.rows], dB[:, self.columns]
         self.scales = np.ones(self.rows.size + self.columns.size)
 
-    def channels(self, scale: float, size: float) -> StandardPlant:
+    def channels(self, scale: float, size: float) -> AnyPlant:
         """Return the mean plant with a disturbance and an output for each row and column."""
         g, r, c, own = self.mean.system, self.rows.size, self.columns.size, self.mean
         D, n, k = scale * self.scales, g.n_states, r + c
@@ -275,7 +275,7 @@ def _worst_norm(moving: PlantRange, K: StateSpace, least: float) -> float:
     return worst
 
 
-def _position_norm(plant: StandardPlant, K: StateSpace) -> float:
+def _position_norm(plant: AnyPlant, K: StateSpace) -> float:
     """Return the norm of the loop of one position."""
     loop = lft(plant.system, K)
     if not loop.is_stable:

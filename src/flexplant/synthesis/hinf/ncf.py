@@ -18,7 +18,7 @@ from ...lti.norms import peak_gain
 from ...lti.riccati import control_care, control_dare, filter_care, filter_dare
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
-from ...plant import StandardPlant
+from ...plant import AnyPlant, StandardPlant
 from ...tolerances import TINY
 from ..controller import Controller, with_left_out
 
@@ -32,7 +32,7 @@ _LARGEST_GAMMA = 1e3
 
 @one_thread()
 def design_ncf(
-    plant: StandardPlant | System,
+    plant: AnyPlant | System,
     *,
     before: System | FloatArray | None = None,
     after: System | FloatArray | None = None,
@@ -122,7 +122,7 @@ def design_ncf(
     return with_left_out(answer, plant) if isinstance(plant, StandardPlant) else answer
 
 
-def ncf_margin(plant: StandardPlant | System, controller: Controller | System) -> float:
+def ncf_margin(plant: AnyPlant | System, controller: Controller | System) -> float:
     """Return the margin of a loop u = K y against errors of normalised coprime factors.
 
     ``b = 1 / | [K; I] (I - G K)^-1 [I, G] |``, between 0 (unstable) and

@@ -20,7 +20,7 @@ from ...lti.minimal import minimal
 from ...lti.responses import responses
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
-from ...plant import StandardPlant
+from ...plant import AnyPlant
 from ..controller import Controller, with_left_out
 from ..laws.loop_design import Axes, axes_of, connected
 from .hinf_design import design_hinf
@@ -73,7 +73,7 @@ class ShapedLoop(Value):
 
 @one_thread()
 def shape_loop(
-    plant: StandardPlant | System,
+    plant: AnyPlant | System,
     *,
     bandwidth: float,
     before: System | FloatArray | None = None,

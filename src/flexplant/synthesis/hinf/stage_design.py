@@ -23,7 +23,7 @@ from ...loop.other_machines import BEYOND, mode_tolerances
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
 from ...parallel import Progress
-from ...plant import StandardPlant, reference_errors, stage_weights, standard_plant
+from ...plant import AnyPlant, StandardPlant, reference_errors, stage_weights, standard_plant
 from ...plant.drawn_machines import damped_less, draws_with_left_out
 from ...plant.realisation import natural
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
@@ -52,7 +52,7 @@ _OF_RATE = 0.1
 
 
 def design_stage(
-    plant: StandardPlant | UncertainPlant[Any],
+    plant: AnyPlant | UncertainPlant[Any],
     *,
     bandwidth: float | None = None,
     margin: float = 0.4,
@@ -150,7 +150,7 @@ class _StageTask:
                 f"no frequency of {uncertain!r} is uncertain: nothing limits the bandwidth. Pass "
                 "plant.uncertain(frequency=0.005)."
             )
-        self.plant: StandardPlant = uncertain.plant
+        self.plant: AnyPlant = uncertain.plant
         #: with the modes left out: a controller of the reduced plant may make them unstable
         self.whole = self.plant.evaluation_plant
         self.errors = reference_errors(self.plant, poi=poi)
@@ -164,7 +164,7 @@ class _StageTask:
         self.damped_less = damped_less(self.known, self.loop_plant)
 
     @cached_property
-    def machines(self) -> list[StandardPlant]:
+    def machines(self) -> list[AnyPlant]:
         """Machines on which a loop must hold, the same for all."""
         drawn = draws_with_left_out(
             self.known, self.loop_plant, generator(0), _DRAWS, shapes=_SHAPES

@@ -17,7 +17,7 @@ from ...lti.frequency import Frf
 from ...lti.interconnection import series, side_by_side
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
-from ...plant import StandardPlant, decouple
+from ...plant import AnyPlant, StandardPlant, decouple
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import checked_loop
 from .law import Law, LawElement
@@ -70,7 +70,7 @@ class Axes:
     before: StateSpace
     after: StateSpace
     rate: float
-    given: StandardPlant | None = None
+    given: AnyPlant | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -131,7 +131,7 @@ def axes_controller(axes: Axes, laws: Mapping[str, Law]) -> StateSpace:
 
 @one_thread()
 def design_loops(
-    plant: StandardPlant | UncertainPlant[Any] | System | Frf,
+    plant: AnyPlant | UncertainPlant[Any] | System | Frf,
     laws: LawElement | Mapping[str, LawElement],
     *,
     before: System | FloatArray | None = None,

@@ -19,7 +19,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
 from ...plant.axes import driven_axes
-from ...plant.partition import require_plain, require_sampled
+from ...plant.partitioned import require_sampled
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..controller import CLOSE, Controller, with_checks
 from .loop_design import Axes, axes_controller, connected
@@ -439,7 +439,6 @@ def servo_task(
 ) -> ServoTask:
     """Return the task of a servo; parameters as for `design_servo`."""
     plant = standard_plant(given)
-    require_plain(plant, "a servo acts on physical channels")
     require_sampled(plant, "a servo is designed at its sampling rate")
     driven = driven_axes(plant, axes=axes, poi=poi)
     (plant.continuous or plant).check().require(("stabilisable",), "a servo")

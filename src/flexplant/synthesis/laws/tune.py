@@ -20,7 +20,7 @@ from ...lti.interconnection import loop_poles, series
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import Progress, one_thread
-from ...plant import StandardPlant
+from ...plant import AnyPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from .axis_law import AxisLaw, MeasuredAxis, are_stable, linear_step, near_lowest
 from .law import Law, decoupled, tustin_s
@@ -33,7 +33,7 @@ _ZERO = 1e-6
 
 @one_thread()
 def tune_loops(
-    plant: StandardPlant | UncertainPlant[Any] | System | Frf,
+    plant: AnyPlant | UncertainPlant[Any] | System | Frf,
     *,
     before: System | FloatArray | None = None,
     after: System | FloatArray | None = None,
@@ -136,9 +136,9 @@ def _joint_plants(
         return [JointPlant(in_axes(given.select(y, u), **measured), *static, axes.names, rigid)]
     own = as_statespace(plant if axes.given is None else axes.given.Gyu)
     found = [JointPlant(own.select(y, u), *static, axes.names, rigid)]
-    more = None if axes.given is None else axes.given.evaluation_plant
+    more = None if axes.given is None else axes.given.machine.evaluation_plant
     if axes.given is not None and more is not None:
-        reading, G = axes.given.origin.reading, more.system.select(more.y, more.u)
+        reading, G = axes.given.reading, more.system.select(more.y, more.u)
         if reading is not None:
             read = [name for name in reading.inputs if name in more.y]
             G = series(G.select(read), reading.select(inputs=read))

@@ -14,7 +14,7 @@ from ...lti.interconnection import lft
 from ...lti.norms import peak_gain
 from ...lti.statespace import StateSpace, System
 from ...parallel import one_thread
-from ...plant import StandardPlant, standard_plant
+from ...plant import AnyPlant, StandardPlant, plant_of
 from ...tolerances import TINY
 from ..controller import Controller, with_left_out
 from ..h2 import design_h2
@@ -38,7 +38,7 @@ _KINDS = (H2, Hinf, PeakGain)
 
 @one_thread()
 def design_lmi(
-    plant: StandardPlant | System,
+    plant: AnyPlant | System,
     *,
     minimize: H2 | Hinf | PeakGain,
     subject_to: Sequence[H2 | Hinf | PeakGain | PoleRegion] = (),
@@ -100,7 +100,7 @@ def design_lmi(
     >>> found.gamma < 1
     True
     """
-    given = standard_plant(plant)
+    given = plant_of(plant)
     _check_specifications(given, minimize, subject_to, whole(max_states, "max_states"))
     require_stabilisable(given, prepared(given.system, given.u, given.y), "synthesis by LMIs")
     require_reachable(given, subject_to)
@@ -131,7 +131,7 @@ def design_lmi(
     )
 
 
-def _check_specifications(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) -> None:
+def _check_specifications(plant: AnyPlant, minimize: Any, subject_to: Any, most: int) -> None:
     """Refuse specifications that do not fit."""
     if not isinstance(minimize, _KINDS) or minimize.below is not None:
         raise ModelError(
@@ -162,7 +162,7 @@ def _check_specifications(plant: StandardPlant, minimize: Any, subject_to: Any, 
         )
 
 
-def _balanced_plant(plant: StandardPlant) -> Plant:
+def _balanced_plant(plant: AnyPlant) -> Plant:
     """Return the plant in balanced states and units of its own, its w and z as they are."""
     g = plant.system
     d = state_scale(g.A, g.B, g.C)
@@ -212,7 +212,7 @@ def _best_rate(problem: ObjectivePrograms) -> tuple[float, float]:
 
 
 def _verified_values(
-    plant: StandardPlant, K: StateSpace, minimize: Any, subject_to: Sequence[Any]
+    plant: AnyPlant, K: StateSpace, minimize: Any, subject_to: Sequence[Any]
 ) -> dict[str, float]:
     """Return what every objective reaches, computed from the closed loop."""
     closed = lft(plant.system, K)
@@ -241,7 +241,7 @@ _NEAR = 1e-3
 _CERTAIN = 0.5
 
 
-def require_reachable(plant: StandardPlant, subject_to: Sequence[Any]) -> None:
+def require_reachable(plant: AnyPlant, subject_to: Sequence[Any]) -> None:
     """Raise InfeasibleError when a bound is below what any controller reaches for it alone."""
     # bounds on peaks and regions of poles are not judged, nor what has no optimum
     for spec in subject_to:

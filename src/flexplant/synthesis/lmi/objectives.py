@@ -16,7 +16,7 @@ from ...errors import SolverError, require_known
 from ...lti.norms import h2_norm, peak_gain
 from ...lti.responses import continuous_poles
 from ...lti.statespace import StateSpace
-from ...plant import StandardPlant
+from ...plant import AnyPlant
 from ...tolerances import TINY
 from ..preparation import less_feedthrough
 from ..structured.judges import GainJudge, H2Judge, Judge, PeakJudge, problem_on, require_finite_h2
@@ -46,7 +46,7 @@ class _ChannelNorm(Value):
     z: tuple[str, ...] | None = field(default=None, metadata=checked(name_list))
     below: float | None = field(default=None, metadata=checked(positive))
 
-    def chosen(self, plant: StandardPlant) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def chosen(self, plant: AnyPlant) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return the names of w and z, all where none were given."""
         for side in "wz":
             require_known(f"channel of {side}", getattr(self, side) or (), getattr(plant, side))
@@ -76,7 +76,7 @@ class H2(_ChannelNorm):
         """Return the norm of a closed loop by its Gramians."""
         return h2_norm(closed)
 
-    def judges(self, plant: StandardPlant, order: int) -> list[Judge]:
+    def judges(self, plant: AnyPlant, order: int) -> list[Judge]:
         """Return what finds the norm for controllers of an order."""
         w, z = self.chosen(plant)
         require_finite_h2(plant, w, z)
@@ -102,7 +102,7 @@ class Hinf(_ChannelNorm):
         """Return the norm of a closed loop."""
         return peak_gain(closed)[0]
 
-    def judges(self, plant: StandardPlant, order: int) -> list[Judge]:
+    def judges(self, plant: AnyPlant, order: int) -> list[Judge]:
         """Return what finds the norm for controllers of an order."""
         return [GainJudge(problem_on(plant, *self.chosen(plant)), order)]
 
@@ -133,7 +133,7 @@ class PeakGain(_ChannelNorm):
         """Return the largest integral or sum of an absolute impulse response."""
         return impulse_sum(closed) if closed.dt else impulse_integral(closed)
 
-    def judges(self, plant: StandardPlant, order: int) -> list[Judge]:
+    def judges(self, plant: AnyPlant, order: int) -> list[Judge]:
         """Return what finds the sum of each channel for controllers of an order."""
         w, z = self.chosen(plant)
         return [PeakJudge(problem_on(plant, [i], [o]), order) for i in w for o in z]
@@ -424,7 +424,7 @@ _ACCURACIES = (1e-8, 1e-6, 1e-5)
 class ObjectivePrograms:
     """The semidefinite programs of one design."""
 
-    given: StandardPlant
+    given: AnyPlant
     plant: Plant
     minimize: Any
     subject_to: tuple[Any, ...]

@@ -25,7 +25,7 @@ from ...lti.interconnection import lft, series, side_by_side
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
-from ...plant import StandardPlant
+from ...plant import AnyPlant, StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...tolerances import ROUNDING
 from ..controller import Controller, SynthesisMethod, with_left_out
@@ -324,7 +324,7 @@ def _by_mode_channels(
 
 
 def _mode_steps(
-    weighted: StandardPlant, channels: Sequence[ModeChannel], method: Any, most: int
+    weighted: AnyPlant, channels: Sequence[ModeChannel], method: Any, most: int
 ) -> Iterator[_DkStep]:
     """Yield controllers, each for Deltas and weights over the mu of the step before."""
     level = 1.0
@@ -339,7 +339,7 @@ def _mode_steps(
 
 
 def _dk_iteration(
-    weighted: StandardPlant,
+    weighted: AnyPlant,
     number: int,
     channels: Sequence[ModeChannel],
     level: float,
@@ -367,7 +367,7 @@ def _dk_iteration(
     return _DkStep(number, mu, K, again)
 
 
-def _performance_plant(plant: StandardPlant, w: Any, z: Any) -> StandardPlant:
+def _performance_plant(plant: AnyPlant, w: Any, z: Any) -> AnyPlant:
     """Return a plant with the channels of performance alone, weighted."""
     sides = {}
     for side, given in (("z", z), ("w", w)):

@@ -18,7 +18,7 @@ from ...lti.frequency_sweep import largest_gains
 from ...lti.norms import peak_gain
 from ...lti.statespace import StateSpace
 from ...parallel import Progress, one_thread
-from ...plant import StandardPlant
+from ...plant import AnyPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ..hinf.mode_channels import mode_channels, tolerated, with_mode_channels
 from .lower import Destabilising, destabilising, smallest_with_block
@@ -75,7 +75,7 @@ class RobustStability(Value):
     lower: float
     freq: float
     values: Mapping[str, float]
-    machine: StandardPlant | None
+    machine: AnyPlant | None
     frequencies: FloatArray
     bounds: FloatArray
     certificate: Mapping[str, float]
@@ -215,7 +215,7 @@ def _worst(
 
 def _worst_machine(
     loop: UncertainLoop, worst: Destabilising | None
-) -> tuple[dict[str, float], StandardPlant | None, float]:
+) -> tuple[dict[str, float], AnyPlant | None, float]:
     """Return the Deltas of the worst machine, that machine and one over its size."""
     # only what is not stable when closed exactly counts
     if worst is None:
@@ -311,7 +311,7 @@ class WorstCaseGain(Value):
     nominal: float
     freq: float
     values: Mapping[str, float]
-    machine: StandardPlant
+    machine: AnyPlant
     frequencies: FloatArray
     bounds: FloatArray
 
@@ -417,7 +417,7 @@ def worst_case_gain(
 
 def _machine_gain(
     loop: UncertainLoop, one: Perturbation
-) -> tuple[float, float, dict[str, float], StandardPlant]:
+) -> tuple[float, float, dict[str, float], AnyPlant]:
     """Return the gain of the machine of a perturbation, where it is, its Deltas, and itself."""
     values, made = loop.deltas(one, 1.0), loop.machine(one, 1.0)
     closed = loop.performed(made)

@@ -16,7 +16,7 @@ from ...lti.discretisation import bilinear, image_freq, tustin
 from ...lti.interconnection import lft, series, side_by_side
 from ...lti.responses import Responder, responder
 from ...lti.statespace import StateSpace, as_statespace, single_channel
-from ...plant import StandardPlant
+from ...plant import AnyPlant, StandardPlant
 from ...plant.building import at_rate
 from ...plant.uncertainty.neglected_modes import with_neglected
 from ...plant.uncertainty.sampled_channels import DeltaChannels, delta_channels
@@ -62,7 +62,7 @@ class UncertainLoop:
             len(self.system.inputs) - m, len(self.system.outputs) - n, name="performance"
         )
 
-    def performed(self, plant: StandardPlant) -> StateSpace:
+    def performed(self, plant: AnyPlant) -> StateSpace:
         """Return the weighted w -> z of the loop around a machine, sampled as it is."""
         p, m = self.performance.z, self.performance.w
         closed = self.loop.around(plant).system
@@ -96,11 +96,11 @@ class UncertainLoop:
         numbers = [size * number.real for number in found.scalars[: len(names)]]
         return dict(zip(names, numbers, strict=True))
 
-    def machine(self, found: Perturbation, size: float) -> StandardPlant:
+    def machine(self, found: Perturbation, size: float) -> AnyPlant:
         """Return the plant of a perturbation: its modes exact, sampled like the nominal one."""
         # white noises do not pass the neglected modes in a sampled machine: their covariance is
         # that of the modes it has
-        plant: StandardPlant = self.uncertain.lft(self.deltas(found, size))
+        plant: AnyPlant = self.uncertain.lft(self.deltas(found, size))
         part, factor = self.neglected, None
         if part is None:
             return plant

@@ -17,7 +17,7 @@ from ...lti.lyapunov import solve_lyapunov
 from ...lti.norms import peak_gain
 from ...lti.responses import responses
 from ...lti.statespace import StateSpace
-from ...plant import StandardPlant
+from ...plant import AnyPlant
 from ...tolerances import ROUNDING, TINY
 from ..preparation import Prepared, prepared
 from .nonsmooth import Pieces
@@ -260,13 +260,13 @@ class LoopObjective(Protocol):
     def below(self) -> float | None:
         """What the number is counted in; None for one objective alone."""
 
-    def chosen(self, plant: StandardPlant, /) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def chosen(self, plant: AnyPlant, /) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return the names of w and z."""
 
     def measured(self, closed: Any, /) -> float:
         """Return the number of a closed loop by another computation: it checks the claim."""
 
-    def judges(self, plant: StandardPlant, order: int, /) -> Sequence[Judge]:
+    def judges(self, plant: AnyPlant, order: int, /) -> Sequence[Judge]:
         """Return what finds the number, the largest of several, for controllers of an order."""
 
 
@@ -445,13 +445,13 @@ def _crossings(t: FloatArray, poles: ComplexArray, residues: ComplexArray) -> Fl
     return np.asarray(low + (high - low) * before / (before - after))
 
 
-def problem_on(plant: StandardPlant, w: Sequence[str], z: Sequence[str]) -> Prepared:
+def problem_on(plant: AnyPlant, w: Sequence[str], z: Sequence[str]) -> Prepared:
     """Return the problem of some channels, ready for synthesis."""
     system = plant.system.select([*z, *plant.y], [*w, *plant.u])
     return prepared(system, plant.u, plant.y)
 
 
-def require_finite_h2(plant: StandardPlant, w: Sequence[str], z: Sequence[str]) -> None:
+def require_finite_h2(plant: AnyPlant, w: Sequence[str], z: Sequence[str]) -> None:
     """Raise AssumptionError where white noise reaches z of a continuous plant at once."""
     direct = plant.system[list(z), list(w)].D
     if not plant.dt and np.any(direct):

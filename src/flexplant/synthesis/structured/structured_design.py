@@ -15,7 +15,7 @@ from ...lti.interconnection import lft
 from ...lti.responses import responder
 from ...lti.statespace import StateSpace, System
 from ...parallel import Progress, one_thread
-from ...plant import StandardPlant
+from ...plant import AnyPlant, StandardPlant
 from ...tolerances import SAME
 from ..controller import (
     Controller,
@@ -64,7 +64,7 @@ _NOTHING = np.finfo(float).tiny
 
 @one_thread()
 def design_structured(
-    plant: StandardPlant | System | Sequence[StandardPlant] | Mapping[float, StandardPlant],
+    plant: AnyPlant | System | Sequence[StandardPlant] | Mapping[float, StandardPlant],
     structure: ControllerStructure,
     *,
     objective: LoopObjective | Sequence[LoopObjective] = Hinf(),  # noqa: B008 - a frozen value
@@ -218,7 +218,7 @@ def design_structured(
     return with_left_out(answer, plants[0])
 
 
-def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> list[StandardPlant]:
+def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> list[AnyPlant]:
     """Return the plants, all with the same channels and rate."""
     many = given if isinstance(given, list | tuple) else [given]
     plants = [posed(one, u, y, "structured synthesis") for one in many]
@@ -270,7 +270,7 @@ def _measure_word(objectives: Sequence[LoopObjective]) -> str:
 
 
 def _require_no_feedthrough(
-    family: ControllerFamily, plant: StandardPlant, objectives: Sequence[LoopObjective]
+    family: ControllerFamily, plant: AnyPlant, objectives: Sequence[LoopObjective]
 ) -> None:
     """Raise AssumptionError where white noise of an H2 norm passes through a controller at once."""
     k, g = family.order, plant.system
@@ -288,7 +288,7 @@ def _require_no_feedthrough(
 
 
 def _verified_loop(
-    plant: StandardPlant, loop: StateSpace, objectives: Sequence[LoopObjective], claim: float
+    plant: AnyPlant, loop: StateSpace, objectives: Sequence[LoopObjective], claim: float
 ) -> dict[str, float]:
     """Return what was verified of a closed loop: `norm` is the largest, over its bound."""
     if _measure_word(objectives) == "H-infinity":

@@ -28,7 +28,7 @@ from ...lti.discretisation import bilinear, tustin
 from ...lti.joining import Matrices as LawMatrices
 from ...lti.riccati import control_care, filter_care
 from ...lti.statespace import StateSpace, System
-from ...plant import StandardPlant
+from ...plant import AnyPlant
 from ..hinf.hinf_design import design_hinf
 from ..laws.law import Law, LawElement, SingleElement, chained, decoupled
 from ..laws.loop_design import axes_of, checked_laws
@@ -86,7 +86,7 @@ class ControllerFamily:
 class ControllerStructure(Protocol):
     """What `design_structured` takes: a value that makes itself ready for a plant."""
 
-    def family(self, plant: StandardPlant, prepared: Prepared) -> ControllerFamily:
+    def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
         """Return the structure made ready for a plant."""
 
 
@@ -131,7 +131,7 @@ class FixedOrder(Value):
                 raise ModelError("a pattern is that of a static gain: leave order out, or it.")
             self._set(pattern=real_array(self.pattern, "pattern", (None, None)) != 0)
 
-    def family(self, plant: StandardPlant, prepared: Prepared) -> _Entries:
+    def family(self, plant: AnyPlant, prepared: Prepared) -> _Entries:
         """Return the structure made ready for a plant."""
         nu, ny = len(plant.u), len(plant.y)
         pattern = np.full((nu, ny), self.direct) if self.pattern is None else self.pattern
@@ -249,7 +249,7 @@ class ObserverGains(Value):
     ObserverGains()
     """
 
-    def family(self, plant: StandardPlant, prepared: Prepared) -> ControllerFamily:
+    def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
         """Return the structure made ready for a plant."""
         p, n, root = prepared, prepared.A.shape[0], np.sqrt(prepared.speed)
         first = -control_care(p.A, p.B2, Q=np.eye(n), R=np.eye(len(p.u))).gain
@@ -313,7 +313,7 @@ class Parametrised:
     def __repr__(self) -> str:
         return f"Parametrised({counted(self.start.size, 'parameter')})"
 
-    def family(self, plant: StandardPlant, prepared: Prepared) -> ControllerFamily:
+    def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
         """Return the structure made ready for a plant."""
         unit = np.where(self.start != 0, np.abs(self.start), 1.0)
 
@@ -366,7 +366,7 @@ class TunedLaws(Value):
         super().__post_init__()
         require_known("number of an element", self.free, _NUMBERS)
 
-    def family(self, plant: StandardPlant, prepared: Prepared) -> ControllerFamily:
+    def family(self, plant: AnyPlant, prepared: Prepared) -> ControllerFamily:
         """Return the structure made ready for a plant."""
         axes = axes_of(plant, self.before, self.after, None, 0.0, True)
         laws = checked_laws(axes, self.laws)

@@ -1,0 +1,300 @@
+"""The generalized plant: a machine between weights and blocks, which synthesis takes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ..checks import FloatArray, instance, short
+from ..errors import ModelError, require_known
+from ..labels import Place
+from ..lti.interconnection import append, series
+from ..lti.statespace import StateSpace, System, as_statespace, single_channel
+from .assumptions import AssumptionReport
+from .building import at_rate
+from .evaluation_model import EvaluationModel
+from .moving import PositionMap, position_map
+from .partitioned import PartitionedSystem
+from .rigid_motion import RigidModes
+
+_WEIGHTS = "Pass stage_weights(plant, bandwidth), or z={...} and w={...}."
+#: fields of the machine, which `replace` changes there
+_OF_MACHINE = ("origin", "uncertainty", "evaluation")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GeneralizedPlant(PartitionedSystem):
+    """The plant of a synthesis: ``W_z P W_w`` with y read through a block.
+
+    Made by `StandardPlant.weighted` and `StandardPlant.through`, in any order and number. Its w and
+    z are no physical channels once weights are applied; `unweighted` is the way back to the
+    machine, which holds ports, modes, noise, uncertainty and evaluation model.
+
+    Parameters
+    ----------
+    system, w, u, z, y, asd : as for `StandardPlant`
+    unweighted : StandardPlant
+        The machine, before weights and blocks.
+    steps : sequence
+        What was applied to the machine, in order: a block, or the weights of z and of w.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> heavy = plant.through(fx.reference_errors(plant)).weighted(fx.stage_weights(plant, 20.0))
+    >>> heavy
+    <GeneralizedPlant: 9 states, dt 0.0005 s, delay 1, weighted and read through a block>
+      w (4) amp  y1:noise  y2:noise  die:ref
+      u (1) u1
+      z (3) die:x  die:error  u1:effort
+      y (2) y1:error  y2:error
+    >>> heavy.unweighted is plant
+    True
+    """
+
+    unweighted: Any
+    steps: tuple[Any, ...] = ()
+
+    @property
+    def machine(self) -> Any:
+        """The machine: `unweighted`."""
+        return self.unweighted
+
+    @property
+    def done(self) -> str:
+        """What was done to the machine, in its repr."""
+        return f", {self.alteration}"
+
+    @property
+    def scaled(self) -> bool:
+        """Whether weights were applied, so that w and z are no physical channels."""
+        return not all(isinstance(step, StateSpace) for step in self.steps)
+
+    @property
+    def reading(self) -> StateSpace | None:
+        """The block from the measurements of the machine to y; None where y are these."""
+        return self._reading
+
+    @cached_property
+    def _reading(self) -> StateSpace | None:
+        found: StateSpace | None = None
+        for block in self.steps:
+            if isinstance(block, StateSpace):
+                own = block if block.n_states else block.replace(dt=self.dt)
+                before = found and found.select(outputs=own.inputs)
+                found = own if before is None else series(before, own)
+        return found
+
+    @property
+    def alteration(self) -> str:
+        """What was done to the machine, in words."""
+        done = ["weighted"] if self.scaled else []
+        done += ["read through a block"] if self.reading is not None else []
+        return " and ".join(done)
+
+    @property
+    def reading_gain(self) -> FloatArray:
+        """The gain (ny, ny of the machine) of the static block that it is read through.
+
+        ModelError when the block has dynamics.
+        """
+        machine, reading = self.unweighted, self.reading
+        if reading is None:
+            return np.eye(len(machine.y))
+        if reading.n_states:
+            raise ModelError(
+                f"the block that the plant is read through has {reading.n_states} states, so that "
+                "noise of its outputs is not white. Give the dynamics to the sensors, "
+                "Sensor(dynamics=...), or use plant.unweighted."
+            )
+        gain = np.zeros((len(self.y), len(machine.y)))
+        gain[:, [machine.y.index(name) for name in reading.inputs]] = reading.D
+        return gain
+
+    @property
+    def noise_factor(self) -> FloatArray:
+        """G (n, r), G G' the covariance that white disturbances add to x in one sample.
+
+        That of the machine where it is read through a static block alone; else ModelError.
+        """
+        if self.scaled:
+            raise ModelError(
+                "the plant is weighted: its w are no physical noise, so that the process noise of "
+                "each sample is not known. Use plant.unweighted."
+            )
+        _ = self.reading_gain  # static: the states are those of the machine
+        found: FloatArray = self.unweighted.noise_factor
+        return found
+
+    @property
+    def uncertainty(self) -> Any:
+        """What is not known of the machine."""
+        return self.unweighted.uncertainty
+
+    @property
+    def evaluation(self) -> EvaluationModel | None:
+        """The evaluation model of the machine."""
+        found: EvaluationModel | None = self.unweighted.evaluation
+        return found
+
+    @cached_property
+    def evaluation_plant(self) -> GeneralizedPlant | None:
+        """The evaluation model of the machine with the same weights and blocks, or None."""
+        whole = self.unweighted.evaluation_plant
+        return None if whole is None else self.around(whole)
+
+    @property
+    def rigid_motions(self) -> RigidModes:
+        """The rigid-body motions of the machine, as `StandardPlant.rigid_motions`."""
+        found: RigidModes = self.unweighted.rigid_motions
+        return found
+
+    def around(self, machine: Any) -> GeneralizedPlant:
+        """Return the same weights and blocks around another machine with the same channels."""
+        found = machine
+        for step in self.steps:  # in their order
+            if isinstance(step, StateSpace):
+                found = measured_through(found, at_rate(step, "y", machine.dt))
+            else:
+                found = weighted(found, *map(dict, step))
+        return found  # type: ignore[no-any-return]
+
+    def _all_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
+        """Return changes of fields; those of the machine are changed there."""
+        own = {name: value for name, value in changes.items() if name in _OF_MACHINE}
+        rest = {name: value for name, value in changes.items() if name not in _OF_MACHINE}
+        return rest | ({"unweighted": self.unweighted.replace(**own)} if own else {})
+
+    def weighted(
+        self,
+        weights: Any = None,
+        *,
+        z: Mapping[str, Any] | None = None,
+        w: Mapping[str, Any] | None = None,
+    ) -> GeneralizedPlant:
+        """Return the plant with more weights, as `StandardPlant.weighted`."""
+        return weighted(self, *both_weights(weights, z, w))
+
+    def through(self, block: System) -> GeneralizedPlant:
+        """Return the plant whose y are the outputs of a block, as `StandardPlant.through`."""
+        return measured_through(self, as_statespace(block))
+
+    def discretized(self, rate: float, *, delay: float = 0.0) -> GeneralizedPlant:
+        """Return the weights and blocks around the machine sampled at a rate (Tustin).
+
+        Parameters are those of `StandardPlant.discretized`. ModelError when a weight or a block is
+        sampled already at another rate.
+        """
+        return self.around(self.unweighted.discretized(rate, delay=delay))
+
+    def at(
+        self, poi: Place | Mapping[str, Place] | None = None, **positions: float
+    ) -> GeneralizedPlant:
+        """Return the weights and blocks around the machine at a place, as `StandardPlant.at`."""
+        return self.around(self.unweighted.at(poi, **positions))
+
+    def uncertain(
+        self, *given: Any, frequency: Any = None, damping: Any = None
+    ) -> GeneralizedPlant:
+        """Return the weights and blocks around the machine with what is not known of it.
+
+        Parameters are those of `StandardPlant.uncertain`.
+        """
+        known = self.unweighted.uncertain(*given, frequency=frequency, damping=damping)
+        return self.around(known.nominal)
+
+    def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
+        """Return what the position does, as `StandardPlant.map`."""
+        return position_map(self, judge, points)
+
+    def to_control(self) -> Any:
+        """Return the whole system as a `control.StateSpace` with the same names."""
+        return self.system.to_control()
+
+    def check(self) -> AssumptionReport:
+        """Return which standard assumptions hold, as `StandardPlant.check`."""
+        return self._report
+
+    @cached_property
+    def _report(self) -> AssumptionReport:
+        return AssumptionReport(self)
+
+
+def both_weights(
+    weights: Any, z: Mapping[str, Any] | None, w: Mapping[str, Any] | None
+) -> tuple[Mapping[str, Any] | None, Mapping[str, Any] | None]:
+    """Return the weights of z and of w; those that are given replace those of a set."""
+    if weights is None:
+        return z, w
+    if not isinstance(getattr(weights, "z", None), Mapping):
+        raise ModelError(f"weights must be StageWeights, got {short(weights)}. {_WEIGHTS}")
+    return {**weights.z, **(z or {})}, {**weights.w, **(w or {})}
+
+
+def weighted(plant: PartitionedSystem, z: Any, w: Any) -> GeneralizedPlant:
+    """Return ``W_z P W_w``; a weight None drops its channel."""
+    z, w = _mapping(z, "z"), _mapping(w, "w")
+    for side, weights in (("z", z), ("w", w)):
+        require_known(f"channel of {side}", weights, getattr(plant, side))
+    keep_z = [name for name in plant.z if name not in z or z[name] is not None]
+    keep_w = [name for name in plant.w if name not in w or w[name] is not None]
+    if not keep_z or not keep_w:
+        raise ModelError("all of z or w was left out: keep at least one channel of each.")
+    inner = plant.system.select([*keep_z, *plant.y], [*keep_w, *plant.u])
+    before, after = (
+        append(
+            *(_weight(plant, side.get(name, 1.0), name) for name in kept), _identity(plant, rest)
+        )
+        for side, kept, rest in ((w, keep_w, plant.u), (z, keep_z, plant.y))
+    )
+    system = series(series(before, inner), after)
+    step = tuple(z.items()), tuple(w.items())
+    return GeneralizedPlant(
+        system.replace(name=plant.system.name), tuple(keep_w), plant.u, tuple(keep_z), plant.y, {},
+        plant.machine, (*_steps(plant), step),
+    )  # fmt: skip
+
+
+def _steps(plant: PartitionedSystem) -> tuple[Any, ...]:
+    """Return what was applied to the machine of a plant."""
+    return plant.steps if isinstance(plant, GeneralizedPlant) else ()
+
+
+def _mapping(weights: Any, side: str) -> dict[str, Any]:
+    if weights is None:
+        return {}
+    instance(
+        weights, Mapping, f"weights of {side}", "{'die:error': lti.inverse_sensitivity(30.0)}, say."
+    )
+    return {
+        name: None if weight is None else as_statespace(weight) for name, weight in weights.items()
+    }
+
+
+def measured_through(plant: PartitionedSystem, block: StateSpace) -> GeneralizedPlant:
+    """Return the plant with y read through a block."""
+    require_known("channel of y", block.inputs, plant.y)
+    inner = plant.system.select([*plant.z, *block.inputs])
+    after = append(
+        _identity(plant, plant.z), block if block.n_states else block.replace(dt=plant.dt)
+    )
+    return GeneralizedPlant(
+        series(inner, after).replace(name=plant.system.name), plant.w, plant.u, plant.z,
+        tuple(block.outputs), plant.asd, plant.machine, (*_steps(plant), block),
+    )  # fmt: skip
+
+
+def _weight(plant: PartitionedSystem, weight: Any, name: str) -> StateSpace:
+    sys = at_rate(single_channel(weight, f"the weight of {name!r}"), name, plant.dt)
+    states = [f"{name}|{state}" for state in sys.states]
+    return sys.replace(inputs=[name], outputs=[name], states=states)
+
+
+def _identity(plant: PartitionedSystem, names: tuple[str, ...]) -> StateSpace:
+    gain = as_statespace(np.eye(len(names)))
+    return gain.replace(dt=plant.dt, inputs=names, outputs=names)

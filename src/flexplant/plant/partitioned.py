@@ -1,0 +1,308 @@
+"""A system partitioned into w, u, z and y, as a machine and a generalized plant are."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from ..checks import FloatArray, IntArray, Value, positive, short
+from ..errors import (
+    AssumptionError,
+    FlexplantError,
+    LabelError,
+    ModelError,
+    counted,
+    require_known,
+    some_names,
+    unknown_label,
+)
+from ..lti.statespace import StateSpace
+from ..structure import FEModel
+from .evaluation_model import NOT_JUDGED
+from .origins import Assembled
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PartitionedSystem(Value):
+    """A system ``[w; u] -> [z; y]`` by the names of its channels.
+
+    Parameters
+    ----------
+    system : StateSpace
+    w, u, z, y : sequences of str
+    asd : mapping {str: float}
+        One-sided amplitude spectral density of the w channels that are white noise.
+    """
+
+    system: StateSpace
+    w: tuple[str, ...]
+    u: tuple[str, ...]
+    z: tuple[str, ...]
+    y: tuple[str, ...]
+    asd: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        for side in "wuzy":
+            self._set(**{side: tuple(getattr(self, side))})
+        if (*self.w, *self.u) != tuple(self.system.inputs):
+            raise LabelError(f"inputs {self.system.inputs} are not [w; u] = {self.w + self.u}.")
+        if (*self.z, *self.y) != tuple(self.system.outputs):
+            raise LabelError(f"outputs {self.system.outputs} are not [z; y] = {self.z + self.y}.")
+        if both := [name for name in self.u if name in self.y]:
+            raise LabelError(
+                f"{short(both)} are names in u and in y: loops, filters and controllers connect "
+                "channels by name, and would take a command for a measurement. Rename the "
+                "actuators or the sensors."
+            )
+        require_known("w channel with an asd", self.asd, self.w)
+        asd = {name: positive(a, f"asd of {name!r}", zero=True) for name, a in self.asd.items()}
+        self._set(asd=asd)
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed, checked like a new one.
+
+        The noise of each sample follows `asd`, and so do plants that are made of this one: at
+        other places, of other modes, with other ports that have the same densities as its own.
+        """
+        return super().replace(**self._all_changes(changes))
+
+    def _all_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
+        """Return changes of fields with what follows from them."""
+        return changes
+
+    @property
+    @abstractmethod
+    def machine(self) -> Any:
+        """The machine: the plant itself, or what it was before weights and blocks."""
+
+    @property
+    def has_own_modes(self) -> bool:
+        """Whether its states have modes, each with its own frequency and damping."""
+        return False
+
+    @property
+    def reading(self) -> StateSpace | None:
+        """The block from the measurements of the machine to y; None where y are these."""
+        return None
+
+    @property
+    def done(self) -> str:
+        """What was done to the machine, in its repr."""
+        return ""
+
+    @property
+    def noise_factor(self) -> FloatArray:
+        """G (n, r), G G' the covariance that white disturbances add to x in one sample."""
+        raise NotImplementedError
+
+    @property
+    def reading_gain(self) -> FloatArray:
+        """The gain (ny, ny of the machine) from the machine's measurements to y."""
+        raise NotImplementedError
+
+    @property
+    def delay(self) -> float:
+        """Delay of the inputs u [samples]."""
+        found: float = self.machine.origin.delay
+        return found
+
+    def __repr__(self) -> str:
+        time = f"dt {self.dt:g} s, delay {self.delay:g}" if self.dt else "continuous"
+        named = f" {self.system.name!r}" if self.system.name else ""
+        states = counted(self.system.n_states, "state")
+        lines = [f"<{type(self).__name__}{named}: {states}, {time}{self.done}>"]
+        for side in "wuzy":
+            names = getattr(self, side)
+            shown = "  ".join(names[:8]) + ("  ..." if len(names) > 8 else "")
+            lines.append(f"  {side} ({len(names)}) {shown}")
+        latencies = self.assembled.ports.latencies if self.is_assembled else {}
+        if latencies and not self.dt:
+            shown = ", ".join(f"{name} {late:g} s" for name, late in latencies.items())
+            lines.append(f"  latencies that act once it is sampled: {shown}")
+        if self.is_assembled and self.assembled.ports.positions:
+            lines.append(f"  at {self.assembled.ports.standing}")
+        if self.form.startswith("dense"):
+            lines.append(f"  {self.form}")
+        if self.machine.evaluation is not None:
+            lines.append(f"  evaluation model: {self.machine.evaluation.text}")
+        if self.unstable_modes:
+            lines.append(f"  unstable rigid-body pairs: {self.unstable_text}")
+        return "\n".join(lines)
+
+    @property
+    def is_assembled(self) -> bool:
+        """Whether it, or the machine of a generalized plant, was assembled from a structure."""
+        return isinstance(self.machine.origin, Assembled)
+
+    @property
+    def assembled(self) -> Assembled:
+        """What it was assembled from: ports, realisation, noise, delay, the plant before sampling.
+
+        For a `GeneralizedPlant`, what its machine was assembled from. ModelError when it was made
+        elsewhere.
+        """
+        found = self.machine.origin
+        if not isinstance(found, Assembled):
+            raise ModelError(
+                "this plant was not assembled from a structure: its ports, modes and process noise "
+                "are not known. Make it by assemble_plant(model, ports)."
+            )
+        return found
+
+    @property
+    def unjudged(self) -> str:
+        """What answers on this plant say where it has no evaluation model; else empty.
+
+        A plant that was assembled from a full FEModel lacks no modes and has no larger model.
+        """
+        complete = isinstance(self.model, FEModel)
+        return "" if complete or self.machine.evaluation is not None else NOT_JUDGED
+
+    @property
+    def dt(self) -> float:
+        """Sampling time [s]; 0 when continuous."""
+        return self.system.dt
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The units of the channels, and of what its ports derive: estimates, too."""
+        derived = self.assembled.ports.units if self.is_assembled else {}
+        return derived | dict(self.system.units)
+
+    @property
+    def n_rigid(self) -> int:
+        """Number of rigid-body modes."""
+        return self.assembled.realisation.n_rigid if self.is_assembled else 0
+
+    @property
+    def form(self) -> str:
+        """`modal blocks`, `dense: ` and why modes are coupled, or `as given` without a structure.
+
+        Weights and filters of the ports add blocks of their own.
+        """
+        return self.assembled.realisation.form if self.is_assembled else "as given"
+
+    @property
+    def model(self) -> Any:
+        """The structural model that the plant was assembled from, or None."""
+        return self.assembled.realisation.model if self.is_assembled else None
+
+    @property
+    def modal_blocks(self) -> FloatArray:
+        """The (b, 2, 2) blocks of the structure's modes [rad/s], before sampling; none without."""
+        return self.assembled.realisation.pairs if self.is_assembled else np.zeros((0, 2, 2))
+
+    @property
+    def unstable_modes(self) -> dict[int, str]:
+        """Modes (counted from 1) that negative stiffness makes unstable, with their two poles."""
+        found = {}
+        for i in np.flatnonzero(np.linalg.det(self.modal_blocks) < 0).tolist():
+            low, high = np.sort(np.linalg.eigvals(self.modal_blocks[i]).real)
+            found[i + 1] = f"mode {i + 1} ({high:+.4g} and {low:+.4g} 1/s)"
+        return found
+
+    @property
+    def unstable_text(self) -> str:
+        """The first three of these modes in words, and how many more there are."""
+        listed = list(self.unstable_modes.values())
+        more = f" and {len(listed) - 3} more" if len(listed) > 3 else ""
+        return ", ".join(listed[:3]) + more
+
+    @property
+    def modal_states(self) -> IntArray:
+        """Where the states of the structure's modes are; sensors' filters stand before them.
+
+        ModelError when the plant was not assembled from a structure, or has other states now.
+        """
+        names = self.assembled.realisation.names
+        if names[0] not in self.system.states:
+            raise ModelError(f"the plant has lost the states of its modes ({names[0]!r}, ...).")
+        first = self.system.states.index(names[0])
+        return np.arange(first, first + len(names), dtype=np.int64)
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Disturbances whose noise is held over each sample: the last columns of `noise_factor`."""
+        ports = self.assembled.ports.w if self.is_assembled else ()
+        return tuple(p.name for p in ports if getattr(p, "held", False) and p.asd > 0)
+
+    @property
+    def noise_direct(self) -> FloatArray:
+        """H (ny, r): what the noises of `noise_factor` add to y in the same sample."""
+        found = np.zeros((len(self.y), self.noise_factor.shape[1]))
+        if held := self.held:
+            sizes = np.array([self.asd.get(name, 0.0) for name in held]) * np.sqrt(0.5 / self.dt)
+            columns = [self.w.index(name) for name in held]
+            found[:, -len(held) :] = self.D21[:, columns] * sizes
+        return found
+
+    @property
+    def process_noise(self) -> FloatArray:
+        """Covariance (n, n) that white disturbances add to x in one sample."""
+        return self.noise_factor @ self.noise_factor.T
+
+    @property
+    def sensor_noise(self) -> FloatArray:
+        """Covariance (ny, ny) of a sample of y: asd^2 rate / 2 for each sensor.
+
+        Through a static block T, ``T R T'``.
+        """
+        return self.sensor_noise_factor @ self.sensor_noise_factor.T
+
+    @property
+    def sensor_noise_factor(self) -> FloatArray:
+        """F (ny, sensors), F F' the covariance of a sample of y."""
+        require_sampled(self, "sensors have a noise of each sample", ModelError)
+        asd = [self.asd.get(f"{name}:noise", 0.0) for name in self.machine.y]
+        return np.asarray(self.reading_gain * (np.array(asd) * np.sqrt(0.5 / self.dt)))
+
+    def channel(self, name: str, side: str = "z") -> str:
+        """Return the channel of `side` that a name means: `die` or `die:hat` mean `die:z`.
+
+        LabelError when it means none.
+        """
+        names: tuple[str, ...] = getattr(self, side)
+        if not isinstance(name, str) or name in names:
+            require_known("channel", [name], names)
+            return name
+        for poi in self.assembled.ports.z if self.is_assembled else ():
+            for axis in poi.axes:
+                aliases = (poi.derived(axis, "hat"), poi.derived(axis, "error"))
+                if name in aliases or (name == poi.name and axis == poi.axes[0]):
+                    return poi.channel(axis)
+        raise unknown_label(f"channel of {side}", name, names)
+
+    B1 = property(lambda self: self.Gzw.B, doc="w to dx/dt.")
+    B2 = property(lambda self: self.Gzu.B, doc="u to dx/dt.")
+    C1 = property(lambda self: self.Gzw.C, doc="x to z.")
+    C2 = property(lambda self: self.Gyw.C, doc="x to y.")
+    D11 = property(lambda self: self.Gzw.D, doc="w to z.")
+    D12 = property(lambda self: self.Gzu.D, doc="u to z.")
+    D21 = property(lambda self: self.Gyw.D, doc="w to y.")
+    D22 = property(lambda self: self.Gyu.D, doc="u to y.")
+
+    Gzw = property(lambda self: self.system.select(self.z, self.w), doc="The system w -> z.")
+    Gzu = property(lambda self: self.system.select(self.z, self.u), doc="The system u -> z.")
+    Gyw = property(lambda self: self.system.select(self.y, self.w), doc="The system w -> y.")
+    Gyu = property(lambda self: self.system.select(self.y, self.u), doc="The system u -> y.")
+
+
+def require_sampled(
+    plant: PartitionedSystem, why: str, error: type[FlexplantError] = AssumptionError
+) -> None:
+    """Refuse a continuous plant."""
+    if not plant.dt:
+        raise error(f"the plant is continuous: {why}. Use plant.discretized(rate, delay=1).")
+
+
+def require_noise(sizes: Mapping[str, float]) -> None:
+    """Refuse sensors whose noise has no size."""
+    if silent := [name for name, size in sizes.items() if not size > 0]:
+        raise AssumptionError(
+            f"sensors {some_names(silent)} have no noise (asd 0): filters would trust them without "
+            "limit and differentiate them. Give Sensor(..., asd=) what the data sheet says."
+        )
