@@ -1,7 +1,8 @@
 """Readers and writers of foreign formats; for our own values use `.save` and `flexplant.load`.
 
 - `read_model(K, mass=, dofs=, units=)`: matrices, nodes and DOFs of a finite-element program.
-- `read_matrices`: matrices without DOFs; `read_modes`: modes of a solved model.
+- `read_matrices`: matrices without DOFs, which have `frequencies(10)`; `read_modes`: modes of a
+  solved model.
 - `read_frf_uff`, `read_frf_csv`: measured responses; `read_records`: time records for
   `estimate_frf`.
 - `read_mat`, `write_mat`: values to and from MATLAB.

@@ -127,6 +127,7 @@ def solve_modes(
         raise ModelError(
             f"solve_modes needs an FEModel, got {type(model).__name__}."
             + (" A reduced model has .modes()." if hasattr(model, "modes") else "")
+            + (" Matrices alone have .frequencies()." if hasattr(model, "frequencies") else "")
         )
     if damping is not None:
         instance(damping, Damping, "damping", "Pass ModalDamping(0.01) for 1 %.")

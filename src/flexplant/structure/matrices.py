@@ -10,13 +10,24 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..checks import IntArray, Value, flag, instance, name_list, one_of, real_array, whole
+from ..checks import (
+    FloatArray,
+    IntArray,
+    Value,
+    flag,
+    instance,
+    name_list,
+    one_of,
+    real_array,
+    whole,
+)
 from ..dof_columns import at_nodes, node_numbers
 from ..errors import LabelError, ModelError, ShapeError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
 from ..tolerances import TYPED
-from .definite import SEMIDEFINITE, are_swapped, square
+from .definite import SEMIDEFINITE, are_swapped, square, symmetric_matrix
+from .frequencies import MOST, natural_frequencies
 from .model import FEModel
 from .singular_mass import empty_rows, held_rows, inertial
 from .units import units
@@ -278,6 +289,36 @@ class FEMatrices(Value):
             turned[name] = 0.5 * (full + full.T)
         return self.replace(**turned)
 
+    def frequencies(self, count: int = 10) -> FloatArray:
+        """Return the lowest natural frequencies (k,) [Hz], motions without energy at exactly 0.
+
+        Neither names nor places of the rows are needed, which `model` and `solve_modes` require.
+
+        Parameters
+        ----------
+        count : int
+            Number of frequencies, those at zero included; 60 at most, and fewer where the matrices
+            have no more.
+
+        Raises
+        ------
+        ModelError
+            When M is missing, a matrix is not symmetric, or K has motions of negative energy.
+        SolverError
+            When residuals, or a Sturm count of the frequencies below, do not confirm the answer.
+
+        Examples
+        --------
+        >>> FEMatrices([[5, -5], [-5, 5]], [[1, 0], [0, 2]]).frequencies().round(4)
+        array([0.    , 0.4359])
+        """
+        number = whole(count, "count", minimum=1, maximum=MOST)
+        if self.M is None:
+            raise ModelError("there is no M, hence no frequency. Read the mass matrix too: mass=.")
+        K, M = (symmetric_matrix(A, name, self.n_dof) for name, A in (("K", self.K), ("M", self.M)))
+        written = 0.0 if self.digits is None else 10.0**-self.digits
+        return natural_frequencies(K, M, number, rounding=written)
+
     def model(
         self, *, massless: str = "refuse", free: bool = False, name: str | None = None
     ) -> FEModel:
@@ -313,7 +354,7 @@ class FEMatrices(Value):
             raise ModelError(
                 f"it is not known what the {self.n_dof} rows stand for: nodes, directions, "
                 "coordinates. with_dofs(DofSet(nodes, directions, xyz)) gives it, or dofs= of "
-                "read_model."
+                "read_model. Frequencies need none of it: frequencies(10) of these matrices."
             )
         if are_swapped(self.K, self.M, self.dofs):
             raise ModelError(

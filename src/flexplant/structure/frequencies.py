@@ -1,0 +1,56 @@
+"""Natural frequencies of matrices alone: neither names nor places of their rows are needed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..checks import FloatArray
+from ..errors import ModelError, SolverError
+from ..sparse.lowest import lowest_modes, multifrontal_inertia
+from ..tolerances import TINY
+
+#: frequencies beyond those asked for, among which a gap to count in is looked for
+_EXTRA = 4
+#: frequencies that are given at most: inverse iteration keeps all shapes at once
+MOST = 60
+#: residual of a shape relative to the largest forces in it
+_RESIDUAL = 1e-8
+
+
+def natural_frequencies(K: Any, M: Any, count: int, *, rounding: float) -> FloatArray:
+    """Return the lowest frequencies [Hz], zero for motions without energy."""
+    n = K.shape[0]
+    found = lowest_modes(K, M, min(count + _EXTRA, n), rounding=rounding)
+    values, shapes = found.values, found.shapes
+    order = np.argsort(np.where(np.arange(values.size) < found.n_zero, -np.inf, values))
+    values, shapes = values[order], shapes[:, order]
+    if found.negative is not None or np.any(values[found.n_zero :] <= 0):
+        raise ModelError(
+            "K has motions of negative energy: no stiffness of a structure. check(matrices) names "
+            "them."
+        )
+    values[: found.n_zero] = 0.0
+    force, size = K @ shapes - (M @ shapes) * values, abs(K) @ np.abs(shapes)
+    off = np.linalg.norm(force, axis=0) / (np.linalg.norm(size, axis=0) + TINY)
+    if off.max(initial=0.0) > max(_RESIDUAL, rounding):
+        raise SolverError(
+            f"a shape leaves {off.max():.1g} of its forces: the frequencies are not accurate. "
+            "Scale the matrices, or give the DOFs and solve_modes."
+        )
+    kept = min(count, values.size)
+    if values.size < np.count_nonzero(M.diagonal()) and values.size > found.n_zero + 1:
+        # by Sylvester's law, in the widest gap
+        first = max(found.n_zero, min(kept, values.size - 1))
+        ratios = values[first:] / np.maximum(values[first - 1 : -1], TINY)
+        at = first + int(np.argmax(ratios))
+        shift = 0.5 * (values[at - 1] + values[at])
+        below = multifrontal_inertia(sp.csc_array(K - shift * M))
+        if below != at:
+            raise SolverError(
+                f"a Sturm count finds {below} frequencies below {np.sqrt(shift) / 2 / np.pi:.6g} "
+                f"Hz, {at} were found. Ask for some more or fewer."
+            )
+    return np.asarray(np.sqrt(values[:kept]) / (2 * np.pi))
