@@ -27,8 +27,8 @@ from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
 from ..tolerances import TYPED
 from .definite import SEMIDEFINITE, are_swapped, square, symmetric_matrix
-from .frequencies import MOST, natural_frequencies
 from .model import FEModel
+from .natural_frequencies import MOST, natural_frequencies
 from .singular_mass import empty_rows, held_rows, inertial
 from .units import units
 from .zero_energy import digits_of, endangered, freed, held_by_rounding, shown_digits
