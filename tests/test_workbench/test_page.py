@@ -417,6 +417,59 @@ def test_files_that_hold_a_plant(frf, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_the_command_takes_what_its_refusals_ask_for(frf, tmp_path, capsys, monkeypatch):
+    """A file of several quantities, and one in an unknown unit; advice as it is typed."""
+    pyuff = pytest.importorskip("pyuff")
+    from flexplant.workbench import __main__ as command
+
+    def written(name, kinds, label):
+        path = tmp_path / name
+        for node, kind in enumerate(kinds, 1):
+            record = {
+                "type": 58, "func_type": 4, "rsp_node": node, "rsp_dir": 3, "ref_node": 1,
+                "ref_dir": 3, "data": frf.data[0, 0], "x": frf.freq, "abscissa_spacing": 1,
+                "abscissa_inc": 0.25, "abscissa_min": 0.25, "abscissa_spec_data_type": 18,
+                "ordinate_spec_data_type": kind, "ordinate_axis_units_lab": label,
+                "orddenom_spec_data_type": 13, "orddenom_axis_units_lab": "N",
+            }  # fmt: skip
+            pyuff.UFF(str(path)).write_sets(record, mode="add" if node > 1 else "overwrite")
+        return str(path)
+
+    opened = []
+    monkeypatch.setattr(command, "workbench", lambda plants, **_: opened.append(plants) or exit(0))
+    mixed = written("mixed.uff", (12, 8), "NONE")
+    assert command.main([mixed, "--continuous"]) == 1
+    said = capsys.readouterr().err
+    assert "--quantity acceleration" in said
+    assert "quantity='" not in said
+    with pytest.raises(SystemExit):
+        command.main([mixed, "--continuous", "--quantity", "displacement"])
+    plant = opened[-1][mixed]
+    assert plant.quantity == "displacement"
+    np.testing.assert_allclose(plant.data[1, 0], frf.data[0, 0], rtol=1e-5)
+    factor = (2j * np.pi * frf.freq) ** -2.0
+    np.testing.assert_allclose(plant.data[0, 0], frf.data[0, 0] * factor, rtol=1e-5)
+    line = open_file(mixed, quantity="velocity")[2]
+    again = {"fx": fx}
+    exec(line, again)
+    assert again["plant"].quantity == "velocity"
+    strange = written("strange.uff", (8,), "EU")
+    assert command.main([strange, "--continuous"]) == 1
+    said = capsys.readouterr().err
+    assert "--scale 9.80665 where they are g/N, --scale 1 where they are SI." in said
+    with pytest.raises(SystemExit):
+        command.main([strange, "--continuous", "--scale", "3.0"])
+    np.testing.assert_allclose(opened[-1][strange].data[0, 0], 3 * frf.data[0, 0], rtol=1e-5)
+    # of other files the response is converted
+    frf.replace(quantity="displacement").save(tmp_path / "a.npz")
+    plant, _, line = open_file(tmp_path / "a.npz", quantity="acceleration")
+    np.testing.assert_allclose(plant.data[0, 0], frf.data[0, 0] / factor, rtol=1e-9)
+    assert line.endswith(".converted('acceleration')")
+    with pytest.raises(fx.FlexplantError, match="takes no scale"):
+        open_file(tmp_path / "a.npz", scale=2.0)
+
+
+@pytest.mark.slow
 def test_a_notebook_shows_the_page_in_its_cell(frf, monkeypatch):
     bench = fx.workbench(frf, **SAMPLED, open_browser=False)
     import panel as pn

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from typing import Any
 
 from ..errors import FlexplantError
-from ..lti.frequency import Frf
+from ..lti.frequency import ORDERS, Frf
 from .launch import open_file, workbench
 
 
@@ -20,6 +21,10 @@ def main(words: list[str] | None = None) -> int:
         "files", nargs="+", metavar="FILE",
         help="measured responses or plants (several: a fleet), and a saved design to go on with",
     )  # fmt: skip
+    parser.add_argument(
+        "--quantity", choices=tuple(ORDERS), help="what measured outputs shall be, converted"
+    )
+    parser.add_argument("--scale", type=float, help="what brings a measurement to SI")
     parser.add_argument("--model", help="a saved StandardPlant beside a measurement")
     parser.add_argument("--rate", type=float, help="of the controller [Hz]; of a measurement")
     parser.add_argument("--continuous", action="store_true", help="no rate, so no C: to look only")
@@ -32,7 +37,8 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--no-browser", action="store_true", help="serve, but open no browser")
     given = parser.parse_args(words)
     try:
-        found = [open_file(path) for path in given.files]
+        options = {"quantity": given.quantity, "scale": given.scale}
+        found = [open_file(path, **options) for path in given.files]
         read = zip(given.files, found, strict=True)
         plants: dict[str, Any] = {path: one[0] for path, one in read if one[0] is not None}
         designs = [design for _, design, _ in found if design is not None]
@@ -55,7 +61,7 @@ def main(words: list[str] | None = None) -> int:
         )  # fmt: skip
         bench.serve(given.port)
     except (FlexplantError, OSError) as problem:
-        sys.stderr.write(f"{problem}\n")
+        sys.stderr.write(f"{_as_typed(str(problem))}\n")
         return 1
     try:
         sys.stdout.write(f"flexplant workbench at {bench.url}, Ctrl-C ends it\n")
@@ -68,6 +74,12 @@ def main(words: list[str] | None = None) -> int:
     except KeyboardInterrupt:  # before it waits
         bench.close()
     return 0
+
+
+def _as_typed(text: str) -> str:
+    """Return advice with the options as they are typed here: --quantity acceleration."""
+    names = "quantity|scale|rate|delay|rigid|model|port"
+    return re.sub(rf"\b({names})=('?)(\.\.\.|[^\s',;]*[^\s',;.])\2", r"--\1 \3", text)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -275,7 +276,9 @@ def workbench(
     return bench
 
 
-def open_file(path: str | Path) -> tuple[Any, LoopDesign | None, str]:
+def open_file(
+    path: str | Path, *, quantity: str | None = None, scale: float | None = None
+) -> tuple[Any, LoopDesign | None, str]:
     """Return the plant of a file, or the design, and the line of Python that reads it.
 
     Parameters
@@ -283,11 +286,17 @@ def open_file(path: str | Path) -> tuple[Any, LoopDesign | None, str]:
     path : str or Path
         An Frf in a universal, CSV, MATLAB or NumPy file; what `.save` of a plant, a response or a
         LoopDesign wrote.
+    quantity : {"displacement", "velocity", "acceleration"}, optional
+        What the outputs of a measurement shall be; as for `flexplant.io.read_frf_uff`.
+    scale : float, optional
+        Factor that brings the numbers of a universal file to SI, where its units are not clear.
 
     Raises
     ------
     FlexplantError
         When it holds none of these.
+    ModelError
+        When `quantity` or `scale` is given for what is no measurement.
     FileNotFoundError
         When there is no such file.
 
@@ -304,7 +313,11 @@ def open_file(path: str | Path) -> tuple[Any, LoopDesign | None, str]:
     file = Path(path)
     if not file.exists():
         raise FileNotFoundError(f"there is no file {str(file)!r}.")
-    universal: dict[str, Callable[[Path], Any]] = {"io.read_frf_uff": read_frf_uff}
+    options: dict[str, Any] = {"quantity": quantity, "scale": scale}
+    given = {name: value for name, value in options.items() if value is not None}
+    said = "".join(f", {name}={value!r}" for name, value in given.items())
+    reader = partial(read_frf_uff, **given)
+    universal: dict[str, Callable[[Path], Any]] = {"io.read_frf_uff": reader}
     readers: dict[str, dict[str, Callable[[Path], Any]]] = {
         ".uff": universal, ".unv": universal, ".uf": universal,
         ".csv": {"io.read_frf_csv": read_frf_csv},
@@ -318,7 +331,8 @@ def open_file(path: str | Path) -> tuple[Any, LoopDesign | None, str]:
     problems = []
     for name, read in readers[file.suffix.lower()].items():
         try:
-            value, line = read(file), f"plant = fx.{name}({str(file)!r})"
+            value = read(file)
+            line = f"plant = fx.{name}({str(file)!r}{said if read is reader else ''})"
             break
         except FlexplantError as problem:
             problems.append(problem)
@@ -331,4 +345,11 @@ def open_file(path: str | Path) -> tuple[Any, LoopDesign | None, str]:
             f"{str(file)!r} holds a {type(value).__name__}: the workbench opens a measured Frf, a "
             "StandardPlant, a StateSpace or a LoopDesign."
         )
+    if given and read is not reader:
+        if scale is not None or quantity is None or not isinstance(value, Frf):
+            raise ModelError(
+                f"{str(file)!r} is no universal file: it takes no scale, and as a plant no "
+                "quantity. Leave them out."
+            )
+        value, line = value.converted(quantity), f"{line}.converted({quantity!r})"
     return value, None, line
