@@ -18,7 +18,7 @@ from ..errors import ModelError
 from ..modes.matching import assigned, clusters, in_span, mac_matrix
 from ..sparse.symmetric import dense, orthonormalised
 from ..structure.definite import elastic_modes, refuse_unstable
-from ..tolerances import RANK, SAME
+from ..tolerances import RANK, SAME, TINY
 from .parameters import Parameter
 
 #: modes whose eigenvalues differ by less than this, relatively, count as exactly repeated
@@ -109,6 +109,7 @@ class Family:
         part.owner = [chosen.index(self.owner[j]) for j in terms]
         part.physical = [stack[terms] for stack in self.physical]
         part.terms = [stack[terms] for stack in self.terms]
+        part.__dict__.pop("_holds", None)
         part._derive(np.zeros(len(chosen)))
         return part
 
@@ -120,6 +121,7 @@ class Family:
         part.M, part.D, part.K = (B.T @ whole @ B for whole in (self.M, self.D, self.K))
         part.terms = [congruence(stack, B) for stack in self.terms]
         part._unchanged, part._weight = [], None
+        part.__dict__.pop("_holds", None)
         part._derive(np.zeros(len(part.parameters)))
         return part
 
@@ -161,8 +163,9 @@ class Family:
         """Return the rigid-body modes (r, r') that no spring to the ground holds at `p`."""
         r = self.n_rigid
         sizes = self._curves(p)[0]
-        acting = self.terms[2][sizes != 0]
-        active = [part @ self.rigid / np.abs(part).max() for part in acting if part.any()]
+        active = [
+            part for part, size in zip(self._holds, sizes, strict=True) if size and part.any()
+        ]
         if not r or not active:
             return np.eye(r)
         _, sizes, right = la.svd(np.vstack(active))
@@ -178,10 +181,12 @@ class Family:
 
     def _solved(self, p: FloatArray) -> Eigen:
         M, D, K = self.matrices(p)
-        rigid = self.rigid @ self.rigid_left(p)
         try:
             if self.condensed:
-                return self._condensed(M, D, K, rigid)
+                return self._condensed(M, D, K, self.rigid @ self.rigid_left(p))
+            # a search meets many impossible masses: they are refused before anything is solved
+            _require_inertia(M)
+            rigid = self.rigid @ self.rigid_left(p)
             omega, W = _modal_basis(M, K, rigid)
         except ModelError as error:
             raise ModelError(f"with {self.text(p)}: {error}") from None
@@ -201,6 +206,15 @@ class Family:
             )
         )
         return M, D, K
+
+    @cached_property
+    def _holds(self) -> list[FloatArray]:
+        """What the stiffness of each term does to rigid-body modes (k, r), zero if but rounding."""
+        found = []
+        for part in self.terms[2]:
+            force = part @ self.rigid / max(float(np.abs(part).max(initial=0.0)), TINY)
+            found.append(force if np.abs(force).max(initial=0.0) > SAME / len(part) else 0 * force)
+        return found
 
     @cached_property
     def _used(self) -> list[bool]:
@@ -300,10 +314,8 @@ def _vertical_stack(stack: FloatArray) -> Any:
     return sp.csr_array(flat) if k > 60 and filled < 0.2 * flat.size else flat
 
 
-def _modal_basis(
-    M: FloatArray, K: FloatArray, rigid: FloatArray, count: int | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Return omega and M-orthonormal modes [rigid, elastic], the rigid ones deflated."""
+def _require_inertia(M: FloatArray) -> None:
+    """Raise ModelError unless M is positive definite."""
     try:
         la.cholesky(M)
     except la.LinAlgError:
@@ -311,6 +323,13 @@ def _modal_basis(
             "M is not positive definite: some motion would have no inertia, or a negative one. "
             "Look at negative masses."
         ) from None
+
+
+def _modal_basis(
+    M: FloatArray, K: FloatArray, rigid: FloatArray, count: int | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return omega and M-orthonormal modes [rigid, elastic], the rigid ones deflated."""
+    _require_inertia(M)
     rigid = orthonormalised(M, rigid)
     omega, phi = elastic_modes(M, K, rigid, count)
     return np.concatenate([np.zeros(rigid.shape[1]), omega]), np.hstack([rigid, phi])

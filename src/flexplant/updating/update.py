@@ -76,7 +76,9 @@ def update(
         always tried (two with more than 100 DOFs), the default the first of them, since a minimum
         does not show that there is another; print(fit) names those of similar chi-square. Up to 20
         (or 4) are tried where none leads to an end, or noise does not explain that responses leave
-        a tenth of their power or that a pole is 0.1 % off (`UpdateResult.starts`).
+        a tenth of their power or that a pole is 0.1 % off (`UpdateResult.starts`). Once an end is
+        found, others are searched for ten steps, and on where their cost comes near to its cost;
+        eight starts in one best minimum are enough.
     starts : int or (s, q) array, optional
         Search from these starts alone, or from so many that are drawn between the bounds (or from
         the priors), and keep the best; `start` is one of them. 1: from `start` alone.

@@ -34,6 +34,10 @@ STUCK = (
 PREDICTED = 1e-2
 
 
+#: why a search ends that was given a limit
+STOPPED = "max_iterations reached"
+
+
 class _ImpossibleError(Exception):
     """No step from the last point is possible."""
 
@@ -154,7 +158,7 @@ class TrustRegion(UpdateMethod):
                 max_nfev=most,
             )
 
-        stopped = "max_iterations reached"
+        stopped = STOPPED
         try:
             answer = searched(inside, most)
         except _ImpossibleError:
@@ -271,7 +275,7 @@ class GaussNewton(UpdateMethod):
         trail.add(objective, p, 0.0)
         step, change = _gauss_newton_step(objective, point, r, self.truncate)
         converged = _is_small(r, size, tolerance)
-        reason = EXACT if converged else "max_iterations reached"
+        reason = EXACT if converged else STOPPED
         for _ in range(most or self.steps):
             if converged:
                 break
@@ -408,7 +412,8 @@ class Secured(UpdateMethod):
             found = TrustRegion().search(objective, way[-1], most=most, tolerance=tolerance)
         except (ModelError, SolverError) as error:
             raise trouble or error from None
-        if trouble is not None and not found.converged:
+        # a search that was cut short may still lead somewhere
+        if trouble is not None and not found.converged and found.reason != STOPPED:
             raise trouble
         found.tried = (f"Gauss-Newton: {reason}", f"trust region: {found.reason}")
         found.trail = found.trail if before is None else before.joined(found.trail)

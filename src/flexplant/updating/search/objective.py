@@ -19,6 +19,9 @@ from ..residuals.modal_residuals import BoundEigenvalues
 from ..residuals.residual import Bound, Residual
 from ..sensitivities import PoleRows, mode_columns, split_point
 
+#: number of entries of the shapes of all remembered points: complex ones of 160 MB
+REMEMBERED = 10_000_000
+
 
 class Defect(NamedTuple):
     """What a better model's residuals, and their derivatives, are more than those of the model."""
@@ -84,6 +87,10 @@ class Objective:
         self.path: list[FloatArray] = []
         #: what is added to the residuals, to first order about the parameters it was found at
         self.defect: Defect | None = None
+        #: the points that searches moved to, by the one they came from and the parameters there:
+        #: a path that is followed once more is not solved once more
+        self._moves: dict[tuple[Point, bytes], Point] = {}
+        self._last: tuple[Point, bytes] | None = None
 
     @property
     def default_start(self) -> FloatArray:
@@ -118,19 +125,36 @@ class Objective:
     def at(self, p: FloatArray, *, refer: bool = False) -> Point:
         """Return the model at `p`, its modes paired with those of the reference point."""
         if self._point is not None and np.array_equal(self._point.p, p):
-            return self._set(self._point, refer=refer)
+            if refer:
+                if self._last is not None and self._last[0] is self.reference:
+                    self._remember(self._last, self._point)
+                self.reference = self._point
+            return self._point
         if self.reference is None:
             return self.begin(p)
         if np.array_equal(self.reference.p, p):
             return self._set(self.reference, refer=refer)
-        return self._set(self._numbered(self.reference.continued(np.array(p))), refer=refer)
+        move = (self.reference, p.tobytes())
+        point = self._moves.get(move)
+        if point is None:
+            point = self._numbered(self.reference.continued(np.array(p)))
+        if refer:
+            self._remember(move, point)
+        self._set(point, refer=refer)
+        self._last = move
+        return point
+
+    def _remember(self, move: tuple[Point, bytes], point: Point) -> None:
+        self._moves[move] = point
+        if len(self._moves) * point.eigen.X.size > REMEMBERED:
+            self._moves.clear()
 
     def place(self, point: Point) -> Point:
         """Return a point whose modes are numbered already, as the reference."""
         return self._set(self._numbered(point), refer=True)
 
     def _set(self, point: Point, *, refer: bool) -> Point:
-        self._point = point
+        self._point, self._last = point, None
         if refer:
             self.reference = point
         return point
