@@ -145,6 +145,7 @@ def test_what_is_no_structure_is_refused(monkeypatch, K, M, kinds, match):
         fx.io.read_ansys("x.full")
 
 
+@pytest.mark.slow
 def test_a_missing_extra_gives_the_line_to_type(monkeypatch, tmp_path):
     (tmp_path / "x.full").write_bytes(b"")
     foreign_parsers._close_all()  # one that waits has imported it

@@ -405,6 +405,7 @@ def measured_machine(rng):
     return G, K, int(np.sum(np.abs(la.eigvals(closed)) > 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zero", [False, True])
 def test_the_modulus_margin_of_a_measured_loop_is_that_of_a_stable_one(zero):
     """Poles of the model say which; an Frf that begins at 0 Hz is read from its next line on."""

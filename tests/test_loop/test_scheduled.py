@@ -37,6 +37,7 @@ def schedule(plant):
     return schedule_loops(plant, design, places=PLACES)
 
 
+@pytest.mark.slow
 def test_at_a_place_it_is_the_design_there(plant, schedule):
     there = plant.at(x=PLACES[3])
     wanted = fx.close_loop(there, *design(there))

@@ -370,6 +370,7 @@ def test_a_violated_lmi_is_named():
         lmi_programs.solve_program(tight, SETTINGS, violation=-1e-3)
 
 
+@pytest.mark.slow
 def test_a_disturbance_that_u_cancels_entirely():
     # y = w, w and u enter alike: u = -w leaves nothing, at no cost
     parts = ([[-1.0]], [[1.0]], [[1.0]], [[1.0]], [[0.0]], [[0.0]], [[0.0]], [[1.0]])

@@ -41,6 +41,7 @@ def case(make):
     return model, residuals, fx.update(model, unknown, residuals)
 
 
+@pytest.mark.slow
 def test_everything_is_in_it(case):
     model, residuals, fit = case
     axs = fx.plot.update(fit, model, residuals)
@@ -72,6 +73,7 @@ def test_everything_is_in_it(case):
     assert np.abs(lines["before"] / lines["measured"] - 1).max() > 0.1
 
 
+@pytest.mark.slow
 def test_only_what_was_measured_is_in_it(case):
     model, residuals, _ = case
     fit = fx.update(model, [fx.AddedMass("2:z")], residuals[:1])
