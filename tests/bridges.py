@@ -13,9 +13,9 @@ from flexplant.errors import FlexplantWarning
 from flexplant.identification import MeasuredModes
 from flexplant.reduction import ReducedModel
 from flexplant.updating import Eigenvalues, MatrixParameter, ModeShapes, update
-from shared_data import DATA
+from shared_data import data_file
 
-FILE = DATA / "fe" / "updating" / "SteelPedBrdg_sim_form1_LM.mat"
+FILE = data_file("fe/updating/SteelPedBrdg_sim_form1_LM.mat")
 
 TRUTH = np.array(
     [0.05, 0.05, -0.05, -0.1, 0.1, -0.15, 0.15, -0.05, -0.1, 0.1, -0.2, -0.3, 0.6, -0.3, 0.6]

@@ -1,12 +1,19 @@
-"""Files of others that tests read where they are present; they are not part of the project."""
+"""Files of others: in tests/data where their licence allows it, else where they are present."""
 
 import os
 from pathlib import Path
 
 import pytest
 
-#: beside the project, or where FLEXPLANT_DATA says
-DATA = Path(os.environ.get("FLEXPLANT_DATA", Path(__file__).parents[2] / "shared" / "data"))
+#: what belongs to the project: see its README.md
+BUNDLED = Path(__file__).parent / "data"
+#: beside the project, or where FLEXPLANT_DATA says: GPL, or without a licence
+ELSEWHERE = Path(os.environ.get("FLEXPLANT_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+def data_file(place):
+    """Return the path of a file or folder of the data, "fe/uff", which may not be there."""
+    return BUNDLED / place if (BUNDLED / place).exists() else ELSEWHERE / place
 
 
 def needs(path):

@@ -15,7 +15,7 @@ import scipy.sparse as sp
 
 import flexplant as fx
 from flexplant.sparse.ordering import dissect
-from shared_data import DATA
+from shared_data import data_file
 
 pytestmark = pytest.mark.benchmark
 
@@ -50,7 +50,7 @@ def of(model):
 
 
 def harwell_boeing():
-    path = DATA / "fe" / "hb" / "bcsstk11.mtx"
+    path = data_file("fe/hb/bcsstk11.mtx")
     if not path.exists():
         pytest.skip("needs the data of shared/data")
     K = sp.csc_array(scipy.io.mmread(path))

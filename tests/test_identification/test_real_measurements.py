@@ -17,11 +17,11 @@ from flexplant.identification import (
 )
 from flexplant.lti import Frf
 from oracles_identification import modal_frf, noisy, pole
-from shared_data import DATA
+from shared_data import data_file
 
 
 def content(name):
-    path = DATA / "measured" / name
+    path = data_file("measured") / name
     return scipy.io.loadmat(path) if path.exists() else pytest.skip(f"needs {path}")
 
 

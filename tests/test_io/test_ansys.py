@@ -12,9 +12,9 @@ import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.io import ansys, foreign_parsers
 from flexplant.io.ansys import cosines_of
-from shared_data import DATA, needs
+from shared_data import data_file, needs
 
-FULL = DATA / "fe" / "ansys" / "file.full"
+FULL = data_file("fe/ansys/file.full")
 
 
 @needs(FULL)

@@ -10,9 +10,9 @@ import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.io import read_dmig
 from flexplant.io.nastran import read_nodes
-from shared_data import DATA, needs
+from shared_data import data_file, needs
 
-SHARED = DATA / "fe" / "nastran"
+SHARED = data_file("fe/nastran")
 needs_data = needs(SHARED)
 
 

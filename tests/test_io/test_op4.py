@@ -10,9 +10,9 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.io import read_op4, read_op4_matrices
-from shared_data import DATA, needs
+from shared_data import data_file, needs
 
-SHARED = DATA / "fe" / "nastran"
+SHARED = data_file("fe/nastran")
 
 
 @pytest.fixture(scope="module")

@@ -276,10 +276,10 @@ def test_what_is_no_record_is_said(tmp_path):
         read_records(written(tmp_path, sets))
 
 
-@shared_data.needs(shared_data.DATA / "fe" / "uff" / "Sample_UFF58b_bin.uff")
+@shared_data.needs(shared_data.data_file("fe/uff/Sample_UFF58b_bin.uff"))
 def test_a_real_binary_file():
     pyuff = pytest.importorskip("pyuff")
-    path = shared_data.DATA / "fe" / "uff" / "Sample_UFF58b_bin.uff"
+    path = shared_data.data_file("fe/uff/Sample_UFF58b_bin.uff")
     parts = pyuff.UFF(str(path)).read_sets()
     parts = [part for part in np.atleast_1d(parts).tolist() if part["type"] == 58]
     found = read_records(path)

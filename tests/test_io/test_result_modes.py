@@ -10,9 +10,9 @@ import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError, ShapeError
 from flexplant.io import read_modes
 from op2_files import op2, punch
-from shared_data import DATA, needs
+from shared_data import data_file, needs
 
-SHARED = DATA / "fe" / "nastran"
+SHARED = data_file("fe/nastran")
 needs_data = needs(SHARED)
 #: two nodes; the second moves in system 5, turned by 90 degrees about z
 XYZ = {7: (0.0, 0.0, 0.0), 9: (0.5, 0.25, 0.0)}

@@ -6,9 +6,9 @@ import scipy.io
 
 from flexplant.errors import FlexplantError, ModelError, ShapeError
 from flexplant.io import read_sierra
-from shared_data import DATA, needs
+from shared_data import data_file, needs
 
-SHARED = DATA / "fe" / "sierra"
+SHARED = data_file("fe/sierra")
 
 K = np.array([[4.0, -1.5, 0.25], [-1.5, 3.0, 0.0], [0.25, 0.0, 5.0]])
 M = np.diag([1.0, 2.0, 3.0])

@@ -14,7 +14,7 @@ from flexplant.io import read_frf_uff, read_modes_uff, read_nodes_uff
 from uff_files import analysis
 
 pyuff = pytest.importorskip("pyuff")
-SHARED = shared_data.DATA / "fe" / "uff"
+SHARED = shared_data.data_file("fe/uff")
 FREQ = np.arange(1, 33) * 0.5
 RNG = np.random.default_rng(3)
 #: (output, input): accelerance

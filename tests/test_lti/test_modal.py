@@ -20,10 +20,10 @@ from flexplant.lti import (
 )
 from flexplant.lti.equations import balanced_matrix, state_scale
 from oracles_lti import sweep
-from shared_data import DATA
+from shared_data import data_file
 from systems_lti import machine, system
 
-CD_PLAYER = DATA / "norms" / "CDplayer.mat"
+CD_PLAYER = data_file("norms/CDplayer.mat")
 FREQ = np.geomspace(1.0, 4900.0, 120)
 
 

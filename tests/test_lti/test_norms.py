@@ -12,10 +12,10 @@ from flexplant.lti import norms as level_set
 from flexplant.lti.peaks import Peaks, exceeding, newton_maxima, proved_peak, residues
 from flexplant.parallel import Progress
 from oracles_lti import largest_gain, lyapunov, peak_by_search, stein, sweep
-from shared_data import DATA
+from shared_data import data_file
 from systems_lti import machine
 
-NORMS = DATA / "norms"
+NORMS = data_file("norms")
 
 
 def resonance(omega=2e3, zeta=1e-3, scale=1.0):

@@ -11,7 +11,7 @@ from flexplant.errors import ModelError, ShapeError, SolverError
 from flexplant.lti import control_care, control_dare, equations, filter_care, filter_dare
 from flexplant.rooms import OURS
 from oracles_lti import double_integrator_dare, riccati_recursion, stein
-from shared_data import DATA
+from shared_data import data_file
 
 
 def benign(seed, n=6, p=2):
@@ -255,7 +255,7 @@ def test_outputs_that_miss_a_rigid_body_mode_are_named():
 
 
 def test_compleib_problems_equal_scipy_or_have_no_solution():
-    path = DATA / "compleib-open.npz"
+    path = data_file("compleib-open.npz")
     if not path.exists():
         pytest.skip("the COMPleib data are not here")
     data = np.load(path)

@@ -13,9 +13,9 @@ from flexplant.errors import FlexplantWarning, ModelError
 from flexplant.structure import FEMatrices, FEModel, Spring
 from flexplant.structure.zero_energy import digits_of
 from meshes import dofs_of, solid
-from shared_data import DATA, needs
+from shared_data import data_file, needs
 
-NASTRAN = DATA / "fe" / "nastran"
+NASTRAN = data_file("fe/nastran")
 
 
 def rounded(values, digits):

@@ -10,9 +10,9 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.structure.matrices import completed
-from shared_data import DATA, needs
+from shared_data import data_file, needs
 
-NASTRAN = DATA / "fe" / "nastran"
+NASTRAN = data_file("fe/nastran")
 LINE = ["x"]
 
 

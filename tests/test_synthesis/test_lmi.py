@@ -16,10 +16,10 @@ from flexplant.synthesis.lmi import lmi_programs as lmi_programs
 from flexplant.synthesis.lmi.lmi_programs import Plant, smallest_gamma, symmetric_blocks
 from flexplant.synthesis.preparation import prepared
 from oracles_lmi import closed_loop, output_feedback_gamma, state_feedback_gamma, swept_norm
-from shared_data import DATA
+from shared_data import data_file
 
 SETTINGS = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}
-COMPLEIB = DATA / "compleib-open.npz"
+COMPLEIB = data_file("compleib-open.npz")
 KEYS = ("A", "B1", "B2", "C1", "C2", "D11", "D12", "D21")
 SMALL = ["NN2", "DIS2", "NN8", "AC15", "AC4", "DIS5", "HE1", "HE2", "NN4", "REA2", "AC2", "EB1"]
 LARGE = ["TMD", "DIS1", "HE5", "AC8", "DLR1", "EB2", "TG1", "WEC1", "BDT1", "AGS", "CSE1"]

@@ -29,9 +29,9 @@ from oracles_synthesis import (
     split,
     stability,
 )
-from shared_data import DATA, needs
+from shared_data import data_file, needs
 
-COMPLEIB = DATA / "compleib-open.npz"
+COMPLEIB = data_file("compleib-open.npz")
 FULL_RANK = ("AC4", "AC8", "DIS5", "EB1", "EB2", "HE5", "JE3")
 needs_data = needs(COMPLEIB)
 
