@@ -5,7 +5,7 @@ From finite-element matrices and a measurement to the closed-loop error at a poi
     FEModel --solve_modes--> Modes --reduce--> ReducedModel --update--> UpdateResult.model
       (M, D, K, dofs)                           (M*, D*, K*, T)  ^            |
                                               MeasuredModes -----'            |
-                                                      assemble_plant(model, ports)
+                                     assemble_plant(model, ports, evaluation=whole)
                                                                               v
       +-----------+   [w;u] -> [z;y]      StandardPlant --discretized(rate, delay)--> sampled
     z<|           |<w                          +-----------+-----------+--------------+
@@ -26,6 +26,7 @@ room below has its own page, ``help(fx.plant)``: what it is for, an example, its
   stable: spectral radius 0.996842717, modulus margin 0.57
   driven: u1
   monitored: die:hat
+  not judged on a larger model
   no frequency of a mode off by 1 % does harm
 
 **Conventions**
@@ -44,9 +45,10 @@ room below has its own page, ``help(fx.plant)``: what it is for, an example, its
 - Answers carry a check made by another route. A Kalman filter's predicted error is recomputed by a
   Stein equation, an H-infinity controller is verified by the closed-loop norm, found with proof and
   by a sweep; modes by residual and count. A failed check raises.
-- Checks go beyond the model. Modes that a reduction left out are noise in a filter's predicted
-  error, and every loop is tried on the plant that has them: what they make unstable is named. A fit
-  says by chi-square whether the parameters explain the data.
+- Checks go beyond the design model. A plant knows its *evaluation model*, a larger model of the
+  same machine: the modes that the plant lacks are noise in a filter's predicted error, and every
+  loop is tried on the plant that has them: what they make unstable is named. Results of a plant
+  without one say so. A fit says by chi-square whether the parameters explain the data.
 - SI units serve as they are. Gains of 1e-9 m/N, damping of 0.1 %, rigid-body modes at exactly zero,
   repeated modes: scaling happens inside.
 - Nothing is repaired silently. Errors say what is wrong, what was got, why it matters and what to
@@ -116,6 +118,19 @@ lower bound too, by a perturbation that reaches it.
 - Structures are linear and time-invariant, M, D and K symmetric: no gyroscopic terms, contact or
   temperature. POIs may move.
 
+**From 0.1 to 0.2**
+
+| 0.1 | 0.2 |
+|---|---|
+| ``larger=whole`` of any function | ``assemble_plant(model, ports, evaluation=whole)`` |
+| ``larger=plant`` (no modes left out) | ``plant.replace(evaluation=None)`` |
+| ``larger_plant(plant, whole)`` | ``plant.evaluation_plant`` |
+| ``PoiVariance(larger=)``, ``LeftOutModes(larger)`` | the plant's evaluation model |
+| ``MachinePipeline(larger=80)`` | ``MachinePipeline(evaluation_modes=80)`` |
+| ``weighted``, ``through`` give a StandardPlant | a `plant.GeneralizedPlant` |
+| ``plant.is_weighted`` | ``isinstance(plant, GeneralizedPlant)`` |
+| ``plant.unweighted`` of any plant | of a GeneralizedPlant; ``plant.machine`` of any |
+
 **Licences.** flexplant has the MIT licence. What it needs at run time: NumPy, SciPy,
 python-control, threadpoolctl and lazy-loader (BSD-3), cvxpy and Clarabel (Apache-2.0), filterpy
 (MIT), matplotlib (its own, of BSD kind), tqdm (MPL-2.0 and MIT). Extras, as in ``pip install -e
@@ -131,7 +146,7 @@ from typing import Any as _Any
 
 from lazy_loader import attach_stub as _attach_stub
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # a room is imported when a name of it is first used: the names are in __init__.pyi
 _imported, __dir__, __all__ = _attach_stub(__name__, __file__)
