@@ -82,7 +82,8 @@ def test_it_reads_as_a_table_and_survives_a_file(found, tmp_path):
     assert lines[0].split("  ")[-1].strip() == "max |S| at u"
     assert lines[1].startswith("servo")
     assert lines[1].count(" Hz") == 2
-    assert "die:ref to die:error" in lines[-1]
+    assert "die:ref to die:error" in lines[-2]
+    assert lines[-1] == "not judged on a larger model"
     found.save(tmp_path / "figures.npz")
     assert repr(load(tmp_path / "figures.npz")) == repr(found)
 
@@ -135,3 +136,15 @@ def test_wrong_use_is_refused(loops, found):
         compare_loops(loops, reference="die:ref", error="die:rx")
     with pytest.raises(LabelError, match="no loop 'servos'"):
         found["servos"]
+
+
+def test_loops_are_judged_on_their_evaluation_models(loops):
+    """The rows are those of the loops around the evaluation plants; what lacks one is named."""
+    plant = stage().replace(evaluation=stage(stiffer=1.02))
+    judged = close_loop(plant, *loops["servo"].blocks)
+    found = compare_loops({"judged": judged, "alone": loops["servo"]})
+    row, other = found.rows["judged"], loops["servo"].around(stage(stiffer=1.02))
+    assert row.margin == pytest.approx(other.modulus_margin, rel=1e-9, abs=0)
+    assert row.margin != pytest.approx(found.rows["alone"].margin, rel=1e-3, abs=0)
+    assert row.decay == pytest.approx(other.spectral_radius, rel=1e-9, abs=0)
+    assert repr(found).splitlines()[-1] == "not judged on a larger model: alone"

@@ -11,6 +11,7 @@ import numpy as np
 from ..checks import ComplexArray, FloatArray, Value, instance, mapping, whole
 from ..errors import LabelError, ModelError, aligned, counted, require_known, unknown_label
 from ..lti.frequency_sweep import climbed_grid, crossings, highest
+from ..plant.evaluation_model import NOT_JUDGED
 from ..tolerances import SPLIT
 from .blocks import references
 from .broken import BrokenLoop, inverted
@@ -349,11 +350,14 @@ class LoopComparison(Value):
         What S is: ``die:ref to die:error``; empty when the loops have no reference.
     sampled : bool
         Whether `decay` of the rows is a spectral radius.
+    unjudged : sequence of str
+        The loops whose plants have no evaluation model.
     """
 
     rows: Mapping[str, LoopFigures]
     channel: str
     sampled: bool = True
+    unjudged: tuple[str, ...] = ()
 
     def __getitem__(self, name: str) -> LoopFigures:
         require_known("loop", [name], self.rows)
@@ -367,6 +371,9 @@ class LoopComparison(Value):
         lines = aligned(head, [(name, *_cells(row)) for name, row in self.rows.items()])
         if self.channel:
             lines.append(f"S is {self.channel}; at u it is 1 / modulus margin.")
+        if self.unjudged:
+            every = len(self.unjudged) == len(self.rows)
+            lines.append(NOT_JUDGED + ("" if every else f": {', '.join(self.unjudged)}"))
         return "\n".join(lines)
 
 
@@ -378,7 +385,8 @@ def compare_loops(
     Parameters
     ----------
     loops : mapping {name: ClosedLoop}
-        What to compare: designs on one machine, or one design on a model and the machine.
+        What to compare: designs on one machine, or one design on a model and the machine. Each is
+        judged on the evaluation model of its plant, where it has one.
     reference : str, optional
         The channel of w that S starts from, where there are several; `axis_sensitivities` has all.
     error : str, optional
@@ -409,6 +417,8 @@ def compare_loops(
     """
     hint = "Pass {'servo': close_loop(plant, observer, servo)}."
     mapping(loops, "loops", hint, least=1, kind=ClosedLoop)
+    alone = tuple(name for name, loop in loops.items() if loop.plant.unjudged)
+    loops = {name: loop.completed or loop for name, loop in loops.items()}
     pair = _reference_pair(next(iter(loops.values())), reference, error)
     for name, loop in loops.items():
         if pair and (pair[0] not in loop.plant.w or pair[1] not in loop.plant.z):
@@ -433,7 +443,7 @@ def compare_loops(
         name: _figures(loop, curves[name], reached[name], low_freq, pair)
         for name, loop in loops.items()
     }
-    return LoopComparison(rows, f"{pair[0]} to {pair[1]}" if pair else "", sampled)
+    return LoopComparison(rows, f"{pair[0]} to {pair[1]}" if pair else "", sampled, alone)
 
 
 def _reference_pair(loop: ClosedLoop, reference: str | None, error: str | None) -> tuple[str, ...]:

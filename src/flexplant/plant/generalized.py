@@ -51,7 +51,7 @@ class GeneralizedPlant(PartitionedSystem):
     <GeneralizedPlant: 9 states, dt 0.0005 s, delay 1, weighted and read through a block>
       w (4) amp  y1:noise  y2:noise  die:ref
       u (1) u1
-      z (3) die:x  die:error  u1:effort
+      z (2) die:error  u1:effort
       y (2) y1:error  y2:error
     >>> heavy.unweighted is plant
     True

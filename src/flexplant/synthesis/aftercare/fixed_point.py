@@ -129,7 +129,7 @@ def fixed_point(
     Parameters
     ----------
     loop : ClosedLoop
-        Around a sampled plant.
+        Around a sampled plant. Words are judged on its evaluation model where it has one.
     run : Response
         A run of the loop that is as large as it gets: it gives the sizes of all signals.
     bits : int, optional
@@ -184,7 +184,8 @@ def fixed_point(
             f"products of {given or _FEWEST} and {wide} bits, and their sums, do not fit 64: take "
             f"fewer; together at most {_PRODUCT}."
         )
-    before = stable_before(closed.plant, K)
+    judge = closed.plant.evaluation_plant or closed.plant
+    before = stable_before(judge, K)
     inputs = np.array([_run_channel(run, name) for name in K.inputs])
     room, allowed = positive(headroom, "headroom"), positive(loss, "loss", zero=True)
     counts = [None] if sections is None else np.atleast_1d(np.asarray(sections)).tolist()
@@ -206,7 +207,7 @@ def fixed_point(
                 break
             words = _WordForm.of(form, powers, length, wide)
             system = words.system(own)
-            facts = loop_facts(closed.plant, system)
+            facts = loop_facts(judge, system)
             lost = loss_text(before, facts, allowed)
             if not lost:
                 best = number * length, length, words, system, facts
