@@ -176,6 +176,7 @@ def hooks():
                     yield getattr(value, name), needed
 
 
+@pytest.mark.slow
 def test_hooks_of_protocols_meet_errors_of_ours():
     wrong = [None, 3, Odd(), "text", [], np.ones((2, 2)), fx.testbeds.three_masses()]
     raw, count = [], 0

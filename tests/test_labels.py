@@ -212,6 +212,7 @@ def test_errors_say_what_to_do(make, error, says):
         make()
 
 
+@pytest.mark.slow
 def test_many_dofs_stay_quick(tmp_path):
     """60 000 DOFs: no dictionary, no comparing of each label, a file in tenths of a second."""
     n = 60_000

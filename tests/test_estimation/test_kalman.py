@@ -325,6 +325,7 @@ def test_certificate_refuses_a_wrong_gain():
         check_gain(plant, estimator.gain[:, :2], estimator.covariance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [stage, plate_plant])
 def test_any_little_noise_of_the_sensors(make):
     """Below 1e-6 of the motion in a sample its square is lost in P: square roots keep it."""
@@ -420,6 +421,7 @@ def test_square_roots_give_the_filter_that_covariances_give():
     assert root.L[0, 0] ** 2 == pytest.approx(errors[best], rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [

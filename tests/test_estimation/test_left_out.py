@@ -72,6 +72,7 @@ def filter_of(kind, zeta, level, count=24):
     )
 
 
+@pytest.mark.slow
 def test_covariances_are_those_of_the_closed_form():
     modes = solve_modes(make_plate(), damping=ModalDamping(0.01))
     plant = sampled(modes.select(range(24)))

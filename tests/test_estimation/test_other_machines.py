@@ -91,6 +91,7 @@ def test_in_a_closed_loop_a_simulation_has_the_same_error():
     assert abs(square - kalman.rms("die", on=loop) ** 2) < 3 * deviation
 
 
+@pytest.mark.slow
 def test_an_observer_beside_a_loop_and_what_is_refused():
     kalman, law = observer(), servo()
     other = fx.design_kalman(kalman.plant.replace(origin=kalman.plant.origin))
@@ -140,6 +141,7 @@ def test_half_a_percent_of_frequency_doubles_the_error_and_the_table_shows_it():
     assert fine.values.max() < 1.1 * fine.nominal[0]
 
 
+@pytest.mark.slow
 def test_the_table_in_a_closed_loop():
     kalman, law = observer(), servo()
     stiffer = plate_plant(1e-2, count=10, sensor_asd=1e-11)

@@ -184,6 +184,7 @@ def test_dampers_of_a_suspension_damp_the_modes_left_out_as_well():
         assert kalman.rms(axis) == pytest.approx(kalman.rms(axis, on=truth), rel=0.02, abs=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [1e-2, 1e-5, 1e-7])
 def test_the_certificate_states_the_digits_that_hold(damping):
     """Rounding of the damping that a mode hardly has is in both routes: it is added."""

@@ -199,6 +199,7 @@ def test_a_repeated_pole_that_passed_for_one_is_taken_apart(seed):
     assert improved(two, [(split_proposals, 6)], steps=150).poles.size == 6
 
 
+@pytest.mark.slow
 def test_a_pair_is_taken_apart_with_one_input():
     truth = pole([47.5, 48.2, 112.0], [0.004, 0.004, 0.01])
     frf = measured(truth, PHI[:, :3], n_in=1, level=1e-2)
@@ -290,6 +291,7 @@ def test_refined_poles_stay_stable():
             assert worse == (k == 1 or step != 1.0), (k, step)
 
 
+@pytest.mark.slow
 def test_without_noise_nothing_is_warned_of():
     """A mode outside the band leaves a millionth of the response, and is no missed mode."""
     truth = pole([90.0, 120.0, 300.0], 0.01)

@@ -75,6 +75,7 @@ def test_coupled_responses_are_those_of_the_machine(quantity):
     assert found.quantity == quantity
 
 
+@pytest.mark.slow
 def test_a_component_is_taken_out_again():
     whole, frame, stage = machine(), measured("frame"), measured("stage")
     rest = fx.uncoupled(whole, {"frame": frame}, JOINTS[:2])

@@ -359,6 +359,7 @@ def test_a_node_of_a_machine_in_a_machine():
         fx.joined({"m": inner, "c": part}, fx.Joint("m/2", "c/1"))
 
 
+@pytest.mark.slow
 def test_slides_and_hinges_are_rigid_body_motions_at_zero():
     models, placed = stage_on_frame()
     machine = fx.joined(models, at_feet(("y", "z")), placed=placed)

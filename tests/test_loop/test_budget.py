@@ -90,6 +90,7 @@ def test_sources_are_told_apart(plate):
     )
 
 
+@pytest.mark.slow
 def test_spectra_of_samples_hold_what_folds_back():
     """Sampled at 500 Hz, the mode at 400 Hz shows at 100 Hz: a fifth of what is seen there."""
     rate = 500.0

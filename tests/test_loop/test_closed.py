@@ -178,6 +178,7 @@ def test_static_gain_fits_any_rate():
         _ = loop.spectral_radius
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(0.1, 1.0), min_size=1, max_size=4), st.integers(0, 3))
 def test_closed_form_of_a_chain_of_gains(gains, seed):
     """u = (prod gains) y through blocks in any order."""

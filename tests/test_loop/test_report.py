@@ -354,6 +354,7 @@ def crossings_of_poles(G, K, factors):
     return np.array(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampled", [False, True])
 @pytest.mark.parametrize("kind", ["undamped", "light", "integrator", "lags"])
 def test_gain_margins_are_the_factors_at_which_poles_cross(kind, sampled):

@@ -70,6 +70,7 @@ def test_a_rigid_body_in_closed_form():
     np.testing.assert_allclose(covariance(g, [1.0], h), wanted, rtol=1e-13)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 100), st.floats(1e-6, 1e-2), st.floats(1e-12, 1e12))
 def test_it_is_a_covariance_of_the_right_size(seed, h, asd):
     g = pairs(*MODEL, seed=seed)

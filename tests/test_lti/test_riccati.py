@@ -86,6 +86,7 @@ def test_continuous_equals_scipy_on_benign_problems(seed):
     assert sol.spectral_abscissa < 0
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000))
 def test_control_forms_are_the_duals(seed):
     A, C, Q, R, _ = benign(seed)

@@ -109,6 +109,7 @@ def test_one_place_in_every_form_is_the_same_vector(plate):
         np.testing.assert_allclose(modes.vector_omega, found[0].vector_omega, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_damping_of_vectors(plate):
     def vector_zeta(**options):
         modes = solve_modes(plate, count=24, compliance_at=[Z8], **options)

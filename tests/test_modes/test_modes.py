@@ -98,6 +98,7 @@ def test_bad_input(changes, error):
         Modes(**given)
 
 
+@pytest.mark.slow
 def test_large_models_tell_what_was_counted():
     modes = solve_modes(make_plate(elements=(24, 24)), count=24)
     shown = modes.certificate

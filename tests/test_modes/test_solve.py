@@ -73,6 +73,7 @@ def test_rectangular_refined_plates():
     np.testing.assert_allclose(freq, [245.50, 358.98, 462.33, 640.01], atol=0.006)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zeta", [0.01, 0.001])
 def test_poles_with_half_a_kilogram(plate, zeta):
     model = truth(plate, zeta)
@@ -199,6 +200,7 @@ def test_wrong_shapes_are_noticed(plate, monkeypatch):
         solve_modes(plate, count=24)
 
 
+@pytest.mark.slow
 def test_held_plate_has_no_rigid_body_modes():
     for elements in ((8, 8), (24, 24)):
         model = make_plate(elements=elements)

@@ -155,6 +155,7 @@ def ends(number):
     return number
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_survived_once(tmp_path, monkeypatch):
     monkeypatch.setattr(flexplant.parallel, "PROBE", 0.0)
     monkeypatch.setattr(flexplant.parallel, "CHUNK", 1e-7)

@@ -40,6 +40,7 @@ def test_a_plant_whose_sensors_do_not_suffice(make):
     assert list(found.ratio) == [1.0, 0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_no_sensor_is_tried_where_none_can_be(make, tmp_path):
     plant, _, _ = make(21)
     every = sensor_map(plant, GRID, asd=1e-11)

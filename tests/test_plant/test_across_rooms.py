@@ -92,6 +92,7 @@ def test_a_reference_without_any_poi_says_so():
         fx.Ports(references=[fx.Reference("die")])
 
 
+@pytest.mark.slow
 def test_an_update_with_a_strong_damper_to_ground_becomes_a_plant():
     """From poles to the plant and its filter; responses against one dense solve per frequency."""
     before = reduced()

@@ -139,6 +139,7 @@ def test_responses_are_those_of_the_matrices(case):
     assert not agree(data, wanted("held light" if case != "held light" else "held grounded"), 1e-2)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10**6), st.floats(-2.0, 4.0), st.booleans())
 def test_any_damping_gives_the_plant_of_its_matrices(seed, size, free):
     rng = np.random.default_rng(seed)

@@ -52,6 +52,7 @@ def same(found, wanted):
     assert found.asd == wanted.asd
 
 
+@pytest.mark.slow
 def test_a_position_is_the_plant_with_its_ports_there(modes):
     plant = fx.assemble_plant(modes, ports())
     same(plant, fx.assemble_plant(modes, ports(0.0, 0.03)))  # x starts at 0, y in its middle

@@ -57,6 +57,7 @@ def test_a_full_model_is_the_dense_receptance(changes):
         assert not close(gain(full(0.01, **changes)), oracle(0.01), 1e-3)
 
 
+@pytest.mark.slow
 def test_one_per_cent_of_thickness_is_seen():
     assert not close(gain(full(thickness=0.0272 * 1.01)), oracle(), 1e-2)
     assert close(gain(full()), oracle(), 1e-6)

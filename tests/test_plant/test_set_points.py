@@ -54,6 +54,7 @@ def test_each_axis_has_its_channels(plant):
     assert only.units["die:ry:ref"] == "rad"
 
 
+@pytest.mark.slow
 def test_a_stage_follows_all_of_them_at_once(plant, loop):
     """Each axis comes to rest at its own goal; another place of the POI sees the same."""
     goals = {"z": 2e-4, "rx": 1e-4, "ry": -3e-4}
@@ -87,6 +88,7 @@ def test_weights_are_of_all_errors(plant):
     assert {"die:error", "die:rx:error", "die:ry:error"} < set(weights.z)
 
 
+@pytest.mark.slow
 def test_feedforward_is_of_the_axis_that_is_named(plant, loop):
     """Turning about x takes the plate's moment of inertia, 1/12 m L^2, and no force in z."""
     turned = fx.design_feedforward(plant, reference="die:rx:ref")

@@ -209,6 +209,7 @@ def test_other_points_of_the_body_move_with_the_reference_and_are_left_out():
     assert resting.z["left:z"] is not None and resting.z["right:z"] is None
 
 
+@pytest.mark.slow
 def test_the_weights_are_taken_as_they_are():
     """By `weighted` whole, by name, and by design_hinf from a bandwidth: one plant each time."""
     plant = fx.testbeds.three_masses()

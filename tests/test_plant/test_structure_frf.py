@@ -92,6 +92,7 @@ def test_without_damping_there_is_no_response_at_a_resonance(plate):
         fx.frequency_response(plate, PLAIN, [100.0, modes.freq[3], 1400.0])
 
 
+@pytest.mark.slow
 def test_all_kinds_of_ports_as_in_a_plant(plate):
     lowpass = fx.lowpass(500.0, order=2)
     ports = fx.Ports(

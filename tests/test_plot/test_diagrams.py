@@ -36,6 +36,7 @@ def test_measured_phases_follow_the_model_by_whole_turns():
     assert np.asarray(points.get_ydata()).min() < -360.0
 
 
+@pytest.mark.slow
 def test_a_grid_of_channels_and_its_refusals():
     g = system()
     ax = fx.plot.bode({"one": g, "two": 2 * g}, outputs=["out1", "out0"], inputs="in2")

@@ -58,6 +58,7 @@ def test_devices_on_a_mode_shape():
         plot.placed(plant, mode=99)
 
 
+@pytest.mark.slow
 def test_the_map_shows_devices_poi_and_zones():
     plant, _, grid = stage()
     found = sensor_map(plant, grid, asd=2e-11)

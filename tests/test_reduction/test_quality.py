@@ -135,6 +135,7 @@ def test_pairs_of_a_cluster_hold_for_every_basis(angle):
     assert one.mac.tolist() == pytest.approx([1.0, 0.0], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_the_report_can_fail(plate):
     model = reduce(plate, ModalTruncation(9, damping=LOW, inputs=KEPT))
     good = model.quality(plate, band=BAND)
@@ -210,6 +211,7 @@ def test_a_large_model_is_solved_by_fronts():
     assert np.all(found.freq_error >= -1e-9)
 
 
+@pytest.mark.slow
 def test_the_worst_error_is_found_at_light_damping(plate):
     """At resonances and antiresonances of either model and between them: beside a fine grid."""
     M, K = oracles_structure.plate_matrices(4, 4)

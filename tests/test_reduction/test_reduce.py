@@ -99,6 +99,7 @@ def test_rigid_body_motions_are_carried_along(plate, vector):
     np.testing.assert_allclose(gram, np.eye(3), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_mass_on_the_reduced_model_gives_the_truth(plate):
     # oracle: first-order poles of the dense full model with the mass
     M, K = oracle.plate_matrices(8, 8)

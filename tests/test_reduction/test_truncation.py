@@ -73,6 +73,7 @@ def test_balanced_truncation_beats_the_lowest_modes(modes, count):
     assert errors[1] <= best.bound.value * (1 + 1e-6) < low.bound.value
 
 
+@pytest.mark.slow
 def test_static_correction_is_exact_at_0_hz(plate, modes):
     for given, method in (
         (plate, ModalTruncation(9, static_at=[*INTO, *OUT], damping=LOW)),

@@ -22,6 +22,7 @@ def made():
     return designs, simulate(loop, duration=0.6, rng=4, runs=4)
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_run(made, tmp_path):
     designs, run = made
     found = compare_estimators(designs, run, "die:z", start=0.2, level=0.9)

@@ -62,6 +62,7 @@ def test_settling_is_the_last_time_outside():
     assert second == pytest.approx(first + 0.05 * np.log(2), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_map_is_the_run_of_a_poi_at_each_point():
     plant = sampled(some_modes(count=8, attached=False))
     blocks = fx.design_static(plant), fx.design_servo(plant, bandwidth=25.0)

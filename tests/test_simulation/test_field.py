@@ -53,6 +53,7 @@ def same(run, wanted, tolerance=1e-9):
         np.testing.assert_allclose(run[name], wanted[name], rtol=0, atol=tolerance * scale)
 
 
+@pytest.mark.slow
 def test_hysteresis_and_an_element_of_ones_own():
     loop = loop_of(stage())
     width = 0.05
@@ -229,6 +230,7 @@ def test_noise_has_the_spectrum_that_was_measured():
     assert apart > 1.0  # samples of a ring would be neighbours: 0
 
 
+@pytest.mark.slow
 def test_one_over_f_at_a_sensor_moves_the_machine_as_its_integral_says():
     """Oracle: the integral of |T|^2 asd^2 over the lines of the record."""
     loop = loop_of(stage())

@@ -120,6 +120,7 @@ def test_standing_still_is_the_ordinary_run(loop):
     np.testing.assert_allclose(run.data / size, still.data / size, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_set_point_is_reference_and_position(loop):
     move = fx.setpoint(0.05, velocity=1.0, acceleration=20.0, jerk=2e3)
     run = fx.simulate(loop, duration=0.03, moving={"x": move}, noise=False, reference=1e-7)
@@ -160,6 +161,7 @@ def test_noise_of_runs_at_rest_is_that_of_the_ordinary_run(loop):
     assert still.std() == pytest.approx(predicted, rel=0.04)
 
 
+@pytest.mark.slow
 def test_refusals(modes, loop):
     with pytest.raises(LabelError, match="POI to move 'w'"):
         fx.simulate(loop, duration=0.01, moving={"w": np.zeros(100)})

@@ -25,6 +25,7 @@ def run(loop):
     return fx.simulate(loop, reference=move, duration=0.6, rng=1, runs=2)
 
 
+@pytest.mark.slow
 def test_each_row_is_what_is_reached(loop, run):
     limits = {"ma": 5e-5, "msd": 5e-5, "rms": 1e-4, "peak": 1e-4, "settling": 0.4, "effort": 5.0,
               "noise": 1e-4, "bandwidth": 1.0, "modulus_margin": 0.1}  # fmt: skip
@@ -100,6 +101,7 @@ def test_the_message_of_a_failed_test_is_the_table(tmp_path):
     assert "MA 2 <= 1 nm FAILED" in " ".join(done.stdout.split())
 
 
+@pytest.mark.slow
 def test_the_only_error_is_meant_or_one_is_named():
     """Whatever the POI is called; without an error the channel must be named."""
     ports = fx.testbeds.three_masses().assembled.ports

@@ -43,6 +43,7 @@ def same(a, b):
         np.testing.assert_array_equal(a[name], b[name])
 
 
+@pytest.mark.slow
 def test_serial_and_process_pool_agree_to_the_bit():
     plain = study(range(8), drawn, rng=5)
     with ProcessPoolExecutor(2) as pool:

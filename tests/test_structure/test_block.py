@@ -15,6 +15,7 @@ def make_block(**changes):
     return solid_block(**({"size": (0.4, 0.3, 0.1), "elements": (4, 3, 1)} | ALU | changes))
 
 
+@pytest.mark.slow
 def test_the_element_is_the_oracle_s():
     model = make_block(size=(0.2, 0.5, 0.3), elements=(1, 1, 1))
     M, K = oracle.brick(0.2, 0.5, 0.3, 70e9, 0.33, 2700)
@@ -22,6 +23,7 @@ def test_the_element_is_the_oracle_s():
     np.testing.assert_allclose(model.K.toarray(), K, atol=1e-12 * K.max())
 
 
+@pytest.mark.slow
 def test_assembly_is_the_oracle_s():
     rng = np.random.default_rng(3)
     missing = np.zeros((3, 2, 2), dtype=bool)

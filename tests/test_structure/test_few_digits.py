@@ -229,6 +229,7 @@ def test_single_precision_in_files(tmp_path, kind):
     assert fx.read_matrices(path).digits == 7
 
 
+@pytest.mark.slow
 def test_entries_show_the_digits_of_a_text():
     """K read from a text by the user: its entries show the digits, unless they are exact."""
     exact = plate((16, 12))

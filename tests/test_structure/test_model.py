@@ -237,6 +237,7 @@ def test_with_damping_refuses_other_things(plate):
         make_plate(elements=(45, 45)).with_damping(ModalDamping(0.01))
 
 
+@pytest.mark.slow
 def test_large_sparse_models_are_checked_too():
     large = make_plate(elements=(24, 24))
     FEModel(large.M, large.K, dofs=large.dofs)

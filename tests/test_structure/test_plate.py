@@ -46,6 +46,7 @@ def test_the_pins_feel_one_percent_of_thickness():
     assert np.all(np.abs(freq[22:24] / 3767.7 - 1) > 5e-3)
 
 
+@pytest.mark.slow
 def test_refined_frequencies():
     freq = frequencies(make_plate(elements=(16, 16)))
     np.testing.assert_allclose(freq[3:7], FINE, atol=0.006)

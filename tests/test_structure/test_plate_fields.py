@@ -66,6 +66,7 @@ def test_simply_supported_square_plate():
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
 
 
+@pytest.mark.slow
 def test_clamped_square_plate_by_fixed_dofs_and_by_stiff_springs():
     plate = square(24)
     clamped = plate.fixed(edges(plate))

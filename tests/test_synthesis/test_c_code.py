@@ -235,6 +235,7 @@ def test_systems_without_distinct_poles(kind, tmp_path):
         x = K.A @ x + K.B @ given
 
 
+@pytest.mark.slow
 @compiles
 def test_what_is_not_finite_holds_the_outputs_and_raises_the_flag(tmp_path):
     K = pi_controller()

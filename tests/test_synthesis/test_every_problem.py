@@ -108,6 +108,7 @@ def test_tiny_efforts_and_noises_beside_ordinary_ones(tiny):
     assert found.gamma <= 1.08 * found.lower
 
 
+@pytest.mark.slow
 def test_units_of_u_and_y_change_nothing():
     A, B, C, D = structure(2, w=2, u=2, z=2, y=2, noise=1e-2, effort=1e-2)
     best = solved(A, B, C, D, 2, 2).gamma
@@ -118,6 +119,7 @@ def test_units_of_u_and_y_change_nothing():
     assert found.gamma == pytest.approx(best, rel=1e-6, abs=0)
 
 
+@pytest.mark.slow
 def test_motions_in_nanometres_beside_efforts_in_kilonewtons():
     """z is what it is, 1e-9 beside 1e3: gamma is that of the large channels."""
     A, B, C, D = structure(3, w=2, z=2, effort=1e-2, noise=1e-2)

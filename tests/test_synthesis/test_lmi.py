@@ -209,6 +209,7 @@ def test_an_answer_that_cannot_be_read_is_named(monkeypatch):
         Lmi().solve(problem(scalar(1.0, 1.0)))
 
 
+@pytest.mark.slow
 def test_sampled_plant_with_rigid_body_and_noise_free_sensor():
     h = 1e-3
     # 2 kg on no spring in SI units, sampled; y in m, z the position error in um and the effort

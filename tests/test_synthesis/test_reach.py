@@ -66,6 +66,7 @@ def test_a_bound_below_the_optimum_is_refused(norm, least):
     assert named == pytest.approx(least, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_an_integrator_follows_its_noise():
     """At zero frequency x = -n in any stable loop."""
     require_reachable(integrator(), [Hinf(w=["n"], z=["x"], below=1.01)])

@@ -329,6 +329,7 @@ def test_a_gamma_that_hangs_on_the_last_digits_of_the_plant_is_refused():
         design_hinf(hidden, u=u, y=y)
 
 
+@pytest.mark.slow
 def test_a_gamma_that_falls_with_the_added_noise_has_the_infimum_zero():
     """y = w, and u enters as w does: u = -w cancels it, at no cost."""
     P, u, y = named([[-1.0]], [[1.0, 1.0]], [[1.0], [0.0]], [[0.0, 0.0], [1.0, 0.0]], 1, 1)
@@ -336,6 +337,7 @@ def test_a_gamma_that_falls_with_the_added_noise_has_the_infimum_zero():
         design_hinf(P, u=u, y=y)
 
 
+@pytest.mark.slow
 def test_an_actuator_that_z_does_not_contain_at_all_does_the_work():
     """u1 stabilises at no cost; z is the effort of u2 alone, which stays at rest."""
     B, C = np.array([[1.0, 0.0, 1.0, 1.0]]), np.array([[0.0], [1.0]])

@@ -230,6 +230,7 @@ def test_a_fast_servo_keeps_its_rolloff_below_half_the_rate():
     np.testing.assert_array_equal(fast.system.A, given.system.A)
 
 
+@pytest.mark.slow
 def test_refusals():
     plant = sampled(some_modes())
     with pytest.raises(ModelError, match="bandwidth 5000 Hz is not well below the rate"):

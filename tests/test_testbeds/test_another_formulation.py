@@ -48,6 +48,7 @@ def test_thin_it_is_kirchhoffs_plate():
     assert np.abs(meshes[1] / exact - 1.0).max() > 6e-4
 
 
+@pytest.mark.slow
 def test_rotary_inertia_is_that_of_its_slopes():
     """First order: (rho h^3 / 12) times the integral of the squared slopes over that of rho h w^2.
 

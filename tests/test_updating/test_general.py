@@ -504,6 +504,7 @@ def test_localisation_says_when_nothing_changed(chain):
         found["mass at 9:z"]
 
 
+@pytest.mark.slow
 def test_validation_on_unused_data(chain):
     parts = changed(chain, mass=[(1, 0.03), (2, 0.02)])
     frf = responses(parts, np.linspace(0.4, 3.2, 30), [0, 2])

@@ -68,6 +68,7 @@ def test_chi_square_is_that_of_noise(chain, weights, prior):
     assert stats.kstest(found, "uniform").pvalue > 1e-3
 
 
+@pytest.mark.slow
 def test_a_bad_fit_warns_names_and_weighs_anew(chain):
     """A mass looked for at 2:z while a spring changed: chi-square says so, with names.
 
@@ -136,6 +137,7 @@ def test_responses_that_a_model_does_not_explain_print_no_deviation(chain):
         assert ("no +-: what is left is no noise" in repr(fit)) != printed
 
 
+@pytest.mark.slow
 def test_a_negative_mass_is_remarked_on(chain):
     poles = heavier(chain, mass=-0.4)
     data = MeasuredModes(poles, modes=[1, 2, 3, 4], covariance=(1e-3 * np.abs(poles)) ** 2)
@@ -157,6 +159,7 @@ def test_without_noise_there_is_no_chi_square(chain):
     assert (fit.chi2, fit.dof, fit.p_value) == (None, 7, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "where"), [(1 / (2 * np.pi), "below"), (2 * np.pi, "above")])
 def test_poles_in_hz_are_seen(plate, factor, where):
     rom = plate.reduced(0.01, True)

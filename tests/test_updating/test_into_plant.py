@@ -28,6 +28,7 @@ from oracles_plant import machine
 from stages import CORNERS, INSET, Z8, full, ports, reduced, some_modes
 
 
+@pytest.mark.slow
 def test_a_large_damper_to_the_ground_on_a_free_plate(plate):
     """60 N s/m at z8: the rigid-body motions are dragged and the plant has no modal form."""
     rom = reduced(0.01)

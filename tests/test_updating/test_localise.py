@@ -69,6 +69,7 @@ def test_nothing_changed_names_nothing(plate, uneven):
     assert sum(one.bic.min() - 2 * np.log(25) < one.nothing_bic for one in found) > named
 
 
+@pytest.mark.slow
 def test_misfit_that_no_candidate_explains_is_said(plate, uneven):
     grid = plate.grid
     data = measured(uneven, {grid[7]: 0.3, grid[18]: 0.4}, seed=0)

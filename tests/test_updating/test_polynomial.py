@@ -108,6 +108,7 @@ def stretched(length):
     return chain(masses=masses, stiffnesses=[4e5 / length, 3e5], ground=[1e5, 0.0, 0.0])
 
 
+@pytest.mark.slow
 def test_matrices_that_are_no_polynomials_are_followed():
     """15 % longer: found to 1e-7, with gradients of the model built anew; bounds where compared."""
     length = PolynomialParameter.from_build("length", stretched, value=1.0, unit="m")

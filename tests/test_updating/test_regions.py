@@ -112,6 +112,7 @@ def test_bad_regions_are_refused():
         MatrixParameter.regions(build, {3: LEFT}, value=THICK)
 
 
+@pytest.mark.slow
 def test_a_soft_region_is_localised(rom):
     """12 regions of 2 elements; one is 8 % softer: found up to the plate's mirror images."""
     masks = {}

@@ -78,6 +78,7 @@ class Simplex(UpdateMethod):
         return SearchEnd(found.x, found.fun, trail, found.success, found.message)
 
 
+@pytest.mark.slow
 def test_a_new_method_is_a_value_with_a_search(make):
     model = make([1, 2], [(0, None, 90), (0, 1, 110)], beta=2e-3)
     M = np.array(model.M)

@@ -43,6 +43,7 @@ def test_a_right_model_leaves_noise(chain):
     assert 1e-3 < stats.chi2.sf(total, 600) < 1 - 1e-3
 
 
+@pytest.mark.slow
 def test_a_mass_in_the_wrong_place_does_not_help(chain):
     """It comes nearer to what was not fitted, and predicts nothing."""
     data = poles_of(chain, 1, 0.3, np.random.default_rng(0))

@@ -58,6 +58,7 @@ def test_the_loop_gain_line_by_line(frf, made):
         np.testing.assert_allclose(loop.PS * loop.C, L / (1.0 + L), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_numbers_are_those_of_report_loops(frf, made):
     report, evaluator = made.loops(frf).report, Evaluator()
     for name in made.axes:
