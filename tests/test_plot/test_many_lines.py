@@ -118,7 +118,8 @@ def test_phase_coherence_and_deviation_beside_a_magnitude():
 def test_many_parameters_are_one_figure():
     modes = fx.solve_modes(fx.chain(masses=[1.0] * 4, stiffnesses=[4e5, 5e5, 6e5]), count=4)
     drawing = fx.reduce(modes, fx.DesiredDofs([f"{k}:x" for k in range(1, 5)]))
-    measured = fx.MeasuredModes(poles=[1j * w * 1.02 for w in modes.omega[1:]], modes=[2, 3, 4])
+    omega = 1.02 * modes.omega[1:]
+    measured = fx.MeasuredModes(1j * omega, modes=[2, 3, 4], covariance=(1e-2 * omega) ** 2)
     unknowns = [fx.AddedMass(f"{k}:x", prior=(0.0, 0.1)) for k in range(1, 5)]
     unknowns += [fx.AddedStiffness(f"{k}:x", prior=(0.0, 1e3)) for k in range(1, 3)]
     fit = fx.update(drawing, unknowns, [fx.Eigenvalues(measured)])
