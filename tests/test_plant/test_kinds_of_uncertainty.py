@@ -346,3 +346,43 @@ def test_what_is_not_known_is_refused_by_name():
         own.plant(reduced=True).uncertain(
             Shapes(direction()[None, :, None], [4]), Parameters({fx.AddedMass("3:x"): 0.1})
         )
+
+
+def steps(plant):
+    """What may be done to a plant with uncertainty, by name."""
+    weights = {"z": {"die:x": 2.0}, "w": {"amp": 3.0}}
+    return {
+        "discretized": lambda one: one.discretized(2e3, delay=1.2),
+        "at": lambda one: one.at({"die": "2:x"}),
+        "through": lambda one: one.through(fx.reference_errors(plant)),
+        "weighted": lambda one: one.weighted(**weights),
+        "uncertain": lambda one: one.uncertain(
+            Gains({"u1": 0.02}), Neglected(), frequency={2: 0.01}
+        ),
+    }
+
+
+@pytest.mark.parametrize("order", list(permutations(["discretized", "at", "uncertain"])))
+@pytest.mark.parametrize("behind", [(), ("through",), ("through", "weighted"), ("weighted",)])
+def test_uncertainty_survives_whatever_is_done_to_the_plant(order, behind):
+    """Steps in any order: the Deltas are those of the plant on which they were stated last."""
+    ports = fx.testbeds.three_masses().assembled.ports
+    plant = fx.assemble_plant(whole().select(range(3)), ports, evaluation=whole())
+    last = plant.discretized(2e3, delay=1.2).at({"die": "2:x"})
+    wanted = steps(plant)["uncertain"](last)
+    made = plant
+    for name in (*order, *behind):
+        made = steps(plant)[name](made)
+    known = made if not behind else made.uncertainty
+    known = known if isinstance(known, fx.plant.UncertainPlant) else known.uncertainty
+    assert [delta.name for delta in known.deltas] == [delta.name for delta in wanted.deltas]
+    np.testing.assert_allclose(known.system.B, wanted.system.B, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(known.system.C, wanted.system.C, rtol=1e-12, atol=1e-15)
+    assert (known.plant.dt, known.plant.delay) == (1 / 2e3, 1.2)
+    assert known.neglected.sampled.tightest == pytest.approx(wanted.neglected.sampled.tightest)
+    values = {"mode2:freq": 0.8, "u1:gain": -1.0}
+    np.testing.assert_allclose(
+        known.lft(values).system.A, wanted.lft(values).system.A, rtol=1e-12, atol=1e-15
+    )
+    # what takes a plant takes it with the uncertainty
+    assert fx.plant.standard_plant(known).uncertainty.frequencies == {2: pytest.approx(0.01)}

@@ -163,7 +163,7 @@ class StandardPlant(Partition):
         The modes are not solved again: this is what placement calls. ModelError when the plant was
         not assembled from a structure.
         """
-        return rebuilt(self, ports=ports)
+        return self._known(rebuilt(self, ports=ports))
 
     def at(
         self, poi: Place | Mapping[str, Place] | None = None, **positions: float
@@ -206,7 +206,7 @@ class StandardPlant(Partition):
 
     def _known(self, found: StandardPlant) -> StandardPlant:
         """Return a plant of the same modes with what is not known of this one."""
-        return found if self.uncertainty is None else self.uncertainty.replace(plant=found).nominal
+        return found if self.uncertainty is None else self.uncertainty.on(found).nominal
 
     def map(self, judge: Any = None, *, points: Any = 21) -> PositionMap:
         """Return what the position does: decoupling, modes seen and reached, figures of one's own.
