@@ -321,6 +321,8 @@ def _height(weights: StateSpace, gap: ComplexArray, freq: FloatArray) -> FloatAr
 _SMOOTH = 20
 #: steps of the fit, and how much more a weight below the curve counts than one above
 _STEPS, _BELOW = 40, 4.0
+#: relative: rounding of a sum in double precision
+_LOST = 1e-16
 #: a value of the curve below this part of what it is around is not followed; how far around
 #: that is, in logarithms
 _VALLEY, _WIDE = 1e-4, 0.1
@@ -433,7 +435,10 @@ def _log_fit(terms: FloatArray, square: FloatArray, spacing: FloatArray) -> Floa
         return np.asarray(side(q) * (np.log(sums(q)) - goal))
 
     def slope(q: FloatArray) -> FloatArray:
-        return np.asarray((side(q) / sums(q))[:, None] * (terms * np.exp(q)))
+        # what is below the rounding of a sum is zero: on some matrices with such entries LAPACK's
+        # singular values do not converge
+        share = terms * np.exp(q) / sums(q)[:, None]
+        return np.asarray(side(q)[:, None] * np.where(share > _LOST, share, 0.0))
 
     # each term as high as it can be below the curve, or nearly so
     start = -np.log(np.quantile(terms / square[:, None], 0.99, axis=0))
