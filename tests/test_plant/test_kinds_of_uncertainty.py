@@ -362,19 +362,23 @@ def steps(plant):
     }
 
 
-@pytest.mark.parametrize("order", list(permutations(["discretized", "at", "uncertain"])))
-@pytest.mark.parametrize("behind", [(), ("through",), ("through", "weighted"), ("weighted",)])
-def test_uncertainty_survives_whatever_is_done_to_the_plant(order, behind):
+@pytest.mark.parametrize(
+    "order",
+    [
+        *permutations(["discretized", "at", "uncertain"]),
+        *list(permutations(["discretized", "at", "uncertain", "through", "weighted"]))[::9],
+    ],
+)
+def test_uncertainty_survives_whatever_is_done_to_the_plant(order):
     """Steps in any order: the Deltas are those of the plant on which they were stated last."""
     ports = fx.testbeds.three_masses().assembled.ports
     plant = fx.assemble_plant(whole().select(range(3)), ports, evaluation=whole())
     last = plant.discretized(2e3, delay=1.2).at({"die": "2:x"})
     wanted = steps(plant)["uncertain"](last)
     made = plant
-    for name in (*order, *behind):
+    for name in order:
         made = steps(plant)[name](made)
-    known = made if not behind else made.uncertainty
-    known = known if isinstance(known, fx.plant.UncertainPlant) else known.uncertainty
+    known = made if isinstance(made, fx.plant.UncertainPlant) else made.uncertainty
     assert [delta.name for delta in known.deltas] == [delta.name for delta in wanted.deltas]
     np.testing.assert_allclose(known.system.B, wanted.system.B, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(known.system.C, wanted.system.C, rtol=1e-12, atol=1e-15)

@@ -17,7 +17,6 @@ from ...lti.statespace import StateSpace
 from ...updating import ModalUncertainty, UpdateResult
 from ..building import P
 from ..partition import Partition
-from ..ports import Ports
 from .channels import Opened, require_exact
 from .delta import Delta, with_changes
 from .fit import Fit
@@ -297,32 +296,6 @@ class UncertainPlant(Value, Generic[P]):
             Sampled, moved or with other ports, say.
         """
         return self.replace(plant=plant.replace(uncertainty=None))
-
-    def discretized(self, rate: float, *, delay: float = 0.0) -> UncertainPlant[P]:
-        """Return what is not known of the sampled plant, as `StandardPlant.discretized`."""
-        return self.on(self._plant.discretized(rate, delay=delay))
-
-    def at(self, poi: Any = None, **positions: float) -> UncertainPlant[P]:
-        """Return what is not known of the plant where ports are elsewhere: `StandardPlant.at`."""
-        return self.on(self._plant.at(poi, **positions))
-
-    def with_ports(self, ports: Ports) -> UncertainPlant[P]:
-        """Return what is not known of the plant with other ports: `StandardPlant.with_ports`."""
-        return self.on(self._plant.with_ports(ports))
-
-    def weighted(self, weights: Any = None, *, z: Any = None, w: Any = None) -> Any:
-        """Return the weighted plant, which keeps what is not known: `StandardPlant.weighted`."""
-        nominal: Any = self.nominal
-        return nominal.weighted(weights, z=z, w=w)
-
-    def through(self, block: Any) -> Any:
-        """Return the plant read through a block, which keeps it: `StandardPlant.through`."""
-        nominal: Any = self.nominal
-        return nominal.through(block)
-
-    @property
-    def _plant(self) -> Any:
-        return self.plant
 
 
 def _opened(base: Partition, deltas: Sequence[Delta]) -> Opened:
