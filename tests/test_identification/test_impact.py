@@ -234,6 +234,36 @@ def test_clipped_blows_are_found_whatever_the_offset(seed):
     assert len(impact_frf(**given, limits=float(np.abs(given["force"]).max())).used) == 2
 
 
+@pytest.mark.parametrize("seed", range(30))
+def test_blows_that_are_clipped_a_little_are_found(seed):
+    """Exactly the blows with three samples at the limit, without noise, with some, in few bits."""
+    rng = np.random.default_rng(200 + seed)
+    rate = 10 ** rng.uniform(3, 5)
+    force, y = half_sines(rng, 10_000, rate)
+    kind = seed % 3
+    if kind == 1:
+        force = force + 0.1 * rng.normal(size=force.size)
+    # bits for which a smooth peak has no three samples in one quantum
+    quantum = 200.0 / 2**14 if kind == 2 else 0.0
+    limit = rng.uniform(0.5, 0.99) * force.max()
+    limit = quantum * np.floor(limit / quantum) if quantum else limit
+    clipped = np.minimum(quantum * np.round(force / quantum) if quantum else force, limit)
+    begins = np.flatnonzero(np.diff((force > 20.0).astype(int)) == 1)
+    held = [np.count_nonzero(clipped[at : at + 60] == limit) >= 3 for at in begins]
+    sign, offset = rng.choice([-1.0, 1.0]), rng.choice([0.0, 7.3, -120.0])
+    y = y + 1e-4 * np.abs(y).max() * rng.normal(size=y.size)
+    given = {"response": y, "rate": rate, "segment": 1500 / rate}
+    scale = 10.0 ** rng.integers(-9, 9)
+    if all(held):
+        with pytest.raises(ModelError, match="u1 is at the limit of its range"):
+            impact_frf(scale * (sign * clipped + offset), **given)
+        return
+    test = impact_frf(scale * (sign * clipped + offset), **given)
+    assert len(test.used) == len(held) - sum(held)
+    assert all("u1 is at the limit" in blow.reason for blow in test.refused)
+    assert len(test.refused) == sum(held)
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_a_record_may_begin_with_its_blow(seed):
     """The same FRF as with zeros in front, whatever is missing of them."""

@@ -21,8 +21,11 @@ from .spectra import Records, dropouts_warned, error_statistics, records
 NOISE = 6.0
 #: median of |x| of normal noise times this is its deviation
 NORMAL = 1.4826
-#: equal samples at a channel's extreme value that are a limit, after a step of so many quanta
-FLAT, STEEP = 3, 4.0
+#: number of equal samples at a channel's extreme value that are a limit, where one of the two steps
+#: before them is larger than this number of quanta. As many equal samples at a smooth peak,
+#: ``p - c t^2``, have c of at most a quantum, and steps of ``3 c`` and ``5 c`` before them, with a
+#: quantum of rounding
+FLAT, STEEP = 3, 6.0
 #: the window ends at exp(-4), 2 %, by default: resonances are 1.3 lines wide at least
 WINDOWS = 4.0
 #: complex degrees of freedom of a variance, averaged over lines where there are few blows
@@ -418,22 +421,23 @@ def _limited(
         else:
             at = np.zeros(signal.size, dtype=np.bool_)
             steps = np.abs(np.diff(signal))
-            least = steps[steps > 0].min(initial=np.inf)
+            # the quantum of a converter; without one the rounding of the numbers
+            quantum = float(np.diff(np.unique(signal)).min(initial=np.inf))
             for extreme in (signal.max(), signal.min()):
                 if abs(extreme - np.median(signal)) > near:
-                    at |= _flat_runs(signal == extreme, steps, STEEP * float(least))
+                    at |= _flat_runs(signal == extreme, steps, STEEP * quantum)
         if at.any():
             found[name] = at
     return found
 
 
 def _flat_runs(extreme: Any, steps: FloatArray, steep: float) -> Any:
-    """Return runs of `extreme` that begin after a step larger than `steep`, of FLAT samples."""
+    """Return runs of FLAT samples of `extreme` with a step larger than `steep` just before them."""
     edges = np.diff(np.concatenate([[0], extreme.astype(np.int8), [0]]))
     at = np.zeros(extreme.size, dtype=np.bool_)
     begins: IntArray = np.flatnonzero(edges == 1)
     for begin, end in zip(begins, np.flatnonzero(edges == -1), strict=True):
-        if end - begin >= FLAT and begin and steps[begin - 1] > steep:
+        if end - begin >= FLAT and np.any(steps[max(begin - 2, 0) : begin] > steep):
             at[begin:end] = True
     return at
 
