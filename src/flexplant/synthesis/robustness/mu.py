@@ -39,7 +39,7 @@ from .uncertainty_blocks import (
 from .upper import WIDE, centred, reached_level, upper_level
 
 #: frequencies at which a perturbation is sought, starts at each
-_SOUGHT, _STARTS = 8, 6
+_SOUGHT, _STARTS = 8, 10
 #: part of the upper bound from which a lower one is not raised further: no design hangs on less
 _MET = 0.999
 #: relative distance of the level to the largest upper bound found at a frequency

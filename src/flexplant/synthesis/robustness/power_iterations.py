@@ -94,8 +94,8 @@ def power_iterations(
     """Return perturbations of size one for which an eigenvalue of ``M Delta`` is large and real.
 
     The iteration of Young and Doyle for real and complex blocks together. The real Deltas of the
-    first start are positive, those of the others have random signs; they may come out inside their
-    interval. It need not converge: what it gives is judged by what it does.
+    first half of the starts are positive, which the blocks of most loops are built for; those of
+    the others have random signs. They may come out inside their interval. It need not converge: what it gives is judged by what it does.
     [Young1990]_; [PackardDoyle1993]_.
     """
     blocks = _Structure(where)
@@ -103,7 +103,8 @@ def power_iterations(
     b, w = (_unit(drawn[:, i, 0] + 1j * drawn[:, i, 1]) for i in range(2))
     q = np.ones((count, blocks.real.size), dtype=np.complex128)
     firsts = blocks.w.channels[blocks.w.first]
-    q[1:][blocks.real & (drawn[1:, 0, 0][:, firsts] < 0)] = -1.0
+    half = (count + 1) // 2
+    q[half:][blocks.real & (drawn[half:, 0, 0][:, firsts] < 0)] = -1.0
     old, a = b.copy(), b @ M.T
     on = np.arange(count)  # starts that have not settled
     for _ in range(_STEPS):
