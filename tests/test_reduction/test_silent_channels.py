@@ -1,11 +1,14 @@
 """Channels that do not respond, known by the construction of the machine, not by rounding."""
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from flexplant import DofSet, FEModel, ModalDamping
+from flexplant import Actuator, DofSet, FEModel, ModalDamping, Ports, Sensor, frequency_response
 from flexplant.modes import solve_modes
 from flexplant.reduction import (
     CraigBampton,
@@ -94,3 +97,26 @@ def test_a_reduced_model_that_answers_where_the_full_one_is_silent_is_said():
     assert found.silent[:, 0].tolist() == [True, False]
     assert found.frf_error[0, 0] > 0.05
     assert "where the full model is silent" in repr(found)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_direct_check_does_not_divide_by_the_rounding_of_silent_channels(seed):
+    """Responses of all channels, or of silent ones only, are as good as those that respond."""
+    turned = 0.7 * (seed // 2)
+    model, places = machine(np.random.default_rng(seed), alike=seed % 2, angle=turned)
+    reduced = reduce(model, ModalTruncation(12))
+    for outputs in ("zy", "z"):
+        found = reduced.quality(
+            model, band=BAND, inputs=[places["1"]], outputs=[places[one] for one in outputs]
+        )
+        gaps = re.search(r"differ by (\S+) of the peak, (\S+) of the", repr(found)).groups()
+        assert float(gaps[0]) < 1e-6 and float(gaps[1]) < 1e-2
+        assert np.isnan(found.resonance_error[0, 0])
+    ports = Ports(
+        u=[Actuator("f", at=places["1"])],
+        y=[Sensor("still", at=places["z"], quantity="velocity"), Sensor("turn", at=places["ry"])],
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = frequency_response(model, ports, np.linspace(*BAND, 40), damping=LOW)
+    assert found.error.max() < 1e-6

@@ -47,7 +47,8 @@ def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u",
         feedback in it, or a ClosedLoop, whose controller is then closed on this plant. A system
         or an Frf alone is a loop gain closed by negative feedback, ``S = (I + L)^-1``.
     freq : (n_freq,) array, optional [Hz]
-        A grid refined at resonances when not given; those of the Frf for a measured plant.
+        A grid refined at resonances when not given; for a measured plant its lines above 0 Hz (at
+        0 Hz free bodies and integrators are infinite).
     at : {"u", "y"}
         Where the loop is broken.
 

@@ -23,7 +23,13 @@ from ..checks import (
 from ..errors import ModelError, aligned, counted
 from ..labels import Place
 from ..lti.frequency_sweep import climbed_grid
-from ..modes.dynamic_basis import DirectCheck, DynamicBasis, antiresonances, checked_response
+from ..modes.dynamic_basis import (
+    SILENT,
+    DirectCheck,
+    DynamicBasis,
+    antiresonances,
+    checked_response,
+)
 from ..modes.matching import pair_modes
 from ..modes.modes import Modes
 from ..modes.solve import modes_reaching
@@ -93,6 +99,7 @@ def quality_of(
     sizes, silent = channel_sizes(peak, places_move.max(axis=0))
     # of the largest response there: a mode on a node line makes no resonance of that pair
     at_peaks = gap / divisor(larger.max(axis=(1, 2), keepdims=True, initial=0.0))
+    at_peaks[:, silent] = np.nan
     at_dips = gap / np.where(silent, sizes, divisor(larger))
     channels = labels_of(pushed, full.dofs), labels_of(watched, full.dofs)
     bound = reduced.bound
@@ -130,7 +137,7 @@ def channel_sizes(peak: FloatArray, places_move: FloatArray) -> tuple[FloatArray
     """
     q = peak.shape[1]
     own = np.sqrt(np.outer(places_move[q:], places_move[:q]))
-    silent = peak <= _SILENT * own
+    silent = peak <= SILENT * own
     return divisor(np.where(silent, own, peak)), silent
 
 
@@ -209,10 +216,6 @@ def _mode_comparison(
     }
 
 
-#: a channel with a peak below this fraction of the responses of its places to their own forces is
-#: silent: it consists of the rounding of modes of other directions (up to 1e-11 was found for beams
-#: of 360 DOFs, in proportion to the condition of K), far below any response that is of use
-_SILENT = 1e-9
 #: points over the band, beside resonances and antiresonances
 _GRID = 200
 #: direct solutions that check the responses of a small and of a large structure
@@ -260,6 +263,8 @@ class FullResponses:
     def drive_points(self, freq: FloatArray) -> FloatArray:
         """Return the size (f, q + p) of the response of each input and output to its own force."""
         loads = np.hstack([self.B, self.C.T])
+        if self.basis is not None:
+            return self.basis.drive_points(freq, loads.T)
         found = np.zeros((freq.size, loads.shape[1]))
         for k, load in enumerate(loads.T):
             found[:, k] = np.abs(self._response(freq, load[None], load[:, None]))[:, 0, 0]
@@ -366,7 +371,7 @@ class ReductionQuality(Value):
         are relative to this mean, and the printed worst channel is one that responds.
     resonance_error : (p, q) array
         Largest error at a resonance of either model, of the largest response of any pair and
-        either model there; NaN without a resonance in the band.
+        either model there; NaN without a resonance in the band, and of silent channels.
     antiresonance_error : (p, q) array
         Largest error at an antiresonance of either model, of the larger response of both there: 1
         where one has an antiresonance that the other does not have. NaN without one. Of silent

@@ -94,8 +94,8 @@ def power_iterations(
     """Return perturbations of size one for which an eigenvalue of ``M Delta`` is large and real.
 
     The iteration of Young and Doyle for real and complex blocks together. The real Deltas of the
-    first half of the starts are positive, which the blocks of most loops are built for; those of
-    the others have random signs. They may come out inside their interval. It need not converge: what it gives is judged by what it does.
+    first half of the starts are positive, those of the others have random signs; they may come out
+    inside their interval. It need not converge: what it gives is judged by what it does.
     [Young1990]_; [PackardDoyle1993]_.
     """
     blocks = _Structure(where)
