@@ -74,8 +74,10 @@ class Fit(Uncertainty):
     --------
     >>> import flexplant as fx
     >>> measured = fx.MeasuredModes(poles=[-6.3 + 632.4j], modes=[2], covariance=[1.0])
-    >>> fx.testbeds.three_masses().uncertain(fx.plant.Fit(measured, deviations=3.0)).deviations
-    3.0
+    >>> fx.testbeds.three_masses().uncertain(fx.plant.Fit(measured, deviations=3.0))
+    <UncertainPlant: 2 real Deltas at 3 std
+      mode2:freq +- 0.335 %
+      mode2:damping +- 33.7 %>
     """
 
     source: UpdateResult | ModalUncertainty | MeasuredModes
